@@ -1,0 +1,1 @@
+"""Grasp data sets: shards, the engine that fills them, the training bundle."""

@@ -1,0 +1,1 @@
+"""Geometry on tensors: knows no robot, reads no file."""

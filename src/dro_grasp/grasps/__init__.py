@@ -1,0 +1,1 @@
+"""Grasps: the batch type, controller, energies, synthesis, ranking."""

@@ -1,0 +1,1 @@
+"""Hands derived from any description."""

@@ -1,0 +1,1 @@
+"""Kinematic trees: loading, forward kinematics, the joint solver."""

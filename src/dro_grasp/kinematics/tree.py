@@ -1,0 +1,177 @@
+"""A hand's kinematic tree: batched forward kinematics and Jacobians.
+
+Mimic joints and stated couplings are resolved once, when the tree is made: everything here takes `q`, the values of
+the *independent* joints, and maps them to all joints by one affine map. Source: paper section III-D and any textbook.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class KinematicTree:
+    """Links in topological order, root first; at most one moving joint per link."""
+
+    link_names: tuple[str, ...]
+    """Names of the n_links links. A body with several joints is split; its extra links are named `name/1`, ..."""
+    joint_names: tuple[str, ...]
+    """Names of the n_dof independent joints, the order of every `q`."""
+    moving_names: tuple[str, ...]
+    """Names of all n_joints moving joints, followers included."""
+    parent: tuple[int, ...]
+    """Index of each link's parent; -1 for the root; always smaller than the link's own index."""
+    link_joint: tuple[int, ...]
+    """Index into moving_names of the joint above each link, or -1 where the link is fixed to its parent."""
+    kind: tuple[int, ...]
+    """FIXED, REVOLUTE or PRISMATIC, one per link."""
+    origin: Float[Tensor, "n_links 4 4"]
+    """T_parent_link at joint value zero [m]."""
+    axis: Float[Tensor, "n_links 3"]
+    """Unit joint axis in the link frame; zero for fixed links."""
+    anchor: Float[Tensor, "n_links 3"]
+    """A point on a revolute joint's axis, in the link frame [m] (zero in every URDF)."""
+    lower: Float[Tensor, " n_dof"]
+    """Lower limits of the independent joints [rad or m]."""
+    upper: Float[Tensor, " n_dof"]
+    """Upper limits of the independent joints [rad or m]."""
+    coupling: Float[Tensor, "n_joints n_dof"]
+    """All moving joints = coupling @ q + offset."""
+    offset: Float[Tensor, " n_joints"]
+    """See coupling [rad or m]."""
+
+    @property
+    def n_links(self) -> int:
+        """Number of links, fixed ones included."""
+        return len(self.link_names)
+
+    @property
+    def n_dof(self) -> int:
+        """Number of independent joints."""
+        return len(self.joint_names)
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> KinematicTree:
+        """The same tree with its tensors on another device or in another precision."""
+        moved = {k: v.to(device=device, dtype=dtype) if isinstance(v, Tensor) else v for k, v in self.fields().items()}
+        return KinematicTree(**moved)
+
+    def fields(self) -> dict[str, object]:
+        """The constructor's arguments by name."""
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
+    @cached_property
+    def _levels(self) -> tuple[tuple[Int[Tensor, " n"], Int[Tensor, " n"]], ...]:
+        """Per depth below the root: the links there, and their parents."""
+        depth = [0] * self.n_links
+        for link, parent in enumerate(self.parent):
+            depth[link] = 0 if parent < 0 else depth[parent] + 1
+        levels = [[i for i in range(self.n_links) if depth[i] == d] for d in range(1, max(depth) + 1)]
+        device = self.origin.device
+        return tuple(
+            (torch.tensor(links, device=device), torch.tensor([self.parent[i] for i in links], device=device))
+            for links in levels
+        )
+
+    @cached_property
+    def link_coupling(self) -> Float[Tensor, "n_links n_dof"]:
+        """Change of each link's own joint per change of each independent joint (zero rows for fixed links)."""
+        rows = self.origin.new_zeros(self.n_links, self.n_dof)
+        for link, joint in enumerate(self.link_joint):
+            if joint >= 0:
+                rows[link] = self.coupling[joint]
+        return rows
+
+    @cached_property
+    def link_offset(self) -> Float[Tensor, " n_links"]:
+        """Value of each link's own joint at q = 0."""
+        values = [0.0 if joint < 0 else float(self.offset[joint]) for joint in self.link_joint]
+        return self.origin.new_tensor(values)
+
+    @cached_property
+    def descends(self) -> Bool[Tensor, "n_links n_links"]:
+        """descends[i, j]: link i is link j or below it."""
+        table = torch.zeros(self.n_links, self.n_links, dtype=torch.bool, device=self.origin.device)
+        for link, parent in enumerate(self.parent):
+            if parent >= 0:
+                table[link] = table[parent]
+            table[link, link] = True
+        return table
+
+    def joint_motion(self, q: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_links 4 4"]:
+        """Motion of each link caused by its own joint, in the link's frame at joint value zero."""
+        x = q @ self.link_coupling.T + self.link_offset
+        revolute = torch.tensor(self.kind, device=q.device) == REVOLUTE
+        angle = torch.where(revolute, x, torch.zeros_like(x))[..., None, None]
+        k = _skew(self.axis)
+        eye = torch.eye(3, dtype=q.dtype, device=q.device)
+        rotation = eye + torch.sin(angle) * k + (1 - torch.cos(angle)) * (k @ k)
+        slide = torch.where(revolute, torch.zeros_like(x), x)[..., None] * self.axis
+        shift = slide + self.anchor - (rotation @ self.anchor[..., None])[..., 0]
+        return _assemble(rotation, shift)
+
+    def forward(self, q: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_links 4 4"]:
+        """Pose of every link in the root link's frame, T_root_link.
+
+        Args:
+            q: Values of the independent joints [rad or m].
+        """
+        local = self.origin @ self.joint_motion(q)
+        poses = local.clone()
+        for links, parents in self._levels:
+            poses[..., links, :, :] = poses[..., parents, :, :].clone() @ local[..., links, :, :]
+        return poses
+
+    def motion_axes(
+        self, T_world_link: Float[Tensor, "*batch n_links 4 4"]
+    ) -> tuple[Float[Tensor, "*batch n_links 3"], Float[Tensor, "*batch n_links 3"]]:
+        """Velocity (linear at the world origin, angular) of everything below each link per unit of its own joint.
+
+        A point p below link j moves by linear[j] + angular[j] x p per unit of joint j.
+        """
+        rotation = T_world_link[..., :3, :3]
+        axis = (rotation @ self.axis[..., None])[..., 0]
+        anchor = (rotation @ self.anchor[..., None])[..., 0] + T_world_link[..., :3, 3]
+        revolute = (torch.tensor(self.kind, device=axis.device) == REVOLUTE)[:, None]
+        angular = torch.where(revolute, axis, torch.zeros_like(axis))
+        linear = torch.where(revolute, -torch.linalg.cross(axis, anchor), axis)
+        return linear, angular
+
+    def point_jacobian(
+        self,
+        T_world_link: Float[Tensor, "*batch n_links 4 4"],
+        points: Float[Tensor, "*batch n_points 3"],
+        links: Int[Tensor, " n_points"],
+    ) -> Float[Tensor, "*batch n_points 3 n_dof"]:
+        """Derivative of world points, each fixed to a link, by the independent joints.
+
+        Args:
+            T_world_link: Poses of all links, as `forward` gives them (in any world frame).
+            points: Positions in that world frame [m].
+            links: The link that each point is fixed to.
+        """
+        linear, angular = self.motion_axes(T_world_link)
+        velocity = linear[..., None, :, :] + torch.linalg.cross(
+            angular[..., None, :, :].expand(*points.shape[:-1], -1, -1), points[..., :, None, :].expand(
+                *points.shape[:-1], self.n_links, 3), dim=-1
+        )
+        velocity = velocity * self.descends[links][:, :, None].to(points.dtype)
+        return torch.einsum("...plx,ld->...pxd", velocity, self.link_coupling)
+
+
+def _skew(v: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    x, y, z = v.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+
+
+def _assemble(rotation: Float[Tensor, "*batch 3 3"], shift: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4 4"]:
+    top = torch.cat([rotation, shift[..., None]], -1)
+    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
+    return torch.cat([top, bottom], -2)

@@ -1,0 +1,1 @@
+"""The D(R,O) network: tensors in, tensors out."""

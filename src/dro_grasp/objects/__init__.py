@@ -1,0 +1,1 @@
+"""Objects: meshes, point clouds, and what a camera sees of them."""

@@ -1,0 +1,1 @@
+"""Physics trials of grasps in MuJoCo."""

@@ -1,0 +1,1 @@
+"""Pretraining and training of the D(R,O) network."""
