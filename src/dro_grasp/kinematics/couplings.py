@@ -1,0 +1,56 @@
+"""Joints that follow others: URDF mimic, MJCF joint equalities and shared tendons."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dro_grasp.errors import HandError
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """follower = multiplier * leader + offset."""
+
+    follower: int
+    """Index of the following joint."""
+    leader: int
+    """Index of the leading joint; -1: the follower is held at the offset."""
+    multiplier: float
+    offset: float
+    """[rad or m]"""
+
+
+def resolve_couplings(
+    couplings: tuple[Coupling, ...], n_joints: int, names: list[str], path: Path
+) -> tuple[list[int], np.ndarray, np.ndarray]:
+    """Every joint as an affine function of the independent ones.
+
+    Returns:
+        Indices of the independent joints, coupling (n_joints n_dof) and offset (n_joints).
+
+    Raises:
+        HandError: Followers follow each other in a cycle.
+    """
+    rule = {c.follower: c for c in couplings}
+    free = [j for j in range(n_joints) if j not in rule]
+    coupling, offset = np.zeros((n_joints, len(free))), np.zeros(n_joints)
+    for joint in range(n_joints):
+        factor, shift, current, seen = 1.0, 0.0, joint, [joint]
+        while current in rule:
+            step = rule[current]
+            shift += factor * step.offset
+            factor *= step.multiplier
+            current = step.leader
+            if current in seen:
+                chain = " -> ".join(names[j] for j in [*seen, current])
+                raise HandError(f"{path}: joints follow each other in a cycle ({chain}); one of them must be free")
+            if current < 0:
+                break
+            seen.append(current)
+        offset[joint] = shift
+        if current >= 0:
+            coupling[joint, free.index(current)] = factor
+    return free, coupling, offset
