@@ -1,0 +1,78 @@
+"""Sampling of surfaces and selection of points."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+def sample_surface(
+    vertices: Float[Tensor, "n_vertices 3"], faces: Int[Tensor, "n_faces 3"], count: int, generator: torch.Generator
+) -> tuple[Float[Tensor, "count 3"], Float[Tensor, "count 3"], Int[Tensor, " count"]]:
+    """Points uniform on a triangle mesh.
+
+    Returns:
+        Points [m], unit normals (counter-clockwise faces look outward), and the face of each point.
+
+    Raises:
+        ValueError: The mesh has no area.
+    """
+    corners = vertices[faces]
+    cross = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = cross.norm(dim=-1)
+    if len(faces) == 0 or float(area.sum()) <= 0:
+        raise ValueError("the mesh has no area to sample; give at least one triangle that is not degenerate")
+    total = area.double().cumsum(0)
+    pick = torch.rand(count, generator=generator, dtype=torch.float64) * total[-1]
+    chosen = torch.searchsorted(total, pick).clamp(max=len(faces) - 1)
+    uv = torch.rand(count, 2, generator=generator).to(vertices)
+    root = uv[:, :1].sqrt()
+    weights = torch.cat([1 - root, root * (1 - uv[:, 1:]), root * uv[:, 1:]], -1)
+    points = (weights[..., None] * corners[chosen]).sum(1)
+    return points, torch.nn.functional.normalize(cross[chosen], dim=-1), chosen
+
+
+def farthest_points(points: Float[Tensor, "*batch n 3"], count: int, start: int = 0) -> Int[Tensor, "*batch count"]:
+    """Farthest point sampling: each next point is the one farthest from all before it.
+
+    Args:
+        points: Clouds to choose from.
+        count: How many to choose, at most n.
+        start: Index of the first one.
+
+    Raises:
+        ValueError: More points are asked for than there are.
+    """
+    n = points.shape[-2]
+    if count > n:
+        raise ValueError(f"{count} points were asked for, the cloud has {n}; ask for fewer or give a denser cloud")
+    flat = points.reshape(-1, n, 3)
+    rows = torch.arange(len(flat), device=points.device)
+    chosen = torch.empty(len(flat), count, dtype=torch.int64, device=points.device)
+    nearest = torch.full(flat.shape[:2], torch.inf, device=points.device, dtype=points.dtype)
+    current = torch.full((len(flat),), start, dtype=torch.int64, device=points.device)
+    for i in range(count):
+        chosen[:, i] = current
+        nearest = torch.minimum(nearest, (flat - flat[rows, current][:, None]).square().sum(-1))
+        current = nearest.argmax(-1)
+    return chosen.reshape(*points.shape[:-2], count)
+
+
+def partial_view(
+    points: Float[Tensor, "n 3"], count: int, generator: torch.Generator
+) -> Int[Tensor, " count"]:
+    """Indices of the points that stay when the far half-space of a random direction is cut away.
+
+    Source: appendix, partial object point cloud sampling: twice as many points as wanted are drawn, and the half
+    with the smaller product of position and a random direction is removed.
+
+    Raises:
+        ValueError: The cloud has fewer than 2 * count points.
+    """
+    if len(points) < 2 * count:
+        raise ValueError(f"a partial view of {count} points needs a cloud of {2 * count}, got {len(points)}")
+    drawn = torch.randperm(len(points), generator=generator)[: 2 * count]
+    direction = torch.randn(3, generator=generator).to(points)
+    along = (points[drawn] - points[drawn].mean(0)) @ (direction / direction.norm())
+    return drawn[along.argsort(descending=True)[:count]]

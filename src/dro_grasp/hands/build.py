@@ -1,0 +1,280 @@
+"""From a description to a Hand: points, fingertips, palm, open ends, all derived.
+
+Source: paper section III-B and appendix, dataset preprocessing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from dro_grasp.errors import HandError
+from dro_grasp.geometry.point_clouds import farthest_points, sample_surface
+from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.palm import CLOSINGS, Palm, find_palm
+from dro_grasp.kinematics.loader import Description
+from dro_grasp.kinematics.tree import FIXED, KinematicTree
+
+POINTS_PER_LINK_SAMPLED = 512
+"""Points sampled on each link before farthest point sampling. Source: appendix, robot point cloud sampling."""
+TIP_OFFSET = 0.03
+"""Distance of the extra target beyond a fingertip [m]."""
+AXIS_ALONG_PALM = 0.75
+"""Cosine of the angle to the palm direction below which a joint's axis does not point out of the palm."""
+REFINEMENTS = 4
+"""How often open ends and palm are derived from each other."""
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """Dense surface samples of all links from the palm on."""
+
+    points: torch.Tensor
+    normals: torch.Tensor
+    link: torch.Tensor
+
+
+def build_hand(description: Description, *, name: str | None = None, seed: int = 0, n_points: int = 512) -> Hand:
+    """Derive everything the method needs from a description.
+
+    Args:
+        description: From `load_description`.
+        name: How the hand is called in files and tables; the file's stem by default.
+        seed: Seed of the point sampling; the same seed gives the same points.
+        n_points: Points of the whole hand.
+
+    Raises:
+        HandError: No finger, or no link with a surface.
+    """
+    tree = description.tree
+    shaped = sorted({g.link for g in description.geometry})
+    if not shaped:
+        raise HandError(f"{description.path} has no visual or collision shape; nothing can be sampled or touch")
+    tips = find_tips(tree, shaped)
+    palm = find_palm_link(tree, tips)
+    below = [link for link in range(tree.n_links) if bool(tree.descends[link, palm])]
+    held = _held_joints(tree, palm)
+    rest = torch.zeros(tree.n_dof).clamp(tree.lower, tree.upper)
+    surface = _sample_links(description, [link for link in below if link in shaped], seed)
+    opening, abduction, found = _open_ends(tree, surface, tips, palm, held, rest)
+    T_palm = _inverse(tree.forward(rest)[palm])
+    to_palm = lambda p: (T_palm[:3, :3] @ torch.tensor(p, dtype=torch.float32) + T_palm[:3, 3])  # noqa: E731
+    draft = Hand(
+        name=name or description.name, tree=tree, link_points=surface.points, link_normals=surface.normals,
+        link_index=surface.link, tips=tips, tip_offsets=_tip_offsets(tree, surface, tips), palm=palm,
+        palm_centre=to_palm(found.centre), palm_direction=T_palm[:3, :3] @ torch.tensor(found.direction, dtype=torch.float32),
+        grasp_centre=to_palm(found.grasp_centre), opening=opening, movable=~held, rest=rest, abduction=abduction,
+        touching=tuple(link for link in below if any(g.link == link and g.collides for g in description.geometry)),
+        sha256=description.sha256, description=description,
+    )
+    return _thin(draft, n_points)
+
+
+def find_tips(tree: KinematicTree, shaped: list[int]) -> tuple[int, ...]:
+    """Fingertips: below each last moving joint, the deepest link with a shape.
+
+    Raises:
+        HandError: No moving joint carries a shape.
+    """
+    tips = []
+    for link in range(tree.n_links):
+        group = [i for i in range(tree.n_links) if bool(tree.descends[i, link])]
+        if tree.kind[link] == FIXED or any(tree.kind[i] != FIXED for i in group if i != link):
+            continue
+        solid = [i for i in group if i in shaped]
+        if solid:
+            tips.append(max(solid, key=lambda i: int(tree.descends[i].sum())))
+    if not tips:
+        raise HandError("no moving joint of this description carries a shape, so it has no fingertip")
+    return tuple(tips)
+
+
+def find_palm_link(tree: KinematicTree, tips: tuple[int, ...]) -> int:
+    """The last common ancestor of the fingertips; with one finger, the link that carries it."""
+    common = torch.stack([tree.descends[t] for t in tips]).all(0).nonzero()[:, 0].tolist()
+    palm = max(common)
+    while len(tips) == 1 and palm > 0 and any(tree.kind[i] != FIXED for i in _chain(tree, palm)):
+        palm = tree.parent[palm]
+    return palm
+
+
+def _chain(tree: KinematicTree, link: int) -> list[int]:
+    return tree.descends[link].nonzero()[:, 0].tolist()
+
+
+def _held_joints(tree: KinematicTree, palm: int) -> torch.Tensor:
+    """Mask (n_dof) of joints that move the palm itself."""
+    above = tree.link_coupling[_chain(tree, palm)].abs().sum(0)
+    return above > 0
+
+
+def _sample_links(description: Description, links: list[int], seed: int) -> _Surface:
+    """Dense samples on what MuJoCo collides, or on the visual shapes of links that do not collide."""
+    generator = torch.Generator().manual_seed(seed)
+    points, normals, index = [], [], []
+    for link in links:
+        shapes = [g for g in description.geometry if g.link == link]
+        shapes = [g for g in shapes if g.collides] or shapes
+        p, n = _sample_shapes([(g.vertices, g.faces) for g in shapes], generator)
+        points.append(p)
+        normals.append(n)
+        index.append(torch.full((len(p),), link))
+    return _Surface(torch.cat(points), torch.cat(normals), torch.cat(index))
+
+
+def _sample_shapes(
+    shapes: list[tuple[np.ndarray, np.ndarray]], generator: torch.Generator
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Samples on the outside of a union of convex shapes."""
+    vertices = torch.cat([torch.tensor(v, dtype=torch.float32) for v, _ in shapes])
+    starts = np.cumsum([0, *[len(v) for v, _ in shapes]])
+    faces = torch.cat([torch.tensor(f.astype(np.int64)) + int(s) for (_, f), s in zip(shapes, starts, strict=False)])
+    owner = torch.cat([torch.full((len(f),), i) for i, (_, f) in enumerate(shapes)])
+    points, normals, face = sample_surface(vertices, faces, 4 * POINTS_PER_LINK_SAMPLED, generator)
+    hidden = torch.zeros(len(points), dtype=torch.bool)
+    if len(shapes) > 1:
+        for i, (v, f) in enumerate(shapes):
+            hidden |= (owner[face] != i) & _inside_convex(points, v, f)
+    seen = (~hidden).nonzero()[:, 0]
+    seen = seen if len(seen) >= POINTS_PER_LINK_SAMPLED // 4 else torch.arange(len(points))
+    seen = seen[:POINTS_PER_LINK_SAMPLED]
+    return points[seen], normals[seen]
+
+
+def _inside_convex(points: torch.Tensor, vertices: np.ndarray, faces: np.ndarray) -> torch.Tensor:
+    """Mask of points behind all faces of a convex shape."""
+    corners = torch.tensor(vertices, dtype=torch.float32)[torch.tensor(faces.astype(np.int64))]
+    normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    height = ((points[:, None] - corners[None, :, 0]) * normal).sum(-1)
+    return (height < -1e-4 * normal.norm(dim=-1)).all(1)
+
+
+def _pose(surface: _Surface, tree: KinematicTree, q: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
+    T = tree.forward(q)[surface.link]
+    points = (T[:, :3, :3] @ surface.points[..., None])[..., 0] + T[:, :3, 3]
+    return points.numpy(), (T[:, :3, :3] @ surface.normals[..., None])[..., 0].numpy()
+
+
+def _open_ends(
+    tree: KinematicTree, surface: _Surface, tips: tuple[int, ...], palm: int, held: torch.Tensor, rest: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, Palm]:
+    """Which end of each joint opens the hand, which joints only spread, and the palm; refined together.
+
+    The open end of a joint is the one at which its fingertips are farther from the grasp centre, with all other
+    joints straight or half closed. A joint whose axis points out of the palm only spreads.
+    """
+    straight = torch.where(held, rest, torch.zeros(tree.n_dof).clamp(tree.lower, tree.upper))
+    centre = torch.tensor(_pose(surface, tree, (tree.lower + tree.upper) / 2)[0].mean(0))
+    opening = -torch.ones(tree.n_dof)
+    abduction = torch.zeros(tree.n_dof, dtype=torch.bool)
+    out_of_palm = _axes_along(tree, straight, None)
+    for _ in range(REFINEMENTS):
+        bases = (straight, _half_closed(tree, opening, abduction, held, rest))
+        found_ends = [[_closing_gain(tree, surface, tips, centre, base, j) for base in bases] for j in range(tree.n_dof)]
+        for j, ends in enumerate(found_ends):
+            abduction[j] = bool(out_of_palm[j])
+            opening[j] = -1.0 if sum(ends) >= 0 or abduction[j] else 1.0
+        found = _examine(tree, surface, tips, palm, opening, abduction, held, rest)
+        centre = torch.tensor(found.grasp_centre, dtype=torch.float32)
+        out_of_palm = _axes_along(tree, straight, torch.tensor(found.direction, dtype=torch.float32))
+    return opening, abduction & ~held, found
+
+
+def _half_closed(
+    tree: KinematicTree, opening: torch.Tensor, abduction: torch.Tensor, held: torch.Tensor, rest: torch.Tensor,
+    share: float = 0.5,
+) -> torch.Tensor:
+    """Joints this share of the way from open to closed; those that only spread near zero."""
+    opened = torch.where(opening > 0, tree.upper, tree.lower)
+    closed = torch.where(opening > 0, tree.lower, tree.upper)
+    neutral = torch.zeros(tree.n_dof).clamp(tree.lower, tree.upper)
+    q = torch.where(abduction, neutral, opened + share * (closed - opened))
+    return torch.where(held, rest, q)
+
+
+def _axes_along(tree: KinematicTree, q: torch.Tensor, direction: torch.Tensor | None) -> torch.Tensor:
+    """Mask (n_dof) of the joints whose axes are along a direction of the root frame."""
+    mask = torch.zeros(tree.n_dof, dtype=torch.bool)
+    if direction is None:
+        return mask
+    angular = tree.motion_axes(tree.forward(q))[1]
+    for j in range(tree.n_dof):
+        moved = tree.link_coupling[:, j].abs() > 0
+        mask[j] = bool(((angular[moved] @ direction).abs() > AXIS_ALONG_PALM).all())
+    return mask
+
+
+def _closing_gain(
+    tree: KinematicTree, surface: _Surface, tips: tuple[int, ...], centre: torch.Tensor, straight: torch.Tensor, j: int
+) -> float:
+    """How much nearer to the centre the upper end of joint j brings its fingertips than the lower end [m]."""
+    moved = [t for t in tips if float(tree.link_coupling[_chain(tree, t), j].abs().sum()) > 0]
+    if not moved:
+        return 0.0
+    middles = [surface.points[surface.link == t].mean(0) for t in moved]
+    q = straight.repeat(2, 1)
+    q[:, j] = torch.stack([tree.lower[j], tree.upper[j]])
+    T = tree.forward(q)
+    path = torch.stack([(T[:, t, :3, :3] @ m) + T[:, t, :3, 3] for t, m in zip(moved, middles, strict=True)], 1)
+    distance = (path - centre).norm(dim=-1).mean(1)
+    return float(distance[0] - distance[1])
+
+
+def _examine(
+    tree: KinematicTree, surface: _Surface, tips: tuple[int, ...], palm: int, opening: torch.Tensor,
+    abduction: torch.Tensor, held: torch.Tensor, rest: torch.Tensor,
+) -> Palm:
+    """The palm at the closing where palm and fingers enclose a ball best, in the frame of the root link."""
+    rigid = [i for i in range(tree.n_links) if _rigid_to(tree, i, palm)]
+    on_palm = torch.isin(surface.link, torch.tensor(rigid)).numpy()
+    if not on_palm.any():
+        on_palm = np.ones(len(on_palm), bool)
+    fingers = [torch.isin(surface.link, torch.tensor([i for i in _chain(tree, t) if i not in rigid])).numpy() for t in tips]
+    best: Palm | None = None
+    for share in CLOSINGS:
+        points, normals = _pose(surface, tree, _half_closed(tree, opening, abduction, held, rest, share))
+        palm_found = find_palm(points[on_palm], normals[on_palm], [points[f] for f in fingers])
+        if best is None or palm_found.score > best.score:
+            best = palm_found
+    assert best is not None
+    return best
+
+
+def _rigid_to(tree: KinematicTree, link: int, palm: int) -> bool:
+    """Whether a link is fixed to the palm."""
+    if not bool(tree.descends[link, palm]):
+        return False
+    while link != palm:
+        if tree.kind[link] != FIXED:
+            return False
+        link = tree.parent[link]
+    return True
+
+
+def _tip_offsets(tree: KinematicTree, surface: _Surface, tips: tuple[int, ...]) -> torch.Tensor:
+    """Beyond each fingertip along the direction from its last joint through the middle of its surface."""
+    poses = tree.forward(torch.zeros(tree.n_dof).clamp(tree.lower, tree.upper))
+    offsets = []
+    for tip in tips:
+        joint_link = max(i for i in _chain(tree, tip) if tree.kind[i] != FIXED)
+        middle = surface.points[surface.link == tip].mean(0)
+        T = _inverse(poses[tip]) @ poses[joint_link]
+        origin = T[:3, 3] + T[:3, :3] @ tree.anchor[joint_link]
+        along = middle - origin
+        offsets.append(middle + TIP_OFFSET * along / along.norm().clamp(min=1e-6))
+    return torch.stack(offsets)
+
+
+def _thin(draft: Hand, n_points: int) -> Hand:
+    """Farthest point sampling over the open hand, grouped by link."""
+    import dataclasses
+
+    keep = farthest_points(draft.points(draft.canonical_joints()), n_points).sort().values
+    return dataclasses.replace(draft, link_points=draft.link_points[keep], link_normals=draft.link_normals[keep],
+                               link_index=draft.link_index[keep])
+
+
+def _inverse(T: torch.Tensor) -> torch.Tensor:
+    return torch.linalg.inv(T)

@@ -1,0 +1,192 @@
+"""A robot hand as the method sees it: tree, surface points, palm, open ends. Everything is derived, nothing annotated."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from dro_grasp.geometry.point_clouds import farthest_points
+from dro_grasp.kinematics.tree import KinematicTree
+
+if TYPE_CHECKING:
+    from dro_grasp.kinematics.loader import Description
+
+MIN_REGISTRATION_POINTS = 4
+"""A link with fewer points, or with collinear ones, has no pose of its own to be read off its points."""
+POINTS_PER_LINK = 6
+"""Points that each link keeps, where it has them, when a hand is thinned."""
+
+
+@dataclass(frozen=True)
+class Hand:
+    """A hand and what was derived from its description."""
+
+    name: str
+    """`allegro`, `assets/allegro_left`, or a file's stem."""
+    tree: KinematicTree
+    """Links, joints, limits, couplings."""
+    link_points: Float[Tensor, "n_hand 3"]
+    """Surface points in their links' frames [m], grouped by link."""
+    link_normals: Float[Tensor, "n_hand 3"]
+    """Outward unit normals of link_points, in their links' frames."""
+    link_index: Int[Tensor, " n_hand"]
+    """The link of each point, ascending."""
+    tips: tuple[int, ...]
+    """Fingertip links."""
+    tip_offsets: Float[Tensor, "n_tips 3"]
+    """Extra target beyond each fingertip, in its link's frame [m]. Source: appendix, URDF file preprocessing."""
+    palm: int
+    """The palm link: the last common ancestor of the fingertips."""
+    palm_centre: Float[Tensor, "3"]
+    """Middle of the palm's inner face, in the palm frame [m]."""
+    palm_direction: Float[Tensor, "3"]
+    """Unit vector out of the palm towards the object, in the palm frame."""
+    grasp_centre: Float[Tensor, "3"]
+    """Centre of the volume that the half-closed hand encloses, in the palm frame [m]."""
+    opening: Float[Tensor, " n_dof"]
+    """+1 where the upper limit is the open end of a joint, -1 where the lower one is."""
+    movable: Bool[Tensor, " n_dof"]
+    """False for joints above the palm, which are held at rest."""
+    rest: Float[Tensor, " n_dof"]
+    """Zero, or the nearest limit: the value of held joints [rad or m]."""
+    abduction: Bool[Tensor, " n_dof"]
+    """Joints that spread fingers and hardly close them."""
+    touching: tuple[int, ...]
+    """Links that can touch an object: the palm and below, with collision geometry."""
+    sha256: str
+    """Hash of the description."""
+    description: Description | None = field(default=None, repr=False, compare=False)
+    """The file behind the hand; None when the hand came out of a training bundle."""
+
+    @property
+    def n_points(self) -> int:
+        """Number of surface points."""
+        return len(self.link_points)
+
+    @property
+    def wrist_link(self) -> str:
+        """Name of the description's root link, whose pose is the wrist pose of a grasp."""
+        return self.tree.link_names[0]
+
+    @cached_property
+    def registrable(self) -> Bool[Tensor, " n_links"]:
+        """Links whose pose their own points determine."""
+        mask = torch.zeros(self.tree.n_links, dtype=torch.bool)
+        for link in self.link_index.unique().tolist():
+            points = self.link_points[self.link_index == link]
+            if len(points) >= MIN_REGISTRATION_POINTS:
+                spread = torch.linalg.svdvals(points - points.mean(0))
+                mask[link] = bool(spread[1] > 1e-4)
+        return mask
+
+    def canonical_joints(self, openness: float = 0.75) -> Float[Tensor, " n_dof"]:
+        """Open-hand joints [rad or m]: this share of the way from the closed to the open end; held joints at rest."""
+        return self._spread_evenly(self._between(torch.full((self.tree.n_dof,), openness)))
+
+    def random_open_joints(self, n: int, generator: torch.Generator) -> Float[Tensor, "n n_dof"]:
+        """Open hands as the network is trained on: openness uniform in 0.65-0.85, one draw per hand."""
+        share = 0.65 + 0.2 * torch.rand(n, 1, generator=generator)
+        return self._spread_evenly(self._between(share.expand(n, self.tree.n_dof)))
+
+    def random_joints(self, n: int, generator: torch.Generator) -> Float[Tensor, "n n_dof"]:
+        """Joints uniform within their limits; held joints at rest."""
+        return self._between(torch.rand(n, self.tree.n_dof, generator=generator))
+
+    def _spread_evenly(self, q: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_dof"]:
+        """Joints that only spread the fingers have no open end: they stand at zero, or a quarter inside their limits."""
+        margin = 0.25 * (self.tree.upper - self.tree.lower)
+        neutral = torch.zeros_like(margin).clamp(self.tree.lower + margin, self.tree.upper - margin)
+        return torch.where(self.abduction & self.movable, neutral, q)
+
+    def _between(self, share: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_dof"]:
+        lower, upper = self.tree.lower, self.tree.upper
+        opened = torch.where(self.opening > 0, upper, lower)
+        closed = torch.where(self.opening > 0, lower, upper)
+        return torch.where(self.movable, opened * share + closed * (1 - share), self.rest)
+
+    def points(
+        self, q: Float[Tensor, "*batch n_dof"], T_world_wrist: Float[Tensor, "*batch 4 4"] | None = None
+    ) -> Float[Tensor, "*batch n_hand 3"]:
+        """Surface points of the posed hand [m], in the world frame (the wrist's without a wrist pose)."""
+        return self._place(self.link_points, q, T_world_wrist)[0]
+
+    def points_and_normals(
+        self, q: Float[Tensor, "*batch n_dof"], T_world_wrist: Float[Tensor, "*batch 4 4"] | None = None
+    ) -> tuple[Float[Tensor, "*batch n_hand 3"], Float[Tensor, "*batch n_hand 3"]]:
+        """As `points`, and the outward unit normals there."""
+        points, poses = self._place(self.link_points, q, T_world_wrist)
+        return points, (poses[..., self.link_index, :3, :3] @ self.link_normals[..., None])[..., 0]
+
+    def _place(
+        self, local: Float[Tensor, "n_hand 3"], q: Float[Tensor, "*batch n_dof"],
+        T_world_wrist: Float[Tensor, "*batch 4 4"] | None,
+    ) -> tuple[Float[Tensor, "*batch n_hand 3"], Float[Tensor, "*batch n_links 4 4"]]:
+        poses = self.tree.forward(q)
+        if T_world_wrist is not None:
+            poses = T_world_wrist[..., None, :, :] @ poses
+        chosen = poses[..., self.link_index, :, :]
+        return (chosen[..., :3, :3] @ local[..., None])[..., 0] + chosen[..., :3, 3], poses
+
+    def T_wrist_palm(self, q: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch 4 4"]:  # noqa: N802
+        """Pose of the palm link in the wrist (root link) frame."""
+        return self.tree.forward(q)[..., self.palm, :, :]
+
+    @cached_property
+    def T_wrist_palm_rest(self) -> Float[Tensor, "4 4"]:  # noqa: N802
+        """The same for held joints at rest: a constant of the hand, since no movable joint lies above the palm."""
+        return self.T_wrist_palm(self.canonical_joints())
+
+    @cached_property
+    def grasp_centre_wrist(self) -> Float[Tensor, "3"]:
+        """grasp_centre in the wrist frame [m]."""
+        T = self.T_wrist_palm_rest
+        return T[:3, :3] @ self.grasp_centre + T[:3, 3]
+
+    @cached_property
+    def palm_direction_wrist(self) -> Float[Tensor, "3"]:
+        """palm_direction in the wrist frame."""
+        return self.T_wrist_palm_rest[:3, :3] @ self.palm_direction
+
+    def with_points(self, count: int) -> Hand:
+        """The same hand with fewer points, spread evenly; each link keeps POINTS_PER_LINK where it has them.
+
+        Raises:
+            ValueError: More points are asked for than the hand has.
+        """
+        if count > self.n_points:
+            raise ValueError(f"hand '{self.name}' has {self.n_points} points, {count} were asked for")
+        if count == self.n_points:
+            return self
+        order = farthest_points(self.points(self.canonical_joints()), self.n_points)
+        rank = torch.empty_like(order)
+        rank[order] = torch.arange(self.n_points)
+        per_link = max(1, min(POINTS_PER_LINK, count // max(1, len(self.link_index.unique()))))
+        first = torch.zeros(self.n_points, dtype=torch.bool)
+        for link in self.link_index.unique().tolist():
+            members = (self.link_index == link).nonzero()[:, 0]
+            first[members[rank[members].argsort()[:per_link]]] = True
+        priority = torch.where(first, rank - self.n_points, rank)
+        keep = priority.argsort()[:count].sort().values
+        return dataclasses.replace(
+            self, link_points=self.link_points[keep], link_normals=self.link_normals[keep],
+            link_index=self.link_index[keep],
+        )
+
+    def to_tensors(self) -> dict[str, Any]:
+        """Tensors and plain values that `from_tensors` turns back into this hand, without its description."""
+        own = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in {"tree", "description"}}
+        return {**own, **{f"tree.{k}": v for k, v in self.tree.fields().items()}}
+
+    @staticmethod
+    def from_tensors(values: dict[str, Any]) -> Hand:
+        """The inverse of `to_tensors`; lists are accepted for tuples."""
+        plain = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+        tree = {k.removeprefix("tree."): v for k, v in plain.items() if k.startswith("tree.")}
+        own = {k: v for k, v in plain.items() if not k.startswith("tree.")}
+        return Hand(tree=KinematicTree(**tree), **own)

@@ -1,0 +1,125 @@
+"""Hands by name or path: built-in, development assets, `robot_descriptions`, or any file."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import os
+from pathlib import Path
+
+from dro_grasp.errors import HandError
+from dro_grasp.hands.build import build_hand
+from dro_grasp.hands.hand import Hand
+from dro_grasp.kinematics.loader import Description, load_description
+
+BUILTIN_FOLDER = Path(__file__).parent / "builtin"
+"""Where our own descriptions lie."""
+ASSET_FILES = {
+    "barrett": "barrett/bhand_model.urdf",
+    "barrett_multidex": "barrett_multidex/model.urdf",
+    "allegro_left": "allegro/allegro_hand_left.urdf",
+    "allegro_right": "allegro/allegro_hand_right.urdf",
+    "shadowhand": "shadowhand/shadow_hand_right.urdf",
+    "leaphand": "leaphand/leap_hand_right.urdf",
+    "inspire": "inspire/inspire_hand_right.urdf",
+    "ability": "ability/ability_hand_right.urdf",
+    "dclaw": "dclaw/dclaw_gripper.urdf",
+    "orca": "orca/scene_right.xml",
+    "ezgripper": "ezgripper/ezgripper.urdf",
+}
+"""Main files of the development assets, below their hands folder."""
+ASSET_PREFIX = "assets/"
+
+
+def load_hand(name: str | Path, *, seed: int = 0, n_points: int = 512) -> Hand:
+    """Load a hand by name or from a URDF or MJCF file; nothing needs to be annotated.
+
+    A bare name is a built-in hand first, then one of the development assets (folder `DRO_GRASP_ASSETS`), then a
+    `robot_descriptions` module; `assets/NAME` forces the asset.
+
+    Args:
+        name: Name or path.
+        seed: Seed of the point sampling.
+        n_points: Points of the hand's cloud.
+
+    Raises:
+        HandError: No such hand, or its description cannot be used.
+    """
+    path, label = locate_hand(name)
+    return build_hand(load_description(path), name=label, seed=seed, n_points=n_points)
+
+
+def load_hand_description(name: str | Path) -> tuple[Description, str]:
+    """The description behind a hand and the hand's name, without deriving points or palm."""
+    path, label = locate_hand(name)
+    return load_description(path), label
+
+
+def hand_names() -> dict[str, str]:
+    """Names that `load_hand` takes, with where they come from: `builtin` or `assets`."""
+    names = {file.stem: "builtin" for file in sorted(BUILTIN_FOLDER.glob("*.urdf"))}
+    folder = _asset_folder()
+    for name, file in ASSET_FILES.items():
+        if folder is not None and (folder / file).is_file():
+            names[ASSET_PREFIX + name] = "assets"
+    return names
+
+
+def locate_hand(name: str | Path) -> tuple[Path, str]:
+    """The file behind a name, and the name that results are filed under.
+
+    Raises:
+        HandError: Nothing has this name.
+    """
+    text = str(name)
+    builtin = BUILTIN_FOLDER / f"{text}.urdf"
+    if "/" not in text and builtin.is_file():
+        return builtin, text
+    asset = _asset_file(text.removeprefix(ASSET_PREFIX))
+    if asset is not None:
+        return asset, ASSET_PREFIX + text.removeprefix(ASSET_PREFIX)
+    path = Path(text).expanduser()
+    if path.exists() or path.suffix.lower() in {".urdf", ".xml", ".mjcf"}:
+        return path, path.stem
+    described = _robot_description(text)
+    if described is not None:
+        return described, text
+    raise HandError(_unknown(text))
+
+
+def _asset_folder() -> Path | None:
+    root = os.environ.get("DRO_GRASP_ASSETS")
+    return Path(root) / "hands" if root else None
+
+
+def _asset_file(name: str) -> Path | None:
+    folder = _asset_folder()
+    if folder is None or name not in ASSET_FILES:
+        return None
+    file = folder / ASSET_FILES[name]
+    return file if file.is_file() else None
+
+
+def _robot_description(name: str) -> Path | None:
+    """The file of a `robot_descriptions` module, when that package is installed and knows the name."""
+    if not name.replace("_", "").isalnum():
+        return None
+    for module in (name, f"{name}_description", f"{name}_mj_description"):
+        try:
+            found = importlib.import_module(f"robot_descriptions.{module}")
+        except ImportError:
+            continue
+        return Path(getattr(found, "URDF_PATH", None) or found.MJCF_PATH)
+    return None
+
+
+def _unknown(name: str) -> str:
+    known = hand_names()
+    near = difflib.get_close_matches(name.removeprefix(ASSET_PREFIX), [n.removeprefix(ASSET_PREFIX) for n in known], n=3)
+    hint = f" Perhaps you meant {' or '.join(near)}." if near else ""
+    missing = ""
+    if name.startswith(ASSET_PREFIX) and _asset_folder() is None:
+        missing = " Names that begin with assets/ need DRO_GRASP_ASSETS to name the assets folder."
+    return (f"no hand is called '{name}'.{hint}{missing} Known: {', '.join(known)}; or give the path of a URDF or MJCF "
+            "file, or install `robot_descriptions` and give one of its names")
+
