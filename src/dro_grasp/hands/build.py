@@ -163,13 +163,14 @@ def _open_ends(
     """Which end of each joint opens the hand, which joints only spread, and the palm; refined together.
 
     The open end of a joint is the one at which its fingertips are farther from the grasp centre, with all other
-    joints straight or half closed. A joint whose axis points out of the palm only spreads.
+    joints straight or half closed. A joint whose axis points out of the palm, be
+    the hand straight or bent, only spreads.
     """
     straight = torch.where(held, rest, torch.zeros(tree.n_dof).clamp(tree.lower, tree.upper))
     centre = torch.tensor(_pose(surface, tree, (tree.lower + tree.upper) / 2)[0].mean(0))
     opening = -torch.ones(tree.n_dof)
     abduction = torch.zeros(tree.n_dof, dtype=torch.bool)
-    out_of_palm = _axes_along(tree, straight, None)
+    out_of_palm = torch.zeros(tree.n_dof, dtype=torch.bool)
     for _ in range(REFINEMENTS):
         bases = (straight, _half_closed(tree, opening, abduction, held, rest))
         found_ends = [[_closing_gain(tree, surface, tips, centre, base, j) for base in bases] for j in range(tree.n_dof)]
@@ -178,7 +179,9 @@ def _open_ends(
             opening[j] = -1.0 if sum(ends) >= 0 or abduction[j] else 1.0
         found = _examine(tree, surface, tips, palm, opening, abduction, held, rest)
         centre = torch.tensor(found.grasp_centre, dtype=torch.float32)
-        out_of_palm = _axes_along(tree, straight, torch.tensor(found.direction, dtype=torch.float32))
+        direction = torch.tensor(found.direction, dtype=torch.float32)
+        bent = _half_closed(tree, opening, torch.zeros_like(abduction), held, rest)
+        out_of_palm = _axes_along(tree, straight, direction) & _axes_along(tree, bent, direction)
     return opening, abduction & ~held, found
 
 
@@ -194,11 +197,9 @@ def _half_closed(
     return torch.where(held, rest, q)
 
 
-def _axes_along(tree: KinematicTree, q: torch.Tensor, direction: torch.Tensor | None) -> torch.Tensor:
+def _axes_along(tree: KinematicTree, q: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
     """Mask (n_dof) of the joints whose axes are along a direction of the root frame."""
     mask = torch.zeros(tree.n_dof, dtype=torch.bool)
-    if direction is None:
-        return mask
     angular = tree.motion_axes(tree.forward(q))[1]
     for j in range(tree.n_dof):
         moved = tree.link_coupling[:, j].abs() > 0
