@@ -1,0 +1,164 @@
+"""Grasp files as tables: Parquet in and out, every problem told with the file's name.
+
+Knows columns and metadata, nothing about what they mean; `batch` gives them their meaning.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import torch
+from torch import Tensor
+
+from dro_grasp.errors import GraspFileError, OutputError
+
+FORMAT_VERSION = 1
+"""Version of the grasp file that this code writes and reads."""
+METADATA_KEY = b"dro_grasp"
+"""Key of the schema metadata under which the JSON header lies."""
+
+
+def check_output(path: Path | str) -> Path:
+    """Refuse a path that cannot be written, before any work is done for it.
+
+    Raises:
+        OutputError: The parent folder is missing or read-only, or the path is a folder or a read-only file.
+    """
+    path = Path(path)
+    parent = path.absolute().parent
+    if not parent.is_dir():
+        raise OutputError(f"cannot write {path}: no folder {parent}; create it first (mkdir -p {parent})")
+    if path.is_dir():
+        raise OutputError(f"cannot write {path}: it is a folder; give the name of a file in it")
+    if not os.access(parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
+        raise OutputError(f"cannot write {path}: no permission; choose another path")
+    return path
+
+
+def write_table(path: Path | str, columns: dict[str, pa.Array], header: dict[str, Any]) -> None:
+    """Write columns to a Parquet file that appears whole or not at all.
+
+    Args:
+        path: The file; an existing one is replaced.
+        columns: Arrow arrays of equal length by name.
+        header: JSON-able metadata; the format version is added.
+
+    Raises:
+        OutputError: The path cannot be written.
+    """
+    path = check_output(path)
+    metadata = {METADATA_KEY: json.dumps({"format_version": FORMAT_VERSION, **header}).encode()}
+    table = pa.table(columns).replace_schema_metadata(metadata)
+    temporary = None
+    try:
+        folder = path.absolute().parent
+        handle, temporary = tempfile.mkstemp(dir=folder, prefix=f".{path.name}", suffix=".part")
+        os.close(handle)
+        pq.write_table(table, temporary, compression="zstd")
+        os.chmod(temporary, 0o666 & ~_umask())
+        os.replace(temporary, path)
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror or error}; choose another path") from error
+    finally:
+        if temporary is not None:
+            Path(temporary).unlink(missing_ok=True)
+
+
+def read_table(path: Path | str) -> tuple[pa.Table, dict[str, Any]]:
+    """Read a grasp file's table and header.
+
+    Raises:
+        GraspFileError: No such file, a truncated or foreign one, or one of another version.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise GraspFileError(f"no grasp file {path}; give the path of a .parquet file that dro-grasp wrote")
+    try:
+        table = pq.read_table(path)
+    except (pa.ArrowException, OSError, ValueError) as error:
+        reason = str(error).splitlines()[0][:200]
+        raise GraspFileError(f"{path} is truncated or no Parquet file ({reason}); write it again") from error
+    return table, read_header(path, table.schema)
+
+
+def read_header(path: Path | str, schema: pa.Schema) -> dict[str, Any]:
+    """The JSON header of a grasp file's schema.
+
+    Raises:
+        GraspFileError: The header is missing, garbled or of another version.
+    """
+    raw = (schema.metadata or {}).get(METADATA_KEY)
+    if raw is None:
+        raise GraspFileError(f"{path} is Parquet, but no grasp file: its schema has no 'dro_grasp' metadata")
+    try:
+        header = json.loads(raw)
+        version = header["format_version"]
+    except (ValueError, TypeError, KeyError) as error:
+        raise GraspFileError(f"{path} has a garbled 'dro_grasp' header: {error!r}") from error
+    if version != FORMAT_VERSION:
+        raise GraspFileError(
+            f"{path} has grasp file version {version}, this dro-grasp reads version {FORMAT_VERSION}; "
+            "install the release that wrote it, or write the file again"
+        )
+    return header
+
+
+def float_column(values: Tensor) -> pa.Array:
+    """A float tensor (n) or (n k) as a column; rows with NaN become null."""
+    array = values.detach().cpu().to(torch.float32).numpy()
+    missing = np.isnan(array) if array.ndim == 1 else np.isnan(array).any(1)
+    if array.ndim == 1:
+        return pa.array(array, mask=missing)
+    offsets = np.arange(len(array) + 1, dtype=np.int32) * array.shape[1]
+    flat = pa.array(np.ascontiguousarray(array).ravel())
+    return pa.ListArray.from_arrays(pa.array(offsets), flat, mask=pa.array(missing))
+
+
+def fixed_column(values: Tensor) -> pa.Array:
+    """A float tensor (n k) without missing rows as a column of fixed-size lists."""
+    array = np.ascontiguousarray(values.detach().cpu().to(torch.float32).numpy())
+    return pa.FixedSizeListArray.from_arrays(pa.array(array.ravel()), array.shape[1])
+
+
+def floats(column: pa.ChunkedArray, width: int | None, where: str) -> Tensor:
+    """The inverse of `float_column` and `fixed_column`; null becomes NaN.
+
+    Args:
+        column: Numbers (width None) or lists of numbers.
+        width: Expected length of each list.
+        where: File and column, for the message.
+
+    Raises:
+        GraspFileError: A list has another length, or the column does not hold numbers.
+    """
+    array = column.combine_chunks()
+    try:
+        if width is None:
+            return torch.from_numpy(_numbers(array))
+        result = np.full((len(array), width), np.nan, np.float32)
+        present = ~np.array(array.is_null())
+        flat = _numbers(array.drop_null().flatten())
+        lengths = np.array(array.drop_null().value_lengths()) if present.any() else np.zeros(0, int)
+        if not (lengths == width).all():
+            raise GraspFileError(f"{where}: lists of length {set(lengths.tolist())}, expected {width}")
+        result[present] = flat.reshape(-1, width)
+    except (pa.ArrowException, AttributeError, ValueError) as error:
+        raise GraspFileError(f"{where}: expected numbers, found {array.type} ({error})") from error
+    return torch.from_numpy(result)
+
+
+def _numbers(array: pa.Array) -> np.ndarray:
+    return np.array(array.cast(pa.float32()).to_numpy(zero_copy_only=False), np.float32)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

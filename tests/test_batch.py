@@ -1,0 +1,224 @@
+"""Grasp batches: selection, joining, and files that survive or refuse what happens to files."""
+
+from __future__ import annotations
+
+import json
+from types import SimpleNamespace
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import roma
+import torch
+
+from dro_grasp.errors import GraspFileError, OutputError
+from dro_grasp.grasps.batch import GraspBatch, check_output
+
+HAND = SimpleNamespace(
+    name="toy", sha256="a" * 64, tree=SimpleNamespace(link_names=("base", "tip"), joint_names=("j0", "j1"))
+)
+BALL = SimpleNamespace(name="ball", sha256="b" * 64, split="train")
+CUBE = SimpleNamespace(name="cube", sha256="c" * 64, split=None)
+
+
+def make(n: int, obj=BALL, seed: int = 0, **optional) -> GraspBatch:
+    generator = torch.Generator().manual_seed(seed)
+    T = torch.eye(4).repeat(n, 1, 1)
+    quaternion = torch.randn(n, 4, generator=generator)
+    T[:, :3, :3] = roma.unitquat_to_rotmat(quaternion / quaternion.norm(dim=-1, keepdim=True))
+    T[:, :3, 3] = torch.randn(n, 3, generator=generator)
+    joints = torch.randn(n, 2, generator=generator)
+    return GraspBatch.create(HAND, obj, T, joints, seed=seed, provenance="test 1", **optional)
+
+
+def tried(n: int, **optional) -> GraspBatch:
+    trial = SimpleNamespace(
+        success=torch.arange(n) % 2 == 0, displacement=torch.rand(n, 6), rotation=torch.rand(n, 6),
+        penetration=torch.rand(n), protocol="dro/1",
+    )
+    return make(n, **optional).with_trial(trial)
+
+
+def test_file_round_trip_keeps_every_field(tmp_path):
+    grasps = tried(5, score=torch.rand(5), pregrasp_joints=torch.rand(5, 2)).replace(
+        extra={"energy_contact": torch.rand(5), "contact_links": torch.arange(5), "wrench": torch.rand(5, 6),
+               "note": ["x"] * 5}
+    )
+    grasps.save(tmp_path / "g.parquet")
+    back = GraspBatch.load(tmp_path / "g.parquet")
+    torch.testing.assert_close(back.T_object_wrist, grasps.T_object_wrist, atol=1e-6, rtol=0)
+    for name in ("joints", "pregrasp_joints", "score", "success", "displacement", "rotation", "penetration",
+                 "seed"):
+        assert torch.equal(getattr(back, name), getattr(grasps, name)), name
+    for name in ("hand", "hand_sha256", "wrist_link", "joint_names", "object", "object_sha256", "split",
+                 "provenance", "protocol"):
+        assert getattr(back, name) == getattr(grasps, name), name
+    assert back.squeeze_joints is None
+    for name in ("energy_contact", "contact_links", "wrench"):
+        assert torch.equal(back.extra[name], grasps.extra[name]), name
+    assert back.extra["note"] == ["x"] * 5
+
+
+def test_untried_batch_has_null_outcome_in_the_file(tmp_path):
+    make(3).save(tmp_path / "g.parquet")
+    table = pq.read_table(tmp_path / "g.parquet")
+    assert all(table[name].null_count == 3 for name in ("success", "displacement", "protocol"))
+    back = GraspBatch.load(tmp_path / "g.parquet")
+    assert back.success is None
+    assert back.protocol is None
+    assert not back.tried.any()
+
+
+def test_file_layout_is_format_version_1(tmp_path):
+    make(2).save(tmp_path / "g.parquet")
+    schema = pq.read_schema(tmp_path / "g.parquet")
+    header = json.loads(schema.metadata[b"dro_grasp"])
+    assert header == {"format_version": 1, "hand": "toy", "hand_sha256": "a" * 64, "wrist_link": "base",
+                      "joint_names": ["j0", "j1"]}
+    assert schema.field("wrist_position").type == pa.list_(pa.float32(), 3)
+    assert schema.field("wrist_quaternion_wxyz").type == pa.list_(pa.float32(), 4)
+    assert schema.field("joints").type == pa.list_(pa.float32())
+
+
+def test_quaternion_on_disk_is_wxyz(tmp_path):
+    T = torch.eye(4)[None].clone()
+    T[0, :3, :3] = roma.rotvec_to_rotmat(torch.tensor([0.0, 0.0, 0.2]))
+    GraspBatch.create(HAND, BALL, T, torch.zeros(1, 2)).save(tmp_path / "g.parquet")
+    w, x, y, z = pq.read_table(tmp_path / "g.parquet")["wrist_quaternion_wxyz"][0].as_py()
+    assert abs(abs(w) - 0.9950042) < 1e-6
+    assert abs(abs(z) - 0.0998334) < 1e-6
+    assert abs(x) + abs(y) < 1e-6
+
+
+MASK = torch.tensor([True, False, True, False, False])
+
+
+@pytest.mark.parametrize("index", [1, -1, slice(1, 4, 2), [3, 0], MASK])
+def test_selection_agrees_between_tensors_and_tuples(index):
+    grasps = tried(5).replace(extra={"row": torch.arange(5), "text": list("abcde")})
+    chosen = grasps[index]
+    for place, row in enumerate(chosen.extra["row"].tolist()):
+        assert torch.equal(chosen.joints[place], grasps.joints[row])
+        assert chosen.extra["text"][place] == "abcde"[row]
+        assert chosen.success[place] == grasps.success[row]
+
+
+def test_iterating_ends_and_out_of_range_is_an_index_error():
+    assert len(list(make(3))) == 3
+    with pytest.raises(IndexError):
+        make(3)[3]
+
+
+def test_joining_tried_and_untried_survives_the_file(tmp_path):
+    joined = GraspBatch.concatenate([make(2, score=torch.rand(2)), tried(3, obj=CUBE, seed=7)])
+    joined.save(tmp_path / "g.parquet")
+    for batch in (joined, GraspBatch.load(tmp_path / "g.parquet")):
+        assert batch.tried.tolist() == [False] * 2 + [True] * 3
+        assert batch.success[2:].tolist() == [True, False, True]
+        assert batch.score[2:].isnan().all()
+        assert batch.score[:2].isfinite().all()
+        assert batch.object == ("ball",) * 2 + ("cube",) * 3
+        assert batch.seed.tolist() == [0, 0, 7, 7, 7]
+
+
+def test_joining_other_hands_is_refused():
+    with pytest.raises(ValueError, match="cannot join"):
+        GraspBatch.concatenate([make(1), make(1).replace(hand="other", hand_sha256="f" * 64)])
+
+
+def test_sorting_puts_the_best_first_and_the_unscored_last():
+    grasps = make(4, score=torch.tensor([0.1, torch.nan, 0.5, 0.1])).replace(extra={"row": torch.arange(4)})
+    assert grasps.sorted_by_score().extra["row"].tolist() == [2, 0, 3, 1]
+
+
+def test_empty_batch_round_trip(tmp_path):
+    make(0).save(tmp_path / "g.parquet")
+    assert len(GraspBatch.load(tmp_path / "g.parquet")) == 0
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])
+def test_truncated_file_is_named(tmp_path, share):
+    path = tmp_path / "g.parquet"
+    make(20).save(path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(GraspFileError, match=r"g\.parquet"):
+        GraspBatch.load(path)
+
+
+FOREIGN = ["plain", "other parquet", "other version", "garbled", "no poses", "nan", "width"]
+
+
+@pytest.mark.parametrize("content", FOREIGN)
+def test_foreign_file_is_refused(tmp_path, content):
+    path = tmp_path / "g.parquet"
+    make(2).save(path)
+    table = pq.read_table(path)
+    if content == "plain":
+        path.write_text("object,joints\n")
+    elif content == "other parquet":
+        pq.write_table(pa.table({"a": [1]}), path)
+    elif content == "other version":
+        pq.write_table(table.replace_schema_metadata({"dro_grasp": '{"format_version": 2}'}), path)
+    elif content == "garbled":
+        pq.write_table(table.replace_schema_metadata({"dro_grasp": "{"}), path)
+    elif content == "no poses":
+        pq.write_table(table.drop_columns(["wrist_position"]), path)
+    elif content == "nan":
+        joints = pa.array([[1.0, None], [0.0, 0.0]], pa.list_(pa.float32()))
+        pq.write_table(table.set_column(3, "joints", joints), path)
+    else:
+        joints = pa.array([[1.0], [0.0]], pa.list_(pa.float32()))
+        pq.write_table(table.set_column(3, "joints", joints), path)
+    with pytest.raises(GraspFileError, match=r"g\.parquet"):
+        GraspBatch.load(path)
+
+
+def test_missing_file_is_a_grasp_file_error(tmp_path):
+    with pytest.raises(GraspFileError, match="no grasp file"):
+        GraspBatch.load(tmp_path / "none.parquet")
+
+
+def test_missing_folder_is_refused_and_not_created(tmp_path):
+    with pytest.raises(OutputError, match="mkdir"):
+        check_output(tmp_path / "no" / "g.parquet")
+    with pytest.raises(OutputError):
+        make(1).save(tmp_path / "no" / "g.parquet")
+    with pytest.raises(OutputError, match="folder"):
+        check_output(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_failed_write_leaves_the_old_file_and_no_rest(tmp_path, monkeypatch):
+    path = tmp_path / "g.parquet"
+    make(2).save(path)
+    before = path.read_bytes()
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(pq, "write_table", full)
+    with pytest.raises(OutputError, match="No space left"):
+        make(3).save(path)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["g.parquet"]
+
+
+def test_pandas_sees_the_columns():
+    pytest.importorskip("pandas")
+    frame = tried(3).to_pandas()
+    assert len(frame) == 3
+    assert set(frame["object"]) == {"ball"}
+    assert frame["success"].tolist() == [True, False, True]
+
+
+def test_unequal_columns_are_refused():
+    with pytest.raises(ValueError, match="other lengths"):
+        make(3).replace(extra={"energy": torch.zeros(2)})
+
+
+def test_another_hand_is_refused():
+    tree = SimpleNamespace(link_names=("base",), joint_names=("k",))
+    other = SimpleNamespace(name="x", sha256="", tree=tree)
+    with pytest.raises(GraspFileError, match="toy"):
+        make(1).require_hand(other)
