@@ -23,6 +23,8 @@ TIP_OFFSET = 0.03
 """Distance of the extra target beyond a fingertip [m]."""
 AXIS_ALONG_PALM = 0.75
 """Cosine of the angle to the palm direction below which a joint's axis does not point out of the palm."""
+PARALLEL = 0.9
+"""Cosine above which two joint axes count as parallel."""
 REFINEMENTS = 4
 """How often open ends and palm are derived from each other."""
 
@@ -198,13 +200,18 @@ def _half_closed(
 
 
 def _axes_along(tree: KinematicTree, q: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
-    """Mask (n_dof) of the joints whose axes are along a direction of the root frame."""
-    mask = torch.zeros(tree.n_dof, dtype=torch.bool)
+    """Mask (n_dof) of the joints whose axes are along a direction of the root frame and which bend nothing.
+
+    A joint with a parallel one below it, or with none below it, is part of a finger's flexion.
+    """
     angular = tree.motion_axes(tree.forward(q))[1]
-    for j in range(tree.n_dof):
-        moved = tree.link_coupling[:, j].abs() > 0
-        mask[j] = bool(((angular[moved] @ direction).abs() > AXIS_ALONG_PALM).all())
-    return mask
+    moving = [i for i in range(tree.n_links) if tree.kind[i] != FIXED]
+    along = torch.zeros(tree.n_links, dtype=torch.bool)
+    for link in moving:
+        below = [i for i in moving if i != link and bool(tree.descends[i, link])]
+        parallel = any(float((angular[i] @ angular[link]).abs()) > PARALLEL for i in below)
+        along[link] = bool(below) and not parallel and float((angular[link] @ direction).abs()) > AXIS_ALONG_PALM
+    return torch.stack([along[tree.link_coupling[:, j].abs() > 0].all() for j in range(tree.n_dof)])
 
 
 def _closing_gain(
