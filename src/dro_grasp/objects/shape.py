@@ -1,0 +1,182 @@
+"""An object: its mesh or cloud, mass, convex parts and signed-distance grid, made once and cached by content."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dro_grasp.errors import ObjectError
+from dro_grasp.geometry.point_clouds import partial_view
+from dro_grasp.geometry.signed_distance import SignedDistanceGrid
+
+DENSITY = 500.0
+"""Density of every object in trials [kg/m^3]. Source: the official release."""
+CLOUD_POINTS = 16384
+"""Points of an object's stored cloud."""
+GRID_SPACING = 0.003
+"""Spacing of the signed-distance grid [m]."""
+GRID_PADDING = 0.04
+"""How far the grid reaches beyond the object [m]."""
+LARGEST_GRID = 8_000_000
+"""Grid points beyond which the spacing grows."""
+
+Part = tuple[np.ndarray, np.ndarray]
+"""Vertices (n 3) [m] and faces (m 3) of a convex part."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectModel:
+    """An object in its mesh's frame."""
+
+    name: str
+    cloud: np.ndarray
+    """(k 3) float32 surface points [m]."""
+    cloud_normals: np.ndarray
+    """(k 3) float32 outward unit normals."""
+    centre_of_mass: np.ndarray
+    """(3) [m]; for a bare cloud the mean of its points."""
+    sha256: str
+    """Hash of the geometry."""
+    vertices: np.ndarray | None = None
+    """(n 3) [m], or None for a bare cloud."""
+    faces: np.ndarray | None = None
+    """(m 3), or None for a bare cloud."""
+    volume: float = 0.0
+    """[m^3]"""
+    inertia: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
+    """Second moments about the centre of mass at unit density [m^5]."""
+    notes: tuple[str, ...] = ()
+    """What loading found and repaired."""
+    split: str | None = None
+    """`train`, `validate`, `test`, or None for an object of the user's."""
+    exact_parts: tuple[Part, ...] | None = None
+    """Convex parts known by construction or from a file; None has them computed."""
+
+    @property
+    def is_cloud(self) -> bool:
+        """Whether there is no mesh."""
+        return self.vertices is None
+
+    @property
+    def mass(self) -> float:
+        """Mass at DENSITY [kg]."""
+        return DENSITY * self.volume
+
+    @property
+    def extents(self) -> np.ndarray:
+        """Size along the axes (3) [m]."""
+        return np.ptp(self.cloud, axis=0)
+
+    @cached_property
+    def parts(self) -> tuple[Part, ...]:
+        """Convex parts that fill the object.
+
+        Raises:
+            ObjectError: The object is a bare cloud.
+        """
+        if self.exact_parts is not None:
+            return self.exact_parts
+        vertices, faces = self._mesh("convex parts")
+        from dro_grasp.objects.convex_parts import decompose
+
+        return decompose(vertices, faces, self.sha256)
+
+    @cached_property
+    def grid(self) -> SignedDistanceGrid | None:
+        """Signed distances around the mesh, cached on disk; None for a bare cloud."""
+        if self.vertices is None or self.faces is None:
+            return None
+        vertices, faces = self.vertices, self.faces
+        stored = cached_arrays(f"grid-{self.sha256[:24]}-{GRID_SPACING * 1e6:.0f}", lambda: bake_grid(vertices, faces))
+        return SignedDistanceGrid.from_values(
+            torch.from_numpy(stored["values"].astype(np.float32)), torch.from_numpy(stored["origin"].astype(np.float32)),
+            float(stored["spacing"]),
+        )
+
+    def sample_points(self, count: int, generator: torch.Generator) -> Float[Tensor, "count 3"]:
+        """Random points of the stored cloud [m]; with repetition where the cloud has too few."""
+        if count > len(self.cloud):
+            index = torch.randint(len(self.cloud), (count,), generator=generator)
+        else:
+            index = torch.randperm(len(self.cloud), generator=generator)[:count]
+        return torch.from_numpy(self.cloud)[index]
+
+    def sample_partial(self, count: int, generator: torch.Generator) -> Float[Tensor, "count 3"]:
+        """A partial cloud as in the paper's appendix: the half facing a random direction."""
+        cloud = torch.from_numpy(self.cloud)
+        if len(cloud) < 2 * count:
+            cloud = self.sample_points(2 * count, generator)
+        return cloud[partial_view(cloud, count, generator)]
+
+    def _mesh(self, what: str) -> Part:
+        if self.vertices is None or self.faces is None:
+            raise ObjectError(f"object '{self.name}' is a bare point cloud and has no {what}; give a mesh instead")
+        return self.vertices, self.faces
+
+
+def bake_grid(vertices: np.ndarray, faces: np.ndarray) -> dict[str, np.ndarray]:
+    """Signed distances on a grid around a mesh: magnitude from the surface, sign from the winding number.
+
+    The two are computed apart because the winding number copes with holes, flipped faces and overlapping shells.
+    """
+    import igl
+
+    low, high = vertices.min(0) - GRID_PADDING, vertices.max(0) + GRID_PADDING
+    spacing = max(GRID_SPACING, float((np.prod(high - low) / LARGEST_GRID) ** (1 / 3)))
+    counts = np.ceil((high - low) / spacing).astype(int) + 1
+    axes = [low[i] + spacing * np.arange(counts[i]) for i in range(3)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    triangles = np.ascontiguousarray(faces, np.int64)
+    corners = np.ascontiguousarray(vertices, np.float64)
+    squared = igl.point_mesh_squared_distance(points, corners, triangles)[0]
+    winding = igl.fast_winding_number(corners, triangles, points)
+    distance = np.where(np.abs(winding) > 0.5, -1.0, 1.0) * np.sqrt(squared)
+    return {"values": distance.reshape(counts).astype(np.float32), "origin": low,
+            "spacing": np.array(spacing)}
+
+
+def cache_folder() -> Path:
+    """Where derived geometry is kept: `DRO_GRASP_CACHE`, or the user's cache folder."""
+    root = os.environ.get("DRO_GRASP_CACHE")
+    return Path(root) if root else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "dro-grasp"
+
+
+def cached_arrays(key: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Arrays from the cache, or made and stored there; a damaged file is made anew, an unwritable folder is no error."""
+    path = cache_folder() / f"{key}.npz"
+    try:
+        with np.load(path) as stored:
+            return {name: stored[name] for name in stored.files}
+    except (OSError, ValueError, KeyError, EOFError):
+        pass
+    except Exception as error:  # zipfile.BadZipFile is no ValueError
+        if type(error).__name__ != "BadZipFile":
+            raise
+    made = make()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, **made)  # type: ignore[arg-type]
+        os.replace(temporary, path)
+    except OSError:
+        pass
+    return made
+
+
+def content_hash(*arrays: np.ndarray) -> str:
+    """Hash of geometry, the same on every machine."""
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
