@@ -8,7 +8,10 @@ from torch import Tensor
 
 
 def sample_surface(
-    vertices: Float[Tensor, "n_vertices 3"], faces: Int[Tensor, "n_faces 3"], count: int, generator: torch.Generator
+    vertices: Float[Tensor, "n_vertices 3"],
+    faces: Int[Tensor, "n_faces 3"],
+    count: int,
+    generator: torch.Generator,
 ) -> tuple[Float[Tensor, "count 3"], Float[Tensor, "count 3"], Int[Tensor, " count"]]:
     """Points uniform on a triangle mesh.
 
@@ -33,7 +36,9 @@ def sample_surface(
     return points, torch.nn.functional.normalize(cross[chosen], dim=-1), chosen
 
 
-def farthest_points(points: Float[Tensor, "*batch n 3"], count: int, start: int = 0) -> Int[Tensor, "*batch count"]:
+def farthest_points(
+    points: Float[Tensor, "*batch n 3"], count: int, start: int = 0
+) -> Int[Tensor, "*batch count"]:
     """Farthest point sampling: each next point is the one farthest from all before it.
 
     Args:
@@ -46,7 +51,7 @@ def farthest_points(points: Float[Tensor, "*batch n 3"], count: int, start: int 
     """
     n = points.shape[-2]
     if count > n:
-        raise ValueError(f"{count} points were asked for, the cloud has {n}; ask for fewer or give a denser cloud")
+        raise ValueError(f"{count} points were asked for, the cloud has {n}; ask for fewer or give more")
     flat = points.reshape(-1, n, 3)
     rows = torch.arange(len(flat), device=points.device)
     chosen = torch.empty(len(flat), count, dtype=torch.int64, device=points.device)
@@ -64,8 +69,8 @@ def partial_view(
 ) -> Int[Tensor, " count"]:
     """Indices of the points that stay when the far half-space of a random direction is cut away.
 
-    Source: appendix, partial object point cloud sampling: twice as many points as wanted are drawn, and the half
-    with the smaller product of position and a random direction is removed.
+    Source: appendix, partial object point cloud sampling: twice as many points as wanted are drawn, and the
+    half with the smaller product of position and a random direction is removed.
 
     Raises:
         ValueError: The cloud has fewer than 2 * count points.

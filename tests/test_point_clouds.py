@@ -1,0 +1,78 @@
+from __future__ import annotations
+
+import fpsample
+import numpy as np
+import pytest
+import torch
+
+from dro_grasp.geometry.point_clouds import farthest_points, partial_view, sample_surface
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_farthest_points_agree_with_fpsample():
+    points = torch.randn(3, 400, 3, generator=seeded())
+    chosen = farthest_points(points, 40)
+    for cloud, own in zip(points, chosen, strict=True):
+        oracle = fpsample.fps_sampling(cloud.numpy(), 40, start_idx=0)
+        np.testing.assert_array_equal(own, oracle.astype(np.int64))
+
+
+def test_farthest_points_start_and_shape():
+    points = torch.randn(50, 3, generator=seeded())
+    chosen = farthest_points(points, 50, start=7)
+    assert chosen[0] == 7
+    assert sorted(chosen.tolist()) == list(range(50))
+
+
+def test_too_many_points_are_refused():
+    with pytest.raises(ValueError, match="6 points were asked for, the cloud has 5"):
+        farthest_points(torch.randn(5, 3), 6)
+
+
+def test_samples_lie_on_their_faces_in_proportion_to_area():
+    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 3]])
+    faces = torch.tensor([[0, 1, 2], [0, 3, 1]])
+    points, normals, face = sample_surface(vertices, faces, 20000, seeded())
+    share = float((face == 1).float().mean())
+    assert abs(share - 0.75) < 0.015  # areas 0.5 and 1.5
+    offset = ((points - vertices[faces[face, 0]]) * normals).sum(-1)
+    assert offset.abs().max() < 1e-6  # [m]
+    inside = points[face == 0]
+    assert (inside[:, :2] >= -1e-6).all()
+    assert (inside[:, :2].sum(-1) <= 1 + 1e-6).all()
+    np.testing.assert_allclose(inside.mean(0), [1 / 3, 1 / 3, 0], atol=0.015)
+    np.testing.assert_allclose(normals[face == 0].mean(0), [0, 0, 1], atol=1e-5)
+
+
+def test_the_seed_fixes_the_sample():
+    vertices, faces = torch.randn(20, 3, generator=seeded()), torch.randint(20, (30, 3), generator=seeded(1))
+    first = sample_surface(vertices, faces, 100, seeded(5))
+    second = sample_surface(vertices, faces, 100, seeded(5))
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+@pytest.mark.parametrize("faces", [torch.empty(0, 3, dtype=torch.int64), torch.tensor([[0, 1, 1]])])
+def test_a_mesh_without_area_is_refused(faces):
+    with pytest.raises(ValueError, match="no area"):
+        sample_surface(torch.eye(3), faces, 10, seeded())
+
+
+def test_a_partial_view_is_a_half_space_of_its_draw():
+    points = torch.randn(400, 3, generator=seeded())
+    kept = partial_view(points, 200, seeded(3))
+    assert len(kept.unique()) == 200
+    rest = torch.tensor(sorted(set(range(400)) - set(kept.tolist())))
+    normal = points[kept].mean(0) - points[rest].mean(0)
+    generator = seeded(3)
+    torch.randperm(400, generator=generator)
+    direction = torch.randn(3, generator=generator)
+    assert (points[kept] @ direction).min() >= (points[rest] @ direction).max()
+    assert normal @ direction > 0
+
+
+def test_a_small_cloud_has_no_partial_view():
+    with pytest.raises(ValueError, match="needs a cloud of 20, got 19"):
+        partial_view(torch.randn(19, 3), 10, seeded())
