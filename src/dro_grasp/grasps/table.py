@@ -88,6 +88,20 @@ def read_table(path: Path | str) -> tuple[pa.Table, dict[str, Any]]:
     return table, read_header(path, table.schema)
 
 
+def read_row_count(path: Path | str) -> int:
+    """Number of grasps in a grasp file, from its footer alone.
+
+    Raises:
+        GraspFileError: As `read_table`.
+    """
+    try:
+        footer = pq.read_metadata(path)
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise GraspFileError(f"{path} cannot be read as a grasp file ({error})") from error
+    read_header(path, footer.schema.to_arrow_schema())
+    return footer.num_rows
+
+
 def read_header(path: Path | str, schema: pa.Schema) -> dict[str, Any]:
     """The JSON header of a grasp file's schema.
 

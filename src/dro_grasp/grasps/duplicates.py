@@ -1,0 +1,36 @@
+"""Which grasps are the same grasp twice."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
+
+NEAR = 0.005
+"""Mean distance between the surface points of two posed hands below which they are one grasp [m]."""
+HAND_POINTS = 64
+"""Surface points that are compared."""
+
+
+def distinct(hand: Hand, grasps: GraspBatch, near: float = NEAR) -> Bool[Tensor, " n"]:
+    """Mask of the grasps that are no near-duplicate of an earlier one of the same object.
+
+    Args:
+        hand: The grasps' hand.
+        grasps: Any grasps of it.
+        near: Mean distance between corresponding surface points that makes two grasps one [m].
+    """
+    thin = hand.with_points(min(HAND_POINTS, hand.n_points))
+    points = thin.points(grasps.joints, grasps.T_object_wrist)
+    keep = torch.ones(len(grasps), dtype=torch.bool)
+    names = sorted(set(grasps.object))
+    owner = torch.tensor([names.index(name) for name in grasps.object])
+    for i in range(1, len(grasps)):
+        earlier = (keep[:i] & (owner[:i] == owner[i])).nonzero()[:, 0]
+        if len(earlier):
+            apart = (points[earlier] - points[i]).norm(dim=-1).mean(-1)
+            keep[i] = bool(apart.min() >= near)
+    return keep

@@ -1,0 +1,241 @@
+"""The grasp energy of one hand on one object: the weighted terms and their gradient, batched over grasps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from dro_grasp.grasps import energies
+from dro_grasp.grasps.field import DistanceField
+from dro_grasp.grasps.fingers import ContactCandidates, ContactConfig, contact_candidates, rigid_group
+from dro_grasp.hands.hand import Hand
+
+TERMS = ("force_closure", "distance", "penetration", "self_penetration", "alignment", "joints")
+"""Names of the terms, the order of every table of them."""
+
+
+@dataclass(frozen=True)
+class EnergyConfig:
+    """Weights and geometry of the energy. Source: DexGraspNet, unless said otherwise."""
+
+    force_closure: float = 1.0
+    """Weight of the squared net wrench."""
+    distance: float = 100.0
+    """Weight of the contacts' distance to the surface [1/m]."""
+    penetration: float = 100.0
+    """Weight of the hand points' depth in the object [1/m]."""
+    self_penetration: float = 10.0
+    """Weight of the overlap of links [1/m]."""
+    alignment: float = 1.0
+    """Weight of the angle between hand and object normals (ours)."""
+    joints: float = 1.0
+    """Weight of joints closer to their closed end than `closing_room` [1/rad or 1/m]."""
+    closing_room: float = 0.1
+    """Share of a joint's range that is left for the squeeze (ours)."""
+    hand_points: int = 200
+    """Points of the hand at which penetration is measured."""
+    margin: float = 0.001
+    """Depth by which hand points are thought thicker than they are, for penetration [m] (ours)."""
+
+
+@dataclass(frozen=True)
+class LinkSpheres:
+    """Spheres that fill the links, and the pairs of them that must not overlap."""
+
+    centres: Float[Tensor, "s 3"]
+    """In their links' frames [m]."""
+    radii: Float[Tensor, " s"]
+    """[m]"""
+    links: Int[Tensor, " s"]
+    """The link of each sphere."""
+    pairs: Int[Tensor, "k 2"]
+    """Pairs to keep apart."""
+
+
+def link_spheres(hand: Hand) -> LinkSpheres:
+    """Spheres along the longest axis of each link, from its surface points.
+
+    Pairs on links that move together or are neighbours, and pairs that overlap in the open hand, may touch.
+    """
+    centres, radii, links = [], [], []
+    for link in hand.link_index.unique().tolist():
+        points = hand.link_points[hand.link_index == link]
+        if len(points) < 4:
+            continue
+        for centre, radius in _fill(points):
+            centres.append(centre)
+            radii.append(radius)
+            links.append(link)
+    centre, radius, link_of = torch.stack(centres), torch.stack(radii), torch.tensor(links)
+    pairs = torch.combinations(torch.arange(len(links)), 2)
+    near = _neighbours(hand)
+    pairs = pairs[~near[link_of[pairs[:, 0]], link_of[pairs[:, 1]]]]
+    poses = hand.tree.forward(hand.canonical_joints(0.9))[link_of]
+    placed = (poses[:, :3, :3] @ centre[..., None])[..., 0] + poses[:, :3, 3]
+    apart = (placed[pairs[:, 0]] - placed[pairs[:, 1]]).norm(dim=-1)
+    pairs = pairs[apart > radius[pairs[:, 0]] + radius[pairs[:, 1]]]
+    return LinkSpheres(centre, radius, link_of, pairs)
+
+
+def _fill(points: Float[Tensor, "n 3"]) -> list[tuple[Tensor, Tensor]]:
+    """Centres and radii of spheres along the longest axis of a set of surface points."""
+    middle = (points.amin(0) + points.amax(0)) / 2
+    axes = torch.linalg.svd(points - points.mean(0), full_matrices=False)[2]
+    local = (points - middle) @ axes.T
+    low, high = local.amin(0), local.amax(0)
+    half = (high - low) / 2
+    radius = half[1:].amin().clamp_min(0.002)
+    count = max(1, min(6, round(float(half[0] / radius))))
+    along = (high[0] + low[0]) / 2 + (half[0] - radius).clamp_min(0) * torch.linspace(-1, 1, count)
+    if count == 1:
+        along = ((high[0] + low[0]) / 2)[None]
+    across = (high + low) / 2
+    return [(middle + torch.stack([a, across[1], across[2]]) @ axes, radius) for a in along]
+
+
+def _neighbours(hand: Hand) -> Tensor:
+    """Pairs of links (n_links n_links) with at most one moving joint between them."""
+    tree = hand.tree
+    rigid = torch.stack([torch.tensor(rigid_group(tree, link)) for link in range(tree.n_links)])
+    rigid = rigid | rigid.T
+    rigid = (rigid.float() @ rigid.float()) > 0
+    step = torch.zeros_like(rigid)
+    for link, parent in enumerate(tree.parent):
+        if parent >= 0:
+            step[link, parent] = step[parent, link] = True
+    near = (rigid.float() @ step.float() @ rigid.float()) > 0
+    return near | rigid
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Energy and gradient of n grasps."""
+
+    terms: Float[Tensor, "n 6"]
+    """Weighted terms in the order of TERMS."""
+    by_pose: Float[Tensor, "n 6"]
+    """Derivative by the hand's translation [1/m] and rotation about its grasp centre [1/rad]."""
+    by_joint: Float[Tensor, "n n_dof"]
+    """Derivative by the joints."""
+
+    @property
+    def total(self) -> Float[Tensor, " n"]:
+        """Sum of the terms."""
+        return self.terms.sum(-1)
+
+
+class GraspEnergy:
+    """The energy of a hand on an object, ready to be evaluated many times."""
+
+    def __init__(
+        self,
+        hand: Hand,
+        field: DistanceField,
+        centre: Float[Tensor, 3],
+        length: float,
+        config: EnergyConfig | None = None,
+        contacts: ContactConfig | None = None,
+    ) -> None:
+        """Prepare everything that does not change from step to step.
+
+        Args:
+            hand: The hand.
+            field: Signed distances of the object.
+            centre: The object's centre of mass [m].
+            length: Typical distance of its surface from there [m].
+            config: Weights.
+            contacts: Where the hand may touch.
+        """
+        self.hand, self.field, self.centre, self.length = hand, field, centre, length
+        self.config = config or EnergyConfig()
+        self.candidates: ContactCandidates = contact_candidates(hand, contacts)
+        self.spheres = link_spheres(hand)
+        thin = hand.with_points(min(self.config.hand_points, hand.n_points))
+        self.body, self.body_links = thin.link_points, thin.link_index
+        one_hot = torch.eye(hand.tree.n_links, dtype=hand.tree.origin.dtype)
+        self.body_members, self.sphere_members = one_hot[self.body_links], one_hot[self.spheres.links]
+        self.one_hot = one_hot
+        room = self.config.closing_room * (hand.tree.upper - hand.tree.lower) * ~hand.abduction
+        self.lower = torch.where(hand.opening > 0, hand.tree.lower + room, hand.tree.lower)
+        self.upper = torch.where(hand.opening > 0, hand.tree.upper, hand.tree.upper - room)
+
+    def __call__(
+        self,
+        T_object_wrist: Float[Tensor, "n 4 4"],
+        q: Float[Tensor, "n n_dof"],
+        contacts: Int[Tensor, "n c"],
+    ) -> Evaluation:
+        """Energy and gradient of n grasps.
+
+        Args:
+            T_object_wrist: Wrist poses [m].
+            q: Joints [rad or m].
+            contacts: Chosen contact candidates.
+        """
+        tree, config = self.hand.tree, self.config
+        poses = T_object_wrist[:, None] @ tree.forward(q)
+        contact_terms, wrenches = self._contacts(poses, contacts)
+        body = place(poses, self.body_links, self.body)
+        distance, gradient = self.field.distances(body)
+        inside = energies.penetration(distance - config.margin, gradient)
+        wrenches = wrenches + energies.link_wrenches(
+            body, config.penetration * inside.by_point, self.body_members
+        )
+        spheres = place(poses, self.spheres.links, self.spheres.centres)
+        own = energies.self_penetration(spheres, self.spheres.radii, self.spheres.pairs)
+        wrenches = wrenches + energies.link_wrenches(
+            spheres, config.self_penetration * own.by_point, self.sphere_members
+        )
+        beyond, slope = energies.joint_margin(q, self.lower, self.upper)
+        by_pose, by_joint = energies.joint_gradient(tree, poses, wrenches, self.pivot(T_object_wrist))
+        closure, apart, alignment = contact_terms
+        terms = torch.stack([
+            config.force_closure * closure,
+            config.distance * apart,
+            config.penetration * inside.value.sum(-1),
+            config.self_penetration * own.value.sum(-1),
+            config.alignment * alignment,
+            config.joints * beyond.sum(-1),
+        ], -1)
+        movable = self.hand.movable.to(q.dtype)
+        return Evaluation(terms, by_pose, (by_joint + config.joints * slope) * movable)
+
+    def pivot(self, T_object_wrist: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 3"]:
+        """The hand's grasp centre, about which it is turned [m]."""
+        return T_object_wrist[:, :3, :3] @ self.hand.grasp_centre_wrist + T_object_wrist[:, :3, 3]
+
+    def _contacts(
+        self, poses: Float[Tensor, "n n_links 4 4"], contacts: Int[Tensor, "n c"]
+    ) -> tuple[tuple[Tensor, Tensor, Tensor], Float[Tensor, "n n_links 6"]]:
+        """The terms that depend on contacts, and their wrenches per link."""
+        config, candidates = self.config, self.candidates
+        links = candidates.links[contacts]
+        chosen = poses[torch.arange(len(poses))[:, None], links]
+        rotation = chosen[..., :3, :3]
+        points = (rotation @ candidates.points[contacts][..., None])[..., 0] + chosen[..., :3, 3]
+        outward = (rotation @ candidates.normals[contacts][..., None])[..., 0]
+        distance, normal, bend = self.field.normals(points)
+        closure = energies.force_closure(points - self.centre, normal, self.length)
+        apart = energies.contact_distance(distance, normal)
+        align = energies.normal_alignment(outward, normal)
+        by_object_normal = config.force_closure * closure.by_normal + config.alignment * outward
+        by_point = (
+            config.force_closure * closure.by_point + config.distance * apart.by_point
+            + (by_object_normal[..., None, :] @ bend)[..., 0, :]
+        )
+        moment = torch.linalg.cross(points, by_point, dim=-1)
+        moment = moment + torch.linalg.cross(outward, config.alignment * align.by_normal, dim=-1)
+        members = self.one_hot[links]
+        wrenches = members.transpose(-1, -2) @ torch.cat([by_point, moment], -1)
+        return (closure.value.sum(-1), apart.value.sum(-1), align.value.sum(-1)), wrenches
+
+
+def place(
+    poses: Float[Tensor, "n n_links 4 4"], links: Int[Tensor, " p"], local: Float[Tensor, "p 3"]
+) -> Float[Tensor, "n p 3"]:
+    """Points fixed to links, in the world [m]."""
+    chosen = poses[:, links, :3]
+    return (chosen[..., :3] @ local[..., None])[..., 0] + chosen[..., 3]

@@ -1,0 +1,226 @@
+"""Grasps from nothing but geometry: annealed descent of the grasp energy from many starts at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import roma
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from dro_grasp.errors import ObjectError, OptionError
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.field import DistanceField
+from dro_grasp.grasps.fingers import ContactConfig
+from dro_grasp.grasps.grasp_energy import TERMS, EnergyConfig, Evaluation, GraspEnergy
+from dro_grasp.grasps.initial import StartConfig, starts
+from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.shape import ObjectModel
+
+PROVENANCE = "synthesis 1"
+"""What synthesised grasps say of their making; counts up when the method changes."""
+
+
+@dataclass(frozen=True)
+class SynthesisConfig:
+    """The optimiser. Source of the scheme: DexGraspNet's annealed Langevin steps; the numbers are ours."""
+
+    steps: int | None = None
+    """Steps; None takes `steps_per_contact` times the number of contacts beyond the third."""
+    steps_per_contact: int = 200
+    """See `steps`: hands with more fingers need longer."""
+    batch_size: int = 128
+    """Grasps optimised at once; the result of a seed depends on it."""
+    translation_step: float = 0.003
+    """First step of the wrist's translation [m]."""
+    rotation_step: float = 0.03
+    """First step of its rotation [rad]."""
+    joint_step: float = 0.04
+    """First step of each joint [rad; for sliding joints times 0.03 m]."""
+    last_step: float = 0.15
+    """Step length at the end, as a share of the first."""
+    smoothing: float = 0.9
+    """Memory of the mean squared gradient that scales the steps."""
+    switch: float = 0.3
+    """Probability that a step also moves one contact to another candidate."""
+    temperature: float = 1.0
+    """Energy increase accepted with probability 1/e at the start; falls to `last_temperature`."""
+    last_temperature: float = 0.02
+    """The same at the end."""
+    energy: EnergyConfig = field(default_factory=EnergyConfig)
+    """Weights of the terms."""
+    starts: StartConfig = field(default_factory=StartConfig)
+    """Where it starts."""
+    contacts: ContactConfig = field(default_factory=ContactConfig)
+    """Where the hand may touch."""
+
+
+@dataclass(frozen=True)
+class State:
+    """n grasps in the middle of the optimisation."""
+
+    T: Float[Tensor, "n 4 4"]
+    """T_object_wrist [m]."""
+    q: Float[Tensor, "n n_dof"]
+    """Joints [rad or m]."""
+    contacts: Int[Tensor, "n c"]
+    """Chosen contact candidates."""
+    result: Evaluation
+    """Energy and gradient there."""
+
+    def where(self, keep: Bool[Tensor, " n"], other: State) -> State:
+        """The other state's grasps where `keep` is true, these elsewhere."""
+        def choose(a: Tensor, b: Tensor) -> Tensor:
+            return torch.where(keep.reshape(-1, *[1] * (a.ndim - 1)), b, a)
+
+        a, b = self.result, other.result
+        result = Evaluation(
+            choose(a.terms, b.terms), choose(a.by_pose, b.by_pose), choose(a.by_joint, b.by_joint)
+        )
+        T, q, contacts = (choose(getattr(self, k), getattr(other, k)) for k in ("T", "q", "contacts"))
+        return State(T, q, contacts, result)
+
+
+def prepare(hand: Hand, obj: ObjectModel, config: SynthesisConfig | None = None) -> GraspEnergy:
+    """The energy of a hand on an object, with the object's grid read and the hand's contacts found.
+
+    Raises:
+        ObjectError: The object is a bare cloud.
+    """
+    config = config or SynthesisConfig()
+    grid = obj.grid
+    if grid is None:
+        raise ObjectError(f"object '{obj.name}' is a bare point cloud; synthesis needs a mesh")
+    centre = torch.as_tensor(obj.centre_of_mass, dtype=torch.float32)
+    surface = torch.as_tensor(obj.cloud, dtype=torch.float32)
+    length = float((surface - centre).norm(dim=-1).mean())
+    return GraspEnergy(hand, DistanceField.from_grid(grid), centre, length, config.energy, config.contacts)
+
+
+def synthesize(
+    hand: Hand, obj: ObjectModel, num: int, seed: int = 0, config: SynthesisConfig | None = None
+) -> GraspBatch:
+    """Grasps of an object by a hand, lowest energy first, untested.
+
+    Args:
+        hand: Any hand.
+        obj: An object with a mesh.
+        num: How many grasps.
+        seed: The same seed gives the same grasps.
+        config: The optimiser.
+
+    Raises:
+        OptionError: `num` is not positive.
+        ObjectError: The object is a bare cloud.
+    """
+    if num < 1:
+        raise OptionError(f"num is {num}; ask for at least one grasp")
+    config = config or SynthesisConfig()
+    energy = prepare(hand, obj, config)
+    generator = torch.Generator().manual_seed(seed)
+    surface = torch.as_tensor(obj.cloud, dtype=torch.float32)
+    sizes = [min(config.batch_size, num - start) for start in range(0, num, config.batch_size)]
+    with torch.inference_mode():
+        states = [optimise(energy, surface, size, config, generator) for size in sizes]
+    terms = torch.cat([s.result.terms for s in states])
+    batch = GraspBatch.create(
+        hand, obj, torch.cat([s.T for s in states]), torch.cat([s.q for s in states]),
+        score=-terms.sum(-1), seed=seed, provenance=PROVENANCE,
+        extra={"depth": torch.cat([depth(energy, s) for s in states])}
+        | {f"energy_{name}": terms[:, i] for i, name in enumerate(TERMS)},
+    )
+    return _plain(batch).sorted_by_score()
+
+
+def depth(energy: GraspEnergy, state: State) -> Float[Tensor, " n"]:
+    """Deepest penetration of any of the hand's surface points in the object [m]."""
+    points = energy.hand.points(state.q, state.T)
+    return -energy.field.distances(points)[0].amin(-1).clamp_max(0)
+
+
+def optimise(
+    energy: GraspEnergy,
+    surface: Float[Tensor, "k 3"],
+    n: int,
+    config: SynthesisConfig,
+    generator: torch.Generator,
+) -> State:
+    """Run n grasps from random starts to the end of the annealing."""
+    T, q = starts(energy.hand, energy.field, surface, energy.centre, n, config.starts, generator)
+    contacts = energy.candidates.draw(n, None, generator)
+    state = State(T, q, contacts, energy(T, q, contacts))
+    squares = _squares(state.result)
+    steps = config.steps or config.steps_per_contact * max(1, contacts.shape[1] - 3)
+    for step in range(steps):
+        left = 1 - step / steps
+        pace = config.last_step + (1 - config.last_step) * left
+        temperature = config.last_temperature * (config.temperature / config.last_temperature) ** left
+        proposal = propose(energy, state, squares, pace, config, generator)
+        rise = proposal.result.total - state.result.total
+        accepted = torch.rand(n, generator=generator) < torch.exp(-rise.clamp_min(0) / temperature)
+        state = state.where(accepted, proposal)
+        squares = config.smoothing * squares + (1 - config.smoothing) * _squares(state.result)
+    return state
+
+
+def propose(
+    energy: GraspEnergy,
+    state: State,
+    squares: Float[Tensor, "n k"],
+    pace: float,
+    config: SynthesisConfig,
+    generator: torch.Generator,
+) -> State:
+    """A step down the gradient, scaled per coordinate, with some contacts moved to other candidates."""
+    scale = 1 / squares.sqrt().clamp_min(1e-3)
+    move, turn = (-pace * state.result.by_pose * scale[:, :6]).split(3, -1)
+    bend = -pace * state.result.by_joint * scale[:, 6:]
+    T = moved(state.T, energy.pivot(state.T), config.translation_step * move, config.rotation_step * turn)
+    tree = energy.hand.tree
+    q = torch.minimum(torch.maximum(state.q + config.joint_step * bend, tree.lower), tree.upper)
+    contacts = switched(energy, state.contacts, config.switch, generator)
+    return State(T, q, contacts, energy(T, q, contacts))
+
+
+def moved(
+    T: Float[Tensor, "n 4 4"],
+    pivot: Float[Tensor, "n 3"],
+    move: Float[Tensor, "n 3"],
+    turn: Float[Tensor, "n 3"],
+) -> Float[Tensor, "n 4 4"]:
+    """Poses after a turn about the pivot [rad] and a translation [m]."""
+    rotation = roma.rotvec_to_rotmat(turn)
+    result = T.clone()
+    result[:, :3, :3] = rotation @ T[:, :3, :3]
+    result[:, :3, 3] = (rotation @ (T[:, :3, 3] - pivot)[..., None])[..., 0] + pivot + move
+    return result
+
+
+def switched(
+    energy: GraspEnergy, contacts: Int[Tensor, "n c"], probability: float, generator: torch.Generator
+) -> Int[Tensor, "n c"]:
+    """Contacts with one slot of some grasps drawn anew; slots keep to their fingers."""
+    n, c = contacts.shape
+    slot = torch.randint(c, (n,), generator=generator)
+    chance = torch.rand(n, generator=generator) < probability
+    fresh = energy.candidates.draw(n, None, generator)
+    change = chance[:, None] & (torch.arange(c) == slot[:, None])
+    return torch.where(change, fresh, contacts)
+
+
+def _squares(result: Evaluation) -> Float[Tensor, "n k"]:
+    """Squared gradient of each coordinate; the three of a translation or rotation share theirs."""
+    move, turn = (part.square().sum(-1, keepdim=True).expand(-1, 3) for part in result.by_pose.split(3, -1))
+    return torch.cat([move, turn, result.by_joint.square()], -1)
+
+
+def _plain(batch: GraspBatch) -> GraspBatch:
+    """The batch with ordinary tensors instead of inference ones, with rotations orthonormal to rounding."""
+    T = batch.T_object_wrist.clone()
+    T[:, :3, :3] = roma.special_procrustes(T[:, :3, :3])
+    return replace(
+        batch, T_object_wrist=T, joints=batch.joints.clone(),
+        score=None if batch.score is None else batch.score.clone(),
+        extra={name: value.clone() for name, value in batch.extra.items()},
+    )
