@@ -1,0 +1,78 @@
+"""The grasp controller: a pregrasp farther from the object and a squeeze closer to it, made from a grasp.
+
+Source: paper, appendix, grasp controller; amounts as in the official release.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dro_grasp.hands.hand import Hand
+
+
+@dataclass(frozen=True)
+class ControllerConfig:
+    """How far joints move from a grasp."""
+
+    outer: float = 0.25
+    """Share of the remaining range by which the pregrasp opens. Source: official release."""
+    inner: float = 0.15
+    """Share of the remaining range by which the squeeze closes. Source: official release."""
+    dead_zone: float = 1e-3
+    """Joints whose downstream points approach the object's centre by less stay [m/rad]."""
+
+
+def pregrasp_and_squeeze(
+    hand: Hand,
+    T_object_wrist: Float[Tensor, "n 4 4"],
+    joints: Float[Tensor, "n n_dof"],
+    centre: Float[Tensor, 3],
+    config: ControllerConfig | None = None,
+) -> tuple[Float[Tensor, "n n_dof"], Float[Tensor, "n n_dof"]]:
+    """Joint values q_outer and q_inner of each grasp.
+
+    Each finger joint moves away from, and towards, the object's centre; which way that is, is decided per grasp and
+    joint by the derivative of the mean distance of the downstream points to the centre. Joints that only spread the
+    fingers, joints above the palm and the wrist stay.
+
+    Args:
+        hand: The hand.
+        T_object_wrist: Wrist poses.
+        joints: The grasps' independent joints [rad or m].
+        centre: The object's centre of mass, in the object's frame [m].
+        config: Amounts.
+    """
+    config = config or ControllerConfig()
+    slope = distance_slope(hand, T_object_wrist, joints, centre)
+    moves = hand.movable & ~hand.abduction & (slope.abs() > config.dead_zone)
+    lower, upper = hand.tree.lower, hand.tree.upper
+    away = torch.where(slope > 0, upper, lower)
+    towards = torch.where(slope > 0, lower, upper)
+    outer = torch.where(moves, joints + config.outer * (away - joints), joints)
+    inner = torch.where(moves, joints + config.inner * (towards - joints), joints)
+    return outer.clamp(lower, upper), inner.clamp(lower, upper)
+
+
+def distance_slope(
+    hand: Hand,
+    T_object_wrist: Float[Tensor, "n 4 4"],
+    joints: Float[Tensor, "n n_dof"],
+    centre: Float[Tensor, 3],
+) -> Float[Tensor, "n n_dof"]:
+    """Derivative by each joint of the mean distance of its downstream points to the object's centre [m/rad or m/m]."""
+    tree = hand.tree
+    poses = T_object_wrist[:, None] @ tree.forward(joints)
+    # The middle of each link's points stands for them: the mean distance hardly differs, and links are few.
+    links = hand.link_index.unique()
+    middles = torch.stack([hand.link_points[hand.link_index == link].mean(0) for link in links])
+    points = (poses[:, links, :3, :3] @ middles[..., None])[..., 0] + poses[:, links, :3, 3]
+    offset = points - centre
+    direction = offset / offset.norm(dim=-1, keepdim=True).clamp(min=1e-9)
+    jacobian = tree.point_jacobian(poses, points, links)
+    rate = (direction[..., None] * jacobian).sum(-2)
+    moved = ((tree.descends[links].float() @ tree.link_coupling.abs()) > 0).float()
+    return (rate * moved).sum(1) / moved.sum(0).clamp(min=1)

@@ -1,0 +1,56 @@
+"""What touches what in a configuration: penetration of labelled grasps, links in contact after closing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.simulation.scene import Scene
+
+
+@dataclass(frozen=True)
+class Penetration:
+    """Of n grasps."""
+
+    object: np.ndarray
+    """Deepest contact of hand and object (n) [m]; zero without contact."""
+    own: np.ndarray
+    """Summed depth over pairs of hand links (n) [m], the deepest contact of each pair."""
+
+
+def measure_penetration(scene: Scene, grasps: GraspBatch) -> Penetration:
+    """Penetration of the collision shapes in the labelled pose, without any step of time."""
+    depth, own = np.zeros(len(grasps)), np.zeros(len(grasps))
+    for i, (bodies, distance) in enumerate(_contacts(scene, scene.qpos(grasps.T_object_wrist, grasps.joints))):
+        inside = np.maximum(-distance, 0.0)
+        with_object = (bodies == scene.object_body).any(1)
+        depth[i] = inside[with_object].max(initial=0.0)
+        deepest: dict[tuple[int, int], float] = {}
+        for (a, b), d in zip(np.sort(bodies[~with_object], axis=1), inside[~with_object], strict=True):
+            deepest[a, b] = max(deepest.get((a, b), 0.0), float(d))
+        own[i] = sum(deepest.values())
+    return Penetration(depth, own)
+
+
+def touching_links(scene: Scene, qpos: np.ndarray) -> np.ndarray:
+    """Number of hand links that touch the object in each configuration (n nq)."""
+    counts = np.zeros(len(qpos), np.int64)
+    for i, (bodies, _) in enumerate(_contacts(scene, qpos)):
+        touching = bodies[(bodies == scene.object_body).any(1)]
+        counts[i] = len(np.unique(touching[touching != scene.object_body]))
+    return counts
+
+
+def _contacts(scene: Scene, qpos: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Bodies (k 2) and distances (k) [m] of the contacts of each configuration."""
+    data = mujoco.MjData(scene.model)
+    for q in qpos:
+        data.qpos[:] = np.nan_to_num(q)
+        mujoco.mj_kinematics(scene.model, data)
+        mujoco.mj_comPos(scene.model, data)
+        mujoco.mj_collision(scene.model, data)
+        yield scene.model.geom_bodyid[data.contact.geom].reshape(-1, 2), data.contact.dist.copy()

@@ -1,0 +1,81 @@
+"""Named, versioned protocols of a grasp trial; every number with its unit and source."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from dro_grasp.errors import OptionError
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """How a grasp is tried and when it counts as a success."""
+
+    name: str
+    version: int = 1
+    """Raised whenever a change can change a verdict."""
+    closing: bool = True
+    """Start at the pregrasp and close onto the squeeze target; otherwise start and stay at the grasp."""
+    friction: float = 1.0
+    """Coefficient between hand and object. (The official release has 3.0.)"""
+    torsional_friction: float = 0.02
+    """[m]"""
+    force: float = 0.5
+    """Disturbing force per object mass [m/s^2]. Source: paper, evaluation metric details."""
+    closing_time: float = 1.0
+    """[s]"""
+    force_time: float = 1.0
+    """Duration of the force along each of +x +y +z -x -y -z of the object's frame [s]."""
+    max_displacement: float = 0.02
+    """Largest displacement of the object after all forces [m]. Source: paper, evaluation metric."""
+    max_closing_shift: float = math.inf
+    """Largest displacement of the object while the hand closes [m]."""
+    max_closing_rotation: float = math.inf
+    """Largest rotation of the object while the hand closes [rad]."""
+    max_penetration: float = math.inf
+    """Deepest penetration of hand and object in the labelled grasp [m]."""
+    max_self_penetration: float = math.inf
+    """Summed penetration of the hand's links in the labelled grasp [m]."""
+    timestep: float = 0.005
+    """[s]; 5 ms agrees with 1 ms on 97 % of verdicts."""
+    impratio: float = 10.0
+    """Friction to normal impedance; at 1 objects creep."""
+    stiffness: float = 3.0
+    """Gain of the position servos [Nm/rad]; 100 ejects objects."""
+    damping: float = 0.3
+    """[Nms/rad]"""
+    armature: float = 1e-3
+    """[kg m^2]"""
+    force_limit: float = 20.0
+    """Largest servo torque or force [Nm or N]."""
+
+    @property
+    def label(self) -> str:
+        """Name and version, as stored with results; another friction is part of it."""
+        friction = "" if self.friction == 1.0 else f"+friction{self.friction:g}"
+        return f"{self.name}{friction}/{self.version}"
+
+
+PROTOCOLS = {
+    "dro": Protocol("dro"),
+    "strict": Protocol(
+        "strict", max_closing_shift=0.02, max_closing_rotation=math.radians(30), max_penetration=0.005,
+        max_self_penetration=0.005,
+    ),
+    "dro_static": Protocol("dro_static", closing=False),
+}
+"""Every protocol by name."""
+
+
+def protocol(name: str | Protocol) -> Protocol:
+    """The protocol of a name; a Protocol is returned as it is.
+
+    Raises:
+        OptionError: No protocol has this name.
+    """
+    if isinstance(name, Protocol):
+        return name
+    if name not in PROTOCOLS:
+        raise OptionError(f"no protocol is called '{name}'; choose one of {', '.join(PROTOCOLS)}")
+    return PROTOCOLS[name]

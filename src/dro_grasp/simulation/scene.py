@@ -1,0 +1,213 @@
+"""One MuJoCo model for a hand and an object; it serves all grasps of the pair.
+
+The hand's root is fixed at the origin, and a grasp's inverse wrist pose is written into the object's free joint.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from dataclasses import dataclass
+from functools import cached_property
+
+import mujoco
+import numpy as np
+import roma
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dro_grasp.errors import HandError, ObjectError
+from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.simulation.protocols import Protocol
+
+HULL_VERTICES = 64
+"""Most vertices of a colliding hull; more only cost time."""
+EQUALITY_TIME = 0.01
+"""Time constant of joint couplings [s], the stiffest that a 5 ms step allows."""
+FAR_AWAY = (0.0, 0.0, 5.0)
+"""Where the object waits while the hand is looked at alone [m]."""
+_PREFIX = "hand/"
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A compiled hand and object, and where to write a grasp."""
+
+    model: mujoco.MjModel
+    hand: Hand
+    obj: ObjectModel
+    protocol: Protocol
+
+    @cached_property
+    def object_body(self) -> int:
+        """Body index of the object."""
+        return self.model.body("object").id
+
+    @cached_property
+    def object_qpos(self) -> slice:
+        """Where the object's position and quaternion WXYZ stand in qpos."""
+        start = int(self.model.jnt_qposadr[self.model.joint("object").id])
+        return slice(start, start + 7)
+
+    @cached_property
+    def hand_qpos(self) -> tuple[np.ndarray, np.ndarray]:
+        """Addresses in qpos, and indices into the tree's moving joints, of the joints that are simulated."""
+        names = {self.model.joint(j).name: int(self.model.jnt_qposadr[j]) for j in range(self.model.njnt)}
+        pairs = [(names[_PREFIX + n], i) for i, n in enumerate(self.hand.tree.moving_names) if _PREFIX + n in names]
+        addresses, joints = np.array(pairs).T
+        return addresses, joints
+
+    @cached_property
+    def actuated(self) -> np.ndarray:
+        """Index into the independent joints of each actuator."""
+        names = [self.model.actuator(i).name.removeprefix(_PREFIX) for i in range(self.model.nu)]
+        return np.array([self.hand.tree.joint_names.index(n) for n in names])
+
+    def qpos(
+        self, T_object_wrist: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"]
+    ) -> np.ndarray:
+        """Configurations (n nq) of the hand at these joints and the object at its pose in the wrist frame."""
+        n = len(joints)
+        q = np.tile(self.model.qpos0, (n, 1))
+        addresses, moving = self.hand_qpos
+        tree = self.hand.tree
+        q[:, addresses] = (joints @ tree.coupling.T + tree.offset).numpy()[:, moving]
+        T_wrist_object = torch.linalg.inv(T_object_wrist.double())
+        rotation = roma.special_procrustes(T_wrist_object[:, :3, :3])
+        quaternion = roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(rotation))
+        q[:, self.object_qpos] = torch.cat([T_wrist_object[:, :3, 3], quaternion], -1).numpy()
+        return q
+
+    def is_hand(self, body: np.ndarray) -> np.ndarray:
+        """Mask of the bodies that belong to the hand."""
+        return (body != 0) & (body != self.object_body)
+
+
+def build_scene(hand: Hand, obj: ObjectModel, protocol: Protocol) -> Scene:
+    """Put a hand and an object into one model.
+
+    Raises:
+        ObjectError: The object is a bare point cloud.
+        HandError: The hand came without its description.
+    """
+    if obj.is_cloud:
+        raise ObjectError(f"object '{obj.name}' is a bare point cloud; a trial needs a mesh (use --protocol none)")
+    if hand.description is None:
+        raise HandError(f"hand '{hand.name}' carries no description; load it by name or file to simulate it")
+    scene = _empty_scene(protocol)
+    scene.attach(_hand_spec(hand, protocol), prefix=_PREFIX, frame=scene.worldbody.add_frame())
+    _add_object(scene, obj, protocol)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        _exclude_resting_contacts(scene, hand)
+        return Scene(scene.compile(), hand, obj, protocol)
+
+
+def _empty_scene(protocol: Protocol) -> mujoco.MjSpec:
+    scene = mujoco.MjSpec()
+    option = scene.option
+    option.timestep, option.impratio, option.gravity = protocol.timestep, protocol.impratio, [0, 0, 0]
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    # The sparse Newton solver of MuJoCo 4.0.0 can be wrong.
+    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    return scene
+
+
+def _hand_spec(hand: Hand, protocol: Protocol) -> mujoco.MjSpec:
+    """The hand with position servos on its independent joints, all hands alike."""
+    assert hand.description is not None
+    spec = hand.description.spec()
+    _hold_joints(spec, hand)
+    for mesh in spec.meshes:
+        mesh.maxhullvert = HULL_VERTICES
+    for geom in spec.geoms:
+        geom.friction[:2] = [protocol.friction, protocol.torsional_friction]
+        geom.condim, geom.margin, geom.gap = 4, 0.0, 0.0
+        geom.solref, geom.solimp = [0.02, 1], [0.9, 0.95, 0.001, 0.5, 2]
+    for equality in spec.equalities:
+        equality.solref = [EQUALITY_TIME, 1]
+    for joint in spec.joints:
+        joint.armature, joint.frictionloss = protocol.armature, 0.0
+        joint.damping[:] = 0.0
+        joint.stiffness[:] = 0.0
+        joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        if joint.name in hand.tree.joint_names:
+            actuator = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+            actuator.set_to_position(kp=protocol.stiffness, kv=protocol.damping)
+            actuator.forcelimited, actuator.forcerange = True, [-protocol.force_limit, protocol.force_limit]
+    return spec
+
+
+def _hold_joints(spec: mujoco.MjSpec, hand: Hand) -> None:
+    """Joints above the palm do not move: at zero they are removed, elsewhere they are tied."""
+    values = hand.tree.coupling @ hand.rest + hand.tree.offset
+    held = (hand.tree.coupling.abs() @ (~hand.movable).float() > 0).tolist()
+    for name, value, hold in zip(hand.tree.moving_names, values.tolist(), held, strict=True):
+        if not hold:
+            continue
+        for equality in [e for e in spec.equalities if name in (e.name1, e.name2)]:
+            spec.delete(equality)
+        if abs(value) < 1e-9:
+            spec.delete(spec.joint(name))
+        else:
+            tie = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1=name, objtype=mujoco.mjtObj.mjOBJ_JOINT)
+            tie.data[0] = value
+
+
+def _add_object(scene: mujoco.MjSpec, obj: ObjectModel, protocol: Protocol) -> None:
+    """The object as its convex parts, with the mass and inertia of its mesh."""
+    body = scene.worldbody.add_body(name="object", pos=FAR_AWAY)
+    body.add_freejoint(name="object")
+    for i, (vertices, faces) in enumerate(obj.parts):
+        mesh = scene.add_mesh(name=f"part{i}", uservert=np.asarray(vertices, float).ravel(),
+                              userface=np.asarray(faces, np.int32).ravel())
+        mesh.maxhullvert = HULL_VERTICES
+        # A part's own inertia plays no role, and thin parts would be refused for it.
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"part{i}", condim=4, mass=0.0,
+                      friction=[protocol.friction, protocol.torsional_friction, 1e-4])
+    inertia = obj.inertia / obj.volume * obj.mass
+    body.explicitinertial, body.mass, body.ipos = True, obj.mass, obj.centre_of_mass
+    body.fullinertia = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
+
+
+def _exclude_resting_contacts(scene: mujoco.MjSpec, hand: Hand) -> None:
+    """Links that touch in the open hand, and each link and what it hangs on, do not collide.
+
+    MuJoCo's own parent-child filter does not apply where the parent is static.
+    """
+    model = scene.compile()
+    data = mujoco.MjData(model)
+    trial = Scene(model, hand, None, None)  # type: ignore[arg-type]
+    addresses, moving = trial.hand_qpos
+    pairs: set[tuple[str, str]] = set()
+    for openness in (0.75, 1.0):
+        q = hand.canonical_joints(openness)
+        data.qpos[addresses] = (hand.tree.coupling @ q + hand.tree.offset).numpy()[moving]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_collision(model, data)
+        pairs |= {_pair(model, int(a), int(b)) for a, b in data.contact.geom}
+    for body in range(1, model.nbody):
+        parent = int(model.body_parentid[body])
+        if parent > 0 and model.body_weldid[parent] == 0:
+            pairs |= {_named(model, body, other) for other in range(1, model.nbody) if model.body_weldid[other] == 0}
+    for first, second in sorted(p for p in pairs if p[0] != p[1] and "object" not in p):
+        scene.add_exclude(bodyname1=first, bodyname2=second)
+
+
+def _pair(model: mujoco.MjModel, a: int, b: int) -> tuple[str, str]:
+    return _named(model, int(model.geom_bodyid[a]), int(model.geom_bodyid[b]))
+
+
+def _named(model: mujoco.MjModel, a: int, b: int) -> tuple[str, str]:
+    first, second = sorted((model.body(a).name, model.body(b).name))
+    return first, second
+
+
+def cores() -> int:
+    """Cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
