@@ -28,7 +28,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.library import load_object
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.simulation.trial import settled, simulate
+from dro_grasp.simulation.trial import settle, simulate
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class EngineConfig:
     """Share of them, lowest energy first, that are tried in simulation."""
     deepest: float = 0.005
     """Candidates that penetrate deeper than this by the signed distances are not tried [m]."""
-    settle: bool = False
+    settle: bool = True
     """Take the labels after the hand has closed on the object in simulation."""
     barren_rounds: int = 3
     """A pair is given up after this many rounds without a single valid grasp."""
@@ -310,7 +310,7 @@ def valid_grasps(hand: Hand, obj: ObjectModel, seed: int, protocol: str, config:
     if not len(grasps):
         return grasps
     if config.settle:
-        grasps = settled(hand, obj, grasps, simulate(hand, obj, grasps, protocol, workers=1))
+        grasps = settle(hand, obj, grasps, protocol, workers=1)
     tried = grasps.with_trial(simulate(hand, obj, grasps, protocol, workers=1))
     if config.keep_failures or tried.success is None:
         return tried
