@@ -30,6 +30,9 @@ from dro_grasp.objects.library import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.trial import settle, simulate
 
+REPORT_EVERY = 10.0
+"""Time between lines of progress [s]."""
+
 
 @dataclass(frozen=True)
 class EngineConfig:
@@ -212,6 +215,7 @@ def _run(
                 running[pool.submit(make_shard, job, Shard(*pair, states[pair].rounds))] = pair
                 states[pair].rounds += 1
             if not running:
+                say(summary(states, goal, time.perf_counter() - started))
                 return done
             finished, _ = wait(running, return_when=FIRST_COMPLETED)
             broken = False
@@ -221,7 +225,7 @@ def _run(
                 done += not states[pair].error
             if broken:
                 done, pool = done, _rebuild(pool, running, states, workers)
-            if time.perf_counter() - told > 10.0 or not running:
+            if time.perf_counter() - told > REPORT_EVERY:
                 told = time.perf_counter()
                 say(summary(states, goal, told - started))
     finally:
