@@ -1,0 +1,201 @@
+"""The D(R,O) network: open hand and object in, distances in the grasp pose out. Source: paper section III-C."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from dro_grasp.models.attention import CrossTransformer
+from dro_grasp.models.distance_head import DistanceHead
+from dro_grasp.models.encoder import StaticGraphEncoder
+from dro_grasp.models.latent import LatentEncoder, sample_posterior
+from dro_grasp.models.placement import PlacementPrior
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Sizes and forms. The defaults are the paper's."""
+
+    n_hand: int = 512
+    """Points of the hand's cloud."""
+    n_object: int = 512
+    """Points of the object's cloud."""
+    width: int = 512
+    """Feature dimension D."""
+    encoder_widths: tuple[int, ...] = (64, 64, 128, 256, 512)
+    """Outputs of the edge layers."""
+    neighbours: int = 32
+    """K of the encoders' graphs."""
+    heads: int = 4
+    """Attention heads."""
+    attention_hidden: int = 1024
+    """Hidden width of the transformers' feed-forward layers."""
+    latent: int = 64
+    """Dimension of z."""
+    latent_widths: tuple[int, ...] = (64, 64, 128, 256)
+    """Edge layers of the latent encoder."""
+    latent_head: tuple[int, int] = (512, 256)
+    """Fully connected layers of the latent encoder."""
+    latent_neighbours: int = 20
+    """K of the latent encoder's graph."""
+    kernel_hidden: tuple[int, int] = (300, 100)
+    """Hidden layers of the kernel."""
+    initial_distance: float = 0.1
+    """Distance that an untrained kernel predicts [m]; softplus alone starts at 0.69."""
+    frame: Literal["object", "wrist"] = "object"
+    """Axes of both clouds: the object's (the paper's form), or the given wrist's."""
+    placed: bool = False
+    """Tell the network where the open hand is; the paper discards it by zero-centring."""
+    residual: bool = False
+    """Add the kernel to the distances of the placed open hand; needs `placed`."""
+    placement_width: int = 128
+    """Width of the placement prior."""
+    placement_components: int = 8
+    """Components of its mixture."""
+    latent_temperature: float = 1.0
+    """Scales z drawn at inference; 1 is the paper's form."""
+    placement_temperature: float = 0.7
+    """Scales the spread of placements drawn at inference."""
+
+    @staticmethod
+    def paper() -> NetworkConfig:
+        """The paper's network, about 14 M parameters."""
+        return NetworkConfig()
+
+    @staticmethod
+    def slim() -> NetworkConfig:
+        """A small one that trains on a CPU: the same code, narrower, in the wrist frame, with placement."""
+        return NetworkConfig(
+            n_hand=160, n_object=128, width=128, encoder_widths=(32, 32, 64, 128), neighbours=16,
+            attention_hidden=256, latent=64, latent_widths=(32, 32, 64), latent_head=(128, 128), latent_neighbours=12,
+            kernel_hidden=(128, 64), frame="wrist", placed=True, residual=True,
+        )
+
+    @staticmethod
+    def from_dict(values: dict[str, Any]) -> NetworkConfig:
+        """From plain values, as stored in a weights file; lists become tuples."""
+        return NetworkConfig(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+
+
+@dataclass(frozen=True)
+class NetworkOutput:
+    """What training needs of one forward pass."""
+
+    distances: Float[Tensor, "b n columns"]
+    """D(R,O) [m]."""
+    mean: Float[Tensor, "b latent"]
+    """Mean of the posterior of z."""
+    log_variance: Float[Tensor, "b latent"]
+    """Its log-variance."""
+    hand_feature: Float[Tensor, "b width"]
+    """Mean feature of the open hand, for the placement prior."""
+
+
+class DistanceNetwork(nn.Module):
+    """Encoders, cross-attention both ways, CVAE latent, symmetric kernel."""
+
+    def __init__(self, config: NetworkConfig, name: str = "untrained") -> None:
+        super().__init__()
+        self.config, self.name = config, name
+        c = config
+        self.hand_encoder = StaticGraphEncoder(c.encoder_widths, c.width, c.neighbours)
+        self.object_encoder = StaticGraphEncoder(c.encoder_widths, c.width, c.neighbours)
+        self.hand_transformer = CrossTransformer(c.width, c.heads, c.attention_hidden)
+        self.object_transformer = CrossTransformer(c.width, c.heads, c.attention_hidden)
+        self.latent_encoder = LatentEncoder(c.width, c.latent, c.latent_widths, c.latent_head, c.latent_neighbours)
+        self.head = DistanceHead(c.width + c.latent, c.kernel_hidden, c.initial_distance)
+        self.place = nn.Linear(3, c.width) if c.placed else None
+        self.placement = PlacementPrior(c.width, c.placement_width, c.placement_components)
+
+    def features(
+        self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"]
+    ) -> tuple[Float[Tensor, "b n width"], Float[Tensor, "b m width"], Float[Tensor, "b width"]]:
+        """Correlated point features of both clouds, and the mean feature of the open hand."""
+        centred = hand - hand.mean(1, keepdim=True)
+        phi_hand, phi_object = self.hand_encoder(centred), self.object_encoder(obj)
+        summary = phi_hand.mean(1)
+        if self.place is not None:
+            phi_hand = phi_hand + self.place(hand * 10)
+        psi_hand = self.hand_transformer(phi_hand, phi_object) + phi_hand
+        psi_object = self.object_transformer(phi_object, phi_hand) + phi_object
+        return psi_hand, psi_object, summary
+
+    def forward(
+        self,
+        hand: Float[Tensor, "b n 3"],
+        obj: Float[Tensor, "b m 3"],
+        grasp: Float[Tensor, "b n 3"],
+        columns: int | None = None,
+    ) -> NetworkOutput:
+        """One training pass: z comes from the true grasp.
+
+        Args:
+            hand: The open hand [m], in the frame of the configuration.
+            obj: The object in the same frame [m].
+            grasp: The hand in the grasp pose, in the same frame [m].
+            columns: Compute distances to this many leading object points only; the order must be random.
+        """
+        psi_hand, psi_object, summary = self.features(hand, obj)
+        mean, log_variance = self.latent_encoder(torch.cat([grasp, obj], 1), torch.cat([psi_hand, psi_object], 1))
+        z = sample_posterior(mean, log_variance)
+        distances = self._distances(psi_hand, psi_object[:, :columns], z, hand, obj[:, :columns])
+        return NetworkOutput(distances, mean, log_variance, summary)
+
+    def predict(
+        self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], z: Float[Tensor, "b latent"]
+    ) -> Float[Tensor, "b n m"]:
+        """D(R,O) [m] for given latents; see `forward` for the clouds."""
+        psi_hand, psi_object, _ = self.features(hand, obj)
+        return self._distances(psi_hand, psi_object, z, hand, obj)
+
+    def _distances(
+        self, psi_hand: Tensor, psi_object: Tensor, z: Tensor, hand: Tensor, obj: Tensor
+    ) -> Float[Tensor, "b n m"]:
+        def joined(features: Tensor) -> Tensor:
+            return torch.cat([features, z[:, None].expand(-1, features.shape[1], -1)], -1)
+
+        base = torch.cdist(hand, obj) if self.config.residual else None
+        return self.head(joined(psi_hand), joined(psi_object), base)
+
+    def to_frame(
+        self, points: Float[Tensor, "b n 3"], centre: Float[Tensor, "b 3"], rotation: Float[Tensor, "b 3 3"]
+    ) -> Float[Tensor, "b n 3"]:
+        """Points of the object's frame in the frame the network works in: about the object's centre.
+
+        Args:
+            points: In the object's frame [m].
+            centre: Mean of the object's cloud [m].
+            rotation: Of the given wrist in the object's frame.
+        """
+        centred = points - centre[:, None]
+        return centred @ rotation if self.config.frame == "wrist" else centred
+
+    def sample_latent(self, num: int, generator: torch.Generator) -> Float[Tensor, "num latent"]:
+        """z from the prior."""
+        return torch.randn(num, self.config.latent, generator=generator) * self.config.latent_temperature
+
+    def sample_placements(
+        self,
+        hand: Float[Tensor, "n 3"],
+        obj: Float[Tensor, "m 3"],
+        rotations: Float[Tensor, "r 3 3"],
+        num: int,
+        generator: torch.Generator,
+    ) -> tuple[Float[Tensor, "num 3 3"], Float[Tensor, "num 3"]]:
+        """Wrist rotations, and positions of the grasp centre in wrist axes about the object's centre [m].
+
+        Args:
+            hand: The open hand in the wrist frame [m].
+            obj: The object's cloud in its own frame [m].
+            rotations: Candidate wrist rotations.
+            num: How many placements.
+            generator: Source of randomness.
+        """
+        feature = self.hand_encoder((hand - hand.mean(0))[None]).mean(1)[0]
+        return self.placement.sample(
+            obj - obj.mean(0), feature, rotations, num, generator, self.config.placement_temperature
+        )

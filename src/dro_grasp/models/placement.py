@@ -1,0 +1,87 @@
+"""Where to put the open hand before asking for a grasp: a learned prior over wrist placements.
+
+Differs from the paper, which zero-centres the hand cloud and leaves the placement to the latent: the open hand is
+given near where it will grasp. The prior says which wrist rotations suit an object and where the grasp centre goes.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+MIN_SCALE = 0.003
+"""Smallest standard deviation of a mixture component [m]."""
+
+
+class PlacementPrior(nn.Module):
+    """A point network over the object in wrist axes, with a hand feature, to a mixture density and a rotation score."""
+
+    def __init__(self, hand_features: int, width: int, components: int) -> None:
+        super().__init__()
+        self.components = components
+        self.points = nn.Sequential(nn.Linear(3, width // 2), nn.ReLU(), nn.Linear(width // 2, width), nn.ReLU(),
+                                    nn.Linear(width, 2 * width))
+        self.hand = nn.Linear(hand_features, width)
+        self.head = nn.Sequential(nn.Linear(3 * width, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(),
+                                  nn.Linear(width, components * 7 + 1))
+
+    def forward(
+        self, obj: Float[Tensor, "b m 3"], hand: Float[Tensor, "b c"]
+    ) -> tuple[Float[Tensor, "b k"], Float[Tensor, "b k 3"], Float[Tensor, "b k 3"], Float[Tensor, " b"]]:
+        """Mixture logits, means [m], standard deviations [m], and the score of the rotation.
+
+        Args:
+            obj: Object points in wrist axes about the object's centre [m].
+            hand: Mean feature of the open hand's points.
+        """
+        # Points are a tenth of a metre large; networks prefer numbers near one.
+        x = torch.cat([self.points(obj * 10).amax(1), self.hand(hand)], -1)
+        out = self.head(x)
+        logits, mean, scale = out[:, :-1].split([self.components, 3 * self.components, 3 * self.components], -1)
+        mean = mean.unflatten(-1, (self.components, 3)) * 0.1
+        scale = functional.softplus(scale).unflatten(-1, (self.components, 3)) * 0.03 + MIN_SCALE
+        return logits, mean, scale, out[:, -1]
+
+    def log_density(
+        self, obj: Float[Tensor, "b m 3"], hand: Float[Tensor, "b c"], position: Float[Tensor, "b 3"]
+    ) -> tuple[Float[Tensor, " b"], Float[Tensor, " b"]]:
+        """Log density of a position of the grasp centre, and the score of the rotation."""
+        logits, mean, scale, score = self(obj, hand)
+        normal = -0.5 * ((position[:, None] - mean) / scale).square() - scale.log() - 0.5 * math.log(2 * math.pi)
+        return torch.logsumexp(torch.log_softmax(logits, -1) + normal.sum(-1), -1), score
+
+    def sample(
+        self,
+        obj: Float[Tensor, "m 3"],
+        hand: Float[Tensor, " c"],
+        rotations: Float[Tensor, "r 3 3"],
+        num: int,
+        generator: torch.Generator,
+        temperature: float,
+    ) -> tuple[Float[Tensor, "num 3 3"], Float[Tensor, "num 3"]]:
+        """Choose rotations by their scores and draw a position of the grasp centre for each.
+
+        Args:
+            obj: Object points about the object's centre, in the object's axes [m].
+            hand: Mean feature of the open hand's points.
+            rotations: Candidate wrist rotations in the object's axes.
+            num: How many to choose, without repetition.
+            generator: Source of randomness.
+            temperature: Scales the spread of the drawn positions.
+
+        Returns:
+            Rotations, and positions in wrist axes about the object's centre [m].
+        """
+        turned = obj @ rotations
+        logits, mean, scale, score = self(turned, hand.expand(len(rotations), -1))
+        noise = -torch.log(-torch.log(torch.rand(len(rotations), generator=generator).clamp(1e-9, 1 - 1e-7)))
+        chosen = (score + noise).topk(num).indices
+        uniform = torch.rand(num, self.components, generator=generator).clamp(1e-9, 1 - 1e-7)
+        component = (logits[chosen] / max(temperature, 1e-3) - torch.log(-torch.log(uniform))).argmax(-1)
+        row = torch.arange(num)
+        spread = torch.randn(num, 3, generator=generator) * temperature
+        return rotations[chosen], mean[chosen][row, component] + scale[chosen][row, component] * spread
