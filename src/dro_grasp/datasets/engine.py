@@ -18,6 +18,8 @@ from functools import lru_cache
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from dro_grasp.datasets.records import Shard, count_grasps, find_shards, remove_leftovers
 from dro_grasp.errors import DroGraspError, OptionError, OutputError
@@ -42,10 +44,12 @@ class EngineConfig:
     """Grasps synthesised for a shard."""
     tried_share: float = 0.34
     """Share of them, lowest energy first, that are tried in simulation."""
-    deepest: float = 0.005
+    deepest: float = 0.01
     """Candidates that penetrate deeper than this by the signed distances are not tried [m]."""
     settle: bool = True
-    """Take the labels after the hand has closed on the object in simulation."""
+    """Take the labels after the hand has closed on the object in simulation, which drives out penetration."""
+    farthest: float = 0.03
+    """Candidates that the closing moves farther than this relative to the object are not tried [m]."""
     barren_rounds: int = 3
     """A pair is given up after this many rounds without a single valid grasp."""
     most_rounds: int = 200
@@ -314,12 +318,20 @@ def valid_grasps(hand: Hand, obj: ObjectModel, seed: int, protocol: str, config:
     if not len(grasps):
         return grasps
     if config.settle:
-        grasps = settle(hand, obj, grasps, protocol, workers=1)
+        closed = settle(hand, obj, grasps, protocol, workers=1)
+        grasps = closed[(_grasp_centres(hand, closed) - _grasp_centres(hand, grasps)).norm(dim=-1) < config.farthest]
+        if not len(grasps):
+            return grasps
     tried = grasps.with_trial(simulate(hand, obj, grasps, protocol, workers=1))
     if config.keep_failures or tried.success is None:
         return tried
     passed = tried[tried.success]
     return passed[distinct(hand, passed)]
+
+
+def _grasp_centres(hand: Hand, grasps: GraspBatch) -> Float[Tensor, "n 3"]:
+    T = grasps.T_object_wrist
+    return T[:, :3, :3] @ hand.grasp_centre_wrist + T[:, :3, 3]
 
 
 def select(grasps: GraspBatch, config: EngineConfig) -> GraspBatch:
