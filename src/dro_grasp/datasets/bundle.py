@@ -1,0 +1,225 @@
+"""Everything that training needs in one portable file: hands, object clouds, grasps.
+
+The file is safetensors. Object points have 16 bits within the cloud's box, normals 8 bits. Reading it needs torch and
+safetensors alone.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import roma
+import torch
+from jaxtyping import Float, Int
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from dro_grasp.errors import BundleError, OutputError
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
+
+FORMAT_VERSION = 1
+MAX_BYTES = 25_000_000
+"""Largest bundle [bytes]."""
+TRAINING_SPLITS = {"train", ""}
+"""Splits that may enter a bundle; the empty one is an object of the user's own."""
+
+
+@dataclass(frozen=True)
+class ObjectCloud:
+    """An object as training sees it."""
+
+    points: Float[Tensor, "k 3"]
+    """[m]"""
+    normals: Float[Tensor, "k 3"]
+    """Outward unit normals."""
+
+
+@dataclass(frozen=True)
+class HandGrasps:
+    """All grasps of one hand."""
+
+    T_object_wrist: Float[Tensor, "n 4 4"]
+    """Wrist poses."""
+    joints: Float[Tensor, "n n_dof"]
+    """Independent joints [rad or m]."""
+    object_index: Int[Tensor, " n"]
+    """Index into the bundle's object names."""
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """What a bundle file holds."""
+
+    hands: dict[str, Hand]
+    objects: dict[str, ObjectCloud]
+    grasps: dict[str, HandGrasps]
+    """By hand name."""
+
+    @property
+    def object_names(self) -> tuple[str, ...]:
+        """Names in the order of object_index."""
+        return tuple(self.objects)
+
+    @property
+    def n_grasps(self) -> int:
+        """Grasps of all hands."""
+        return sum(len(g.joints) for g in self.grasps.values())
+
+    def summary(self) -> dict[str, Any]:
+        """Counts for people."""
+        return {
+            "hands": {name: len(g.joints) for name, g in self.grasps.items()},
+            "objects": len(self.objects), "grasps": self.n_grasps,
+        }
+
+
+def write_bundle(
+    path: Path | str,
+    hands: Sequence[Hand],
+    objects: Mapping[str, ObjectCloud],
+    grasps: Sequence[GraspBatch],
+) -> Bundle:
+    """Write a training bundle.
+
+    Args:
+        path: The file to write.
+        hands: The hands of the grasps.
+        objects: Clouds of the objects of the grasps, by name.
+        grasps: Batches of any of the hands on any of the objects.
+
+    Raises:
+        BundleError: A grasp's object is not for training, its hand or object is missing, or the file grows too large.
+        OutputError: The file cannot be written.
+    """
+    names = list(objects)
+    tensors: dict[str, Tensor] = {}
+    header: dict[str, Any] = {"format_version": FORMAT_VERSION, "objects": names, "hands": []}
+    for i, (name, cloud) in enumerate(objects.items()):
+        tensors |= _pack_cloud(f"object.{i}", cloud, name)
+    for i, hand in enumerate(hands):
+        header["hands"].append(_pack_hand(f"hand.{i}", hand, tensors))
+        tensors |= _pack_grasps(f"grasps.{i}", hand, [b for b in grasps if b.hand_sha256 == hand.sha256], names)
+    strangers = {b.hand for b in grasps} - {h.name for h in hands}
+    if strangers:
+        raise BundleError(f"grasps of {', '.join(sorted(strangers))} were given without these hands; pass the hands too")
+    _save(Path(path), tensors, header)
+    return load_bundle(path)
+
+
+def load_bundle(path: Path | str) -> Bundle:
+    """Read a training bundle.
+
+    Raises:
+        BundleError: The file is missing, truncated, foreign or of another version.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise BundleError(f"no bundle at {path}; make one with `dro-grasp dataset bundle`")
+    try:
+        with safe_open(path, "pt") as file:
+            header = json.loads((file.metadata() or {}).get("dro_grasp_bundle", "null"))
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    except (SafetensorError, json.JSONDecodeError, OSError) as error:
+        raise BundleError(f"{path} is no bundle, or was cut short ({error}); make it again") from error
+    if header is None:
+        raise BundleError(f"{path} is a safetensors file but no bundle; make one with `dro-grasp dataset bundle`")
+    if header["format_version"] != FORMAT_VERSION:
+        raise BundleError(f"{path} has bundle version {header['format_version']}, expected {FORMAT_VERSION}; make it again "
+                          "with this version of dro-grasp")
+    objects = {name: _unpack_cloud(f"object.{i}", tensors) for i, name in enumerate(header["objects"])}
+    hands, grasps = {}, {}
+    for i, plain in enumerate(header["hands"]):
+        hand = _unpack_hand(f"hand.{i}", plain, tensors)
+        hands[hand.name] = hand
+        grasps[hand.name] = _unpack_grasps(f"grasps.{i}", tensors)
+    return Bundle(hands, objects, grasps)
+
+
+def _pack_cloud(key: str, cloud: ObjectCloud, name: str) -> dict[str, Tensor]:
+    if not (cloud.points.isfinite().all() and cloud.normals.isfinite().all()):
+        raise BundleError(f"the cloud of object '{name}' has non-finite values; check its mesh")
+    low = cloud.points.amin(0)
+    size = (cloud.points.amax(0) - low).clamp(min=1e-9)
+    levels = ((cloud.points - low) / size * 65535).round().to(torch.int32)
+    return {
+        f"{key}.points": (levels - 32768).to(torch.int16), f"{key}.box": torch.stack([low, size]),
+        f"{key}.normals": (cloud.normals * 127).round().to(torch.int8),
+    }
+
+
+def _unpack_cloud(key: str, tensors: dict[str, Tensor]) -> ObjectCloud:
+    low, size = tensors[f"{key}.box"]
+    points = (tensors[f"{key}.points"].float() + 32768) / 65535 * size + low
+    return ObjectCloud(points, torch.nn.functional.normalize(tensors[f"{key}.normals"].float(), dim=-1))
+
+
+def _pack_hand(key: str, hand: Hand, tensors: dict[str, Tensor]) -> dict[str, Any]:
+    """Tensors go into the file, plain values into its header."""
+    plain = {}
+    for field, value in hand.to_tensors().items():
+        if isinstance(value, Tensor):
+            tensors[f"{key}.{field}"] = value.contiguous().clone()
+        else:
+            plain[field] = value
+    return plain
+
+
+def _unpack_hand(key: str, plain: dict[str, Any], tensors: dict[str, Tensor]) -> Hand:
+    prefix = f"{key}."
+    own = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+    return Hand.from_tensors(plain | own)
+
+
+def _pack_grasps(key: str, hand: Hand, batches: list[GraspBatch], names: list[str]) -> dict[str, Tensor]:
+    if not batches:
+        raise BundleError(f"no grasps of hand '{hand.name}'; synthesise some or leave the hand out")
+    known = {name: i for i, name in enumerate(names)}
+    for batch in batches:
+        refused = {o for o, s in zip(batch.object, batch.split, strict=True) if s not in TRAINING_SPLITS}
+        if refused:
+            raise BundleError(f"objects {', '.join(sorted(refused)[:5])} are held out for evaluation and may not enter a "
+                              "training bundle; filter them out")
+        missing = set(batch.object) - set(known)
+        if missing:
+            raise BundleError(f"no cloud was given for objects {', '.join(sorted(missing)[:5])}")
+    T = torch.cat([b.T_object_wrist for b in batches])
+    return {
+        f"{key}.position": T[:, :3, 3].contiguous(),
+        f"{key}.quaternion_wxyz": roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(T[:, :3, :3])).contiguous(),
+        f"{key}.joints": torch.cat([b.joints for b in batches]).contiguous(),
+        f"{key}.object": torch.tensor([known[o] for b in batches for o in b.object], dtype=torch.int32),
+    }
+
+
+def _unpack_grasps(key: str, tensors: dict[str, Tensor]) -> HandGrasps:
+    quaternion = roma.quat_wxyz_to_xyzw(tensors[f"{key}.quaternion_wxyz"])
+    T = torch.eye(4).repeat(len(quaternion), 1, 1)
+    T[:, :3, :3] = roma.unitquat_to_rotmat(torch.nn.functional.normalize(quaternion, dim=-1))
+    T[:, :3, 3] = tensors[f"{key}.position"]
+    return HandGrasps(T, tensors[f"{key}.joints"], tensors[f"{key}.object"].long())
+
+
+def _save(path: Path, tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
+    size = sum(t.numel() * t.element_size() for t in tensors.values())
+    if size > MAX_BYTES:
+        raise BundleError(f"the bundle would have {size / 1e6:.1f} MB, at most {MAX_BYTES / 1e6:.0f} MB are allowed; take "
+                          "fewer objects or fewer grasps a pair")
+    try:
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}", suffix=".part")
+        os.close(handle)
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}; choose another folder") from error
+    try:
+        save_file(tensors, temporary, metadata={"dro_grasp_bundle": json.dumps(header)})
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise

@@ -1,0 +1,121 @@
+"""Weights files: safetensors, half precision, with the network's configuration inside; never pickle."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from dro_grasp.errors import OutputError, WeightsError
+from dro_grasp.models.network import DistanceNetwork, NetworkConfig
+
+FORMAT_VERSION = 1
+SHIPPED_FOLDER = Path(__file__).parent.parent / "weights"
+"""Where shipped weights lie."""
+DEFAULT = "slim"
+"""Weights that are used when none are named."""
+
+
+def save_weights(network: DistanceNetwork, path: Path | str, about: dict[str, Any] | None = None) -> None:
+    """Write weights in half precision; counters and statistics of BatchNorm stay in single precision.
+
+    Args:
+        network: The network; its configuration goes along.
+        path: The file to write.
+        about: What the weights were trained on, for people.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    path = Path(path)
+    tensors = {
+        name: value.half().contiguous() if value.is_floating_point() and "running" not in name else value.contiguous()
+        for name, value in network.state_dict().items()
+    }
+    header = {"format_version": FORMAT_VERSION, "config": dataclasses.asdict(network.config), "about": about or {}}
+    try:
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}", suffix=".part")
+        os.close(handle)
+        save_file(tensors, temporary, metadata={"dro_grasp_weights": json.dumps(header)})
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise OutputError(f"cannot write weights to {path}: {error.strerror}; choose another folder") from error
+
+
+def load_weights(name: str | Path | None = None) -> DistanceNetwork:
+    """A network with trained weights, in evaluation mode and single precision.
+
+    Args:
+        name: Name of shipped weights, or the path of a weights file; None takes the default.
+
+    Raises:
+        WeightsError: No such weights, or the file is truncated, foreign, a pickle, or of another version.
+    """
+    path = locate_weights(name)
+    header, tensors = _read(path)
+    network = DistanceNetwork(NetworkConfig.from_dict(header["config"]), name=path.stem)
+    try:
+        network.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in tensors.items()})
+    except RuntimeError as error:
+        raise WeightsError(f"{path} does not fit this version of the network ({str(error).splitlines()[0]}); use weights "
+                           "made with this version") from error
+    return network.eval()
+
+
+def locate_weights(name: str | Path | None = None) -> Path:
+    """The file behind a name.
+
+    Raises:
+        WeightsError: Nothing has this name.
+    """
+    text = str(name or DEFAULT)
+    shipped = SHIPPED_FOLDER / f"{text}.safetensors"
+    if "/" not in text and shipped.is_file():
+        return shipped
+    path = Path(text).expanduser()
+    if path.is_file():
+        return path
+    raise WeightsError(f"no weights at '{text}'; shipped weights are {', '.join(weights_names()) or 'none'}, or give the "
+                       "path of a .safetensors file that `dro-grasp train` wrote")
+
+
+def weights_names() -> list[str]:
+    """Names of the shipped weights."""
+    return sorted(file.stem for file in SHIPPED_FOLDER.glob("*.safetensors"))
+
+
+def describe_weights(name: str | Path | None = None) -> dict[str, Any]:
+    """What a weights file says of itself, its size and its SHA-256."""
+    path = locate_weights(name)
+    header, tensors = _read(path)
+    return {
+        "name": path.stem, "parameters": sum(t.numel() for t in tensors.values()), "bytes": path.stat().st_size,
+        "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "config": header["config"], "about": header["about"],
+    }
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+    if path.read_bytes()[:2] in (b"PK", b"\x80\x02", b"\x80\x04"):
+        raise WeightsError(f"{path} is a pickled PyTorch file, which can run code and is refused; expected safetensors "
+                           "written by `dro-grasp train`")
+    try:
+        with safe_open(path, "pt") as file:
+            header = json.loads((file.metadata() or {}).get("dro_grasp_weights", "null"))
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    except (SafetensorError, json.JSONDecodeError) as error:
+        raise WeightsError(f"{path} is no weights file, or was cut short ({error}); copy or train it again") from error
+    if header is None:
+        raise WeightsError(f"{path} is a safetensors file, but not of dro-grasp; give a file that `dro-grasp train` wrote")
+    if header["format_version"] != FORMAT_VERSION:
+        raise WeightsError(f"{path} has weights version {header['format_version']}, expected {FORMAT_VERSION}; use weights "
+                           "made with this version")
+    return header, tensors

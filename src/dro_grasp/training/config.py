@@ -1,0 +1,89 @@
+"""Typed settings of pretraining and training; every number that matters, with its source."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class AugmentationConfig:
+    """How a sample differs from the stored grasp."""
+
+    object_noise: float = 0.002
+    """Standard deviation of the noise on object points [m]. Source: appendix, object point cloud sampling."""
+    placement_rotation: float = math.radians(8)
+    """Largest rotation of the open hand's placement away from the grasp's [rad]."""
+    placement_shift: float = 0.01
+    """Standard deviation of its shift along each axis [m]."""
+    partial: float = 0.0
+    """Share of samples that see half of the object, as in the appendix."""
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of the four terms. Source: the official release; the KL weight is swept."""
+
+    distance: float = 1.0
+    pose: float = 0.01
+    penetration: float = 1.0
+    divergence: float = 0.01
+    divergence_form: Literal["batch_mean", "official"] = "batch_mean"
+    """Sum over latents and mean over the batch, or the release's sum over all and sqrt(1 + x^2) - 1."""
+    placement: float = 0.01
+    """Weight of the placement prior's own loss; it shares no parameter with the rest."""
+
+
+@dataclass(frozen=True)
+class ScheduleConfig:
+    """Optimiser and bookkeeping of both loops."""
+
+    steps: int = 10_000
+    """Optimiser steps in all."""
+    learning_rate: float = 1e-3
+    """Peak of Adam's rate. Differs from the paper (1e-4): better at equal time on a CPU."""
+    warmup_steps: int = 200
+    """Steps of linear warm-up; a cosine to zero follows."""
+    gradient_norm: float = 1.0
+    """Gradients are clipped to this norm."""
+    average_decay: float = 0.998
+    """Decay of the moving average of the weights, which is what is saved."""
+    checkpoint_seconds: float = 60.0
+    """A checkpoint is written this often [s]."""
+    log_every: int = 20
+    """Steps between lines of the log."""
+    seed: int = 0
+    """Seed of initial weights and of all samples."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Main training."""
+
+    schedule: ScheduleConfig = ScheduleConfig()
+    losses: LossConfig = LossConfig()
+    augmentation: AugmentationConfig = AugmentationConfig()
+    hands_per_step: int = 4
+    """Different hands in one step."""
+    samples_per_hand: int = 4
+    """Grasps of each of them."""
+    columns: int = 48
+    """Object points to which distances are predicted in a step; inference uses all."""
+    freeze_hand_encoder: bool = True
+    """Keep the pretrained hand encoder as it is. Source: paper section III-C."""
+
+
+@dataclass(frozen=True)
+class PretrainConfig:
+    """Configuration-invariant pretraining of the hand encoder."""
+
+    schedule: ScheduleConfig = ScheduleConfig(steps=3_000)
+    hands_per_step: int = 4
+    samples_per_hand: int = 4
+    temperature: float = 0.1
+    """tau. Source: paper section III-B."""
+    sharpness: float = 10.0
+    """lambda of the tanh weights [1/m]. Source: paper section III-B."""
+    rotation: float = math.radians(15)
+    """Largest rotation between the two clouds' wrists [rad]."""

@@ -1,0 +1,121 @@
+"""Main training of the D(R,O) network. Source: paper section III-E."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from dro_grasp import distance_matrix
+from dro_grasp.datasets.bundle import Bundle
+from dro_grasp.models.network import DistanceNetwork, NetworkConfig, NetworkOutput
+from dro_grasp.training.config import LossConfig, TrainConfig
+from dro_grasp.training.losses import (
+    distance_loss,
+    divergence,
+    official_divergence,
+    penetration_loss,
+    placement_loss,
+    pose_loss,
+)
+from dro_grasp.training.runs import Run, console_report
+from dro_grasp.training.samples import HandSamples, SampleSource
+
+
+def train(
+    bundle: Bundle,
+    network: NetworkConfig,
+    config: TrainConfig,
+    folder: Path,
+    pretrained: DistanceNetwork | None = None,
+    report: Callable[[Run, dict[str, float]], None] | None = None,
+    name: str = "trained",
+) -> DistanceNetwork:
+    """Train on a bundle, on the CPU.
+
+    Args:
+        bundle: Hands, objects and grasps.
+        network: Sizes and forms.
+        config: Losses, augmentation and schedule.
+        folder: Run folder; a checkpoint in it is taken up, to the same curve.
+        pretrained: Where the hand encoder comes from; without it the encoder is trained along.
+        report: Called now and then; the console by default.
+        name: How the weights are called.
+
+    Returns:
+        The moving average of the weights, in evaluation mode.
+
+    Raises:
+        TrainingError: A loss is not finite.
+    """
+    torch.manual_seed(config.schedule.seed)
+    generator = torch.Generator().manual_seed(config.schedule.seed)
+    model = DistanceNetwork(network, name=name)
+    frozen = pretrained is not None and config.freeze_hand_encoder
+    if pretrained is not None:
+        model.hand_encoder.load_state_dict(pretrained.hand_encoder.state_dict())
+    model.hand_encoder.requires_grad_(not frozen)
+    source = SampleSource(bundle, network, config.augmentation)
+    run = Run(folder, model, config.schedule, generator)
+    model.train()
+    if frozen:
+        # train() would put the frozen encoder's BatchNorm back into training mode.
+        model.hand_encoder.eval()
+
+    def losses() -> dict[str, Tensor]:
+        names = source.draw_hands(config.hands_per_step, generator)
+        groups = [source.draw(hand, config.samples_per_hand, generator) for hand in names]
+        return step_losses(model, groups, config)
+
+    run.train(losses, report or console_report("training"))
+    model.load_state_dict(run.average.module.state_dict())
+    return model.eval()
+
+
+def step_losses(model: DistanceNetwork, groups: list[HandSamples], config: TrainConfig) -> dict[str, Tensor]:
+    """All losses of one batch, by name, with their weighted sum as `total`."""
+    placed, grasp, obj = (torch.cat([getattr(g, n) for g in groups]) for n in ("placed", "grasp", "obj"))
+    output = model(placed, obj, grasp, columns=config.columns)
+    anchors = obj[:, : config.columns]
+    parts = {"distance": distance_loss(output.distances, distance_matrix.build(grasp, anchors))}
+    poses, penetrations = [], []
+    start = 0
+    for group in groups:
+        rows = slice(start, start + len(group.placed))
+        decoded = distance_matrix.decode(group.hand, output.distances[rows], anchors[rows])
+        poses.append(pose_loss(decoded.T_world_link, group.T_frame_link, decoded.valid))
+        posed = _posed_points(group, decoded)
+        penetrations.append(penetration_loss(posed, group.obj, group.normals))
+        start = rows.stop
+    parts["pose"] = torch.cat(poses).mean()
+    parts["penetration"] = torch.cat(penetrations).mean()
+    parts["divergence"] = _divergence(output, config.losses)
+    parts["placement"] = _placement(model, groups, output)
+    weights = config.losses
+    total = torch.stack([getattr(weights, name) * value for name, value in parts.items()]).sum()
+    return {"total": total, **parts}
+
+
+def _posed_points(group: HandSamples, decoded: distance_matrix.LinkPoses) -> Tensor:
+    """Hand points under the decoded link poses (b k 3), of the links that have one."""
+    kept = decoded.valid[group.hand.link_index]
+    T = decoded.T_world_link[:, group.hand.link_index[kept]]
+    return (T[..., :3, :3] @ group.hand.link_points[kept][..., None])[..., 0] + T[..., :3, 3]
+
+
+def _divergence(output: NetworkOutput, config: LossConfig) -> Tensor:
+    if config.divergence_form == "official":
+        return official_divergence(output.mean, output.log_variance)
+    return divergence(output.mean, output.log_variance).mean()
+
+
+def _placement(model: DistanceNetwork, groups: list[HandSamples], output: NetworkOutput) -> Tensor:
+    feature = output.hand_feature.detach()
+    obj, other, position = (
+        torch.cat([getattr(g, n) for g in groups]) for n in ("obj_wrist", "obj_random", "position")
+    )
+    density, score = model.placement.log_density(obj, feature, position)
+    other_score = model.placement(other, feature)[3]
+    return placement_loss(density, score, other_score)

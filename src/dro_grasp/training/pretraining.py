@@ -1,0 +1,92 @@
+"""Configuration-invariant pretraining of the hand encoder. Source: paper section III-B."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from dro_grasp.datasets.bundle import Bundle
+from dro_grasp.models.encoder import StaticGraphEncoder
+from dro_grasp.models.network import DistanceNetwork, NetworkConfig
+from dro_grasp.training.config import AugmentationConfig, PretrainConfig
+from dro_grasp.training.losses import contrastive_loss
+from dro_grasp.training.runs import Run, console_report
+from dro_grasp.training.samples import SampleSource, random_rotations, random_turns
+
+
+def pretrain(
+    bundle: Bundle,
+    network: NetworkConfig,
+    config: PretrainConfig,
+    folder: Path,
+    report: Callable[[Run, dict[str, float]], None] | None = None,
+) -> DistanceNetwork:
+    """Pretrain the hand encoder on the bundle's grasps.
+
+    Args:
+        bundle: Hands and grasps.
+        network: Sizes.
+        config: Loss and schedule.
+        folder: Run folder; a checkpoint in it is taken up.
+        report: Called now and then; the console by default.
+
+    Returns:
+        A network whose hand encoder is trained and whose other parts are fresh, in evaluation mode.
+
+    Raises:
+        TrainingError: A loss is not finite.
+    """
+    torch.manual_seed(config.schedule.seed)
+    whole = DistanceNetwork(network, name="pretrained")
+    generator = torch.Generator().manual_seed(config.schedule.seed)
+    source = SampleSource(bundle, network, AugmentationConfig())
+    encoder = whole.hand_encoder
+    run = Run(folder, encoder, config.schedule, generator)
+    encoder.train()
+
+    def losses() -> dict[str, torch.Tensor]:
+        return {"total": contrastive_step(encoder, source, config, generator)}
+
+    run.train(losses, report or console_report("pretraining"))
+    encoder.load_state_dict(run.average.module.state_dict())
+    return whole.eval()
+
+
+def contrastive_step(
+    encoder: StaticGraphEncoder, source: SampleSource, config: PretrainConfig, generator: torch.Generator
+) -> torch.Tensor:
+    """Loss of one batch: grasps (cloud A) against the open hand (cloud B) with a similar wrist rotation."""
+    grasp_clouds, open_clouds = [], []
+    for name in source.draw_hands(config.hands_per_step, generator):
+        hand, grasps = source.hands[name], source.bundle.grasps[name]
+        chosen = torch.randint(len(grasps.joints), (config.samples_per_hand,), generator=generator)
+        if source.network.frame == "wrist":
+            wrist = torch.eye(3).expand(len(chosen), 3, 3)
+        else:
+            wrist = random_rotations(len(chosen), generator)
+        turn = wrist @ random_turns(len(chosen), config.rotation, generator)
+        grasp_clouds.append(hand.points(grasps.joints[chosen]) @ turn.mT)
+        open_clouds.append(hand.points(hand.random_open_joints(len(chosen), generator)) @ wrist.mT)
+    a, b = (torch.cat(c) for c in (grasp_clouds, open_clouds))
+    features = encoder(torch.cat([c - c.mean(1, keepdim=True) for c in (a, b)]))
+    features_a, features_b = features.chunk(2)
+    return contrastive_loss(features_a, features_b, b, config.temperature, config.sharpness).mean()
+
+
+@torch.inference_mode()
+def matching_rank(
+    encoder: StaticGraphEncoder, source: SampleSource, samples: int, generator: torch.Generator
+) -> dict[str, float]:
+    """Mean rank, by cosine similarity, of each point's counterpart among the open hand's points; chance is n / 2."""
+    ranks = {}
+    for name in source.names:
+        hand, grasps = source.hands[name], source.bundle.grasps[name]
+        chosen = torch.randint(len(grasps.joints), (samples,), generator=generator)
+        a, b = hand.points(grasps.joints[chosen]), hand.points(hand.random_open_joints(samples, generator))
+        features = [torch.nn.functional.normalize(encoder(c - c.mean(1, keepdim=True)), dim=-1) for c in (a, b)]
+        similarity = features[0] @ features[1].mT
+        own = similarity.diagonal(dim1=1, dim2=2)[..., None]
+        ranks[name] = float((similarity > own).sum(-1).float().mean() + 1)
+    return ranks
