@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import torch
 import torch.nn.functional as F
@@ -41,6 +42,13 @@ class DistanceField:
         origin = grid.origin.to(dtype)
         return DistanceField(table.flatten(0, 2).contiguous(), shape, origin, float(grid.spacing))
 
+    @staticmethod
+    def of(grid: SignedDistanceGrid) -> DistanceField:
+        """The field of a grid in single precision, made once for each grid object."""
+        if grid not in _FIELDS:
+            _FIELDS[grid] = DistanceField.from_grid(grid)
+        return _FIELDS[grid]
+
     def distances(
         self, points: Float[Tensor, "*b 3"]
     ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
@@ -72,6 +80,39 @@ class DistanceField:
         offset = (place - index) * self.spacing
         strides = place.new_tensor([self.shape[1] * self.shape[2], self.shape[2], 1])
         return (index @ strides).to(torch.int64), offset
+
+
+_FIELDS: WeakKeyDictionary[SignedDistanceGrid, DistanceField] = WeakKeyDictionary()
+
+
+@dataclass(frozen=True)
+class CloudField:
+    """The same queries on a bare cloud: distance to the nearest point, its normal deciding the side."""
+
+    points: Float[Tensor, "m 3"]
+    """Surface points [m]."""
+    point_normals: Float[Tensor, "m 3"]
+    """Outward unit normals there."""
+    chunk: int = 4096
+    """Queries answered at once."""
+
+    def distances(
+        self, points: Float[Tensor, "*b 3"]
+    ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
+        """Signed distance [m] along the nearest point's normal close by, to the point itself far away; its gradient."""
+        flat = points.reshape(-1, 3)
+        index = torch.cat([torch.cdist(part, self.points).argmin(-1) for part in flat.split(self.chunk)])
+        normal = self.point_normals[index].reshape(points.shape)
+        apart = points - self.points[index].reshape(points.shape)
+        height = (apart * normal).sum(-1)
+        return height.sign() * apart.norm(dim=-1), normal
+
+    def normals(
+        self, points: Float[Tensor, "*b 3"]
+    ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"], Float[Tensor, "*b 3 3"]]:
+        """Signed distance [m], outward unit normal, and zero for the normal's derivative, which is unknown."""
+        distance, normal = self.distances(points)
+        return distance, normal, normal.new_zeros(*normal.shape, 3)
 
 
 def _smooth(values: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:

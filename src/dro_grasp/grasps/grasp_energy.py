@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dro_grasp.grasps import energies
-from dro_grasp.grasps.field import DistanceField
+from dro_grasp.grasps.field import CloudField, DistanceField
 from dro_grasp.grasps.fingers import ContactCandidates, ContactConfig, contact_candidates, rigid_group
 from dro_grasp.hands.hand import Hand
 
@@ -133,7 +133,7 @@ class GraspEnergy:
     def __init__(
         self,
         hand: Hand,
-        field: DistanceField,
+        field: DistanceField | CloudField,
         centre: Float[Tensor, 3],
         length: float,
         config: EnergyConfig | None = None,

@@ -95,7 +95,7 @@ def prepare(hand: Hand, obj: ObjectModel, config: SynthesisConfig | None = None)
     centre = torch.as_tensor(obj.centre_of_mass, dtype=torch.float32)
     surface = torch.as_tensor(obj.cloud, dtype=torch.float32)
     length = float((surface - centre).norm(dim=-1).mean())
-    return GraspEnergy(hand, DistanceField.from_grid(grid), centre, length, config.energy, config.contacts)
+    return GraspEnergy(hand, DistanceField.of(grid), centre, length, config.energy, config.contacts)
 
 
 def synthesize(
