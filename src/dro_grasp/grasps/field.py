@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import torch
@@ -16,12 +17,27 @@ BLUR = (0.25, 0.5, 0.25)
 """Weights along each axis by which the normals' field is smoothed; edges of a voxel grid are not edges."""
 
 
+class SurfaceModel(NamedTuple):
+    """The object's surface as seen from some points."""
+
+    distance: Tensor
+    """Signed distance (*b) [m]."""
+    gradient: Tensor
+    """Its gradient (*b 3), about a unit vector."""
+    normal: Tensor
+    """The gradient's direction: the outward normal (*b 3)."""
+    bend: Tensor
+    """The normal's derivative by position (*b 3 3) [1/m]."""
+
+
 @dataclass(frozen=True)
 class DistanceField:
     """Second-order model of the signed distance around every voxel of a grid."""
 
-    table: Float[Tensor, "voxels 13"]
-    """Per voxel: distance [m], unit normal (3), derivative of the normal (9) [1/m]."""
+    slopes: Float[Tensor, "voxels 4"]
+    """Per voxel: distance [m] and unit gradient."""
+    curvatures: Float[Tensor, "voxels 9"]
+    """Per voxel: symmetric derivative of the gradient [1/m]."""
     shape: tuple[int, int, int]
     """Voxels per axis."""
     origin: Float[Tensor, 3]
@@ -36,11 +52,17 @@ class DistanceField:
         gradient = _differences(_smooth(values), grid.spacing)
         gradient = gradient / gradient.norm(dim=-1, keepdim=True).clamp_min(1e-6)
         columns = [_differences(gradient[..., k], grid.spacing) for k in range(3)]
-        curvature = torch.stack(columns, -2).clamp(-0.5 / grid.spacing, 0.5 / grid.spacing)
-        table = torch.cat([values[..., None], gradient, curvature.flatten(-2)], -1)
+        curvature = torch.stack(columns, -2)
+        curvature = (0.5 * (curvature + curvature.mT)).clamp(-0.5 / grid.spacing, 0.5 / grid.spacing)
+        # Beyond the grid the model is linear.
+        for axis in range(3):
+            for end in (0, -1):
+                curvature.select(axis, end).zero_()
+        slopes = torch.cat([values[..., None], gradient], -1).flatten(0, 2)
         shape = (values.shape[0], values.shape[1], values.shape[2])
         origin = grid.origin.to(dtype)
-        return DistanceField(table.flatten(0, 2).contiguous(), shape, origin, float(grid.spacing))
+        curvatures = curvature.flatten(-2).flatten(0, 2).contiguous()
+        return DistanceField(slopes, curvatures, shape, origin, float(grid.spacing))
 
     @staticmethod
     def of(grid: SignedDistanceGrid) -> DistanceField:
@@ -54,24 +76,24 @@ class DistanceField:
     ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
         """Signed distance [m] and its gradient: nearest voxel and first order; linear beyond the grid."""
         row, offset = self._locate(points)
-        near = self.table[:, :4][row]
+        near = self.slopes.index_select(0, row.flatten()).reshape(*points.shape[:-1], 4)
         gradient = near[..., 1:]
         return near[..., 0] + (gradient * offset).sum(-1), gradient
 
     def normals(
         self, points: Float[Tensor, "*b 3"]
-    ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"], Float[Tensor, "*b 3 3"]]:
-        """Signed distance [m], outward unit normal, and the normal's derivative by position [1/m]."""
+    ) -> SurfaceModel:
+        """Second-order model at the nearest voxel, consistent: each part is the derivative of the one before."""
         row, offset = self._locate(points)
-        near = self.table[row]
-        gradient, curvature = near[..., 1:4], near[..., 4:].unflatten(-1, (3, 3))
-        distance = near[..., 0] + (gradient * offset).sum(-1)
-        within = offset.clamp(-self.spacing, self.spacing)
-        raw = gradient + (curvature @ within[..., None])[..., 0]
+        near, curvature = self.slopes[row], self.curvatures[row].unflatten(-1, (3, 3))
+        gradient = near[..., 1:]
+        turned = (curvature @ offset[..., None])[..., 0]
+        distance = near[..., 0] + (gradient * offset).sum(-1) + 0.5 * (turned * offset).sum(-1)
+        raw = gradient + turned
         length = raw.norm(dim=-1, keepdim=True).clamp_min(1e-6)
         normal = raw / length
         tangent = curvature - normal[..., :, None] * (normal[..., None, :] @ curvature)
-        return distance, normal, tangent / length[..., None]
+        return SurfaceModel(distance, raw, normal, tangent / length[..., None])
 
     def _locate(self, points: Float[Tensor, "*b 3"]) -> tuple[Tensor, Float[Tensor, "*b 3"]]:
         place = (points - self.origin) / self.spacing
@@ -93,26 +115,37 @@ class CloudField:
     """Surface points [m]."""
     point_normals: Float[Tensor, "m 3"]
     """Outward unit normals there."""
+    spacing: float
+    """Distance between neighbouring points [m]: nearer to a point than this, its tangent plane is the surface."""
     chunk: int = 4096
     """Queries answered at once."""
+
+    @staticmethod
+    def of(points: Float[Tensor, "m 3"], normals: Float[Tensor, "m 3"]) -> CloudField:
+        """The field of a cloud, with its spacing measured on some of its points."""
+        some = points[:: max(1, len(points) // 256)]
+        nearest = torch.cdist(some, points).topk(min(7, len(points)), largest=False).values
+        return CloudField(points, normals, float(nearest[:, -1].median()))
 
     def distances(
         self, points: Float[Tensor, "*b 3"]
     ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
-        """Signed distance [m] along the nearest point's normal close by, to the point itself far away; its gradient."""
+        """Signed distance [m]: to the nearest point's tangent plane beside it, to its rim beyond; and the normal."""
         flat = points.reshape(-1, 3)
         index = torch.cat([torch.cdist(part, self.points).argmin(-1) for part in flat.split(self.chunk)])
         normal = self.point_normals[index].reshape(points.shape)
         apart = points - self.points[index].reshape(points.shape)
         height = (apart * normal).sum(-1)
-        return height.sign() * apart.norm(dim=-1), normal
+        aside = (apart - height[..., None] * normal).norm(dim=-1)
+        beyond = (aside - self.spacing).clamp_min(0)
+        return torch.where(height < 0, -1.0, 1.0) * (height.square() + beyond.square()).sqrt(), normal
 
     def normals(
         self, points: Float[Tensor, "*b 3"]
-    ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"], Float[Tensor, "*b 3 3"]]:
-        """Signed distance [m], outward unit normal, and zero for the normal's derivative, which is unknown."""
+    ) -> SurfaceModel:
+        """The nearest point's normal, with zero for its derivative, which is unknown."""
         distance, normal = self.distances(points)
-        return distance, normal, normal.new_zeros(*normal.shape, 3)
+        return SurfaceModel(distance, normal, normal, normal.new_zeros(*normal.shape, 3))
 
 
 def _smooth(values: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:

@@ -127,6 +127,29 @@ class Evaluation:
         return self.terms.sum(-1)
 
 
+@dataclass(frozen=True)
+class LinkPoints:
+    """Points fixed to links, laid out so that one matrix product places them all."""
+
+    layout: Float[Tensor, "rows p"]
+    """Homogeneous coordinates of each point in the four rows of its link [m]."""
+    members: Float[Tensor, "p n_links"]
+    """One-hot link of each point."""
+
+    @staticmethod
+    def of(local: Float[Tensor, "p 3"], links: Int[Tensor, " p"], n_links: int) -> LinkPoints:
+        """Lay out points given in their links' frames."""
+        members = torch.eye(n_links, dtype=local.dtype)[links]
+        homogeneous = torch.cat([local, torch.ones_like(local[:, :1])], -1)
+        layout = (members[:, :, None] * homogeneous[:, None, :]).flatten(1).T.contiguous()
+        return LinkPoints(layout, members)
+
+    def place(self, poses: Float[Tensor, "n n_links 4 4"]) -> Float[Tensor, "n p 3"]:
+        """The points in the world [m]."""
+        rows = poses[:, :, :3].transpose(1, 2).reshape(3 * len(poses), -1)
+        return (rows @ self.layout).unflatten(0, (-1, 3)).mT
+
+
 class GraspEnergy:
     """The energy of a hand on an object, ready to be evaluated many times."""
 
@@ -154,10 +177,9 @@ class GraspEnergy:
         self.candidates: ContactCandidates = contact_candidates(hand, contacts)
         self.spheres = link_spheres(hand)
         thin = hand.with_points(min(self.config.hand_points, hand.n_points))
-        self.body, self.body_links = thin.link_points, thin.link_index
-        one_hot = torch.eye(hand.tree.n_links, dtype=hand.tree.origin.dtype)
-        self.body_members, self.sphere_members = one_hot[self.body_links], one_hot[self.spheres.links]
-        self.one_hot = one_hot
+        self.one_hot = torch.eye(hand.tree.n_links, dtype=hand.tree.origin.dtype)
+        self.body = LinkPoints.of(thin.link_points, thin.link_index, hand.tree.n_links)
+        self.ball = LinkPoints.of(self.spheres.centres, self.spheres.links, hand.tree.n_links)
         room = self.config.closing_room * (hand.tree.upper - hand.tree.lower) * ~hand.abduction
         self.lower = torch.where(hand.opening > 0, hand.tree.lower + room, hand.tree.lower)
         self.upper = torch.where(hand.opening > 0, hand.tree.upper, hand.tree.upper - room)
@@ -178,16 +200,16 @@ class GraspEnergy:
         tree, config = self.hand.tree, self.config
         poses = T_object_wrist[:, None] @ tree.forward(q)
         contact_terms, wrenches = self._contacts(poses, contacts)
-        body = place(poses, self.body_links, self.body)
+        body = self.body.place(poses)
         distance, gradient = self.field.distances(body)
         inside = energies.penetration(distance - config.margin, gradient)
         wrenches = wrenches + energies.link_wrenches(
-            body, config.penetration * inside.by_point, self.body_members
+            body, config.penetration * inside.by_point, self.body.members
         )
-        spheres = place(poses, self.spheres.links, self.spheres.centres)
+        spheres = self.ball.place(poses)
         own = energies.self_penetration(spheres, self.spheres.radii, self.spheres.pairs)
         wrenches = wrenches + energies.link_wrenches(
-            spheres, config.self_penetration * own.by_point, self.sphere_members
+            spheres, config.self_penetration * own.by_point, self.ball.members
         )
         beyond, slope = energies.joint_margin(q, self.lower, self.upper)
         by_pose, by_joint = energies.joint_gradient(tree, poses, wrenches, self.pivot(T_object_wrist))
@@ -217,9 +239,10 @@ class GraspEnergy:
         rotation = chosen[..., :3, :3]
         points = (rotation @ candidates.points[contacts][..., None])[..., 0] + chosen[..., :3, 3]
         outward = (rotation @ candidates.normals[contacts][..., None])[..., 0]
-        distance, normal, bend = self.field.normals(points)
+        surface = self.field.normals(points)
+        normal, bend = surface.normal, surface.bend
         closure = energies.force_closure(points - self.centre, normal, self.length)
-        apart = energies.contact_distance(distance, normal)
+        apart = energies.contact_distance(surface.distance, surface.gradient)
         align = energies.normal_alignment(outward, normal)
         by_object_normal = config.force_closure * closure.by_normal + config.alignment * outward
         by_point = (
@@ -233,9 +256,3 @@ class GraspEnergy:
         return (closure.value.sum(-1), apart.value.sum(-1), align.value.sum(-1)), wrenches
 
 
-def place(
-    poses: Float[Tensor, "n n_links 4 4"], links: Int[Tensor, " p"], local: Float[Tensor, "p 3"]
-) -> Float[Tensor, "n p 3"]:
-    """Points fixed to links, in the world [m]."""
-    chosen = poses[:, links, :3]
-    return (chosen[..., :3] @ local[..., None])[..., 0] + chosen[..., 3]

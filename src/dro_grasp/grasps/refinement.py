@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.field import CloudField, DistanceField
-from dro_grasp.grasps.grasp_energy import EnergyConfig, Evaluation, GraspEnergy, place
+from dro_grasp.grasps.grasp_energy import EnergyConfig, Evaluation, GraspEnergy, LinkPoints
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 
@@ -65,7 +65,7 @@ def score_energy(hand: Hand, obj: ObjectModel, config: ScoreConfig) -> GraspEner
     if grid is None:
         step = max(1, len(surface) // config.cloud_points)
         normals = torch.as_tensor(obj.cloud_normals, dtype=torch.float32)
-        surroundings: DistanceField | CloudField = CloudField(surface[::step], normals[::step])
+        surroundings: DistanceField | CloudField = CloudField.of(surface[::step], normals[::step])
     else:
         surroundings = DistanceField.of(grid)
     centre = torch.as_tensor(obj.centre_of_mass, dtype=torch.float32)
@@ -86,7 +86,7 @@ def nearest_contacts(
     """For each slot its candidate nearest to the surface; slots do not share a candidate."""
     candidates = energy.candidates
     poses = T_object_wrist[:, None] @ energy.hand.tree.forward(q)
-    points = place(poses, candidates.links, candidates.points)
+    points = LinkPoints.of(candidates.points, candidates.links, energy.hand.tree.n_links).place(poses)
     distance = energy.field.distances(points)[0].abs()
     taken = torch.zeros_like(distance)
     chosen = []
