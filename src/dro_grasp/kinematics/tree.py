@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -62,7 +63,12 @@ class KinematicTree:
         moved = {k: v.to(device=device, dtype=dtype) if isinstance(v, Tensor) else v for k, v in self.fields().items()}
         return KinematicTree(**moved)
 
-    def fields(self) -> dict[str, object]:
+    @cached_property
+    def double(self) -> KinematicTree:
+        """The same tree in double precision."""
+        return self if self.origin.dtype == torch.float64 else self.to(dtype=torch.float64)
+
+    def fields(self) -> dict[str, Any]:
         """The constructor's arguments by name."""
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 

@@ -1,0 +1,46 @@
+"""Rigid poses from corresponding points.
+
+Source: paper section III-D, 6D pose estimation of links.
+"""
+
+from __future__ import annotations
+
+import roma
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def register(
+    source: Float[Tensor, "*b n 3"],
+    target: Float[Tensor, "*b n 3"],
+    weights: Float[Tensor, "*b n"] | None = None,
+) -> tuple[Float[Tensor, "*b 4 4"], Float[Tensor, "*b"]]:
+    """The rigid motion that maps source points onto target points best, never a reflection.
+
+    The backward pass is regularised (roma), so that gradients stay finite on thin and even on collinear sets. Where
+    all weights are zero, they count as one: check the rank of the points before using such a pose.
+
+    Args:
+        source: Points in their own frame [m].
+        target: The same points in the target frame [m].
+        weights: Weight of each pair; 1 by default, 0 leaves a pair out.
+
+    Returns:
+        T_target_source, and the weighted root mean square distance that remains [m].
+    """
+    weights = source.new_ones(source.shape[:-1]) if weights is None else weights
+    weights = torch.where(weights.sum(-1, keepdim=True) > 0, weights, torch.ones_like(weights))
+    rotation, shift = roma.rigid_points_registration(source, target, weights=weights)
+    error = target - source @ rotation.mT - shift[..., None, :]
+    with torch.no_grad():
+        share = weights / weights.sum(-1, keepdim=True)
+    # The root has an infinite slope at zero error: the floor is far below a micrometre.
+    residual = ((error.square().sum(-1) * share).sum(-1) + 1e-16).sqrt()
+    return _pose(rotation, shift), residual
+
+
+def _pose(rotation: Float[Tensor, "*b 3 3"], shift: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
+    top = torch.cat([rotation, shift[..., None]], -1)
+    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
+    return torch.cat([top, bottom], -2)

@@ -1,0 +1,138 @@
+"""One step of the joint solver: a convex problem per grasp, solved for a whole batch at once.
+
+Minimise over d the weighted sum of un-squared norms |residual_i + J_i d|, with d inside a box. The norms are handled
+by iteratively reweighted least squares (IRLS), the box by an active set, each pass by one batched Cholesky
+factorisation. Source: paper section III-D, joint configurations.
+
+A norm |r| has the curvature (I - u u^T) / |r|, u = r / |r|. IRLS takes I / |r| instead: it never overshoots, and
+creeps near an optimum that misses its targets. `sharpness` s in [0, 1] takes (I - s u u^T) / |r|: 0 is IRLS, 1 is
+Newton's method.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class StepConfig:
+    """How precisely one step is solved."""
+
+    reweightings: int = 1
+    """IRLS passes."""
+    active_set_passes: int = 3
+    """Corrections of the active set after each reweighting; a pass that changes nothing ends them."""
+    norm_floor: float = 3e-4
+    """Norms below this count as squared ones [m]: keeps the weights finite, changes the optimum by less."""
+
+
+@dataclass(frozen=True)
+class _Quadratic:
+    """d^T H d / 2 + g^T d over the box [lower, upper]."""
+
+    matrix: Float[Tensor, "b p p"]
+    gradient: Float[Tensor, "b p"]
+    lower: Float[Tensor, "b p"]
+    upper: Float[Tensor, "b p"]
+
+
+def best_step(
+    jacobian: Float[Tensor, "b p k"],
+    residual: Float[Tensor, "b k"],
+    weights: Float[Tensor, "b t"],
+    lower: Float[Tensor, "b p"],
+    upper: Float[Tensor, "b p"],
+    damping: Float[Tensor, " b"],
+    sharpness: Float[Tensor, " b"] | None = None,
+    config: StepConfig | None = None,
+) -> Float[Tensor, "b p"]:
+    """The step that brings all points closest to their targets, to first order.
+
+    Args:
+        jacobian: Transposed derivative of the k = 3 t coordinates by the p unknowns.
+        residual: Coordinates minus targets [m].
+        weights: Weight of each of the t targets.
+        lower: Smallest allowed step, at most 0.
+        upper: Largest allowed step, at least 0.
+        damping: Multiple of the identity that is added to the normal equations [1/m].
+        sharpness: Between IRLS (0, the default) and Newton's method (1).
+        config: See StepConfig.
+    """
+    config = config or StepConfig()
+    ridge = damping[:, None] * torch.ones_like(lower)
+    step = torch.zeros_like(lower)
+    held: tuple[Bool[Tensor, "b p"], Bool[Tensor, "b p"]] | None = None
+    for _ in range(config.reweightings):
+        matrix, gradient = _model(jacobian, residual + (step[:, None] @ jacobian)[:, 0], weights, sharpness, config)
+        matrix.diagonal(dim1=-2, dim2=-1).add_(ridge)
+        constant = gradient - ((matrix - torch.diag_embed(ridge)) @ step[..., None])[..., 0]
+        quadratic = _Quadratic(matrix, constant, lower, upper)
+        step, held = _minimum_in_box(quadratic, held, config.active_set_passes)
+    return step
+
+
+def _model(
+    jacobian: Float[Tensor, "b p k"], left: Float[Tensor, "b k"], weights: Float[Tensor, "b t"],
+    sharpness: Float[Tensor, " b"] | None, config: StepConfig,
+) -> tuple[Float[Tensor, "b p p"], Float[Tensor, "b p"]]:
+    """Curvature and slope of the sum of norms where these residuals are left."""
+    vectors = left.unflatten(-1, (-1, 3))
+    norms = vectors.norm(dim=-1)
+    scale = weights / norms.clamp(min=config.norm_floor)
+    weighted = jacobian * scale.repeat_interleave(3, -1)[:, None]
+    matrix = weighted @ jacobian.mT
+    gradient = (weighted @ left[..., None])[..., 0]
+    if sharpness is not None:
+        # Below the floor the function is a parabola, whose curvature IRLS has exactly.
+        share = torch.where(norms > config.norm_floor, sharpness[:, None] * scale, 0.0)
+        directions = vectors / norms.clamp(min=config.norm_floor)[..., None]
+        along = (jacobian.unflatten(-1, (-1, 3)) * directions[:, None]).sum(-1)
+        matrix = matrix - (along * share[:, None]) @ along.mT
+    return matrix, gradient
+
+
+def smoothed_norms(residual: Float[Tensor, "*b k"], floor: float) -> Float[Tensor, "*b t"]:
+    """Norms of the points' residuals as IRLS with a floor minimises them [m]."""
+    norms = residual.unflatten(-1, (-1, 3)).norm(dim=-1)
+    return torch.where(norms > floor, norms, (norms.square() + floor**2) / (2 * floor))
+
+
+def _minimum_in_box(
+    quadratic: _Quadratic, held: tuple[Tensor, Tensor] | None, passes: int
+) -> tuple[Float[Tensor, "b p"], tuple[Bool[Tensor, "b p"], Bool[Tensor, "b p"]]]:
+    """Primal-dual active set: variables are held at a bound while the slope pushes them outwards."""
+    lower, upper, gradient = quadratic.lower, quadratic.upper, quadratic.gradient
+    frozen = lower >= upper
+    if held is None:
+        held = (lower >= 0) & (gradient > 0), (upper <= 0) & (gradient < 0)
+    at_lower, at_upper = held[0] | frozen, held[1] & ~frozen
+    step = torch.zeros_like(lower)
+    for _ in range(passes):
+        step = _solve_free(quadratic, at_lower, at_upper)
+        slope = (quadratic.matrix @ step[..., None])[..., 0] + gradient
+        fixed = at_lower | at_upper
+        next_lower = torch.where(fixed, at_lower & (slope > 0), step < lower) | frozen
+        next_upper = torch.where(fixed, at_upper & (slope < 0), step > upper) & ~frozen
+        settled = bool((next_lower == at_lower).all()) and bool((next_upper == at_upper).all())
+        at_lower, at_upper = next_lower, next_upper
+        if settled:
+            break
+    return torch.minimum(torch.maximum(step, lower), upper), (at_lower, at_upper)
+
+
+def _solve_free(
+    quadratic: _Quadratic, at_lower: Bool[Tensor, "b p"], at_upper: Bool[Tensor, "b p"]
+) -> Float[Tensor, "b p"]:
+    """Minimum over the free variables, the others standing at their bounds."""
+    fixed = at_lower | at_upper
+    value = torch.where(at_lower, quadratic.lower, torch.where(at_upper, quadratic.upper, 0.0))
+    free = (~fixed).to(value.dtype)
+    matrix = quadratic.matrix * free[:, :, None] * free[:, None, :]
+    matrix.diagonal(dim1=-2, dim2=-1).add_(1 - free)
+    right = -(quadratic.gradient + (quadratic.matrix @ value[..., None])[..., 0]) * free
+    factor, _ = torch.linalg.cholesky_ex(matrix)
+    return torch.cholesky_solve(right[..., None], factor)[..., 0] * free + value
