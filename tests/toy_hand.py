@@ -72,6 +72,6 @@ def toy_hand(dtype: torch.dtype = torch.float32) -> Hand:
         palm=0, palm_centre=torch.tensor([0.0, 0.0, 0.01]).to(dtype),
         palm_direction=torch.tensor([0.0, 0.0, 1.0]).to(dtype), grasp_centre=torch.tensor([0.0, 0.0, 0.045]).to(dtype),
         opening=torch.full((dof,), -1.0).to(dtype), movable=torch.ones(dof, dtype=torch.bool),
-        rest=torch.zeros(dof).to(dtype), abduction=torch.zeros(dof, dtype=torch.bool), touching=tuple(range(tree.n_links)),
-        sha256="toy",
+        rest=torch.zeros(dof).to(dtype), abduction=torch.zeros(dof, dtype=torch.bool),
+        touching=tuple(range(tree.n_links)), sha256="toy",
     )

@@ -87,12 +87,15 @@ def self_penetration(
 ) -> Term:
     """Overlap of the pairs of spheres that stand for links which may not touch [m], (*b k)."""
     first, second = pairs[:, 0], pairs[:, 1]
-    apart = centres[..., first, :] - centres[..., second, :]
-    distance = apart.norm(dim=-1).clamp_min(1e-6)
+    one_hot = torch.eye(len(radii), dtype=centres.dtype)
+    difference = one_hot[first] - one_hot[second]
+    # As plain matrix products, several times faster than gathering and adding by index.
+    apart = (centres.mT.reshape(-1, len(radii)) @ difference.T).unflatten(0, (*centres.shape[:-2], 3))
+    distance = apart.square().sum(-2).clamp_min(1e-12).sqrt()
     overlap = radii[first] + radii[second] - distance
     touching = (overlap > 0).to(centres.dtype)
-    push = -apart / distance[..., None] * touching[..., None]
-    by_point = torch.zeros_like(centres).index_add(-2, first, push).index_add(-2, second, -push)
+    push = -apart * (touching / distance)[..., None, :]
+    by_point = (push.reshape(-1, len(pairs)) @ difference).unflatten(0, (*centres.shape[:-2], 3)).mT
     return Term(overlap * touching, by_point)
 
 
@@ -128,7 +131,8 @@ def link_wrenches(
     moment = torch.linalg.cross(points, by_point, dim=-1)
     if normals is not None and by_normal is not None:
         moment = moment + torch.linalg.cross(normals, by_normal, dim=-1)
-    return members.T @ torch.cat([by_point, moment], -1)
+    both = torch.cat([by_point.mT, moment.mT], -2)
+    return (both.reshape(-1, len(members)) @ members).unflatten(0, both.shape[:-1]).mT
 
 
 def joint_gradient(
