@@ -1,0 +1,90 @@
+"""`dro-grasp evaluate`: try the grasps of a file."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from dro_grasp.cli.output import print_json, print_table, progress_bar
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Try the grasps of a file in simulation and report success rates with 95 % intervals.
+
+    Example: dro-grasp evaluate grasps.parquet --protocol strict
+    """
+
+    file: tyro.conf.Positional[Path]
+    """Grasp file."""
+    protocol: Literal["dro", "strict", "dro_static"] = "dro"
+    """The trial."""
+    friction: float = 1.0
+    """Friction coefficient between hand and object; the official release has 3."""
+    hand: str | None = None
+    """Hand to use, where the name in the file is not one that can be found here."""
+    object: str | None = None
+    """Mesh to use, likewise, for a file with one object."""
+    scale: float = 1.0
+    """Scale of the object's file."""
+    output: Path | None = None
+    """Save the grasps with their results."""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print one JSON object instead of a table."""
+
+    def run(self) -> int:
+        """Group by object, try, report."""
+        import dataclasses
+
+        from dro_grasp.errors import OptionError
+        from dro_grasp.evaluation.metrics import wilson_interval
+        from dro_grasp.grasps.batch import GraspBatch, check_output
+        from dro_grasp.hands.library import load_hand
+        from dro_grasp.objects.library import load_object
+        from dro_grasp.simulation.protocols import protocol
+        from dro_grasp.simulation.trial import simulate
+
+        if not 0 < self.friction <= 10:
+            raise OptionError(f"friction is {self.friction}; give a coefficient between 0 and 10")
+        if self.output is not None:
+            check_output(self.output)
+        begin = time.perf_counter()
+        grasps = GraspBatch.load(self.file)
+        hand = load_hand(self.hand or grasps.hand)
+        rules = dataclasses.replace(protocol(self.protocol), friction=self.friction)
+        rows, tried, reasons = [], [], Counter()
+        names = list(dict.fromkeys(grasps.object))
+        if self.object is not None and len(names) > 1:
+            raise OptionError(f"{self.file} holds grasps of {len(names)} objects; --object fits a file with one")
+        with progress_bar("trying", self.json) as progress:
+            for name in names:
+                index = [i for i, o in enumerate(grasps.object) if o == name]
+                part = grasps[index]
+                obj = load_object(self.object or name, scale=self.scale)
+                result = simulate(hand, obj, part, rules, progress=progress)
+                tried.append(part.with_trial(result))
+                reasons.update(r for r in result.reason if r)
+                rows.append([name, len(part), int(result.success.sum()), result.success_rate])
+        done = GraspBatch.concatenate(tried)
+        if self.output is not None:
+            done.save(self.output)
+        success = sum(row[2] for row in rows)
+        low, high = wilson_interval(success, len(grasps))
+        report = {
+            "file": str(self.file), "hand": hand.name, "protocol": rules.label, "num": len(grasps), "success": success,
+            "success_rate": success / max(1, len(grasps)), "interval_95": [low, high],
+            "objects": {row[0]: {"num": row[1], "success": row[2]} for row in rows},
+            "reasons": dict(reasons.most_common(10)), "seconds": round(time.perf_counter() - begin, 3),
+            "output": None if self.output is None else str(self.output),
+        }
+        if self.json:
+            print_json(report)
+            return 0
+        note = f"{success} of {len(grasps)} succeeded: {success / max(1, len(grasps)):.1%} (95 %: {low:.1%} to {high:.1%})"
+        print_table(f"{hand.name}, protocol {rules.label}", ["object", "grasps", "success", "rate"], rows, note=note)
+        return 0

@@ -1,0 +1,71 @@
+"""`dro-grasp hands`, `objects` and `weights`: what there is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import tyro
+
+from dro_grasp.cli.output import print_json, print_table
+
+Flag = tyro.conf.FlagCreatePairsOff[bool]
+
+
+@dataclass(frozen=True)
+class Hands:
+    """List the hands that have names. Any URDF or MJCF file works as well."""
+
+    json: Flag = False
+    """Print one JSON object."""
+
+    def run(self) -> int:
+        """Print names and where they come from."""
+        from dro_grasp.hands.library import hand_names
+
+        names = hand_names()
+        if self.json:
+            print_json({"hands": names})
+        else:
+            print_table("hands", ["name", "from"], [[n, o] for n, o in names.items()],
+                        note="or the path of a URDF or MJCF file, or a robot_descriptions name")
+        return 0
+
+
+@dataclass(frozen=True)
+class Objects:
+    """List the objects that have names. Any mesh or point cloud file works as well."""
+
+    json: Flag = False
+    """Print one JSON object."""
+
+    def run(self) -> int:
+        """Print names and splits."""
+        from dro_grasp.objects.library import object_names
+
+        names = object_names()
+        if self.json:
+            print_json({"objects": names})
+        else:
+            print_table("objects", ["name", "split"], [[n, s] for n, s in names.items()],
+                        note="or the path of a mesh or point cloud")
+        return 0
+
+
+@dataclass(frozen=True)
+class Weights:
+    """List the shipped weights: size, checksum, and what they were trained on."""
+
+    json: Flag = False
+    """Print one JSON object."""
+
+    def run(self) -> int:
+        """Print what each file says of itself."""
+        from dro_grasp.models.checkpoints import describe_weights, weights_names
+
+        found = [describe_weights(name) for name in weights_names()]
+        if self.json:
+            print_json({"weights": found})
+        else:
+            rows = [[w["name"], w["parameters"], w["bytes"] / 1e6, w["sha256"][:16]] for w in found]
+            print_table("weights", ["name", "parameters", "MB", "sha256"], rows)
+        return 0

@@ -1,0 +1,75 @@
+"""The `dro-grasp` command: parses, runs one command, and turns errors into messages and exit codes."""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from collections.abc import Sequence
+from typing import Annotated
+
+import tyro
+
+from dro_grasp import __version__
+from dro_grasp.cli.dataset import Dataset
+from dro_grasp.cli.evaluate import Evaluate
+from dro_grasp.cli.generate import Generate
+from dro_grasp.cli.hand import HandCommand
+from dro_grasp.cli.listing import Hands, Objects, Weights
+from dro_grasp.cli.synthesize import Synthesize
+from dro_grasp.cli.train import Pretrain, Train
+from dro_grasp.cli.view import View
+from dro_grasp.errors import DroGraspError
+
+DONE, OUR_FAULT, BAD_INPUT = 0, 1, 2
+"""Exit codes."""
+
+named = tyro.conf.subcommand
+Command = (
+    Annotated[Generate, named("generate")]
+    | Annotated[Evaluate, named("evaluate")]
+    | Annotated[Synthesize, named("synthesize")]
+    | Annotated[Dataset, named("dataset")]
+    | Annotated[Pretrain, named("pretrain")]
+    | Annotated[Train, named("train")]
+    | Annotated[View, named("view")]
+    | Annotated[HandCommand, named("hand")]
+    | Annotated[Hands, named("hands")]
+    | Annotated[Objects, named("objects")]
+    | Annotated[Weights, named("weights")]
+)
+"""Every command of the tool."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns its exit code: 0 done, 2 bad input, 1 our fault."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments in (["--version"], ["-V"]):
+        print(f"dro-grasp {__version__}")
+        return DONE
+    verbose = "--verbose" in arguments
+    arguments = [a for a in arguments if a != "--verbose"] or ["--help"]
+    command = tyro.cli(
+        Command,  # type: ignore[arg-type]
+        prog="dro-grasp",
+        description="Any robot hand description in, simulation-checked dexterous grasps out. "
+        "--version prints the version; --verbose, anywhere, shows tracebacks.",
+        args=arguments,
+        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
+    )
+    try:
+        return command.run()
+    except DroGraspError as error:
+        if verbose:
+            traceback.print_exc()
+        print(f"error: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        return 130
+    except Exception as error:
+        if verbose:
+            traceback.print_exc()
+        else:
+            print(f"internal error: {type(error).__name__}: {error}\nThis is a fault of dro-grasp, not of your input. "
+                  "Run again with --verbose and report the traceback.", file=sys.stderr)
+        return OUR_FAULT

@@ -1,0 +1,61 @@
+"""`dro-grasp synthesize`: grasp data for any hand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from dro_grasp.cli.output import print_json, print_table, stderr
+
+
+@dataclass(frozen=True)
+class Synthesize:
+    """Make grasps from geometry alone and keep those that pass a trial; a rerun goes on where it stopped.
+
+    Example: dro-grasp synthesize --hand my_hand.urdf --object mug bottle --grasps 50 --output data
+    """
+
+    hand: tuple[str, ...]
+    """Hands: names or paths."""
+    object: tuple[str, ...]
+    """Objects: names, meshes, or folders of meshes."""
+    output: Path
+    """Folder for the grasp files; its parent must exist."""
+    grasps: int = 50
+    """Valid grasps of each hand and object."""
+    workers: int = 2
+    """Processes of one thread each."""
+    seed: int = 0
+    """The same seed gives the same grasps."""
+    protocol: Literal["strict", "dro"] = "strict"
+    """Trial that grasps must pass."""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print one JSON object instead of a table."""
+
+    def run(self) -> int:
+        """Check names first, then fill the folder."""
+        from dro_grasp.datasets.engine import synthesize_dataset
+        from dro_grasp.hands.library import locate_hand
+        from dro_grasp.objects.library import resolve_objects
+
+        for name in self.hand:
+            locate_hand(name)
+        objects = resolve_objects(list(self.object))
+        report = synthesize_dataset(
+            self.hand, objects, self.grasps, self.output, workers=self.workers, seed=self.seed, protocol=self.protocol,
+            progress=lambda line: stderr.print(line),
+        )
+        failures = [{"hand": h, "object": o, "reason": why} for (h, o), why in report.failures.items()]
+        values = {"output": str(self.output), "grasps": report.grasps, "added": report.added, "shards": report.shards,
+                  "seconds": round(report.seconds, 2), "failures": failures}
+        if self.json:
+            print_json(values)
+            return 0
+        print_table("synthesis", ["grasps", "added", "shards", "seconds"],
+                    [[report.grasps, report.added, report.shards, report.seconds]])
+        for failure in failures:
+            stderr.print(f"{failure['hand']} on {failure['object']}: {failure['reason']}")
+        return 0

@@ -1,0 +1,130 @@
+"""`dro-grasp pretrain` and `dro-grasp train`: weights from a bundle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import tyro
+
+from dro_grasp.cli.output import print_json, print_table
+
+if TYPE_CHECKING:
+    from dro_grasp.models.network import NetworkConfig
+
+Flag = tyro.conf.FlagCreatePairsOff[bool]
+
+
+def network_config(size: str) -> NetworkConfig:
+    """The network configuration of a size."""
+    from dro_grasp.models.network import NetworkConfig
+
+    return NetworkConfig.slim() if size == "slim" else NetworkConfig.paper()
+
+
+@dataclass(frozen=True)
+class Pretrain:
+    """Pretrain the hand encoder so that a point keeps its features whatever the joints.
+
+    Example: dro-grasp pretrain --bundle bundle.safetensors --run-folder runs/pre --output pretrained.safetensors
+    """
+
+    bundle: Path
+    """Bundle from `dro-grasp dataset bundle`."""
+    run_folder: Path
+    """Folder for log and checkpoints; a run in it is taken up. Its parent must exist."""
+    output: Path
+    """Weights file to write."""
+    size: Literal["slim", "paper"] = "slim"
+    """Network size."""
+    steps: int = 3000
+    """Optimiser steps."""
+    seed: int = 0
+    """Seed of everything."""
+    json: Flag = False
+    """Print one JSON object at the end."""
+
+    def run(self) -> int:
+        """Pretrain, save, and report the matching rank."""
+        import torch
+
+        from dro_grasp.datasets.bundle import load_bundle
+        from dro_grasp.grasps.batch import check_output
+        from dro_grasp.models.checkpoints import save_weights
+        from dro_grasp.training.config import AugmentationConfig, PretrainConfig, ScheduleConfig
+        from dro_grasp.training.pretraining import matching_rank, pretrain
+        from dro_grasp.training.samples import SampleSource
+
+        check_output(self.output)
+        bundle, network = load_bundle(self.bundle), network_config(self.size)
+        schedule = ScheduleConfig(steps=self.steps, seed=self.seed)
+        model = pretrain(bundle, network, PretrainConfig(schedule=schedule), self.run_folder)
+        save_weights(model, self.output, {"stage": "pretraining", "steps": self.steps, "data": bundle.summary()})
+        source = SampleSource(bundle, network, AugmentationConfig())
+        ranks = matching_rank(model.hand_encoder, source, 32, torch.Generator().manual_seed(1))
+        report = {"output": str(self.output), "steps": self.steps, "mean_rank": ranks, "chance": network.n_hand / 2}
+        if self.json:
+            print_json(report)
+        else:
+            print_table("mean rank of each point's counterpart", ["hand", "rank"], [list(i) for i in ranks.items()],
+                        note=f"1 is perfect, {network.n_hand / 2:.0f} is chance; weights: {self.output}")
+        return 0
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train the D(R,O) network on a bundle; a stopped run goes on where it was.
+
+    Example: dro-grasp train --bundle bundle.safetensors --run-folder runs/main --pretrained pretrained.safetensors
+    --output my_weights.safetensors
+    """
+
+    bundle: Path
+    """Bundle from `dro-grasp dataset bundle`."""
+    run_folder: Path
+    """Folder for log and checkpoints; a run in it is taken up. Its parent must exist."""
+    output: Path
+    """Weights file to write."""
+    pretrained: str | None = None
+    """Weights from `dro-grasp pretrain`; without them the hand encoder is trained along."""
+    size: Literal["slim", "paper"] = "slim"
+    """Network size."""
+    steps: int = 10_000
+    """Optimiser steps."""
+    learning_rate: float = 1e-3
+    """Peak of the learning rate."""
+    divergence: float = 0.01
+    """Weight of the KL term."""
+    partial: float = 0.0
+    """Share of samples with half of the object cut away."""
+    seed: int = 0
+    """Seed of everything."""
+    json: Flag = False
+    """Print one JSON object at the end."""
+
+    def run(self) -> int:
+        """Train and save."""
+        from dro_grasp.datasets.bundle import load_bundle
+        from dro_grasp.grasps.batch import check_output
+        from dro_grasp.models.checkpoints import load_weights, save_weights
+        from dro_grasp.training.config import AugmentationConfig, LossConfig, ScheduleConfig, TrainConfig
+        from dro_grasp.training.loop import train
+
+        check_output(self.output)
+        bundle = load_bundle(self.bundle)
+        pretrained = None if self.pretrained is None else load_weights(self.pretrained)
+        config = TrainConfig(
+            schedule=ScheduleConfig(steps=self.steps, learning_rate=self.learning_rate, seed=self.seed),
+            losses=LossConfig(divergence=self.divergence), augmentation=AugmentationConfig(partial=self.partial),
+        )
+        model = train(bundle, network_config(self.size), config, self.run_folder, pretrained, name=self.output.stem)
+        about = {"stage": "training", "steps": self.steps, "pretrained": self.pretrained is not None,
+                 "data": bundle.summary()}
+        save_weights(model, self.output, about)
+        report = {"output": str(self.output), "steps": self.steps, "log": str(self.run_folder / "log.jsonl")}
+        if self.json:
+            print_json(report)
+        else:
+            print_table("training", ["steps", "weights", "log"], [[self.steps, report["output"], report["log"]]])
+        return 0

@@ -1,0 +1,55 @@
+"""`dro-grasp view`: look at the grasps of a file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from dro_grasp.cli.output import stdout
+
+
+@dataclass(frozen=True)
+class View:
+    """Look at the grasps of a file in the browser (localhost only), or as a picture.
+
+    Example: dro-grasp view grasps.parquet
+    """
+
+    file: tyro.conf.Positional[Path]
+    """Grasp file."""
+    hand: str | None = None
+    """Hand to use, where the name in the file is not one that can be found here."""
+    object: str | None = None
+    """Object to look at: a name in the file, or the mesh to use for its only object."""
+    scale: float = 1.0
+    """Scale of the object's file."""
+    port: int = 8080
+    """Port on localhost; the next free one is taken."""
+    picture: Path | None = None
+    """Write a PNG instead of opening the viewer."""
+
+    def run(self) -> int:
+        """Load the file and show the grasps of one object."""
+        from dro_grasp.grasps.batch import GraspBatch, check_output
+        from dro_grasp.hands.library import load_hand
+        from dro_grasp.objects.library import load_object
+
+        if self.picture is not None:
+            check_output(self.picture)
+        grasps = GraspBatch.load(self.file)
+        hand = load_hand(self.hand or grasps.hand)
+        name = self.object if self.object in grasps.object else grasps.object[0]
+        chosen = grasps[[i for i, o in enumerate(grasps.object) if o == name]]
+        obj = load_object(self.object or name, scale=self.scale)
+        if self.picture is not None:
+            from dro_grasp.viewer.pictures import draw_grasps
+
+            draw_grasps(hand, obj, chosen, self.picture)
+            stdout.print(f"picture: {self.picture}")
+            return 0
+        from dro_grasp.viewer.app import view_grasps
+
+        view_grasps(hand, obj, chosen, port=self.port)
+        return 0

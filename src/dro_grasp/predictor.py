@@ -1,0 +1,255 @@
+"""The one-call interface: a hand and an object in, ranked grasps out.
+
+Source: paper section III; the order of the steps is that of figure 2, with a placement of the open hand chosen
+first (by the caller's direction or by the learned placement prior).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import roma
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dro_grasp import distance_matrix
+from dro_grasp.errors import OptionError
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.controller import pregrasp_and_squeeze
+from dro_grasp.grasps.refinement import score_grasps
+from dro_grasp.hands.hand import Hand
+from dro_grasp.models.checkpoints import load_weights
+from dro_grasp.models.network import DistanceNetwork
+from dro_grasp.objects.shape import ObjectModel
+
+
+@dataclass(frozen=True)
+class PredictorConfig:
+    """How grasps are sampled and decoded."""
+
+    rotations_per_grasp: int = 16
+    """Wrist rotations offered to the placement prior for each grasp, when no direction is asked for."""
+    rolls_per_grasp: int = 8
+    """The same with a direction: rolls about it."""
+    direction_spread: float = math.radians(5.0)
+    """Standard deviation of the palm direction around the one asked for [rad]."""
+    batch_size: int = 16
+    """Grasps that go through the network at once."""
+    table_rounds: int = 20
+    """How often sampling goes on when a table plane rejects grasps."""
+
+
+@dataclass
+class GraspPredictor:
+    """Predicts grasps of any object by any hand with one set of weights.
+
+    Example:
+        >>> import dro_grasp as dro
+        >>> hand, obj = dro.load_hand("allegro"), dro.load_object("mug")
+        >>> grasps = dro.GraspPredictor().predict(hand, obj, num=16)
+    """
+
+    weights: str | None = None
+    """Name of shipped weights or path of a weights file; None takes the default."""
+    device: str = "cpu"
+    """Where the network runs."""
+    config: PredictorConfig = field(default_factory=PredictorConfig)
+    timings: dict[str, float] = field(default_factory=dict, init=False)
+    """Seconds of the last call: network, decode, rank."""
+    candidates: int = field(default=0, init=False)
+    """Grasps decoded in the last call, those below a table included."""
+
+    def __post_init__(self) -> None:
+        """Load the weights once."""
+        self.network: DistanceNetwork = load_weights(self.weights).to(self.device).eval()
+        self.weights_name: str = self.network.name
+
+    @torch.inference_mode()
+    def predict(
+        self,
+        hand: Hand,
+        obj: ObjectModel,
+        num: int = 16,
+        seed: int = 0,
+        direction: tuple[float, float, float] | None = None,
+        table: float | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> GraspBatch:
+        """Predict grasps, best score first.
+
+        Args:
+            hand: The hand, from `load_hand`.
+            obj: The object, from `load_object`: a mesh or a bare point cloud.
+            num: How many grasps to return.
+            seed: The same seed gives the same grasps.
+            direction: Palm direction asked for, in the object's frame; any length but zero.
+            table: Height [m] of a plane in the object's frame; grasps whose hand goes below it in the pregrasp or
+                in the grasp are dropped and sampling goes on.
+            progress: Called with (grasps decoded, grasps wanted).
+
+        Returns:
+            `num` grasps with pregrasp, squeeze and score. Results do not depend on the batch size.
+
+        Raises:
+            OptionError: `num` is not positive, `direction` is zero, or too few grasps stay above the table.
+        """
+        check_request(num, direction)
+        self.timings = {"network": 0.0, "decode": 0.0, "rank": 0.0}
+        self.candidates = 0
+        generator = torch.Generator().manual_seed(seed)
+        kept: list[GraspBatch] = []
+        for _ in range(self.config.table_rounds if table is not None else 1):
+            batch = self._sample(hand, obj, num, seed, direction, generator, progress)
+            self.candidates += len(batch)
+            kept.append(batch if table is None else batch[above_table(hand, batch, table)])
+            if sum(map(len, kept)) >= num:
+                break
+        found = GraspBatch.concatenate(kept)[slice(0, num)]
+        if len(found) < num:
+            raise OptionError(
+                f"only {len(found)} of {self.candidates} grasps keep the hand above table {table} m, {num} were asked "
+                f"for; lower --table (the object spans z = {float(obj.cloud[:, 2].min()):.3f} to "
+                f"{float(obj.cloud[:, 2].max()):.3f} m), or ask for a --direction from above (0 0 -1)"
+            )
+        with _timed(self.timings, "rank"):
+            scored = found.replace(score=score_grasps(hand, obj, found))
+        return scored.sorted_by_score()
+
+    def _sample(
+        self,
+        hand: Hand,
+        obj: ObjectModel,
+        num: int,
+        seed: int,
+        direction: tuple[float, float, float] | None,
+        generator: torch.Generator,
+        progress: Callable[[int, int], None] | None,
+    ) -> GraspBatch:
+        """Decode `num` grasps and complete them with pregrasp and squeeze."""
+        network, config = self.network, self.network.config
+        small = hand.with_points(config.n_hand)
+        points = obj.sample_points(config.n_object, generator)
+        with _timed(self.timings, "network"):
+            T_object_wrist = self._placements(small, points, num, direction, generator)
+            joints = small.random_open_joints(num, generator)
+            latent = network.sample_latent(num, generator)
+        poses, solved = [], []
+        for start in range(0, num, self.config.batch_size):
+            part = slice(start, min(start + self.config.batch_size, num))
+            with _timed(self.timings, "network"):
+                placed = small.points(joints[part], T_object_wrist[part])
+                distances = self._distances(placed, points, T_object_wrist[part], latent[part])
+            with _timed(self.timings, "decode"):
+                anchors = points.expand(len(placed), -1, -1)
+                links = distance_matrix.decode(small, distances, anchors)
+                solution = distance_matrix.solve(small, links, joints[part])
+            poses.append(solution.T_world_wrist)
+            solved.append(solution.joints)
+            if progress is not None:
+                progress(part.stop, num)
+        T, q = torch.cat(poses), torch.cat(solved)
+        pregrasp, squeeze = pregrasp_and_squeeze(hand, T, q, torch.as_tensor(obj.centre_of_mass, dtype=q.dtype))
+        return GraspBatch.create(
+            hand, obj, T, q, pregrasp_joints=pregrasp, squeeze_joints=squeeze,
+            seed=torch.full((num,), seed, dtype=torch.int64), provenance=(f"network {self.weights_name}",) * num,
+        )
+
+    def _placements(
+        self,
+        hand: Hand,
+        points: Float[Tensor, "m 3"],
+        num: int,
+        direction: tuple[float, float, float] | None,
+        generator: torch.Generator,
+    ) -> Float[Tensor, "num 4 4"]:
+        """Wrist poses near which grasps are asked for, in the object's frame."""
+        per_grasp = self.config.rotations_per_grasp if direction is None else self.config.rolls_per_grasp
+        candidates = self._rotations(hand, num * per_grasp, direction, generator)
+        opened = hand.points(hand.canonical_joints())
+        rotation, position = self.network.sample_placements(opened, points, candidates, num, generator)
+        T = torch.eye(4).repeat(num, 1, 1)
+        T[:, :3, :3] = rotation
+        T[:, :3, 3] = points.mean(0) + (rotation @ (position - hand.grasp_centre_wrist)[..., None])[..., 0]
+        return T
+
+    def _distances(
+        self,
+        placed: Float[Tensor, "b n 3"],
+        points: Float[Tensor, "m 3"],
+        T_object_wrist: Float[Tensor, "b 4 4"],
+        latent: Float[Tensor, "b latent"],
+    ) -> Float[Tensor, "b n m"]:
+        """D(R,O) of a batch of placed hands; distances do not depend on the frame, so none needs to be undone."""
+        rotation = T_object_wrist[:, :3, :3]
+        centre = points.mean(0).expand(len(placed), 3)
+        hand = self.network.to_frame(placed, centre, rotation)
+        obj = self.network.to_frame(points.expand(len(placed), -1, -1), centre, rotation)
+        return self.network.predict(hand, obj, latent).float()
+
+    def _rotations(
+        self, hand: Hand, count: int, direction: tuple[float, float, float] | None, generator: torch.Generator
+    ) -> Float[Tensor, "count 3 3"]:
+        """Wrist rotations to choose from: uniform, or with the palm near `direction` and any roll."""
+        if direction is None:
+            quaternions = torch.randn(count, 4, generator=generator)
+            return roma.unitquat_to_rotmat(quaternions / quaternions.norm(dim=-1, keepdim=True))
+        palm = hand.palm_direction_wrist
+        wanted = torch.tensor(direction) / torch.tensor(direction).norm()
+        align = rotation_between(palm, wanted)
+        roll = torch.rand(count, generator=generator) * 2 * math.pi
+        tilt = torch.randn(count, 3, generator=generator) * self.config.direction_spread
+        tilt = tilt - (tilt @ wanted)[:, None] * wanted
+        return roma.rotvec_to_rotmat(tilt) @ roma.rotvec_to_rotmat(roll[:, None] * wanted) @ align
+
+
+def rotation_between(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """The smallest rotation that takes unit vector a to unit vector b (any half turn when they are opposite)."""
+    axis = torch.linalg.cross(a, b)
+    if axis.norm() < 1e-6:
+        helper = torch.eye(3)[a.abs().argmin()]
+        axis = torch.linalg.cross(a, helper)
+    angle = torch.atan2(torch.linalg.cross(a, b).norm(), a @ b)
+    return roma.rotvec_to_rotmat(axis / axis.norm() * angle)
+
+
+def above_table(hand: Hand, grasps: GraspBatch, table: float) -> Tensor:
+    """Mask (n) of the grasps whose hand stays above the plane z = table [m] in the grasp and in the pregrasp."""
+    lowest = hand.points(grasps.joints, grasps.T_object_wrist)[..., 2].amin(-1)
+    if grasps.pregrasp_joints is not None:
+        before = hand.points(grasps.pregrasp_joints, grasps.T_object_wrist)[..., 2].amin(-1)
+        lowest = torch.minimum(lowest, before)
+    return lowest > table
+
+
+def check_request(num: int, direction: tuple[float, float, float] | None) -> None:
+    """Refuse impossible requests before any work.
+
+    Raises:
+        OptionError: `num` is not positive, or `direction` is zero or not finite.
+    """
+    if num < 1:
+        raise OptionError(f"num is {num}; ask for at least one grasp (--num 16)")
+    if direction is not None:
+        length = math.sqrt(sum(x * x for x in direction))
+        if not math.isfinite(length) or length < 1e-9:
+            raise OptionError(
+                f"direction {direction} has no direction; give the palm direction in the object's frame, for example "
+                "--direction 0 0 -1 to grasp from above"
+            )
+
+
+class _timed:  # noqa: N801
+    """Adds the time spent in a block to a dictionary entry."""
+
+    def __init__(self, timings: dict[str, float], key: str) -> None:
+        self.timings, self.key = timings, key
+
+    def __enter__(self) -> None:
+        self.begin = time.perf_counter()
+
+    def __exit__(self, *_: object) -> None:
+        self.timings[self.key] += time.perf_counter() - self.begin
