@@ -31,10 +31,16 @@ def register(
     """
     weights = source.new_ones(source.shape[:-1]) if weights is None else weights
     weights = torch.where(weights.sum(-1, keepdim=True) > 0, weights, torch.ones_like(weights))
-    rotation, shift = roma.rigid_points_registration(source, target, weights=weights)
-    error = target - source @ rotation.mT - shift[..., None, :]
     with torch.no_grad():
+        # roma's regularisation is absolute, and in square metres it would drown the gradients of a finger link: the
+        # points are scaled to unit size.
         share = weights / weights.sum(-1, keepdim=True)
+        centred = source - (share[..., None] * source).sum(-2, keepdim=True)
+        size = (share * centred.square().sum(-1)).sum(-1).sqrt().clamp(min=1e-6)[..., None]
+    rotation, shift = roma.rigid_points_registration(
+        source / size[..., None], target / size[..., None], weights=share)
+    shift = shift * size
+    error = target - source @ rotation.mT - shift[..., None, :]
     # The root has an infinite slope at zero error: the floor is far below a micrometre.
     residual = ((error.square().sum(-1) * share).sum(-1) + 1e-16).sqrt()
     return _pose(rotation, shift), residual

@@ -60,8 +60,9 @@ class KinematicTree:
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> KinematicTree:
         """The same tree with its tensors on another device or in another precision."""
-        moved = {k: v.to(device=device, dtype=dtype) if isinstance(v, Tensor) else v for k, v in self.fields().items()}
-        return KinematicTree(**moved)
+        fields: dict[str, Any] = self.fields()
+        tensors = {k: v.to(device=device, dtype=dtype) for k, v in fields.items() if isinstance(v, Tensor)}
+        return KinematicTree(**{**fields, **tensors})
 
     @cached_property
     def double(self) -> KinematicTree:

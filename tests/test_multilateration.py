@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from dro_grasp.geometry.multilateration import distance_misfit, multilaterate, multilaterate_both
+
+
+def scene(batch: tuple[int, ...], thickness: float, noise: float = 0.0, dtype=torch.float32, m: int = 200):
+    """Points, anchors far from the origin and oblique, and their distances [m]."""
+    g = torch.Generator().manual_seed(0)
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=g, dtype=torch.float64))[0]
+    anchors = torch.randn(*batch, m, 3, generator=g, dtype=torch.float64) * torch.tensor([0.04, 0.03, thickness])
+    points = torch.randn(*batch, 60, 3, generator=g, dtype=torch.float64) * 0.05
+    anchors, points = anchors @ turn.T, points @ turn.T
+    distances = torch.cdist(points, anchors, compute_mode="donot_use_mm_for_euclid_dist")
+    distances = (distances + noise * torch.randn(distances.shape, generator=g, dtype=torch.float64)).abs()
+    shift = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
+    return (points + shift).to(dtype), (anchors + shift).to(dtype), distances.to(dtype)
+
+
+@pytest.mark.parametrize("batch", [(), (2,), (1, 2)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("refine", [True, False, "auto"])
+def test_exact_distances_give_the_points_back(batch, dtype, refine):
+    points, anchors, distances = scene(batch, 0.03, dtype=dtype)
+    found = multilaterate(distances, anchors, refine=refine)
+    assert found.dtype == dtype
+    np.testing.assert_allclose(found, points, atol=2e-5 if dtype == torch.float32 else 3e-6)  # [m], the ridge
+
+
+def test_closed_form_equals_lstsq_under_noise():
+    _, anchors, distances = scene((), 0.03, noise=0.005, dtype=torch.float64)
+    found = multilaterate(distances, anchors, refine=False).numpy()
+    a, d = anchors.numpy(), distances.numpy()
+    # |p|^2 - 2 a.p = d^2 - |a|^2, linear in (|p|^2, p): the same problem with the square as a free unknown.
+    system = np.concatenate([np.ones((len(a), 1)), -2 * a], 1)
+    oracle = np.linalg.lstsq(system, (d**2 - (a**2).sum(1)).T, rcond=None)[0][1:].T
+    np.testing.assert_allclose(found, oracle, atol=5e-6)  # [m], the ridge accounts for the difference
+
+
+def test_refinement_is_a_minimum_of_unsquared_distances():
+    _, anchors, distances = scene((), 0.02, noise=0.005, dtype=torch.float64)
+    points = multilaterate(distances, anchors, refine=True).requires_grad_()
+    distance_misfit(points, distances, anchors).sum().backward()
+    assert points.grad.abs().max() < 1e-5
+    closed = multilaterate(distances, anchors, refine=False)
+    assert (distance_misfit(points, distances, anchors) <= distance_misfit(closed, distances, anchors)).all()
+
+
+@pytest.mark.parametrize("thickness", [0.001, 0.004])
+def test_thin_clouds_are_refined_by_default(thickness):
+    points, anchors, distances = scene((3,), thickness, noise=0.005)
+    error = (multilaterate(distances, anchors) - points).norm(dim=-1).mean()
+    closed = (multilaterate(distances, anchors, refine=False) - points).norm(dim=-1).mean()
+    assert error < 0.5 * closed
+
+
+def test_an_exact_plane_leaves_two_mirrored_candidates():
+    points, anchors, distances = scene((2,), 0.0)
+    both, flat = multilaterate_both(distances, anchors)
+    assert flat.all()
+    error = (both - points[:, None]).norm(dim=-1).amin(1)
+    assert error.max() < 2e-3  # [m], heights under a millimetre
+    assert error.median() < 1e-5
+    centre = anchors.mean(1, keepdim=True)
+    normal = torch.linalg.svd(anchors - centre)[2][:, 2]
+    heights = ((both - centre[:, None]) * normal[:, None, None]).sum(-1)
+    np.testing.assert_allclose(heights[:, 0], -heights[:, 1], atol=2e-3)
+
+
+def test_thick_clouds_have_one_candidate():
+    points, anchors, distances = scene((2,), 0.03)
+    both, flat = multilaterate_both(distances, anchors)
+    assert not flat.any()
+    assert torch.equal(both[:, 0], both[:, 1])
+    np.testing.assert_allclose(both[:, 0], points, atol=2e-5)
+
+
+def test_a_cloud_does_not_depend_on_its_neighbours_in_the_batch():
+    _, thin, near_thin = scene((), 0.001, noise=0.003)
+    _, thick, near_thick = scene((), 0.03, noise=0.003)
+    together = multilaterate(torch.stack([near_thin, near_thick]), torch.stack([thin, thick]))
+    np.testing.assert_allclose(together[0], multilaterate(near_thin, thin), atol=1e-5)
+    np.testing.assert_allclose(together[1], multilaterate(near_thick, thick), atol=1e-5)
+
+
+@pytest.mark.parametrize("refine", [True, False])
+def test_gradient_agrees_with_finite_differences(refine):
+    _, anchors, distances = scene((), 0.02, dtype=torch.float64, m=12)
+    distances = distances[:2].clone().requires_grad_()
+    assert torch.autograd.gradcheck(lambda d: multilaterate(d, anchors, refine=refine), distances, atol=1e-3, rtol=1e-2)
