@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 
-GRID_SPACING = 0.006
+GRID_SPACING = 0.008
 """Spacing of candidate ball centres [m]."""
 CLOSINGS = (0.35, 0.5, 0.65)
 """Shares of the way from open to closed at which the hand is examined."""
-FACE_POINTS = 48
+FACE_POINTS = 16
 """Palm samples nearest to the grasp centre that make up its inner face."""
 LARGEST_BALL = 0.05
 """Radius beyond which a larger empty ball is no better [m]."""
@@ -48,7 +48,9 @@ def find_palm(palm_points: np.ndarray, palm_normals: np.ndarray, fingers: list[n
     low, high = everything.min(0), everything.max(0)
     axes = [np.arange(a, b, GRID_SPACING) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    grid = grid[(grid @ hull.equations[:, :3].T + hull.equations[:, 3] < 0).all(1)]
+    planes = np.unique(hull.equations.round(6), axis=0)
+    for plane in planes:
+        grid = grid[grid @ plane[:3] < -plane[3]]
     tree = cKDTree(palm_points)
     to_palm, nearest = tree.query(grid)
     outside = ((grid - palm_points[nearest]) * palm_normals[nearest]).sum(1) > 0.7 * to_palm
