@@ -11,11 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dro_grasp.geometry.multilateration import (
-    MultilaterationConfig,
-    distance_misfit,
-    multilaterate_both,
-)
+from dro_grasp.geometry.mirrored_sides import SideConfig, choose_sides
+from dro_grasp.geometry.multilateration import MultilaterationConfig, distance_misfit, multilaterate_both
 from dro_grasp.geometry.registration import register
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinematics.joint_reading import read_joints
@@ -28,11 +25,8 @@ class DecodeConfig:
 
     multilateration: MultilaterationConfig = field(default_factory=MultilaterationConfig)
     """Closed form and refinement."""
-    side_margin: float = 0.8
-    """On flat clouds, a link's two mirrored candidates are told apart when the ratio of their errors is below this;
-    else the palm's side is taken."""
-    side_rounds: int = 3
-    """On flat clouds, how often each point picks its nearer candidate and the link is registered again."""
+    sides: SideConfig = field(default_factory=SideConfig)
+    """How mirrored candidates are told apart on flat clouds."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +69,8 @@ def decode(
 ) -> LinkPoses:
     """Multilaterate each row and register each link; differentiable.
 
-    Flat object clouds leave two mirrored candidates per point: each link takes the side on which it fits without
-    reflection, and in doubt the palm's.
+    Flat object clouds leave two mirrored candidates per point: each link takes those with which it fits without
+    reflection, and in doubt the palm's side.
     """
     config = config or DecodeConfig()
     batch, (n, m) = distances.shape[:-2], distances.shape[-2:]
@@ -85,8 +79,9 @@ def decode(
     both, flat = multilaterate_both(distances, object_points, config.multilateration)
     points = both[:, 0]
     if bool(flat.any()):
-        sides = _choose_sides(hand, segments, both[flat], distances[flat], object_points[flat], config)
-        points = points.index_put((flat.nonzero()[:, 0],), _pick(both[flat], sides))
+        second = _sides(hand, segments, both[flat].detach(), distances[flat].detach(), object_points[flat], config)
+        chosen = torch.where(second[..., None], both[flat, 1], both[flat, 0])
+        points = points.index_put((flat.nonzero()[:, 0],), chosen)
     local = segments.local.expand(len(points), -1, -1, -1)
     poses, residual = register(local, points[:, segments.index], segments.weight.expand(local.shape[:-1]))
     T = torch.eye(4, dtype=points.dtype, device=points.device).expand(len(points), hand.tree.n_links, 4, 4)
@@ -109,47 +104,20 @@ def _segments(hand: Hand, like: Tensor) -> _Segments:
     return _Segments(links.to(like.device), index.to(like.device), weight, local)
 
 
-def _pick(both: Float[Tensor, "b 2 n 3"], second: Bool[Tensor, "b n"]) -> Float[Tensor, "b n 3"]:
-    return torch.where(second[..., None], both[:, 1], both[:, 0])
-
-
-@torch.no_grad()
-def _choose_sides(
+def _sides(
     hand: Hand, segments: _Segments, both: Float[Tensor, "b 2 n 3"], distances: Float[Tensor, "b n m"],
     object_points: Float[Tensor, "b m 3"], config: DecodeConfig,
 ) -> Bool[Tensor, "b n"]:
-    """For each hand point, whether its second candidate is the right one.
-
-    Each link is registered from either side; its points then pick their nearer candidates (a finger may reach through
-    the plane) and the link is registered again. The side with the smaller error wins.
-    """
-    misfits = [distance_misfit(both[:, side], distances, object_points) for side in (0, 1)]
-    candidates, misfit = both[:, :, segments.index], torch.stack(misfits, 1)[:, :, segments.index]
-    local, weight = segments.local.expand(len(both), -1, -1, -1), segments.weight
-    picks, errors = [], []
-    for side in (0, 1):
-        second = torch.full_like(candidates[:, 0, ..., 0], side).bool()
-        for _ in range(config.side_rounds):
-            points = torch.where(second[..., None], candidates[:, 1], candidates[:, 0])
-            T, _ = register(local, points, weight.expand(len(both), -1, -1))
-            posed = local @ T[..., :3, :3].mT + T[..., None, :3, 3]
-            away = (candidates - posed[:, None]).square().sum(-1) + misfit
-            second = away[:, 1] < away[:, 0]
-        picks.append(second)
-        errors.append((torch.minimum(away[:, 0], away[:, 1]) * weight).sum(-1) / weight.sum(-1))
-    take_second = _take_second(torch.stack(errors, 1), int((segments.links == hand.palm).float().argmax()), config)
-    chosen = torch.where(take_second[..., None], picks[1], picks[0])
-    sides = chosen.new_zeros(both.shape[0], both.shape[2])
-    used = weight.bool()
-    sides[:, segments.index[used]] = chosen[:, used]
-    return sides
-
-
-def _take_second(errors: Float[Tensor, "b 2 l"], palm: int, config: DecodeConfig) -> Bool[Tensor, "b l"]:
-    """Links that fit from the second side; those that fit alike from both follow the palm."""
-    second = errors[:, 1] < errors[:, 0]
-    doubtful = errors.amin(1) > config.side_margin * errors.amax(1)
-    return torch.where(doubtful, second[:, palm : palm + 1], second)
+    """For each hand point over a flat object, whether its second candidate is the right one."""
+    misfit = torch.stack([distance_misfit(both[:, side], distances, object_points) for side in (0, 1)], 1)
+    palm = int((segments.links == hand.palm).float().argmax())
+    chosen = choose_sides(
+        segments.local, segments.weight, both[:, :, segments.index], misfit[:, :, segments.index], palm, config.sides
+    )
+    second = chosen.new_zeros(both.shape[0], both.shape[2])
+    used = segments.weight.bool()
+    second[:, segments.index[used]] = chosen[:, used]
+    return second
 
 
 def targets(hand: Hand, poses: LinkPoses) -> tuple[Float[Tensor, "*b t 3"], Int[Tensor, " t"], Float[Tensor, "t 3"]]:
