@@ -71,8 +71,8 @@ class Camera:
 class Style:
     """Light and finish of a picture."""
 
-    ambient: float = 0.36
-    diffuse: float = 0.62
+    ambient: float = 0.44
+    diffuse: float = 0.64
     specular: float = 0.16
     shininess: float = 24.0
     crease: float = 0.75

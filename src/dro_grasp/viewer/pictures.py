@@ -1,0 +1,103 @@
+"""Pictures of grasps without a browser, OpenGL or any system package."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageFont
+
+from dro_grasp.errors import OutputError
+from dro_grasp.geometry.rasterizer import render
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.viewer.scene import best_camera, hand_meshes, object_meshes, success_colour
+
+TILE = (320, 280)
+"""Width and height of one grasp's picture [pixels]."""
+MOST = 16
+"""Grasps on one sheet, unless told otherwise."""
+COLUMNS = 4
+CAPTION, HEADER = 26, 44
+"""Heights of the line under each picture and of the title [pixels]."""
+INK, FAINT = (40, 44, 52), (120, 126, 136)
+
+
+def draw_grasps(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, path: Path | str, count: int = MOST, columns: int = COLUMNS
+) -> None:
+    """Write a PNG with pictures of the first `count` grasps, captioned with score and trial outcome.
+
+    Args:
+        hand: The hand of the grasps; links above its palm are not drawn.
+        obj: Their object.
+        grasps: At least one grasp; the first ones are drawn.
+        path: PNG to write.
+        count: Most grasps drawn.
+        columns: Pictures side by side.
+
+    Raises:
+        OutputError: The file cannot be written, or there is no grasp to draw.
+    """
+    if len(grasps) == 0:
+        raise OutputError(f"no grasp to draw into {path}; ask for at least one")
+    shown = min(count, len(grasps))
+    tiles = [draw_grasp(hand, obj, grasps, i) for i in range(shown)]
+    sheet = contact_sheet(tiles, [caption(grasps, i) for i in range(shown)], heading(hand, obj, grasps), columns)
+    try:
+        sheet.save(path, format="PNG", optimize=True)
+    except OSError as error:
+        raise OutputError(f"cannot write picture {path}: {error.strerror or error}; choose another path") from error
+
+
+def draw_grasp(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, index: int, size: tuple[int, int] = TILE
+) -> np.ndarray:
+    """The picture (height width 3) of one grasp, from the viewpoint that hides least."""
+    joints, T = grasps.joints[index].float(), grasps.T_object_wrist[index].float()
+    with torch.inference_mode():
+        points = hand.points(joints, T).numpy()
+        meshes = [*object_meshes(obj), *hand_meshes(hand, joints, T, above_palm=False)]
+    cloud = obj.cloud[:: max(1, len(obj.cloud) // 1024)]
+    return render(meshes, best_camera(points, cloud), *size)
+
+
+def heading(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> str:
+    """Title of a sheet."""
+    text = f"{hand.name} on {obj.name}: {len(grasps)} grasps"
+    tried = grasps.tried
+    if grasps.success is None or not bool(tried.any()):
+        return text
+    protocols = sorted({p for p in grasps.protocol or () if p})
+    return f"{text}, {int(grasps.success[tried].sum())} of {int(tried.sum())} succeeded ({', '.join(protocols)})"
+
+
+def caption(grasps: GraspBatch, index: int) -> tuple[str, bool | None]:
+    """The line under a picture, and the outcome that colours it."""
+    tried = grasps.success is not None and bool(grasps.tried[index])
+    outcome = bool(grasps.success[index]) if tried and grasps.success is not None else None
+    words = {True: "success", False: "failed", None: "not tried"}[outcome]
+    score = "" if grasps.score is None else f"   score {float(grasps.score[index]):.2f}"
+    return f"{index}   {words}{score}", outcome
+
+
+def contact_sheet(
+    tiles: list[np.ndarray], captions: list[tuple[str, bool | None]], title: str, columns: int = COLUMNS
+) -> Image.Image:
+    """Pictures in a grid, each with a caption, under a title."""
+    height, width = tiles[0].shape[:2]
+    columns = min(columns, len(tiles))
+    rows = -(-len(tiles) // columns)
+    sheet = Image.new("RGB", (columns * width, HEADER + rows * (height + CAPTION)), (255, 255, 255))
+    pen = ImageDraw.Draw(sheet)
+    pen.text((16, 12), title, fill=INK, font=ImageFont.load_default(18))
+    font = ImageFont.load_default(14)
+    for i, (tile, (text, outcome)) in enumerate(zip(tiles, captions, strict=True)):
+        x, y = (i % columns) * width, HEADER + (i // columns) * (height + CAPTION)
+        sheet.paste(Image.fromarray(tile), (x, y))
+        red, green, blue = (int(255 * c) for c in success_colour(outcome))
+        pen.ellipse((x + 16, y + height + 5, x + 26, y + height + 15), fill=(red, green, blue))
+        pen.text((x + 34, y + height + 1), text, fill=INK if outcome is not None else FAINT, font=font)
+    return sheet
