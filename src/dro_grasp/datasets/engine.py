@@ -5,59 +5,26 @@ Killing it at any time loses the shards in flight at most; a rerun does only wha
 
 from __future__ import annotations
 
-import hashlib
 import multiprocessing
 import os
 import sys
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field
-from functools import lru_cache
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
+from dro_grasp.datasets.production import EngineConfig, Job, make_shard
 from dro_grasp.datasets.records import Shard, count_grasps, find_shards, remove_leftovers
 from dro_grasp.errors import DroGraspError, OptionError, OutputError
-from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.duplicates import distinct
-from dro_grasp.grasps.synthesis import SynthesisConfig, synthesize
-from dro_grasp.hands.hand import Hand
-from dro_grasp.hands.library import load_hand
-from dro_grasp.objects.library import load_object
-from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.simulation.trial import settle, simulate
+
+__all__ = ["DatasetReport", "EngineConfig", "synthesize_dataset"]
 
 REPORT_EVERY = 10.0
 """Time between lines of progress [s]."""
-
-
-@dataclass(frozen=True)
-class EngineConfig:
-    """How a data set is made."""
-
-    candidates: int = 256
-    """Grasps synthesised for a shard."""
-    tried_share: float = 0.34
-    """Share of them, lowest energy first, that are tried in simulation."""
-    deepest: float = 0.01
-    """Candidates that penetrate deeper than this by the signed distances are not tried [m]."""
-    settle: bool = True
-    """Take the labels after the hand has closed on the object in simulation, which drives out penetration."""
-    farthest: float = 0.03
-    """Candidates that the closing moves farther than this relative to the object are not tried [m]."""
-    barren_rounds: int = 3
-    """A pair is given up after this many rounds without a single valid grasp."""
-    most_rounds: int = 200
-    """A pair is given up after this many rounds."""
-    keep_failures: bool = False
-    """Store grasps that failed their trial as well."""
-    synthesis: SynthesisConfig = field(default_factory=SynthesisConfig)
-    """The optimiser."""
 
 
 @dataclass
@@ -137,16 +104,6 @@ def synthesize_dataset(
     return DatasetReport(total, total - before, shards, time.perf_counter() - started, failures)
 
 
-@dataclass(frozen=True)
-class Job:
-    """What all shards of a run share."""
-
-    folder: Path
-    seed: int
-    protocol: str
-    config: EngineConfig
-
-
 def make_folder(path: Path | str) -> Path:
     """The output folder, made when only itself is missing.
 
@@ -188,12 +145,15 @@ def note_shard(state: PairState, count: int, started: bool = False) -> None:
 def next_pair(
     states: dict[tuple[str, str], PairState], busy: set[tuple[str, str]], goal: int, config: EngineConfig
 ) -> tuple[str, str] | None:
-    """The unfinished pair with the fewest rounds that no worker is busy with, or None."""
+    """The unfinished pair with the fewest rounds that no worker is busy with, or None.
+
+    Pairs on which a worker died come last: they run alone, so that they take no other down.
+    """
     open_pairs = [
         pair for pair, s in states.items()
         if pair not in busy and not s.error and s.grasps < goal and _worth_trying(s, config)
     ]
-    return min(open_pairs, key=lambda pair: states[pair].rounds, default=None)
+    return min(open_pairs, key=lambda pair: (states[pair].crashes, states[pair].rounds), default=None)
 
 
 def _worth_trying(state: PairState, config: EngineConfig) -> bool:
@@ -214,10 +174,12 @@ def _run(
         while True:
             while len(running) < workers:
                 pair = next_pair(states, set(running.values()), goal, job.config)
-                if pair is None:
+                if pair is None or (running and states[pair].crashes):
                     break
                 running[pool.submit(make_shard, job, Shard(*pair, states[pair].rounds))] = pair
                 states[pair].rounds += 1
+                if states[pair].crashes:
+                    break
             if not running:
                 say(summary(states, goal, time.perf_counter() - started))
                 return done
@@ -242,6 +204,7 @@ def _collect(
     """Note a shard's outcome; true when the pool broke."""
     try:
         note_shard(state, future.result(), started=True)
+        state.crashes = 0
     except BrokenProcessPool:
         _crashed(state)
         return True
@@ -253,7 +216,7 @@ def _collect(
 
 
 def _crashed(state: PairState) -> None:
-    """Note that a worker died while the pair was in flight; its round is tried once more."""
+    """Note that a worker died while the pair was in flight; its round is tried once more, alone."""
     state.crashes += 1
     state.rounds -= 1
     if state.crashes >= 2:
@@ -261,9 +224,9 @@ def _crashed(state: PairState) -> None:
 
 
 def _rebuild(
-    pool: ProcessPoolExecutor, running: dict[Future[int], tuple[str, str]],
+    pool: Executor, running: dict[Future[int], tuple[str, str]],
     states: dict[tuple[str, str], PairState], workers: int,
-) -> ProcessPoolExecutor:
+) -> Executor:
     """A new pool after a worker died; shards that were in flight are forgotten and come again."""
     for pair in running.values():
         _crashed(states[pair])
@@ -272,7 +235,7 @@ def _rebuild(
     return _pool(workers)
 
 
-def _pool(workers: int) -> ProcessPoolExecutor:
+def _pool(workers: int) -> Executor:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), torch.set_num_threads, (1,))
 
@@ -285,57 +248,3 @@ def summary(states: dict[tuple[str, str], PairState], goal: int, seconds: float)
     fewest = min((s.rounds for s in states.values() if not s.error), default=0)
     return (f"{grasps} grasps; {full} of {len(states)} pairs full, {given_up} given up, round {fewest}; "
             f"{seconds:.0f} s")
-
-
-def shard_seed(seed: int, shard: Shard) -> int:
-    """A seed of its own for every shard, the same on every machine."""
-    text = f"{seed}/{shard.hand}/{shard.object}/{shard.round}".encode()
-    return int.from_bytes(hashlib.sha256(text).digest()[:6], "big")
-
-
-@lru_cache(maxsize=16)
-def _hand(name: str) -> Hand:
-    return load_hand(name)
-
-
-@lru_cache(maxsize=4)
-def _object(name: str) -> ObjectModel:
-    return load_object(name)
-
-
-def make_shard(job: Job, shard: Shard) -> int:
-    """Synthesise, try and store one shard; returns the number of grasps stored."""
-    hand, obj = _hand(shard.hand), _object(shard.object)
-    grasps = valid_grasps(hand, obj, shard_seed(job.seed, shard), job.protocol, job.config)
-    shard.save(grasps, job.folder)
-    return len(grasps)
-
-
-def valid_grasps(hand: Hand, obj: ObjectModel, seed: int, protocol: str, config: EngineConfig) -> GraspBatch:
-    """Candidates of one seed that pass the protocol, near-duplicates once, best energy first."""
-    grasps = synthesize(hand, obj, config.candidates, seed, config.synthesis)
-    grasps = select(grasps, config)
-    if not len(grasps):
-        return grasps
-    if config.settle:
-        closed = settle(hand, obj, grasps, protocol, workers=1)
-        grasps = closed[(_grasp_centres(hand, closed) - _grasp_centres(hand, grasps)).norm(dim=-1) < config.farthest]
-        if not len(grasps):
-            return grasps
-    tried = grasps.with_trial(simulate(hand, obj, grasps, protocol, workers=1))
-    if config.keep_failures or tried.success is None:
-        return tried
-    passed = tried[tried.success]
-    return passed[distinct(hand, passed)]
-
-
-def _grasp_centres(hand: Hand, grasps: GraspBatch) -> Float[Tensor, "n 3"]:
-    T = grasps.T_object_wrist
-    return T[:, :3, :3] @ hand.grasp_centre_wrist + T[:, :3, 3]
-
-
-def select(grasps: GraspBatch, config: EngineConfig) -> GraspBatch:
-    """The candidates worth a trial: lowest energy, not deep inside the object."""
-    best = grasps[0 : max(1, round(config.tried_share * len(grasps)))]
-    depth = best.extra.get("depth")
-    return best if depth is None else best[depth < config.deepest]

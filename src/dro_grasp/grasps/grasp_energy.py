@@ -27,8 +27,8 @@ class EnergyConfig:
     """Weight of the contacts' distance to the surface [1/m]."""
     penetration: float = 100.0
     """Weight of the hand points' depth in the object [1/m]."""
-    self_penetration: float = 10.0
-    """Weight of the overlap of links [1/m]."""
+    self_penetration: float = 50.0
+    """Weight of the overlap of links [1/m] (DexGraspNet: 10; its spheres are finer)."""
     alignment: float = 1.0
     """Weight of the angle between hand and object normals (ours)."""
     joints: float = 1.0

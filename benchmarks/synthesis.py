@@ -1,0 +1,84 @@
+"""How many strict-valid grasps an hour of one CPU core yields, by synthesis, settling and trial together.
+
+The work is the data engine's own: every shard is synthesised, closed, tried with protocol `strict`, and its
+near-duplicates are counted once. CPU time is that of the process, models compiled on the way included; loading a hand
+and the cached geometry of an object (grid, convex parts) is not counted, as it is done once for thousands of grasps.
+
+    python benchmarks/synthesis.py [--json] [--full] [--seed 0]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import sys
+import time
+from pathlib import Path
+
+import torch
+from report import emit
+
+from dro_grasp.datasets.production import EngineConfig, valid_grasps
+from dro_grasp.grasps.duplicates import NEAR
+from dro_grasp.hands.library import load_hand
+from dro_grasp.objects.library import load_object
+
+HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand")
+"""The paper hands."""
+SAMPLE = 8
+"""Training objects that are drawn, unless all 48 are taken."""
+CANDIDATES = 128
+"""Grasps synthesised for each pair."""
+
+
+def training_objects() -> list[str]:
+    """Names of the paper's training objects."""
+    manifest = Path(os.environ["DRO_GRASP_ASSETS"]) / "objects" / "manifest.json"
+    entries = json.loads(manifest.read_text())
+    return sorted(e["name"] for e in entries if e["multidex_split"] == "train")
+
+
+def measure(hand_name: str, objects: list[str], seed: int) -> list[tuple[str, int, float]]:
+    """Per object: its name, valid grasps, CPU time [s]."""
+    hand, config, rows = load_hand(hand_name), EngineConfig(candidates=CANDIDATES), []
+    for name in objects:
+        obj = load_object(name)
+        _ = obj.grid, obj.parts
+        start = time.process_time()
+        grasps = valid_grasps(hand, obj, seed, "strict", config)
+        rows.append((name, len(grasps), time.process_time() - start))
+        print(f"{hand_name} on {name}: {len(grasps)} grasps in {rows[-1][2]:.1f} CPU seconds", file=sys.stderr)
+    return rows
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--full", action="store_true", help="all 48 training objects")
+    parser.add_argument("--seed", type=int, default=0, help="draws the objects and the grasps")
+    options = parser.parse_args()
+    if "DRO_GRASP_ASSETS" not in os.environ:
+        parser.error("set DRO_GRASP_ASSETS to the folder of the development assets")
+    torch.set_num_threads(1)
+    names = training_objects()
+    objects = names if options.full else random.Random(options.seed).sample(names, SAMPLE)
+    per_hand, table = {}, []
+    for hand in HANDS:
+        rows = measure(hand, objects, options.seed)
+        valid, seconds = sum(r[1] for r in rows), sum(r[2] for r in rows)
+        per_hand[hand] = valid / seconds * 3600
+        worst = min(rows, key=lambda r: r[1] / r[2])
+        table.append([hand, valid, seconds, per_hand[hand], worst[0], worst[1] / worst[2] * 3600])
+    emit(
+        f"Synthesis: {CANDIDATES} candidates for each of {len(objects)} of the paper's {len(names)} training objects "
+        f"(seed {options.seed}); grasps closer than {NEAR * 1e3:.0f} mm count once",
+        table, ["hand", "valid", "CPU time [s]", "valid per CPU-hour", "worst object", "there"],
+        {"strict_valid_per_cpu_hour": sum(per_hand.values()) / len(per_hand), "per_hand": per_hand}, options.json,
+    )
+
+
+if __name__ == "__main__":
+    main()

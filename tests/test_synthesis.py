@@ -1,0 +1,136 @@
+"""Synthesis: where it starts, that the energy falls, that results repeat, and that physics agrees."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from dro_grasp.errors import ObjectError, OptionError
+from dro_grasp.grasps.duplicates import distinct
+from dro_grasp.grasps.fingers import PALM, contact_candidates, find_thumb, finger_links
+from dro_grasp.grasps.grasp_energy import link_spheres
+from dro_grasp.grasps.initial import StartConfig, starts
+from dro_grasp.grasps.synthesis import SynthesisConfig, depth, optimise, prepare, synthesize
+from dro_grasp.hands.library import load_hand
+from dro_grasp.objects.library import load_object
+from dro_grasp.objects.shape import ObjectModel
+from tests.toy_hand import toy_hand
+
+SHORT = SynthesisConfig(steps=60, batch_size=32)
+
+
+@pytest.fixture(scope="module")
+def ball() -> ObjectModel:
+    return load_object("sphere")
+
+
+def test_fingers_of_the_toy_hand():
+    hand = toy_hand()
+    assert finger_links(hand.tree, hand.tips, hand.palm).tolist() == [PALM, 0, 0, 1, 1, 2, 2]
+    assert find_thumb(hand, 0.5) is None  # all of three fingers hold
+
+
+def test_candidates_face_inwards_and_slots_keep_to_their_fingers():
+    hand = toy_hand()
+    candidates = contact_candidates(hand)
+    assert candidates.slot_finger == (0, 1, 2, PALM)
+    drawn = candidates.draw(200, None, torch.Generator().manual_seed(0))
+    for slot in range(3):
+        assert (candidates.fingers[drawn[:, slot]] == slot).all()
+    assert len(candidates.fingers[drawn[:, 3]].unique()) > 1
+    fingers = candidates.fingers != PALM
+    assert (candidates.normals[fingers, 0] < 0.5).all()  # the outer faces of the fingers look along +x
+
+
+@pytest.mark.assets
+@pytest.mark.parametrize(
+    ("name", "thumb"),
+    [("allegro_left", "link_15.0_tip"), ("ability", "thumb_L2"), ("barrett_multidex", None)],
+)
+def test_thumb_is_found(assets_folder, name, thumb):
+    hand = load_hand(f"assets/{name}")
+    found = find_thumb(hand, 0.55)
+    assert (None if found is None else hand.tree.link_names[hand.tips[found]]) == thumb
+
+
+def test_spheres_lie_in_their_links_and_may_not_meet_across_fingers():
+    hand = toy_hand()
+    spheres = link_spheres(hand)
+    for link in range(hand.tree.n_links):
+        points = hand.link_points[hand.link_index == link]
+        inside = spheres.centres[spheres.links == link]
+        assert (inside >= points.amin(0) - 1e-6).all()
+        assert (inside <= points.amax(0) + 1e-6).all()
+    pairs = {tuple(sorted(p)) for p in spheres.links[spheres.pairs].tolist()}
+    assert (2, 4) in pairs
+    assert (1, 2) not in pairs  # neighbours
+
+
+def test_starts_face_the_object_from_all_sides_and_touch_nothing(ball):
+    hand = toy_hand()
+    energy = prepare(hand, ball)
+    surface, config = torch.from_numpy(ball.cloud), StartConfig(gap=(0.002, 0.01))
+    T, q = starts(hand, energy.field, surface, energy.centre, 256, config, torch.Generator().manual_seed(0))
+    clearance = energy.field.distances(hand.points(q, T))[0].amin(-1)
+    assert clearance.min() > 0  # [m]
+    centres = energy.pivot(T)
+    direction = T[:, :3, :3] @ hand.palm_direction_wrist
+    assert ((energy.centre - centres) * direction).sum(-1).min() > -ball.extents.max()
+    assert direction.mean(0).norm() < 0.15  # uniform directions average out: 1 / sqrt(256) each way
+    assert (q >= hand.tree.lower).all()
+    assert (q <= hand.tree.upper).all()
+
+
+def test_energy_falls_and_limits_hold(ball):
+    hand = toy_hand()
+    energy, surface = prepare(hand, ball, SHORT), torch.from_numpy(ball.cloud)
+    before = optimise(energy, surface, 32, SynthesisConfig(steps=1), torch.Generator().manual_seed(0))
+    after = optimise(energy, surface, 32, SHORT, torch.Generator().manual_seed(0))
+    assert after.result.total.median() < 0.4 * before.result.total.median()
+    assert (after.q >= hand.tree.lower).all()
+    assert (after.q <= hand.tree.upper).all()
+    assert depth(energy, after).median() < 0.006  # [m]
+    torch.testing.assert_close(
+        after.result.total, energy(after.T, after.q, after.contacts).total, atol=1e-5, rtol=1e-4)
+
+
+def test_synthesis_repeats_for_a_seed_and_comes_sorted(ball):
+    hand = toy_hand()
+    first, again, other = (synthesize(hand, ball, 40, seed, SHORT) for seed in (3, 3, 4))
+    assert torch.equal(first.T_object_wrist, again.T_object_wrist)
+    assert torch.equal(first.joints, again.joints)
+    assert not torch.equal(first.joints, other.joints)
+    assert len(first) == 40
+    assert (first.score.diff() <= 0).all()
+    terms = torch.stack([v for k, v in first.extra.items() if k.startswith("energy_")])
+    torch.testing.assert_close(-first.score, terms.sum(0))
+    rotation = first.T_object_wrist[:, :3, :3].double()
+    torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).double().expand(40, 3, 3), atol=1e-5, rtol=0)
+
+
+def test_impossible_requests_are_refused(ball):
+    with pytest.raises(OptionError, match="at least one"):
+        synthesize(toy_hand(), ball, 0)
+    cloud = ObjectModel("cloud", ball.cloud, ball.cloud_normals, np.zeros(3), "x")
+    with pytest.raises(ObjectError, match="mesh"):
+        synthesize(toy_hand(), cloud, 4)
+
+
+def test_near_duplicates_are_counted_once(ball):
+    hand = toy_hand()
+    grasps = synthesize(hand, ball, 8, 0, SHORT)
+    shifted = grasps.replace(T_object_wrist=grasps.T_object_wrist + 0.0)
+    shifted.T_object_wrist[:, 0, 3] += torch.tensor([0.004, 0.006] * 4)  # [m]
+    both = type(grasps).concatenate([grasps, shifted])
+    assert distinct(hand, both)[8:].tolist() == [False, True] * 4
+    elsewhere = shifted.replace(object=("another",) * 8)
+    assert distinct(hand, type(grasps).concatenate([grasps, elsewhere]))[8:].all()
+
+
+def test_physics_agrees_on_an_easy_pair():
+    from dro_grasp.simulation.trial import simulate
+
+    hand, can = load_hand("barrett"), load_object("can")
+    best = synthesize(hand, can, 48, 0, SynthesisConfig(steps=120, batch_size=48))[slice(0, 12)]
+    assert simulate(hand, can, best, "dro").success.float().mean() > 0.6
