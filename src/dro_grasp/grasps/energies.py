@@ -17,20 +17,38 @@ from torch import Tensor
 from dro_grasp.kinematics.tree import KinematicTree
 
 
-class Term(NamedTuple):
-    """Values of one energy term and their derivatives."""
+class PointTerm(NamedTuple):
+    """Values of a term that depends on positions."""
 
     value: Tensor
     """Unreduced, (*b k)."""
-    by_point: Tensor | None = None
+    by_point: Tensor
     """Derivative of the summed values by the points given, (*b c 3) [1/m times the value's unit]."""
-    by_normal: Tensor | None = None
+
+
+class NormalTerm(NamedTuple):
+    """Values of a term that depends on directions."""
+
+    value: Tensor
+    """Unreduced, (*b k)."""
+    by_normal: Tensor
     """Derivative of the summed values by the normals given, (*b c 3)."""
+
+
+class ContactTerm(NamedTuple):
+    """Values of a term that depends on positions and directions."""
+
+    value: Tensor
+    """Unreduced, (*b k)."""
+    by_point: Tensor
+    """As in PointTerm."""
+    by_normal: Tensor
+    """As in NormalTerm."""
 
 
 def force_closure(
     points: Float[Tensor, "*b c 3"], normals: Float[Tensor, "*b c 3"], length: float
-) -> Term:
+) -> ContactTerm:
     """Squared components of the net wrench of unit forces along the contact normals, (*b 6).
 
     Zero means that equal normal forces alone hold the object: the differentiable relaxation of force closure.
@@ -47,30 +65,30 @@ def force_closure(
     arm = 2 * torque[..., None, :] / length
     by_point = torch.linalg.cross(normals, arm.expand_as(normals), dim=-1)
     by_normal = 2 * force[..., None, :] + torch.linalg.cross(arm.expand_as(points), points, dim=-1)
-    return Term(wrench**2, by_point, by_normal)
+    return ContactTerm(wrench**2, by_point, by_normal)
 
 
-def contact_distance(distance: Float[Tensor, "*b c"], gradient: Float[Tensor, "*b c 3"]) -> Term:
+def contact_distance(distance: Float[Tensor, "*b c"], gradient: Float[Tensor, "*b c 3"]) -> PointTerm:
     """Distance of each contact to the object's surface, inside or outside [m].
 
     Args:
         distance: Signed distance at the contacts [m].
         gradient: Its gradient there.
     """
-    return Term(distance.abs(), distance.sign()[..., None] * gradient)
+    return PointTerm(distance.abs(), distance.sign()[..., None] * gradient)
 
 
 def normal_alignment(
     hand_normals: Float[Tensor, "*b c 3"], object_normals: Float[Tensor, "*b c 3"]
-) -> Term:
+) -> NormalTerm:
     """One plus the cosine between hand and object normal at each contact: 0 where they oppose.
 
     `by_normal` is the derivative by the hand's normals; that by the object's is `hand_normals` itself.
     """
-    return Term(1 + (hand_normals * object_normals).sum(-1), None, object_normals)
+    return NormalTerm(1 + (hand_normals * object_normals).sum(-1), object_normals)
 
 
-def penetration(distance: Float[Tensor, "*b p"], gradient: Float[Tensor, "*b p 3"]) -> Term:
+def penetration(distance: Float[Tensor, "*b p"], gradient: Float[Tensor, "*b p 3"]) -> PointTerm:
     """Depth of each hand point inside the object [m], zero outside.
 
     Args:
@@ -79,12 +97,12 @@ def penetration(distance: Float[Tensor, "*b p"], gradient: Float[Tensor, "*b p 3
     """
     # Differs from DexGraspNet, which sums over object points inside the hand: here hand points in the object.
     inside = (distance < 0).to(distance.dtype)
-    return Term(-distance * inside, -gradient * inside[..., None])
+    return PointTerm(-distance * inside, -gradient * inside[..., None])
 
 
 def self_penetration(
     centres: Float[Tensor, "*b s 3"], radii: Float[Tensor, " s"], pairs: Int[Tensor, "k 2"]
-) -> Term:
+) -> PointTerm:
     """Overlap of the pairs of spheres that stand for links which may not touch [m], (*b k)."""
     first, second = pairs[:, 0], pairs[:, 1]
     one_hot = torch.eye(len(radii), dtype=centres.dtype)
@@ -96,7 +114,7 @@ def self_penetration(
     touching = (overlap > 0).to(centres.dtype)
     push = -apart * (touching / distance)[..., None, :]
     by_point = (push.reshape(-1, len(pairs)) @ difference).unflatten(0, (*centres.shape[:-2], 3)).mT
-    return Term(overlap * touching, by_point)
+    return PointTerm(overlap * touching, by_point)
 
 
 def joint_margin(

@@ -218,7 +218,7 @@ def _squares(result: Evaluation) -> Float[Tensor, "n k"]:
 def _plain(batch: GraspBatch) -> GraspBatch:
     """The batch with ordinary tensors instead of inference ones, with rotations orthonormal to rounding."""
     T = batch.T_object_wrist.clone()
-    T[:, :3, :3] = roma.special_procrustes(T[:, :3, :3])
+    T[:, :3, :3] = torch.as_tensor(roma.special_procrustes(T[:, :3, :3]))
     return replace(
         batch, T_object_wrist=T, joints=batch.joints.clone(),
         score=None if batch.score is None else batch.score.clone(),
