@@ -49,13 +49,28 @@ class Camera:
         direction: tuple[float, float, float],
         up: tuple[float, float, float] = (0.0, 0.0, 1.0),
         field_of_view: float = 0.6,
+        aspect: float = 4 / 3,
+        margin: float = 0.06,
     ) -> Camera:
-        """A camera that sees all points from `direction` (from the points towards the camera)."""
-        towards = _unit(np.asarray(direction, float))
-        centre = (points.min(0) + points.max(0)) / 2
-        radius = float(np.linalg.norm(points - centre, axis=1).max())
-        position = centre + towards * radius / np.sin(field_of_view / 2)
-        return Camera(tuple(position.tolist()), tuple(centre.tolist()), up, field_of_view)
+        """The nearest camera that sees all points from `direction` (from the points towards the camera).
+
+        Args:
+            points: What must be in the picture [m].
+            direction: Towards the camera.
+            up: Direction that points up in the picture.
+            field_of_view: Angle between the upper and lower edges [rad].
+            aspect: Width of the picture over its height.
+            margin: Share of the picture that stays free at each edge.
+        """
+        axes = Camera(direction, (0.0, 0.0, 0.0), up).axes()
+        seen = points.astype(float) @ axes.T
+        centre = (seen.min(0) + seen.max(0)) / 2
+        seen = seen - centre
+        half = np.tan(field_of_view / 2) * (1 - 2 * margin)
+        distance = float((np.abs(seen[:, :2]) / (half * aspect, half) + seen[:, 2:]).max()) + 10 * NEAR
+        target = centre @ axes
+        position = target + distance * axes[2]
+        return Camera(tuple(position.tolist()), tuple(target.tolist()), up, field_of_view)
 
     def axes(self) -> Float[np.ndarray, "3 3"]:
         """Right, up and backward of the picture in world coordinates, as rows."""

@@ -47,7 +47,7 @@ def draw_grasps(
     tiles = [draw_grasp(hand, obj, grasps, i) for i in range(shown)]
     sheet = contact_sheet(tiles, [caption(grasps, i) for i in range(shown)], heading(hand, obj, grasps), columns)
     try:
-        sheet.save(path, format="PNG", optimize=True)
+        sheet.save(path, format="PNG")
     except OSError as error:
         raise OutputError(f"cannot write picture {path}: {error.strerror or error}; choose another path") from error
 
@@ -58,10 +58,9 @@ def draw_grasp(
     """The picture (height width 3) of one grasp, from the viewpoint that hides least."""
     joints, T = grasps.joints[index].float(), grasps.T_object_wrist[index].float()
     with torch.inference_mode():
-        points = hand.points(joints, T).numpy()
         meshes = [*object_meshes(obj), *hand_meshes(hand, joints, T, above_palm=False)]
-    cloud = obj.cloud[:: max(1, len(obj.cloud) // 1024)]
-    return render(meshes, best_camera(points, cloud), *size)
+        camera = best_camera(hand, joints, T, obj, aspect=size[0] / size[1])
+    return render(meshes, camera, *size)
 
 
 def heading(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> str:

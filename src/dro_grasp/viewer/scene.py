@@ -26,8 +26,8 @@ CELLS = 28
 """Cells along each side of the coarse picture that rates a viewpoint."""
 VIEWPOINTS = 48
 """Viewpoints that are rated."""
-LOWEST_VIEW = -0.15
-"""Cameras stay above this height on the unit sphere: people look at things from above."""
+LOWEST_VIEW, HIGHEST_VIEW = -0.5, 0.85
+"""Cameras stay between these heights on the unit sphere: neither straight from below nor from above."""
 
 
 def finger_of_link(hand: Hand) -> list[int]:
@@ -96,34 +96,39 @@ def object_meshes(obj: ObjectModel) -> list[Mesh]:
     return [Mesh(np.asarray(obj.vertices, float), np.asarray(obj.faces, np.int64), OBJECT_COLOUR)]
 
 
-def best_camera(hand_points: Float[np.ndarray, "n 3"], object_points: Float[np.ndarray, "m 3"]) -> Camera:
-    """The viewpoint, out of many around the grasp, from which most of object and hand can be told apart."""
-    points = np.concatenate([hand_points, object_points]).astype(float)
-    owner = np.repeat([0, 1], [len(hand_points), len(object_points)])
-    rated = [(_visible_cells(points, owner, direction), direction) for direction in _directions()]
-    return Camera.around(points, max(rated)[1], field_of_view=0.5)
+def best_camera(
+    hand: Hand, joints: Float[Tensor, " n_dof"], T_object_wrist: Float[Tensor, "4 4"], obj: ObjectModel,
+    aspect: float = 4 / 3,
+) -> Camera:
+    """The viewpoint, out of many around a grasp, from which most of the object and of the fingers can be told apart."""
+    of_hand = hand.points(joints, T_object_wrist).double().numpy()
+    finger = np.asarray(finger_of_link(hand))[hand.link_index.numpy()] >= 0
+    of_object = obj.cloud[:: max(1, len(obj.cloud) // 1024)].astype(float)
+    points = np.concatenate([of_hand, of_object])
+    owner = np.concatenate([finger.astype(int), np.full(len(of_object), 2)])
+    rated = [(_clarity(points, owner, direction), direction) for direction in _directions()]
+    return Camera.around(points, max(rated)[1], field_of_view=0.5, aspect=aspect)
 
 
 @lru_cache(maxsize=1)
 def _directions() -> tuple[tuple[float, float, float], ...]:
-    """Evenly spread viewpoints (Fibonacci sphere), none from below or straight from above."""
+    """Evenly spread viewpoints (Fibonacci sphere), none straight from below or above."""
     i = np.arange(2 * VIEWPOINTS) + 0.5
     z = 1 - i / VIEWPOINTS
     angle = np.pi * (1 + 5**0.5) * i
     r = np.sqrt(1 - z**2)
     rows = zip((r * np.cos(angle)).tolist(), (r * np.sin(angle)).tolist(), z.tolist(), strict=True)
-    return tuple(row for row in rows if LOWEST_VIEW < row[2] < 0.85)
+    return tuple(row for row in rows if LOWEST_VIEW < row[2] < HIGHEST_VIEW)
 
 
-def _visible_cells(points: np.ndarray, owner: np.ndarray, direction: tuple[float, float, float]) -> float:
-    """Cells of a coarse picture in which the object, and in which the hand, is the nearest; the scarcer counts more."""
+def _clarity(points: np.ndarray, owner: np.ndarray, direction: tuple[float, float, float]) -> float:
+    """Cells of a coarse picture that show the object (2) and the fingers (1); the scarcer of the two counts more."""
     right, up, backward = Camera(direction, (0.0, 0.0, 0.0)).axes()
-    flat = np.stack([points @ right, points @ up], 1)
-    low, size = flat.min(0), np.ptp(flat, 0).max() + 1e-9
-    cell = ((flat - low) / size * (CELLS - 1)).astype(int)
-    key = cell[:, 0] * CELLS + cell[:, 1]
+    size = float(np.linalg.norm(np.ptp(points, axis=0))) + 1e-9
+    x, y = (((points @ axis) - (points @ axis).min()) / size * CELLS for axis in (right, up))
+    key = x.astype(int) * (CELLS + 1) + y.astype(int)
     order = np.lexsort((-(points @ backward), key))
     _, first = np.unique(key[order], return_index=True)
     nearest = owner[order][first]
-    hand, obj = int((nearest == 0).sum()), int((nearest == 1).sum())
-    return 2 * min(hand, obj) + max(hand, obj)
+    fingers, obj = int((nearest == 1).sum()), int((nearest == 2).sum())
+    return 2 * min(fingers, obj) + max(fingers, obj)
