@@ -2,103 +2,114 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import trimesh
 
 from dro_grasp.objects.loading import mesh_object
-from dro_grasp.objects.primitives import box, frustum, hollow, hull, ring, superquadric, tilted, turned
+from dro_grasp.objects.primitives import Solid, box, frustum, hollow, hull, ring, superquadric, tilted, turned
 from dro_grasp.objects.shape import ObjectModel
 
-Parts = list[trimesh.Trimesh]
+Pieces = Sequence[trimesh.Trimesh | Solid]
+"""Convex meshes and solids whose union is the object."""
 
 
 @dataclass(frozen=True)
 class BuiltinObject:
     """How a built-in object is made."""
 
-    make: Callable[[], Parts]
+    make: Callable[[], Pieces]
     split: str
     """`train` or `test`."""
 
 
-def _mug() -> Parts:
+def _mug() -> Pieces:
     body = hollow([(0.036, -0.045), (0.038, 0.0), (0.04, 0.045)], wall=0.006, floor=0.006)
-    return [*body, *ring(0.026, 0.006, 9, arc=np.pi, axis="y", at=(0.036, 0, 0), start=0.0)]
+    return [body, ring(0.026, 0.006, 9, arc=np.pi, axis="y", at=(0.036, 0, 0))]
 
 
-def _teapot() -> Parts:
-    body = turned([(0.03, -0.045), (0.05, -0.02), (0.05, 0.015), (0.03, 0.04), (0.012, 0.045), (0.012, 0.058)])
-    spout = [hull(np.concatenate([
+def _teapot() -> Pieces:
+    profile = [(0.03, -0.045), (0.05, -0.02), (0.05, 0.015), (0.03, 0.04), (0.012, 0.045), (0.012, 0.058)]
+    spout = hull(np.concatenate([
         frustum((0.012, 0.012), (-0.008, 0.008), (0.045, 0, -0.01)).vertices,
         frustum((0.007, 0.007), (-0.003, 0.003), (0.085, 0, 0.03)).vertices,
-    ]))]
-    return [*body, *spout, *ring(0.026, 0.006, 9, arc=np.pi, axis="y", at=(-0.044, 0, 0), start=np.pi)]
+    ]))
+    return [*turned(profile), spout, ring(0.026, 0.006, 9, arc=np.pi, axis="y", at=(-0.044, 0, 0), start=np.pi)]
 
 
-def _hammer() -> Parts:
-    return [frustum((0.013, 0.011), (-0.09, 0.07)), frustum((0.016, 0.016), (-0.035, 0.04), (0, 0, 0.075), axis="x"),
-            frustum((0.016, 0.006), (-0.06, -0.035), (0, 0, 0.075), axis="x")]
+def _hammer() -> Pieces:
+    head = (0, 0, 0.075)
+    return [frustum((0.013, 0.011), (-0.09, 0.07)), frustum((0.016, 0.016), (-0.035, 0.04), head, axis="x"),
+            frustum((0.016, 0.006), (-0.06, -0.035), head, axis="x")]
 
 
-def _screwdriver() -> Parts:
-    return [*turned([(0.012, -0.09), (0.017, -0.075), (0.017, -0.02), (0.010, -0.005)]), frustum((0.0045, 0.0045), (-0.005, 0.09))]
+def _screwdriver() -> Pieces:
+    grip = turned([(0.012, -0.09), (0.017, -0.075), (0.017, -0.02), (0.010, -0.005)])
+    return [*grip, frustum((0.0045, 0.0045), (-0.005, 0.09))]
 
 
-def _wrench() -> Parts:
-    jaw = [box((0.012, 0.028, 0.014), (0.014, 0, 0.078)), box((0.012, 0.028, 0.014), (-0.014, 0, 0.078))]
+def _wrench() -> Pieces:
+    jaw = [box((0.012, 0.028, 0.014), (x, 0, 0.078)) for x in (0.014, -0.014)]
     return [box((0.02, 0.014, 0.15), (0, 0, -0.005)), box((0.04, 0.028, 0.018), (0, 0, 0.066)), *jaw]
 
 
-def _spray_bottle() -> Parts:
+def _spray_bottle() -> Pieces:
     body = turned([(0.036, -0.08), (0.036, 0.02), (0.016, 0.05), (0.016, 0.065)])
     return [*body, box((0.075, 0.026, 0.028), (0.012, 0, 0.078)), box((0.01, 0.016, 0.04), (0.04, 0, 0.048))]
 
 
-def _light_bulb() -> Parts:
+def _light_bulb() -> Pieces:
     globe = superquadric((0.032, 0.032, 0.032), (1, 1), (0, 0, 0.02))
     return [globe, *turned([(0.014, -0.045), (0.014, -0.02), (0.026, 0.005)])]
 
 
-def _camera() -> Parts:
-    return [box((0.11, 0.04, 0.07)), frustum((0.027, 0.025), (0.018, 0.055), axis="y"), box((0.035, 0.03, 0.014), (0, 0, 0.041))]
+def _camera() -> Pieces:
+    lens = frustum((0.027, 0.025), (0.018, 0.055), axis="y")
+    return [box((0.11, 0.04, 0.07)), lens, box((0.035, 0.03, 0.014), (0, 0, 0.041))]
 
 
-def _dumbbell() -> Parts:
-    ends = [frustum((0.033, 0.033), (a, b), axis="x") for a, b in ((-0.075, -0.04), (0.04, 0.075))]
+def _dumbbell() -> Pieces:
+    ends = [frustum((0.033, 0.033), heights, axis="x") for heights in ((-0.075, -0.04), (0.04, 0.075))]
     return [frustum((0.014, 0.014), (-0.041, 0.041), axis="x"), *ends]
 
 
-def _airplane() -> Parts:
-    return [frustum((0.016, 0.012), (-0.07, 0.06), axis="x"), frustum((0.012, 0.002), (0.06, 0.085), axis="x"),
-            box((0.04, 0.17, 0.012), (0.005, 0, 0)), box((0.022, 0.06, 0.008), (-0.06, 0, 0.005)), box((0.022, 0.008, 0.04), (-0.06, 0, 0.025))]
+def _airplane() -> Pieces:
+    body = [frustum((0.016, 0.012), (-0.07, 0.06), axis="x"), frustum((0.012, 0.002), (0.06, 0.085), axis="x")]
+    tail = [box((0.022, 0.06, 0.008), (-0.06, 0, 0.005)), box((0.022, 0.008, 0.04), (-0.06, 0, 0.025))]
+    return [*body, box((0.04, 0.17, 0.012), (0.005, 0, 0)), *tail]
 
 
-def _duck() -> Parts:
-    beak = hull(np.concatenate([frustum((0.011, 0.011), (0.02, 0.022), (0.018, 0, 0.045), axis="x").vertices,
-                                frustum((0.004, 0.004), (0.036, 0.038), (0.018, 0, 0.042), axis="x").vertices]))
-    return [superquadric((0.046, 0.034, 0.03), (1, 1)), superquadric((0.024, 0.024, 0.024), (1, 1), (0.022, 0, 0.043)), beak,
-            *tilted([box((0.03, 0.03, 0.012), (-0.045, 0, 0.0))], 0.5)]
+def _duck() -> Pieces:
+    beak = hull(np.concatenate([
+        frustum((0.011, 0.011), (0.02, 0.022), (0.018, 0, 0.045), axis="x").vertices,
+        frustum((0.004, 0.004), (0.036, 0.038), (0.018, 0, 0.042), axis="x").vertices,
+    ]))
+    body = superquadric((0.046, 0.034, 0.03), (1, 1))
+    head = superquadric((0.024, 0.024, 0.024), (1, 1), (0.022, 0, 0.043))
+    return [body, head, beak, *tilted([box((0.03, 0.03, 0.012), (-0.045, 0, 0.0))], 0.5)]
 
 
-def _joystick() -> Parts:
-    return [*turned([(0.045, -0.05), (0.04, -0.03)]), frustum((0.014, 0.014), (-0.031, 0.03)), superquadric((0.022, 0.022, 0.026), (1, 1), (0, 0, 0.045))]
+def _joystick() -> Pieces:
+    base, stick = turned([(0.045, -0.05), (0.04, -0.03)]), frustum((0.014, 0.014), (-0.031, 0.03))
+    return [*base, stick, superquadric((0.022, 0.022, 0.026), (1, 1), (0, 0, 0.045))]
 
 
-def _chess_pawn() -> Parts:
-    return [*turned([(0.032, -0.05), (0.032, -0.04), (0.022, -0.03), (0.012, 0.0), (0.012, 0.02), (0.02, 0.024), (0.02, 0.028)]),
-            superquadric((0.021, 0.021, 0.021), (1, 1), (0, 0, 0.044))]
+def _chess_pawn() -> Pieces:
+    profile = [(0.032, -0.05), (0.032, -0.04), (0.022, -0.03), (0.012, 0.0), (0.012, 0.02), (0.02, 0.024),
+               (0.02, 0.028)]
+    return [*turned(profile), superquadric((0.021, 0.021, 0.021), (1, 1), (0, 0, 0.044))]
 
 
-def _wine_glass() -> Parts:
+def _wine_glass() -> Pieces:
     stem = turned([(0.034, -0.085), (0.034, -0.08), (0.006, -0.074), (0.006, -0.015), (0.02, 0.0), (0.034, 0.02)])
-    return [*stem, *_lifted(hollow([(0.034, 0.0), (0.037, 0.03), (0.032, 0.06)], wall=0.005, floor=0.005), 0.019)]
+    cup = hollow([(0.034, 0.0), (0.037, 0.03), (0.032, 0.06)], wall=0.005, floor=0.005)
+    return [*stem, cup.moved((0, 0, 0.019))]
 
 
-def _lifted(parts: Parts, height: float) -> Parts:
-    return [hull(np.asarray(p.vertices) + (0, 0, height)) for p in parts]
+def _jar() -> Pieces:
+    return turned([(0.036, -0.05), (0.04, -0.04), (0.04, 0.03), (0.034, 0.038), (0.036, 0.04), (0.036, 0.055)])
 
 
 BUILTIN: dict[str, BuiltinObject] = {name: BuiltinObject(make, split) for name, make, split in (
@@ -122,11 +133,11 @@ BUILTIN: dict[str, BuiltinObject] = {name: BuiltinObject(make, split) for name, 
     ("hexagon", lambda: [frustum((0.035, 0.035), (-0.045, 0.045), corners=6)], "train"),
     ("pyramid", lambda: [frustum((0.055, 0.003), (-0.035, 0.05), corners=4)], "train"),
     ("bottle", lambda: turned([(0.034, -0.09), (0.036, -0.08), (0.036, 0.02), (0.014, 0.06), (0.014, 0.09)]), "train"),
-    ("jar", lambda: turned([(0.036, -0.05), (0.04, -0.04), (0.04, 0.03), (0.034, 0.038), (0.036, 0.04), (0.036, 0.055)]), "train"),
+    ("jar", _jar, "train"),
     ("vase", lambda: turned([(0.025, -0.075), (0.04, -0.03), (0.036, 0.01), (0.018, 0.05), (0.026, 0.075)]), "train"),
-    ("cup", lambda: hollow([(0.03, -0.045), (0.034, 0.0), (0.038, 0.045)], wall=0.006, floor=0.006), "train"),
-    ("bowl", lambda: hollow([(0.03, -0.025), (0.05, -0.005), (0.062, 0.025)], wall=0.008, floor=0.008), "train"),
-    ("torus", lambda: ring(0.045, 0.015), "train"),
+    ("cup", lambda: [hollow([(0.03, -0.045), (0.034, 0.0), (0.038, 0.045)], wall=0.006, floor=0.006)], "train"),
+    ("bowl", lambda: [hollow([(0.03, -0.025), (0.05, -0.005), (0.062, 0.025)], wall=0.008, floor=0.008)], "train"),
+    ("torus", lambda: [ring(0.045, 0.015)], "train"),
     ("l_block", lambda: [box((0.04, 0.04, 0.11)), box((0.05, 0.04, 0.04), (0.045, 0, -0.035))], "train"),
     ("t_block", lambda: [box((0.036, 0.036, 0.1)), box((0.11, 0.036, 0.036), (0, 0, 0.068))], "train"),
     ("cross", lambda: [box((0.12, 0.034, 0.034)), box((0.034, 0.12, 0.034))], "train"),
@@ -150,10 +161,11 @@ BUILTIN: dict[str, BuiltinObject] = {name: BuiltinObject(make, split) for name, 
 """Every built-in object. Test objects never enter a training bundle."""
 
 
-def make_builtin(name: str) -> ObjectModel:
-    """Build one of the built-in objects: the union of its convex parts, and the parts themselves."""
+def make_builtin(name: str, *, scale: float = 1.0) -> ObjectModel:
+    """Build one of the built-in objects: the union of its pieces, and its exact convex parts."""
     kind = BUILTIN[name]
-    parts = kind.make()
-    mesh = parts[0] if len(parts) == 1 else trimesh.boolean.union(parts, engine="manifold")
-    exact = tuple((np.asarray(p.vertices), np.asarray(p.faces)) for p in parts)
-    return mesh_object(name, mesh, origin=name, split=kind.split, parts=exact)
+    pieces = [piece if isinstance(piece, Solid) else Solid(piece, [piece]) for piece in kind.make()]
+    meshes = [piece.mesh for piece in pieces]
+    mesh = meshes[0] if len(meshes) == 1 else trimesh.boolean.union(meshes, engine="manifold")
+    parts = tuple((np.asarray(part.vertices), np.asarray(part.faces)) for piece in pieces for part in piece.parts)
+    return mesh_object(name, mesh, origin=name, scale=scale, split=kind.split, parts=parts)

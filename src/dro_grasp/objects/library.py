@@ -8,14 +8,17 @@ import math
 import os
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.objects.builtin import BUILTIN, make_builtin
-from dro_grasp.objects.loading import load_file, mesh_object
-from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.objects.loading import load_file, mesh_object, read_geometry
+from dro_grasp.objects.shape import ObjectModel, Part
+
+if TYPE_CHECKING:
+    import trimesh
 
 ASSET_PREFIX = "assets/"
 MESH_SUFFIXES = {".obj", ".stl", ".ply", ".glb", ".gltf", ".off", ".dae", ".npy", ".pcd", ".3mf"}
@@ -27,20 +30,19 @@ def load_object(name: str | Path, *, scale: float = 1.0) -> ObjectModel:
 
     Args:
         name: A built-in name, an asset's name (`contactdb+apple`), or a path; `assets/NAME` forces the asset.
-        scale: Multiplies the coordinates of a file.
+        scale: Multiplies all coordinates.
 
     Raises:
-        ObjectError: No such object, or it cannot be used.
-        ObjectError: `scale` is not positive.
+        ObjectError: No such object, it cannot be used, or `scale` is not positive.
     """
     if not (math.isfinite(scale) and scale > 0):
         raise ObjectError(f"scale is {scale}; give a positive number, for example --scale 0.001 for millimetres")
     text = str(name)
-    if text in BUILTIN and scale == 1.0:
-        return make_builtin(text)
+    if text in BUILTIN:
+        return make_builtin(text, scale=scale)
     entry = _assets().get(text.removeprefix(ASSET_PREFIX))
-    if entry is not None and scale == 1.0:
-        return _load_asset(entry)
+    if entry is not None:
+        return _load_asset(entry, scale)
     path = Path(text).expanduser()
     if path.is_dir():
         raise ObjectError(f"{path} is a folder; name one of its files, or use a command that takes folders")
@@ -84,18 +86,33 @@ def _assets() -> dict[str, dict[str, Any]]:
 def _manifest(path: Path) -> dict[str, dict[str, Any]]:
     if not path.is_file():
         return {}
-    return {entry["name"]: {**entry, "folder": path.parent} for entry in json.loads(path.read_text())}
+    try:
+        return {entry["name"]: {**entry, "folder": path.parent} for entry in json.loads(path.read_text())}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ObjectError(f"{path} is no list of objects ({error}); unset DRO_GRASP_ASSETS or repair it") from error
 
 
-def _load_asset(entry: dict[str, Any]) -> ObjectModel:
-    import trimesh
+def _load_asset(entry: dict[str, Any], scale: float) -> ObjectModel:
+    folder, collision = entry["folder"], entry.get("collision")
+    return mesh_object(
+        entry["name"], _read_mesh(folder / entry["file"]), origin=entry["name"], scale=scale,
+        split=entry["multidex_split"], parts=_read_parts(folder / collision["file"]) if collision else None,
+    )
 
-    mesh = trimesh.load_mesh(entry["folder"] / entry["file"], process=False)
-    parts = None
-    if entry.get("collision"):
-        hulls = trimesh.load_mesh(entry["folder"] / entry["collision"]["file"], process=False).split(only_watertight=False)
-        parts = tuple((np.asarray(h.vertices), np.asarray(h.faces)) for h in hulls if len(h.vertices) >= 4)
-    return mesh_object(entry["name"], mesh, origin=entry["name"], split=entry["multidex_split"], parts=parts)
+
+def _read_mesh(path: Path) -> trimesh.Trimesh:
+    if not path.is_file():
+        raise ObjectError(f"the assets' manifest names {path}, which does not exist; repair the assets folder")
+    mesh = read_geometry(path)[0]
+    if isinstance(mesh, np.ndarray):
+        raise ObjectError(f"{path} has no faces; repair the assets folder")
+    return mesh
+
+
+def _read_parts(path: Path) -> tuple[Part, ...]:
+    """Convex parts of an asset: the bodies of its collision file that have a volume."""
+    hulls = _read_mesh(path).split(only_watertight=False)
+    return tuple((np.asarray(h.vertices), np.asarray(h.faces)) for h in hulls if len(h.vertices) >= 4)
 
 
 def _unknown(name: str) -> str:
@@ -103,5 +120,5 @@ def _unknown(name: str) -> str:
     near = difflib.get_close_matches(name.removeprefix(ASSET_PREFIX), known, n=3)
     hint = f" Perhaps you meant {' or '.join(near)}." if near else ""
     listed = ", ".join(list(BUILTIN)[:12])
-    return (f"no object is called '{name}'.{hint} Known: {listed}, ... (`dro-grasp objects` lists all {len(known)}); or give "
-            "the path of a mesh or point cloud")
+    return (f"no object is called '{name}'.{hint} Known: {listed}, ... (`dro-grasp objects` lists all {len(known)}); "
+            "or give the path of a mesh or point cloud")

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
-import os
-import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -18,6 +13,7 @@ from torch import Tensor
 from dro_grasp.errors import ObjectError
 from dro_grasp.geometry.point_clouds import partial_view
 from dro_grasp.geometry.signed_distance import SignedDistanceGrid
+from dro_grasp.objects.cache import cached_arrays
 
 DENSITY = 500.0
 """Density of every object in trials [kg/m^3]. Source: the official release."""
@@ -75,7 +71,7 @@ class ObjectModel:
     @property
     def extents(self) -> np.ndarray:
         """Size along the axes (3) [m]."""
-        return np.ptp(self.cloud, axis=0)
+        return np.ptp(self.cloud if self.vertices is None else self.vertices, axis=0)
 
     @cached_property
     def parts(self) -> tuple[Part, ...]:
@@ -97,11 +93,10 @@ class ObjectModel:
         if self.vertices is None or self.faces is None:
             return None
         vertices, faces = self.vertices, self.faces
-        stored = cached_arrays(f"grid-{self.sha256[:24]}-{GRID_SPACING * 1e6:.0f}", lambda: bake_grid(vertices, faces))
-        return SignedDistanceGrid.from_values(
-            torch.from_numpy(stored["values"].astype(np.float32)), torch.from_numpy(stored["origin"].astype(np.float32)),
-            float(stored["spacing"]),
-        )
+        key = f"grid-{self.sha256[:24]}-{GRID_SPACING * 1e6:.0f}"
+        stored = cached_arrays(key, lambda: bake_grid(vertices, faces))
+        values, origin = (torch.from_numpy(stored[name].astype(np.float32)) for name in ("values", "origin"))
+        return SignedDistanceGrid.from_values(values, origin, float(stored["spacing"]))
 
     def sample_points(self, count: int, generator: torch.Generator) -> Float[Tensor, "count 3"]:
         """Random points of the stored cloud [m]; with repetition where the cloud has too few."""
@@ -125,58 +120,24 @@ class ObjectModel:
 
 
 def bake_grid(vertices: np.ndarray, faces: np.ndarray) -> dict[str, np.ndarray]:
-    """Signed distances on a grid around a mesh: magnitude from the surface, sign from the winding number.
-
-    The two are computed apart because the winding number copes with holes, flipped faces and overlapping shells.
-    """
-    import igl
-
+    """Signed distances on a grid around a mesh: `values` (nx ny nz), `origin` (3) and `spacing` [m]."""
     low, high = vertices.min(0) - GRID_PADDING, vertices.max(0) + GRID_PADDING
     spacing = max(GRID_SPACING, float((np.prod(high - low) / LARGEST_GRID) ** (1 / 3)))
     counts = np.ceil((high - low) / spacing).astype(int) + 1
     axes = [low[i] + spacing * np.arange(counts[i]) for i in range(3)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    triangles = np.ascontiguousarray(faces, np.int64)
-    corners = np.ascontiguousarray(vertices, np.float64)
+    distance = signed_distances(vertices, faces, points)
+    return {"values": distance.reshape(counts).astype(np.float32), "origin": low, "spacing": np.array(spacing)}
+
+
+def signed_distances(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Distance of each point (n 3) to a mesh [m], negative inside.
+
+    Magnitude and sign are computed apart: the winding number copes with holes, flipped faces and overlapping shells.
+    """
+    import igl
+
+    corners, triangles = np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64)
     squared = igl.point_mesh_squared_distance(points, corners, triangles)[0]
     winding = igl.fast_winding_number(corners, triangles, points)
-    distance = np.where(np.abs(winding) > 0.5, -1.0, 1.0) * np.sqrt(squared)
-    return {"values": distance.reshape(counts).astype(np.float32), "origin": low,
-            "spacing": np.array(spacing)}
-
-
-def cache_folder() -> Path:
-    """Where derived geometry is kept: `DRO_GRASP_CACHE`, or the user's cache folder."""
-    root = os.environ.get("DRO_GRASP_CACHE")
-    return Path(root) if root else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "dro-grasp"
-
-
-def cached_arrays(key: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Arrays from the cache, or made and stored there; a damaged file is made anew, an unwritable folder is no error."""
-    path = cache_folder() / f"{key}.npz"
-    try:
-        with np.load(path) as stored:
-            return {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, KeyError, EOFError):
-        pass
-    except Exception as error:  # zipfile.BadZipFile is no ValueError
-        if type(error).__name__ != "BadZipFile":
-            raise
-    made = make()
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, **made)  # type: ignore[arg-type]
-        os.replace(temporary, path)
-    except OSError:
-        pass
-    return made
-
-
-def content_hash(*arrays: np.ndarray) -> str:
-    """Hash of geometry, the same on every machine."""
-    digest = hashlib.sha256()
-    for array in arrays:
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
+    return np.where(np.abs(winding) > 0.5, -1.0, 1.0) * np.sqrt(squared)

@@ -1,0 +1,124 @@
+"""What a depth camera sees of an object: the near side, sampled by pixels, with noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dro_grasp.errors import OptionError
+from dro_grasp.objects.shape import ObjectModel
+
+
+@dataclass(frozen=True)
+class DepthCamera:
+    """A pinhole depth camera that looks at the middle of the object."""
+
+    distance: float = 0.5
+    """From the camera to the object's middle [m]."""
+    pixel: float = 0.0015
+    """Size of a pixel at that distance [m]; a 640-pixel camera of 87 degrees has it at half a metre."""
+    noise: float = 0.001
+    """Standard deviation of depth along the ray at half a metre [m]; it grows with the square of depth."""
+    lost: float = 0.0
+    """Share of pixels that return nothing."""
+    grazing: float = 0.17
+    """Surfaces seen at less than this above their tangent return nothing [rad]."""
+
+    def __post_init__(self) -> None:
+        """Refuse settings that no camera has."""
+        if min(self.distance, self.pixel) <= 0 or self.noise < 0 or not 0 <= self.lost < 1:
+            raise OptionError(f"{self} cannot see: distance and pixel must be positive, noise at least 0, and lost "
+                              "at least 0 and below 1")
+
+
+def visible_points(
+    obj: ObjectModel, direction: Float[Tensor, " 3"], generator: torch.Generator, camera: DepthCamera | None = None
+) -> Float[Tensor, "n 3"]:
+    """Points of one depth image of the object, in the object's frame [m].
+
+    A mesh is seen by casting rays. A bare cloud is seen through a depth buffer, whose pixels are made large enough
+    to close the gaps between its points.
+
+    Args:
+        obj: Mesh or bare cloud.
+        direction: From the object towards the camera, of any length.
+        generator: Draws noise and lost pixels.
+        camera: Place and quality of the camera.
+
+    Raises:
+        OptionError: The direction has no length, or the camera stands inside the object.
+    """
+    camera = camera or DepthCamera()
+    length = float(direction.norm())
+    if not np.isfinite(length) or length < 1e-9:
+        raise OptionError(f"direction is {direction.tolist()}; give a vector from the object to the camera, as 0 0 1")
+    low, high = obj.cloud.min(0).astype(np.float64), obj.cloud.max(0).astype(np.float64)
+    middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    if camera.distance <= radius:
+        raise OptionError(f"a camera at {camera.distance:g} m stands within the object, {radius:.3g} m in radius; "
+                          "move it away")
+    T_object_camera = _looking_at(middle, direction.double().numpy() / length, camera.distance)
+    see = _depth_of_cloud if obj.is_cloud else _depth_of_mesh
+    rays, depth = see(obj, T_object_camera, radius, camera)
+    return _measured(rays, depth, T_object_camera, camera, generator)
+
+
+def _looking_at(middle: np.ndarray, towards: np.ndarray, distance: float) -> np.ndarray:
+    """Camera pose (4 4): z looks from the camera at the middle."""
+    helper = np.eye(3)[np.abs(towards).argmin()]
+    x = np.cross(helper, -towards)
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([x, np.cross(-towards, x), -towards], 1)
+    pose[:3, 3] = middle + distance * towards
+    return pose
+
+
+def _depth_of_mesh(
+    obj: ObjectModel, T_object_camera: np.ndarray, radius: float, camera: DepthCamera
+) -> tuple[np.ndarray, np.ndarray]:
+    """Ray directions (n 3) in the camera's frame with z = 1, and the depth along z (n) of what they hit first [m]."""
+    import trimesh
+
+    mesh = trimesh.Trimesh(obj.vertices, obj.faces, process=False)
+    # The silhouette of a sphere reaches beyond its radius at the distance of its middle.
+    reach = camera.distance * radius / np.sqrt(camera.distance**2 - radius**2)
+    side = np.arange(-reach, reach + camera.pixel, camera.pixel) / camera.distance
+    rays = np.stack([*np.meshgrid(side, side, indexing="ij"), np.ones((len(side), len(side)))], -1).reshape(-1, 3)
+    rotation, place = T_object_camera[:3, :3], T_object_camera[:3, 3]
+    towards = rays @ rotation.T
+    hits, ray, face = mesh.ray.intersects_location(np.tile(place, (len(rays), 1)), towards, multiple_hits=False)
+    cosine = np.abs((mesh.face_normals[face] * towards[ray]).sum(1)) / np.linalg.norm(towards[ray], axis=1)
+    seen = cosine > np.sin(camera.grazing)
+    return rays[ray[seen]], ((hits - place) @ rotation[:, 2])[seen]
+
+
+def _depth_of_cloud(
+    obj: ObjectModel, T_object_camera: np.ndarray, radius: float, camera: DepthCamera
+) -> tuple[np.ndarray, np.ndarray]:
+    """As `_depth_of_mesh`, for the points that are nearest in their pixel."""
+    local = (obj.cloud.astype(np.float64) - T_object_camera[:3, 3]) @ T_object_camera[:3, :3]
+    image = local[:, :2] / local[:, 2:] * camera.distance
+    gap = 2.5 * np.sqrt(np.prod(np.ptp(image, axis=0).clip(camera.pixel)) / len(image))
+    pixel = max(camera.pixel, gap)
+    cells = np.floor((image - image.min(0)) / pixel).astype(np.int64)
+    cell = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
+    nearest = np.full(cell.max() + 1, np.inf)
+    np.minimum.at(nearest, cell, local[:, 2])
+    # Twice the pixel spans a surface at 63 degrees; what lies deeper is another surface.
+    seen = local[:, 2] <= nearest[cell] + 2 * pixel
+    return local[seen] / local[seen, 2:], local[seen, 2]
+
+
+def _measured(
+    rays: np.ndarray, depth: np.ndarray, T_object_camera: np.ndarray, camera: DepthCamera, generator: torch.Generator
+) -> Float[Tensor, "n 3"]:
+    """Points in the object's frame from noisy depths, without the pixels that are lost."""
+    kept = torch.rand(len(depth), generator=generator).numpy() >= camera.lost
+    error = torch.randn(len(depth), generator=generator).numpy() * camera.noise * (depth / 0.5) ** 2
+    points = (rays * (depth + error)[:, None])[kept]
+    return torch.from_numpy((points @ T_object_camera[:3, :3].T + T_object_camera[:3, 3]).astype(np.float32))

@@ -1,0 +1,147 @@
+"""Safe repairs of a mesh, and its mass properties, each with a note of what was found."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dro_grasp.errors import ObjectError
+
+if TYPE_CHECKING:
+    import trimesh
+
+MANY_FACES = 100_000
+"""Meshes with more faces are decimated."""
+KEPT_FACES = 50_000
+"""Faces that decimation leaves."""
+LEAST_VOLUME = 1e-9
+"""Volume of the convex hull below which a mesh encloses nothing [m^3]."""
+LEAST_FILL = 1e-3
+"""Share of its bounding box that a hull, and share of its hull that a mesh must fill; less is a sheet."""
+OVERLAP = 1e-3
+"""Share of the volume by which bodies may overlap unnoticed."""
+PROBES = 48
+"""Points along the longest side of the grid that measures a mesh with holes."""
+
+
+def repair(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
+    """Decimate, close, turn outward and join, as far as that is safe; a sound mesh comes back as it is.
+
+    Args:
+        mesh: Mesh with merged vertices.
+        notes: Gets a line for everything that was found.
+    """
+    if len(mesh.faces) > MANY_FACES:
+        before = len(mesh.faces)
+        mesh = mesh.simplify_quadric_decimation(face_count=KEPT_FACES)
+        notes.append(f"decimated from {before} to {len(mesh.faces)} faces")
+    if not mesh.is_watertight:
+        _close(mesh, notes)
+    if _turn_outward(mesh):
+        notes.append("faces were turned outward")
+    return _join(mesh, notes)
+
+
+def mass_properties(
+    mesh: trimesh.Trimesh, origin: str, notes: list[str]
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Volume [m^3], centre of mass (3) [m], and inertia (3 3) at unit density about it [m^5].
+
+    A mesh with holes is measured by where its winding number says inside, a mere sheet by its convex hull.
+
+    Raises:
+        ObjectError: Not even the convex hull encloses a volume.
+    """
+    hull = _hull(mesh)
+    box = float(np.prod(mesh.extents))
+    if hull is None or hull.volume < max(LEAST_FILL * box, LEAST_VOLUME):
+        raise ObjectError(f"{origin} encloses no volume (extents {np.round(mesh.extents * 1000, 2).tolist()} mm); "
+                          "give a closed solid, or a point cloud if only its surface is known")
+    if mesh.is_volume and LEAST_FILL * hull.volume < mesh.volume <= (1 + OVERLAP) * hull.volume:
+        return _of_solid(mesh)
+    inside, cell = _inside(mesh)
+    if len(inside) * cell > max(LEAST_FILL * hull.volume, 100 * cell):
+        return _of_points(inside, cell)
+    notes.append("volume and mass are those of the convex hull, because the mesh encloses none")
+    return _of_solid(hull)
+
+
+def _close(mesh: trimesh.Trimesh, notes: list[str]) -> None:
+    import trimesh
+
+    mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
+    mesh.remove_unreferenced_vertices()
+    trimesh.repair.fill_holes(mesh)
+    notes.append("holes were closed" if mesh.is_watertight else
+                 "not watertight: distances use winding numbers, which cope with small holes")
+
+
+def _turn_outward(mesh: trimesh.Trimesh) -> bool:
+    """Make the faces counter-clockwise seen from outside; whether any had to be turned."""
+    import trimesh
+
+    before = np.array(mesh.faces)
+    if not mesh.is_winding_consistent or (mesh.is_watertight and mesh.volume < 0):
+        trimesh.repair.fix_normals(mesh, multibody=True)
+    if not mesh.is_watertight and _winding(mesh)[0].sum() < 0:
+        # The volume of an open mesh depends on where the origin is, so it cannot tell inside from outside.
+        mesh.invert()
+    return not np.array_equal(before, mesh.faces)
+
+
+def _join(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
+    """The union of bodies that overlap, which would count twice in mass and hide surface inside."""
+    import trimesh
+
+    if not mesh.is_watertight or mesh.body_count == 1:
+        return mesh
+    bodies = list(mesh.split(only_watertight=False))
+    notes.append(f"{len(bodies)} separate bodies")
+    if not all(body.is_volume for body in bodies):
+        return mesh
+    joined = trimesh.boolean.union(bodies, engine="manifold")
+    if not joined.is_volume or joined.volume > (1 - OVERLAP) * mesh.volume:
+        return mesh
+    notes[-1] = f"{len(bodies)} overlapping bodies were joined"
+    return joined
+
+
+def _hull(mesh: trimesh.Trimesh) -> trimesh.Trimesh | None:
+    import trimesh
+    from scipy.spatial import QhullError
+
+    try:
+        return trimesh.convex.convex_hull(mesh)
+    except QhullError:
+        return None
+
+
+def _winding(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray, float]:
+    """Winding numbers on a grid over the mesh's box, the grid's points, and the volume of a cell [m^3]."""
+    import igl
+
+    spacing = float(mesh.extents.max()) / PROBES
+    axes = [np.arange(low + spacing / 2, high, spacing) for low, high in mesh.bounds.T]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    winding = igl.fast_winding_number(
+        np.ascontiguousarray(mesh.vertices, np.float64), np.ascontiguousarray(mesh.faces, np.int64), points)
+    return np.asarray(winding), points, spacing**3
+
+
+def _inside(mesh: trimesh.Trimesh) -> tuple[np.ndarray, float]:
+    winding, points, cell = _winding(mesh)
+    return points[np.abs(winding) > 0.5], cell
+
+
+def _of_solid(body: trimesh.Trimesh) -> tuple[float, np.ndarray, np.ndarray]:
+    body = body.copy()
+    body.density = 1.0
+    return float(body.volume), np.asarray(body.center_mass), np.asarray(body.moment_inertia)
+
+
+def _of_points(points: np.ndarray, cell: float) -> tuple[float, np.ndarray, np.ndarray]:
+    """Mass properties of cubic cells of a volume `cell` around points (n 3)."""
+    volume, centre = len(points) * cell, points.mean(0)
+    second = (points - centre).T @ (points - centre) * cell + np.eye(3) * volume * cell ** (2 / 3) / 12
+    return volume, centre, np.trace(second) * np.eye(3) - second
