@@ -1,0 +1,203 @@
+"""What is derived from a hand description and what is wrong with it, in words and in a picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from dro_grasp.geometry.rasterizer import Camera, Mesh, arrow, render
+from dro_grasp.hands.build import build_hand
+from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.library import load_hand_description
+from dro_grasp.kinematics.loader import Description
+from dro_grasp.kinematics.urdf import Note
+
+LARGEST_HAND, SMALLEST_HAND = 1.0, 0.02
+"""Extents outside of which a hand's units are doubtful [m]."""
+TILE, TEXT = (560, 520), 30
+"""Size of one view, and height of a line of text [pixels]."""
+TOUCHING, OTHER, DIRECTION, TRACK = (0.93, 0.66, 0.30), (0.62, 0.66, 0.72), (0.85, 0.15, 0.15), (0.15, 0.39, 0.92)
+"""Colours of links that can touch, of others, of the palm direction and of the fingertips' tracks."""
+THIN_VOLUME = 1e-9
+"""Volume below which a link's shapes enclose nothing [m^3]."""
+
+
+@dataclass(frozen=True)
+class HandReport:
+    """Everything `dro-grasp hand check` says."""
+
+    hand: Hand
+    facts: dict[str, Any]
+    """What was derived, by name."""
+    notes: tuple[Note, ...]
+    """What was found, repaired or is wrong."""
+
+    def lines(self) -> list[str]:
+        """The report for people."""
+        width = max(len(name) for name in self.facts)
+        told = [f"{name.replace('_', ' '):<{width}}  {_words(value)}" for name, value in self.facts.items()]
+        found = [f"{note.level}: {note.subject}: {note.text}" for note in self.notes]
+        return [f"hand {self.hand.name}", *told, "", *(found or ["nothing wrong was found"])]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The report for programs."""
+        notes = [{"level": n.level, "subject": n.subject, "text": n.text} for n in self.notes]
+        return {"hand": self.hand.name, **self.facts, "notes": notes}
+
+
+def check_hand(name: str | Path) -> HandReport:
+    """Derive a hand and look for what is wrong with its description.
+
+    Raises:
+        HandError: The description cannot be used at all.
+    """
+    description, label = load_hand_description(name)
+    hand = build_hand(description, name=label)
+    notes = (*description.notes, *_size_notes(hand), *_shape_notes(hand, description), *_point_notes(hand))
+    return HandReport(hand, _facts(hand, description), notes)
+
+
+def _facts(hand: Hand, description: Description) -> dict[str, Any]:
+    tree = hand.tree
+    names = tree.link_names
+    couplings = [
+        f"{tree.moving_names[c.follower]} = {c.multiplier:g} * {tree.moving_names[c.leader]} + {c.offset:g}"
+        if c.leader >= 0 else f"{tree.moving_names[c.follower]} = {c.offset:g}" for c in description.couplings
+    ]
+    ends = {True: "upper", False: "lower"}
+    return {
+        "file": str(description.path),
+        "wrist_link": hand.wrist_link,
+        "palm_link": names[hand.palm],
+        "palm_direction": [round(float(x), 3) for x in hand.palm_direction_wrist],
+        "fingertips": [names[t] for t in hand.tips],
+        "side": hand_side(hand),
+        "free_joints": [n for n, m in zip(tree.joint_names, hand.movable.tolist(), strict=True) if m],
+        "held_joints": [n for n, m in zip(tree.joint_names, hand.movable.tolist(), strict=True) if not m],
+        "coupled_joints": couplings,
+        "open_ends": {n: ends[o > 0] for n, o in zip(tree.joint_names, hand.opening.tolist(), strict=True)},
+        "spreading_joints": [n for n, a in zip(tree.joint_names, hand.abduction.tolist(), strict=True) if a],
+        "contact_links": [names[i] for i in hand.touching],
+        "points": hand.n_points,
+        "size_m": [round(float(x), 3) for x in np.ptp(hand.points(hand.canonical_joints()).numpy(), axis=0)],
+    }
+
+
+def hand_side(hand: Hand) -> str:
+    """`left`, `right`, or `none` for a hand with fewer than four fingers.
+
+    The thumb is the finger whose tip is farthest from the others' mean. With the fingers up and the palm towards the
+    viewer, the thumb of a right hand is on the viewer's right.
+    """
+    if len(hand.tips) < 4:
+        return "none"
+    points, index = hand.points(hand.canonical_joints(1.0)), hand.link_index
+    tips = torch.stack([points[index == t].mean(0) for t in hand.tips])
+    T = hand.T_wrist_palm_rest
+    palm = T[:3, :3] @ hand.palm_centre + T[:3, 3]
+    apart = [float((tips[i] - torch.cat([tips[:i], tips[i + 1 :]]).mean(0)).norm()) for i in range(len(tips))]
+    thumb = int(np.argmax(apart))
+    others = torch.cat([tips[:thumb], tips[thumb + 1 :]]).mean(0)
+    handed = float(torch.linalg.cross(others - palm, hand.palm_direction_wrist) @ (tips[thumb] - palm))
+    return "right" if handed > 0 else "left"
+
+
+def _size_notes(hand: Hand) -> list[Note]:
+    size = float(np.ptp(hand.points(hand.canonical_joints()).numpy(), axis=0).max())
+    if SMALLEST_HAND < size < LARGEST_HAND:
+        return []
+    unit = "millimetres; set the meshes' scale to 0.001" if size > LARGEST_HAND else "another unit than metres"
+    return [Note("warning", hand.name, f"is {size:.3g} m large, which looks like {unit}")]
+
+
+def _shape_notes(hand: Hand, description: Description) -> list[Note]:
+    """Links that cannot touch anything, or whose shapes enclose nothing."""
+    import trimesh
+
+    notes = []
+    for link, name in enumerate(hand.tree.link_names):
+        if not bool(hand.tree.descends[link, hand.palm]):
+            continue
+        shapes = [g for g in description.geometry if g.link == link]
+        if shapes and not any(g.collides for g in shapes):
+            notes.append(Note("warning", name, "has a visual but no collision shape; it cannot touch anything"))
+        volume = sum(abs(trimesh.Trimesh(g.vertices, g.faces, process=False).volume) for g in shapes)
+        if shapes and volume < THIN_VOLUME:
+            notes.append(Note("warning", name, "has shapes without volume"))
+    return notes
+
+
+def _point_notes(hand: Hand) -> list[Note]:
+    few = [hand.tree.link_names[i] for i in hand.link_index.unique().tolist() if not bool(hand.registrable[i])]
+    return [Note("info", name, "has too few points for a pose of its own; its neighbours place it") for name in few]
+
+
+def _words(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{k} {v}" for k, v in value.items()) or "none"
+    if isinstance(value, list):
+        return ", ".join(str(v) for v in value) or "none"
+    return str(value)
+
+
+def picture(hand: Hand, path: Path | str) -> None:
+    """Draw the hand open and closed: contact links coloured, palm direction, and the way each fingertip moves.
+
+    Args:
+        hand: From `load_hand` or a report; it needs its description.
+        path: PNG to write.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    width, height = TILE
+    sheet = Image.new("RGB", (2 * width, height + 2 * TEXT), (255, 255, 255))
+    pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(15)
+    camera = _camera(hand)
+    for column, (title, openness) in enumerate((("open", 1.0), ("closed", 0.25))):
+        sheet.paste(Image.fromarray(render(_meshes(hand, openness), camera, width, height)), (column * width, TEXT))
+        pen.text((column * width + 12, 6), f"{hand.name}, {title}", fill=(20, 20, 20), font=font)
+    legend = "orange: can touch   grey: cannot   red: palm direction   blue: fingertips from open to closed"
+    pen.text((12, height + TEXT + 6), legend, fill=(90, 90, 90), font=font)
+    sheet.save(path, format="PNG")
+
+
+def _camera(hand: Hand) -> Camera:
+    """From in front of the palm, a little aside and above."""
+    points = torch.cat([hand.points(hand.canonical_joints(x)) for x in (1.0, 0.25)]).numpy()
+    front = hand.palm_direction_wrist.numpy()
+    up = points.mean(0) - (hand.T_wrist_palm_rest[:3, 3]).numpy()
+    up = up - (up @ front) * front
+    up = up / max(float(np.linalg.norm(up)), 1e-9)
+    side = np.cross(up, front)
+    direction = front + 0.75 * side + 0.35 * up
+    as_tuple = lambda v: (float(v[0]), float(v[1]), float(v[2]))  # noqa: E731
+    return Camera.around(points, as_tuple(direction), as_tuple(up), aspect=TILE[0] / TILE[1])
+
+
+def _meshes(hand: Hand, openness: float) -> list[Mesh]:
+    """The posed hand, the palm direction, and the fingertips' tracks."""
+    poses = hand.tree.forward(hand.canonical_joints(openness)).numpy()
+    meshes = [
+        Mesh(g.vertices @ poses[g.link, :3, :3].T + poses[g.link, :3, 3], g.faces,
+             TOUCHING if g.link in hand.touching else OTHER)
+        for g in (hand.description.geometry if hand.description else ())
+        if g.visual and bool(hand.tree.descends[g.link, hand.palm])
+    ]
+    T = hand.T_wrist_palm_rest
+    start = (T[:3, :3] @ hand.palm_centre + T[:3, 3]).numpy()
+    meshes.append(arrow(start, start + 0.1 * hand.palm_direction_wrist.numpy(), DIRECTION, radius=0.003))
+    for track in _tracks(hand):
+        meshes.extend(arrow(a, b, TRACK, radius=0.0012) for a, b in zip(track[:-1], track[1:], strict=True))
+    return meshes
+
+
+def _tracks(hand: Hand, steps: int = 8) -> np.ndarray:
+    """Positions (n_tips steps 3) of the fingertips from open to closed [m]."""
+    joints = torch.stack([hand.canonical_joints(float(x)) for x in torch.linspace(1, 0.25, steps)])
+    poses = hand.tree.forward(joints)[:, list(hand.tips)]
+    middles = torch.stack([hand.link_points[hand.link_index == t].mean(0) for t in hand.tips])
+    return ((poses[..., :3, :3] @ middles[..., None])[..., 0] + poses[..., :3, 3]).transpose(0, 1).numpy()
