@@ -26,6 +26,9 @@ from dro_grasp.models.checkpoints import load_weights
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.shape import ObjectModel
 
+PREDICTED = "predicted_points"
+"""Column that carries the multilaterated points through selection and sorting; no file holds it."""
+
 
 @dataclass(frozen=True)
 class PredictorConfig:
@@ -62,6 +65,8 @@ class GraspPredictor:
     """Seconds of the last call: network, decode, rank."""
     candidates: int = field(default=0, init=False)
     """Grasps decoded in the last call, those below a table included."""
+    predicted_points: Float[Tensor, "n n_hand 3"] | None = field(default=None, init=False)
+    """Hand points as multilaterated in the last call [m], in the order of its grasps; the solved hand differs."""
 
     def __post_init__(self) -> None:
         """Load the weights once."""
@@ -117,7 +122,9 @@ class GraspPredictor:
             )
         with _timed(self.timings, "rank"):
             scored = found.replace(score=score_grasps(hand, obj, found))
-        return scored.sorted_by_score()
+        ranked = scored.sorted_by_score()
+        self.predicted_points = ranked.extra[PREDICTED].unflatten(1, (-1, 3))
+        return ranked.replace(extra={k: v for k, v in ranked.extra.items() if k != PREDICTED})
 
     def _sample(
         self,
@@ -137,7 +144,7 @@ class GraspPredictor:
             T_object_wrist = self._placements(small, points, num, direction, generator)
             joints = small.random_open_joints(num, generator)
             latent = network.sample_latent(num, generator)
-        poses, solved = [], []
+        poses, solved, predicted = [], [], []
         for start in range(0, num, self.config.batch_size):
             part = slice(start, min(start + self.config.batch_size, num))
             with _timed(self.timings, "network"):
@@ -149,6 +156,7 @@ class GraspPredictor:
                 solution = distance_matrix.solve(small, links, joints[part])
             poses.append(solution.T_world_wrist)
             solved.append(solution.joints)
+            predicted.append(links.points.flatten(1))
             if progress is not None:
                 progress(part.stop, num)
         T, q = torch.cat(poses), torch.cat(solved)
@@ -156,6 +164,7 @@ class GraspPredictor:
         return GraspBatch.create(
             hand, obj, T, q, pregrasp_joints=pregrasp, squeeze_joints=squeeze,
             seed=torch.full((num,), seed, dtype=torch.int64), provenance=(f"network {self.weights_name}",) * num,
+            extra={PREDICTED: torch.cat(predicted)},
         )
 
     def _placements(
@@ -242,7 +251,7 @@ def check_request(num: int, direction: tuple[float, float, float] | None) -> Non
             )
 
 
-class _timed:  # noqa: N801
+class _timed:
     """Adds the time spent in a block to a dictionary entry."""
 
     def __init__(self, timings: dict[str, float], key: str) -> None:

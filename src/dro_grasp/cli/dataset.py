@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from dro_grasp.cli.output import print_json, print_table, stderr
+from dro_grasp.cli.output import print_json, print_table, say_aside
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class BundleCommand:
         kept = [b[[i for i, s in enumerate(b.split) if s in TRAINING_SPLITS]] for b in batches]
         left_out = sum(map(len, batches)) - sum(map(len, kept))
         if left_out:
-            stderr.print(f"{left_out} grasps of held-out objects are left out")
+            say_aside(f"{left_out} grasps of held-out objects are left out")
         kept = [b for b in kept if len(b)]
         hands = [load_hand(name) for name in dict.fromkeys(b.hand for b in kept)]
         clouds = {}

@@ -6,11 +6,11 @@ import time
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 
-from dro_grasp.cli.output import print_json, print_table, progress_bar
+from dro_grasp.cli.output import load_grasps, optional, print_json, print_table, progress_bar
 
 
 @dataclass(frozen=True)
@@ -26,13 +26,13 @@ class Evaluate:
     """The trial."""
     friction: float = 1.0
     """Friction coefficient between hand and object; the official release has 3."""
-    hand: str | None = None
+    hand: Annotated[str | None, optional("NAME|PATH", "the name in the file")] = None
     """Hand to use, where the name in the file is not one that can be found here."""
-    object: str | None = None
+    object: Annotated[str | None, optional("NAME|PATH", "the names in the file")] = None
     """Mesh to use, likewise, for a file with one object."""
     scale: float = 1.0
     """Scale of the object's file."""
-    output: Path | None = None
+    output: Annotated[Path | None, optional("PATH", "not saved")] = None
     """Save the grasps with their results."""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print one JSON object instead of a table."""
@@ -54,7 +54,7 @@ class Evaluate:
         if self.output is not None:
             check_output(self.output)
         begin = time.perf_counter()
-        grasps = GraspBatch.load(self.file)
+        grasps = load_grasps(self.file)
         hand = load_hand(self.hand or grasps.hand)
         rules = dataclasses.replace(protocol(self.protocol), friction=self.friction)
         rows, tried, reasons = [], [], Counter()
@@ -85,6 +85,7 @@ class Evaluate:
         if self.json:
             print_json(report)
             return 0
-        note = f"{success} of {len(grasps)} succeeded: {success / max(1, len(grasps)):.1%} (95 %: {low:.1%} to {high:.1%})"
+        rate = success / max(1, len(grasps))
+        note = f"{success} of {len(grasps)} succeeded: {rate:.1%} (95 %: {low:.1%} to {high:.1%})"
         print_table(f"{hand.name}, protocol {rules.label}", ["object", "grasps", "success", "rate"], rows, note=note)
         return 0

@@ -5,13 +5,15 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from dro_grasp.cli.output import print_json, print_table, progress_bar, stderr, stdout
+from dro_grasp.cli.output import optional, print_json, print_table, progress_bar, say, say_aside
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.hands.hand import Hand
     from dro_grasp.objects.shape import ObjectModel
@@ -38,22 +40,25 @@ class Generate:
     """How many grasps of each object."""
     seed: int = 0
     """The same seed gives the same grasps."""
-    direction: tuple[float, float, float] | None = None
+    direction: Annotated[tuple[float, float, float] | None, optional("X Y Z", "any direction")] = None
     """Palm direction in the object's frame: 0 0 -1 grasps from above."""
-    table: float | None = None
+    table: Annotated[float | None, optional("Z", "no table")] = None
     """Height [m] of a table in the object's frame; no hand goes below it."""
     scale: float = 1.0
     """Multiplies the object's coordinates; 0.001 for files in millimetres."""
-    weights: str | None = None
+    weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Name of shipped weights (see `dro-grasp weights`) or the path of a weights file."""
-    protocol: Literal["dro", "strict", "dro_static", "none"] | None = None
-    """Trial that each grasp goes through; by default dro for a mesh and none for a bare point cloud."""
+    protocol: Annotated[
+        Literal["dro", "strict", "dro_static", "none"] | None,
+        optional("{dro,strict,dro_static,none}", "dro for a mesh, none for a bare point cloud"),
+    ] = None
+    """Trial that each grasp goes through."""
     only_successful: Flag = False
     """Save only the grasps that passed; the success rate still counts all."""
-    output: Path | None = None
-    """Parquet file for the grasps; with a folder of objects, one file an object in this folder."""
-    picture: Path | None = None
-    """PNG with pictures of the best grasps."""
+    output: Annotated[Path | None, optional("PATH", "not saved")] = None
+    """Parquet file for the grasps; with a folder of objects, an existing folder that gets one file an object."""
+    picture: Annotated[Path | None, optional("PNG", "no picture")] = None
+    """Picture of the best grasps; with a folder of objects, an existing folder."""
     view: Flag = False
     """Open the viewer on the result."""
     json: Flag = False
@@ -61,35 +66,34 @@ class Generate:
 
     def run(self) -> int:
         """Check everything that can be checked before the work, then do it."""
-        from dro_grasp.grasps.batch import check_output
+        from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.library import resolve_objects
         from dro_grasp.predictor import GraspPredictor, check_request
 
         check_request(self.num, self.direction)
+        check_seed(self.seed)
         names = resolve_objects([self.object])
-        outputs = self._outputs(names)
-        for path in [*outputs, self.picture]:
-            if path is not None:
-                check_output(path)
+        several = names != [self.object]
+        outputs = paths_per_object(self.output, names, several, ".parquet")
+        pictures = paths_per_object(self.picture, names, several, ".png")
         begin = time.perf_counter()
-        hand = _load_hand(self.hand)
+        hand = load_hand(self.hand)
         predictor = GraspPredictor(self.weights)
         load = time.perf_counter() - begin
-        reports = [
-            self._one(predictor, hand, name, path, load) for name, path in zip(names, outputs, strict=True)
-        ]
+        jobs = zip(names, outputs, pictures, strict=True)
+        done = [self._one(predictor, hand, name, output, picture, load) for name, output, picture in jobs]
         if self.json:
-            print_json(reports[0] if len(reports) == 1 else {"results": reports})
+            print_json({"results": [d.report for d in done]} if several else done[0].report)
+        if self.view:
+            from dro_grasp.viewer.app import view_grasps
+
+            for d in done:
+                view_grasps(hand, d.obj, d.grasps, d.predicted_points)
         return 0
 
-    def _outputs(self, names: list[str]) -> list[Path | None]:
-        if self.output is None or len(names) == 1:
-            return [self.output] * len(names)
-        return [self.output / f"{Path(name).stem}.parquet" for name in names]
-
     def _one(
-        self, predictor: GraspPredictor, hand: Hand, name: str, output: Path | None, load: float
-    ) -> dict[str, Any]:
+        self, predictor: GraspPredictor, hand: Hand, name: str, output: Path | None, picture: Path | None, load: float
+    ) -> Done:
         """One object, start to end."""
         from dro_grasp.objects.library import load_object
 
@@ -97,34 +101,35 @@ class Generate:
         obj = load_object(name, scale=self.scale)
         load += time.perf_counter() - begin
         for note in obj.notes:
-            stderr.print(f"{obj.name}: {note}")
+            say_aside(f"{obj.name}: {note}")
         with progress_bar("predicting", self.json) as progress:
             grasps = predictor.predict(hand, obj, self.num, self.seed, self.direction, self.table, progress)
-        timings = dict(predictor.timings)
+        points, timings = predictor.predicted_points, dict(predictor.timings)
         begin = time.perf_counter()
         result, protocol = self._try(hand, obj, grasps)
         grasps = grasps if result is None else grasps.with_trial(result)
         seconds = {"load": load, **timings, "trial": time.perf_counter() - begin if result is not None else 0.0}
-        kept = grasps if result is None or not self.only_successful else grasps[result.success]
-        if output is not None:
-            kept.save(output)
-        if self.picture is not None:
-            self._draw(hand, obj, kept if len(kept) else grasps)
-        success = None if result is None else int(result.success.sum())
         report = {
             "hand": hand.name, "object": obj.name, "num": len(grasps), "candidates": predictor.candidates,
-            "seed": self.seed, "weights": predictor.weights_name, "protocol": protocol, "success": success,
-            "success_rate": None if success is None else success / len(grasps),
+            "seed": self.seed, "weights": predictor.weights_name, "protocol": protocol,
+            "success": None if result is None else int(result.success.sum()),
+            "success_rate": None if result is None else result.success_rate,
             "seconds": {k: round(v, 4) for k, v in seconds.items()},
             "output": None if output is None else str(output),
         }
+        kept = grasps
+        if result is not None and self.only_successful:
+            kept, points = grasps[result.success], None if points is None else points[result.success]
+        if output is not None:
+            kept.save(output)
+        if picture is not None:
+            from dro_grasp.viewer.pictures import draw_grasps
+
+            report["picture"] = str(picture)
+            draw_grasps(hand, obj, kept if len(kept) else grasps, picture)
         if not self.json:
             self._show(report, grasps, result)
-        if self.view:
-            from dro_grasp.viewer.app import view_grasps
-
-            view_grasps(hand, obj, kept)
-        return report
+        return Done(report, obj, kept, points)
 
     def _try(self, hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> tuple[TrialResult | None, str]:
         protocol = self.protocol or ("none" if obj.is_cloud else "dro")
@@ -135,12 +140,6 @@ class Generate:
         with progress_bar("trying", self.json) as progress:
             result = simulate(hand, obj, grasps, protocol, progress=progress)
         return result, protocol
-
-    def _draw(self, hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> None:
-        from dro_grasp.viewer.pictures import draw_grasps
-
-        assert self.picture is not None
-        draw_grasps(hand, obj, grasps, self.picture)
 
     def _show(self, report: dict[str, Any], grasps: GraspBatch, result: TrialResult | None) -> None:
         rows = []
@@ -154,14 +153,45 @@ class Generate:
         seconds = "  ".join(f"{k} {v:.2f} s" for k, v in report["seconds"].items())
         print_table(f"{report['hand']} on {report['object']}", columns, rows, note=seconds)
         if result is not None:
-            stdout.print(f"{report['success']} of {report['num']} grasps succeeded under protocol {report['protocol']}")
-        if report["output"]:
-            stdout.print(f"grasps: {report['output']}")
-        if self.picture is not None:
-            stdout.print(f"picture: {self.picture}")
+            say(f"{report['success']} of {report['num']} grasps succeeded under protocol {report['protocol']}")
+        for what, key in (("grasps", "output"), ("picture", "picture")):
+            if report.get(key):
+                say(f"{what}: {report[key]}")
 
 
-def _load_hand(name: str) -> Hand:
-    from dro_grasp.hands.library import load_hand
+@dataclass(frozen=True)
+class Done:
+    """What one object led to."""
 
-    return load_hand(name)
+    report: dict[str, Any]
+    """The JSON object."""
+    obj: ObjectModel
+    grasps: GraspBatch
+    """The grasps that were kept."""
+    predicted_points: Tensor | None
+    """Their hand points as the network placed them."""
+
+
+def check_seed(seed: int) -> None:
+    """Refuse seeds that the random generators cannot take."""
+    from dro_grasp.errors import OptionError
+
+    if not 0 <= seed < 2**63:
+        raise OptionError(f"seed is {seed}; give an integer from 0 to 2^63 - 1")
+
+
+def paths_per_object(path: Path | None, names: list[str], several: bool, suffix: str) -> list[Path | None]:
+    """Where each object's file goes, checked before the work: the path itself, or files in the folder that it names."""
+    from dro_grasp.errors import OutputError
+    from dro_grasp.grasps.batch import check_output
+
+    if path is None:
+        return [None] * len(names)
+    if not several:
+        return [check_output(path)]
+    if not path.is_dir():
+        raise OutputError(f"{path} is no folder; for {len(names)} objects name an existing one (mkdir -p {path})")
+    stems = [Path(name).stem for name in names]
+    # mug.obj and mug.ply would overwrite each other's results.
+    labels = [Path(n).name.replace(".", "_") if stems.count(s) > 1 else s for n, s in zip(names, stems, strict=True)]
+    return [check_output(path / f"{label}{suffix}") for label in labels]

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from dro_grasp.cli.listing import Hands
-from dro_grasp.cli.output import print_json, stdout
+from dro_grasp.cli.output import optional, print_json, say
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Check:
 
     hand: tyro.conf.Positional[str]
     """A hand's name or the path of its URDF or MJCF file."""
-    picture: Path | None = None
+    picture: Annotated[Path | None, optional("PNG", "none")] = None
     """PNG of the hand open and closed, with palm direction and contact links."""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print one JSON object instead of text."""
@@ -40,9 +40,9 @@ class Check:
             print_json({**report.to_dict(), "picture": None if self.picture is None else str(self.picture)})
             return 0
         for line in report.lines():
-            stdout.print(line)
+            say(line)
         if self.picture is not None:
-            stdout.print(f"picture: {self.picture}")
+            say(f"picture: {self.picture}")
         return 0
 
 

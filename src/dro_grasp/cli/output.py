@@ -6,14 +6,34 @@ import json
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-stdout = Console(highlight=False)
-stderr = Console(stderr=True, highlight=False)
+if TYPE_CHECKING:
+    from dro_grasp.grasps.batch import GraspBatch
+
+stdout = Console(highlight=False, markup=False)
+stderr = Console(stderr=True, highlight=False, markup=False)
+
+
+def say(text: str) -> None:
+    """One line on stdout, never broken: paths stay whole."""
+    stdout.print(text, soft_wrap=True)
+
+
+def say_aside(text: str) -> None:
+    """One line on stderr, never broken."""
+    stderr.print(text, soft_wrap=True)
+
+
+def optional(metavar: str, default: str) -> Any:
+    """How an option that may be left out is listed in --help, with what happens then."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})")
 
 
 def print_json(values: dict[str, Any]) -> None:
@@ -61,3 +81,18 @@ def progress_bar(title: str, quiet: bool) -> Iterator[Callable[[int, int], None]
     with Progress(*columns, console=stderr, transient=True) as bar:
         task = bar.add_task(title, total=None)
         yield lambda done, wanted: bar.update(task, completed=done, total=wanted)
+
+
+def load_grasps(path: Path) -> GraspBatch:
+    """A grasp file with at least one grasp in it.
+
+    Raises:
+        GraspFileError: No such file, a foreign one, or an empty one.
+    """
+    from dro_grasp.errors import GraspFileError
+    from dro_grasp.grasps.batch import GraspBatch
+
+    grasps = GraspBatch.load(path)
+    if len(grasps) == 0:
+        raise GraspFileError(f"{path} holds no grasp; generate again, perhaps without --only-successful")
+    return grasps

@@ -8,7 +8,7 @@ from typing import Literal
 
 import tyro
 
-from dro_grasp.cli.output import print_json, print_table, stderr
+from dro_grasp.cli.output import print_json, print_table, say_aside
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Synthesize:
         objects = resolve_objects(list(self.object))
         report = synthesize_dataset(
             self.hand, objects, self.grasps, self.output, workers=self.workers, seed=self.seed, protocol=self.protocol,
-            progress=lambda line: stderr.print(line),
+            progress=say_aside,
         )
         failures = [{"hand": h, "object": o, "reason": why} for (h, o), why in report.failures.items()]
         values = {"output": str(self.output), "grasps": report.grasps, "added": report.added, "shards": report.shards,
@@ -57,5 +57,5 @@ class Synthesize:
         print_table("synthesis", ["grasps", "added", "shards", "seconds"],
                     [[report.grasps, report.added, report.shards, report.seconds]])
         for failure in failures:
-            stderr.print(f"{failure['hand']} on {failure['object']}: {failure['reason']}")
+            say_aside(f"{failure['hand']} on {failure['object']}: {failure['reason']}")
         return 0

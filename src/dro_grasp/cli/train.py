@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from dro_grasp.cli.output import print_json, print_table
+from dro_grasp.cli.output import optional, print_json, print_table
 
 if TYPE_CHECKING:
     from dro_grasp.models.network import NetworkConfig
@@ -86,7 +86,7 @@ class Train:
     """Folder for log and checkpoints; a run in it is taken up. Its parent must exist."""
     output: Path
     """Weights file to write."""
-    pretrained: str | None = None
+    pretrained: Annotated[str | None, optional("PATH", "none")] = None
     """Weights from `dro-grasp pretrain`; without them the hand encoder is trained along."""
     size: Literal["slim", "paper"] = "slim"
     """Network size."""

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
-from dro_grasp.cli.output import stdout
+from dro_grasp.cli.output import load_grasps, optional, say
 
 
 @dataclass(frozen=True)
@@ -19,26 +20,26 @@ class View:
 
     file: tyro.conf.Positional[Path]
     """Grasp file."""
-    hand: str | None = None
+    hand: Annotated[str | None, optional("NAME|PATH", "the name in the file")] = None
     """Hand to use, where the name in the file is not one that can be found here."""
-    object: str | None = None
+    object: Annotated[str | None, optional("NAME|PATH", "the names in the file")] = None
     """Object to look at: a name in the file, or the mesh to use for its only object."""
     scale: float = 1.0
     """Scale of the object's file."""
     port: int = 8080
     """Port on localhost; the next free one is taken."""
-    picture: Path | None = None
+    picture: Annotated[Path | None, optional("PNG", "none")] = None
     """Write a PNG instead of opening the viewer."""
 
     def run(self) -> int:
         """Load the file and show the grasps of one object."""
-        from dro_grasp.grasps.batch import GraspBatch, check_output
+        from dro_grasp.grasps.batch import check_output
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.library import load_object
 
         if self.picture is not None:
             check_output(self.picture)
-        grasps = GraspBatch.load(self.file)
+        grasps = load_grasps(self.file)
         hand = load_hand(self.hand or grasps.hand)
         name = self.object if self.object in grasps.object else grasps.object[0]
         chosen = grasps[[i for i, o in enumerate(grasps.object) if o == name]]
@@ -47,7 +48,7 @@ class View:
             from dro_grasp.viewer.pictures import draw_grasps
 
             draw_grasps(hand, obj, chosen, self.picture)
-            stdout.print(f"picture: {self.picture}")
+            say(f"picture: {self.picture}")
             return 0
         from dro_grasp.viewer.app import view_grasps
 

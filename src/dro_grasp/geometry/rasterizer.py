@@ -209,7 +209,7 @@ def _project(
 ) -> tuple[Float[np.ndarray, "f 3 3"], Bool[np.ndarray, " f"]]:
     """Pixel coordinates with inverse depth of the corners, and which triangles lie before the camera."""
     depth = -corners[..., 2]
-    keep = (depth > NEAR).all(1)
+    keep = np.asarray((depth > NEAR).all(1))
     focal = h / 2 / np.tan(camera.field_of_view / 2)
     inverse = 1 / np.maximum(depth, NEAR)
     x = w / 2 + focal * corners[..., 0] * inverse

@@ -24,9 +24,14 @@ __all__ = ["GraspBatch", "check_output"]
 class HandIdentity(Protocol):
     """What a batch records of a hand; every Hand has it."""
 
-    name: str
-    sha256: str
-    tree: Any
+    @property
+    def name(self) -> str: ...  # noqa: D102
+
+    @property
+    def sha256(self) -> str: ...  # noqa: D102
+
+    @property
+    def tree(self) -> Any: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
