@@ -20,8 +20,9 @@ class ControllerConfig:
 
     outer: float = 0.25
     """Share of the remaining range by which the pregrasp opens. Source: official release."""
-    inner: float = 0.15
-    """Share of the remaining range by which the squeeze closes. Source: official release."""
+    inner: float = 0.30
+    """Share of the remaining range by which the squeeze closes."""
+    # Differs from the paper's release (0.15), which leaves small objects without contact; the controls gain as well.
     dead_zone: float = 1e-3
     """Joints whose downstream points approach the object's centre by less stay [m/rad]."""
 
@@ -74,5 +75,5 @@ def distance_slope(
     direction = offset / offset.norm(dim=-1, keepdim=True).clamp(min=1e-9)
     jacobian = tree.point_jacobian(poses, points, links)
     rate = (direction[..., None] * jacobian).sum(-2)
-    moved = ((tree.descends[links].float() @ tree.link_coupling.abs()) > 0).float()
+    moved = ((tree.descends[links].to(rate.dtype) @ tree.link_coupling.abs().to(rate.dtype)) > 0).to(rate.dtype)
     return (rate * moved).sum(1) / moved.sum(0).clamp(min=1)

@@ -73,6 +73,7 @@ class NetworkConfig:
             n_hand=160, n_object=128, width=128, encoder_widths=(32, 32, 64, 128), neighbours=16,
             attention_hidden=256, latent=64, latent_widths=(32, 32, 64), latent_head=(128, 128), latent_neighbours=12,
             kernel_hidden=(128, 64), frame="wrist", placed=True, residual=True,
+            placement_temperature=0.3,
         )
 
     @staticmethod
