@@ -165,7 +165,7 @@ def random_step_problem(seed: int):
 
 
 def step_objective(jacobian, residual, weights, step) -> float:
-    return float((np.linalg.norm((residual + step @ jacobian).reshape(-1, 3), axis=1) * weights).sum())
+    return float((np.linalg.norm((residual + step @ jacobian).reshape(3, -1), axis=0) * weights).sum())
 
 
 @pytest.mark.parametrize("sharpness", [None, 0.8])
@@ -180,8 +180,8 @@ def test_one_step_reaches_the_objective_of_cvxpy(sharpness):
     for i in range(4):
         j, r, w = jacobian[i].numpy(), residual[i].numpy(), weights[i].numpy()
         x = cp.Variable(9)
-        left = cp.reshape(r + j.T @ x, (10, 3), order="C")
-        cost = cp.sum(cp.multiply(w, cp.norm(left, axis=1)))
+        left = cp.reshape(r + j.T @ x, (3, 10), order="C")
+        cost = cp.sum(cp.multiply(w, cp.norm(left, axis=0)))
         best = cp.Problem(cp.Minimize(cost), [x >= lower[i].numpy(), x <= upper[i].numpy()]).solve(solver=cp.CLARABEL)
         np.testing.assert_allclose(step_objective(j, r, w, steps[i].numpy()), best, rtol=1e-4)
 

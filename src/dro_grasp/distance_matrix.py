@@ -42,6 +42,10 @@ class LinkPoses:
     points: Float[Tensor, "*b n_hand 3"]
     """The multilaterated hand cloud [m]."""
 
+    def to(self, device: torch.device | str) -> LinkPoses:
+        """The same on another device."""
+        return LinkPoses(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+
 
 @dataclass(frozen=True)
 class _Segments:
@@ -155,9 +159,10 @@ def solve(
         q_start: The open hand that the network saw; the canonical one by default [rad or m].
         config: See JointSolverConfig.
     """
+    link_poses = link_poses.to(hand.tree.origin.device)
     positions, links, local = targets(hand, link_poses)
     batch = positions.shape[:-2]
-    given = hand.canonical_joints() if q_start is None else q_start
+    given = hand.canonical_joints() if q_start is None else q_start.to(positions.device)
     given = torch.where(hand.movable, given, hand.rest).expand(*batch, -1)
     read = read_joints(hand.tree, link_poses.T_world_link, link_poses.valid, given)
     read = torch.where(hand.movable, read, given)

@@ -5,6 +5,8 @@ Source: paper section III-D, 6D pose estimation of links.
 
 from __future__ import annotations
 
+from typing import Any
+
 import roma
 import torch
 from jaxtyping import Float
@@ -37,9 +39,8 @@ def register(
         share = weights / weights.sum(-1, keepdim=True)
         centred = source - (share[..., None] * source).sum(-2, keepdim=True)
         size = (share * centred.square().sum(-1)).sum(-1).sqrt().clamp(min=1e-6)[..., None]
-    rotation, shift = roma.rigid_points_registration(
-        source / size[..., None], target / size[..., None], weights=share)
-    shift = shift * size
+    motion: Any = roma.rigid_points_registration(source / size[..., None], target / size[..., None], weights=share)
+    rotation, shift = motion[0], motion[1] * size
     error = target - source @ rotation.mT - shift[..., None, :]
     # The root has an infinite slope at zero error: the floor is far below a micrometre.
     residual = ((error.square().sum(-1) * share).sum(-1) + 1e-16).sqrt()

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
-from dro_grasp.kinematics.joint_step import StepConfig, best_step, smoothed_norms
+from dro_grasp.kinematics.joint_step import StepConfig, best_step, point_norms, smoothed_norms
 from dro_grasp.kinematics.tree import KinematicTree
 
 
@@ -32,10 +32,9 @@ class JointSolverConfig:
     """Largest change of a joint or of a wrist coordinate per iteration [rad or m]. Source: section III-D."""
     tolerance: float = 2e-5
     """A grasp is done when no coordinate changes by more than this [rad or m]."""
-    objective_tolerance: float = 1e-4
-    """A grasp is also done when `patience` steps in a row lower the objective by a smaller share than this."""
-    patience: int = 2
-    """See objective_tolerance."""
+    objective_tolerance: float = 5e-4
+    """A grasp is also done when a step lowers the objective, but by a smaller share than this, or when two steps in a
+    row fail to lower it."""
     damping: float = 1e-2
     """First damping, relative to the normal equations' mean weight times a square centimetre."""
     damping_range: tuple[float, float] = (1e-6, 1e8)
@@ -71,7 +70,7 @@ class _Problem:
     tree: KinematicTree
     links: Int[Tensor, " t"]
     points: Float[Tensor, "t 3"]
-    drive: Float[Tensor, "t pairs"]
+    drive: Float[Tensor, "pairs k"]
     """Change of a link's own joint per unit of a dof, where the joint lies above the target's link, else zero."""
     pair_link: Int[Tensor, " pairs"]
     pair_dof: Float[Tensor, "n_dof pairs"] | None
@@ -98,7 +97,7 @@ class _State:
     damping: Float[Tensor, " b"]
     sharpness: Float[Tensor, " b"]
     stalled: Int[Tensor, " b"]
-    """Steps in a row that hardly lowered the objective."""
+    """Since the last real gain: 2 for each step that gained little, 1 for each that was undone."""
 
     def rows(self, index: Tensor) -> _State:
         """Some of the grasps."""
@@ -108,6 +107,28 @@ class _State:
         """This state where the mask holds, the other elsewhere."""
         pairs = ((getattr(self, name), getattr(other, name)) for name in self.__dataclass_fields__)
         return _State(*(torch.where(mask.view(-1, *[1] * (a.ndim - 1)), a, b) for a, b in pairs))
+
+
+@dataclass(frozen=True)
+class _Result:
+    """Filled row by row as grasps finish."""
+
+    T: Float[Tensor, "b 4 4"]
+    q: Float[Tensor, "b n_dof"]
+    residual: Float[Tensor, "b k"]
+    converged: Bool[Tensor, " b"]
+    iterations: Int[Tensor, " b"]
+
+    @staticmethod
+    def empty(state: _State) -> _Result:
+        """Room for the results of these grasps, as if no step were taken."""
+        none = torch.zeros_like(state.stalled)
+        return _Result(state.T.clone(), state.q.clone(), state.residual.clone(), none.bool(), none)
+
+    def put(self, rows: Int[Tensor, " r"], state: _State, converged: Bool[Tensor, " r"], iterations: int) -> None:
+        """Store finished grasps."""
+        self.T[rows], self.q[rows], self.residual[rows] = state.T, state.q, state.residual
+        self.converged[rows], self.iterations[rows] = converged, iterations
 
 
 @torch.no_grad()
@@ -160,38 +181,32 @@ def solve_joints(
     )
     T = T_world_wrist.reshape(-1, 4, 4).double()
     start = _state(problem, T, torch.minimum(torch.maximum(q, low), high), config)
-    final, converged, iterations = _iterate(problem, start, config)
+    final = _iterate(problem, start, config)
     total = problem.weights.sum(-1).clamp(min=1e-12)
-    residual = (final.residual.unflatten(-1, (t, 3)).norm(dim=-1) * problem.weights).sum(-1) / total
+    residual = (point_norms(final.residual) * problem.weights).sum(-1) / total
     # Rounding to single precision may step over a limit by half a unit: clamp once more.
     joints = torch.minimum(torch.maximum(final.q.to(dtype), low.to(dtype)), high.to(dtype))
     return JointSolution(
         _orthonormal(final.T).to(dtype).reshape(*batch, 4, 4), joints.reshape(*batch, tree.n_dof),
-        residual.to(dtype).reshape(batch), converged.reshape(batch), iterations.reshape(batch),
+        residual.to(dtype).reshape(batch), final.converged.reshape(batch), final.iterations.reshape(batch),
     )
 
 
-def _iterate(
-    problem: _Problem, start: _State, config: JointSolverConfig
-) -> tuple[_State, Bool[Tensor, " b"], Int[Tensor, " b"]]:
+def _iterate(problem: _Problem, state: _State, config: JointSolverConfig) -> _Result:
     """Iterate until every grasp is done; the rows of finished grasps leave the computation."""
-    n = len(start.q)
-    final = _State(*(getattr(start, name).clone() for name in start.__dataclass_fields__))
-    converged = torch.zeros(n, dtype=torch.bool, device=start.q.device)
-    iterations = torch.zeros(n, dtype=torch.int64, device=start.q.device)
-    rows, state = torch.arange(n, device=start.q.device), start
-    for _ in range(config.max_iterations):
+    result = _Result.empty(state)
+    rows = torch.arange(len(state.q), device=state.q.device)
+    for iteration in range(1, config.max_iterations + 1):
+        state, change = _advance(problem, state, config)
+        done = (change < config.tolerance) | (state.stalled >= 2)
+        last = iteration == config.max_iterations
+        if last or bool(done.any()):
+            leaving = torch.ones_like(done) if last else done
+            result.put(rows[leaving], state.rows(leaving), done[leaving], iteration)
+            problem, state, rows = problem.rows(~leaving), state.rows(~leaving), rows[~leaving]
         if len(rows) == 0:
             break
-        state, change = _advance(problem, state, config)
-        iterations[rows] += 1
-        done = (change < config.tolerance) | (state.stalled >= config.patience)
-        converged[rows] = done
-        for name in state.__dataclass_fields__:
-            getattr(final, name)[rows] = getattr(state, name)
-        if bool(done.any()):
-            problem, state, rows = problem.rows(~done), state.rows(~done), rows[~done]
-    return final, converged, iterations
+    return result
 
 
 def _advance(problem: _Problem, state: _State, config: JointSolverConfig) -> tuple[_State, Float[Tensor, " b"]]:
@@ -212,7 +227,7 @@ def _advance(problem: _Problem, state: _State, config: JointSolverConfig) -> tup
     damping = torch.where(better, state.damping / 8, state.damping * 16).clamp(*config.damping_range)
     sharpness = torch.where(better & (change < config.sharpen_below), config.sharpness, 0.0).to(damping)
     little = tried.cost > state.cost * (1 - config.objective_tolerance)
-    stalled = torch.where(little, state.stalled + 1, 0)
+    stalled = torch.where(little, state.stalled + 1 + better.long(), 0)
     return replace(tried.where(better, state), damping=damping, sharpness=sharpness, stalled=stalled), change
 
 
@@ -229,7 +244,7 @@ def _problem(
 ) -> _Problem:
     coupling = tree.link_coupling
     pair_link, dof = coupling.nonzero(as_tuple=True)
-    drive = tree.descends[links][:, pair_link].to(coupling.dtype) * coupling[pair_link, dof]
+    drive = (tree.descends[links][:, pair_link].to(coupling.dtype) * coupling[pair_link, dof]).T.repeat(1, 3)
     gather = torch.zeros(tree.n_dof, len(dof), dtype=coupling.dtype, device=coupling.device)
     gather[dof, torch.arange(len(dof), device=dof.device)] = 1
     same = gather.shape[0] == gather.shape[1] and bool((gather.diagonal() == 1).all())
@@ -244,7 +259,7 @@ def _state(
     chosen = poses[:, problem.links]
     points = (chosen[..., :3, :3] @ problem.points[..., None])[..., 0] + chosen[..., :3, 3]
     wanted = (problem.targets - T[:, None, :3, 3]) @ T[:, :3, :3]
-    residual = (points - wanted).flatten(1)
+    residual = (points - wanted).mT.flatten(1)
     cost = (smoothed_norms(residual, config.step.norm_floor) * problem.weights).sum(-1)
     damping = torch.full_like(cost, config.damping)
     none = torch.zeros_like(cost)
@@ -262,10 +277,10 @@ def _jacobian(
     zero, one = torch.zeros_like(points[..., 0]), torch.ones_like(points[..., 0])
     x, y, z = points.unbind(-1)
     rows = [one, zero, zero, zero, one, zero, zero, zero, one, zero, -z, y, z, zero, -x, -y, x, zero]
-    twist = torch.stack(rows, 1).unflatten(1, (6, 3)).transpose(2, 3).flatten(2)
+    twist = torch.stack(rows, 1).unflatten(1, (6, 3)).flatten(2)
     linear, angular = problem.tree.motion_axes(poses)
     axes = torch.cat([linear, angular], -1)[:, problem.pair_link]
-    joints = (axes @ twist) * problem.drive.T.repeat_interleave(3, -1)
+    joints = (axes @ twist) * problem.drive
     if problem.pair_dof is not None:
         joints = problem.pair_dof @ joints
     return torch.cat([twist, joints], 1)

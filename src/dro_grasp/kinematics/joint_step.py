@@ -39,6 +39,10 @@ class _Quadratic:
     lower: Float[Tensor, "b p"]
     upper: Float[Tensor, "b p"]
 
+    def rows(self, index: Tensor) -> _Quadratic:
+        """Some of the problems."""
+        return _Quadratic(self.matrix[index], self.gradient[index], self.lower[index], self.upper[index])
+
 
 def best_step(
     jacobian: Float[Tensor, "b p k"],
@@ -53,8 +57,8 @@ def best_step(
     """The step that brings all points closest to their targets, to first order.
 
     Args:
-        jacobian: Transposed derivative of the k = 3 t coordinates by the p unknowns.
-        residual: Coordinates minus targets [m].
+        jacobian: Transposed derivative of the k = 3 t coordinates (x of all targets, then y, then z) by p unknowns.
+        residual: Coordinates minus targets, likewise [m].
         weights: Weight of each of the t targets.
         lower: Smallest allowed step, at most 0.
         upper: Largest allowed step, at least 0.
@@ -63,13 +67,13 @@ def best_step(
         config: See StepConfig.
     """
     config = config or StepConfig()
-    ridge = damping[:, None] * torch.ones_like(lower)
     step = torch.zeros_like(lower)
     held: tuple[Bool[Tensor, "b p"], Bool[Tensor, "b p"]] | None = None
-    for _ in range(config.reweightings):
-        matrix, gradient = _model(jacobian, residual + (step[:, None] @ jacobian)[:, 0], weights, sharpness, config)
-        matrix.diagonal(dim1=-2, dim2=-1).add_(ridge)
-        constant = gradient - ((matrix - torch.diag_embed(ridge)) @ step[..., None])[..., 0]
+    for i in range(config.reweightings):
+        left = residual + (step[:, None] @ jacobian)[:, 0] if i else residual
+        matrix, gradient = _model(jacobian, left, weights, sharpness, config)
+        constant = gradient - (matrix @ step[..., None])[..., 0] if i else gradient
+        matrix.diagonal(dim1=-2, dim2=-1).add_(damping[:, None])
         quadratic = _Quadratic(matrix, constant, lower, upper)
         step, held = _minimum_in_box(quadratic, held, config.active_set_passes)
     return step
@@ -80,48 +84,67 @@ def _model(
     sharpness: Float[Tensor, " b"] | None, config: StepConfig,
 ) -> tuple[Float[Tensor, "b p p"], Float[Tensor, "b p"]]:
     """Curvature and slope of the sum of norms where these residuals are left."""
-    vectors = left.unflatten(-1, (-1, 3))
-    norms = vectors.norm(dim=-1)
-    scale = weights / norms.clamp(min=config.norm_floor)
-    weighted = jacobian * scale.repeat_interleave(3, -1)[:, None]
-    matrix = weighted @ jacobian.mT
+    norms = point_norms(left)
+    floored = norms.clamp(min=config.norm_floor)
+    scale = weights / floored
+    weighted, plain = jacobian * scale.repeat(1, 3)[:, None], jacobian
     gradient = (weighted @ left[..., None])[..., 0]
     if sharpness is not None:
         # Below the floor the function is a parabola, whose curvature IRLS has exactly.
         share = torch.where(norms > config.norm_floor, sharpness[:, None] * scale, 0.0)
-        directions = vectors / norms.clamp(min=config.norm_floor)[..., None]
-        along = (jacobian.unflatten(-1, (-1, 3)) * directions[:, None]).sum(-1)
-        matrix = matrix - (along * share[:, None]) @ along.mT
-    return matrix, gradient
+        directions = left / floored.repeat(1, 3)
+        x, y, z = (jacobian * directions[:, None]).chunk(3, -1)
+        along = x + y + z
+        weighted, plain = torch.cat([weighted, -along * share[:, None]], -1), torch.cat([jacobian, along], -1)
+    return weighted @ plain.mT, gradient
+
+
+def point_norms(residual: Float[Tensor, "*b k"]) -> Float[Tensor, "*b t"]:
+    """Length of each point's residual [m]; the coordinates are x of all points, then y, then z."""
+    x, y, z = residual.square().chunk(3, -1)
+    return (x + y + z).sqrt()
 
 
 def smoothed_norms(residual: Float[Tensor, "*b k"], floor: float) -> Float[Tensor, "*b t"]:
     """Norms of the points' residuals as IRLS with a floor minimises them [m]."""
-    norms = residual.unflatten(-1, (-1, 3)).norm(dim=-1)
+    norms = point_norms(residual)
     return torch.where(norms > floor, norms, (norms.square() + floor**2) / (2 * floor))
 
 
 def _minimum_in_box(
     quadratic: _Quadratic, held: tuple[Tensor, Tensor] | None, passes: int
 ) -> tuple[Float[Tensor, "b p"], tuple[Bool[Tensor, "b p"], Bool[Tensor, "b p"]]]:
-    """Primal-dual active set: variables are held at a bound while the slope pushes them outwards."""
+    """Primal-dual active set: variables are held at a bound while the slope pushes them outwards.
+
+    Passes after the first one see only the rows whose active set has changed.
+    """
     lower, upper, gradient = quadratic.lower, quadratic.upper, quadratic.gradient
     frozen = lower >= upper
     if held is None:
         held = (lower >= 0) & (gradient > 0), (upper <= 0) & (gradient < 0)
     at_lower, at_upper = held[0] | frozen, held[1] & ~frozen
-    step = torch.zeros_like(lower)
-    for _ in range(passes):
-        step = _solve_free(quadratic, at_lower, at_upper)
-        slope = (quadratic.matrix @ step[..., None])[..., 0] + gradient
-        fixed = at_lower | at_upper
-        next_lower = torch.where(fixed, at_lower & (slope > 0), step < lower) | frozen
-        next_upper = torch.where(fixed, at_upper & (slope < 0), step > upper) & ~frozen
-        settled = bool((next_lower == at_lower).all()) and bool((next_upper == at_upper).all())
-        at_lower, at_upper = next_lower, next_upper
-        if settled:
+    step, at_lower, at_upper, changed = _pass(quadratic, at_lower, at_upper)
+    for _ in range(passes - 1):
+        rows = changed.nonzero()[:, 0]
+        if len(rows) == 0:
             break
+        again = _pass(quadratic.rows(rows), at_lower[rows], at_upper[rows])
+        step[rows], at_lower[rows], at_upper[rows], changed[rows] = again
     return torch.minimum(torch.maximum(step, lower), upper), (at_lower, at_upper)
+
+
+def _pass(
+    quadratic: _Quadratic, at_lower: Bool[Tensor, "b p"], at_upper: Bool[Tensor, "b p"]
+) -> tuple[Float[Tensor, "b p"], Bool[Tensor, "b p"], Bool[Tensor, "b p"], Bool[Tensor, " b"]]:
+    """The minimum for an active set, the active set that it suggests, and the rows in which that differs."""
+    step = _solve_free(quadratic, at_lower, at_upper)
+    slope = (quadratic.matrix @ step[..., None])[..., 0] + quadratic.gradient
+    frozen = quadratic.lower >= quadratic.upper
+    fixed = at_lower | at_upper
+    next_lower = torch.where(fixed, at_lower & (slope > 0), step < quadratic.lower) | frozen
+    next_upper = torch.where(fixed, at_upper & (slope < 0), step > quadratic.upper) & ~frozen
+    changed = ((next_lower != at_lower) | (next_upper != at_upper)).any(-1)
+    return step, next_lower, next_upper, changed
 
 
 def _solve_free(

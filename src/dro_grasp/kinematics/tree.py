@@ -75,16 +75,49 @@ class KinematicTree:
 
     @cached_property
     def _levels(self) -> tuple[tuple[Int[Tensor, " n"], Int[Tensor, " n"]], ...]:
-        """Per depth below the root: the links there, and their parents."""
+        """Per depth below the root: the links there, and where their parents stand in the level above."""
         depth = [0] * self.n_links
         for link, parent in enumerate(self.parent):
             depth[link] = 0 if parent < 0 else depth[parent] + 1
-        levels = [[i for i in range(self.n_links) if depth[i] == d] for d in range(1, max(depth) + 1)]
+        levels = [[i for i in range(self.n_links) if depth[i] == d] for d in range(max(depth) + 1)]
+        above = [[levels[d].index(self.parent[i]) for i in links] for d, links in enumerate(levels[1:])]
         device = self.origin.device
-        return tuple(
-            (torch.tensor(links, device=device), torch.tensor([self.parent[i] for i in links], device=device))
-            for links in levels
-        )
+        pairs = zip(levels[1:], above, strict=True)
+        return tuple((torch.tensor(links, device=device), torch.tensor(at, device=device)) for links, at in pairs)
+
+    @cached_property
+    def _level_order(self) -> Int[Tensor, " n_links"]:
+        """Where each link stands when the levels are joined."""
+        joined = torch.cat([self._roots, *[links for links, _ in self._levels]])
+        return joined.argsort()
+
+    @cached_property
+    def _roots(self) -> Int[Tensor, " n"]:
+        return torch.tensor([i for i, parent in enumerate(self.parent) if parent < 0], device=self.origin.device)
+
+    @cached_property
+    def _revolute(self) -> Bool[Tensor, " n_links"]:
+        return torch.tensor(self.kind, device=self.origin.device) == REVOLUTE
+
+    @cached_property
+    def _motion_basis(self) -> Float[Tensor, "4 n_links 4 4"]:
+        """Four constant matrices per link: the factors of 1, sin x, 1 - cos x and x in its own joint's motion.
+
+        Rodrigues' formula about an axis through the anchor, and a slide, are linear in these.
+        """
+        k = _skew(self.axis)
+        revolute, prismatic = self._revolute, torch.tensor(self.kind, device=self.axis.device) == PRISMATIC
+        basis = self.origin.new_zeros(4, self.n_links, 4, 4)
+        basis[0] = torch.eye(4)
+        basis[1, revolute, :3, :3], basis[2, revolute, :3, :3] = k[revolute], (k @ k)[revolute]
+        basis[1:3, :, :3, 3] = -(basis[1:3, :, :3, :3] @ self.anchor[..., None])[..., 0]
+        basis[3, prismatic, :3, 3] = self.axis[prismatic]
+        return basis
+
+    @cached_property
+    def _local_basis(self) -> Float[Tensor, "4 n_links 4 4"]:
+        """The same for T_parent_link."""
+        return self.origin @ self._motion_basis
 
     @cached_property
     def link_coupling(self) -> Float[Tensor, "n_links n_dof"]:
@@ -113,15 +146,13 @@ class KinematicTree:
 
     def joint_motion(self, q: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_links 4 4"]:
         """Motion of each link caused by its own joint, in the link's frame at joint value zero."""
-        x = q @ self.link_coupling.T + self.link_offset
-        revolute = torch.tensor(self.kind, device=q.device) == REVOLUTE
-        angle = torch.where(revolute, x, torch.zeros_like(x))[..., None, None]
-        k = _skew(self.axis)
-        eye = torch.eye(3, dtype=q.dtype, device=q.device)
-        rotation = eye + torch.sin(angle) * k + (1 - torch.cos(angle)) * (k @ k)
-        slide = torch.where(revolute, torch.zeros_like(x), x)[..., None] * self.axis
-        shift = slide + self.anchor - (rotation @ self.anchor[..., None])[..., 0]
-        return _assemble(rotation, shift)
+        return self._combine(self._motion_basis, q)
+
+    def _combine(
+        self, basis: Float[Tensor, "4 n_links 4 4"], q: Float[Tensor, "*batch n_dof"]
+    ) -> Float[Tensor, "*batch n_links 4 4"]:
+        x = (q @ self.link_coupling.T + self.link_offset)[..., None, None]
+        return basis[0] + torch.sin(x) * basis[1] + (1 - torch.cos(x)) * basis[2] + x * basis[3]
 
     def forward(self, q: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_links 4 4"]:
         """Pose of every link in the root link's frame, T_root_link.
@@ -129,11 +160,11 @@ class KinematicTree:
         Args:
             q: Values of the independent joints [rad or m].
         """
-        local = self.origin @ self.joint_motion(q)
-        poses = local.clone()
+        local = self._combine(self._local_basis, q)
+        levels = [local[..., self._roots, :, :]]
         for links, parents in self._levels:
-            poses[..., links, :, :] = poses[..., parents, :, :].clone() @ local[..., links, :, :]
-        return poses
+            levels.append(levels[-1][..., parents, :, :] @ local[..., links, :, :])
+        return torch.cat(levels, -3)[..., self._level_order, :, :]
 
     def motion_axes(
         self, T_world_link: Float[Tensor, "*batch n_links 4 4"]
@@ -145,9 +176,9 @@ class KinematicTree:
         rotation = T_world_link[..., :3, :3]
         axis = (rotation @ self.axis[..., None])[..., 0]
         anchor = (rotation @ self.anchor[..., None])[..., 0] + T_world_link[..., :3, 3]
-        revolute = (torch.tensor(self.kind, device=axis.device) == REVOLUTE)[:, None]
+        revolute = self._revolute[:, None]
         angular = torch.where(revolute, axis, torch.zeros_like(axis))
-        linear = torch.where(revolute, -torch.linalg.cross(axis, anchor), axis)
+        linear = torch.where(revolute, _cross(anchor, axis), axis)
         return linear, angular
 
     def point_jacobian(
@@ -178,7 +209,7 @@ def _skew(v: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
 
 
-def _assemble(rotation: Float[Tensor, "*batch 3 3"], shift: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4 4"]:
-    top = torch.cat([rotation, shift[..., None]], -1)
-    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
-    return torch.cat([top, bottom], -2)
+def _cross(a: Float[Tensor, "*batch 3"], b: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """torch.linalg.cross takes several times as long on small tensors."""
+    (ax, ay, az), (bx, by, bz) = a.unbind(-1), b.unbind(-1)
+    return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1)
