@@ -6,7 +6,18 @@ Public names are loaded on first use, so that importing the package costs nothin
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dro_grasp.errors import DroGraspError
+    from dro_grasp.grasps.batch import GraspBatch
+    from dro_grasp.grasps.synthesis import synthesize
+    from dro_grasp.hands.hand import Hand
+    from dro_grasp.hands.library import load_hand
+    from dro_grasp.objects.library import load_object
+    from dro_grasp.objects.shape import ObjectModel
+    from dro_grasp.predictor import GraspPredictor
+    from dro_grasp.simulation.trial import TrialResult, simulate
 
 __version__ = "0.1.0"
 
@@ -23,7 +34,19 @@ _EXPORTS = {
     "synthesize": "grasps.synthesis",
 }
 
-__all__ = ["__version__", *_EXPORTS]  # noqa: PLE0604
+__all__ = [
+    "DroGraspError",
+    "GraspBatch",
+    "GraspPredictor",
+    "Hand",
+    "ObjectModel",
+    "TrialResult",
+    "__version__",
+    "load_hand",
+    "load_object",
+    "simulate",
+    "synthesize",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -38,7 +38,7 @@ def diversity(
     """
     if len(joints) < 2:
         return {"all": 0.0, "wrist": 0.0, "joints": 0.0}
-    angles = roma.rotmat_to_euler("xyz", T_object_wrist[:, :3, :3].double())
+    angles = torch.stack(list(roma.rotmat_to_euler("xyz", T_object_wrist[:, :3, :3].double(), as_tuple=True)), -1)
     wrist = torch.cat([T_object_wrist[:, :3, 3].double(), angles], -1).std(0)
     fingers = joints.double().std(0)
     return {"all": float(torch.cat([wrist, fingers]).mean()), "wrist": float(wrist.mean()), "joints": float(fingers.mean())}

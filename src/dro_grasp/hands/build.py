@@ -179,6 +179,7 @@ def _open_ends(
     opening = -torch.ones(tree.n_dof)
     abduction = torch.zeros(tree.n_dof, dtype=torch.bool)
     out_of_palm = torch.zeros(tree.n_dof, dtype=torch.bool)
+    found = _examine(tree, surface, tips, palm, opening, abduction, held, rest)
     for _ in range(REFINEMENTS):
         bases = (straight, _half_closed(tree, opening, abduction, held, rest))
         found_ends = [[_closing_gain(tree, surface, tips, centre, base, j) for base in bases] for j in range(tree.n_dof)]

@@ -186,7 +186,7 @@ class Hand:
     @staticmethod
     def from_tensors(values: dict[str, Any]) -> Hand:
         """The inverse of `to_tensors`; lists are accepted for tuples."""
-        plain = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+        plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
         tree = {k.removeprefix("tree."): v for k, v in plain.items() if k.startswith("tree.")}
         own = {k: v for k, v in plain.items() if not k.startswith("tree.")}
         return Hand(tree=KinematicTree(**tree), **own)

@@ -54,12 +54,15 @@ def parse_xml(path: Path) -> ET.Element:
         raise HandError(f"no hand description at {path}; give an existing .urdf or .xml file, or a name that "
                         "`dro-grasp hands` lists")
     try:
-        return defusedxml.ElementTree.parse(path, forbid_dtd=False).getroot()
+        root = defusedxml.ElementTree.parse(path, forbid_dtd=False).getroot()
     except defusedxml.DefusedXmlException as error:
         raise HandError(f"{path} declares XML entities ({type(error).__name__}), which are refused because they can "
                         "exhaust memory or read other files; remove its <!ENTITY ...> lines") from error
     except ET.ParseError as error:
         raise HandError(f"{path} is not valid XML ({error}); expected a URDF (<robot>) or MJCF (<mujoco>) file") from error
+    if root is None:
+        raise HandError(f"{path} is an empty XML file; expected a URDF (<robot>) or MJCF (<mujoco>) file")
+    return root
 
 
 def prepare_urdf(root: ET.Element, path: Path) -> PreparedUrdf:

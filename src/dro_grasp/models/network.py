@@ -79,7 +79,8 @@ class NetworkConfig:
     @staticmethod
     def from_dict(values: dict[str, Any]) -> NetworkConfig:
         """From plain values, as stored in a weights file; lists become tuples."""
-        return NetworkConfig(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+        plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+        return NetworkConfig(**plain)
 
 
 @dataclass(frozen=True)
