@@ -92,6 +92,14 @@ def test_decode_gives_points_and_link_poses():
     assert poses.valid.all()
 
 
+def test_exact_link_poses_need_no_search():
+    hand = toy_hand()
+    T, q = random_grasps(hand, 20)
+    truth, cloud = hand.points(q, T), ellipsoid(300).expand(20, -1, -1)
+    poses = distance_matrix.decode(hand, distance_matrix.build(truth, cloud), cloud)
+    assert distance_matrix.solve(hand, poses).iterations.max() <= 3
+
+
 def test_single_grasp_without_batch_axis():
     hand = toy_hand()
     T, q = random_grasps(hand, 1)
