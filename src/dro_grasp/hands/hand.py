@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -12,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.geometry.point_clouds import farthest_points
-from dro_grasp.kinematics.tree import KinematicTree
+from dro_grasp.kinematics.tree import KinematicTree, cached_tensor
 
 if TYPE_CHECKING:
     from dro_grasp.kinematics.loader import Description
@@ -74,7 +73,7 @@ class Hand:
         """Name of the description's root link, whose pose is the wrist pose of a grasp."""
         return self.tree.link_names[0]
 
-    @cached_property
+    @cached_tensor
     def registrable(self) -> Bool[Tensor, " n_links"]:
         """Links whose pose their own points determine."""
         mask = torch.zeros(self.tree.n_links, dtype=torch.bool)
@@ -133,22 +132,22 @@ class Hand:
         chosen = poses[..., self.link_index, :, :]
         return (chosen[..., :3, :3] @ local[..., None])[..., 0] + chosen[..., :3, 3], poses
 
-    def T_wrist_palm(self, q: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch 4 4"]:  # noqa: N802
+    def T_wrist_palm(self, q: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch 4 4"]:
         """Pose of the palm link in the wrist (root link) frame."""
         return self.tree.forward(q)[..., self.palm, :, :]
 
-    @cached_property
-    def T_wrist_palm_rest(self) -> Float[Tensor, "4 4"]:  # noqa: N802
+    @cached_tensor
+    def T_wrist_palm_rest(self) -> Float[Tensor, "4 4"]:
         """The same for held joints at rest: a constant of the hand, since no movable joint lies above the palm."""
         return self.T_wrist_palm(self.canonical_joints())
 
-    @cached_property
+    @cached_tensor
     def grasp_centre_wrist(self) -> Float[Tensor, "3"]:
         """grasp_centre in the wrist frame [m]."""
         T = self.T_wrist_palm_rest
         return T[:3, :3] @ self.grasp_centre + T[:3, 3]
 
-    @cached_property
+    @cached_tensor
     def palm_direction_wrist(self) -> Float[Tensor, "3"]:
         """palm_direction in the wrist frame."""
         return self.T_wrist_palm_rest[:3, :3] @ self.palm_direction

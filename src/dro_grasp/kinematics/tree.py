@@ -17,6 +17,14 @@ from torch import Tensor
 FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
 
 
+class cached_tensor(cached_property):  # type: ignore[type-arg]  # reads like the decorator it extends
+    """A cached property whose tensors can be used in training even if inference asked for them first."""
+
+    def __get__(self, instance: Any, owner: type | None = None) -> Any:
+        with torch.inference_mode(False):
+            return super().__get__(instance, owner)
+
+
 @dataclass(frozen=True)
 class KinematicTree:
     """Links in topological order, root first; at most one moving joint per link."""
@@ -64,7 +72,7 @@ class KinematicTree:
         tensors = {k: v.to(device=device, dtype=dtype) for k, v in fields.items() if isinstance(v, Tensor)}
         return KinematicTree(**{**fields, **tensors})
 
-    @cached_property
+    @cached_tensor
     def double(self) -> KinematicTree:
         """The same tree in double precision."""
         return self if self.origin.dtype == torch.float64 else self.to(dtype=torch.float64)
@@ -73,7 +81,7 @@ class KinematicTree:
         """The constructor's arguments by name."""
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
-    @cached_property
+    @cached_tensor
     def _levels(self) -> tuple[tuple[Int[Tensor, " n"], Int[Tensor, " n"]], ...]:
         """Per depth below the root: the links there, and where their parents stand in the level above."""
         depth = [0] * self.n_links
@@ -85,21 +93,21 @@ class KinematicTree:
         pairs = zip(levels[1:], above, strict=True)
         return tuple((torch.tensor(links, device=device), torch.tensor(at, device=device)) for links, at in pairs)
 
-    @cached_property
+    @cached_tensor
     def _level_order(self) -> Int[Tensor, " n_links"]:
         """Where each link stands when the levels are joined."""
         joined = torch.cat([self._roots, *[links for links, _ in self._levels]])
         return joined.argsort()
 
-    @cached_property
+    @cached_tensor
     def _roots(self) -> Int[Tensor, " n"]:
         return torch.tensor([i for i, parent in enumerate(self.parent) if parent < 0], device=self.origin.device)
 
-    @cached_property
+    @cached_tensor
     def _revolute(self) -> Bool[Tensor, " n_links"]:
         return torch.tensor(self.kind, device=self.origin.device) == REVOLUTE
 
-    @cached_property
+    @cached_tensor
     def _motion_basis(self) -> Float[Tensor, "4 n_links 4 4"]:
         """Four constant matrices per link: the factors of 1, sin x, 1 - cos x and x in its own joint's motion.
 
@@ -114,12 +122,12 @@ class KinematicTree:
         basis[3, prismatic, :3, 3] = self.axis[prismatic]
         return basis
 
-    @cached_property
+    @cached_tensor
     def _local_basis(self) -> Float[Tensor, "4 n_links 4 4"]:
         """The same for T_parent_link."""
         return self.origin @ self._motion_basis
 
-    @cached_property
+    @cached_tensor
     def link_coupling(self) -> Float[Tensor, "n_links n_dof"]:
         """Change of each link's own joint per change of each independent joint (zero rows for fixed links)."""
         rows = self.origin.new_zeros(self.n_links, self.n_dof)
@@ -128,13 +136,13 @@ class KinematicTree:
                 rows[link] = self.coupling[joint]
         return rows
 
-    @cached_property
+    @cached_tensor
     def link_offset(self) -> Float[Tensor, " n_links"]:
         """Value of each link's own joint at q = 0."""
         values = [0.0 if joint < 0 else float(self.offset[joint]) for joint in self.link_joint]
         return self.origin.new_tensor(values)
 
-    @cached_property
+    @cached_tensor
     def descends(self) -> Bool[Tensor, "n_links n_links"]:
         """descends[i, j]: link i is link j or below it."""
         table = torch.zeros(self.n_links, self.n_links, dtype=torch.bool, device=self.origin.device)

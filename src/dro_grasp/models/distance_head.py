@@ -76,6 +76,6 @@ class DistanceHead(nn.Module):
 
 
 def inverse_softplus(x: Tensor) -> Tensor:
-    """y with softplus(y) = x, for x > 0; distances below 0.1 mm count as 0.1 mm."""
+    """The y with softplus(y) = x, for x > 0; distances below 0.1 mm count as 0.1 mm."""
     x = x.clamp(min=1e-4)
     return x + torch.log(-torch.expm1(-x))

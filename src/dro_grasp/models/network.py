@@ -177,7 +177,7 @@ class DistanceNetwork(nn.Module):
         return centred @ rotation if self.config.frame == "wrist" else centred
 
     def sample_latent(self, num: int, generator: torch.Generator) -> Float[Tensor, "num latent"]:
-        """z from the prior."""
+        """Draws of z from the prior."""
         return torch.randn(num, self.config.latent, generator=generator) * self.config.latent_temperature
 
     def sample_placements(
