@@ -12,6 +12,9 @@ from torch import Tensor
 from dro_grasp.errors import OptionError
 from dro_grasp.objects.shape import ObjectModel
 
+FLIP = 300.0
+"""Radius about which a cloud is turned inside out, in its largest distances: larger sees more, smaller hides more."""
+
 
 @dataclass(frozen=True)
 class DepthCamera:
@@ -40,8 +43,7 @@ def visible_points(
 ) -> Float[Tensor, "n 3"]:
     """Points of one depth image of the object, in the object's frame [m].
 
-    A mesh is seen by casting rays. A bare cloud is seen through a depth buffer, whose pixels are made large enough
-    to close the gaps between its points.
+    A mesh is seen by casting rays. Of a bare cloud, the points that no others hide are seen.
 
     Args:
         obj: Mesh or bare cloud.
@@ -100,18 +102,20 @@ def _depth_of_mesh(
 def _depth_of_cloud(
     obj: ObjectModel, T_object_camera: np.ndarray, radius: float, camera: DepthCamera
 ) -> tuple[np.ndarray, np.ndarray]:
-    """As `_depth_of_mesh`, for the points that are nearest in their pixel."""
+    """As `_depth_of_mesh`, for the points that no others hide.
+
+    Points turned inside out about the camera lie on their convex hull exactly where nothing stands before them.
+
+    Source: Katz, Tal and Basri, Direct visibility of point sets, 2007.
+    """
+    from scipy.spatial import ConvexHull
+
     local = (obj.cloud.astype(np.float64) - T_object_camera[:3, 3]) @ T_object_camera[:3, :3]
-    image = local[:, :2] / local[:, 2:] * camera.distance
-    gap = 2.5 * np.sqrt(np.prod(np.ptp(image, axis=0).clip(camera.pixel)) / len(image))
-    pixel = max(camera.pixel, gap)
-    cells = np.floor((image - image.min(0)) / pixel).astype(np.int64)
-    cell = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
-    nearest = np.full(cell.max() + 1, np.inf)
-    np.minimum.at(nearest, cell, local[:, 2])
-    # Twice the pixel spans a surface at 63 degrees; what lies deeper is another surface.
-    seen = local[:, 2] <= nearest[cell] + 2 * pixel
-    return local[seen] / local[seen, 2:], local[seen, 2]
+    away = np.linalg.norm(local, axis=1, keepdims=True)
+    flipped = local + 2 * (FLIP * away.max() - away) * local / away
+    hull = ConvexHull(np.concatenate([flipped, np.zeros((1, 3))]), qhull_options="QJ").vertices
+    seen = local[np.sort(hull[hull < len(local)])]
+    return seen / seen[:, 2:], seen[:, 2]
 
 
 def _measured(

@@ -104,11 +104,13 @@ def mesh_object(
     notes: list[str] = []
     vertices, faces = np.asarray(mesh.vertices, np.float64) * scale, np.asarray(mesh.faces, np.int64)
     _check_numbers(vertices, faces, origin)
-    used = np.unique(faces)
+    used = np.bincount(faces.ravel(), minlength=len(vertices)) > 0
     _check_size(np.ptp(vertices[used], axis=0), origin, scale)
     merged = trimesh.Trimesh(vertices, faces, process=True)
-    if len(merged.vertices) < len(used):
-        notes.append(f"merged {len(used) - len(merged.vertices)} duplicated vertices")
+    duplicated = int(used.sum()) - len(merged.vertices)
+    soup = used.sum() == 3 * len(faces)  # as in every STL file, where it says nothing about the mesh
+    if duplicated and not soup:
+        notes.append(f"merged {duplicated} duplicated vertices")
     clean = repair(merged, notes)
     volume, centre, inertia = mass_properties(clean, origin, notes)
     points, face = trimesh.sample.sample_surface(clean, CLOUD_POINTS, seed=0)[:2]

@@ -18,7 +18,9 @@ KEPT_FACES = 50_000
 LEAST_VOLUME = 1e-9
 """Volume of the convex hull below which a mesh encloses nothing [m^3]."""
 LEAST_FILL = 1e-3
-"""Share of its bounding box that a hull, and share of its hull that a mesh must fill; less is a sheet."""
+"""Share of its bounding box that a hull, and share of its hull that a closed mesh must fill; less is a sheet."""
+OPEN_FILL = 0.05
+"""Share of its hull that a mesh with holes must fill; a bent sheet seems to fill a little."""
 OVERLAP = 1e-3
 """Share of the volume by which bodies may overlap unnoticed."""
 PROBES = 48
@@ -58,10 +60,10 @@ def mass_properties(
     if hull is None or hull.volume < max(LEAST_FILL * box, LEAST_VOLUME):
         raise ObjectError(f"{origin} encloses no volume (extents {np.round(mesh.extents * 1000, 2).tolist()} mm); "
                           "give a closed solid, or a point cloud if only its surface is known")
-    if mesh.is_volume and LEAST_FILL * hull.volume < mesh.volume <= (1 + OVERLAP) * hull.volume:
+    if _is_solid(mesh) and LEAST_FILL * hull.volume < _volume(mesh) <= (1 + OVERLAP) * hull.volume:
         return _of_solid(mesh)
     inside, cell = _inside(mesh)
-    if len(inside) * cell > max(LEAST_FILL * hull.volume, 100 * cell):
+    if len(inside) * cell > max(OPEN_FILL * hull.volume, 100 * cell):
         return _of_points(inside, cell)
     notes.append("volume and mass are those of the convex hull, because the mesh encloses none")
     return _of_solid(hull)
@@ -82,8 +84,9 @@ def _turn_outward(mesh: trimesh.Trimesh) -> bool:
     import trimesh
 
     before = np.array(mesh.faces)
-    if not mesh.is_winding_consistent or (mesh.is_watertight and mesh.volume < 0):
-        trimesh.repair.fix_normals(mesh, multibody=True)
+    if not mesh.is_winding_consistent or (mesh.is_watertight and _volume(mesh) < 0):
+        with np.errstate(invalid="ignore", divide="ignore"):  # flat bodies have no centre of mass
+            trimesh.repair.fix_normals(mesh, multibody=True)
     if not mesh.is_watertight and _winding(mesh)[0].sum() < 0:
         # The volume of an open mesh depends on where the origin is, so it cannot tell inside from outside.
         mesh.invert()
@@ -98,13 +101,23 @@ def _join(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
         return mesh
     bodies = list(mesh.split(only_watertight=False))
     notes.append(f"{len(bodies)} separate bodies")
-    if not all(body.is_volume for body in bodies):
+    if not all(_is_solid(body) for body in bodies):
         return mesh
     joined = trimesh.boolean.union(bodies, engine="manifold")
-    if not joined.is_volume or joined.volume > (1 - OVERLAP) * mesh.volume:
+    if not _is_solid(joined) or _volume(joined) > (1 - OVERLAP) * _volume(mesh):
         return mesh
     notes[-1] = f"{len(bodies)} overlapping bodies were joined"
     return joined
+
+
+def _volume(mesh: trimesh.Trimesh) -> float:
+    """Signed volume [m^3]; trimesh's own divides by it to find the centre of mass."""
+    a, b, c = mesh.triangles.transpose(1, 0, 2)
+    return float(np.einsum("ni,ni->", a, np.cross(b, c)) / 6)
+
+
+def _is_solid(mesh: trimesh.Trimesh) -> bool:
+    return mesh.is_watertight and mesh.is_winding_consistent and _volume(mesh) > 0
 
 
 def _hull(mesh: trimesh.Trimesh) -> trimesh.Trimesh | None:
@@ -112,7 +125,8 @@ def _hull(mesh: trimesh.Trimesh) -> trimesh.Trimesh | None:
     from scipy.spatial import QhullError
 
     try:
-        return trimesh.convex.convex_hull(mesh)
+        with np.errstate(invalid="ignore", divide="ignore"):  # a flat one has no centre of mass
+            return trimesh.convex.convex_hull(mesh)
     except QhullError:
         return None
 

@@ -1,0 +1,330 @@
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from dro_grasp.errors import ObjectError
+from dro_grasp.objects.loading import MIN_CLOUD, estimate_normals, load_file
+from dro_grasp.objects.shape import CLOUD_POINTS
+
+
+def save(mesh: trimesh.Trimesh, path: Path) -> Path:
+    mesh.export(path)
+    return path
+
+
+def sphere(radius: float = 0.03, at: tuple[float, float, float] = (0, 0, 0)) -> trimesh.Trimesh:
+    mesh = trimesh.creation.icosphere(3, radius)
+    mesh.apply_translation(at)
+    return mesh
+
+
+def directions(count: int, seed: int = 0) -> np.ndarray:
+    points = np.random.default_rng(seed).normal(size=(count, 3))
+    return points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "off", "glb", "gltf", "dae", "3mf"])
+def test_every_format_gives_the_same_object(tmp_path: Path, suffix: str):
+    mesh = trimesh.creation.box((0.04, 0.05, 0.06))
+    mesh.visual = trimesh.visual.ColorVisuals(mesh)
+    path = tmp_path / f"thing.{suffix}"
+    if suffix == "3mf":  # states millimetres
+        mesh.apply_scale(1000)
+    if suffix == "gltf":
+        for name, data in trimesh.Scene(mesh).export(file_type="gltf").items():
+            (tmp_path / ("thing.gltf" if name == "model.gltf" else name)).write_bytes(data)
+    else:
+        mesh.export(path)
+    obj = load_file(path)
+    assert obj.name == "thing"
+    assert obj.split is None
+    np.testing.assert_allclose(np.sort(obj.extents), (0.04, 0.05, 0.06), atol=1e-6)
+    assert obj.volume == pytest.approx(1.2e-4, rel=1e-4)
+    assert obj.notes == ()
+
+
+def test_scene_is_merged_with_its_transforms(tmp_path: Path):
+    scene = trimesh.Scene()
+    scene.add_geometry(trimesh.creation.box((0.02, 0.02, 0.02)))
+    scene.add_geometry(
+        trimesh.creation.box((0.02, 0.02, 0.02)), transform=trimesh.transformations.translation_matrix((0.05, 0, 0)))
+    scene.export(tmp_path / "two.glb")
+    obj = load_file(tmp_path / "two.glb")
+    assert obj.volume == pytest.approx(2 * 8e-6, rel=1e-4)
+    assert obj.extents[0] == pytest.approx(0.07, abs=1e-6)
+    assert obj.notes == ("2 separate bodies",)
+
+
+def test_overlapping_bodies_are_joined(tmp_path: Path):
+    r, d = 0.03, 0.029
+    mesh = trimesh.util.concatenate([sphere(r), sphere(r, (d, 0, 0))])
+    obj = load_file(save(mesh, tmp_path / "two.ply"))
+    shared = np.pi * (4 * r + d) * (2 * r - d) ** 2 / 12
+    assert obj.volume == pytest.approx(8 / 3 * np.pi * r**3 - shared, rel=0.02)
+    assert obj.notes == ("2 overlapping bodies were joined",)
+    assert trimesh.Trimesh(obj.vertices, obj.faces, process=False).is_volume
+
+
+def test_scale_applies_to_a_mesh_in_millimetres(tmp_path: Path):
+    path = save(sphere(30), tmp_path / "ball.stl")
+    with pytest.raises(ObjectError, match=r"measures 60 m, too large .*--scale: 0.001 for millimetres, or 0.001"):
+        load_file(path)
+    assert load_file(path, scale=0.001).extents[0] == pytest.approx(0.06, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("radius", "message"),
+    [(5.0, r"10 m, too large .*or 0.01, which makes it 10 cm"), (0.001, r"2 mm, too small .*or 100, .* 20 cm"),
+     (0.75, r"1.5 m, too large .*or 0.1, which makes it 15 cm")])
+def test_unlikely_sizes_are_refused_with_a_scale(tmp_path: Path, radius: float, message: str):
+    with pytest.raises(ObjectError, match=message):
+        load_file(save(sphere(radius), tmp_path / "ball.ply"))
+
+
+def test_suggested_scale_is_accepted(tmp_path: Path):
+    path = save(sphere(5.0), tmp_path / "ball.ply")
+    with pytest.raises(ObjectError, match=r"5 m, too large .*or 0.005, which makes it 5 cm"):
+        load_file(path, scale=0.5)
+    assert load_file(path, scale=0.005).extents[0] == pytest.approx(0.05)
+
+
+def test_nan_vertices_are_refused(tmp_path: Path):
+    (tmp_path / "bad.obj").write_text("v 0 0 0\nv nan 0 0\nv 0 0.05 0\nv 0 0 0.05\nf 1 2 3\nf 1 2 4\n")
+    with pytest.raises(ObjectError, match="1 vertices with NaN"):
+        load_file(tmp_path / "bad.obj")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [("empty.obj", "", "no faces|cannot be read"),
+     ("line.obj", "v 0 0 0\nv 0.1 0 0\nl 1 2\n", "no faces|2 distinct points"),
+     ("noise.stl", "solid what\nfacet nonsense", "cannot be read|no faces"), ("noise.xyzw", "?", "cannot be read"),
+     ("cut.glb", "glTF", "cannot be read"),
+     ("face.off", "OFF\n3 1 0\n0 0 0\n0.05 0 0\n0 0.05 0\n3 0 1 9\n", "cannot be read|face with vertex 9")])
+def test_files_without_a_mesh_are_refused(tmp_path: Path, name: str, text: str, message: str):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ObjectError, match=message):
+        load_file(tmp_path / name)
+
+
+def test_missing_file_is_named(tmp_path: Path):
+    with pytest.raises(ObjectError, match=r"no object file at .*mug\.obj; give an existing mesh"):
+        load_file(tmp_path / "mug.obj")
+
+
+def test_flat_mesh_is_refused(tmp_path: Path):
+    flat = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]], [[0, 1, 2], [0, 2, 3]])
+    with pytest.raises(ObjectError, match=r"encloses no volume \(extents \[100.0, 100.0, 0.0\] mm\)"):
+        load_file(save(flat, tmp_path / "flat.ply"))
+
+
+def test_inverted_mesh_is_turned(tmp_path: Path):
+    mesh = sphere(at=(0.1, 0, 0))
+    mesh.invert()
+    obj = load_file(save(mesh, tmp_path / "ball.ply"))
+    assert obj.notes == ("faces were turned outward",)
+    assert ((obj.cloud - (0.1, 0, 0)) * obj.cloud_normals).sum(1).min() > 0
+    assert obj.volume > 0
+
+
+def test_some_flipped_faces_are_turned(tmp_path: Path):
+    mesh = sphere()
+    faces = mesh.faces.copy()
+    faces[::7] = faces[::7, ::-1]
+    obj = load_file(save(trimesh.Trimesh(mesh.vertices, faces, process=False), tmp_path / "ball.ply"))
+    assert (obj.cloud * obj.cloud_normals).sum(1).min() > 0
+
+
+def test_small_hole_is_closed(tmp_path: Path):
+    mesh = sphere()
+    obj = load_file(save(trimesh.Trimesh(mesh.vertices, mesh.faces[1:], process=False), tmp_path / "ball.ply"))
+    assert "holes were closed" in obj.notes
+    assert obj.volume == pytest.approx(mesh.volume, rel=1e-3)
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+def test_open_shell_keeps_its_volume_and_outside(tmp_path: Path, inverted: bool):
+    mesh = sphere(at=(0.3, 0.2, 0))  # far from the origin, where an open mesh's own volume is meaningless
+    cut = mesh.slice_plane((0.3, 0.2, 0.024), (0, 0, -1))
+    if inverted:
+        cut.invert()
+    obj = load_file(save(cut, tmp_path / "shell.ply"))
+    assert any("not watertight" in note for note in obj.notes)
+    assert obj.volume == pytest.approx(mesh.volume, rel=0.05)
+    np.testing.assert_allclose(obj.centre_of_mass, (0.3, 0.2, 0), atol=2e-3)
+    expected = 2 / 5 * obj.volume * 0.03**2
+    np.testing.assert_allclose(np.diag(obj.inertia), expected, rtol=0.1)
+    assert ((obj.cloud - (0.3, 0.2, 0)) * obj.cloud_normals).sum(1).mean() > 0.02
+
+
+def test_bent_sheet_weighs_as_its_hull(tmp_path: Path):
+    x, y = np.meshgrid(np.linspace(-0.05, 0.05, 12), np.linspace(-0.05, 0.05, 12), indexing="ij")
+    vertices = np.stack([x, y, 4 * x * y], -1).reshape(-1, 3)  # a saddle, which faces no side
+    corner = (np.arange(11)[:, None] * 12 + np.arange(11)).ravel()
+    faces = np.concatenate([corner[:, None] + (0, 12, 13), corner[:, None] + (0, 13, 1)])
+    obj = load_file(save(trimesh.Trimesh(vertices, faces), tmp_path / "sheet.ply"))
+    assert obj.volume == pytest.approx(trimesh.convex.convex_hull(vertices).volume)
+    assert any("convex hull" in note for note in obj.notes)
+
+
+def test_duplicated_vertices_are_merged(tmp_path: Path):
+    lines = ["v 0 0 0", "v 0.05 0 0", "v 0 0.05 0", "v 0 0 0.05", "v 0 0 0"]
+    (tmp_path / "t.obj").write_text("\n".join([*lines, "f 1 3 2", "f 1 2 4", "f 5 4 3", "f 2 3 4"]))
+    obj = load_file(tmp_path / "t.obj")
+    assert obj.notes == ("merged 1 duplicated vertices",)
+    assert obj.volume == pytest.approx(0.05**3 / 6)
+
+
+def test_unused_vertices_do_not_count_as_size(tmp_path: Path):
+    mesh = trimesh.creation.box((0.05, 0.05, 0.05))
+    far = trimesh.Trimesh(np.concatenate([mesh.vertices, [[50, 0, 0]]]), mesh.faces, process=False)
+    assert load_file(save(far, tmp_path / "far.ply")).extents.max() == pytest.approx(0.05)
+
+
+def test_million_faces_are_decimated(tmp_path: Path):
+    turn, tube = np.meshgrid(*2 * [np.linspace(0, 2 * np.pi, 710, endpoint=False)], indexing="ij")
+    reach = 0.04 + 0.015 * np.cos(tube)
+    vertices = np.stack([reach * np.cos(turn), reach * np.sin(turn), 0.015 * np.sin(tube)], -1).reshape(-1, 3)
+    index = np.arange(710 * 710).reshape(710, 710)
+    a, b, c, d = (np.roll(index, shift, (0, 1)).ravel() for shift in ((0, 0), (-1, 0), (-1, -1), (0, -1)))
+    mesh = trimesh.Trimesh(vertices, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]), process=False)
+    assert len(mesh.faces) > 1_000_000
+    obj = load_file(save(mesh, tmp_path / "dense.stl"))
+    assert obj.faces is not None
+    assert len(obj.faces) <= 50_000
+    assert obj.notes[0].startswith(f"decimated from {len(mesh.faces)} to ")
+    assert obj.volume == pytest.approx(mesh.volume, rel=1e-3)
+
+
+# --- bare clouds
+
+
+def test_cloud_from_npy(tmp_path: Path):
+    np.save(tmp_path / "c.npy", 0.04 * directions(3000))
+    obj = load_file(tmp_path / "c.npy")
+    assert obj.is_cloud
+    assert obj.cloud.shape == (3000, 3)
+    assert ((obj.cloud / 0.04) * obj.cloud_normals).sum(1).min() > 0.9
+    assert obj.volume == 0
+    assert "normals were estimated" in obj.notes[0]
+
+
+def test_given_normals_are_kept_and_not_scaled(tmp_path: Path):
+    normals = directions(500, 1)
+    np.save(tmp_path / "c.npy", np.concatenate([40 * directions(500), 3 * normals], 1))
+    obj = load_file(tmp_path / "c.npy", scale=0.001)
+    assert obj.extents.max() < 0.081
+    assert "estimated" not in obj.notes[0]
+    kept, given = obj.cloud_normals, normals.astype(np.float32)
+    np.testing.assert_allclose(kept[np.lexsort(kept.T)], given[np.lexsort(given.T)], atol=1e-6)
+
+
+def test_zero_normals_are_estimated(tmp_path: Path):
+    np.save(tmp_path / "c.npy", np.concatenate([0.04 * directions(500), np.zeros((500, 3))], 1))
+    np.testing.assert_allclose(np.linalg.norm(load_file(tmp_path / "c.npy").cloud_normals, axis=1), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "glb", "obj"])
+def test_faceless_file_is_a_cloud(tmp_path: Path, suffix: str):
+    points = 0.04 * directions(200)
+    path = tmp_path / f"c.{suffix}"
+    if suffix == "obj":
+        path.write_text("\n".join(f"v {x} {y} {z}" for x, y, z in points))
+    else:
+        trimesh.PointCloud(points).export(path)
+    obj = load_file(path)
+    assert obj.is_cloud
+    np.testing.assert_allclose(obj.centre_of_mass, points.mean(0), atol=1e-6)
+
+
+def pcd(points: np.ndarray, kind: str) -> bytes:
+    names = "x y z normal_x normal_y normal_z"
+    count = points.shape[1]
+    head = (f"# .PCD v0.7\nVERSION 0.7\nFIELDS rgb {' '.join(names.split()[:count])}\nSIZE 4{' 4' * count}\n"
+            f"TYPE U{' F' * count}\nCOUNT 2{' 1' * count}\nWIDTH {len(points)}\nHEIGHT 1\n"
+            f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(points)}\nDATA {kind}\n").encode()
+    if kind == "ascii":
+        return head + "".join(f"7 8 {' '.join(map(str, row))}\n" for row in points).encode()
+    return head + b"".join(struct.pack(f"<II{count}f", 7, 8, *row) for row in points)
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary"])
+@pytest.mark.parametrize("width", [3, 6])
+def test_cloud_from_pcd(tmp_path: Path, kind: str, width: int):
+    points = np.concatenate([0.04 * directions(300), directions(300)], 1)[:, :width]
+    (tmp_path / "c.pcd").write_bytes(pcd(points, kind))
+    obj = load_file(tmp_path / "c.pcd")
+    order, given = np.lexsort(obj.cloud.T), np.lexsort(points[:, :3].astype(np.float32).T)
+    np.testing.assert_allclose(obj.cloud[order], points[given, :3], atol=1e-7)
+    if width == 6:
+        np.testing.assert_allclose(obj.cloud_normals[order], points[given, 3:], atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary"])
+def test_cut_pcd_is_refused(tmp_path: Path, kind: str):
+    whole = pcd(0.04 * directions(300), kind)
+    (tmp_path / "c.pcd").write_bytes(whole[: len(whole) * 3 // 4])
+    with pytest.raises(ObjectError, match=r"cut short|damaged"):
+        load_file(tmp_path / "c.pcd")
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [(b"not a cloud at all", "no DATA line"), (b"FIELDS x y\nPOINTS 1\nDATA ascii\n0 0\n", "damaged"),
+     (b"FIELDS x y z\nPOINTS 1\nDATA binary_compressed\n", "binary_compressed data; save the cloud as ascii"),
+     (b"FIELDS x y z\nPOINTS 1\nDATA\n", "damaged")])
+def test_foreign_pcd_is_refused(tmp_path: Path, data: bytes, message: str):
+    (tmp_path / "c.pcd").write_bytes(data)
+    with pytest.raises(ObjectError, match=message):
+        load_file(tmp_path / "c.pcd")
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0.0]]), f"3 distinct points; a cloud needs at least {MIN_CLOUD}"),
+     (np.full((500, 3), 0.1), "1 distinct points"), (np.zeros((0, 3)), "0 distinct points"),
+     (np.where(np.arange(600).reshape(200, 3) == 4, np.nan, 0.04 * directions(200)), "1 points with NaN"),
+     (np.zeros((20, 4)), r"shape \(20, 4\); expected \(n, 3\)"), (np.zeros(30), r"shape \(30,\)"),
+     (40 * directions(200), r"too large .*0.001"), (np.array(["a", "b"]), "no plain NPY array")])
+def test_unusable_clouds_are_refused(tmp_path: Path, points: np.ndarray, message: str):
+    np.save(tmp_path / "c.npy", points)
+    with pytest.raises(ObjectError, match=message):
+        load_file(tmp_path / "c.npy")
+
+
+def test_npy_with_objects_or_noise_is_refused(tmp_path: Path):
+    np.save(tmp_path / "c.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    with pytest.raises(ObjectError, match="no plain NPY array"):
+        load_file(tmp_path / "c.npy")
+    (tmp_path / "c.npy").write_bytes(b"")
+    with pytest.raises(ObjectError, match="no plain NPY array"):
+        load_file(tmp_path / "c.npy")
+
+
+def test_planar_cloud_works(tmp_path: Path):
+    points = np.random.default_rng(0).uniform(-0.05, 0.05, (400, 3)) * (1, 1, 0)
+    np.save(tmp_path / "c.npy", points)
+    obj = load_file(tmp_path / "c.npy")
+    np.testing.assert_allclose(np.abs(obj.cloud_normals[:, 2]), 1, atol=1e-5)
+
+
+def test_huge_cloud_is_thinned_the_same_way_every_time(tmp_path: Path):
+    np.save(tmp_path / "c.npy", 0.04 * directions(100_000))
+    first, second = load_file(tmp_path / "c.npy"), load_file(tmp_path / "c.npy")
+    assert len(first.cloud) == CLOUD_POINTS
+    np.testing.assert_array_equal(first.cloud, second.cloud)
+    assert first.sha256 == second.sha256
+    assert f"{CLOUD_POINTS} of them kept" in first.notes[0]
+
+
+def test_estimated_normals_of_a_box_point_outward():
+    points, face = trimesh.sample.sample_surface(trimesh.creation.box((0.1, 0.1, 0.1)), 4000, seed=0)[:2]
+    normals = estimate_normals(np.asarray(points, np.float32))
+    true = trimesh.creation.box((0.1, 0.1, 0.1)).face_normals[face]
+    inner = np.sort(np.abs(points), axis=1)[:, 1] < 0.04  # away from the edges
+    assert (normals * true).sum(1)[inner].min() > 0.98

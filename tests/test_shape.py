@@ -1,0 +1,179 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from dro_grasp.errors import ObjectError
+from dro_grasp.objects import shape
+from dro_grasp.objects.cache import cache_folder, cached_arrays, content_hash
+from dro_grasp.objects.loading import cloud_object, mesh_object
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("DRO_GRASP_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def ball(radius: float = 0.03, fineness: int = 4) -> shape.ObjectModel:
+    return mesh_object("ball", trimesh.creation.icosphere(fineness, radius), origin="ball")
+
+
+def l_block() -> trimesh.Trimesh:
+    arm = trimesh.creation.box((0.03, 0.03, 0.03), trimesh.transformations.translation_matrix((0.03, 0, -0.03)))
+    return trimesh.boolean.union([trimesh.creation.box((0.03, 0.03, 0.09)), arm], engine="manifold")
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_mass_properties_of_a_box():
+    sides = np.array([0.04, 0.06, 0.08])
+    box = trimesh.creation.box(sides, trimesh.transformations.translation_matrix((0.1, 0, -0.05)))
+    obj = mesh_object("box", box, origin="box")
+    volume = sides.prod()
+    assert obj.volume == pytest.approx(volume)
+    assert obj.mass == pytest.approx(500 * volume)
+    np.testing.assert_allclose(obj.centre_of_mass, (0.1, 0, -0.05), atol=1e-9)
+    squares = sides**2
+    np.testing.assert_allclose(obj.inertia, np.diag(volume / 12 * (squares.sum() - squares)), atol=1e-15)
+    np.testing.assert_allclose(obj.extents, sides)
+
+
+def test_cloud_lies_on_the_surface_with_outward_normals():
+    obj = ball()
+    assert obj.cloud.shape == obj.cloud_normals.shape == (shape.CLOUD_POINTS, 3)
+    radii = np.linalg.norm(obj.cloud, axis=1)
+    assert 0.0297 < radii.min() <= radii.max() < 0.03001
+    assert ((obj.cloud / radii[:, None] * obj.cloud_normals).sum(1) > 0.99).all()
+    np.testing.assert_array_equal(obj.cloud, ball().cloud)
+
+
+def test_grid_gives_the_distance_to_a_sphere():
+    obj = ball()
+    assert obj.grid is not None
+    points = 0.12 * (torch.rand(2000, 3, generator=seeded()) - 0.5)
+    value, gradient = obj.grid.query(points)
+    radius = points.norm(dim=-1)
+    assert (value - (radius - 0.03)).abs().max() < 5e-4
+    clear = radius > 0.012  # at the centre the gradient has no direction
+    assert ((gradient * points / radius[:, None]).sum(-1)[clear] > 0.97).all()
+
+
+def test_signed_distances_survive_a_hole_flipped_faces_and_overlap():
+    mesh = trimesh.creation.icosphere(4, 0.03)
+    faces = mesh.faces[40:].copy()
+    faces[::50] = faces[::50, ::-1]
+    second = trimesh.creation.icosphere(3, 0.02)
+    vertices = np.concatenate([mesh.vertices, second.vertices])
+    faces = np.concatenate([faces, second.faces + len(mesh.vertices)])
+    points = np.random.default_rng(0).normal(size=(1000, 3))
+    points *= (np.linspace(0.001, 0.06, 1000) / np.linalg.norm(points, axis=1))[:, None]
+    radius = np.linalg.norm(points, axis=1)
+    distance = shape.signed_distances(vertices, faces, points)
+    clear = np.abs(radius - 0.03) > 0.002
+    assert (np.sign(distance) == np.sign(radius - 0.03))[clear].mean() > 0.995
+
+
+def test_grid_of_a_large_object_stays_small(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(shape, "LARGEST_GRID", 20_000)
+    box = trimesh.creation.box((0.3, 0.3, 0.3))
+    baked = shape.bake_grid(box.vertices, box.faces)
+    assert baked["values"].size < 25_000
+    assert baked["spacing"] > shape.GRID_SPACING
+
+
+def test_grid_is_read_from_the_cache_and_damage_is_mended(cache: Path, monkeypatch: pytest.MonkeyPatch):
+    first = ball(0.01, 1).grid
+    (file,) = cache.iterdir()
+    assert file.name.startswith(f"grid-{ball(0.01, 1).sha256[:24]}")
+    with monkeypatch.context() as patch:
+        patch.setattr(shape, "bake_grid", lambda *_: pytest.fail("was in the cache"))
+        second = ball(0.01, 1).grid
+    assert first is not None
+    assert second is not None
+    torch.testing.assert_close(first.values, second.values)
+    whole = file.read_bytes()
+    for damaged in (b"", whole[: len(whole) // 2], b"something else", whole[:200] + b"\0" * 50 + whole[250:]):
+        file.write_bytes(damaged)
+        third = ball(0.01, 1).grid
+        assert third is not None
+        torch.testing.assert_close(first.values, third.values)
+        assert len(file.read_bytes()) == len(whole)
+    assert [f.name for f in cache.iterdir()] == [file.name]
+
+
+def test_unwritable_cache_is_no_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("DRO_GRASP_CACHE", str(tmp_path / "file" / "cache"))
+    assert cached_arrays("key", lambda: {"a": np.arange(3)})["a"].tolist() == [0, 1, 2]
+    assert cache_folder() == tmp_path / "file" / "cache"
+
+
+def test_nothing_half_written_stays_in_the_cache(cache: Path, monkeypatch: pytest.MonkeyPatch):
+    def fail(*_: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr("dro_grasp.objects.cache.os.replace", fail)
+    cached_arrays("key", lambda: {"a": np.arange(3)})
+    assert list(cache.iterdir()) == []
+
+
+def test_convex_mesh_is_its_own_part():
+    ((vertices, faces),) = mesh_object("box", trimesh.creation.box((0.05, 0.05, 0.05)), origin="box").parts
+    assert trimesh.Trimesh(vertices, faces).volume == pytest.approx(0.05**3)
+
+
+def test_parts_of_a_concave_mesh_fill_it_and_are_cached(monkeypatch: pytest.MonkeyPatch):
+    obj = mesh_object("l", l_block(), origin="l")
+    hulls = [trimesh.Trimesh(*part) for part in obj.parts]
+    assert len(hulls) >= 2
+    assert all(hull.is_convex for hull in hulls)
+    assert sum(hull.volume for hull in hulls) == pytest.approx(obj.volume, rel=0.1)
+    monkeypatch.setattr("dro_grasp.objects.convex_parts._run", lambda *_: pytest.fail("was in the cache"))
+    again = mesh_object("l", l_block(), origin="l").parts
+    assert len(again) == len(hulls)
+    for (vertices, faces), hull in zip(again, hulls, strict=True):
+        np.testing.assert_allclose(trimesh.Trimesh(vertices, faces).volume, hull.volume)
+
+
+def test_bare_cloud_has_no_grid_and_no_parts():
+    obj = cloud_object("cloud", ball().cloud.astype(np.float64), origin="cloud")
+    assert obj.is_cloud
+    assert obj.grid is None
+    with pytest.raises(ObjectError, match=r"'cloud' is a bare point cloud and has no convex parts; give a mesh"):
+        _ = obj.parts
+
+
+def test_sampled_points_are_distinct_and_seeded():
+    obj = ball()
+    points = obj.sample_points(512, seeded(3))
+    assert points.shape == (512, 3)
+    assert len(points.unique(dim=0)) == 512
+    torch.testing.assert_close(points, obj.sample_points(512, seeded(3)))
+    assert not torch.equal(points, obj.sample_points(512, seeded(4)))
+
+
+def test_sampling_more_points_than_a_small_cloud_has():
+    obj = cloud_object("cloud", ball().cloud[:100].astype(np.float64), origin="cloud")
+    assert obj.sample_points(512, seeded()).shape == (512, 3)
+    assert obj.sample_partial(256, seeded()).shape == (256, 3)
+
+
+def test_partial_cloud_is_one_side():
+    points = ball().sample_partial(512, seeded())
+    assert points.shape == (512, 3)
+    towards = points.mean(0)
+    assert towards.norm() > 0.012  # the mean of a half sphere lies at half the radius
+    assert (points @ towards / towards.norm() > -0.004).all()
+
+
+def test_hash_tells_content_apart():
+    points = np.arange(6, dtype=np.float32).reshape(2, 3)
+    assert content_hash(points) == content_hash(np.asfortranarray(points))
+    assert content_hash(points) != content_hash(points + 1)
