@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import traceback
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -40,6 +40,22 @@ Command = (
 """Every command of the tool."""
 
 
+def parse(arguments: Sequence[str]) -> Any:
+    """The command that the arguments ask for, not yet run.
+
+    Raises:
+        SystemExit: With code 2 after a message about wrong arguments, with 0 after `--help`.
+    """
+    return tyro.cli(
+        Command,  # type: ignore[arg-type]
+        prog="dro-grasp",
+        description="Any robot hand description in, simulation-checked dexterous grasps out. "
+        "--version prints the version; --verbose, anywhere, shows tracebacks.",
+        args=list(arguments),
+        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
+    )
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code: 0 done, 2 bad input, 1 our fault."""
     arguments = list(sys.argv[1:] if argv is None else argv)
@@ -48,14 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return DONE
     verbose = "--verbose" in arguments
     arguments = [a for a in arguments if a != "--verbose"] or ["--help"]
-    command = tyro.cli(
-        Command,  # type: ignore[arg-type]
-        prog="dro-grasp",
-        description="Any robot hand description in, simulation-checked dexterous grasps out. "
-        "--version prints the version; --verbose, anywhere, shows tracebacks.",
-        args=arguments,
-        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
-    )
+    command = parse(arguments)
     try:
         return command.run()
     except DroGraspError as error:

@@ -53,12 +53,14 @@ def _plain(value: Any) -> Any:
 
 def print_table(title: str, columns: list[str], rows: list[list[Any]], note: str = "") -> None:
     """A table for people."""
-    table = Table(title=title, caption=note or None, title_justify="left", caption_justify="left")
+    table = Table(title=title, title_justify="left")
     for column in columns:
         table.add_column(column, justify="left" if column in {"name", "hand", "object", "reason", "from"} else "right")
     for row in rows:
         table.add_row(*[_cell(value) for value in row])
     stdout.print(table)
+    if note:
+        say(note)
 
 
 def _cell(value: Any) -> str:

@@ -90,8 +90,8 @@ class Style:
     diffuse: float = 0.64
     specular: float = 0.16
     shininess: float = 24.0
-    crease: float = 0.75
-    """Faces whose normal deviates from the vertex normal by more than this cosine keep a sharp edge."""
+    crease: float = 0.85
+    """Faces whose normal has a smaller cosine to the vertex normal keep a sharp edge."""
     outline: float = 4.0
     """Darkening of depth steps, which separates fingers from what lies behind."""
     outline_scale: float = 0.02

@@ -140,7 +140,7 @@ class GraspViewer:
     def _cloud(self, name: str, points: np.ndarray, colour: Colour) -> viser.PointCloudHandle:
         return self.server.scene.add_point_cloud(
             name, points.astype(np.float32), colors=_rgb(colour), point_size=POINT_SIZE, point_shape="circle",
-            visible=False,
+            precision="float32", visible=False,
         )
 
     def _add_controls(self) -> None:

@@ -1,0 +1,43 @@
+"""The layers of the package, and that training needs no simulator."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+FORBIDDEN = ("mujoco", "trimesh", "viser", "igl", "coacd", "fpsample", "matplotlib", "PIL", "rich", "tyro")
+
+
+def test_imports_point_downwards_only() -> None:
+    tool = Path(sys.executable).parent / "lint-imports"
+    done = subprocess.run([tool, "--no-logo", "--no-cache"], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.parametrize(
+    "module", ["dro_grasp.training.loop", "dro_grasp.training.pretraining", "dro_grasp.datasets.bundle",
+               "dro_grasp.models.checkpoints", "dro_grasp.hands.hand"],
+)
+def test_training_runs_where_there_is_no_simulator(module: str) -> None:
+    blocked = "".join(f"sys.modules[{name!r}] = None; " for name in FORBIDDEN)
+    done = subprocess.run(
+        [sys.executable, "-c", f"import sys; {blocked}import {module}"], capture_output=True, text=True, check=False,
+        env={**os.environ, "PYTHONPATH": str(ROOT / "src")},
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_only_their_layers_import_mujoco_and_viser() -> None:
+    source = ROOT / "src" / "dro_grasp"
+    for name, allowed in (("mujoco", {"simulation", "kinematics"}), ("viser", {"viewer"})):
+        users = {
+            f.relative_to(source).parts[0]
+            for f in source.rglob("*.py")
+            if any(line.split()[:2] in (["import", name], ["from", name]) for line in f.read_text().splitlines())
+        }
+        assert users <= allowed, name

@@ -1,0 +1,115 @@
+"""Pictures: the sheet's layout, its captions, and that every part of a grasp is to be seen on it."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from dro_grasp.errors import OutputError
+from dro_grasp.geometry.rasterizer import render
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.library import load_hand
+from dro_grasp.objects.library import load_object
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.viewer.pictures import CAPTION, HEADER, TILE, caption, draw_grasp, draw_grasps, heading
+from dro_grasp.viewer.scene import (
+    OBJECT_COLOUR,
+    best_camera,
+    finger_of_link,
+    hand_meshes,
+    link_colours,
+    object_meshes,
+    success_colour,
+)
+
+
+@pytest.fixture(scope="module")
+def hand() -> Hand:
+    return load_hand("gripper3")
+
+
+@pytest.fixture(scope="module")
+def obj() -> ObjectModel:
+    return load_object("sphere")
+
+
+@pytest.fixture(scope="module")
+def grasps(hand: Hand, obj: ObjectModel) -> GraspBatch:
+    T = torch.eye(4).repeat(3, 1, 1)
+    T[:, :3, 3] = -hand.grasp_centre_wrist
+    return GraspBatch.create(
+        hand, obj, T, hand.canonical_joints(0.6).expand(3, -1), score=torch.tensor([1.0, 0.5, -2.0]),
+        success=torch.tensor([True, False, False]), protocol=("dro/1", "dro/1", ""),
+    )
+
+
+def test_sheet_has_a_tile_and_a_dot_of_the_right_colour_per_grasp(hand, obj, grasps, tmp_path: Path) -> None:
+    path = tmp_path / "sheet.png"
+    draw_grasps(hand, obj, grasps, path, columns=2)
+    with Image.open(path) as file:
+        picture = np.asarray(file)
+    assert picture.shape == (HEADER + 2 * (TILE[1] + CAPTION), 2 * TILE[0], 3)
+    for i, outcome in enumerate((True, False, None)):
+        x, y = (i % 2) * TILE[0] + 21, HEADER + (i // 2) * (TILE[1] + CAPTION) + TILE[1] + 10
+        assert picture[y, x].tolist() == [int(255 * c) for c in success_colour(outcome)]
+        tile = picture[y - TILE[1] - 10 : y - 10, x - 21 : x - 21 + TILE[0]]
+        assert (tile != 255).any(-1).mean() > 0.1
+
+
+def test_count_limits_the_tiles(hand, obj, grasps, tmp_path: Path) -> None:
+    draw_grasps(hand, obj, grasps, tmp_path / "one.png", count=1)
+    with Image.open(tmp_path / "one.png") as picture:
+        assert picture.size == (TILE[0], HEADER + TILE[1] + CAPTION)
+
+
+def test_object_and_every_finger_are_seen(hand, obj, grasps) -> None:
+    joints, T = grasps.joints[0], grasps.T_object_wrist[0]
+    camera = best_camera(hand, joints, T, obj)
+    everything = [*object_meshes(obj), *hand_meshes(hand, joints, T)]
+    whole = render(everything, camera, 160, 120)
+    for colour in {OBJECT_COLOUR, *link_colours(hand)}:
+        without = render([m for m in everything if m.colour != colour], camera, 160, 120)
+        assert (whole != without).any(-1).sum() > 30, colour
+
+
+def test_clouds_and_hands_without_description_are_drawn_as_points(hand, obj, grasps) -> None:
+    bare = ObjectModel("cloud", obj.cloud, obj.cloud_normals, obj.centre_of_mass, "0")
+    tensors = Hand.from_tensors(hand.to_tensors())
+    picture = draw_grasp(tensors, bare, grasps, 0)
+    assert (picture != 255).any(-1).mean() > 0.05
+
+
+def test_links_above_the_palm_can_be_left_out(hand, grasps) -> None:
+    first = hand.tree.parent.index(hand.palm)
+    elsewhere = dataclasses.replace(hand, palm=first)
+    everything, below = (hand_meshes(elsewhere, grasps.joints[0], above_palm=above) for above in (True, False))
+    shapes = [g for g in hand.description.geometry if g.visual]
+    assert len(everything) == len(shapes)
+    assert len(below) == sum(bool(hand.tree.descends[g.link, first]) for g in shapes) < len(everything)
+
+
+def test_fingers_are_counted_from_the_palm_on(hand) -> None:
+    fingers = finger_of_link(hand)
+    assert fingers[hand.palm] == -1
+    assert sorted({fingers[tip] for tip in hand.tips}) == [0, 1, 2]
+
+
+def test_captions_and_heading_tell_what_was_tried(hand, obj, grasps) -> None:
+    assert [caption(grasps, i)[1] for i in range(3)] == [True, False, None]
+    assert "1.00" in caption(grasps, 0)[0]
+    assert heading(hand, obj, grasps) == "gripper3 on sphere: 3 grasps, 1 of 2 succeeded (dro/1)"
+    untried = grasps.replace(success=None, protocol=None)
+    assert heading(hand, obj, untried) == "gripper3 on sphere: 3 grasps"
+
+
+def test_unwritable_path_and_no_grasps_are_refused(hand, obj, grasps, tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="nowhere"):
+        draw_grasps(hand, obj, grasps, tmp_path / "nowhere" / "a.png", count=1)
+    with pytest.raises(OutputError, match="no grasp"):
+        draw_grasps(hand, obj, grasps[slice(0, 0)], tmp_path / "a.png")
