@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 from dro_grasp.errors import OptionError
+from dro_grasp.grasps.controller import ControllerConfig
 
 
 @dataclass(frozen=True)
@@ -17,6 +18,8 @@ class Protocol:
     """Raised whenever a change can change a verdict."""
     closing: bool = True
     """Start at the pregrasp and close onto the squeeze target; otherwise start and stay at the grasp."""
+    controller: ControllerConfig = field(default_factory=ControllerConfig)
+    """Makes pregrasp and squeeze where a grasp does not state them."""
     friction: float = 1.0
     """Coefficient between hand and object. (The official release has 3.0.)"""
     torsional_friction: float = 0.02
@@ -48,13 +51,17 @@ class Protocol:
     armature: float = 1e-3
     """[kg m^2]"""
     force_limit: float = 20.0
-    """Largest servo torque or force [Nm or N]."""
+    """Largest servo torque [Nm]."""
+    lever: float = 0.03
+    """Sliding joints get the servo of a turning joint that acts at this distance [m]."""
 
     @property
     def label(self) -> str:
-        """Name and version, as stored with results; another friction is part of it."""
-        friction = "" if self.friction == 1.0 else f"+friction{self.friction:g}"
-        return f"{self.name}{friction}/{self.version}"
+        """Name and version, as stored with results; it says when friction or anything else is not as named."""
+        named = PROTOCOLS.get(self.name, self)
+        friction = "" if self.friction == named.friction else f"+friction{self.friction:g}"
+        changed = "" if replace(self, friction=named.friction) == named else "+changed"
+        return f"{self.name}{friction}{changed}/{self.version}"
 
 
 PROTOCOLS = {

@@ -24,6 +24,8 @@ from dro_grasp.simulation.protocols import Protocol
 
 HULL_VERTICES = 64
 """Most vertices of a colliding hull; more only cost time."""
+SOLVER_ITERATIONS = 20
+"""Most iterations of the contact solver; two are the rule, and a hundred give the same verdicts."""
 EQUALITY_TIME = 0.01
 """Time constant of joint couplings [s], the stiffest that a 5 ms step allows."""
 FAR_AWAY = (0.0, 0.0, 5.0)
@@ -54,10 +56,7 @@ class Scene:
     @cached_property
     def hand_qpos(self) -> tuple[np.ndarray, np.ndarray]:
         """Addresses in qpos, and indices into the tree's moving joints, of the joints that are simulated."""
-        names = {self.model.joint(j).name: int(self.model.jnt_qposadr[j]) for j in range(self.model.njnt)}
-        pairs = [(names[_PREFIX + n], i) for i, n in enumerate(self.hand.tree.moving_names) if _PREFIX + n in names]
-        addresses, joints = np.array(pairs).T
-        return addresses, joints
+        return _joint_addresses(self.model, self.hand)
 
     @cached_property
     def actuated(self) -> np.ndarray:
@@ -80,10 +79,6 @@ class Scene:
         q[:, self.object_qpos] = torch.cat([T_wrist_object[:, :3, 3], quaternion], -1).numpy()
         return q
 
-    def is_hand(self, body: np.ndarray) -> np.ndarray:
-        """Mask of the bodies that belong to the hand."""
-        return (body != 0) & (body != self.object_body)
-
 
 def build_scene(hand: Hand, obj: ObjectModel, protocol: Protocol) -> Scene:
     """Put a hand and an object into one model.
@@ -97,7 +92,8 @@ def build_scene(hand: Hand, obj: ObjectModel, protocol: Protocol) -> Scene:
     if hand.description is None:
         raise HandError(f"hand '{hand.name}' carries no description; load it by name or file to simulate it")
     scene = _empty_scene(protocol)
-    scene.attach(_hand_spec(hand, protocol), prefix=_PREFIX, frame=scene.worldbody.add_frame())
+    _attach(scene, _hand_spec(hand, protocol))
+    _add_servos(scene, hand, protocol)
     _add_object(scene, obj, protocol)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -113,11 +109,12 @@ def _empty_scene(protocol: Protocol) -> mujoco.MjSpec:
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     # The sparse Newton solver of MuJoCo 4.0.0 can be wrong.
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    option.iterations = SOLVER_ITERATIONS
     return scene
 
 
 def _hand_spec(hand: Hand, protocol: Protocol) -> mujoco.MjSpec:
-    """The hand with position servos on its independent joints, all hands alike."""
+    """The hand with the protocol's contacts, without a description's damping, springs and limits of effort."""
     assert hand.description is not None
     spec = hand.description.spec()
     _hold_joints(spec, hand)
@@ -125,20 +122,48 @@ def _hand_spec(hand: Hand, protocol: Protocol) -> mujoco.MjSpec:
         mesh.maxhullvert = HULL_VERTICES
     for geom in spec.geoms:
         geom.friction[:2] = [protocol.friction, protocol.torsional_friction]
-        geom.condim, geom.margin, geom.gap = 4, 0.0, 0.0
+        # A contact takes the larger of two dimensions: four with the object, none but the normal between links.
+        # With friction there, the Newton solver of MuJoCo 4.0.0 diverges at times, and 1 % of the trials explode.
+        geom.condim, geom.margin, geom.gap = 1, 0.0, 0.0
         geom.solref, geom.solimp = [0.02, 1], [0.9, 0.95, 0.001, 0.5, 2]
     for equality in spec.equalities:
         equality.solref = [EQUALITY_TIME, 1]
     for joint in spec.joints:
-        joint.armature, joint.frictionloss = protocol.armature, 0.0
+        joint.armature, joint.frictionloss = protocol.armature / _lever(joint, protocol) ** 2, 0.0
         joint.damping[:] = 0.0
         joint.stiffness[:] = 0.0
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-        if joint.name in hand.tree.joint_names:
-            actuator = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-            actuator.set_to_position(kp=protocol.stiffness, kv=protocol.damping)
-            actuator.forcelimited, actuator.forcerange = True, [-protocol.force_limit, protocol.force_limit]
     return spec
+
+
+def _attach(scene: mujoco.MjSpec, hand: mujoco.MjSpec) -> None:
+    """Put the hand's root at the origin, fixed."""
+    # Where some meshes live in memory, MuJoCo 4.0.0 puts the prefix into the file names of the others as well.
+    on_disk = {_PREFIX + mesh.name: mesh.file for mesh in hand.meshes if mesh.file and mesh.file not in hand.assets}
+    scene.attach(hand, prefix=_PREFIX, frame=scene.worldbody.add_frame())
+    for mesh in scene.meshes:
+        mesh.file = on_disk.get(mesh.name, mesh.file)
+
+
+def _add_servos(scene: mujoco.MjSpec, hand: Hand, protocol: Protocol) -> None:
+    """Position servos on the independent joints, all hands alike.
+
+    They are added to the scene, not to the hand, whose description may set defaults for actuators.
+    """
+    for joint in scene.joints:
+        if joint.name.removeprefix(_PREFIX) not in hand.tree.joint_names:
+            continue
+        lever = _lever(joint, protocol)
+        name = joint.name.removeprefix(_PREFIX)
+        actuator = scene.add_actuator(name=name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator.set_to_position(kp=protocol.stiffness / lever**2, kv=protocol.damping / lever**2)
+        limit = protocol.force_limit / lever
+        actuator.forcelimited, actuator.forcerange = True, [-limit, limit]
+
+
+def _lever(joint: mujoco.MjsJoint, protocol: Protocol) -> float:
+    """What turns Nm/rad into N/m for sliding joints."""
+    return protocol.lever if joint.type == mujoco.mjtJoint.mjJNT_SLIDE else 1.0
 
 
 def _hold_joints(spec: mujoco.MjSpec, hand: Hand) -> None:
@@ -181,8 +206,7 @@ def _exclude_resting_contacts(scene: mujoco.MjSpec, hand: Hand) -> None:
     """
     model = scene.compile()
     data = mujoco.MjData(model)
-    trial = Scene(model, hand, None, None)  # type: ignore[arg-type]
-    addresses, moving = trial.hand_qpos
+    addresses, moving = _joint_addresses(model, hand)
     pairs: set[tuple[str, str]] = set()
     for openness in (0.75, 1.0):
         q = hand.canonical_joints(openness)
@@ -197,6 +221,12 @@ def _exclude_resting_contacts(scene: mujoco.MjSpec, hand: Hand) -> None:
             pairs |= {_named(model, body, other) for other in range(1, model.nbody) if model.body_weldid[other] == 0}
     for first, second in sorted(p for p in pairs if p[0] != p[1] and "object" not in p):
         scene.add_exclude(bodyname1=first, bodyname2=second)
+
+
+def _joint_addresses(model: mujoco.MjModel, hand: Hand) -> tuple[np.ndarray, np.ndarray]:
+    names = {model.joint(j).name: int(model.jnt_qposadr[j]) for j in range(model.njnt)}
+    pairs = [(names[_PREFIX + n], i) for i, n in enumerate(hand.tree.moving_names) if _PREFIX + n in names]
+    return np.array([a for a, _ in pairs], int), np.array([i for _, i in pairs], int)
 
 
 def _pair(model: mujoco.MjModel, a: int, b: int) -> tuple[str, str]:
