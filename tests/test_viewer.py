@@ -140,7 +140,7 @@ def test_a_browser_shows_the_grasp(grasps: GraspBatch, tmp_path: Path) -> None:
         assert errors == []
     finally:
         server.terminate()
-        server.wait(20)
+        server.communicate(timeout=20)
     from PIL import Image
 
     with Image.open(tmp_path / "viewer.png") as file_:

@@ -1,0 +1,108 @@
+"""The documents say nothing that is not there: commands parse, names exist, snippets run, links lead somewhere."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+import dro_grasp as dro
+from dro_grasp.cli.main import parse
+from tests.weights import untrained_weights
+
+ROOT = Path(__file__).parent.parent
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+FILE = re.compile(r"`((?:benchmarks|docs|tests|geometry|kinematics|models|src)/[\w/.-]+\.\w+)`")
+MAKE_TARGET = re.compile(r"^([\w-]+):", re.MULTILINE)
+
+
+def blocks(language: str) -> list[tuple[str, str]]:
+    """(document, text) of every code block in a language."""
+    found = []
+    for document in DOCUMENTS:
+        found += [(document.name, m[2]) for m in BLOCK.finditer(document.read_text()) if m[1] == language]
+    return found
+
+
+def commands() -> list[str]:
+    """Every line of shell in the documents, and of the examples in --help."""
+    lines = [line.split("#")[0].strip() for _, text in blocks("bash") for line in text.splitlines()]
+    for file in (ROOT / "src" / "dro_grasp" / "cli").glob("*.py"):
+        for example in re.findall(r"Example: (.*?)\n    (?:\"\"\"|\n)", file.read_text(), re.DOTALL):
+            lines.append(" ".join(example.split()))
+    return sorted({line for line in lines if line})
+
+
+@pytest.mark.parametrize("command", commands())
+def test_commands_are_understood(command: str) -> None:
+    words = shlex.split(command)
+    if words[0] == "make":
+        assert words[1] in MAKE_TARGET.findall((ROOT / "Makefile").read_text())
+    elif words[0] == "dro-grasp":
+        parse(words[1:])
+    else:
+        assert words[0] in {"mkdir", "git", "cd", "pip"}, command
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda d: d.name)
+def test_links_lead_somewhere(document: Path) -> None:
+    for target in LINK.findall(document.read_text()):
+        if not target.startswith(("http://", "https://", "#")):
+            assert (document.parent / target.split("#")[0]).exists(), target
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda d: d.name)
+def test_named_files_exist(document: Path) -> None:
+    for name in FILE.findall(document.read_text()):
+        assert (ROOT / name).exists() or (ROOT / "src" / "dro_grasp" / name).exists(), name
+
+
+def test_every_document_is_reachable_from_the_readme() -> None:
+    linked = set(LINK.findall((ROOT / "README.md").read_text()))
+    assert {f"docs/{d.name}" for d in DOCUMENTS[1:]} <= linked
+
+
+def test_python_parses_and_uses_public_names() -> None:
+    for document, text in blocks("python"):
+        for node in ast.walk(ast.parse(text, document)):
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "dro":
+                assert node.attr in dro.__all__, f"{document}: dro.{node.attr}"
+
+
+def test_the_snippets_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """The README's, then the one that reads its file; a small hand and untrained weights keep it quick."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("dro_grasp.models.checkpoints.locate_weights", lambda name=None: untrained_weights(tmp_path))
+    readme = next(t for d, t in blocks("python") if d == "README.md")
+    reader = next(t for d, t in blocks("python") if d == "file-formats.md")
+    quick = readme.replace('"allegro"', '"gripper3"').replace('"mug"', '"sphere"').replace("num=16", "num=2")
+    assert quick != readme
+    names: dict = {}
+    exec(compile(quick, "README.md", "exec"), names)
+    names["grasps"].save("grasps.parquet")
+    exec(compile(reader, "file-formats.md", "exec"), {})
+    assert "a_base" in capsys.readouterr().out
+
+
+def test_json_example_has_the_keys_of_generate() -> None:
+    (_, text), *_ = blocks("json")
+    example = json.loads(text)
+    source = (ROOT / "src" / "dro_grasp" / "cli" / "generate.py").read_text()
+    assert all(f'"{key}":' in source for key in example)
+    assert list(example["seconds"]) == ["load", "network", "decode", "rank", "trial"]
+
+
+def test_public_names_of_the_readme_demo_exist() -> None:
+    from dro_grasp.hands.library import hand_names
+    from dro_grasp.objects.library import object_names
+
+    makefile = (ROOT / "Makefile").read_text()
+    hand, obj = re.search(r"--hand (\w+)", makefile)[1], re.search(r"--object (\w+)", makefile)[1]
+    assert hand_names()[hand] == "builtin"
+    assert object_names()[obj] == "test", "the demo's object is one that no weights were trained on"
