@@ -73,7 +73,8 @@ class GraspPredictor:
         self.network: DistanceNetwork = load_weights(self.weights).to(self.device).eval()
         self.weights_name: str = self.network.name
 
-    @torch.inference_mode()
+    # no_grad, not inference_mode: roma caches a tensor at first use, which training could then not use.
+    @torch.no_grad()
     def predict(
         self,
         hand: Hand,

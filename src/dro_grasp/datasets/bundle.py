@@ -126,7 +126,7 @@ def load_bundle(path: Path | str) -> Bundle:
     try:
         with safe_open(path, "pt") as file:
             header = json.loads((file.metadata() or {}).get("dro_grasp_bundle", "null"))
-            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+            tensors = {key: file.get_tensor(key) for key in file.keys()}
     except (SafetensorError, json.JSONDecodeError, OSError) as error:
         raise BundleError(f"{path} is no bundle, or was cut short ({error}); make it again") from error
     if header is None:

@@ -25,13 +25,13 @@ class HandIdentity(Protocol):
     """What a batch records of a hand; every Hand has it."""
 
     @property
-    def name(self) -> str: ...  # noqa: D102
+    def name(self) -> str: ...
 
     @property
-    def sha256(self) -> str: ...  # noqa: D102
+    def sha256(self) -> str: ...
 
     @property
-    def tree(self) -> Any: ...  # noqa: D102
+    def tree(self) -> Any: ...
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ def score_grasps(
     config = config or ScoreConfig()
     if not len(grasps):
         return torch.zeros(0)
-    with torch.inference_mode():
+    with torch.no_grad():
         energy = score_energy(hand, obj, config)
         parts = [
             evaluate_nearest(energy, T, q).total

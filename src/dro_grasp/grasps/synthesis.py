@@ -121,7 +121,7 @@ def synthesize(
     generator = torch.Generator().manual_seed(seed)
     surface = torch.as_tensor(obj.cloud, dtype=torch.float32)
     sizes = [min(config.batch_size, num - start) for start in range(0, num, config.batch_size)]
-    with torch.inference_mode():
+    with torch.no_grad():
         states = [optimise(energy, surface, size, config, generator) for size in sizes]
     terms = torch.cat([s.result.terms for s in states])
     batch = GraspBatch.create(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from dro_grasp.hands.build import build_hand
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand_description
 from dro_grasp.kinematics.loader import Description
-from dro_grasp.kinematics.urdf import Note
+from dro_grasp.kinematics.notes import Note
 
 LARGEST_HAND, SMALLEST_HAND = 1.0, 0.02
 """Extents outside of which a hand's units are doubtful [m]."""
@@ -191,7 +192,7 @@ def _meshes(hand: Hand, openness: float) -> list[Mesh]:
     start = (T[:3, :3] @ hand.palm_centre + T[:3, 3]).numpy()
     meshes.append(arrow(start, start + 0.1 * hand.palm_direction_wrist.numpy(), DIRECTION, radius=0.003))
     for track in _tracks(hand):
-        meshes.extend(arrow(a, b, TRACK, radius=0.0012) for a, b in zip(track[:-1], track[1:], strict=True))
+        meshes.extend(arrow(a, b, TRACK, radius=0.0012) for a, b in pairwise(track))
     return meshes
 
 

@@ -5,29 +5,18 @@ The result is an XML string that MuJoCo reads; everything found on the way is re
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
-
-import defusedxml
-import defusedxml.ElementTree
 
 from dro_grasp.errors import HandError
+from dro_grasp.kinematics.notes import Note
+from dro_grasp.kinematics.urdf_meshes import resolve_meshes
 
-READABLE_MESHES = {".stl", ".obj", ".msh"}
-"""Mesh formats that MuJoCo reads itself; others go through trimesh."""
-
-
-@dataclass(frozen=True)
-class Note:
-    """Something that loading found: what was derived, repaired or is wrong."""
-
-    level: Literal["info", "warning", "error"]
-    subject: str
-    """The link, joint or file concerned."""
-    text: str
+MOVING = {"revolute", "continuous", "prismatic"}
+"""URDF joint types that move in one way."""
 
 
 @dataclass(frozen=True)
@@ -42,29 +31,6 @@ class PreparedUrdf:
     """Stand-in file name -> mesh in a format that MuJoCo cannot read (GLB, DAE, ...)."""
 
 
-def parse_xml(path: Path) -> ET.Element:
-    """Parse a description, refusing entity tricks.
-
-    Raises:
-        HandError: The file is missing, is not XML, or declares entities.
-    """
-    if path.is_dir():
-        raise HandError(f"{path} is a folder; give the URDF or MJCF file inside it")
-    if not path.is_file():
-        raise HandError(f"no hand description at {path}; give an existing .urdf or .xml file, or a name that "
-                        "`dro-grasp hands` lists")
-    try:
-        root = defusedxml.ElementTree.parse(path, forbid_dtd=False).getroot()
-    except defusedxml.DefusedXmlException as error:
-        raise HandError(f"{path} declares XML entities ({type(error).__name__}), which are refused because they can "
-                        "exhaust memory or read other files; remove its <!ENTITY ...> lines") from error
-    except ET.ParseError as error:
-        raise HandError(f"{path} is not valid XML ({error}); expected a URDF (<robot>) or MJCF (<mujoco>) file") from error
-    if root is None:
-        raise HandError(f"{path} is an empty XML file; expected a URDF (<robot>) or MJCF (<mujoco>) file")
-    return root
-
-
 def prepare_urdf(root: ET.Element, path: Path) -> PreparedUrdf:
     """Check the link tree, resolve meshes and set what MuJoCo needs to know.
 
@@ -72,11 +38,12 @@ def prepare_urdf(root: ET.Element, path: Path) -> PreparedUrdf:
         HandError: No moving joint, a cycle, several roots, or no mesh that can be found.
     """
     notes: list[Note] = []
+    _settle_joints(root, path, notes)
     base = _check_links(root, path)
     if base == "world":
         _rename_link(root, "world", "world_link")
     _check_mimic(root, path, notes)
-    files, converted = _resolve_meshes(root, path, notes)
+    files, converted = resolve_meshes(root, path, notes)
     extension = root.find("mujoco")
     extension = ET.SubElement(root, "mujoco") if extension is None else extension
     compiler = extension.find("compiler")
@@ -88,11 +55,65 @@ def prepare_urdf(root: ET.Element, path: Path) -> PreparedUrdf:
     return PreparedUrdf(ET.tostring(root, encoding="unicode"), tuple(notes), tuple(files), converted)
 
 
+def _settle_joints(root: ET.Element, path: Path, notes: list[Note]) -> None:
+    """Every joint fixed or moving in one way, about an axis, within sensible limits."""
+    for joint in root.findall("joint"):
+        name, kind = joint.get("name", ""), joint.get("type")
+        if kind == "floating":
+            joint.set("type", "fixed")
+            notes.append(Note("info", name, "is a floating joint and is taken as fixed: the wrist is free anyway"))
+        elif kind not in MOVING | {"fixed"}:
+            raise HandError(f"{path}: joint '{name}' has the type '{kind}'; expected one of "
+                            f"{', '.join(sorted(MOVING))}, fixed, floating")
+        elif kind != "fixed":
+            _check_axis(joint, path)
+            if kind != "continuous":
+                _check_limits(joint, path, notes)
+
+
+def _check_axis(joint: ET.Element, path: Path) -> None:
+    element = joint.find("axis")
+    if element is None:
+        return
+    axis = _numbers(element, "xyz", path, joint)
+    if len(axis) != 3 or math.hypot(*axis) < 1e-6:
+        raise HandError(f"{path}: joint '{joint.get('name')}' has the axis '{element.get('xyz')}'; expected a direction "
+                        "of three numbers, not all zero")
+
+
+def _check_limits(joint: ET.Element, path: Path, notes: list[Note]) -> None:
+    """Refuse limits that no joint value satisfies; a joint without range is fixed."""
+    element = joint.find("limit")
+    if element is None or "lower" not in element.attrib or "upper" not in element.attrib:
+        return
+    lower, upper = (_numbers(element, end, path, joint)[0] for end in ("lower", "upper"))
+    if lower > upper:
+        raise HandError(f"{path}: joint '{joint.get('name')}' has the lower limit {lower:g} above its upper limit "
+                        f"{upper:g}; swap them")
+    if lower == upper != 0:
+        raise HandError(f"{path}: joint '{joint.get('name')}' has both limits at {lower:g}, so it cannot move; give it a "
+                        "range, or make it fixed at that value")
+    if lower == upper and joint.find("mimic") is None:
+        joint.set("type", "fixed")
+        notes.append(Note("warning", joint.get("name", ""), "has both limits at zero and is taken as fixed"))
+
+
+def _numbers(element: ET.Element, attribute: str, path: Path, joint: ET.Element) -> list[float]:
+    try:
+        values = [float(x) for x in element.get(attribute, "").split()]
+    except ValueError:
+        values = []
+    if not values or not all(math.isfinite(x) for x in values):
+        raise HandError(f"{path}: joint '{joint.get('name')}' has {attribute}=\"{element.get(attribute)}\" in "
+                        f"<{element.tag}>; expected finite numbers")
+    return values
+
+
 def _check_links(root: ET.Element, path: Path) -> str:
     """The root link's name; the tree must be a tree."""
     links = [link.get("name", "") for link in root.findall("link")]
     joints = root.findall("joint")
-    moving = [j for j in joints if j.get("type") in {"revolute", "continuous", "prismatic"}]
+    moving = [j for j in joints if j.get("type") in MOVING]
     if not links:
         raise HandError(f"{path} has no <link>; expected a robot hand description")
     if not moving:
@@ -151,56 +172,6 @@ def _check_mimic(root: ET.Element, path: Path, notes: list[Note]) -> None:
                 raise HandError(f"{path}: mimic joints follow each other in a cycle ({' -> '.join(chain)}); one of "
                                 "them must be free")
         kind = joints[target].get("type") if target in joints else "missing"
-        if kind not in {"revolute", "continuous", "prismatic"}:
+        if kind not in MOVING:
             notes.append(Note("warning", name, f"mimics joint '{target}', which is {kind}; the joint is taken as free"))
             joints[name].remove(joints[name].find("mimic"))  # type: ignore[arg-type]
-
-
-def _resolve_meshes(root: ET.Element, path: Path, notes: list[Note]) -> tuple[list[Path], dict[str, Path]]:
-    """Point every mesh to its file; drop what cannot be found, if something is left."""
-    files: list[Path] = []
-    converted: dict[str, Path] = {}
-    missing: list[str] = []
-    for link in root.iter("link"):
-        for element in [*link.findall("visual"), *link.findall("collision")]:
-            mesh = element.find("geometry/mesh")
-            if mesh is None:
-                continue
-            name = mesh.get("filename", "")
-            file = find_mesh(name, path.parent)
-            if file is None:
-                missing.append(name)
-                link.remove(element)
-                notes.append(Note("warning", link.get("name", ""), f"{element.tag} mesh '{name}' was not found and is "
-                                  "left out"))
-                continue
-            files.append(file)
-            if file.suffix.lower() not in READABLE_MESHES:
-                converted[name] = file
-                mesh.set("filename", name)
-            else:
-                mesh.set("filename", str(file))
-    if missing and not files and not _has_geometry(root):
-        looked = ", ".join(str(p) for p in _mesh_roots(missing[0], path.parent)[:3])
-        raise HandError(f"{path}: none of its {len(missing)} meshes can be found (first: '{missing[0]}'; looked below "
-                        f"{looked}); put the meshes beside the URDF or correct the file names")
-    return files, converted
-
-
-def _has_geometry(root: ET.Element) -> bool:
-    return any(link.find(f"{kind}/geometry") is not None for link in root.iter("link") for kind in ("visual", "collision"))
-
-
-def _mesh_roots(name: str, folder: Path) -> tuple[Path, ...]:
-    return (folder, *list(folder.parents)[:4]) if "://" in name else (folder,)
-
-
-def find_mesh(name: str, folder: Path) -> Path | None:
-    """The file behind a mesh name: relative, absolute, `package://` or `file://`; None when there is none."""
-    rest = name.split("://", 1)[-1]
-    for root in _mesh_roots(name, folder):
-        for tail in (rest, rest.split("/", 1)[-1]):
-            candidate = root / tail
-            if candidate.is_file():
-                return candidate.resolve()
-    return None

@@ -75,7 +75,7 @@ def contrastive_step(
     return contrastive_loss(features_a, features_b, b, config.temperature, config.sharpness).mean()
 
 
-@torch.inference_mode()
+@torch.no_grad()
 def matching_rank(
     encoder: StaticGraphEncoder, source: SampleSource, samples: int, generator: torch.Generator
 ) -> dict[str, float]:

@@ -93,7 +93,7 @@ class GraspViewer:
         self.index = index
         self.posture = posture or self.posture
         T, q = self.grasps.T_object_wrist[index].float(), self._joints[self.posture][index]
-        with torch.inference_mode():
+        with torch.no_grad():
             poses = (T @ self.hand.tree.forward(q)).double().numpy()
             points = self.hand.points(q, T).numpy()
         with self.server.atomic():

@@ -57,7 +57,7 @@ def draw_grasp(
 ) -> np.ndarray:
     """The picture (height width 3) of one grasp, from the viewpoint that hides least."""
     joints, T = grasps.joints[index].float(), grasps.T_object_wrist[index].float()
-    with torch.inference_mode():
+    with torch.no_grad():
         meshes = [*object_meshes(obj), *hand_meshes(hand, joints, T, above_palm=False)]
         camera = best_camera(hand, joints, T, obj, aspect=size[0] / size[1])
     return render(meshes, camera, *size)

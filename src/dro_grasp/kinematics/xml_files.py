@@ -1,0 +1,64 @@
+"""Reading description files as XML, refusing what XML can do besides describing."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import defusedxml
+import defusedxml.ElementTree
+
+from dro_grasp.errors import HandError
+
+XACRO = "{http://www.ros.org/wiki/xacro}"
+"""Namespace of xacro's tags, as ElementTree spells it."""
+
+
+def parse_xml(path: Path) -> ET.Element:
+    """Parse a description, refusing entity tricks.
+
+    Raises:
+        HandError: The file is missing, is not XML, or declares entities.
+    """
+    if path.is_dir():
+        raise HandError(f"{path} is a folder; give the URDF or MJCF file inside it")
+    if not path.is_file():
+        raise HandError(f"no hand description at {path}; give an existing .urdf or .xml file, or a name that "
+                        "`dro-grasp hands` lists")
+    try:
+        root = defusedxml.ElementTree.parse(path, forbid_dtd=False).getroot()
+    except defusedxml.DefusedXmlException as error:
+        raise HandError(f"{path} declares XML entities ({type(error).__name__}), which are refused because they can "
+                        "exhaust memory or read other files; remove its <!ENTITY ...> lines") from error
+    except (ET.ParseError, UnicodeError) as error:
+        raise HandError(f"{path} is not valid XML ({error}); expected a URDF (<robot>) or MJCF (<mujoco>) file") from error
+    except (OSError, ValueError, LookupError) as error:
+        raise HandError(f"{path} cannot be read ({error}); expected a URDF (<robot>) or MJCF (<mujoco>) file") from error
+    if root is None:
+        raise HandError(f"{path} is an empty XML file; expected a URDF (<robot>) or MJCF (<mujoco>) file")
+    if any(isinstance(element.tag, str) and element.tag.startswith(XACRO) for element in root.iter()):
+        raise HandError(f"{path} is a xacro template; expand it first: xacro {path.name} > {path.stem}.urdf")
+    return root
+
+
+def included_files(root: ET.Element, path: Path) -> tuple[Path, ...]:
+    """Every file that an MJCF includes, directly or through others.
+
+    Raises:
+        HandError: One is missing or cannot be parsed.
+    """
+    found: dict[Path, None] = {}
+    waiting = [(root, path)]
+    while waiting:
+        element, including = waiting.pop()
+        for include in element.iter("include"):
+            name = include.get("file", "")
+            # MuJoCo reads includes relative to the main file, at any depth.
+            file = next((f for f in (path.parent / name, including.parent / name) if f.is_file()), None)
+            if file is None:
+                raise HandError(f"{including} includes '{name}', which does not exist in {path.parent}; put it there or "
+                                "remove the <include>")
+            if file.resolve() not in found:
+                found[file.resolve()] = None
+                waiting.append((parse_xml(file), file))
+    return tuple(found)
