@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from dro_grasp.errors import OutputError
-from dro_grasp.geometry.rasterizer import render
+from dro_grasp.geometry.rasterizer import Camera, render
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
@@ -76,6 +76,28 @@ def test_object_and_every_finger_are_seen(hand, obj, grasps) -> None:
     for colour in {OBJECT_COLOUR, *link_colours(hand)}:
         without = render([m for m in everything if m.colour != colour], camera, 160, 120)
         assert (whole != without).any(-1).sum() > 30, colour
+
+
+def test_the_palm_is_not_in_the_way(hand, obj) -> None:
+    # Laid on its side, so that the view from behind the palm is one of those to choose from.
+    T = torch.eye(4)
+    T[:3, :3] = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    T[:3, 3] = -T[:3, :3] @ hand.grasp_centre_wrist
+    joints = hand.canonical_joints(0.6)
+    points = np.concatenate([hand.points(joints, T).numpy(), obj.cloud])
+    chosen = best_camera(hand, joints, T, obj)
+    behind = Camera.around(points, tuple((-T[:3, :3] @ hand.palm_direction_wrist).tolist()), field_of_view=0.5)
+    shown = []
+    for camera in (chosen, behind):
+        pictures = [
+            render([*hand_meshes(hand, joints, T), *[dataclasses.replace(m, colour=c) for m in object_meshes(obj)]],
+                   camera, 160, 120)
+            for c in ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+        ]
+        shown.append((pictures[0] != pictures[1]).any(-1).sum())
+    assert shown[0] > 1.5 * shown[1]
+    towards = np.subtract(chosen.position, chosen.target) / np.linalg.norm(np.subtract(chosen.position, chosen.target))
+    assert towards @ (T[:3, :3] @ hand.palm_direction_wrist).numpy() > -0.5
 
 
 def test_clouds_and_hands_without_description_are_drawn_as_points(hand, obj, grasps) -> None:
