@@ -142,6 +142,24 @@ def test_parts_of_a_concave_mesh_fill_it_and_are_cached(monkeypatch: pytest.Monk
         np.testing.assert_allclose(trimesh.Trimesh(vertices, faces).volume, hull.volume)
 
 
+def test_parts_of_a_mesh_with_a_hole_fill_it():
+    whole = l_block().subdivide().subdivide().subdivide()
+    obj = mesh_object("l", trimesh.Trimesh(whole.vertices, whole.faces[60:]), origin="l")
+    assert any("not watertight" in note for note in obj.notes)
+    hulls = [trimesh.Trimesh(*part) for part in obj.parts]
+    assert len(hulls) >= 2
+    assert sum(hull.volume for hull in hulls) == pytest.approx(whole.volume, rel=0.15)
+
+
+def test_part_of_a_sheet_is_its_hull():
+    x, y = np.meshgrid(np.linspace(-0.05, 0.05, 12), np.linspace(-0.05, 0.05, 12), indexing="ij")
+    vertices = np.stack([x, y, 4 * x * y], -1).reshape(-1, 3)
+    corner = (np.arange(11)[:, None] * 12 + np.arange(11)).ravel()
+    faces = np.concatenate([corner[:, None] + (0, 12, 13), corner[:, None] + (0, 13, 1)])
+    obj = mesh_object("sheet", trimesh.Trimesh(vertices, faces), origin="sheet")
+    assert sum(trimesh.Trimesh(*part).volume for part in obj.parts) == pytest.approx(obj.volume, rel=0.1)
+
+
 def test_bare_cloud_has_no_grid_and_no_parts():
     obj = cloud_object("cloud", ball().cloud.astype(np.float64), origin="cloud")
     assert obj.is_cloud

@@ -131,6 +131,8 @@ def test_stated_joints_come_before_the_controller_s(hand, obj):
     held = grasps.replace(pregrasp_joints=grasps.joints, squeeze_joints=grasps.joints)
     still = replace(protocol("dro"), controller=ControllerConfig(outer=0.0, inner=0.0))
     same(simulate(hand, obj, held, "dro"), simulate(hand, obj, grasps, still))
+    unopened = replace(protocol("dro"), controller=ControllerConfig(outer=0.0))
+    same(simulate(hand, obj, held.replace(squeeze_joints=None), "dro"), simulate(hand, obj, grasps, unopened))
 
 
 def test_settled_labels_touch_without_penetrating(hand, obj):

@@ -5,20 +5,19 @@ Source: paper section III-B and appendix, dataset preprocessing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import dataclasses
 
 import numpy as np
 import torch
 
 from dro_grasp.errors import HandError
-from dro_grasp.geometry.point_clouds import farthest_points, sample_surface
+from dro_grasp.geometry.point_clouds import farthest_points
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.palm import CLOSINGS, Palm, find_palm
+from dro_grasp.hands.surface import LinkSurface, sample_links
 from dro_grasp.kinematics.loader import Description
 from dro_grasp.kinematics.tree import FIXED, KinematicTree
 
-POINTS_PER_LINK_SAMPLED = 512
-"""Points sampled on each link before farthest point sampling. Source: appendix, robot point cloud sampling."""
 TIP_OFFSET = 0.03
 """Distance of the extra target beyond a fingertip [m]."""
 AXIS_ALONG_PALM = 0.75
@@ -27,15 +26,6 @@ PARALLEL = 0.9
 """Cosine above which two joint axes count as parallel."""
 REFINEMENTS = 3
 """How often open ends and palm are derived from each other."""
-
-
-@dataclass(frozen=True)
-class _Surface:
-    """Dense surface samples of all links from the palm on."""
-
-    points: torch.Tensor
-    normals: torch.Tensor
-    link: torch.Tensor
 
 
 def build_hand(description: Description, *, name: str | None = None, seed: int = 0, n_points: int = 512) -> Hand:
@@ -55,12 +45,12 @@ def build_hand(description: Description, *, name: str | None = None, seed: int =
     if not shaped:
         raise HandError(f"{description.path} has no visual or collision shape; nothing can be sampled or touch")
     tips = find_tips(tree, shaped)
-    palm = find_palm_link(tree, tips)
+    palm = find_palm_link(tree, tips, shaped)
     below = [link for link in range(tree.n_links) if bool(tree.descends[link, palm])]
     held = _held_joints(tree, palm)
     rest = torch.zeros(tree.n_dof).clamp(tree.lower, tree.upper)
-    surface = _sample_links(description, [link for link in below if link in shaped], seed)
-    opening, abduction, found = _open_ends(tree, _coarse(surface), tips, palm, held, rest)
+    surface = sample_links(description, [link for link in below if link in shaped], seed)
+    opening, abduction, found = _open_ends(tree, surface.coarse(), tips, palm, held, rest)
     T_palm = _inverse(tree.forward(rest)[palm])
     to_palm = lambda p: (T_palm[:3, :3] @ torch.tensor(p, dtype=torch.float32) + T_palm[:3, 3])  # noqa: E731
     draft = Hand(
@@ -74,12 +64,6 @@ def build_hand(description: Description, *, name: str | None = None, seed: int =
     return _thin(draft, n_points)
 
 
-def _coarse(surface: _Surface) -> _Surface:
-    """A quarter of the samples, enough to see where the palm looks."""
-    kept = slice(None, None, 4)
-    return _Surface(surface.points[kept], surface.normals[kept], surface.link[kept])
-
-
 def find_tips(tree: KinematicTree, shaped: list[int]) -> tuple[int, ...]:
     """Fingertips: below each last moving joint, the deepest link with a shape.
 
@@ -88,24 +72,33 @@ def find_tips(tree: KinematicTree, shaped: list[int]) -> tuple[int, ...]:
     """
     tips = []
     for link in range(tree.n_links):
-        group = [i for i in range(tree.n_links) if bool(tree.descends[i, link])]
-        if tree.kind[link] == FIXED or any(tree.kind[i] != FIXED for i in group if i != link):
+        if tree.kind[link] == FIXED:
             continue
+        group = [i for i in range(tree.n_links) if bool(tree.descends[i, link])]
         solid = [i for i in group if i in shaped]
-        if solid:
+        moved_further = any(tree.kind[j] != FIXED and j > link for i in solid for j in _chain(tree, i))
+        if solid and not moved_further:
             tips.append(max(solid, key=lambda i: int(tree.descends[i].sum())))
     if not tips:
         raise HandError("no moving joint of this description carries a shape, so it has no fingertip")
     return tuple(tips)
 
 
-def find_palm_link(tree: KinematicTree, tips: tuple[int, ...]) -> int:
-    """The last common ancestor of the fingertips; with one finger, the link that carries it."""
+def find_palm_link(tree: KinematicTree, tips: tuple[int, ...], shaped: list[int]) -> int:
+    """The last common ancestor of the fingertips; with one finger, the link that carries it.
+
+    Where neither it nor anything fixed to it has a shape, the nearest link that it is fixed to and that has one.
+    """
     common = torch.stack([tree.descends[t] for t in tips]).all(0).nonzero()[:, 0].tolist()
     palm = max(common)
     while len(tips) == 1 and palm > 0 and any(tree.kind[i] != FIXED for i in _chain(tree, palm)):
         palm = tree.parent[palm]
-    return palm
+    candidate = palm
+    while not any(_rigid_to(tree, i, candidate) for i in shaped):
+        if candidate == 0 or tree.kind[candidate] != FIXED:
+            return palm
+        candidate = tree.parent[candidate]
+    return candidate
 
 
 def _chain(tree: KinematicTree, link: int) -> list[int]:
@@ -118,55 +111,8 @@ def _held_joints(tree: KinematicTree, palm: int) -> torch.Tensor:
     return above > 0
 
 
-def _sample_links(description: Description, links: list[int], seed: int) -> _Surface:
-    """Dense samples on what MuJoCo collides, or on the visual shapes of links that do not collide."""
-    generator = torch.Generator().manual_seed(seed)
-    points, normals, index = [], [], []
-    for link in links:
-        shapes = [g for g in description.geometry if g.link == link]
-        shapes = [g for g in shapes if g.collides] or shapes
-        p, n = _sample_shapes([(g.vertices, g.faces) for g in shapes], generator)
-        points.append(p)
-        normals.append(n)
-        index.append(torch.full((len(p),), link))
-    return _Surface(torch.cat(points), torch.cat(normals), torch.cat(index))
-
-
-def _sample_shapes(
-    shapes: list[tuple[np.ndarray, np.ndarray]], generator: torch.Generator
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Samples on the outside of a union of convex shapes."""
-    vertices = torch.cat([torch.tensor(v, dtype=torch.float32) for v, _ in shapes])
-    starts = np.cumsum([0, *[len(v) for v, _ in shapes]])
-    faces = torch.cat([torch.tensor(f.astype(np.int64)) + int(s) for (_, f), s in zip(shapes, starts, strict=False)])
-    owner = torch.cat([torch.full((len(f),), i) for i, (_, f) in enumerate(shapes)])
-    points, normals, face = sample_surface(vertices, faces, 4 * POINTS_PER_LINK_SAMPLED, generator)
-    hidden = torch.zeros(len(points), dtype=torch.bool)
-    if len(shapes) > 1:
-        for i, (v, f) in enumerate(shapes):
-            hidden |= (owner[face] != i) & _inside_convex(points, v, f)
-    seen = (~hidden).nonzero()[:, 0]
-    seen = seen if len(seen) >= POINTS_PER_LINK_SAMPLED // 4 else torch.arange(len(points))
-    seen = seen[:POINTS_PER_LINK_SAMPLED]
-    return points[seen], normals[seen]
-
-
-def _inside_convex(points: torch.Tensor, vertices: np.ndarray, faces: np.ndarray) -> torch.Tensor:
-    """Mask of points behind all faces of a convex shape."""
-    corners = torch.tensor(vertices, dtype=torch.float32)[torch.tensor(faces.astype(np.int64))]
-    normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    height = ((points[:, None] - corners[None, :, 0]) * normal).sum(-1)
-    return (height < -1e-4 * normal.norm(dim=-1)).all(1)
-
-
-def _pose(surface: _Surface, tree: KinematicTree, q: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-    T = tree.forward(q)[surface.link]
-    points = (T[:, :3, :3] @ surface.points[..., None])[..., 0] + T[:, :3, 3]
-    return points.numpy(), (T[:, :3, :3] @ surface.normals[..., None])[..., 0].numpy()
-
-
 def _open_ends(
-    tree: KinematicTree, surface: _Surface, tips: tuple[int, ...], palm: int, held: torch.Tensor, rest: torch.Tensor
+    tree: KinematicTree, surface: LinkSurface, tips: tuple[int, ...], palm: int, held: torch.Tensor, rest: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, Palm]:
     """Which end of each joint opens the hand, which joints only spread, and the palm; refined together.
 
@@ -175,22 +121,25 @@ def _open_ends(
     the hand straight or bent, only spreads.
     """
     straight = torch.where(held, rest, torch.zeros(tree.n_dof).clamp(tree.lower, tree.upper))
-    centre = torch.tensor(_pose(surface, tree, (tree.lower + tree.upper) / 2)[0].mean(0))
+    centre = torch.tensor(surface.posed(tree, (tree.lower + tree.upper) / 2)[0].mean(0))
     opening = -torch.ones(tree.n_dof)
     abduction = torch.zeros(tree.n_dof, dtype=torch.bool)
     out_of_palm = torch.zeros(tree.n_dof, dtype=torch.bool)
-    found = _examine(tree, surface, tips, palm, opening, abduction, held, rest)
+    found: Palm | None = None
     for _ in range(REFINEMENTS):
+        before = torch.cat([opening, abduction])
         bases = (straight, _half_closed(tree, opening, abduction, held, rest))
         found_ends = [[_closing_gain(tree, surface, tips, centre, base, j) for base in bases] for j in range(tree.n_dof)]
         for j, ends in enumerate(found_ends):
             abduction[j] = bool(out_of_palm[j])
             opening[j] = -1.0 if sum(ends) >= 0 or abduction[j] else 1.0
-        found = _examine(tree, surface, tips, palm, opening, abduction, held, rest)
+        if found is None or not torch.equal(before, torch.cat([opening, abduction])):
+            found = _examine(tree, surface, tips, palm, opening, abduction, held, rest)
         centre = torch.tensor(found.grasp_centre, dtype=torch.float32)
         direction = torch.tensor(found.direction, dtype=torch.float32)
         bent = _half_closed(tree, opening, torch.zeros_like(abduction), held, rest)
         out_of_palm = _axes_along(tree, straight, direction) & _axes_along(tree, bent, direction)
+    assert found is not None
     return opening, abduction & ~held, found
 
 
@@ -222,7 +171,7 @@ def _axes_along(tree: KinematicTree, q: torch.Tensor, direction: torch.Tensor) -
 
 
 def _closing_gain(
-    tree: KinematicTree, surface: _Surface, tips: tuple[int, ...], centre: torch.Tensor, straight: torch.Tensor, j: int
+    tree: KinematicTree, surface: LinkSurface, tips: tuple[int, ...], centre: torch.Tensor, straight: torch.Tensor, j: int
 ) -> float:
     """How much nearer to the centre the upper end of joint j brings its fingertips than the lower end [m]."""
     moved = [t for t in tips if float(tree.link_coupling[_chain(tree, t), j].abs().sum()) > 0]
@@ -238,7 +187,7 @@ def _closing_gain(
 
 
 def _examine(
-    tree: KinematicTree, surface: _Surface, tips: tuple[int, ...], palm: int, opening: torch.Tensor,
+    tree: KinematicTree, surface: LinkSurface, tips: tuple[int, ...], palm: int, opening: torch.Tensor,
     abduction: torch.Tensor, held: torch.Tensor, rest: torch.Tensor,
 ) -> Palm:
     """The palm at the closing where palm and fingers enclose a ball best, in the frame of the root link."""
@@ -249,7 +198,7 @@ def _examine(
     fingers = [torch.isin(surface.link, torch.tensor([i for i in _chain(tree, t) if i not in rigid])).numpy() for t in tips]
     best: Palm | None = None
     for share in CLOSINGS:
-        points, normals = _pose(surface, tree, _half_closed(tree, opening, abduction, held, rest, share))
+        points, normals = surface.posed(tree, _half_closed(tree, opening, abduction, held, rest, share))
         palm_found = find_palm(points[on_palm], normals[on_palm], [points[f] for f in fingers])
         if best is None or palm_found.score > best.score:
             best = palm_found
@@ -268,7 +217,7 @@ def _rigid_to(tree: KinematicTree, link: int, palm: int) -> bool:
     return True
 
 
-def _tip_offsets(tree: KinematicTree, surface: _Surface, tips: tuple[int, ...]) -> torch.Tensor:
+def _tip_offsets(tree: KinematicTree, surface: LinkSurface, tips: tuple[int, ...]) -> torch.Tensor:
     """Beyond each fingertip along the direction from its last joint through the middle of its surface."""
     poses = tree.forward(torch.zeros(tree.n_dof).clamp(tree.lower, tree.upper))
     offsets = []
@@ -284,8 +233,6 @@ def _tip_offsets(tree: KinematicTree, surface: _Surface, tips: tuple[int, ...]) 
 
 def _thin(draft: Hand, n_points: int) -> Hand:
     """Farthest point sampling over the open hand, grouped by link."""
-    import dataclasses
-
     keep = farthest_points(draft.points(draft.canonical_joints()), n_points).sort().values
     return dataclasses.replace(draft, link_points=draft.link_points[keep], link_normals=draft.link_normals[keep],
                                link_index=draft.link_index[keep])

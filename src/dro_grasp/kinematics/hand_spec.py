@@ -37,6 +37,8 @@ def keep_hand_only(spec: mujoco.MjSpec, path: Path) -> tuple[Note, ...]:
             notes.append(Note("info", body.name, "is not part of the hand and is left out"))
             spec.delete(body)
     hand.pos, hand.quat, hand.mocap = [0, 0, 0], [1, 0, 0, 0], False
+    # A description in Euler angles or axes would win over the quaternion.
+    hand.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
     for joint in list(hand.joints):
         if joint.type == mujoco.mjtJoint.mjJNT_FREE:
             spec.delete(joint)
