@@ -40,6 +40,10 @@ class Pretrain:
     """Network size."""
     steps: int = 3000
     """Optimiser steps."""
+    minutes: Annotated[float | None, optional("MINUTES", "no limit")] = None
+    """Time limit; the learning rate follows whichever of steps and time is further on."""
+    tensorboard: Flag = False
+    """Also write the log for TensorBoard."""
     seed: int = 0
     """Seed of everything."""
     json: Flag = False
@@ -58,7 +62,7 @@ class Pretrain:
 
         check_output(self.output)
         bundle, network = load_bundle(self.bundle), network_config(self.size)
-        schedule = ScheduleConfig(steps=self.steps, seed=self.seed)
+        schedule = ScheduleConfig(steps=self.steps, minutes=self.minutes, tensorboard=self.tensorboard, seed=self.seed)
         model = pretrain(bundle, network, PretrainConfig(schedule=schedule), self.run_folder)
         save_weights(model, self.output, {"stage": "pretraining", "steps": self.steps, "data": bundle.summary()})
         source = SampleSource(bundle, network, AugmentationConfig())
@@ -92,6 +96,10 @@ class Train:
     """Network size."""
     steps: int = 10_000
     """Optimiser steps."""
+    minutes: Annotated[float | None, optional("MINUTES", "no limit")] = None
+    """Time limit; the learning rate follows whichever of steps and time is further on."""
+    tensorboard: Flag = False
+    """Also write the log for TensorBoard."""
     learning_rate: float = 1e-3
     """Peak of the learning rate."""
     divergence: float = 0.01
@@ -115,7 +123,10 @@ class Train:
         bundle = load_bundle(self.bundle)
         pretrained = None if self.pretrained is None else load_weights(self.pretrained)
         config = TrainConfig(
-            schedule=ScheduleConfig(steps=self.steps, learning_rate=self.learning_rate, seed=self.seed),
+            schedule=ScheduleConfig(
+                steps=self.steps, minutes=self.minutes, tensorboard=self.tensorboard, learning_rate=self.learning_rate,
+                seed=self.seed,
+            ),
             losses=LossConfig(divergence=self.divergence), augmentation=AugmentationConfig(partial=self.partial),
         )
         model = train(bundle, network_config(self.size), config, self.run_folder, pretrained, name=self.output.stem)

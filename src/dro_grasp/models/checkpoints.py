@@ -20,6 +20,10 @@ from dro_grasp.models.network import DistanceNetwork, NetworkConfig
 FORMAT_VERSION = 1
 SHIPPED_FOLDER = Path(__file__).parent.parent / "weights"
 """Where shipped weights lie."""
+KEY = "dro_grasp_weights"
+"""Metadata entry that marks a file as ours."""
+PICKLES = (b"PK", b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")
+"""How zipped and bare pickles begin."""
 DEFAULT = "slim"
 """Weights that are used when none are named."""
 
@@ -44,11 +48,16 @@ def save_weights(network: DistanceNetwork, path: Path | str, about: dict[str, An
     try:
         handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}", suffix=".part")
         os.close(handle)
-        save_file(tensors, temporary, metadata={"dro_grasp_weights": json.dumps(header)})
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
     except OSError as error:
         raise OutputError(f"cannot write weights to {path}: {error.strerror}; choose another folder") from error
+    try:
+        save_file(tensors, temporary, metadata={KEY: json.dumps(header)})
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except (OSError, SafetensorError) as error:
+        raise OutputError(f"cannot write weights to {path}: {error}; free some space or choose another folder") from error
+    finally:
+        Path(temporary).unlink(missing_ok=True)
 
 
 def load_weights(name: str | Path | None = None) -> DistanceNetwork:
@@ -62,10 +71,10 @@ def load_weights(name: str | Path | None = None) -> DistanceNetwork:
     """
     path = locate_weights(name)
     header, tensors = _read(path)
-    network = DistanceNetwork(NetworkConfig.from_dict(header["config"]), name=path.stem)
     try:
+        network = DistanceNetwork(NetworkConfig.from_dict(header["config"]), name=path.stem)
         network.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in tensors.items()})
-    except RuntimeError as error:
+    except (RuntimeError, TypeError, KeyError) as error:
         raise WeightsError(f"{path} does not fit this version of the network ({str(error).splitlines()[0]}); use weights "
                            "made with this version") from error
     return network.eval()
@@ -104,18 +113,27 @@ def describe_weights(name: str | Path | None = None) -> dict[str, Any]:
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
-    if path.read_bytes()[:2] in (b"PK", b"\x80\x02", b"\x80\x04"):
-        raise WeightsError(f"{path} is a pickled PyTorch file, which can run code and is refused; expected safetensors "
-                           "written by `dro-grasp train`")
     try:
         with safe_open(path, "pt") as file:
-            header = json.loads((file.metadata() or {}).get("dro_grasp_weights", "null"))
+            text = (file.metadata() or {}).get(KEY)
             tensors = {key: file.get_tensor(key) for key in file.keys()}
-    except (SafetensorError, json.JSONDecodeError) as error:
+        header = None if text is None else json.loads(text)
+    except (SafetensorError, json.JSONDecodeError, OSError) as error:
+        if _starts_like_a_pickle(path):
+            raise WeightsError(f"{path} is a pickled PyTorch file, which can run code and is refused; expected safetensors "
+                               "written by `dro-grasp train`") from error
         raise WeightsError(f"{path} is no weights file, or was cut short ({error}); copy or train it again") from error
-    if header is None:
+    if not isinstance(header, dict):
         raise WeightsError(f"{path} is a safetensors file, but not of dro-grasp; give a file that `dro-grasp train` wrote")
-    if header["format_version"] != FORMAT_VERSION:
-        raise WeightsError(f"{path} has weights version {header['format_version']}, expected {FORMAT_VERSION}; use weights "
-                           "made with this version")
+    if header.get("format_version") != FORMAT_VERSION:
+        raise WeightsError(f"{path} has weights version {header.get('format_version')}, expected {FORMAT_VERSION}; use "
+                           "weights made with this version")
     return header, tensors
+
+
+def _starts_like_a_pickle(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return file.read(2) in PICKLES
+    except OSError:
+        return False

@@ -1,20 +1,25 @@
 """The symmetric kernel that turns pairs of point features into distances, factorised and chunked.
 
 The first layer of the kernel is linear in its two arguments, W [a; b] = U a + V b, so it is computed once per point
-instead of once per pair; the remaining layers run over chunks of rows and are computed again in the backward pass.
+instead of once per pair. The remaining layers run over chunks of pairs small enough for a processor's cache, and are
+computed again in the backward pass, so that memory does not grow with the number of pairs.
 Source: paper section III-C and appendix (kernel MLP, matrix block computation); the factorisation is ours.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.nn import functional
-from torch.utils.checkpoint import checkpoint
 
-ROWS_PER_CHUNK = 8
-"""Hand points whose pairs are computed together."""
+threshold_backward = torch.ops.aten.threshold_backward
+PAIRS_PER_CHUNK = {"cpu": 2048, "cuda": 1 << 19}
+"""Pairs of points whose hidden layers exist at a time, by kind of device; others count as cuda."""
 
 
 class DistanceHead(nn.Module):
@@ -44,35 +49,92 @@ class DistanceHead(nn.Module):
         """
         left, right = self.first.weight.chunk(2, 1)
         both = torch.cat([left, right])
-        hand_left, hand_right = (hand @ both.T).chunk(2, -1)
-        obj_left, obj_right = (obj @ both.T + self.first.bias.repeat(2)).chunk(2, -1)
-        rows = []
-        for start in range(0, hand.shape[1], ROWS_PER_CHUNK):
-            part = slice(start, start + ROWS_PER_CHUNK)
-            inputs = hand_left[:, part], hand_right[:, part], obj_right, obj_left
-            rows.append(
-                checkpoint(self._rows, *inputs, use_reentrant=False) if torch.is_grad_enabled() else self._rows(*inputs)
-            )
-        logits = torch.cat(rows, 1)
+        hand_sides = _sides(hand @ both.T)
+        object_sides = _sides(obj @ both.T + self.first.bias.repeat(2)).flip(0)
+        logits = _pair_layers(
+            hand_sides, object_sides, self.second.weight, self.second.bias, self.last.weight[0]
+        ) + self.last.bias
         if base is not None:
             offset = inverse_softplus(torch.tensor(self.initial_distance)).to(base)
             logits = logits - offset + inverse_softplus(base)
-        return functional.softplus(logits.float())
+        return functional.softplus(logits)
 
-    def _rows(
-        self,
-        hand_left: Float[Tensor, "b r h"],
-        hand_right: Float[Tensor, "b r h"],
-        obj_right: Float[Tensor, "b m h"],
-        obj_left: Float[Tensor, "b m h"],
-    ) -> Float[Tensor, "b r m"]:
-        """The kernel before its softplus, for some rows; the last layer is linear, so the two orders are averaged before it."""
-        forwards = self._second(hand_left[:, :, None] + obj_right[:, None])
-        backwards = self._second(obj_left[:, None] + hand_right[:, :, None])
-        return self.last((forwards + backwards) * 0.5)[..., 0]
 
-    def _second(self, x: Float[Tensor, "b r m h"]) -> Float[Tensor, "b r m k"]:
-        return functional.relu(self.second(functional.relu(x, inplace=not torch.is_grad_enabled())))
+def _sides(x: Float[Tensor, "b n h2"]) -> Float[Tensor, "2 b n h"]:
+    """First-layer values of points as left and as right argument; in single precision from here on."""
+    return torch.stack(x.float().chunk(2, -1))
+
+
+def _pair_layers(
+    hand: Float[Tensor, "2 b n h"],
+    obj: Float[Tensor, "2 b m h"],
+    weight: Float[Tensor, "k h"],
+    bias: Float[Tensor, " k"],
+    last: Float[Tensor, " k"],
+) -> Float[Tensor, "b n m"]:
+    """Mean over both orders of the hidden layers' output, for every pair."""
+    if torch.is_grad_enabled():
+        result: Tensor = _PairLayers.apply(hand, obj, weight, bias, last)  # type: ignore[assignment]
+        return result
+    return _forward(hand, obj, weight, bias, last)
+
+
+def _chunks(hand: Tensor, obj: Tensor) -> Iterator[tuple[slice, slice]]:
+    """Slices of samples and of hand points whose pairs are computed together."""
+    (_, b, n, _), m = hand.shape, obj.shape[2]
+    pairs = PAIRS_PER_CHUNK.get(hand.device.type, PAIRS_PER_CHUNK["cuda"])
+    rows = min(n, max(1, pairs // m))
+    samples = max(1, pairs // (n * m))
+    for i in range(0, b, samples):
+        for j in range(0, n, rows):
+            yield slice(i, i + samples), slice(j, j + rows)
+
+
+def _hidden(
+    hand: Float[Tensor, "2 s r h"], obj: Float[Tensor, "2 s m h"], weight: Float[Tensor, "k h"], bias: Float[Tensor, " k"]
+) -> tuple[Float[Tensor, "p h"], Float[Tensor, "p k"]]:
+    """Both hidden layers of a chunk, one row per order and pair."""
+    x = (hand[:, :, :, None] + obj[:, :, None]).relu_().flatten(0, 3)
+    return x, torch.addmm(bias, x, weight.T).relu_()
+
+
+def _forward(hand: Tensor, obj: Tensor, weight: Tensor, bias: Tensor, last: Tensor) -> Tensor:
+    out = hand.new_empty(*hand.shape[1:3], obj.shape[2])
+    for samples, rows in _chunks(hand, obj):
+        _, y = _hidden(hand[:, samples, rows], obj[:, samples], weight, bias)
+        target = out[samples, rows]
+        torch.mean((y @ last).view(2, *target.shape), 0, out=target)
+    return out
+
+
+class _PairLayers(torch.autograd.Function):
+    """`_forward` with a backward pass that computes each chunk again and keeps nothing of it."""
+
+    @staticmethod
+    def forward(ctx: Any, hand: Tensor, obj: Tensor, weight: Tensor, bias: Tensor, last: Tensor) -> Tensor:
+        ctx.save_for_backward(hand, obj, weight, bias, last)
+        return _forward(hand, obj, weight, bias, last)
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, *grad_outputs: Tensor
+    ) -> tuple[Tensor, ...]:
+        (grad,) = grad_outputs
+        hand, obj, weight, bias, last = ctx.saved_tensors
+        grads = tuple(torch.zeros_like(t) for t in ctx.saved_tensors)
+        grad_hand, grad_obj, grad_weight, grad_bias, grad_last = grads
+        for samples, rows in _chunks(hand, obj):
+            x, y = _hidden(hand[:, samples, rows], obj[:, samples], weight, bias)
+            here = (grad[samples, rows] * 0.5).expand(2, -1, -1, -1).flatten()
+            grad_last += y.T @ here
+            grad_y = threshold_backward(torch.outer(here, last), y, 0)
+            grad_bias += grad_y.sum(0)
+            grad_weight.addmm_(grad_y.T, x)
+            grad_x = threshold_backward(grad_y @ weight, x, 0).view(2, *grad[samples, rows].shape, -1)
+            grad_hand[:, samples, rows] += grad_x.sum(3)
+            grad_obj[:, samples] += grad_x.sum(2)
+        return grads
 
 
 def inverse_softplus(x: Tensor) -> Tensor:

@@ -19,18 +19,18 @@ def nearest_neighbours(points: Float[Tensor, "b n 3"], k: int) -> Int[Tensor, "b
     return torch.cdist(points, points).topk(min(k, points.shape[1]), largest=False).indices
 
 
-def gather(features: Float[Tensor, "b n c"], index: Int[Tensor, "b n k"]) -> Float[Tensor, "b n k c"]:
-    """Features of each point's neighbours."""
-    b, n, k = index.shape
-    flat = index.reshape(b, n * k, 1).expand(-1, -1, features.shape[-1])
-    return features.gather(1, flat).reshape(b, n, k, -1)
+def rows_of(index: Int[Tensor, "b n k"]) -> Int[Tensor, "bn k"]:
+    """Neighbours as rows of the clouds laid end to end."""
+    start = torch.arange(len(index), device=index.device)[:, None, None] * index.shape[1]
+    return (index + start).flatten(0, 1)
 
 
 class EdgeLayer(nn.Module):
     """Graph convolution: max over neighbours of LeakyReLU(BatchNorm(W [x_j - x_i, x_i])).
 
-    The linear map is applied per point before neighbours are gathered, which is the same because it is linear. In
-    evaluation the normalisation is a positive or negative scale per channel, so the maximum is taken first.
+    The linear map splits into a part of the neighbour and a part of the point itself, each computed once per point.
+    Normalisation and LeakyReLU are monotone in each channel, so the neighbour that attains the maximum is found first,
+    and only its value is carried on; the statistics of all edges follow from sums over points.
     """
 
     def __init__(self, inputs: int, outputs: int) -> None:
@@ -41,16 +41,60 @@ class EdgeLayer(nn.Module):
     def forward(self, x: Float[Tensor, "b n c"], index: Int[Tensor, "b n k"]) -> Float[Tensor, "b n d"]:
         """Features of the next layer."""
         difference, centre = self.linear.weight.chunk(2, 1)
-        if not self.norm.training and self.norm.running_mean is not None and self.norm.running_var is not None:
-            scale = self.norm.weight * torch.rsqrt(self.norm.running_var + self.norm.eps)
-            neighbour = gather(x @ (difference * scale[:, None]).T, index).amax(2)
-            own = x @ ((centre - difference) * scale[:, None]).T
-            shift = self.norm.bias - self.norm.running_mean * scale
-            return functional.leaky_relu(neighbour + own + shift, SLOPE)
-        neighbour = gather(x @ difference.T, index)
-        edge = neighbour + (x @ (centre - difference).T)[:, :, None]
-        normed = self.norm(edge.flatten(0, 2)).reshape(edge.shape)
-        return functional.leaky_relu(normed.amax(2), SLOPE)
+        neighbour, own = (x @ torch.cat([difference, centre - difference]).T).chunk(2, -1)
+        if self.norm.training:
+            mean, variance = self._batch_statistics(neighbour, own, index)
+        else:
+            mean, variance = self.norm.running_mean, self.norm.running_var
+            assert mean is not None
+            assert variance is not None
+        scale = self.norm.weight * torch.rsqrt(variance + self.norm.eps)
+        highest = self._highest(neighbour, index)
+        return functional.leaky_relu(torch.addcmul(self.norm.bias - mean * scale, highest + own, scale), SLOPE)
+
+    def _highest(self, neighbour: Float[Tensor, "b n d"], index: Int[Tensor, "b n k"]) -> Float[Tensor, "b n d"]:
+        """The value, among each point's neighbours, that a positive or negative scale makes the highest."""
+        sign = torch.where(self.norm.weight < 0, -1.0, 1.0).to(neighbour.dtype)
+        rows, needs_source = rows_of(index), neighbour.requires_grad
+        with torch.no_grad():
+            signed = (neighbour * sign).flatten(0, 1)
+            best = signed.index_select(0, rows[:, 0])
+            position = torch.zeros(best.shape, dtype=torch.int16, device=best.device)
+            for j in range(1, rows.shape[1]):
+                candidate = signed.index_select(0, rows[:, j])
+                if needs_source:
+                    position.masked_fill_(candidate > best, j)
+                torch.maximum(best, candidate, out=best)
+        if not needs_source:
+            return (best * sign).view_as(neighbour)
+        return neighbour.flatten(0, 1).gather(0, rows.gather(1, position.long())).view_as(neighbour)
+
+    def _batch_statistics(
+        self, neighbour: Float[Tensor, "b n d"], own: Float[Tensor, "b n d"], index: Int[Tensor, "b n k"]
+    ) -> tuple[Float[Tensor, " d"], Float[Tensor, " d"]]:
+        """Mean and variance over all edges, without forming them; running averages are updated as BatchNorm does."""
+        (b, n, k), edges = index.shape, index.numel()
+        adjacency = neighbour.new_zeros(b, n, n).scatter_(2, index, 1.0)
+        degree = adjacency.sum(1)[..., None]
+        mean_neighbour = (degree * neighbour).sum((0, 1)) / edges
+        mean_own = own.mean((0, 1))
+        # Squares of centred values: differences of large sums would lose digits.
+        left, right = neighbour - mean_neighbour, own - mean_own
+        squares = degree * left.square() + k * right.square() + 2 * right * (adjacency @ left)
+        mean, variance = mean_neighbour + mean_own, squares.sum((0, 1)) / edges
+        self._track(mean.detach(), variance.detach() * (edges / max(edges - 1, 1)))
+        return mean, variance
+
+    @torch.no_grad()
+    def _track(self, mean: Float[Tensor, " d"], variance: Float[Tensor, " d"]) -> None:
+        norm = self.norm
+        if norm.running_mean is None or norm.running_var is None or norm.num_batches_tracked is None:
+            return
+        norm.num_batches_tracked += 1
+        # Without a momentum BatchNorm keeps the plain mean of all batches.
+        share = norm.momentum if norm.momentum is not None else 1.0 / float(norm.num_batches_tracked)
+        norm.running_mean.lerp_(mean.to(norm.running_mean), share)
+        norm.running_var.lerp_(variance.to(norm.running_var), share)
 
 
 class PointLayer(nn.Module):

@@ -43,4 +43,3 @@ def sample_posterior(
 ) -> Float[Tensor, "b latent"]:
     """A draw of z that lets gradients through."""
     return mean + torch.randn_like(mean) * (0.5 * log_variance).exp()
-

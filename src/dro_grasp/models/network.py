@@ -14,6 +14,7 @@ from dro_grasp.models.distance_head import DistanceHead
 from dro_grasp.models.encoder import StaticGraphEncoder
 from dro_grasp.models.latent import LatentEncoder, sample_posterior
 from dro_grasp.models.placement import PlacementPrior
+from dro_grasp.models.precision import fast_products
 
 
 @dataclass(frozen=True)
@@ -151,8 +152,9 @@ class DistanceNetwork(nn.Module):
         self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], z: Float[Tensor, "b latent"]
     ) -> Float[Tensor, "b n m"]:
         """D(R,O) [m] for given latents; see `forward` for the clouds."""
-        psi_hand, psi_object, _ = self.features(hand, obj)
-        return self._distances(psi_hand, psi_object, z, hand, obj)
+        with fast_products():
+            psi_hand, psi_object, _ = self.features(hand, obj)
+            return self._distances(psi_hand, psi_object, z, hand, obj)
 
     def _distances(
         self, psi_hand: Tensor, psi_object: Tensor, z: Tensor, hand: Tensor, obj: Tensor
@@ -160,7 +162,9 @@ class DistanceNetwork(nn.Module):
         def joined(features: Tensor) -> Tensor:
             return torch.cat([features, z[:, None].expand(-1, features.shape[1], -1)], -1)
 
-        base = torch.cdist(hand, obj) if self.config.residual else None
+        # The matrix-product form of cdist loses half of the digits.
+        exact = "donot_use_mm_for_euclid_dist"
+        base = torch.cdist(hand, obj, compute_mode=exact) if self.config.residual else None
         return self.head(joined(psi_hand), joined(psi_object), base)
 
     def to_frame(

@@ -41,6 +41,8 @@ class ScheduleConfig:
 
     steps: int = 10_000
     """Optimiser steps in all."""
+    minutes: float | None = None
+    """Time limit [min]; learning rate and end follow whichever of steps and time is further on."""
     learning_rate: float = 1e-3
     """Peak of Adam's rate. Differs from the paper (1e-4): better at equal time on a CPU."""
     warmup_steps: int = 200
@@ -53,6 +55,8 @@ class ScheduleConfig:
     """A checkpoint is written this often [s]."""
     log_every: int = 20
     """Steps between lines of the log."""
+    tensorboard: bool = False
+    """Also write the log for TensorBoard, where that is installed."""
     seed: int = 0
     """Seed of initial weights and of all samples."""
 

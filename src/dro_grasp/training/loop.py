@@ -20,7 +20,8 @@ from dro_grasp.training.losses import (
     placement_loss,
     pose_loss,
 )
-from dro_grasp.training.runs import Run, console_report
+from dro_grasp.training.reports import console_report
+from dro_grasp.training.runs import Run
 from dro_grasp.training.samples import HandSamples, SampleSource
 
 

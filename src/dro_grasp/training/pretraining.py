@@ -12,7 +12,8 @@ from dro_grasp.models.encoder import StaticGraphEncoder
 from dro_grasp.models.network import DistanceNetwork, NetworkConfig
 from dro_grasp.training.config import AugmentationConfig, PretrainConfig
 from dro_grasp.training.losses import contrastive_loss
-from dro_grasp.training.runs import Run, console_report
+from dro_grasp.training.reports import console_report
+from dro_grasp.training.runs import Run
 from dro_grasp.training.samples import SampleSource, random_rotations, random_turns
 
 

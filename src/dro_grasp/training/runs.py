@@ -10,16 +10,17 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from pickle import UnpicklingError
 
 import torch
 from torch import nn
 from torch.optim import Adam
-from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from dro_grasp.errors import OutputError, TrainingError
+from dro_grasp.models.precision import fast_products
 from dro_grasp.training.config import ScheduleConfig
+from dro_grasp.training.reports import tensorboard_report
 
 CHECKPOINT = "checkpoint.pt"
 LOG = "log.jsonl"
@@ -34,21 +35,28 @@ class Run:
     schedule: ScheduleConfig
     generator: torch.Generator
     optimiser: Adam = field(init=False)
-    scheduler: LambdaLR = field(init=False)
     average: AveragedModel = field(init=False)
     step: int = field(default=0, init=False)
+    seconds: float = field(default=0.0, init=False)
+    """Time spent training, over all sittings [s]."""
 
     def __post_init__(self) -> None:
-        """Make optimiser, schedule and average; take up the folder's checkpoint if there is one."""
+        """Make optimiser and average; take up the folder's checkpoint if there is one."""
         make_run_folder(self.folder)
         parameters = [p for p in self.model.parameters() if p.requires_grad]
         self.optimiser = Adam(parameters, lr=self.schedule.learning_rate)
-        self.scheduler = LambdaLR(self.optimiser, lambda step: learning_rate_share(step, self.schedule))
         self.average = AveragedModel(
             self.model, multi_avg_fn=get_ema_multi_avg_fn(self.schedule.average_decay), use_buffers=True
         )
         if (self.folder / CHECKPOINT).is_file():
             self._resume()
+
+    @property
+    def progress(self) -> float:
+        """How much of the schedule is behind: 0 at the start, 1 at the end."""
+        steps = self.step / self.schedule.steps
+        limit = self.schedule.minutes
+        return steps if limit is None else max(steps, self.seconds / (60 * limit))
 
     def train(self, losses: Callable[[], dict[str, torch.Tensor]], report: Callable[[Run, dict[str, float]], None]) -> None:
         """Steps until the schedule ends.
@@ -58,46 +66,67 @@ class Run:
             report: Called with the run and the mean losses since the last call, every `log_every` steps.
 
         Raises:
-            TrainingError: A loss is not finite.
+            TrainingError: A loss or the gradient is not finite.
         """
+        reports = [report]
+        board = tensorboard_report(self.folder) if self.schedule.tensorboard else None
+        if board is not None:
+            reports.append(board)
+        with fast_products():
+            self._steps(losses, reports)
+        self.save()
+
+    def _steps(
+        self, losses: Callable[[], dict[str, torch.Tensor]], reports: list[Callable[[Run, dict[str, float]], None]]
+    ) -> None:
         sums: dict[str, float] = {}
-        counted = 0
-        saved = time.monotonic()
-        while self.step < self.schedule.steps:
-            values = losses()
-            self._check(values)
-            self.optimiser.zero_grad(set_to_none=True)
-            values["total"].backward()
-            nn.utils.clip_grad_norm_(self.model.parameters(), self.schedule.gradient_norm)
-            self.optimiser.step()
-            self.scheduler.step()
-            self.average.update_parameters(self.model)
-            self.step += 1
+        counted, saved = 0, time.monotonic()
+        while self.progress < 1:
+            began = time.monotonic()
+            for name, value in self._step(losses).items():
+                sums[name] = sums.get(name, 0.0) + value
             counted += 1
-            for name, value in values.items():
-                sums[name] = sums.get(name, 0.0) + float(value.detach())
-            if self.step % self.schedule.log_every == 0 or self.step == self.schedule.steps:
+            self.seconds += time.monotonic() - began
+            if self.step % self.schedule.log_every == 0 or self.progress >= 1:
                 means = {name: total / counted for name, total in sums.items()}
                 self._log(means)
-                report(self, means)
+                for report in reports:
+                    report(self, means)
                 sums, counted = {}, 0
             # A checkpoint goes only where the log has a line, so that a resumed log has neither gap nor double.
-            if counted == 0 and time.monotonic() - saved > self.schedule.checkpoint_seconds:
+            if counted == 0 and time.monotonic() - saved >= self.schedule.checkpoint_seconds:
                 self.save()
                 saved = time.monotonic()
-        self.save()
+
+    def _step(self, losses: Callable[[], dict[str, torch.Tensor]]) -> dict[str, float]:
+        """One step of the optimiser; returns the losses before it."""
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.schedule.learning_rate * learning_rate_share(self.step, self.progress, self.schedule)
+        values = losses()
+        self._check(values)
+        self.optimiser.zero_grad(set_to_none=True)
+        values["total"].backward()
+        norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.schedule.gradient_norm)
+        self._check({"gradient": norm})
+        self.optimiser.step()
+        self.average.update_parameters(self.model)
+        self.step += 1
+        return {name: float(value.detach()) for name, value in values.items()}
 
     def save(self) -> None:
         """Write the checkpoint, whole or not at all."""
         state = {
-            "step": self.step, "model": self.model.state_dict(), "average": self.average.state_dict(),
-            "optimiser": self.optimiser.state_dict(), "scheduler": self.scheduler.state_dict(),
+            "step": self.step, "seconds": self.seconds, "model": self.model.state_dict(),
+            "average": self.average.state_dict(), "optimiser": self.optimiser.state_dict(),
             "generator": self.generator.get_state(), "torch_rng": torch.get_rng_state(), "steps": self.schedule.steps,
         }
         handle, temporary = tempfile.mkstemp(dir=self.folder, suffix=".part")
-        with os.fdopen(handle, "wb") as file:
-            torch.save(state, file)
-        os.replace(temporary, self.folder / CHECKPOINT)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                torch.save(state, file)
+            os.replace(temporary, self.folder / CHECKPOINT)
+        finally:
+            Path(temporary).unlink(missing_ok=True)
 
     def _resume(self) -> None:
         path = self.folder / CHECKPOINT
@@ -108,37 +137,52 @@ class Run:
                                     "for; use the same number to go on, or another folder")
             self.model.load_state_dict(state["model"])
             self.average.load_state_dict(state["average"])
-        except (RuntimeError, KeyError, EOFError) as error:
+            self.optimiser.load_state_dict(state["optimiser"])
+            self.step, self.seconds = state["step"], state["seconds"]
+        except (RuntimeError, KeyError, ValueError, EOFError, UnpicklingError) as error:
             raise TrainingError(f"{path} does not fit this training ({str(error).splitlines()[0]}); use another folder, or "
                                 "the configuration it was made with") from error
-        self.optimiser.load_state_dict(state["optimiser"])
-        self.scheduler.load_state_dict(state["scheduler"])
         self.generator.set_state(state["generator"])
         torch.set_rng_state(state["torch_rng"])
-        self.step = state["step"]
+        self._cut_log()
+
+    def _cut_log(self) -> None:
+        """Drop the log's lines after the checkpoint; a line that was cut short is one of them."""
         log = self.folder / LOG
-        if log.is_file():
-            kept = [line for line in log.read_text().splitlines() if line and json.loads(line)["step"] <= self.step]
-            log.write_text("".join(line + "\n" for line in kept))
+        if not log.is_file():
+            return
+        kept = []
+        for line in log.read_text().splitlines():
+            try:
+                if json.loads(line)["step"] <= self.step:
+                    kept.append(line)
+            except json.JSONDecodeError:
+                break
+        log.write_text("".join(line + "\n" for line in kept))
 
     def _check(self, values: dict[str, torch.Tensor]) -> None:
         wrong = [name for name, value in values.items() if not bool(torch.isfinite(value))]
+        if len(wrong) > 1 and "total" in wrong:
+            wrong.remove("total")
         if wrong:
-            raise TrainingError(f"loss {', '.join(wrong)} is not finite at step {self.step}; the last checkpoint in "
+            raise TrainingError(f"{', '.join(wrong)} is not finite at step {self.step}; the last checkpoint in "
                                 f"{self.folder} is sound. Lower the learning rate or check the data")
 
     def _log(self, means: dict[str, float]) -> None:
-        line = {"step": self.step, "learning_rate": self.scheduler.get_last_lr()[0], **means}
+        line = {"step": self.step, "seconds": round(self.seconds, 3), "learning_rate": self.learning_rate, **means}
         with (self.folder / LOG).open("a") as file:
             file.write(json.dumps(line) + "\n")
 
+    @property
+    def learning_rate(self) -> float:
+        """The rate of the last step."""
+        return self.optimiser.param_groups[0]["lr"]
 
-def learning_rate_share(step: int, schedule: ScheduleConfig) -> float:
-    """Linear warm-up, then a cosine to zero."""
-    if step < schedule.warmup_steps:
-        return (step + 1) / schedule.warmup_steps
-    progress = (step - schedule.warmup_steps) / max(1, schedule.steps - schedule.warmup_steps)
-    return 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
+
+def learning_rate_share(step: int, progress: float, schedule: ScheduleConfig) -> float:
+    """Linear warm-up over the first steps, times a cosine to zero over the whole schedule."""
+    warmup = min(1.0, (step + 1) / max(1, schedule.warmup_steps))
+    return warmup * 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
 
 
 def make_run_folder(folder: Path) -> None:
@@ -151,38 +195,3 @@ def make_run_folder(folder: Path) -> None:
         folder.mkdir(exist_ok=True)
     except OSError as error:
         raise OutputError(f"cannot make the run folder {folder}: {error.strerror}; create {folder.parent} first") from error
-
-
-def console_report(title: str) -> Callable[[Run, dict[str, float]], None]:
-    """Prints a line of losses and the time left to stderr, at most every ten seconds."""
-    import sys
-
-    state: dict[str, Any] = {"begin": time.monotonic(), "first": None, "said": 0.0}
-
-    def report(run: Run, means: dict[str, float]) -> None:
-        now = time.monotonic()
-        state["first"] = run.step if state["first"] is None else state["first"]
-        if now - state["said"] < 10 and run.step < run.schedule.steps:
-            return
-        state["said"] = now
-        done = run.step - state["first"]
-        left = (now - state["begin"]) / max(done, 1) * (run.schedule.steps - run.step) if done else float("nan")
-        text = "  ".join(f"{name} {value:.4f}" for name, value in means.items())
-        print(f"{title} {run.step}/{run.schedule.steps}  {text}  {left / 60:.0f} min left", file=sys.stderr, flush=True)
-
-    return report
-
-
-def tensorboard_report(folder: Path) -> Callable[[Run, dict[str, float]], None] | None:
-    """Writes losses for TensorBoard; None where it is not installed."""
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        return None
-    writer = SummaryWriter(str(folder))
-
-    def report(run: Run, means: dict[str, float]) -> None:
-        for name, value in means.items():
-            writer.add_scalar(name, value, run.step)
-
-    return report

@@ -1,0 +1,192 @@
+"""The network: graph layers against their plain form, symmetries, sizes, and what the latent does."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dro_grasp.models import precision
+from dro_grasp.models.attention import Attention
+from dro_grasp.models.encoder import SLOPE, EdgeLayer, StaticGraphEncoder, nearest_neighbours
+from dro_grasp.models.network import DistanceNetwork, NetworkConfig
+from dro_grasp.models.precision import fast_products
+
+SMALL = NetworkConfig(
+    n_hand=40, n_object=32, width=24, encoder_widths=(8, 16), neighbours=6, attention_hidden=32, latent=8,
+    latent_widths=(8, 16), latent_head=(16, 16), latent_neighbours=5, kernel_hidden=(20, 12), placement_width=16,
+)
+
+
+def plain_edge_layer(layer: EdgeLayer, norm: nn.BatchNorm1d, x: Tensor, index: Tensor) -> Tensor:
+    """Every edge's features, normalised by PyTorch, activated, then the maximum."""
+    rows = torch.arange(len(x))[:, None, None]
+    neighbour, own = x[rows, index], x[:, :, None].expand(-1, -1, index.shape[2], -1)
+    edges = torch.cat([neighbour - own, own], -1) @ layer.linear.weight.T
+    return functional.leaky_relu(norm(edges.flatten(0, 2)).view(edges.shape), SLOPE).amax(2)
+
+
+@pytest.fixture
+def edge_case() -> tuple[EdgeLayer, nn.BatchNorm1d, Tensor, Tensor]:
+    torch.manual_seed(0)
+    layer, norm = EdgeLayer(5, 12), nn.BatchNorm1d(12)
+    nn.init.normal_(layer.norm.weight)
+    nn.init.normal_(layer.norm.bias)
+    norm.load_state_dict(layer.norm.state_dict())
+    points = torch.randn(3, 30, 3)
+    return layer, norm, torch.randn(3, 30, 5) + 2, nearest_neighbours(points, 7)
+
+
+def test_edge_layer_equals_its_plain_form_in_training(
+    edge_case: tuple[EdgeLayer, nn.BatchNorm1d, Tensor, Tensor]
+) -> None:
+    layer, norm, x, index = edge_case
+    x.requires_grad_()
+    weight = torch.randn(3, 30, 12)
+    fast, slow = layer(x, index), plain_edge_layer(layer, norm, x, index)
+    torch.testing.assert_close(fast, slow, rtol=1e-4, atol=1e-5)
+    ours = torch.autograd.grad((fast * weight).sum(), [x, layer.linear.weight, layer.norm.weight, layer.norm.bias])
+    theirs = torch.autograd.grad((slow * weight).sum(), [x, layer.linear.weight, norm.weight, norm.bias])
+    for a, b in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("momentum", [0.1, None], ids=["moving average", "plain mean"])
+def test_edge_layer_keeps_the_statistics_of_batch_norm(
+    edge_case: tuple[EdgeLayer, nn.BatchNorm1d, Tensor, Tensor], momentum: float | None
+) -> None:
+    layer, norm, x, index = edge_case
+    layer.norm.momentum = norm.momentum = momentum
+    for step in range(3):
+        layer(x * (step + 1), index)
+        plain_edge_layer(layer, norm, x * (step + 1), index)
+    torch.testing.assert_close(layer.norm.running_mean, norm.running_mean, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(layer.norm.running_var, norm.running_var, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(
+        layer.eval()(x, index), plain_edge_layer(layer, norm.eval(), x, index), rtol=1e-4, atol=1e-5
+    )
+
+
+def test_statistics_do_not_lose_digits_far_from_zero() -> None:
+    torch.manual_seed(0)
+    layer, norm = EdgeLayer(3, 4), nn.BatchNorm1d(4)
+    x, index = torch.randn(2, 20, 3) * 1e-2 + 10, nearest_neighbours(torch.randn(2, 20, 3), 4)
+    double = EdgeLayer(3, 4).double()
+    double.load_state_dict(layer.state_dict())
+    exact = plain_edge_layer(double, norm.double(), x.double(), index)
+    torch.testing.assert_close(layer(x, index), exact.float(), rtol=1e-3, atol=2e-3)
+
+
+def test_nearest_neighbours_are_the_nearest() -> None:
+    torch.manual_seed(0)
+    points = torch.rand(2, 50, 3)
+    found = nearest_neighbours(points, 6)
+    brute = (points[:, :, None] - points[:, None]).norm(dim=-1).argsort(-1)[..., :6]
+    assert torch.equal(found.sort(-1).values, brute.sort(-1).values)
+
+
+def test_encoder_does_not_care_for_the_order_of_points() -> None:
+    torch.manual_seed(0)
+    encoder = StaticGraphEncoder((8, 16), 24, 6).eval()
+    points, order = torch.randn(2, 40, 3), torch.randperm(40)
+    torch.testing.assert_close(encoder(points)[:, order], encoder(points[:, order]), rtol=1e-4, atol=1e-5)
+
+
+def test_attention_equals_pytorch() -> None:
+    torch.manual_seed(0)
+    ours, theirs = Attention(16, 4), nn.MultiheadAttention(16, 4, batch_first=True)
+    with torch.no_grad():
+        theirs.in_proj_weight.copy_(torch.cat([ours.query.weight, ours.memory.weight]))
+        theirs.in_proj_bias.copy_(torch.cat([ours.query.bias, ours.memory.bias]))
+        theirs.out_proj.load_state_dict(ours.output.state_dict())
+    x, memory = torch.randn(2, 9, 16), torch.randn(2, 7, 16)
+    torch.testing.assert_close(ours(x, memory), theirs(x, memory, memory)[0], rtol=1e-5, atol=1e-6)
+
+
+def test_paper_network_has_fourteen_million_parameters() -> None:
+    config = NetworkConfig.paper()
+    network = DistanceNetwork(config)
+    paper_parts = [p for name, p in network.named_parameters() if not name.startswith("placement")]
+    assert 13.5e6 < sum(p.numel() for p in paper_parts) < 15e6
+    assert (config.width, config.n_hand, config.n_object, config.latent, config.kernel_hidden) == (
+        512, 512, 512, 64, (300, 100)
+    )
+    assert (config.frame, config.placed, config.residual) == ("object", False, False)
+
+
+@pytest.mark.parametrize("frame", ["object", "wrist"])
+def test_training_pass_has_gradients_everywhere(frame: str) -> None:
+    torch.manual_seed(0)
+    values = {**SMALL.__dict__, "frame": frame, "placed": frame == "wrist", "residual": frame == "wrist"}
+    network = DistanceNetwork(NetworkConfig.from_dict(values))
+    hand, obj, grasp = torch.randn(4, 40, 3) * 0.1, torch.randn(4, 32, 3) * 0.1, torch.randn(4, 40, 3) * 0.1
+    out = network(hand, obj, grasp, columns=10)
+    assert out.distances.shape == (4, 40, 10)
+    (out.distances.sum() + out.mean.sum() + out.log_variance.sum()).backward()
+    silent = [n for n, p in network.named_parameters() if p.grad is None and not n.startswith("placement")]
+    assert not silent
+
+
+def test_zero_centred_hand_forgets_its_place_unless_placed() -> None:
+    torch.manual_seed(0)
+    hand, obj, z = torch.randn(1, 40, 3) * 0.1, torch.randn(1, 32, 3) * 0.1, torch.randn(1, 8)
+    moved = hand + torch.tensor([0.2, 0.0, 0.0])
+    paper = DistanceNetwork(SMALL).eval()
+    torch.testing.assert_close(paper.predict(hand, obj, z), paper.predict(moved, obj, z), rtol=1e-4, atol=1e-5)
+    placed = DistanceNetwork(NetworkConfig.from_dict({**SMALL.__dict__, "placed": True})).eval()
+    assert (placed.predict(hand, obj, z) - placed.predict(moved, obj, z)).abs().max() > 1e-3
+
+
+def test_latents_change_the_prediction_and_temperature_scales_them() -> None:
+    torch.manual_seed(0)
+    network = DistanceNetwork(SMALL).eval()
+    hand, obj = torch.randn(1, 40, 3) * 0.1, torch.randn(1, 32, 3) * 0.1
+    z = network.sample_latent(2, torch.Generator().manual_seed(1))
+    a, b = network.predict(hand.expand(2, -1, -1), obj.expand(2, -1, -1), z)
+    assert (a - b).abs().max() > 1e-4
+    cold = DistanceNetwork(NetworkConfig.from_dict({**SMALL.__dict__, "latent_temperature": 0.5}))
+    torch.testing.assert_close(cold.sample_latent(2, torch.Generator().manual_seed(1)), z * 0.5)
+
+
+def test_prediction_does_not_depend_on_the_batch() -> None:
+    torch.manual_seed(0)
+    network = DistanceNetwork(SMALL).eval()
+    hand, obj, z = torch.randn(5, 40, 3) * 0.1, torch.randn(5, 32, 3) * 0.1, torch.randn(5, 8)
+    whole = network.predict(hand, obj, z)
+    for i in range(5):
+        torch.testing.assert_close(network.predict(hand[i : i + 1], obj[i : i + 1], z[i : i + 1])[0], whole[i],
+                                   rtol=1e-4, atol=1e-6)
+
+
+def test_wrist_frame_turns_with_the_wrist() -> None:
+    network = DistanceNetwork(NetworkConfig.from_dict({**SMALL.__dict__, "frame": "wrist"}))
+    rotation = torch.linalg.qr(torch.randn(1, 3, 3, generator=torch.Generator().manual_seed(0)))[0]
+    rotation = rotation * torch.linalg.det(rotation)
+    points, centre = torch.rand(1, 6, 3), torch.rand(1, 3)
+    expected = torch.einsum("ji,nj->ni", rotation[0], points[0] - centre)
+    torch.testing.assert_close(network.to_frame(points, centre, rotation)[0], expected)
+    assert torch.equal(DistanceNetwork(SMALL).to_frame(points, centre, rotation), points - centre)
+
+
+def test_caller_keeps_the_precision_setting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(precision, "quick_path_is_accurate", lambda: True)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    before = torch.get_float32_matmul_precision()
+    inside = []
+
+    def fail() -> None:
+        inside.append(torch.get_float32_matmul_precision())
+        raise KeyError
+
+    with pytest.raises(KeyError), fast_products():
+        fail()
+    assert inside == ["medium"]
+    assert torch.get_float32_matmul_precision() == before
+
+
+def test_inaccurate_processors_keep_full_precision(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(precision, "quick_path_is_accurate", lambda: False)
+    before = torch.get_float32_matmul_precision()
+    with fast_products():
+        assert torch.get_float32_matmul_precision() == before
