@@ -1,0 +1,93 @@
+"""How long one grasp takes, and one of sixteen, from loaded hand and object to joints, pregrasp and score.
+
+The paper-size network has random weights, so its distances are no distances of a grasp and the joint solver needs more
+steps than it would: its times are an upper bound. `slim` are the shipped weights. Each figure is the median over hands
+and repetitions; loading of hands, objects and weights is not counted, one prediction before the clock starts is.
+
+    python benchmarks/inference.py [--json] [--full] [--threads N] [--seed 0]
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import tempfile
+import time
+from collections import defaultdict
+from pathlib import Path
+
+import torch
+from report import emit
+
+from dro_grasp.hands.library import load_hand
+from dro_grasp.models.checkpoints import save_weights
+from dro_grasp.models.network import DistanceNetwork, NetworkConfig
+from dro_grasp.objects.library import load_object
+from dro_grasp.predictor import GraspPredictor
+from dro_grasp.simulation.scene import cores
+
+HANDS = ("barrett", "allegro", "shadowhand")
+"""Built-in versions of the paper's hands."""
+OBJECT = "rubber_duck"
+RUNS, FULL = 3, 15
+PARTS = ("network", "decode", "rank")
+
+
+def paper_size(folder: Path, seed: int) -> Path:
+    """Weights of the paper's size, untrained."""
+    torch.manual_seed(seed)
+    path = folder / "paper_size.safetensors"
+    save_weights(DistanceNetwork(NetworkConfig.paper()), path)
+    return path
+
+
+def measure(predictor: GraspPredictor, num: int, runs: int, seed: int) -> dict[str, list[float]]:
+    """Seconds of every prediction, whole and in parts."""
+    obj, times = load_object(OBJECT), defaultdict(list)
+    for name in HANDS:
+        hand = load_hand(name)
+        predictor.predict(hand, obj, num=num, seed=seed)
+        for run in range(runs):
+            begin = time.perf_counter()
+            predictor.predict(hand, obj, num=num, seed=seed + run)
+            times["whole"].append(time.perf_counter() - begin)
+            for part in PARTS:
+                times[part].append(predictor.timings[part])
+    return times
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--full", action="store_true", help=f"{FULL} runs a hand instead of {RUNS}")
+    parser.add_argument("--threads", type=int, default=cores())
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    runs = FULL if options.full else RUNS
+    rows, seconds = [], {}
+    with tempfile.TemporaryDirectory() as folder:
+        predictors = {"paper": GraspPredictor(paper_size(Path(folder), options.seed)), "slim": GraspPredictor("slim")}
+    for size, predictor in predictors.items():
+        for num in (1, 16):
+            times = measure(predictor, num, runs, options.seed)
+            median = {key: statistics.median(values) for key, values in times.items()}
+            seconds[size, num] = median["whole"]
+            parameters = sum(p.numel() for p in predictor.network.parameters()) / 1e6
+            rows.append([f"{size}, {parameters:.1f} M parameters", num, 1e3 * median["whole"] / num,
+                         *(1e3 * median[part] / num for part in PARTS), 1e3 * max(times["whole"]) / num])
+    emit(
+        f"Grasps of {OBJECT} with {', '.join(HANDS)}: median of {runs * len(HANDS)} predictions, {options.threads} "
+        f"thread(s), seed {options.seed}; times per grasp",
+        rows, ["network", "grasps", "whole [ms]", *(f"{part} [ms]" for part in PARTS), "slowest [ms]"],
+        {
+            "latency_paper": seconds["paper", 1], "latency_slim": seconds["slim", 1],
+            "batch16_per_grasp_paper": seconds["paper", 16] / 16, "batch16_per_grasp_slim": seconds["slim", 16] / 16,
+            "threads": options.threads,
+        }, options.json,
+    )
+
+
+if __name__ == "__main__":
+    main()
