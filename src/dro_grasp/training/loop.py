@@ -6,11 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from dro_grasp import distance_matrix
 from dro_grasp.datasets.bundle import Bundle
 from dro_grasp.models.network import DistanceNetwork, NetworkConfig, NetworkOutput
+from dro_grasp.training.batch_statistics import recalibrate
 from dro_grasp.training.config import LossConfig, TrainConfig
 from dro_grasp.training.losses import (
     distance_loss,
@@ -65,43 +66,19 @@ def train(
         # train() would put the frozen encoder's BatchNorm back into training mode.
         model.hand_encoder.eval()
 
-    def losses() -> dict[str, Tensor]:
+    def draw() -> list[HandSamples]:
         names = source.draw_hands(config.hands_per_step, generator)
-        groups = [source.draw(hand, config.samples_per_hand, generator) for hand in names]
-        return step_losses(model, groups, config)
+        return [source.draw(hand, config.samples_per_hand, generator) for hand in names]
 
-    run.train(losses, report or console_report("training"))
+    run.train(lambda: step_losses(model, draw(), config), report or console_report("training"))
     model.load_state_dict(run.average.module.state_dict())
-    recalibrate(model, source, config, generator)
+    recalibrate(model, lambda: model(*_clouds(draw()), columns=1))
     return model.eval()
-
-
-@torch.no_grad()
-def recalibrate(
-    model: DistanceNetwork, source: SampleSource, config: TrainConfig, generator: torch.Generator, batches: int = 64
-) -> None:
-    """Measure the statistics of BatchNorm anew for the averaged weights.
-
-    The averages kept during training belong to other weights: with them the distance error in evaluation mode is
-    twice that in training mode. Statistics of a frozen encoder stay.
-    """
-    layers = [layer for layer in model.modules() if isinstance(layer, nn.BatchNorm1d) and layer.training]
-    momenta = [layer.momentum for layer in layers]
-    for layer in layers:
-        layer.reset_running_stats()
-        layer.momentum = None
-    for _ in range(batches):
-        names = source.draw_hands(config.hands_per_step, generator)
-        groups = [source.draw(hand, config.samples_per_hand, generator) for hand in names]
-        placed, grasp, obj = (torch.cat([getattr(g, n) for g in groups]) for n in ("placed", "grasp", "obj"))
-        model(placed, obj, grasp, columns=1)
-    for layer, momentum in zip(layers, momenta, strict=True):
-        layer.momentum = momentum
 
 
 def step_losses(model: DistanceNetwork, groups: list[HandSamples], config: TrainConfig) -> dict[str, Tensor]:
     """All losses of one batch, by name, with their weighted sum as `total`."""
-    placed, grasp, obj = (torch.cat([getattr(g, n) for g in groups]) for n in ("placed", "grasp", "obj"))
+    placed, obj, grasp = _clouds(groups)
     output = model(placed, obj, grasp, columns=config.columns)
     anchors = obj[:, : config.columns]
     parts = {"distance": distance_loss(output.distances, distance_matrix.build(grasp, anchors))}
@@ -121,6 +98,12 @@ def step_losses(model: DistanceNetwork, groups: list[HandSamples], config: Train
     weights = config.losses
     total = torch.stack([getattr(weights, name) * value for name, value in parts.items()]).sum()
     return {"total": total, **parts}
+
+
+def _clouds(groups: list[HandSamples]) -> tuple[Tensor, Tensor, Tensor]:
+    """The network's inputs: open hands, objects, grasps."""
+    placed, obj, grasp = (torch.cat([getattr(g, n) for g in groups]) for n in ("placed", "obj", "grasp"))
+    return placed, obj, grasp
 
 
 def _posed_points(group: HandSamples, decoded: distance_matrix.LinkPoses) -> Tensor:

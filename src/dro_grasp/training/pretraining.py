@@ -10,6 +10,7 @@ import torch
 from dro_grasp.datasets.bundle import Bundle
 from dro_grasp.models.encoder import StaticGraphEncoder
 from dro_grasp.models.network import DistanceNetwork, NetworkConfig
+from dro_grasp.training.batch_statistics import recalibrate
 from dro_grasp.training.config import AugmentationConfig, PretrainConfig
 from dro_grasp.training.losses import contrastive_loss
 from dro_grasp.training.reports import console_report
@@ -52,6 +53,7 @@ def pretrain(
 
     run.train(losses, report or console_report("pretraining"))
     encoder.load_state_dict(run.average.module.state_dict())
+    recalibrate(encoder, losses)
     return whole.eval()
 
 
