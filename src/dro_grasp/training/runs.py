@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import math
 import os
-import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from pickle import UnpicklingError
@@ -67,6 +67,7 @@ class Run:
 
         Raises:
             TrainingError: A loss or the gradient is not finite.
+            OutputError: Log or checkpoint cannot be written.
         """
         reports = [report]
         board = tensorboard_report(self.folder) if self.schedule.tensorboard else None
@@ -114,19 +115,23 @@ class Run:
         return {name: float(value.detach()) for name, value in values.items()}
 
     def save(self) -> None:
-        """Write the checkpoint, whole or not at all."""
+        """Write the checkpoint, whole or not at all.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
         state = {
             "step": self.step, "seconds": self.seconds, "model": self.model.state_dict(),
             "average": self.average.state_dict(), "optimiser": self.optimiser.state_dict(),
             "generator": self.generator.get_state(), "torch_rng": torch.get_rng_state(), "steps": self.schedule.steps,
         }
-        handle, temporary = tempfile.mkstemp(dir=self.folder, suffix=".part")
+        path, temporary = self.folder / CHECKPOINT, self.folder / f"{CHECKPOINT}.part"
         try:
-            with os.fdopen(handle, "wb") as file:
-                torch.save(state, file)
-            os.replace(temporary, self.folder / CHECKPOINT)
+            with writing_into(self.folder):
+                torch.save(state, temporary)
+                os.replace(temporary, path)
         finally:
-            Path(temporary).unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
 
     def _resume(self) -> None:
         path = self.folder / CHECKPOINT
@@ -139,11 +144,12 @@ class Run:
             self.average.load_state_dict(state["average"])
             self.optimiser.load_state_dict(state["optimiser"])
             self.step, self.seconds = state["step"], state["seconds"]
-        except (RuntimeError, KeyError, ValueError, EOFError, UnpicklingError) as error:
-            raise TrainingError(f"{path} does not fit this training ({str(error).splitlines()[0]}); use another folder, or "
-                                "the configuration it was made with") from error
-        self.generator.set_state(state["generator"])
-        torch.set_rng_state(state["torch_rng"])
+            self.generator.set_state(state["generator"])
+            torch.set_rng_state(state["torch_rng"])
+        except (RuntimeError, LookupError, TypeError, ValueError, EOFError, OSError, UnpicklingError) as error:
+            reason = str(error).partition("\n")[0] or "it is empty"
+            raise TrainingError(f"{path} does not fit this training ({reason}); use another folder, or the configuration "
+                                "it was made with") from error
         self._cut_log()
 
     def _cut_log(self) -> None:
@@ -170,7 +176,7 @@ class Run:
 
     def _log(self, means: dict[str, float]) -> None:
         line = {"step": self.step, "seconds": round(self.seconds, 3), "learning_rate": self.learning_rate, **means}
-        with (self.folder / LOG).open("a") as file:
+        with writing_into(self.folder), (self.folder / LOG).open("a") as file:
             file.write(json.dumps(line) + "\n")
 
     @property
@@ -183,6 +189,20 @@ def learning_rate_share(step: int, progress: float, schedule: ScheduleConfig) ->
     """Linear warm-up over the first steps, times a cosine to zero over the whole schedule."""
     warmup = min(1.0, (step + 1) / max(1, schedule.warmup_steps))
     return warmup * 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
+
+
+@contextmanager
+def writing_into(folder: Path) -> Iterator[None]:
+    """Tells of a full disk or a missing permission; PyTorch's writer says RuntimeError for both.
+
+    Raises:
+        OutputError: The block could not write.
+    """
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        raise OutputError(f"cannot write into {folder}: {error}; free some space, or make it writable, and start again: the "
+                          "run goes on from its last checkpoint") from error
 
 
 def make_run_folder(folder: Path) -> None:
