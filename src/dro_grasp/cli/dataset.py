@@ -4,11 +4,27 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
 from dro_grasp.cli.output import print_json, print_table, say_aside
+
+
+def distinct_names(things: list[Any]) -> list[Any]:
+    """Hands or objects, each once; two of one name would be mixed up.
+
+    Raises:
+        BundleError: Different things have one name.
+    """
+    from dro_grasp.errors import BundleError
+
+    found = {thing.sha256: thing for thing in things}
+    names = [thing.name for thing in found.values()]
+    double = sorted({name for name in names if names.count(name) > 1})
+    if double:
+        raise BundleError(f"different files are called {', '.join(double)}; rename them and synthesise again")
+    return list(found.values())
 
 
 @dataclass(frozen=True)
@@ -36,18 +52,17 @@ class BundleCommand:
         from dro_grasp.objects.library import load_object
 
         check_output(self.output)
-        batches = [batch for _, batch in read_pairs(self.folder)]
-        kept = [b[[i for i, s in enumerate(b.split) if s in TRAINING_SPLITS]] for b in batches]
-        left_out = sum(map(len, batches)) - sum(map(len, kept))
+        # Folders are named as the pair was asked for: a path where the grasps know the name alone.
+        pairs = dict(read_pairs(self.folder))
+        kept = {pair: b[[i for i, s in enumerate(b.split) if s in TRAINING_SPLITS]] for pair, b in pairs.items()}
+        left_out = sum(map(len, pairs.values())) - sum(map(len, kept.values()))
         if left_out:
             say_aside(f"{left_out} grasps of held-out objects are left out")
-        kept = [b for b in kept if len(b)]
-        hands = [load_hand(name) for name in dict.fromkeys(b.hand for b in kept)]
-        clouds = {}
-        for name in sorted({o for b in kept for o in b.object}):
-            obj = load_object(name)
-            clouds[name] = ObjectCloud(torch.from_numpy(obj.cloud), torch.from_numpy(obj.cloud_normals))
-        bundle = write_bundle(self.output, hands, clouds, kept)
+        kept = {pair: b for pair, b in kept.items() if len(b)}
+        hands = distinct_names([load_hand(name) for name in dict.fromkeys(hand for hand, _ in kept)])
+        objects = distinct_names([load_object(name) for name in sorted({obj for _, obj in kept})])
+        clouds = {o.name: ObjectCloud(torch.from_numpy(o.cloud), torch.from_numpy(o.cloud_normals)) for o in objects}
+        bundle = write_bundle(self.output, hands, clouds, list(kept.values()))
         report = {"output": str(self.output), "bytes": self.output.stat().st_size, **bundle.summary()}
         if self.json:
             print_json(report)

@@ -99,6 +99,12 @@ def write_bundle(
         BundleError: A grasp's object is not for training, its hand or object is missing, or the file grows too large.
         OutputError: The file cannot be written.
     """
+    strangers = {b.hand for b in grasps if b.hand_sha256 not in {h.sha256 for h in hands}}
+    if strangers:
+        raise BundleError(f"grasps of {', '.join(sorted(strangers))} were given without these hands, or for other versions of "
+                          "them; pass the hands they were made for")
+    if not grasps:
+        raise BundleError("no grasps were given; synthesise some on objects for training first")
     names = list(objects)
     tensors: dict[str, Tensor] = {}
     header: dict[str, Any] = {"format_version": FORMAT_VERSION, "objects": names, "hands": []}
@@ -107,9 +113,6 @@ def write_bundle(
     for i, hand in enumerate(hands):
         header["hands"].append(_pack_hand(f"hand.{i}", hand, tensors))
         tensors |= _pack_grasps(f"grasps.{i}", hand, [b for b in grasps if b.hand_sha256 == hand.sha256], names)
-    strangers = {b.hand for b in grasps} - {h.name for h in hands}
-    if strangers:
-        raise BundleError(f"grasps of {', '.join(sorted(strangers))} were given without these hands; pass the hands too")
     _save(Path(path), tensors, header)
     return load_bundle(path)
 
@@ -129,11 +132,18 @@ def load_bundle(path: Path | str) -> Bundle:
             tensors = {key: file.get_tensor(key) for key in file.keys()}
     except (SafetensorError, json.JSONDecodeError, OSError) as error:
         raise BundleError(f"{path} is no bundle, or was cut short ({error}); make it again") from error
-    if header is None:
+    if not isinstance(header, dict):
         raise BundleError(f"{path} is a safetensors file but no bundle; make one with `dro-grasp dataset bundle`")
-    if header["format_version"] != FORMAT_VERSION:
-        raise BundleError(f"{path} has bundle version {header['format_version']}, expected {FORMAT_VERSION}; make it again "
-                          "with this version of dro-grasp")
+    if header.get("format_version") != FORMAT_VERSION:
+        raise BundleError(f"{path} has bundle version {header.get('format_version')}, expected {FORMAT_VERSION}; make it "
+                          "again with this version of dro-grasp")
+    try:
+        return _unpack(header, tensors)
+    except (KeyError, TypeError, ValueError) as error:
+        raise BundleError(f"{path} lacks a part ({error}); make it again with `dro-grasp dataset bundle`") from error
+
+
+def _unpack(header: dict[str, Any], tensors: dict[str, Tensor]) -> Bundle:
     objects = {name: _unpack_cloud(f"object.{i}", tensors) for i, name in enumerate(header["objects"])}
     hands, grasps = {}, {}
     for i, plain in enumerate(header["hands"]):
@@ -219,7 +229,9 @@ def _save(path: Path, tensors: dict[str, Tensor], header: dict[str, Any]) -> Non
         raise OutputError(f"cannot write {path}: {error.strerror}; choose another folder") from error
     try:
         save_file(tensors, temporary, metadata={"dro_grasp_bundle": json.dumps(header)})
+        os.chmod(temporary, 0o644)
         os.replace(temporary, path)
-    except BaseException:
+    except (OSError, SafetensorError) as error:
+        raise OutputError(f"cannot write {path}: {error}; free some space or choose another folder") from error
+    finally:
         Path(temporary).unlink(missing_ok=True)
-        raise

@@ -136,7 +136,7 @@ class GraspBatch:
                 raise IndexError(f"grasp {index} of a batch of {len(self)}")
             chosen = rows[index].reshape(1)
         else:
-            chosen = rows[index if isinstance(index, slice) else torch.as_tensor(index).cpu()]
+            chosen = rows[index if isinstance(index, slice) else torch.as_tensor(index if len(index) else rows[:0]).cpu()]
         return self._take(chosen)
 
     def _take(self, rows: Int[Tensor, " k"]) -> GraspBatch:
