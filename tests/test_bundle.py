@@ -107,6 +107,7 @@ def change(path: Path, how: str) -> None:
     with safe_open(path, "pt") as file:
         header = json.loads(file.metadata()["dro_grasp_bundle"])
         tensors = {key: file.get_tensor(key) for key in file.keys()}
+    path.unlink()
     if how == "cut short":
         path.write_bytes(whole[:-100])
     elif how == "empty":

@@ -55,8 +55,8 @@ def mean_grasps(hand: Hand, obj: ObjectModel, mean: MeanGrasp, num: int, seed: i
 def palm_facing_starts(hand: Hand, obj: ObjectModel, num: int, seed: int) -> GraspBatch:
     """Open hands that face the object with the palm at its surface: starts of synthesis, never optimised.
 
-    The grasp centre is put at the object's centre and moved back along the palm direction until no hand point is
-    inside the object's extent along it; joints are half closed.
+    The palm's axis goes through the object's centre; the palm's centre is at the object's extent along that axis, or up
+    to a centimetre before it. Joints are half closed.
     """
     generator = torch.Generator().manual_seed(seed)
     rotation = _random_rotations(num, generator)

@@ -1,0 +1,189 @@
+"""The predictor with untrained weights: repeatability, batches, order, directions, tables, bare clouds."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from dro_grasp.errors import OptionError
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.refinement import score_grasps
+from dro_grasp.objects.library import load_object
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.predictor import GraspPredictor, PredictorConfig, rotation_between
+from tests.toy_hand import toy_hand
+from tests.weights import untrained_weights
+
+HAND = toy_hand()
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return str(untrained_weights(tmp_path_factory.mktemp("weights")))
+
+
+@pytest.fixture(scope="module")
+def predictor(weights: str) -> GraspPredictor:
+    return GraspPredictor(weights)
+
+
+@pytest.fixture(scope="module")
+def ball() -> ObjectModel:
+    return load_object("sphere")
+
+
+@pytest.fixture(scope="module")
+def grasps(predictor: GraspPredictor, ball: ObjectModel) -> GraspBatch:
+    return predictor.predict(HAND, ball, num=7, seed=3)
+
+
+def lowest_point(q: Tensor, T: Tensor) -> float:
+    """Height of the lowest surface point of a grasping hand [m], point by point."""
+    poses = T @ HAND.tree.forward(q)
+    heights = []
+    for link, point in zip(HAND.link_index.tolist(), HAND.link_points, strict=True):
+        heights.append(float(poses[link, 2, :3] @ point + poses[link, 2, 3]))
+    return min(heights)
+
+
+def test_the_same_seed_gives_the_same_grasps(predictor: GraspPredictor, ball: ObjectModel, grasps: GraspBatch) -> None:
+    torch.manual_seed(99)
+    again, other = (predictor.predict(HAND, ball, num=7, seed=seed) for seed in (3, 4))
+    assert torch.equal(again.T_object_wrist, grasps.T_object_wrist)
+    assert torch.equal(again.joints, grasps.joints)
+    assert not torch.equal(other.joints, grasps.joints)
+    assert grasps.seed.tolist() == [3] * 7
+
+
+@pytest.mark.parametrize("batch_size", [1, 3, 100])
+def test_grasps_do_not_depend_on_the_batch_size(
+    weights: str, ball: ObjectModel, grasps: GraspBatch, batch_size: int
+) -> None:
+    other = GraspPredictor(weights, config=PredictorConfig(batch_size=batch_size)).predict(HAND, ball, num=7, seed=3)
+    for name in ("T_object_wrist", "joints", "pregrasp_joints", "squeeze_joints", "score"):
+        torch.testing.assert_close(getattr(other, name), getattr(grasps, name), atol=1e-4, rtol=1e-4)
+
+
+def test_grasps_are_complete_valid_and_sorted(
+    predictor: GraspPredictor, weights: str, ball: ObjectModel, grasps: GraspBatch
+) -> None:
+    assert len(grasps) == 7
+    assert grasps.score is not None
+    assert grasps.score.tolist() == sorted(grasps.score.tolist(), reverse=True)
+    torch.testing.assert_close(grasps.score, score_grasps(HAND, ball, grasps), atol=1e-4, rtol=1e-4)
+    for joints in (grasps.joints, grasps.pregrasp_joints, grasps.squeeze_joints):
+        assert joints is not None
+        assert bool(((joints >= HAND.tree.lower - 1e-5) & (joints <= HAND.tree.upper + 1e-5)).all())
+    rotation = grasps.T_object_wrist[:, :3, :3]
+    torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).expand(7, 3, 3), atol=1e-5, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(rotation), torch.ones(7))
+    assert (grasps.hand, set(grasps.object), set(grasps.provenance)) == ("toy", {"sphere"}, {"network untrained"})
+    assert not grasps.extra
+
+
+def test_what_the_predictor_tells_of_a_call(predictor: GraspPredictor, ball: ObjectModel) -> None:
+    steps: list[tuple[int, int]] = []
+    made = predictor.predict(HAND, ball, num=20, progress=lambda done, wanted: steps.append((done, wanted)))
+    assert steps == [(16, 20), (20, 20)]
+    assert predictor.candidates == 20
+    assert set(predictor.timings) == {"network", "decode", "rank"}
+    assert min(predictor.timings.values()) > 0
+    # Solved hands stay near the multilaterated points they were fitted to, row by row.
+    points = predictor.predicted_points
+    assert points is not None
+    hand = HAND.with_points(predictor.network.config.n_hand)
+    solved = hand.points(made.joints, made.T_object_wrist)
+    own = (points - solved).norm(dim=-1).mean(-1)
+    others = (points - solved.roll(1, 0)).norm(dim=-1).mean(-1)
+    assert float(own.mean()) < 0.5 * float(others.mean())
+
+
+@pytest.mark.parametrize("num", [0, -3])
+def test_no_grasp_cannot_be_asked_for(predictor: GraspPredictor, ball: ObjectModel, num: int) -> None:
+    with pytest.raises(OptionError, match=f"num is {num}"):
+        predictor.predict(HAND, ball, num=num)
+
+
+@pytest.mark.parametrize("direction", [(0.0, 0.0, 0.0), (math.nan, 0.0, 1.0), (math.inf, 0.0, 0.0)])
+def test_a_direction_must_point_somewhere(
+    predictor: GraspPredictor, ball: ObjectModel, direction: tuple[float, float, float]
+) -> None:
+    with pytest.raises(OptionError, match="has no direction"):
+        predictor.predict(HAND, ball, num=1, direction=direction)
+
+
+@pytest.mark.parametrize("direction", [(0.0, 0.0, -5.0), (0.0, 0.0, 1e-3), (1.0, 2.0, 2.0)])
+def test_placements_face_the_direction_at_any_roll(
+    predictor: GraspPredictor, direction: tuple[float, float, float]
+) -> None:
+    turns = predictor._rotations(HAND, 400, direction, torch.Generator().manual_seed(0))
+    wanted = torch.nn.functional.normalize(torch.tensor(direction), dim=0)
+    angles = torch.acos((turns @ HAND.palm_direction_wrist @ wanted).clamp(-1, 1))
+    # Two normal tilts of 5 degrees: their length is Rayleigh distributed.
+    expected = math.radians(5) * math.sqrt(math.pi / 2)
+    assert float(angles.mean()) == pytest.approx(expected, rel=0.15)
+    side = torch.linalg.cross(wanted, torch.eye(3)[wanted.abs().argmin()])
+    side = side / side.norm()
+    seen = turns @ torch.eye(3)[0]
+    roll = torch.atan2(seen @ torch.linalg.cross(wanted, side), seen @ side)
+    assert bool((torch.histc(roll, 4, -math.pi, math.pi) > 70).all())
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_rotation_between_parallel_vectors(sign: float) -> None:
+    a = torch.nn.functional.normalize(torch.tensor([1.0, -2.0, 0.5]), dim=0)
+    turn = rotation_between(a, sign * a)
+    torch.testing.assert_close(turn @ a, sign * a, atol=1e-5, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(turn), torch.tensor(1.0))
+
+
+def test_a_table_drops_what_goes_below_it(predictor: GraspPredictor, ball: ObjectModel) -> None:
+    free = predictor.predict(HAND, ball, num=12)
+    assert free.pregrasp_joints is not None
+    heights = sorted(
+        min(lowest_point(q, T), lowest_point(p, T))
+        for q, p, T in zip(free.joints, free.pregrasp_joints, free.T_object_wrist, strict=True)
+    )
+    table = (heights[5] + heights[6]) / 2
+    kept = predictor.predict(HAND, ball, num=12, table=table)
+    assert len(kept) == 12
+    assert predictor.candidates >= 24
+    assert predictor.candidates % 12 == 0
+    assert kept.pregrasp_joints is not None
+    for q, p, T in zip(kept.joints, kept.pregrasp_joints, kept.T_object_wrist, strict=True):
+        assert min(lowest_point(q, T), lowest_point(p, T)) > table - 1e-6
+    below = predictor.predict(HAND, ball, num=12, table=heights[0] - 0.01)
+    assert torch.equal(below.joints, free.joints)
+    assert predictor.candidates == 12
+
+
+def test_an_impossible_table_is_told(weights: str, ball: ObjectModel) -> None:
+    predictor = GraspPredictor(weights, config=PredictorConfig(table_rounds=2))
+    with pytest.raises(OptionError, match=r"only 0 of 6 grasps .* 3 were asked for; lower --table \(the object spans"):
+        predictor.predict(HAND, ball, num=3, table=5.0)
+
+
+def test_a_bare_cloud_is_grasped(predictor: GraspPredictor, ball: ObjectModel, grasps: GraspBatch) -> None:
+    cloud = dataclasses.replace(ball, vertices=None, faces=None)
+    made = predictor.predict(HAND, cloud, num=7, seed=3)
+    assert made.score is not None
+    assert bool(made.score.isfinite().all())
+    # The network sees points alone: the same grasps, in an order of their own.
+    assert sorted(map(tuple, made.joints.tolist())) == sorted(map(tuple, grasps.joints.tolist()))
+
+
+def test_a_cloud_with_too_few_points_is_grasped(predictor: GraspPredictor, ball: ObjectModel) -> None:
+    few = dataclasses.replace(
+        ball, cloud=ball.cloud[:40], cloud_normals=ball.cloud_normals[:40], vertices=None, faces=None
+    )
+    assert bool(predictor.predict(HAND, few, num=2).joints.isfinite().all())
+
+
+def test_gradients_are_left_alone(predictor: GraspPredictor, grasps: GraspBatch) -> None:
+    assert torch.is_grad_enabled()
+    assert not grasps.joints.requires_grad
+    assert not grasps.joints.is_inference()
