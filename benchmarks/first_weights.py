@@ -1,8 +1,11 @@
 """Success of the shipped weights, raw, beside the controls: paper hands on the validate objects.
 
-    python benchmarks/first_weights.py --bundle bundle.safetensors --num 10
+The distance error is that on the synthesised grasps of the same objects: with z from the true grasp (posterior) and z
+from N(0, I) (prior); the open hand is placed near the true grasp, as far off as in training.
 
-Needs the development assets. The mean grasp comes from the training bundle.
+    python benchmarks/first_weights.py --bundle bundle.safetensors [--num 20] [--json]
+
+Needs the development assets. The mean grasp comes from the training bundle. All the work on one thread but the trials.
 """
 
 from __future__ import annotations
@@ -17,21 +20,27 @@ from typing import Any
 import torch
 from report import emit, machine
 
-from dro_grasp.datasets.bundle import Bundle, load_bundle
+from dro_grasp import distance_matrix
+from dro_grasp.datasets.bundle import Bundle, HandGrasps, ObjectCloud, load_bundle
 from dro_grasp.evaluation.controls import mean_grasp, mean_grasps, palm_facing_starts
 from dro_grasp.evaluation.metrics import diversity, wilson_interval
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.synthesis import synthesize
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
+from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.library import load_object, object_names
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predictor import GraspPredictor
 from dro_grasp.simulation.protocols import protocol
 from dro_grasp.simulation.trial import settle, simulate
+from dro_grasp.training.config import AugmentationConfig
+from dro_grasp.training.samples import SampleSource
 
 HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand")
 ROWS = ("network, raw", "mean grasp", "unoptimised start", "synthesised")
+ERROR_SAMPLES = 200
+"""Placed hands that the distance error is measured on, of each hand."""
 PROTOCOLS = {
     "dro": protocol("dro"),
     "dro, friction 3": dataclasses.replace(protocol("dro"), friction=3.0),
@@ -50,6 +59,22 @@ def grasps_of(row: str, hand: Hand, obj: ObjectModel, bundle: Bundle, predictor:
     return settle(hand, obj, synthesize(hand, obj, 4 * num, seed=0)[slice(0, num)])
 
 
+@torch.no_grad()
+def distance_errors(network: DistanceNetwork, hand: Hand, objects: list[ObjectModel], grasps: list[GraspBatch]) -> list[float]:
+    """Mean absolute error of D(R,O) [m] on known grasps, with posterior and with prior z."""
+    clouds = {o.name: ObjectCloud(torch.from_numpy(o.cloud), torch.from_numpy(o.cloud_normals)) for o in objects}
+    index = torch.cat([torch.full((len(g),), i) for i, g in enumerate(grasps)])
+    known = HandGrasps(torch.cat([g.T_object_wrist for g in grasps]), torch.cat([g.joints for g in grasps]), index)
+    source = SampleSource(Bundle({hand.name: hand}, clouds, {hand.name: known}), network.config, AugmentationConfig())
+    generator = torch.Generator().manual_seed(0)
+    torch.manual_seed(0)
+    samples = source.draw(hand.name, ERROR_SAMPLES, generator)
+    true = distance_matrix.build(samples.grasp, samples.obj)
+    posterior = network(samples.placed, samples.obj, samples.grasp).distances
+    prior = network.predict(samples.placed, samples.obj, network.sample_latent(ERROR_SAMPLES, generator))
+    return [float((d - true).abs().mean()) for d in (posterior, prior)]
+
+
 def main() -> None:
     """Fill the table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -62,11 +87,14 @@ def main() -> None:
     objects = [load_object(n) for n, split in object_names().items() if split == "validate"]
     success: dict[tuple[str, str, str], int] = defaultdict(int)
     spread: dict[tuple[str, str], float] = {}
+    errors: dict[str, list[float]] = {}
     began = time.perf_counter()
     for name in HANDS:
         hand = load_hand(name)
         for row in ROWS:
             made = [grasps_of(row, hand, obj, bundle, predictor, options.num) for obj in objects]
+            if row == ROWS[3]:
+                errors[name] = distance_errors(predictor.network, hand, objects, made)
             everything = GraspBatch.concatenate(made)
             spread[name, row] = diversity(everything.T_object_wrist, everything.joints)["all"]
             for obj, grasps in zip(objects, made, strict=True):
@@ -87,6 +115,8 @@ def main() -> None:
                 result[f"{row}/{name}/{rules}"] = k / n
             mean_spread = sum(spread[h, row] for h in counted) / len(counted)
             table.append([row, name, *cells, f"{mean_spread:.3f}"])
+    for kind, i in (("posterior", 0), ("prior", 1)):
+        result[f"distance_error_{kind}_mm"] = sum(1e3 * e[i] for e in errors.values()) / len(errors)
     title = f"success [%] with 95 % intervals, {total} grasps a hand, {len(objects)} unseen objects"
     emit(title, table, ["grasps", "hand", *PROTOCOLS, "diversity"], result, options.json)
 

@@ -13,9 +13,9 @@ class AugmentationConfig:
 
     object_noise: float = 0.002
     """Standard deviation of the noise on object points [m]. Source: appendix, object point cloud sampling."""
-    placement_rotation: float = math.radians(8)
+    placement_rotation: float = math.radians(4)
     """Largest rotation of the open hand's placement away from the grasp's [rad]."""
-    placement_shift: float = 0.01
+    placement_shift: float = 0.004
     """Standard deviation of its shift along each axis [m]."""
     partial: float = 0.0
     """Share of samples that see half of the object, as in the appendix."""
@@ -27,7 +27,8 @@ class LossConfig:
 
     distance: float = 1.0
     pose: float = 0.01
-    penetration: float = 1.0
+    penetration: float = 5.0
+    """Differs from the release (1): at 1 the hand ends up a few millimetres inside the object."""
     divergence: float = 0.01
     divergence_form: Literal["batch_mean", "official"] = "batch_mean"
     """Sum over latents and mean over the batch, or the release's sum over all and sqrt(1 + x^2) - 1."""
