@@ -50,6 +50,7 @@ class Run:
         )
         if (self.folder / CHECKPOINT).is_file():
             self._resume()
+        self._cut_log()
 
     @property
     def progress(self) -> float:
@@ -150,10 +151,9 @@ class Run:
             reason = str(error).partition("\n")[0] or "it is empty"
             raise TrainingError(f"{path} does not fit this training ({reason}); use another folder, or the configuration "
                                 "it was made with") from error
-        self._cut_log()
 
     def _cut_log(self) -> None:
-        """Drop the log's lines after the checkpoint; a line that was cut short is one of them."""
+        """Drop the log's lines after the checkpoint, all where there is none; a line that was cut short is one of them."""
         log = self.folder / LOG
         if not log.is_file():
             return
