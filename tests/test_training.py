@@ -18,7 +18,7 @@ import torch
 from torch import nn
 
 from dro_grasp.datasets.bundle import Bundle
-from dro_grasp.errors import OutputError, TrainingError
+from dro_grasp.errors import OptionError, OutputError, TrainingError
 from dro_grasp.models.network import DistanceNetwork, NetworkConfig
 from dro_grasp.training import batch_statistics, loop, pretraining
 from dro_grasp.training.config import AugmentationConfig, LossConfig, PretrainConfig, ScheduleConfig, TrainConfig
@@ -198,6 +198,15 @@ def test_a_checkpoint_of_another_training_is_refused(bundle: Bundle, finished: d
         run_stage("train", bundle, finished["train"], network=dataclasses.replace(TINY, width=20))
     with pytest.raises(TrainingError, match="does not fit this training"):
         run_stage("train", bundle, finished["pretrain"])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("steps", 0), ("steps", -5), ("minutes", 0.0), ("learning_rate", math.nan), ("log_every", 0)]
+)
+def test_an_impossible_schedule_is_refused(bundle: Bundle, tmp_path: Path, name: str, value: float) -> None:
+    with pytest.raises(OptionError, match=f"{name} is {value}"):
+        run_stage("train", bundle, tmp_path / "run", dataclasses.replace(SCHEDULE, **{name: value}))
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_folder_that_cannot_be_made_is_refused_before_the_work(

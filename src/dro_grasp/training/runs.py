@@ -17,7 +17,7 @@ from torch import nn
 from torch.optim import Adam
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from dro_grasp.errors import OutputError, TrainingError
+from dro_grasp.errors import OptionError, OutputError, TrainingError
 from dro_grasp.models.precision import fast_products
 from dro_grasp.training.config import ScheduleConfig
 from dro_grasp.training.reports import tensorboard_report
@@ -42,6 +42,7 @@ class Run:
 
     def __post_init__(self) -> None:
         """Make optimiser and average; take up the folder's checkpoint if there is one."""
+        check_schedule(self.schedule)
         make_run_folder(self.folder)
         parameters = [p for p in self.model.parameters() if p.requires_grad]
         self.optimiser = Adam(parameters, lr=self.schedule.learning_rate)
@@ -189,6 +190,18 @@ def learning_rate_share(step: int, progress: float, schedule: ScheduleConfig) ->
     """Linear warm-up over the first steps, times a cosine to zero over the whole schedule."""
     warmup = min(1.0, (step + 1) / max(1, schedule.warmup_steps))
     return warmup * 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
+
+
+def check_schedule(schedule: ScheduleConfig) -> None:
+    """Refuse a schedule without end or without a step.
+
+    Raises:
+        OptionError: A number is not positive and finite.
+    """
+    for name in ("steps", "minutes", "learning_rate", "log_every"):
+        value = getattr(schedule, name)
+        if value is not None and not 0 < value < math.inf:
+            raise OptionError(f"{name} is {value}; give a positive number")
 
 
 @contextmanager
