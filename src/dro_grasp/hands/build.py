@@ -24,6 +24,8 @@ AXIS_ALONG_PALM = 0.75
 """Cosine of the angle to the palm direction below which a joint's axis does not point out of the palm."""
 PARALLEL = 0.9
 """Cosine above which two joint axes count as parallel."""
+LARGEST_HAND, SMALLEST_HAND = 1.5, 0.02
+"""Extents from the palm on, outside of which a hand is not in metres [m]."""
 REFINEMENTS = 3
 """How often open ends and palm are derived from each other."""
 
@@ -38,7 +40,7 @@ def build_hand(description: Description, *, name: str | None = None, seed: int =
         n_points: Points of the whole hand.
 
     Raises:
-        HandError: No finger, or no link with a surface.
+        HandError: No finger, no link with a surface, or a size that no hand has.
     """
     tree = description.tree
     shaped = sorted({g.link for g in description.geometry})
@@ -50,6 +52,7 @@ def build_hand(description: Description, *, name: str | None = None, seed: int =
     held = _held_joints(tree, palm)
     rest = torch.zeros(tree.n_dof).clamp(tree.lower, tree.upper)
     surface = sample_links(description, [link for link in below if link in shaped], seed)
+    _check_size(description, float(np.ptp(surface.posed(tree, rest)[0], axis=0).max()))
     opening, abduction, found = _open_ends(tree, surface.coarse(), tips, palm, held, rest)
     T_palm = _inverse(tree.forward(rest)[palm])
     to_palm = lambda p: (T_palm[:3, :3] @ torch.tensor(p, dtype=torch.float32) + T_palm[:3, 3])  # noqa: E731
@@ -62,6 +65,15 @@ def build_hand(description: Description, *, name: str | None = None, seed: int =
         sha256=description.sha256, description=description,
     )
     return _thin(draft, n_points)
+
+
+def _check_size(description: Description, size: float) -> None:
+    if size > LARGEST_HAND:
+        raise HandError(f"{description.path}: the hand is {size:.3g} m large, which looks like millimetres; expected metres: "
+                        "scale its origins, shapes and meshes by 0.001")
+    if size < SMALLEST_HAND:
+        raise HandError(f"{description.path}: the hand is {size:.3g} m large, which looks like another unit than metres; "
+                        f"expected {SMALLEST_HAND} to {LARGEST_HAND} m: scale its origins, shapes and meshes")
 
 
 def find_tips(tree: KinematicTree, shaped: list[int]) -> tuple[int, ...]:

@@ -17,8 +17,6 @@ from dro_grasp.hands.library import load_hand_description
 from dro_grasp.kinematics.loader import Description
 from dro_grasp.kinematics.notes import Note
 
-LARGEST_HAND, SMALLEST_HAND = 1.0, 0.02
-"""Extents outside of which a hand's units are doubtful [m]."""
 TILE, TEXT = (560, 520), 30
 """Size of one view, and height of a line of text [pixels]."""
 TOUCHING, OTHER, DIRECTION, TRACK = (0.93, 0.66, 0.30), (0.62, 0.66, 0.72), (0.85, 0.15, 0.15), (0.15, 0.39, 0.92)
@@ -58,7 +56,7 @@ def check_hand(name: str | Path) -> HandReport:
     """
     description, label = load_hand_description(name)
     hand = build_hand(description, name=label)
-    notes = (*description.notes, *_size_notes(hand), *_shape_notes(hand, description), *_point_notes(hand))
+    notes = (*description.notes, *_shape_notes(hand, description), *_point_notes(hand))
     return HandReport(hand, _facts(hand, description), notes)
 
 
@@ -107,18 +105,8 @@ def hand_side(hand: Hand) -> str:
     return "right" if handed > 0 else "left"
 
 
-def _size_notes(hand: Hand) -> list[Note]:
-    size = float(np.ptp(hand.points(hand.canonical_joints()).numpy(), axis=0).max())
-    if SMALLEST_HAND < size < LARGEST_HAND:
-        return []
-    unit = "millimetres; set the meshes' scale to 0.001" if size > LARGEST_HAND else "another unit than metres"
-    return [Note("warning", hand.name, f"is {size:.3g} m large, which looks like {unit}")]
-
-
 def _shape_notes(hand: Hand, description: Description) -> list[Note]:
     """Links that cannot touch anything, or whose shapes enclose nothing."""
-    import trimesh
-
     notes = []
     for link, name in enumerate(hand.tree.link_names):
         if not bool(hand.tree.descends[link, hand.palm]):
@@ -126,10 +114,15 @@ def _shape_notes(hand: Hand, description: Description) -> list[Note]:
         shapes = [g for g in description.geometry if g.link == link]
         if shapes and not any(g.collides for g in shapes):
             notes.append(Note("warning", name, "has a visual but no collision shape; it cannot touch anything"))
-        volume = sum(abs(trimesh.Trimesh(g.vertices, g.faces, process=False).volume) for g in shapes)
+        volume = sum(_volume(g.vertices[g.faces]) for g in shapes)
         if shapes and volume < THIN_VOLUME:
             notes.append(Note("warning", name, "has shapes without volume"))
     return notes
+
+
+def _volume(triangles: np.ndarray) -> float:
+    """What a closed surface (n 3 3) encloses [m^3]."""
+    return abs(float((triangles[:, 0] * np.cross(triangles[:, 1], triangles[:, 2])).sum())) / 6
 
 
 def _point_notes(hand: Hand) -> list[Note]:

@@ -9,7 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+
+from dro_grasp.errors import HandError
 
 GRID_SPACING = 0.008
 """Spacing of candidate ball centres [m]."""
@@ -17,6 +19,9 @@ CLOSINGS = (0.35, 0.5, 0.65)
 """Shares of the way from open to closed at which the hand is examined."""
 FACE_POINTS = 16
 """Palm samples nearest to the grasp centre that make up its inner face."""
+NOTHING_ENCLOSED = ("palm and fingers of the half-closed hand enclose no space, so nothing can be grasped; check the origins, "
+                    "axes and limits of its joints")
+"""What a hand without a grasp is told."""
 LARGEST_BALL = 0.05
 """Radius beyond which a larger empty ball is no better [m]."""
 
@@ -42,9 +47,15 @@ def find_palm(palm_points: np.ndarray, palm_normals: np.ndarray, fingers: list[n
         palm_points: Surface of the palm (n 3) [m].
         palm_normals: Outward normals there (n 3).
         fingers: Surface points of each finger, distal links (n_i 3 each).
+
+    Raises:
+        HandError: They enclose nothing.
     """
     everything = np.concatenate([palm_points, *fingers])
-    hull = ConvexHull(everything)
+    try:
+        hull = ConvexHull(everything)
+    except QhullError as error:
+        raise HandError(NOTHING_ENCLOSED) from error
     low, high = everything.min(0), everything.max(0)
     axes = [np.arange(a, b, GRID_SPACING) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
@@ -55,6 +66,8 @@ def find_palm(palm_points: np.ndarray, palm_normals: np.ndarray, fingers: list[n
     to_palm, nearest = tree.query(grid)
     outside = ((grid - palm_points[nearest]) * palm_normals[nearest]).sum(1) > 0.7 * to_palm
     grid, to_palm, nearest = grid[outside], to_palm[outside], nearest[outside]
+    if not len(grid):
+        raise HandError(NOTHING_ENCLOSED)
     to_fingers = np.stack([cKDTree(f).query(grid)[0] for f in fingers], 1)
     radius = np.minimum(np.minimum(to_palm, to_fingers.min(1)), LARGEST_BALL)
     # A ball that touches everything around it scores its radius; gaps to palm and fingers count against it.

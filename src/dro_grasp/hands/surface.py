@@ -15,6 +15,8 @@ from dro_grasp.kinematics.tree import KinematicTree
 
 POINTS_PER_LINK_SAMPLED = 512
 """Points sampled on each link before farthest point sampling. Source: appendix, robot point cloud sampling."""
+NUDGE = 5e-4
+"""Samples this close in front of another shape of their link are where the two meet, not outside [m]."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,7 @@ def _sample_shapes(
     if len(shapes) > 1:
         for i, (v, f) in enumerate(shapes):
             others = (owner[face] != i).nonzero()[:, 0]
-            hidden[others] |= _inside_convex(points[others], v, f)
+            hidden[others] |= _inside_convex(points[others] + NUDGE * normals[others], v, f)
     seen = (~hidden).nonzero()[:, 0]
     seen = seen if len(seen) >= POINTS_PER_LINK_SAMPLED // 4 else torch.arange(len(points))
     seen = seen[:POINTS_PER_LINK_SAMPLED]

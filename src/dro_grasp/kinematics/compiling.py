@@ -67,6 +67,12 @@ def _repair(spec: mujoco.MjSpec, message: str, notes: list[Note]) -> bool:
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
         notes.append(Note("warning", mesh.name, "is a mesh without volume"))
         return True
+    if "at least 4 vertices" in message and mesh is not None:
+        for geom in [g for g in spec.geoms if g.meshname == mesh.name]:
+            spec.delete(geom)
+        notes.append(Note("warning", mesh.name, "is a mesh of fewer than 4 vertices, which encloses nothing; it is left out"))
+        spec.delete(mesh)
+        return True
     if "convex hull" in message and mesh is not None:
         touching = [g for g in spec.geoms if g.meshname == mesh.name and (g.contype or g.conaffinity)]
         for geom in touching:
