@@ -147,6 +147,23 @@ def deaf_links(hand: Hand) -> list[str]:
     return deaf
 
 
+def largest_shift(hand: Hand) -> float:
+    """How far links stand from where the kinematic tree has them [m], wrist joints that are held included."""
+    scene = build_scene(hand, ball(0.005), protocol("dro"))
+    q, data = hand.canonical_joints(), mujoco.MjData(scene.model)
+    data.qpos[:] = scene.qpos(wrist_below(1.0), q[None])[0]
+    mujoco.mj_kinematics(scene.model, data)
+    poses = {name: T[:3, 3].numpy() for name, T in zip(hand.tree.link_names, hand.tree.forward(q), strict=True)}
+    bodies = [scene.model.body(b) for b in range(scene.model.nbody)]
+    named = [(b.id, b.name.removeprefix("hand/")) for b in bodies if b.name.removeprefix("hand/") in poses]
+    assert len(named) > len(hand.tips)
+    return max(float(np.linalg.norm(data.xpos[i] - poses[name])) for i, name in named)
+
+
+def test_the_scene_stands_as_the_tree_says(hand):
+    assert largest_shift(hand) < 1e-5
+
+
 def test_every_link_of_the_claw_collides(hand):
     assert len(hand.touching) == 9
     assert deaf_links(hand) == []
@@ -157,6 +174,7 @@ def test_every_link_of_the_claw_collides(hand):
 def test_every_link_collides_and_the_hand_closes(name: str, assets_folder: Path):
     hand = load_hand(f"assets/{name}")
     assert deaf_links(hand) == []
+    assert largest_shift(hand) < 1e-5
     scene = build_scene(hand, ball(0.005), protocol("dro"))
     data = mujoco.MjData(scene.model)
     target = hand.canonical_joints(0.6)

@@ -167,7 +167,9 @@ def _lever(joint: mujoco.MjsJoint, protocol: Protocol) -> float:
 
 
 def _hold_joints(spec: mujoco.MjSpec, hand: Hand) -> None:
-    """Joints above the palm do not move: at zero they are removed, elsewhere they are tied."""
+    """Joints above the palm do not move: where the model has them already they are removed, elsewhere they are tied."""
+    assert hand.description is not None
+    model = hand.description.model
     values = hand.tree.coupling @ hand.rest + hand.tree.offset
     held = (hand.tree.coupling.abs() @ (~hand.movable).float() > 0).tolist()
     for name, value, hold in zip(hand.tree.moving_names, values.tolist(), held, strict=True):
@@ -175,11 +177,13 @@ def _hold_joints(spec: mujoco.MjSpec, hand: Hand) -> None:
             continue
         for equality in [e for e in spec.equalities if name in (e.name1, e.name2)]:
             spec.delete(equality)
-        if abs(value) < 1e-9:
+        # Equalities count from the reference value, at which the model stands without the joint.
+        offset = value - float(model.qpos0[model.joint(name).qposadr[0]])
+        if abs(offset) < 1e-6:
             spec.delete(spec.joint(name))
         else:
             tie = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1=name, objtype=mujoco.mjtObj.mjOBJ_JOINT)
-            tie.data[0] = value
+            tie.data[0] = offset
 
 
 def _add_object(scene: mujoco.MjSpec, obj: ObjectModel, protocol: Protocol) -> None:
