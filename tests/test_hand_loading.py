@@ -265,3 +265,15 @@ def test_without_robot_descriptions_the_error_names_it(monkeypatch: pytest.Monke
     monkeypatch.setitem(sys.modules, "robot_descriptions", None)
     with pytest.raises(HandError, match="install `robot_descriptions`"):
         dro.load_hand("panda")
+
+
+def test_fingers_that_curl_past_the_centre_open_outwards(tmp_path: Path) -> None:
+    """Two fingers face one; half closed they have passed each other."""
+    links = joints = ""
+    for i, (x, y, axis) in enumerate(((-0.04, -0.02, "0 1 0"), (-0.04, 0.02, "0 1 0"), (0.04, 0.0, "0 -1 0"))):
+        links += link(f"a{i}") + link(f"b{i}")
+        joints += joint(f"j{i}", "palm", f"a{i}", f"{x} {y} 0.01", axis)
+        joints += joint(f"k{i}", f"a{i}", f"b{i}", "0 0 0.06", axis, LIMIT + f'<mimic joint="j{i}" multiplier="0.6"/>')
+    hand = dro.load_hand(written(tmp_path, claw(links=links, joints=joints)))
+    assert hand.opening.tolist() == [-1, -1, -1]
+    assert float(hand.palm_direction_wrist[2]) > 0.99

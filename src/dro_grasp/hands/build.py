@@ -134,6 +134,8 @@ def _open_ends(
     """
     straight = torch.where(held, rest, torch.zeros(tree.n_dof).clamp(tree.lower, tree.upper))
     centre = torch.tensor(surface.posed(tree, (tree.lower + tree.upper) / 2)[0].mean(0))
+    on_palm = _on_palm(tree, surface, palm)
+    middle = torch.tensor(surface.posed(tree, straight)[0][on_palm].mean(0))
     opening = -torch.ones(tree.n_dof)
     abduction = torch.zeros(tree.n_dof, dtype=torch.bool)
     out_of_palm = torch.zeros(tree.n_dof, dtype=torch.bool)
@@ -141,7 +143,9 @@ def _open_ends(
     for _ in range(REFINEMENTS):
         before = torch.cat([opening, abduction])
         bases = (straight, _half_closed(tree, opening, abduction, held, rest))
-        found_ends = [[_closing_gain(tree, surface, tips, centre, base, j) for base in bases] for j in range(tree.n_dof)]
+        found_ends = [
+            [_closing_gain(tree, surface, tips, centre, middle, base, j) for base in bases] for j in range(tree.n_dof)
+        ]
         for j, ends in enumerate(found_ends):
             abduction[j] = bool(out_of_palm[j])
             opening[j] = -1.0 if sum(ends) >= 0 or abduction[j] else 1.0
@@ -183,9 +187,14 @@ def _axes_along(tree: KinematicTree, q: torch.Tensor, direction: torch.Tensor) -
 
 
 def _closing_gain(
-    tree: KinematicTree, surface: LinkSurface, tips: tuple[int, ...], centre: torch.Tensor, straight: torch.Tensor, j: int
+    tree: KinematicTree, surface: LinkSurface, tips: tuple[int, ...], centre: torch.Tensor, middle: torch.Tensor,
+    straight: torch.Tensor, j: int,
 ) -> float:
-    """How much nearer to the centre the upper end of joint j brings its fingertips than the lower end [m]."""
+    """How much nearer to the centre and to the palm's middle the upper end of joint j brings its fingertips than the lower
+    end, added [m].
+
+    The centre tells closing from spreading; but curled fingers pass it, while they come nearer to the palm all the way.
+    """
     moved = [t for t in tips if float(tree.link_coupling[_chain(tree, t), j].abs().sum()) > 0]
     if not moved:
         return 0.0
@@ -194,7 +203,7 @@ def _closing_gain(
     q[:, j] = torch.stack([tree.lower[j], tree.upper[j]])
     T = tree.forward(q)
     path = torch.stack([(T[:, t, :3, :3] @ m) + T[:, t, :3, 3] for t, m in zip(moved, middles, strict=True)], 1)
-    distance = (path - centre).norm(dim=-1).mean(1)
+    distance = sum((path - target).norm(dim=-1).mean(1) for target in (centre, middle))
     return float(distance[0] - distance[1])
 
 
@@ -203,10 +212,7 @@ def _examine(
     abduction: torch.Tensor, held: torch.Tensor, rest: torch.Tensor,
 ) -> Palm:
     """The palm at the closing where palm and fingers enclose a ball best, in the frame of the root link."""
-    rigid = [i for i in range(tree.n_links) if _rigid_to(tree, i, palm)]
-    on_palm = torch.isin(surface.link, torch.tensor(rigid)).numpy()
-    if not on_palm.any():
-        on_palm = np.ones(len(on_palm), bool)
+    rigid, on_palm = _palm_links(tree, palm), _on_palm(tree, surface, palm)
     fingers = [torch.isin(surface.link, torch.tensor([i for i in _chain(tree, t) if i not in rigid])).numpy() for t in tips]
     best: Palm | None = None
     for share in CLOSINGS:
@@ -216,6 +222,16 @@ def _examine(
             best = palm_found
     assert best is not None
     return best
+
+
+def _palm_links(tree: KinematicTree, palm: int) -> list[int]:
+    return [i for i in range(tree.n_links) if _rigid_to(tree, i, palm)]
+
+
+def _on_palm(tree: KinematicTree, surface: LinkSurface, palm: int) -> np.ndarray:
+    """Mask of the samples on the palm; all of them where it has none."""
+    mask = torch.isin(surface.link, torch.tensor(_palm_links(tree, palm))).numpy()
+    return mask if mask.any() else np.ones(len(mask), bool)
 
 
 def _rigid_to(tree: KinematicTree, link: int, palm: int) -> bool:
