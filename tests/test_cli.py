@@ -239,3 +239,27 @@ def test_hand_check_in_both_forms(capsys: pytest.CaptureFixture[str], tmp_path: 
     assert main(["hand", "check", "gripper3", "--picture", str(tmp_path / "hand.png")]) == 0
     assert "palm" in capsys.readouterr().out
     assert main(["hand", "check", "nowhere.urdf"]) == 2
+
+
+def test_own_files_are_found_again(
+    weights: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import shutil
+
+    import trimesh
+
+    from dro_grasp.hands.library import BUILTIN_FOLDER
+
+    shutil.copy(BUILTIN_FOLDER / "gripper3.urdf", tmp_path / "mine.urdf")
+    trimesh.creation.box((40, 40, 60)).export(tmp_path / "box.stl")
+    (tmp_path / "below").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert main(["generate", "--hand", "mine.urdf", "--object", "box.stl", "--scale", "0.001", "--num", "2", "--weights",
+                 weights, "--output", "grasps.parquet", "--json"]) == 0
+    made = json.loads(capsys.readouterr().out)
+    monkeypatch.chdir(tmp_path / "below")
+    assert main(["evaluate", "../grasps.parquet", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["success"] == made["success"]
+    (tmp_path / "mine.urdf").unlink()
+    assert main(["view", "../grasps.parquet", "--picture", "a.png"]) == 2
+    assert "give its file with --hand" in capsys.readouterr().err

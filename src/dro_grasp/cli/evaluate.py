@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 import tyro
 
 from dro_grasp.cli.output import load_grasps, optional, print_json, print_table, progress_bar
+from dro_grasp.cli.sources import hand_of, object_of
 
 
 @dataclass(frozen=True)
@@ -26,12 +27,12 @@ class Evaluate:
     """The trial."""
     friction: float = 1.0
     """Friction coefficient between hand and object; the official release has 3."""
-    hand: Annotated[str | None, optional("NAME|PATH", "the name in the file")] = None
-    """Hand to use, where the name in the file is not one that can be found here."""
-    object: Annotated[str | None, optional("NAME|PATH", "the names in the file")] = None
+    hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
+    """Hand to use instead of the one that the file names or remembers."""
+    object: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Mesh to use, likewise, for a file with one object."""
     scale: float = 1.0
-    """Scale of the object's file."""
+    """Scale of the mesh given with --object."""
     output: Annotated[Path | None, optional("PATH", "not saved")] = None
     """Save the grasps with their results."""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -44,8 +45,6 @@ class Evaluate:
         from dro_grasp.errors import OptionError
         from dro_grasp.evaluation.metrics import wilson_interval
         from dro_grasp.grasps.batch import GraspBatch, check_output
-        from dro_grasp.hands.library import load_hand
-        from dro_grasp.objects.library import load_object
         from dro_grasp.simulation.protocols import protocol
         from dro_grasp.simulation.trial import simulate
 
@@ -55,7 +54,7 @@ class Evaluate:
             check_output(self.output)
         begin = time.perf_counter()
         grasps = load_grasps(self.file)
-        hand = load_hand(self.hand or grasps.hand)
+        hand = hand_of(grasps, self.hand)
         rules = dataclasses.replace(protocol(self.protocol), friction=self.friction)
         rows, tried, reasons = [], [], Counter()
         names = list(dict.fromkeys(grasps.object))
@@ -65,7 +64,7 @@ class Evaluate:
             for name in names:
                 index = [i for i, o in enumerate(grasps.object) if o == name]
                 part = grasps[index]
-                obj = load_object(self.object or name, scale=self.scale)
+                obj = object_of(part, self.object, self.scale)
                 result = simulate(hand, obj, part, rules, progress=progress)
                 tried.append(part.with_trial(result))
                 reasons.update(r for r in result.reason if r)

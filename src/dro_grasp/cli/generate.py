@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from dro_grasp.cli.output import optional, print_json, print_table, progress_bar, say, say_aside
+from dro_grasp.cli.sources import with_sources
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -121,7 +122,7 @@ class Generate:
         if result is not None and self.only_successful:
             kept, points = grasps[result.success], None if points is None else points[result.success]
         if output is not None:
-            kept.save(output)
+            with_sources(kept, self.hand, name, self.scale).save(output)
         if picture is not None:
             from dro_grasp.viewer.pictures import draw_grasps
 

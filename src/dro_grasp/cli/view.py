@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from dro_grasp.cli.output import load_grasps, optional, say
+from dro_grasp.cli.sources import hand_of, object_of
 
 
 @dataclass(frozen=True)
@@ -20,12 +21,12 @@ class View:
 
     file: tyro.conf.Positional[Path]
     """Grasp file."""
-    hand: Annotated[str | None, optional("NAME|PATH", "the name in the file")] = None
-    """Hand to use, where the name in the file is not one that can be found here."""
+    hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
+    """Hand to use instead of the one that the file names or remembers."""
     object: Annotated[str | None, optional("NAME|PATH", "the names in the file")] = None
     """Object to look at: a name in the file, or the mesh to use for its only object."""
     scale: float = 1.0
-    """Scale of the object's file."""
+    """Scale of the mesh given with --object."""
     port: int = 8080
     """Port on localhost; the next free one is taken."""
     picture: Annotated[Path | None, optional("PNG", "none")] = None
@@ -34,16 +35,14 @@ class View:
     def run(self) -> int:
         """Load the file and show the grasps of one object."""
         from dro_grasp.grasps.batch import check_output
-        from dro_grasp.hands.library import load_hand
-        from dro_grasp.objects.library import load_object
 
         if self.picture is not None:
             check_output(self.picture)
         grasps = load_grasps(self.file)
-        hand = load_hand(self.hand or grasps.hand)
+        hand = hand_of(grasps, self.hand)
         name = self.object if self.object in grasps.object else grasps.object[0]
         chosen = grasps[[i for i, o in enumerate(grasps.object) if o == name]]
-        obj = load_object(self.object or name, scale=self.scale)
+        obj = object_of(chosen, None if self.object == name else self.object, self.scale)
         if self.picture is not None:
             from dro_grasp.viewer.pictures import draw_grasps
 

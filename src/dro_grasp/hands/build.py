@@ -190,10 +190,10 @@ def _closing_gain(
     tree: KinematicTree, surface: LinkSurface, tips: tuple[int, ...], centre: torch.Tensor, middle: torch.Tensor,
     straight: torch.Tensor, j: int,
 ) -> float:
-    """How much nearer to the centre and to the palm's middle the upper end of joint j brings its fingertips than the lower
-    end, added [m].
+    """How much nearer the upper end of joint j brings its fingertips than the lower end [m].
 
-    The centre tells closing from spreading; but curled fingers pass it, while they come nearer to the palm all the way.
+    Nearer to the centre and to the palm's middle, added. The centre tells closing from spreading; but curled fingers
+    pass it, while they come nearer to the palm all the way.
     """
     moved = [t for t in tips if float(tree.link_coupling[_chain(tree, t), j].abs().sum()) > 0]
     if not moved:
@@ -203,7 +203,7 @@ def _closing_gain(
     q[:, j] = torch.stack([tree.lower[j], tree.upper[j]])
     T = tree.forward(q)
     path = torch.stack([(T[:, t, :3, :3] @ m) + T[:, t, :3, 3] for t, m in zip(moved, middles, strict=True)], 1)
-    distance = sum((path - target).norm(dim=-1).mean(1) for target in (centre, middle))
+    distance = (path - centre).norm(dim=-1).mean(1) + (path - middle).norm(dim=-1).mean(1)
     return float(distance[0] - distance[1])
 
 

@@ -1,0 +1,77 @@
+"""The hand and the objects of a grasp file: by the names in it, or the files that it remembers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dro_grasp.errors import HandError, ObjectError
+
+if TYPE_CHECKING:
+    from dro_grasp.grasps.batch import GraspBatch
+    from dro_grasp.hands.hand import Hand
+    from dro_grasp.objects.shape import ObjectModel
+
+HAND_FILE, OBJECT_FILE, OBJECT_SCALE = "hand_file", "object_file", "object_scale"
+"""Columns of grasps whose hand or object came from a file of the user's own."""
+
+
+def with_sources(grasps: GraspBatch, hand: str, obj: str, scale: float) -> GraspBatch:
+    """Grasps that remember which files they were made from; names need no remembering."""
+    import torch
+
+    from dro_grasp.hands.library import locate_hand
+
+    n, extra = len(grasps), dict(grasps.extra)
+    if Path(hand).expanduser().is_file() and locate_hand(hand)[0] == Path(hand).expanduser():
+        extra[HAND_FILE] = (str(Path(hand).expanduser().resolve()),) * n
+    if Path(obj).expanduser().is_file():
+        extra[OBJECT_FILE] = (str(Path(obj).expanduser().resolve()),) * n
+        extra[OBJECT_SCALE] = torch.full((n,), scale)
+    return grasps.replace(extra=extra)
+
+
+def hand_of(grasps: GraspBatch, given: str | None) -> Hand:
+    """The hand of a file's grasps, or the one given instead.
+
+    Raises:
+        HandError: It cannot be found; the message asks for --hand.
+    """
+    from dro_grasp.hands.library import load_hand
+
+    if given is not None:
+        return load_hand(given)
+    source = _remembered(grasps, HAND_FILE) or grasps.hand
+    try:
+        return load_hand(source)
+    except HandError as error:
+        raise HandError(f"the grasps are of hand '{grasps.hand}', which cannot be loaded ({error}); give its file with "
+                        "--hand") from error
+
+
+def object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectModel:
+    """The object of one object's grasps, or the one given instead.
+
+    Args:
+        grasps: Of one object.
+        given: Name or path that replaces the one in the file.
+        scale: Scale of that; what the file remembers has its own.
+
+    Raises:
+        ObjectError: It cannot be found; the message asks for --object.
+    """
+    from dro_grasp.objects.library import load_object
+
+    if given is not None:
+        return load_object(given, scale=scale)
+    source = _remembered(grasps, OBJECT_FILE)
+    own_scale = float(grasps.extra[OBJECT_SCALE][0]) if source and OBJECT_SCALE in grasps.extra else scale
+    try:
+        return load_object(source or grasps.object[0], scale=own_scale)
+    except ObjectError as error:
+        raise ObjectError(f"the grasps are of object '{grasps.object[0]}', which cannot be loaded ({error}); give its file "
+                          "with --object, and --scale if it had one") from error
+
+
+def _remembered(grasps: GraspBatch, column: str) -> str | None:
+    return next((value for value in grasps.extra.get(column, ()) if value), None)
