@@ -64,10 +64,11 @@ class Pretrain:
         bundle, network = load_bundle(self.bundle), network_config(self.size)
         schedule = ScheduleConfig(steps=self.steps, minutes=self.minutes, tensorboard=self.tensorboard, seed=self.seed)
         model = pretrain(bundle, network, PretrainConfig(schedule=schedule), self.run_folder)
-        save_weights(model, self.output, {"stage": "pretraining", "steps": self.steps, "data": bundle.summary()})
+        about = how_long(self.run_folder) | {"stage": "pretraining", "data": bundle.summary()}
+        save_weights(model, self.output, about)
         source = SampleSource(bundle, network, AugmentationConfig())
         ranks = matching_rank(model.hand_encoder, source, 32, torch.Generator().manual_seed(1))
-        report = {"output": str(self.output), "steps": self.steps, "mean_rank": ranks, "chance": network.n_hand / 2}
+        report = {"output": str(self.output), "steps": about["steps"], "mean_rank": ranks, "chance": network.n_hand / 2}
         if self.json:
             print_json(report)
         else:
@@ -130,12 +131,21 @@ class Train:
             losses=LossConfig(divergence=self.divergence), augmentation=AugmentationConfig(partial=self.partial),
         )
         model = train(bundle, network_config(self.size), config, self.run_folder, pretrained, name=self.output.stem)
-        about = {"stage": "training", "steps": self.steps, "pretrained": self.pretrained is not None,
-                 "data": bundle.summary()}
+        about = how_long(self.run_folder) | {
+            "stage": "training", "pretrained": self.pretrained is not None, "data": bundle.summary(),
+        }
         save_weights(model, self.output, about)
-        report = {"output": str(self.output), "steps": self.steps, "log": str(self.run_folder / "log.jsonl")}
+        report = {"output": str(self.output), "steps": about["steps"], "log": str(self.run_folder / "log.jsonl")}
         if self.json:
             print_json(report)
         else:
-            print_table("training", ["steps", "weights", "log"], [[self.steps, report["output"], report["log"]]])
+            print_table("training", ["steps", "weights", "log"], [[report["steps"], report["output"], report["log"]]])
         return 0
+
+
+def how_long(run_folder: Path) -> dict[str, int]:
+    """Steps and seconds that a run took, whichever of its limits ended it."""
+    from dro_grasp.training.runs import last_logged
+
+    last = last_logged(run_folder)
+    return {"steps": int(last["step"]), "seconds": round(last["seconds"])}

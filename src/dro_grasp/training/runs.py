@@ -218,6 +218,11 @@ def writing_into(folder: Path) -> Iterator[None]:
                           "run goes on from its last checkpoint") from error
 
 
+def last_logged(folder: Path) -> dict[str, float]:
+    """The last line of a run's log: steps, seconds and losses when it ended."""
+    return json.loads((folder / LOG).read_text().splitlines()[-1])
+
+
 def make_run_folder(folder: Path) -> None:
     """The folder of a run; its parent must exist.
 
