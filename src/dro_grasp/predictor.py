@@ -41,7 +41,9 @@ class PredictorConfig:
     direction_spread: float = math.radians(5.0)
     """Standard deviation of the palm direction around the one asked for [rad]."""
     batch_size: int = 16
-    """Grasps that go through the network at once."""
+    """Grasps that are decoded at once."""
+    network_batch_size: int = 4
+    """Grasps of these that go through the network at once; more do not fit a processor's cache."""
     table_rounds: int = 20
     """How often sampling goes on when a table plane rejects grasps."""
 
@@ -194,11 +196,15 @@ class GraspPredictor:
         latent: Float[Tensor, "b latent"],
     ) -> Float[Tensor, "b n m"]:
         """D(R,O) of a batch of placed hands; distances do not depend on the frame, so none needs to be undone."""
-        rotation = T_object_wrist[:, :3, :3]
-        centre = points.mean(0).expand(len(placed), 3)
-        hand = self.network.to_frame(placed, centre, rotation)
-        obj = self.network.to_frame(points.expand(len(placed), -1, -1), centre, rotation)
-        return self.network.predict(hand, obj, latent).float()
+        found = []
+        size = self.config.network_batch_size
+        for clouds, T, z in zip(placed.split(size), T_object_wrist.split(size), latent.split(size), strict=True):
+            rotation = T[:, :3, :3]
+            centre = points.mean(0).expand(len(clouds), 3)
+            hand = self.network.to_frame(clouds, centre, rotation)
+            obj = self.network.to_frame(points.expand(len(clouds), -1, -1), centre, rotation)
+            found.append(self.network.predict(hand, obj, z).float())
+        return torch.cat(found)
 
     def _rotations(
         self, hand: Hand, count: int, direction: tuple[float, float, float] | None, generator: torch.Generator
