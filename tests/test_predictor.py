@@ -63,7 +63,8 @@ def test_the_same_seed_gives_the_same_grasps(predictor: GraspPredictor, ball: Ob
 def test_grasps_do_not_depend_on_the_batch_size(
     weights: str, ball: ObjectModel, grasps: GraspBatch, batch_size: int
 ) -> None:
-    other = GraspPredictor(weights, config=PredictorConfig(batch_size=batch_size, network_batch_size=batch_size)).predict(HAND, ball, num=7, seed=3)
+    config = PredictorConfig(batch_size=batch_size, network_batch_size=batch_size)
+    other = GraspPredictor(weights, config=config).predict(HAND, ball, num=7, seed=3)
     for name in ("T_object_wrist", "joints", "pregrasp_joints", "squeeze_joints", "score"):
         torch.testing.assert_close(getattr(other, name), getattr(grasps, name), atol=1e-4, rtol=1e-4)
 

@@ -115,7 +115,8 @@ def _robot_description(name: str) -> Path | None:
 
 def _unknown(name: str) -> str:
     known = hand_names()
-    near = difflib.get_close_matches(name.removeprefix(ASSET_PREFIX), [n.removeprefix(ASSET_PREFIX) for n in known], n=3)
+    bare = dict.fromkeys(n.removeprefix(ASSET_PREFIX) for n in known)
+    near = difflib.get_close_matches(name.removeprefix(ASSET_PREFIX), bare, n=3)
     hint = f" Perhaps you meant {' or '.join(near)}." if near else ""
     missing = ""
     if name.startswith(ASSET_PREFIX) and _asset_folder() is None:

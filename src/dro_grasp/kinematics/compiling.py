@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from dro_grasp.errors import HandError
 from dro_grasp.kinematics.notes import Note
@@ -47,16 +48,35 @@ def compile_hand(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> mujoco.M
     """The compiled model; repairs change the specification, so that simulation gets them too.
 
     Raises:
-        HandError: MuJoCo refuses the description for a reason that cannot be repaired.
+        HandError: MuJoCo refuses the description for a reason that cannot be repaired, or places something nowhere.
     """
     with mujoco_speaks_to(notes, path):
-        for _ in range(MOST_REPAIRS):
-            try:
-                return spec.copy().compile()
-            except ValueError as error:
-                if not _repair(spec, str(error), notes):
-                    raise
-        return spec.copy().compile()
+        model = _compile(spec, notes)
+    _check_finite(model, path)
+    return model
+
+
+def _compile(spec: mujoco.MjSpec, notes: list[Note]) -> mujoco.MjModel:
+    for _ in range(MOST_REPAIRS):
+        try:
+            return spec.copy().compile()
+        except ValueError as error:
+            if not _repair(spec, str(error), notes):
+                raise
+    return spec.copy().compile()
+
+
+def _check_finite(model: mujoco.MjModel, path: Path) -> None:
+    """MuJoCo reads NaN and infinity as numbers."""
+    bodies = np.concatenate([np.arange(model.nbody), model.geom_bodyid, model.jnt_bodyid])
+    places = np.concatenate([
+        np.concatenate([model.body_pos, model.body_quat], 1), np.concatenate([model.geom_pos, model.geom_quat], 1),
+        np.concatenate([model.jnt_pos, model.jnt_axis, model.jnt_range[:, :1]], 1),
+    ])
+    lost = bodies[~np.isfinite(places).all(1)]
+    if len(lost):
+        raise HandError(f"{path}: an origin or a limit of link '{model.body(int(lost[0])).name}' is not finite; expected "
+                        "numbers, not nan or inf")
 
 
 def _repair(spec: mujoco.MjSpec, message: str, notes: list[Note]) -> bool:
@@ -68,9 +88,12 @@ def _repair(spec: mujoco.MjSpec, message: str, notes: list[Note]) -> bool:
         notes.append(Note("warning", mesh.name, "is a mesh without volume"))
         return True
     if "at least 4 vertices" in message and mesh is not None:
-        for geom in [g for g in spec.geoms if g.meshname == mesh.name]:
+        shapes = [g for g in spec.geoms if g.meshname == mesh.name]
+        for link in dict.fromkeys(g.parent.name for g in shapes):
+            notes.append(Note("warning", link, f"has the mesh '{mesh.name}' of fewer than 4 vertices, which encloses nothing; "
+                              "it is left out"))
+        for geom in shapes:
             spec.delete(geom)
-        notes.append(Note("warning", mesh.name, "is a mesh of fewer than 4 vertices, which encloses nothing; it is left out"))
         spec.delete(mesh)
         return True
     if "convex hull" in message and mesh is not None:

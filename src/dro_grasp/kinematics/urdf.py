@@ -35,10 +35,12 @@ def prepare_urdf(root: ET.Element, path: Path) -> PreparedUrdf:
     """Check the link tree, resolve meshes and set what MuJoCo needs to know.
 
     Raises:
-        HandError: No moving joint, a cycle, several roots, or no mesh that can be found.
+        HandError: Names used twice, numbers that are none, no moving joint, a cycle, several roots, or no mesh to be found.
     """
     notes: list[Note] = []
+    _check_names(root, path)
     _settle_joints(root, path, notes)
+    _drop_empty_shapes(root, path, notes)
     base = _check_links(root, path)
     if base == "world":
         _rename_link(root, "world", "world_link")
@@ -53,6 +55,14 @@ def prepare_urdf(root: ET.Element, path: Path) -> PreparedUrdf:
     compiler.attrib.update(discardvisual="false", fusestatic="false", balanceinertia="true", boundmass="1e-4",
                            boundinertia="1e-8", strippath="false")
     return PreparedUrdf(ET.tostring(root, encoding="unicode"), tuple(notes), tuple(files), converted)
+
+
+def _check_names(root: ET.Element, path: Path) -> None:
+    for kind in ("link", "joint"):
+        names = [element.get("name", "") for element in root.findall(kind)]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise HandError(f"{path}: two {kind}s are called '{twice}'; expected a name of its own for each, rename one")
 
 
 def _settle_joints(root: ET.Element, path: Path, notes: list[Note]) -> None:
@@ -75,18 +85,20 @@ def _check_axis(joint: ET.Element, path: Path) -> None:
     element = joint.find("axis")
     if element is None:
         return
-    axis = _numbers(element, "xyz", path, joint)
+    axis = _numbers(element, "xyz", path, _called(joint))
     if len(axis) != 3 or math.hypot(*axis) < 1e-6:
         raise HandError(f"{path}: joint '{joint.get('name')}' has the axis '{element.get('xyz')}'; expected a direction "
                         "of three numbers, not all zero")
 
 
 def _check_limits(joint: ET.Element, path: Path, notes: list[Note]) -> None:
-    """Refuse limits that no joint value satisfies; a joint without range is fixed."""
+    """Refuse limits that no joint value satisfies; one limit alone has zero opposite; a joint without range is fixed."""
     element = joint.find("limit")
-    if element is None or "lower" not in element.attrib or "upper" not in element.attrib:
+    if element is None or not {"lower", "upper"} & element.attrib.keys():
         return
-    lower, upper = (_numbers(element, end, path, joint)[0] for end in ("lower", "upper"))
+    for end in ("lower", "upper"):
+        element.attrib.setdefault(end, "0")
+    lower, upper = (_numbers(element, end, path, _called(joint))[0] for end in ("lower", "upper"))
     if lower > upper:
         raise HandError(f"{path}: joint '{joint.get('name')}' has the lower limit {lower:g} above its upper limit "
                         f"{upper:g}; swap them")
@@ -98,14 +110,33 @@ def _check_limits(joint: ET.Element, path: Path, notes: list[Note]) -> None:
         notes.append(Note("warning", joint.get("name", ""), "has both limits at zero and is taken as fixed"))
 
 
-def _numbers(element: ET.Element, attribute: str, path: Path, joint: ET.Element) -> list[float]:
+def _drop_empty_shapes(root: ET.Element, path: Path, notes: list[Note]) -> None:
+    """Boxes, spheres and cylinders without extent, which MuJoCo refuses."""
+    for link in root.findall("link"):
+        for element in [*link.findall("visual"), *link.findall("collision")]:
+            shape = element.find("geometry/*")
+            sizes = [] if shape is None else [
+                x for name in ("size", "radius", "length") if name in shape.attrib
+                for x in _numbers(shape, name, path, _called(link))
+            ]
+            if shape is not None and sizes and min(sizes) <= 0:
+                link.remove(element)
+                notes.append(Note("warning", link.get("name", ""), f"{element.tag} {shape.tag} of size "
+                                  f"{' '.join(f'{x:g}' for x in sizes)} has no volume and is left out"))
+
+
+def _called(element: ET.Element) -> str:
+    return f"{element.tag} '{element.get('name')}'"
+
+
+def _numbers(element: ET.Element, attribute: str, path: Path, owner: str) -> list[float]:
     try:
         values = [float(x) for x in element.get(attribute, "").split()]
     except ValueError:
         values = []
     if not values or not all(math.isfinite(x) for x in values):
-        raise HandError(f"{path}: joint '{joint.get('name')}' has {attribute}=\"{element.get(attribute)}\" in "
-                        f"<{element.tag}>; expected finite numbers")
+        raise HandError(f"{path}: {owner} has {attribute}=\"{element.get(attribute)}\" in <{element.tag}>; expected "
+                        "finite numbers")
     return values
 
 
