@@ -1,4 +1,4 @@
-"""Descriptions that are wrong, told in words; odd ones that must work; and what `hand check` says of them."""
+"""Descriptions that are wrong, told in words, and odd ones that must work."""
 
 from __future__ import annotations
 
@@ -13,39 +13,7 @@ import trimesh
 
 import dro_grasp as dro
 from dro_grasp.errors import HandError
-from dro_grasp.hands.check import check_hand, hand_side, picture
-
-PALM = '<link name="palm"><visual><geometry><box size="0.08 0.08 0.02"/></geometry></visual>' \
-       '<collision><geometry><box size="0.08 0.08 0.02"/></geometry></collision></link>'
-LIMIT = '<limit lower="0" upper="1.5" effort="1" velocity="1"/>'
-
-
-def link(name: str, geometry: str = '<box size="0.012 0.012 0.06"/>', kinds: tuple[str, ...] = ("visual", "collision")) -> str:
-    """A link whose shape begins at its joint."""
-    shape = f'<origin xyz="0 0 0.03"/><geometry>{geometry}</geometry>'
-    return f'<link name="{name}">' + "".join(f"<{kind}>{shape}</{kind}>" for kind in kinds) + "</link>"
-
-
-def joint(
-    name: str, parent: str, child: str, at: str, axis: str = "0 1 0", more: str = LIMIT, kind: str = "revolute"
-) -> str:
-    """A joint of a URDF."""
-    return (f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/><origin xyz="{at}"/>'
-            f'<axis xyz="{axis}"/>{more}</joint>')
-
-
-def claw(inside: str = "", *, links: str = "", joints: str = "") -> str:
-    """Two facing fingers on a palm; parts may be replaced."""
-    links = links or link("left") + link("right")
-    joints = joints or joint("a", "palm", "left", "-0.035 0 0.01") + joint("b", "palm", "right", "0.035 0 0.01", "0 -1 0")
-    return f'<robot name="claw">{PALM}{links}{joints}{inside}</robot>'
-
-
-def written(folder: Path, text: str, name: str = "claw.urdf") -> Path:
-    """The text as a file."""
-    path = folder / name
-    path.write_text(text)
-    return path
+from tests.claw_urdf import LIMIT, claw, joint, link, meshed, written
 
 
 def test_a_plain_claw_loads_and_its_file_stays_as_it_was(tmp_path: Path) -> None:
@@ -85,6 +53,11 @@ READER = '<!DOCTYPE r [<!ENTITY a SYSTEM "file:///etc/passwd">]>'
         (claw(joints=joint("a", "palm", "left", "0 0 0", kind="rotary") + joint("b", "palm", "right", "0 0 0")), "'rotary'"),
         (claw(joints=joint("a", "palm", "left", "0 0 0", more=LIMIT + '<mimic joint="b"/>')
               + joint("b", "palm", "right", "0 0 0", more=LIMIT + '<mimic joint="a"/>')), "cycle (a -> b -> a)"),
+        (claw(joints=joint("a", "palm", "left", "0 0 0") + joint("a", "palm", "right", "0 0 0")), "two joints are called 'a'"),
+        (claw(link("left")), "two links are called 'left'"),
+        (claw(joints=joint("a", "palm", "left", "nan 0 0") + joint("b", "palm", "right", "0 0 0")), "link 'left' is not"),
+        (claw(links=link("left").replace("0 0 0.03", "0 inf 0") + link("right")), "link 'left' is not"),
+        (claw(links=link("left", '<sphere radius="big"/>') + link("right")), "link 'left' has radius=\"big\""),
     ],
 )
 def test_bad_urdf_is_refused(tmp_path: Path, text: str, told: str) -> None:
@@ -124,14 +97,19 @@ def test_a_path_that_is_no_file(tmp_path: Path) -> None:
         dro.load_hand(tmp_path / "nowhere.urdf")
 
 
-def test_an_unknown_name_names_near_ones() -> None:
-    with pytest.raises(HandError, match=r"Perhaps you meant.*allegro"):
-        dro.load_hand("alegro")
+def test_an_unknown_name_names_near_ones_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dro_grasp.hands.library.hand_names", lambda: {"barrett": "builtin", "assets/barrett": "assets"})
+    with pytest.raises(HandError, match=r"Perhaps you meant barrett\. Known: barrett, assets/barrett;"):
+        dro.load_hand("barett")
 
 
-def meshed(name: str) -> str:
-    """A claw whose left finger is a mesh."""
-    return claw(links=link("left", f'<mesh filename="{name}"/>') + link("right"))
+@pytest.mark.parametrize(("limit", "ends"), [('upper="1.2"', [0, 1.2]), ('lower="-0.4"', [-0.4, 0])])
+def test_a_limit_left_out_is_zero(tmp_path: Path, limit: str, ends: list[float]) -> None:
+    """As URDF has it."""
+    text = claw(joints=joint("a", "palm", "left", "-0.035 0 0.01", more=f"<limit {limit} effort='1' velocity='1'/>")
+                + joint("b", "palm", "right", "0.035 0 0.01", "0 -1 0"))
+    tree = dro.load_hand(written(tmp_path, text)).tree
+    assert [float(tree.lower[0]), float(tree.upper[0])] == pytest.approx(ends)
 
 
 @pytest.mark.parametrize("name", ["../meshes/finger.stl", "package://my_hand/meshes/finger.stl", "file://{folder}/meshes/finger.stl"])
@@ -143,11 +121,6 @@ def test_meshes_are_found_where_descriptions_put_them(tmp_path: Path, name: str)
     hand = dro.load_hand(path)
     finger = hand.link_points[hand.link_index == hand.tree.link_names.index("left")]
     torch.testing.assert_close(finger.abs().amax(0)[:2], torch.tensor([0.006, 0.01]), atol=2e-4, rtol=0)
-
-
-def test_a_lost_mesh_is_named_and_the_rest_is_used(tmp_path: Path) -> None:
-    report = check_hand(written(tmp_path, meshed("package://x/lost.stl")))
-    assert any(n.subject == "left" and "'package://x/lost.stl' was not found" in n.text for n in report.notes)
 
 
 def test_a_hand_of_lost_meshes_only_is_refused(tmp_path: Path) -> None:
@@ -163,39 +136,6 @@ def test_a_broken_mesh_is_named(tmp_path: Path) -> None:
         dro.load_hand(written(tmp_path, meshed("finger.stl")))
 
 
-def notes(folder: Path, text: str) -> dict[str, str]:
-    """What `hand check` finds, by link or joint."""
-    return {note.subject: note.text for note in check_hand(written(folder, text)).notes}
-
-
-def test_check_names_free_coupled_and_unlimited_joints(tmp_path: Path) -> None:
-    tip = link("tip")
-    joints = (joint("a", "palm", "left", "-0.035 0 0.01", kind="continuous", more="")
-              + joint("b", "palm", "right", "0.035 0 0.01", "0 -1 0")
-              + joint("c", "right", "tip", "0 0 0.06", "0 -1 0", LIMIT + '<mimic joint="b" multiplier="0.5" offset="0.1"/>'))
-    text = claw(links=link("left") + link("right") + tip, joints=joints)
-    report = check_hand(written(tmp_path, text))
-    assert report.facts["free_joints"] == ["a", "b"]
-    assert report.facts["coupled_joints"] == ["c = 0.5 * b + 0.1"]
-    assert "no limits" in notes(tmp_path, text)["a"]
-    assert any("free joints" in line and "a, b" in line for line in report.lines())
-
-
-def test_check_names_a_mimic_of_nothing(tmp_path: Path) -> None:
-    text = claw(joints=joint("a", "palm", "left", "-0.035 0 0.01", more=LIMIT + '<mimic joint="ghost"/>')
-                + joint("b", "palm", "right", "0.035 0 0.01", "0 -1 0"))
-    assert "'ghost'" in notes(tmp_path, text)["a"]
-
-
-def test_check_names_links_that_cannot_collide_or_have_no_volume(tmp_path: Path) -> None:
-    assert "cannot touch" in notes(tmp_path, claw(links=link("left", kinds=("visual",)) + link("right")))["left"]
-    corners = [[0, 0, 0], [0, 0, 0.06], [0, 0.02, 0.0], [0, 0.02, 0.06]]
-    trimesh.Trimesh(corners, [[0, 1, 2], [1, 3, 2]], process=False).export(tmp_path / "flat.stl")
-    assert "without volume" in notes(tmp_path, meshed("flat.stl"))["left"]
-    trimesh.Trimesh(corners[:3], [[0, 1, 2]], process=False).export(tmp_path / "flat.stl")
-    assert "fewer than 4 vertices" in notes(tmp_path, meshed("flat.stl"))["flat"]
-
-
 @pytest.mark.parametrize(("factor", "told"), [(1000, "looks like millimetres"), (0.1, "another unit")])
 def test_units_that_are_not_metres_are_refused(tmp_path: Path, factor: float, told: str) -> None:
     def scaled(match: re.Match[str]) -> str:
@@ -203,7 +143,7 @@ def test_units_that_are_not_metres_are_refused(tmp_path: Path, factor: float, to
 
     text = re.sub(r'((?:size=|<origin xyz=)")([^"]*)"', scaled, claw())
     with pytest.raises(HandError, match=told):
-        check_hand(written(tmp_path, text))
+        dro.load_hand(written(tmp_path, text))
 
 
 def test_fingers_that_enclose_nothing_are_refused(tmp_path: Path) -> None:
@@ -211,45 +151,6 @@ def test_fingers_that_enclose_nothing_are_refused(tmp_path: Path) -> None:
     text = claw(links=flat, joints=joint("a", "palm", "left", "0 0 0", "0 1 0"))
     with pytest.raises(HandError, match="enclose no space"):
         dro.load_hand(written(tmp_path, text.replace("0.08 0.08 0.02", "0.02 1e-9 0.02")))
-
-
-def three_fingers_and_thumb(side: float) -> str:
-    """Fingers up along z, palm towards x, thumb at +y or -y: a right hand has it at +y."""
-    links, joints = "", ""
-    for i in range(3):
-        links += link(f"f{i}")
-        joints += joint(f"j{i}", "palm", f"f{i}", f"0 {0.03 * (i - 1)} 0.05")
-    links += link("thumb")
-    joints += joint("jt", "palm", "thumb", f"0.02 {side * 0.07} -0.02")
-    palm = PALM.replace("0.08 0.08 0.02", "0.02 0.09 0.1")
-    return f'<robot name="h">{palm}{links}{joints}</robot>'
-
-
-@pytest.mark.parametrize(("side", "name"), [(1.0, "right"), (-1.0, "left")])
-def test_sides_of_mirrored_hands(tmp_path: Path, side: float, name: str) -> None:
-    assert hand_side(dro.load_hand(written(tmp_path, three_fingers_and_thumb(side)))) == name
-
-
-@pytest.mark.assets
-@pytest.mark.parametrize(
-    ("name", "side"),
-    [("allegro_left", "left"), ("allegro_right", "right"), ("shadowhand", "right"), ("leaphand", "right"),
-     ("inspire", "right"), ("ability", "right"), ("orca", "right"), ("barrett", "none")],
-)
-def test_sides_of_real_hands(assets_folder: Path, name: str, side: str) -> None:
-    assert hand_side(dro.load_hand(f"assets/{name}")) == side
-
-
-def test_the_picture_shows_the_hand_open_and_closed(tmp_path: Path) -> None:
-    from PIL import Image
-
-    picture(dro.load_hand(written(tmp_path, claw())), tmp_path / "claw.png")
-    with Image.open(tmp_path / "claw.png") as sheet:
-        opened, closed = (sheet.crop((x, 30, x + sheet.width // 2, sheet.height - 30)) for x in (0, sheet.width // 2))
-        assert opened.tobytes() != closed.tobytes()
-        colours = {colour for _, colour in sheet.convert("RGB").getcolors(1 << 24)}
-    assert any(r > 150 and g < 60 and b < 60 for r, g, b in colours), "no red arrow"
-    assert any(b > 150 and r < 80 and g < 120 for r, g, b in colours), "no blue track"
 
 
 def test_names_of_robot_descriptions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,6 +21,8 @@ TILE, TEXT = (560, 520), 30
 """Size of one view, and height of a line of text [pixels]."""
 TOUCHING, OTHER, DIRECTION, TRACK = (0.93, 0.66, 0.30), (0.62, 0.66, 0.72), (0.85, 0.15, 0.15), (0.15, 0.39, 0.92)
 """Colours of links that can touch, of others, of the palm direction and of the fingertips' tracks."""
+SIDEWAYS = 0.15
+"""Sine below which a thumb is on no side of the other fingers; hands with a side have 0.34 to 0.96."""
 THIN_VOLUME = 1e-9
 """Volume below which a link's shapes enclose nothing [m^3]."""
 
@@ -87,7 +89,7 @@ def _facts(hand: Hand, description: Description) -> dict[str, Any]:
 
 
 def hand_side(hand: Hand) -> str:
-    """`left`, `right`, or `none` for a hand with fewer than four fingers.
+    """`left`, `right`, or `none` for a hand with fewer than four fingers or with fingers all around.
 
     The thumb is the finger whose tip is farthest from the others' mean. With the fingers up and the palm towards the
     viewer, the thumb of a right hand is on the viewer's right.
@@ -101,8 +103,9 @@ def hand_side(hand: Hand) -> str:
     apart = [float((tips[i] - torch.cat([tips[:i], tips[i + 1 :]]).mean(0)).norm()) for i in range(len(tips))]
     thumb = int(np.argmax(apart))
     others = torch.cat([tips[:thumb], tips[thumb + 1 :]]).mean(0)
-    handed = float(torch.linalg.cross(others - palm, hand.palm_direction_wrist) @ (tips[thumb] - palm))
-    return "right" if handed > 0 else "left"
+    aside = torch.linalg.cross(others - palm, hand.palm_direction_wrist)
+    handed = float(torch.nn.functional.cosine_similarity(aside, tips[thumb] - palm, dim=0))
+    return "none" if abs(handed) < SIDEWAYS else "right" if handed > 0 else "left"
 
 
 def _shape_notes(hand: Hand, description: Description) -> list[Note]:
