@@ -178,3 +178,12 @@ def test_fingers_that_curl_past_the_centre_open_outwards(tmp_path: Path) -> None
     hand = dro.load_hand(written(tmp_path, claw(links=links, joints=joints)))
     assert hand.opening.tolist() == [-1, -1, -1]
     assert float(hand.palm_direction_wrist[2]) > 0.99
+
+
+def test_a_description_that_cannot_be_fetched_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(name: str) -> ModuleType:
+        raise RuntimeError(f"git fetch\n  stderr: 'could not resolve host' for {name}")
+
+    monkeypatch.setattr("dro_grasp.hands.library.importlib.import_module", fail)
+    with pytest.raises(HandError, match=r"could not fetch 'panda' .*could not resolve host.*connect to the network"):
+        dro.load_hand("panda")

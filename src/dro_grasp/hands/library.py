@@ -101,7 +101,11 @@ def _asset_file(name: str) -> Path | None:
 
 
 def _robot_description(name: str) -> Path | None:
-    """The file of a `robot_descriptions` module, when that package is installed and knows the name."""
+    """The file of a `robot_descriptions` module, when that package is installed and knows the name.
+
+    Raises:
+        HandError: It knows the name but cannot download the description.
+    """
     if not name.replace("_", "").isalnum():
         return None
     for module in (name, f"{name}_description", f"{name}_mj_description"):
@@ -109,6 +113,10 @@ def _robot_description(name: str) -> Path | None:
             found = importlib.import_module(f"robot_descriptions.{module}")
         except ImportError:
             continue
+        except Exception as error:  # git, the network and the disk fail in their own ways
+            reason = str(error).strip().splitlines()[-1:] or [type(error).__name__]
+            raise HandError(f"robot_descriptions could not fetch '{module}' ({reason[0].strip()}); connect to the network, or "
+                            "give the path of a URDF or MJCF file") from error
         return Path(getattr(found, "URDF_PATH", None) or found.MJCF_PATH)
     return None
 
