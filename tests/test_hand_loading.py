@@ -149,7 +149,7 @@ def test_units_that_are_not_metres_are_refused(tmp_path: Path, factor: float, to
 def test_fingers_that_enclose_nothing_are_refused(tmp_path: Path) -> None:
     flat = link("left", '<box size="0.012 1e-9 0.06"/>')
     text = claw(links=flat, joints=joint("a", "palm", "left", "0 0 0", "0 1 0"))
-    with pytest.raises(HandError, match="enclose no space"):
+    with pytest.raises(HandError, match=r"claw\.urdf: .*enclose no space"):
         dro.load_hand(written(tmp_path, text.replace("0.08 0.08 0.02", "0.02 1e-9 0.02")))
 
 

@@ -53,7 +53,10 @@ def build_hand(description: Description, *, name: str | None = None, seed: int =
     rest = torch.zeros(tree.n_dof).clamp(tree.lower, tree.upper)
     surface = sample_links(description, [link for link in below if link in shaped], seed)
     _check_size(description, float(np.ptp(surface.posed(tree, rest)[0], axis=0).max()))
-    opening, abduction, found = _open_ends(tree, surface.coarse(), tips, palm, held, rest)
+    try:
+        opening, abduction, found = _open_ends(tree, surface.coarse(), tips, palm, held, rest)
+    except HandError as error:
+        raise HandError(f"{description.path}: {error}") from error
     T_palm = _inverse(tree.forward(rest)[palm])
     to_palm = lambda p: (T_palm[:3, :3] @ torch.tensor(p, dtype=torch.float32) + T_palm[:3, 3])  # noqa: E731
     draft = Hand(
