@@ -12,7 +12,8 @@ import roma
 import torch
 
 from dro_grasp.errors import GraspFileError, OutputError
-from dro_grasp.grasps.batch import GraspBatch, check_output
+from dro_grasp.files import check_output
+from dro_grasp.grasps.batch import GraspBatch
 
 HAND = SimpleNamespace(
     name="toy", sha256="a" * 64, tree=SimpleNamespace(link_names=("base", "tip"), joint_names=("j0", "j1"))

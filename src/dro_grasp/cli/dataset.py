@@ -47,7 +47,7 @@ class BundleCommand:
 
         from dro_grasp.datasets.bundle import TRAINING_SPLITS, ObjectCloud, write_bundle
         from dro_grasp.datasets.records import read_pairs
-        from dro_grasp.grasps.batch import check_output
+        from dro_grasp.files import check_output
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.library import load_object
 

@@ -44,7 +44,8 @@ class Evaluate:
 
         from dro_grasp.errors import OptionError
         from dro_grasp.evaluation.metrics import wilson_interval
-        from dro_grasp.grasps.batch import GraspBatch, check_output
+        from dro_grasp.files import check_output
+        from dro_grasp.grasps.batch import GraspBatch
         from dro_grasp.simulation.protocols import protocol
         from dro_grasp.simulation.trial import simulate
 

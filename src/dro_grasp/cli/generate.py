@@ -184,7 +184,7 @@ def check_seed(seed: int) -> None:
 def paths_per_object(path: Path | None, names: list[str], several: bool, suffix: str) -> list[Path | None]:
     """Where each object's file goes, checked before the work: the path itself, or files in the folder that it names."""
     from dro_grasp.errors import OutputError
-    from dro_grasp.grasps.batch import check_output
+    from dro_grasp.files import check_output
 
     if path is None:
         return [None] * len(names)

@@ -28,7 +28,7 @@ class Check:
 
     def run(self) -> int:
         """Check, print, draw."""
-        from dro_grasp.grasps.batch import check_output
+        from dro_grasp.files import check_output
         from dro_grasp.hands.check import check_hand, picture
 
         if self.picture is not None:

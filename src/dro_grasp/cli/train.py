@@ -54,7 +54,7 @@ class Pretrain:
         import torch
 
         from dro_grasp.datasets.bundle import load_bundle
-        from dro_grasp.grasps.batch import check_output
+        from dro_grasp.files import check_output
         from dro_grasp.models.checkpoints import save_weights
         from dro_grasp.training.config import AugmentationConfig, PretrainConfig, ScheduleConfig
         from dro_grasp.training.pretraining import matching_rank, pretrain
@@ -115,7 +115,7 @@ class Train:
     def run(self) -> int:
         """Train and save."""
         from dro_grasp.datasets.bundle import load_bundle
-        from dro_grasp.grasps.batch import check_output
+        from dro_grasp.files import check_output
         from dro_grasp.models.checkpoints import load_weights, save_weights
         from dro_grasp.training.config import AugmentationConfig, LossConfig, ScheduleConfig, TrainConfig
         from dro_grasp.training.loop import train

@@ -34,7 +34,7 @@ class View:
 
     def run(self) -> int:
         """Load the file and show the grasps of one object."""
-        from dro_grasp.grasps.batch import check_output
+        from dro_grasp.files import check_output
 
         if self.picture is not None:
             check_output(self.picture)

@@ -7,8 +7,6 @@ safetensors alone.
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +19,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from dro_grasp.errors import BundleError, OutputError
+from dro_grasp.errors import BundleError
+from dro_grasp.files import replacing
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 
@@ -222,16 +221,5 @@ def _save(path: Path, tensors: dict[str, Tensor], header: dict[str, Any]) -> Non
     if size > MAX_BYTES:
         raise BundleError(f"the bundle would have {size / 1e6:.1f} MB, at most {MAX_BYTES / 1e6:.0f} MB are allowed; take "
                           "fewer objects or fewer grasps a pair")
-    try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}", suffix=".part")
-        os.close(handle)
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}; choose another folder") from error
-    try:
+    with replacing(path) as temporary:
         save_file(tensors, temporary, metadata={"dro_grasp_bundle": json.dumps(header)})
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except (OSError, SafetensorError) as error:
-        raise OutputError(f"cannot write {path}: {error}; free some space or choose another folder") from error
-    finally:
-        Path(temporary).unlink(missing_ok=True)

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from dro_grasp.errors import GraspFileError
 from dro_grasp.grasps.codec import FLOATS, LISTS, TEXTS, UNTRIED, decode, encode
-from dro_grasp.grasps.table import check_output, read_table, write_table
+from dro_grasp.grasps.table import read_table, write_table
 
-__all__ = ["GraspBatch", "check_output"]
+__all__ = ["GraspBatch"]
 
 
 @runtime_checkable

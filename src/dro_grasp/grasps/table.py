@@ -6,8 +6,6 @@ Knows columns and metadata, nothing about what they mean; `batch` gives them the
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -17,29 +15,13 @@ import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
-from dro_grasp.errors import GraspFileError, OutputError
+from dro_grasp.errors import GraspFileError
+from dro_grasp.files import check_output, replacing
 
 FORMAT_VERSION = 1
 """Version of the grasp file that this code writes and reads."""
 METADATA_KEY = b"dro_grasp"
 """Key of the schema metadata under which the JSON header lies."""
-
-
-def check_output(path: Path | str) -> Path:
-    """Refuse a path that cannot be written, before any work is done for it.
-
-    Raises:
-        OutputError: The parent folder is missing or read-only, or the path is a folder or a read-only file.
-    """
-    path = Path(path)
-    parent = path.absolute().parent
-    if not parent.is_dir():
-        raise OutputError(f"cannot write {path}: no folder {parent}; create it first (mkdir -p {parent})")
-    if path.is_dir():
-        raise OutputError(f"cannot write {path}: it is a folder; give the name of a file in it")
-    if not os.access(parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
-        raise OutputError(f"cannot write {path}: no permission; choose another path")
-    return path
 
 
 def write_table(path: Path | str, columns: dict[str, pa.Array], header: dict[str, Any]) -> None:
@@ -56,19 +38,8 @@ def write_table(path: Path | str, columns: dict[str, pa.Array], header: dict[str
     path = check_output(path)
     metadata = {METADATA_KEY: json.dumps({"format_version": FORMAT_VERSION, **header}).encode()}
     table = pa.table(columns).replace_schema_metadata(metadata)
-    temporary = None
-    try:
-        folder = path.absolute().parent
-        handle, temporary = tempfile.mkstemp(dir=folder, prefix=f".{path.name}", suffix=".part")
-        os.close(handle)
+    with replacing(path) as temporary:
         pq.write_table(table, temporary, compression="zstd")
-        os.chmod(temporary, 0o666 & ~_umask())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror or error}; choose another path") from error
-    finally:
-        if temporary is not None:
-            Path(temporary).unlink(missing_ok=True)
 
 
 def read_table(path: Path | str) -> tuple[pa.Table, dict[str, Any]]:
@@ -170,9 +141,3 @@ def floats(column: pa.ChunkedArray, width: int | None, where: str) -> Tensor:
 
 def _numbers(array: pa.Array) -> np.ndarray:
     return np.array(array.cast(pa.float32()).to_numpy(zero_copy_only=False), np.float32)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

@@ -57,7 +57,7 @@ def build_hand(description: Description, *, name: str | None = None, seed: int =
         opening, abduction, found = _open_ends(tree, surface.coarse(), tips, palm, held, rest)
     except HandError as error:
         raise HandError(f"{description.path}: {error}") from error
-    T_palm = _inverse(tree.forward(rest)[palm])
+    T_palm = torch.linalg.inv(tree.forward(rest)[palm])
     to_palm = lambda p: (T_palm[:3, :3] @ torch.tensor(p, dtype=torch.float32) + T_palm[:3, 3])  # noqa: E731
     draft = Hand(
         name=name or description.name, tree=tree, link_points=surface.points, link_normals=surface.normals,
@@ -255,7 +255,7 @@ def _tip_offsets(tree: KinematicTree, surface: LinkSurface, tips: tuple[int, ...
     for tip in tips:
         joint_link = max(i for i in _chain(tree, tip) if tree.kind[i] != FIXED)
         middle = surface.points[surface.link == tip].mean(0)
-        T = _inverse(poses[tip]) @ poses[joint_link]
+        T = torch.linalg.inv(poses[tip]) @ poses[joint_link]
         origin = T[:3, 3] + T[:3, :3] @ tree.anchor[joint_link]
         along = middle - origin
         offsets.append(middle + TIP_OFFSET * along / along.norm().clamp(min=1e-6))
@@ -267,7 +267,3 @@ def _thin(draft: Hand, n_points: int) -> Hand:
     keep = farthest_points(draft.points(draft.canonical_joints()), n_points).sort().values
     return dataclasses.replace(draft, link_points=draft.link_points[keep], link_normals=draft.link_normals[keep],
                                link_index=draft.link_index[keep])
-
-
-def _inverse(T: torch.Tensor) -> torch.Tensor:
-    return torch.linalg.inv(T)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +12,8 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
-from dro_grasp.errors import OutputError, WeightsError
+from dro_grasp.errors import WeightsError
+from dro_grasp.files import replacing
 from dro_grasp.models.network import DistanceNetwork, NetworkConfig
 
 FORMAT_VERSION = 1
@@ -45,19 +44,8 @@ def save_weights(network: DistanceNetwork, path: Path | str, about: dict[str, An
         for name, value in network.state_dict().items()
     }
     header = {"format_version": FORMAT_VERSION, "config": dataclasses.asdict(network.config), "about": about or {}}
-    try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}", suffix=".part")
-        os.close(handle)
-    except OSError as error:
-        raise OutputError(f"cannot write weights to {path}: {error.strerror}; choose another folder") from error
-    try:
+    with replacing(path, "weights") as temporary:
         save_file(tensors, temporary, metadata={KEY: json.dumps(header)})
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except (OSError, SafetensorError) as error:
-        raise OutputError(f"cannot write weights to {path}: {error}; free some space or choose another folder") from error
-    finally:
-        Path(temporary).unlink(missing_ok=True)
 
 
 def load_weights(name: str | Path | None = None) -> DistanceNetwork:

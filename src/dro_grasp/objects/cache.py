@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-import tempfile
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+
+from dro_grasp.errors import OutputError
+from dro_grasp.files import replacing
 
 DAMAGED = (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile)
 """What numpy raises on a file that is missing, cut short, or no archive of arrays."""
@@ -33,7 +35,7 @@ def cached_arrays(key: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[s
             return {name: stored[name] for name in stored.files}
     except DAMAGED:
         made = make()
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError, OutputError):
         _store(path, made)
     return made
 
@@ -49,11 +51,5 @@ def content_hash(*arrays: np.ndarray) -> str:
 def _store(path: Path, arrays: dict[str, np.ndarray]) -> None:
     """Write under a temporary name and rename, so that no reader meets half a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, **arrays)  # type: ignore[arg-type]
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]

@@ -1,0 +1,64 @@
+"""Writing files: refused before the work where it cannot succeed, and whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from safetensors import SafetensorError
+
+from dro_grasp.errors import OutputError
+
+
+def check_output(path: Path | str) -> Path:
+    """Refuse a path that cannot be written, before any work is done for it.
+
+    Raises:
+        OutputError: The parent folder is missing or read-only, or the path is a folder or a read-only file.
+    """
+    path = Path(path)
+    parent = path.absolute().parent
+    if not parent.is_dir():
+        raise OutputError(f"cannot write {path}: no folder {parent}; create it first (mkdir -p {parent})")
+    if path.is_dir():
+        raise OutputError(f"cannot write {path}: it is a folder; give the name of a file in it")
+    if not os.access(parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
+        raise OutputError(f"cannot write {path}: no permission; choose another path")
+    return path
+
+
+@contextmanager
+def replacing(path: Path, what: str = "") -> Iterator[Path]:
+    """A temporary path beside `path`, which takes its place when the block has written it; a failure leaves nothing.
+
+    Args:
+        path: The file; an existing one is replaced.
+        what: What is written, for the error.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    temporary: Path | None = None
+    try:
+        handle, name = tempfile.mkstemp(dir=path.absolute().parent, prefix=f".{path.name}", suffix=".part")
+        os.close(handle)
+        temporary = Path(name)
+        yield temporary
+        os.chmod(temporary, 0o666 & ~_umask())
+        os.replace(temporary, path)
+    except (OSError, SafetensorError) as error:
+        reason = getattr(error, "strerror", None) or error
+        target = f"{what} to {path}" if what else path
+        raise OutputError(f"cannot write {target}: {reason}; free some space or choose another folder") from error
+    finally:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
