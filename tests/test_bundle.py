@@ -6,21 +6,24 @@ import dataclasses
 import json
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
+from dro_grasp.cli.dataset_bundle import sources
 from dro_grasp.cli.main import main
 from dro_grasp.datasets import bundle as bundle_module
 from dro_grasp.datasets.bundle import ObjectCloud, load_bundle, write_bundle
 from dro_grasp.datasets.records import Shard
-from dro_grasp.errors import BundleError, OutputError
+from dro_grasp.datasets.splits import SPLITS, split_of
+from dro_grasp.errors import BundleError, GraspFileError, OutputError
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.sources import with_sources
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import BUILTIN_FOLDER, load_hand
+from dro_grasp.objects.library import load_object
 from dro_grasp.training.config import AugmentationConfig
 from dro_grasp.training.samples import SampleSource
 from tests.tiny_bundle import SEMIAXES, TINY, ellipsoid, made_up_grasps, tiny_bundle
@@ -186,8 +189,10 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for obj, split in (("sphere", "train"), ("cube", "test")):
             for round_ in range(2):
                 made = made_up_grasps(hand, obj, count=5, split=split, seed=round_)
-                tried = made.replace(success=torch.arange(5) > 0, protocol=("strict/1",) * 5)
-                Shard(name, obj, round_).save(tried, home / "data")
+                tried = made.replace(success=torch.arange(5) > 0, protocol=("strict/1",) * 5,
+                                     object_sha256=(load_object(obj).sha256,) * 5)
+                tried = with_sources(tried, name, obj, 1.0)
+                Shard(name, obj, round_).save(tried.to_bytes(), home / "data")
     return home
 
 
@@ -202,7 +207,7 @@ def test_dataset_bundle_packs_what_is_for_training(dataset: Path, capsys: pytest
     output = dataset / "bundle.safetensors"
     assert main(["dataset", "bundle", str(dataset / "data"), "--output", str(output), "--json"]) == 0
     said = capsys.readouterr()
-    assert "16 grasps of held-out objects are left out" in said.err
+    assert "16 grasps that are not of split 'train' are left out" in said.err
     report = json.loads(said.out)
     assert report == {"output": str(output), "bytes": output.stat().st_size, "hands": {"gripper3": 8, "mine": 8},
                       "objects": 1, "grasps": 16}
@@ -214,7 +219,7 @@ def test_dataset_bundle_packs_what_is_for_training(dataset: Path, capsys: pytest
 
 @pytest.mark.parametrize(
     ("folder", "output", "word"),
-    [("none", "b.safetensors", "no folder"), ("data", "none/b.safetensors", "create it first"), ("empty", "b", "no grasps")],
+    [("none", "b.safetensors", "no grasps at"), ("data", "none/b.safetensors", "create it first"), ("empty", "b", "no grasps")],
 )
 def test_dataset_bundle_refuses(
     dataset: Path, capsys: pytest.CaptureFixture[str], folder: str, output: str, word: str
@@ -228,10 +233,35 @@ def test_no_index_takes_no_grasp() -> None:
     assert len(made_up_grasps(HAND)[[]]) == 0
 
 
-def test_namesakes_are_not_mixed_up() -> None:
-    from dro_grasp.cli.dataset import distinct_names
+def test_namesakes_are_not_mixed_up(tmp_path: Path) -> None:
+    batches = []
+    for folder in "ab":
+        own = tmp_path / folder / "mine.urdf"
+        own.parent.mkdir()
+        own.write_text((BUILTIN_FOLDER / "gripper3.urdf").read_text() + f"<!-- {folder} -->")
+        made = made_up_grasps(load_hand(own), "sphere", 2).replace(object_sha256=(load_object("sphere").sha256,) * 2)
+        batches.append(with_sources(made, str(own), "sphere", 1.0))
+    hands, clouds = sources([batches[0], batches[0]])
+    assert [hand.name for hand in hands] == ["mine"]
+    assert list(clouds) == ["sphere"]
+    with pytest.raises(BundleError, match="of a hand are called mine"):
+        sources(batches)
 
-    a, b = (SimpleNamespace(name="mug", sha256=x) for x in "ab")
-    assert distinct_names([a, a]) == [a]
-    with pytest.raises(BundleError, match="called mug"):
-        distinct_names([a, b])
+
+def test_an_object_that_has_changed_is_refused() -> None:
+    hand = load_hand("gripper3")
+    grasps = made_up_grasps(hand, "sphere", 2).replace(object_sha256=("0123456789abcdef",) * 2)
+    with pytest.raises(GraspFileError, match="another version of object 'sphere' .hash 0123456789ab"):
+        sources([grasps])
+
+
+def test_held_out_hands_enter_few_shot_bundles_only(path: Path) -> None:
+    assert [split_of("assets/inspire", s) for s in ("train", "", "validate", "test")] == [
+        "few_shot", "few_shot", "validate", "test"]
+    assert split_of("assets/shadowhand", "train") == "train"
+    grasps = made_up_grasps(HAND, "ball", 3, split="few_shot")
+    with pytest.raises(BundleError, match="held out"):
+        write_bundle(path, [HAND], BALL, [grasps])
+    assert write_bundle(path, [HAND], BALL, [grasps], SPLITS["few_shot"]).n_grasps == 3
+    with pytest.raises(BundleError, match="held out"):
+        write_bundle(path, [HAND], BALL, [made_up_grasps(HAND, "ball", 3)], SPLITS["few_shot"])

@@ -9,7 +9,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from dro_grasp.datasets.records import Shard, count_grasps, find_shards, read_pairs, remove_leftovers
+from dro_grasp.datasets.collections import count_collection, read_collection
+from dro_grasp.datasets.records import Shard, find_shards, notes_of, read_yield, remove_leftovers
+from dro_grasp.datasets.yields import Yield
 from dro_grasp.errors import GraspFileError, OutputError
 from dro_grasp.grasps.batch import GraspBatch
 
@@ -29,38 +31,61 @@ def grasps(n: int, hand: str = "toy", obj: str = "ball", success: bool | None = 
 @pytest.mark.parametrize("obj", ["ball", "contactdb+apple", "../mesh.obj"])
 def test_any_name_makes_a_shard_inside_the_folder(tmp_path, hand, obj):
     shard = Shard(hand, obj, 3)
-    shard.save(grasps(2, hand, obj), tmp_path)
+    shard.save(grasps(2, hand, obj).to_bytes(), tmp_path)
     assert find_shards(tmp_path) == [shard]
     assert shard.path(tmp_path).resolve().is_relative_to(tmp_path.resolve())
-    assert count_grasps(tmp_path, shard) == 2
+    assert read_yield(tmp_path, shard).valid == 2
 
 
 def test_an_empty_shard_counts_as_done(tmp_path):
-    Shard("toy", "ball", 0).save(grasps(0), tmp_path)
-    assert count_grasps(tmp_path, Shard("toy", "ball", 0)) == 0
-    assert list(read_pairs(tmp_path)) == []
+    shard, made = Shard("toy", "ball", 0), Yield(candidates=64, failures={"slipped": 3}, cpu_seconds=1.5)
+    shard.save(grasps(0).to_bytes(notes_of(made)), tmp_path)
+    assert read_yield(tmp_path, shard) == made
+    (pair,) = read_collection(tmp_path)
+    assert len(pair.grasps) == 0
+    assert pair.made == made
 
 
 def test_pairs_join_their_rounds_and_leave_failures_out(tmp_path):
-    Shard("toy", "ball", 0).save(grasps(2), tmp_path)
-    Shard("toy", "ball", 1).save(grasps(3), tmp_path)
-    Shard("toy", "ball", 2).save(grasps(5, success=False), tmp_path)
-    Shard("toy", "cube", 0).save(grasps(4, obj="cube", success=None), tmp_path)
-    Shard("other", "ball", 0).save(grasps(1, hand="other"), tmp_path)
-    pairs = {pair: len(batch) for pair, batch in read_pairs(tmp_path)}
-    assert pairs == {("toy", "ball"): 5, ("other", "ball"): 1}
-    everything = {pair: len(batch) for pair, batch in read_pairs(tmp_path, ["toy"], only_successful=False)}
-    assert everything == {("toy", "ball"): 10, ("toy", "cube"): 4}
+    Shard("toy", "ball", 0).save(grasps(2).to_bytes(notes_of(Yield(candidates=64, valid=2))), tmp_path)
+    Shard("toy", "ball", 1).save(grasps(3).to_bytes(notes_of(Yield(candidates=128, valid=3))), tmp_path)
+    Shard("toy", "ball", 2).save(grasps(5, success=False).to_bytes(), tmp_path)
+    Shard("toy", "cube", 0).save(grasps(4, obj="cube", success=None).to_bytes(), tmp_path)
+    Shard("other", "ball", 0).save(grasps(1, hand="other").to_bytes(), tmp_path)
+    pairs = {(p.hand, p.object): len(p.grasps) for p in read_collection(tmp_path)}
+    assert pairs == {("toy", "ball"): 5, ("toy", "cube"): 0, ("other", "ball"): 1}
+    everything = {(p.hand, p.object): p for p in read_collection(tmp_path, only_successful=False)}
+    assert len(everything["toy", "ball"].grasps) == 10
+    assert everything["toy", "ball"].made.candidates == 192
+    assert count_collection(tmp_path) == {"toy": {"ball": 10, "cube": 4}, "other": {"ball": 1}}
+
+
+def test_files_and_folders_of_files_are_collections_as_well(tmp_path):
+    both = GraspBatch.concatenate([grasps(2), grasps(3, obj="cube")])
+    both.save(tmp_path / "toy.parquet", {"yields": {"cube": Yield(candidates=9).to_dict(), "none": Yield(deep=4).to_dict()}})
+    grasps(1, hand="other").save(tmp_path / "other.parquet")
+    found = {(p.hand, p.object): (len(p.grasps), p.made.candidates, p.made.deep) for p in read_collection(tmp_path)}
+    assert found == {
+        ("toy", "ball"): (2, 0, 0), ("toy", "cube"): (3, 9, 0), ("toy", "none"): (0, 0, 4), ("other", "ball"): (1, 0, 0)}
+    assert {p.object for p in read_collection(tmp_path / "toy.parquet")} == {"ball", "cube", "none"}
+
+
+def test_shards_of_two_versions_of_a_hand_are_not_mixed(tmp_path):
+    Shard("toy", "ball", 0).save(grasps(2).to_bytes(), tmp_path)
+    Shard("toy", "ball", 1).save(grasps(2).replace(hand_sha256="new").to_bytes(), tmp_path)
+    with pytest.raises(GraspFileError, match="different versions of hand 'toy'"):
+        list(read_collection(tmp_path))
 
 
 def test_a_damaged_shard_does_not_count_and_is_named_when_read(tmp_path):
     shard = Shard("toy", "ball", 0)
-    shard.save(grasps(2), tmp_path)
+    shard.save(grasps(2).to_bytes(), tmp_path)
     path = shard.path(tmp_path)
     path.write_bytes(path.read_bytes()[:-20])
-    assert count_grasps(tmp_path, shard) is None
     with pytest.raises(GraspFileError, match=r"00000\.parquet"):
-        list(read_pairs(tmp_path))
+        read_yield(tmp_path, shard)
+    with pytest.raises(GraspFileError, match=r"00000\.parquet"):
+        list(read_collection(tmp_path))
 
 
 def test_a_missing_folder_is_refused(tmp_path):
@@ -71,7 +96,7 @@ def test_a_missing_folder_is_refused(tmp_path):
 def test_a_folder_that_cannot_be_made_is_an_output_error(tmp_path):
     (tmp_path / "toy").write_text("in the way")
     with pytest.raises(OutputError):
-        Shard("toy", "ball", 0).save(grasps(1), tmp_path)
+        Shard("toy", "ball", 0).save(grasps(1).to_bytes(), tmp_path)
 
 
 def test_only_old_leftovers_are_removed(tmp_path):

@@ -35,7 +35,7 @@ def test_candidates_face_inwards_and_slots_keep_to_their_fingers():
     hand = toy_hand()
     candidates = contact_candidates(hand)
     assert candidates.slot_finger == (0, 1, 2, PALM)
-    drawn = candidates.draw(200, None, torch.Generator().manual_seed(0))
+    drawn = candidates.draw(200, torch.Generator().manual_seed(0))
     for slot in range(3):
         assert (candidates.fingers[drawn[:, slot]] == slot).all()
     assert len(candidates.fingers[drawn[:, 3]].unique()) > 1
@@ -85,8 +85,10 @@ def test_starts_face_the_object_from_all_sides_and_touch_nothing(ball):
 def test_energy_falls_and_limits_hold(ball):
     hand = toy_hand()
     energy, surface = prepare(hand, ball, SHORT), torch.from_numpy(ball.cloud)
-    before = optimise(energy, surface, 32, SynthesisConfig(steps=1), torch.Generator().manual_seed(0))
-    after = optimise(energy, surface, 32, SHORT, torch.Generator().manual_seed(0))
+    generator = torch.Generator().manual_seed(0)
+    start = starts(hand, energy.field, surface, energy.centre, 32, SHORT.starts, generator)
+    before = optimise(energy, *start, SynthesisConfig(steps=1), generator)
+    after = optimise(energy, *start, SHORT, generator)
     assert after.result.total.median() < 0.4 * before.result.total.median()
     assert (after.q >= hand.tree.lower).all()
     assert (after.q <= hand.tree.upper).all()
@@ -117,6 +119,34 @@ def test_impossible_requests_are_refused(ball):
         synthesize(toy_hand(), cloud, 4)
 
 
+def test_idle_fingers_hold_nothing_and_two_always_hold():
+    hand = load_hand("allegro")
+    candidates = contact_candidates(hand)
+    own = torch.arange(len(candidates.slot_finger))
+    slots = candidates.assign(400, 0.5, torch.Generator().manual_seed(0))
+    fingers = torch.tensor(candidates.slot_finger)[slots]
+    assert (slots[:, candidates.thumb] == candidates.thumb).all()
+    used = torch.stack([(fingers == i).any(-1) for i in range(len(hand.tips))], -1)
+    assert (used.sum(-1) >= 2).all()
+    assert used.sum(-1).unique().tolist() == [2, 3, 4]
+    others = [i for i in range(4) if i != candidates.thumb]
+    # Each of three is idle half the time, but not all three at once: (3 / 2 - 1 / 8) / 3.
+    assert (~used).float()[:, others].mean() == pytest.approx(0.458, abs=0.04)
+    assert (candidates.assign(50, 0.0, torch.Generator().manual_seed(0)) == own).all()
+    assert (contact_candidates(toy_hand()).assign(50, 0.9, torch.Generator().manual_seed(0)) == torch.arange(4)).all()
+
+
+def test_energy_runs_wholly_on_the_device_it_is_told(ball):
+    hand = toy_hand()
+    here, there = (prepare(hand, ball, SynthesisConfig(device=device)) for device in ("cpu", "meta"))
+    T, q = torch.eye(4).repeat(5, 1, 1), torch.zeros(5, hand.tree.n_dof)
+    contacts = torch.zeros(5, 4, dtype=torch.int64)
+    expected, found = here(T, q, contacts), there(T.to("meta"), q.to("meta"), contacts.to("meta"))
+    for name in ("terms", "by_pose", "by_joint"):
+        assert getattr(found, name).device.type == "meta"
+        assert getattr(found, name).shape == getattr(expected, name).shape
+
+
 def test_near_duplicates_are_counted_once(ball):
     hand = toy_hand()
     grasps = synthesize(hand, ball, 8, 0, SHORT)
@@ -126,6 +156,8 @@ def test_near_duplicates_are_counted_once(ball):
     assert distinct(hand, both)[8:].tolist() == [False, True] * 4
     elsewhere = shifted.replace(object=("another",) * 8)
     assert distinct(hand, type(grasps).concatenate([grasps, elsewhere]))[8:].all()
+    assert distinct(hand, shifted, earlier=grasps).tolist() == [False, True] * 4
+    assert distinct(hand, elsewhere, earlier=grasps).all()
 
 
 def test_physics_agrees_on_an_easy_pair():

@@ -1,100 +1,74 @@
-"""`dro-grasp dataset`: work with folders of grasps."""
+"""`dro-grasp dataset`: work with data sets of grasps."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
-from dro_grasp.cli.output import print_json, print_table, say_aside
-
-
-def distinct_names(things: list[Any]) -> list[Any]:
-    """Hands or objects, each once; two of one name would be mixed up.
-
-    Raises:
-        BundleError: Different things have one name.
-    """
-    from dro_grasp.errors import BundleError
-
-    found = {thing.sha256: thing for thing in things}
-    names = [thing.name for thing in found.values()]
-    double = sorted({name for name in names if names.count(name) > 1})
-    if double:
-        raise BundleError(f"different files are called {', '.join(double)}; rename them and synthesise again")
-    return list(found.values())
-
-
-@dataclass(frozen=True)
-class BundleCommand:
-    """Pack grasps, hands and object clouds into one portable file for training.
-
-    Example: dro-grasp dataset bundle data --output bundle.safetensors
-    """
-
-    folder: tyro.conf.Positional[Path]
-    """Folder that `dro-grasp synthesize` filled."""
-    output: Path
-    """The bundle to write."""
-    json: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Print one JSON object instead of a table."""
-
-    def run(self) -> int:
-        """Load every shard and its hand and objects, leave out what is held out, write."""
-        import torch
-
-        from dro_grasp.datasets.bundle import TRAINING_SPLITS, ObjectCloud, write_bundle
-        from dro_grasp.datasets.records import read_pairs
-        from dro_grasp.files import check_output
-        from dro_grasp.hands.library import load_hand
-        from dro_grasp.objects.library import load_object
-
-        check_output(self.output)
-        # Folders are named as the pair was asked for: a path where the grasps know the name alone.
-        pairs = dict(read_pairs(self.folder))
-        kept = {pair: b[[i for i, s in enumerate(b.split) if s in TRAINING_SPLITS]] for pair, b in pairs.items()}
-        left_out = sum(map(len, pairs.values())) - sum(map(len, kept.values()))
-        if left_out:
-            say_aside(f"{left_out} grasps of held-out objects are left out")
-        kept = {pair: b for pair, b in kept.items() if len(b)}
-        hands = distinct_names([load_hand(name) for name in dict.fromkeys(hand for hand, _ in kept)])
-        objects = distinct_names([load_object(name) for name in sorted({obj for _, obj in kept})])
-        clouds = {o.name: ObjectCloud(torch.from_numpy(o.cloud), torch.from_numpy(o.cloud_normals)) for o in objects}
-        bundle = write_bundle(self.output, hands, clouds, list(kept.values()))
-        report = {"output": str(self.output), "bytes": self.output.stat().st_size, **bundle.summary()}
-        if self.json:
-            print_json(report)
-        else:
-            print_table(f"bundle {self.output}", ["hand", "grasps"], [list(i) for i in report["hands"].items()],
-                        note=f"{report['objects']} objects, {report['grasps']} grasps, {report['bytes'] / 1e6:.1f} MB")
-        return 0
+from dro_grasp.cli.dataset_bundle import BundleCommand
+from dro_grasp.cli.dataset_report import Report
+from dro_grasp.cli.dataset_trials import Check, Filter
+from dro_grasp.cli.output import optional, print_json, print_table
 
 
 @dataclass(frozen=True)
 class Info:
-    """Count the grasps of a folder, per hand and object."""
+    """Count the grasps of a data set, per hand and object."""
 
     folder: tyro.conf.Positional[Path]
-    """Folder that `dro-grasp synthesize` filled."""
+    """A folder that `dro-grasp synthesize` filled, a folder of grasp files, or one grasp file."""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print one JSON object instead of a table."""
 
     def run(self) -> int:
-        """Read the footers and count."""
-        from dro_grasp.datasets.records import count_grasps, find_shards
+        """Count."""
+        from dro_grasp.datasets.collections import count_collection
 
-        counts: dict[str, dict[str, int]] = {}
-        for shard in find_shards(self.folder):
-            of_hand = counts.setdefault(shard.hand, {})
-            of_hand[shard.object] = of_hand.get(shard.object, 0) + (count_grasps(self.folder, shard) or 0)
+        counts = count_collection(self.folder)
         total = sum(sum(c.values()) for c in counts.values())
         if self.json:
             print_json({"total": total, "hands": counts})
         else:
-            rows = [[hand, len(c), sum(c.values())] for hand, c in counts.items()]
-            print_table(f"data set {self.folder}", ["hand", "objects", "grasps"], rows, note=f"{total} grasps in all")
+            rows = [[hand, len(c), sum(c.values()), min(c.values())] for hand, c in counts.items()]
+            print_table(f"data set {self.folder}", ["hand", "objects", "grasps", "fewest"], rows, note=f"{total} grasps in all")
+        return 0
+
+
+@dataclass(frozen=True)
+class Merge:
+    """Join data sets into one compact file a hand: near-duplicates once, failures left out.
+
+    Example: dro-grasp dataset merge data more --output grasps --per-pair 150
+    """
+
+    inputs: tyro.conf.Positional[tuple[Path, ...]]
+    """Folders that `dro-grasp synthesize` filled, folders of grasp files, or grasp files."""
+    output: Path
+    """Folder for the files, one a hand; made when only itself is missing."""
+    per_pair: Annotated[int | None, optional("N", "all")] = None
+    """Most grasps of a hand on an object; of more, those that spread best over palm directions are kept."""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print one JSON object instead of a table."""
+
+    def run(self) -> int:
+        """Merge, then write all files."""
+        from dro_grasp.datasets.engine import make_folder
+        from dro_grasp.datasets.merging import file_name, merge
+
+        folder = make_folder(self.output)
+        rows = []
+        for merged in merge(self.inputs, self.per_pair):
+            path = folder / file_name(merged.hand)
+            merged.save(path)
+            rows.append([merged.hand, len(merged.grasps), merged.duplicates, merged.surplus, path.stat().st_size])
+        columns = ["hand", "grasps", "duplicates", "surplus", "bytes"]
+        if self.json:
+            print_json({"output": str(folder), "files": [dict(zip(columns, row, strict=True)) for row in rows]})
+        else:
+            print_table(f"merged into {folder}", columns, rows, note=f"{sum(row[1] for row in rows)} grasps in all")
         return 0
 
 
@@ -102,7 +76,14 @@ class Info:
 class Dataset:
     """Work with grasp data sets."""
 
-    command: Annotated[BundleCommand, tyro.conf.subcommand("bundle")] | Annotated[Info, tyro.conf.subcommand("info")]
+    command: (
+        Annotated[Info, tyro.conf.subcommand("info")]
+        | Annotated[Report, tyro.conf.subcommand("report")]
+        | Annotated[Merge, tyro.conf.subcommand("merge")]
+        | Annotated[Check, tyro.conf.subcommand("check")]
+        | Annotated[Filter, tyro.conf.subcommand("filter")]
+        | Annotated[BundleCommand, tyro.conf.subcommand("bundle")]
+    )
 
     def run(self) -> int:
         """Run the subcommand."""

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import tyro
 
 from dro_grasp.cli.output import load_grasps, optional, print_json, print_table, progress_bar
-from dro_grasp.cli.sources import hand_of, object_of
+from dro_grasp.grasps.sources import hand_of, object_of
 
 
 @dataclass(frozen=True)
@@ -40,23 +40,19 @@ class Evaluate:
 
     def run(self) -> int:
         """Group by object, try, report."""
-        import dataclasses
-
         from dro_grasp.errors import OptionError
         from dro_grasp.evaluation.metrics import wilson_interval
         from dro_grasp.files import check_output
         from dro_grasp.grasps.batch import GraspBatch
-        from dro_grasp.simulation.protocols import protocol
+        from dro_grasp.simulation.protocols import changed
         from dro_grasp.simulation.trial import simulate
 
-        if not 0 < self.friction <= 10:
-            raise OptionError(f"friction is {self.friction}; give a coefficient between 0 and 10")
+        rules = changed(self.protocol, friction=self.friction)
         if self.output is not None:
             check_output(self.output)
         begin = time.perf_counter()
         grasps = load_grasps(self.file)
         hand = hand_of(grasps, self.hand)
-        rules = dataclasses.replace(protocol(self.protocol), friction=self.friction)
         rows, tried, reasons = [], [], Counter()
         names = list(dict.fromkeys(grasps.object))
         if self.object is not None and len(names) > 1:

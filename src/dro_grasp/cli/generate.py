@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from dro_grasp.cli.output import optional, print_json, print_table, progress_bar, say, say_aside
-from dro_grasp.cli.sources import with_sources
+from dro_grasp.grasps.sources import with_sources
 
 if TYPE_CHECKING:
     from torch import Tensor

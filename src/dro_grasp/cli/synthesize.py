@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from dro_grasp.cli.output import print_json, print_table, say_aside
+from dro_grasp.cli.output import optional, print_json, print_table, say_aside
+
+if TYPE_CHECKING:
+    from dro_grasp.datasets.pools import Pool
+    from dro_grasp.datasets.production import Job
 
 
 @dataclass(frozen=True)
@@ -24,10 +28,18 @@ class Synthesize:
     """Objects: names, meshes, or folders of meshes."""
     output: Path
     """Folder for the grasp files; its parent must exist."""
-    grasps: int = 50
-    """Valid grasps of each hand and object."""
+    grasps: int = 150
+    """Valid grasps of each hand and object; a rerun with more adds the rest."""
     workers: int = 2
-    """Processes of one thread each."""
+    """Processes of one thread each; on a running Ray cluster, all of its CPUs are used instead."""
+    engine: Literal["local", "ray"] = "local"
+    """Where the work is done: processes of this machine, or a Ray cluster (the running one, or a new one here)."""
+    ray_address: Annotated[str | None, optional("HOST:PORT", "RAY_ADDRESS, or the running one")] = None
+    """Head of the Ray cluster."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where energies are computed; trials always run on the CPU."""
+    scale: float = 1.0
+    """Multiplies the coordinates of the objects: 0.001 for millimetres."""
     seed: int = 0
     """The same seed gives the same grasps."""
     protocol: Literal["strict", "dro"] = "strict"
@@ -37,7 +49,8 @@ class Synthesize:
 
     def run(self) -> int:
         """Check names first, then fill the folder."""
-        from dro_grasp.datasets.engine import synthesize_dataset
+        from dro_grasp.datasets.engine import EngineConfig, synthesize_dataset
+        from dro_grasp.grasps.synthesis import SynthesisConfig
         from dro_grasp.hands.library import locate_hand
         from dro_grasp.objects.library import resolve_objects
 
@@ -46,7 +59,8 @@ class Synthesize:
         objects = resolve_objects(list(self.object))
         report = synthesize_dataset(
             self.hand, objects, self.grasps, self.output, workers=self.workers, seed=self.seed, protocol=self.protocol,
-            progress=say_aside,
+            config=EngineConfig(synthesis=SynthesisConfig(device=self.device)), scale=self.scale, progress=say_aside,
+            make_pool=self._ray_pool if self.engine == "ray" else None,
         )
         failures = [{"hand": h, "object": o, "reason": why} for (h, o), why in report.failures.items()]
         values = {"output": str(self.output), "grasps": report.grasps, "added": report.added, "shards": report.shards,
@@ -59,3 +73,8 @@ class Synthesize:
         for failure in failures:
             say_aside(f"{failure['hand']} on {failure['object']}: {failure['reason']}")
         return 0
+
+    def _ray_pool(self, job: Job) -> Pool:
+        from dro_grasp.datasets.ray_pool import RayPool
+
+        return RayPool(job, self.workers, job.config.shard_limit, self.ray_address)

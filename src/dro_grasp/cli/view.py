@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from dro_grasp.cli.output import load_grasps, optional, say
-from dro_grasp.cli.sources import hand_of, object_of
+from dro_grasp.grasps.sources import hand_of, object_of
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ safetensors alone.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from dro_grasp.datasets.splits import TRAINING
 from dro_grasp.errors import BundleError
 from dro_grasp.files import replacing
 from dro_grasp.grasps.batch import GraspBatch
@@ -27,8 +28,6 @@ from dro_grasp.hands.hand import Hand
 FORMAT_VERSION = 1
 MAX_BYTES = 25_000_000
 """Largest bundle [bytes]."""
-TRAINING_SPLITS = {"train", ""}
-"""Splits that may enter a bundle; the empty one is an object of the user's own."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +84,7 @@ def write_bundle(
     hands: Sequence[Hand],
     objects: Mapping[str, ObjectCloud],
     grasps: Sequence[GraspBatch],
+    splits: Set[str] = TRAINING,
 ) -> Bundle:
     """Write a training bundle.
 
@@ -93,9 +93,10 @@ def write_bundle(
         hands: The hands of the grasps.
         objects: Clouds of the objects of the grasps, by name.
         grasps: Batches of any of the hands on any of the objects.
+        splits: Splits that may enter.
 
     Raises:
-        BundleError: A grasp's object is not for training, its hand or object is missing, or the file grows too large.
+        BundleError: A grasp is of another split, its hand or object is missing, or the file grows too large.
         OutputError: The file cannot be written.
     """
     strangers = {b.hand for b in grasps if b.hand_sha256 not in {h.sha256 for h in hands}}
@@ -111,7 +112,7 @@ def write_bundle(
         tensors |= _pack_cloud(f"object.{i}", cloud, name)
     for i, hand in enumerate(hands):
         header["hands"].append(_pack_hand(f"hand.{i}", hand, tensors))
-        tensors |= _pack_grasps(f"grasps.{i}", hand, [b for b in grasps if b.hand_sha256 == hand.sha256], names)
+        tensors |= _pack_grasps(f"grasps.{i}", hand, [b for b in grasps if b.hand_sha256 == hand.sha256], names, splits)
     _save(Path(path), tensors, header)
     return load_bundle(path)
 
@@ -187,15 +188,17 @@ def _unpack_hand(key: str, plain: dict[str, Any], tensors: dict[str, Tensor]) ->
     return Hand.from_tensors(plain | own)
 
 
-def _pack_grasps(key: str, hand: Hand, batches: list[GraspBatch], names: list[str]) -> dict[str, Tensor]:
+def _pack_grasps(
+    key: str, hand: Hand, batches: list[GraspBatch], names: list[str], splits: Set[str]
+) -> dict[str, Tensor]:
     if not batches:
         raise BundleError(f"no grasps of hand '{hand.name}'; synthesise some or leave the hand out")
     known = {name: i for i, name in enumerate(names)}
     for batch in batches:
-        refused = {o for o, s in zip(batch.object, batch.split, strict=True) if s not in TRAINING_SPLITS}
+        refused = {o for o, s in zip(batch.object, batch.split, strict=True) if s not in splits}
         if refused:
-            raise BundleError(f"objects {', '.join(sorted(refused)[:5])} are held out for evaluation and may not enter a "
-                              "training bundle; filter them out")
+            raise BundleError(f"grasps on {', '.join(sorted(refused)[:5])} are held out for other uses than this bundle's "
+                              f"({', '.join(sorted(s for s in splits if s)) or 'none'}); leave them out")
         missing = set(batch.object) - set(known)
         if missing:
             raise BundleError(f"no cloud was given for objects {', '.join(sorted(missing)[:5])}")
@@ -220,6 +223,6 @@ def _save(path: Path, tensors: dict[str, Tensor], header: dict[str, Any]) -> Non
     size = sum(t.numel() * t.element_size() for t in tensors.values())
     if size > MAX_BYTES:
         raise BundleError(f"the bundle would have {size / 1e6:.1f} MB, at most {MAX_BYTES / 1e6:.0f} MB are allowed; take "
-                          "fewer objects or fewer grasps a pair")
+                          "fewer objects or fewer grasps a pair (--per-pair)")
     with replacing(path) as temporary:
         save_file(tensors, temporary, metadata={"dro_grasp_bundle": json.dumps(header)})

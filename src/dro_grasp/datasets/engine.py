@@ -1,46 +1,72 @@
-"""Synthesise and try grasps for many hands and objects: independent shards on a local pool of processes.
+"""Synthesise and try grasps for many hands and objects: independent shards, here or on many machines.
 
 Killing it at any time loses the shards in flight at most; a rerun does only what is missing.
 """
 
 from __future__ import annotations
 
-import multiprocessing
+import itertools
+import math
 import os
 import sys
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
-import torch
-
-from dro_grasp.datasets.production import EngineConfig, Job, make_shard
-from dro_grasp.datasets.records import Shard, count_grasps, find_shards, remove_leftovers
-from dro_grasp.errors import DroGraspError, OptionError, OutputError
+from dro_grasp.datasets.pools import Failed, LocalPool, Outcome, Pool
+from dro_grasp.datasets.production import EngineConfig, Job, Task
+from dro_grasp.datasets.records import Shard, find_shards, read_yield, remove_leftovers, sole_run
+from dro_grasp.datasets.yields import Yield
+from dro_grasp.errors import GraspFileError, OptionError, OutputError
 
 __all__ = ["DatasetReport", "EngineConfig", "synthesize_dataset"]
 
 REPORT_EVERY = 10.0
 """Time between lines of progress [s]."""
+CANDIDATE_STEP = 64
+"""Shards have a multiple of this many candidates."""
+Pair = tuple[str, str]
 
 
 @dataclass
 class PairState:
     """Progress of one (hand, object) pair."""
 
-    grasps: int = 0
-    """Stored so far."""
-    rounds: int = 0
-    """Shards finished or in flight."""
+    total: Yield = field(default_factory=Yield)
+    """Of all its shards."""
+    done: set[int] = field(default_factory=set)
+    """Rounds that are finished; those of a damaged shard may be missing in between."""
     barren: int = 0
     """Rounds without a grasp since the last one with."""
     crashes: int = 0
     """Times that a worker died on it."""
     error: str = ""
     """Why it was given up, empty while it is not."""
+
+    @property
+    def grasps(self) -> int:
+        """Stored so far."""
+        return self.total.valid
+
+    @property
+    def next_round(self) -> int:
+        """The first round that is missing."""
+        return next(i for i in itertools.count() if i not in self.done)
+
+    def note(self, shard: Shard, made: Yield) -> None:
+        """Record a finished shard."""
+        self.done.add(shard.round)
+        self.total = self.total + made
+        self.barren = 0 if made.valid else self.barren + 1
+
+    def next_candidates(self, goal: int, config: EngineConfig) -> int:
+        """Size of the next shard: what is missing, at the pair's yield so far, within the config's bounds."""
+        if not self.total.candidates or not self.grasps:
+            return config.candidates
+        wanted = (goal - self.grasps) * self.total.candidates / self.grasps
+        steps = math.ceil(wanted / CANDIDATE_STEP) * CANDIDATE_STEP
+        return min(max(steps, config.least_candidates), config.largest_shard)
 
 
 @dataclass(frozen=True)
@@ -55,7 +81,7 @@ class DatasetReport:
     """Shards made in this run."""
     seconds: float
     """Wall time [s]."""
-    failures: dict[tuple[str, str], str]
+    failures: dict[Pair, str]
     """Pairs that were given up, and why."""
 
 
@@ -68,7 +94,9 @@ def synthesize_dataset(
     seed: int = 0,
     protocol: str = "strict",
     config: EngineConfig | None = None,
+    scale: float = 1.0,
     progress: Callable[[str], None] | None = None,
+    make_pool: Callable[[Job], Pool] | None = None,
 ) -> DatasetReport:
     """Fill a folder with valid grasps of every hand on every object.
 
@@ -80,25 +108,29 @@ def synthesize_dataset(
         grasps_per_pair: A pair is finished when it has this many valid grasps.
         output_dir: The folder; made when missing (its parent must exist).
         workers: Processes, of one thread each.
-        seed: With hand, object and round it determines every shard.
+        seed: With hand, object, round and the number of candidates it determines every shard.
         protocol: The trial that grasps must pass.
         config: Sizes.
+        scale: Multiplies the coordinates of all objects.
         progress: Called with a line of text now and then; None prints to stderr.
+        make_pool: Where shards are made; None makes them in processes of this machine.
 
     Raises:
         OptionError: A number is not positive.
-        OutputError: The folder cannot be made.
+        OutputError: The folder cannot be made or written, or another run is filling it.
     """
     if grasps_per_pair < 1 or workers < 1:
         raise OptionError(f"grasps_per_pair is {grasps_per_pair}, workers {workers}; both must be at least 1")
     config = config or EngineConfig()
     folder = make_folder(output_dir)
-    states = {(hand, obj): PairState() for hand in hands for obj in objects}
-    resume(folder, states)
-    before, started = sum(s.grasps for s in states.values()), time.perf_counter()
-    job = Job(folder, seed, protocol, config)
     say = progress or (lambda line: print(line, file=sys.stderr, flush=True))
-    shards = _run(job, states, grasps_per_pair, workers, say)
+    with sole_run(folder):
+        states = {(hand, obj): PairState() for hand in hands for obj in objects}
+        resume(folder, states, say)
+        before, started = sum(s.grasps for s in states.values()), time.perf_counter()
+        job = Job(seed, protocol, config, scale)
+        pool = make_pool(job) if make_pool else LocalPool(job, workers, config.shard_limit)
+        shards = Run(pool, folder, states, grasps_per_pair, config, say).finish()
     total = sum(s.grasps for s in states.values())
     failures = {pair: s.error for pair, s in states.items() if s.error}
     return DatasetReport(total, total - before, shards, time.perf_counter() - started, failures)
@@ -124,127 +156,111 @@ def make_folder(path: Path | str) -> Path:
     return path
 
 
-def resume(folder: Path, states: dict[tuple[str, str], PairState]) -> None:
-    """Take up what earlier runs have left in the folder."""
+def resume(folder: Path, states: dict[Pair, PairState], say: Callable[[str], None]) -> None:
+    """Take up what earlier runs have left in the folder; a damaged or foreign shard is named and made again."""
     remove_leftovers(folder)
     for shard in find_shards(folder):
         state = states.get((shard.hand, shard.object))
-        count = None if state is None else count_grasps(folder, shard)
-        if state is None or count is None or shard.round != state.rounds:
+        if state is None:
             continue
-        note_shard(state, count)
+        try:
+            state.note(shard, read_yield(folder, shard))
+        except GraspFileError as error:
+            say(f"{error}; it is made again")
 
 
-def note_shard(state: PairState, count: int, started: bool = False) -> None:
-    """Record a finished shard of `count` grasps; `started` when it was already counted as a round."""
-    state.grasps += count
-    state.rounds += not started
-    state.barren = 0 if count else state.barren + 1
-
-
-def next_pair(
-    states: dict[tuple[str, str], PairState], busy: set[tuple[str, str]], goal: int, config: EngineConfig
-) -> tuple[str, str] | None:
+def next_pair(states: dict[Pair, PairState], busy: set[Pair], goal: int, config: EngineConfig) -> Pair | None:
     """The unfinished pair with the fewest rounds that no worker is busy with, or None.
 
-    Pairs on which a worker died come last: they run alone, so that they take no other down.
+    Objects that come for the first time are spread over the workers, since preparing one can take minutes; pairs on
+    which a worker died come last.
     """
     open_pairs = [
         pair for pair, s in states.items()
         if pair not in busy and not s.error and s.grasps < goal and _worth_trying(s, config)
     ]
-    return min(open_pairs, key=lambda pair: (states[pair].crashes, states[pair].rounds), default=None)
+    prepared_now = {obj for hand, obj in busy if not states[hand, obj].total.candidates}
+    return min(
+        open_pairs, key=lambda pair: (states[pair].crashes, pair[1] in prepared_now, len(states[pair].done)), default=None
+    )
 
 
 def _worth_trying(state: PairState, config: EngineConfig) -> bool:
     if state.barren >= config.barren_rounds:
-        state.error = f"no valid grasp in {state.barren} rounds"
-    elif state.rounds >= config.most_rounds:
-        state.error = f"stopped after {state.rounds} rounds with {state.grasps} grasps"
+        state.error = f"{state.grasps} grasps, none in the last {state.barren} rounds: {state.total.main_obstacle()}"
+    elif state.total.candidates >= config.most_candidates:
+        state.error = (f"{state.grasps} grasps of {state.total.candidates} candidates, then given up: "
+                       f"{state.total.main_obstacle()}")
     return not state.error
 
 
-def _run(
-    job: Job, states: dict[tuple[str, str], PairState], goal: int, workers: int, say: Callable[[str], None]
-) -> int:
-    """Keep the pool busy until every pair is finished or given up; returns the number of shards made."""
-    done, running, pool, told = 0, {}, _pool(workers), time.perf_counter()
-    started = told
-    try:
-        while True:
-            while len(running) < workers:
-                pair = next_pair(states, set(running.values()), goal, job.config)
-                if pair is None or (running and states[pair].crashes):
-                    break
-                running[pool.submit(make_shard, job, Shard(*pair, states[pair].rounds))] = pair
-                states[pair].rounds += 1
-                if states[pair].crashes:
-                    break
-            if not running:
-                say(summary(states, goal, time.perf_counter() - started))
-                return done
-            finished, _ = wait(running, return_when=FIRST_COMPLETED)
-            broken = False
-            for future in finished:
-                pair = running.pop(future)
-                broken |= _collect(future, pair, states[pair], say)
-                done += not states[pair].error
-            if broken:
-                done, pool = done, _rebuild(pool, running, states, workers)
-            if time.perf_counter() - told > REPORT_EVERY:
-                told = time.perf_counter()
-                say(summary(states, goal, told - started))
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+@dataclass
+class Run:
+    """One run of the engine over a folder."""
+
+    pool: Pool
+    folder: Path
+    states: dict[Pair, PairState]
+    goal: int
+    config: EngineConfig
+    say: Callable[[str], None]
+    busy: set[Pair] = field(default_factory=set)
+    made: int = 0
+
+    def finish(self) -> int:
+        """Keep the pool busy until every pair is finished or given up; returns the number of shards made."""
+        started = told = time.perf_counter()
+        try:
+            while self._fill():
+                for outcome in self.pool.wait(REPORT_EVERY):
+                    self._collect(outcome)
+                if time.perf_counter() - told > REPORT_EVERY:
+                    told = time.perf_counter()
+                    self.say(summary(self.states, self.goal, told - started))
+        finally:
+            self.pool.close()
+        self.say(summary(self.states, self.goal, time.perf_counter() - started))
+        return self.made
+
+    def _fill(self) -> bool:
+        """Start shards while there is room; false when none is left and none in flight."""
+        while self.pool.free > 0:
+            pair = next_pair(self.states, self.busy, self.goal, self.config)
+            if pair is None:
+                break
+            state = self.states[pair]
+            earlier = tuple(Shard(*pair, i).path(self.folder).read_bytes() for i in sorted(state.done))
+            self.pool.submit(Task(Shard(*pair, state.next_round), state.next_candidates(self.goal, self.config), earlier))
+            self.busy.add(pair)
+        return bool(self.busy)
+
+    def _collect(self, outcome: Outcome) -> None:
+        """Store a shard, or note why there is none.
+
+        Raises:
+            OutputError: It cannot be stored; then no other could be.
+        """
+        task, result = outcome
+        pair = (task.shard.hand, task.shard.object)
+        state = self.states[pair]
+        self.busy.discard(pair)
+        if not isinstance(result, Failed):
+            task.shard.save(result.payload, self.folder)
+            state.note(task.shard, result.result)
+            state.crashes = 0
+            self.made += 1
+            return
+        state.crashes += result.died
+        if not result.died or state.crashes >= self.config.most_crashes:
+            state.error = result.reason + (f", {state.crashes} times" if result.died else "")
+            self.say(f"{pair[0]} on {pair[1]}: {state.error}")
 
 
-def _collect(
-    future: Future[int], pair: tuple[str, str], state: PairState, say: Callable[[str], None]
-) -> bool:
-    """Note a shard's outcome; true when the pool broke."""
-    try:
-        note_shard(state, future.result(), started=True)
-        state.crashes = 0
-    except BrokenProcessPool:
-        _crashed(state)
-        return True
-    except Exception as error:  # any failure of one pair must not stop the others
-        reason = str(error) if isinstance(error, DroGraspError) else f"{type(error).__name__}: {error}"
-        state.error = reason.splitlines()[0][:300] if reason else type(error).__name__
-        say(f"{pair[0]} on {pair[1]}: {state.error}")
-    return False
-
-
-def _crashed(state: PairState) -> None:
-    """Note that a worker died while the pair was in flight; its round is tried once more, alone."""
-    state.crashes += 1
-    state.rounds -= 1
-    if state.crashes >= 2:
-        state.error = "a worker process died on it twice"
-
-
-def _rebuild(
-    pool: Executor, running: dict[Future[int], tuple[str, str]],
-    states: dict[tuple[str, str], PairState], workers: int,
-) -> Executor:
-    """A new pool after a worker died; shards that were in flight are forgotten and come again."""
-    for pair in running.values():
-        _crashed(states[pair])
-    running.clear()
-    pool.shutdown(wait=False, cancel_futures=True)
-    return _pool(workers)
-
-
-def _pool(workers: int) -> Executor:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), torch.set_num_threads, (1,))
-
-
-def summary(states: dict[tuple[str, str], PairState], goal: int, seconds: float) -> str:
+def summary(states: dict[Pair, PairState], goal: int, seconds: float) -> str:
     """One line about where a run stands."""
     grasps = sum(s.grasps for s in states.values())
     full = sum(s.grasps >= goal for s in states.values())
     given_up = sum(bool(s.error) for s in states.values())
-    fewest = min((s.rounds for s in states.values() if not s.error), default=0)
+    fewest = min((len(s.done) for s in states.values() if not s.error), default=0)
     return (f"{grasps} grasps; {full} of {len(states)} pairs full, {given_up} given up, round {fewest}; "
             f"{seconds:.0f} s")

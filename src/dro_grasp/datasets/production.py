@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
+import io
+import time
+from collections import Counter
 from dataclasses import dataclass, field
 from functools import lru_cache
-from pathlib import Path
 
-from jaxtyping import Float
-from torch import Tensor
-
-from dro_grasp.datasets.records import Shard
+from dro_grasp.datasets.records import Shard, notes_of
+from dro_grasp.datasets.splits import split_of
+from dro_grasp.datasets.yields import Yield
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.duplicates import distinct
+from dro_grasp.grasps.sources import with_sources
 from dro_grasp.grasps.synthesis import SynthesisConfig, synthesize
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.library import load_object
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.simulation.outcome import kind_of_failure
 from dro_grasp.simulation.trial import settle, simulate
 
 
@@ -26,7 +30,11 @@ class EngineConfig:
     """How a data set is made."""
 
     candidates: int = 256
-    """Grasps synthesised for a shard."""
+    """Grasps synthesised for the first shard of a pair; later ones are as large as the pair's yield asks for."""
+    least_candidates: int = 128
+    """Smallest later shard."""
+    largest_shard: int = 768
+    """Largest later shard."""
     tried_share: float = 0.34
     """Share of them, lowest energy first, that are tried in simulation."""
     deepest: float = 0.01
@@ -37,10 +45,12 @@ class EngineConfig:
     """Candidates that the closing moves farther than this relative to the object are not tried [m]."""
     barren_rounds: int = 3
     """A pair is given up after this many rounds without a single valid grasp."""
-    most_rounds: int = 200
-    """A pair is given up after this many rounds."""
-    keep_failures: bool = False
-    """Store grasps that failed their trial as well."""
+    most_candidates: int = 8192
+    """A pair is given up after this many candidates."""
+    most_crashes: int = 2
+    """A pair is given up when workers died on it this often in a row."""
+    shard_limit: float = 1800.0
+    """A shard that takes longer is stopped, as if its worker had died [s]; preparing the object counts."""
     synthesis: SynthesisConfig = field(default_factory=SynthesisConfig)
     """The optimiser."""
 
@@ -49,10 +59,32 @@ class EngineConfig:
 class Job:
     """What all shards of a run share."""
 
-    folder: Path
     seed: int
     protocol: str
     config: EngineConfig
+    scale: float = 1.0
+    """Multiplies the coordinates of all objects."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One shard to make."""
+
+    shard: Shard
+    candidates: int
+    """Grasps to synthesise."""
+    earlier: tuple[bytes, ...] = ()
+    """The pair's shards so far, as files: what is in them counts as a duplicate."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """One shard, made."""
+
+    shard: Shard
+    payload: bytes
+    """The shard's file."""
+    result: Yield
 
 
 def shard_seed(seed: int, shard: Shard) -> int:
@@ -66,44 +98,66 @@ def _hand(name: str) -> Hand:
     return load_hand(name)
 
 
-@lru_cache(maxsize=4)
-def _object(name: str) -> ObjectModel:
-    return load_object(name)
+@lru_cache(maxsize=16)
+def _object(name: str, scale: float) -> ObjectModel:
+    return load_object(name, scale=scale)
 
 
-def make_shard(job: Job, shard: Shard) -> int:
-    """Synthesise, try and store one shard; returns the number of grasps stored."""
-    hand, obj = _hand(shard.hand), _object(shard.object)
-    grasps = valid_grasps(hand, obj, shard_seed(job.seed, shard), job.protocol, job.config)
-    shard.save(grasps, job.folder)
-    return len(grasps)
+def make_shard(job: Job, task: Task) -> Made:
+    """Synthesise and try one shard. Files go to and from it as bytes, so that it runs where the folder is not."""
+    started = time.process_time()
+    hand, obj = _hand(task.shard.hand), _object(task.shard.object, job.scale)
+    _ = obj.grid, obj.parts
+    prepared = time.process_time()
+    earlier = [GraspBatch.load(io.BytesIO(payload)) for payload in task.earlier]
+    grasps, result = valid_grasps(
+        hand, obj, shard_seed(job.seed, task.shard), job.protocol, job.config, task.candidates,
+        GraspBatch.concatenate(earlier) if earlier else None,
+    )
+    grasps = with_sources(grasps, task.shard.hand, task.shard.object, job.scale)
+    grasps = grasps.replace(split=tuple(split_of(task.shard.hand, split) for split in grasps.split))
+    result = dataclasses.replace(
+        result, cpu_seconds=time.process_time() - prepared, preparation_seconds=prepared - started
+    )
+    return Made(task.shard, grasps.to_bytes(notes_of(result)), result)
 
 
-def valid_grasps(hand: Hand, obj: ObjectModel, seed: int, protocol: str, config: EngineConfig) -> GraspBatch:
-    """Candidates of one seed that pass the protocol, near-duplicates once, best energy first."""
-    grasps = synthesize(hand, obj, config.candidates, seed, config.synthesis)
-    grasps = select(grasps, config)
-    if not len(grasps):
-        return grasps
-    if config.settle:
+def valid_grasps(
+    hand: Hand,
+    obj: ObjectModel,
+    seed: int,
+    protocol: str,
+    config: EngineConfig,
+    candidates: int | None = None,
+    earlier: GraspBatch | None = None,
+) -> tuple[GraspBatch, Yield]:
+    """Candidates of one seed that pass the protocol, near-duplicates once, best energy first.
+
+    Args:
+        hand: The hand.
+        obj: The object, with a mesh.
+        seed: The same seed gives the same grasps.
+        protocol: The trial.
+        config: Sizes and thresholds.
+        candidates: How many to synthesise; the config's number by default.
+        earlier: Grasps of the pair that are there already.
+    """
+    count = candidates or config.candidates
+    drawn = synthesize(hand, obj, count, seed, config.synthesis)
+    ranked = drawn[0 : max(1, round(config.tried_share * count))]
+    grasps = ranked[ranked.extra["depth"] < config.deepest]
+    made = Yield(candidates=count, ranked_out=count - len(ranked), deep=len(ranked) - len(grasps))
+    if config.settle and len(grasps):
         closed = settle(hand, obj, grasps, protocol, workers=1)
-        grasps = closed[(_grasp_centres(hand, closed) - _grasp_centres(hand, grasps)).norm(dim=-1) < config.farthest]
-        if not len(grasps):
-            return grasps
-    tried = grasps.with_trial(simulate(hand, obj, grasps, protocol, workers=1))
-    if config.keep_failures or tried.success is None:
-        return tried
-    passed = tried[tried.success]
-    return passed[distinct(hand, passed)]
-
-
-def _grasp_centres(hand: Hand, grasps: GraspBatch) -> Float[Tensor, "n 3"]:
-    T = grasps.T_object_wrist
-    return T[:, :3, :3] @ hand.grasp_centre_wrist + T[:, :3, 3]
-
-
-def select(grasps: GraspBatch, config: EngineConfig) -> GraspBatch:
-    """The candidates worth a trial: lowest energy, not deep inside the object."""
-    best = grasps[0 : max(1, round(config.tried_share * len(grasps)))]
-    depth = best.extra.get("depth")
-    return best if depth is None else best[depth < config.deepest]
+        shift = (hand.grasp_centres(closed.T_object_wrist) - hand.grasp_centres(grasps.T_object_wrist)).norm(dim=-1)
+        made = dataclasses.replace(made, moved=int((shift >= config.farthest).sum()))
+        grasps = closed[shift < config.farthest]
+    trial = simulate(hand, obj, grasps, protocol, workers=1)
+    tried = trial.fill(grasps)
+    passed = tried[trial.success]
+    new = distinct(hand, passed, earlier=earlier)
+    failures = Counter(kind_of_failure(reason) for reason in trial.reason if reason)
+    made = dataclasses.replace(
+        made, failures=dict(failures), duplicates=int((~new).sum()), valid=int(new.sum())
+    )
+    return passed[new], made

@@ -5,17 +5,26 @@ The folder is the state of a data set's making: what is there is done, everythin
 
 from __future__ import annotations
 
+import dataclasses
+import fcntl
+import os
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote, unquote
 
+from dro_grasp import __version__
+from dro_grasp.datasets.yields import Yield
 from dro_grasp.errors import GraspFileError, OutputError
-from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.table import read_row_count
+from dro_grasp.files import replacing
+from dro_grasp.grasps.table import read_footer
 
+LOCK = ".lock"
+"""File in a data set's folder that a run holds while it fills it."""
 STALE = 3600.0
 """Age after which a temporary file is taken as left behind by a killed process [s]."""
 
@@ -35,7 +44,7 @@ class Shard:
         """Where the shard's file lies in a data set's folder."""
         return folder / quote(self.hand, safe="") / quote(self.object, safe="+") / f"{self.round:05d}.parquet"
 
-    def save(self, grasps: GraspBatch, folder: Path) -> None:
+    def save(self, payload: bytes, folder: Path) -> None:
         """Write the shard's file; it appears whole or not at all.
 
         Raises:
@@ -45,8 +54,15 @@ class Shard:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise OutputError(f"cannot make {path.parent}: {error.strerror}") from error
-        grasps.save(path)
+            raise OutputError(f"cannot make {path.parent}: {error.strerror}; free some space or choose another "
+                              "folder") from error
+        with replacing(path) as temporary:
+            temporary.write_bytes(payload)
+
+
+def notes_of(result: Yield) -> dict[str, Any]:
+    """What a shard's header says of its making."""
+    return {"yield": result.to_dict(), "version": __version__}
 
 
 def find_shards(folder: Path | str) -> list[Shard]:
@@ -65,39 +81,35 @@ def find_shards(folder: Path | str) -> list[Shard]:
     return sorted(shards)
 
 
-def count_grasps(folder: Path, shard: Shard) -> int | None:
-    """Number of grasps in a shard, from the file's footer; None when the file cannot be read."""
-    try:
-        return read_row_count(shard.path(folder))
-    except GraspFileError:
-        return None
-
-
-def read_pairs(
-    folder: Path | str, hands: Sequence[str] | None = None, only_successful: bool = True
-) -> Iterator[tuple[tuple[str, str], GraspBatch]]:
-    """The grasps of each (hand, object) pair of a data set, one pair after the other.
-
-    Args:
-        folder: The data set's folder.
-        hands: Only these hands; None for all.
-        only_successful: Leave out grasps that failed their trial or had none.
+def read_yield(folder: Path, shard: Shard) -> Yield:
+    """What became of the candidates of a shard, from the file's footer; `valid` is the number of grasps it holds.
 
     Raises:
-        GraspFileError: There is no such folder, or a shard is damaged.
+        GraspFileError: The file cannot be read, or is of another version.
     """
-    folder = Path(folder)
-    pairs: dict[tuple[str, str], list[Shard]] = {}
-    for shard in find_shards(folder):
-        if hands is None or shard.hand in hands:
-            pairs.setdefault((shard.hand, shard.object), []).append(shard)
-    for pair, shards in pairs.items():
-        batches = [GraspBatch.load(shard.path(folder)) for shard in shards]
-        grasps = GraspBatch.concatenate(batches)
-        if only_successful:
-            grasps = grasps[grasps.success & grasps.tried] if grasps.success is not None else grasps[0:0]
-        if len(grasps):
-            yield pair, grasps
+    rows, header = read_footer(shard.path(folder))
+    notes = header.get("notes") or {}
+    return dataclasses.replace(Yield.from_dict(notes.get("yield") or {}), valid=rows)
+
+
+@contextmanager
+def sole_run(folder: Path) -> Iterator[None]:
+    """Keep a second run out of a folder while the block lasts; the lock goes with the process.
+
+    Raises:
+        OutputError: Another run is filling the folder.
+    """
+    with (folder / LOCK).open("a+") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            lock.seek(0)
+            raise OutputError(f"another run is filling {folder} (process {lock.read().strip() or 'unknown'}); wait for it, or "
+                              "give another folder and join both with `dro-grasp dataset merge`") from error
+        lock.truncate(0)
+        lock.write(str(os.getpid()))
+        lock.flush()
+        yield
 
 
 def remove_leftovers(folder: Path) -> int:

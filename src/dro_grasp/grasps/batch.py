@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -14,8 +15,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.errors import GraspFileError
+from dro_grasp.files import check_output, replacing
 from dro_grasp.grasps.codec import FLOATS, LISTS, TEXTS, UNTRIED, decode, encode
-from dro_grasp.grasps.table import read_table, write_table
+from dro_grasp.grasps.table import read_table, table_bytes
 
 __all__ = ["GraspBatch"]
 
@@ -190,6 +192,11 @@ class GraspBatch:
             return self
         return self._take((-self.score.nan_to_num(nan=-torch.inf)).argsort(stable=True))
 
+    def bare(self) -> GraspBatch:
+        """Poses, joints and objects alone, without outcomes and further columns."""
+        empty: dict[str, Any] = dict.fromkeys((*FLOATS, *LISTS, "success", "protocol"))
+        return self.replace(**empty, extra={})
+
     def with_trial(self, trial: Any) -> GraspBatch:
         """The batch with a trial's outcome.
 
@@ -206,17 +213,28 @@ class GraspBatch:
             protocol=(trial.protocol,) * len(self),
         )
 
-    def save(self, path: Path | str) -> None:
+    def save(self, path: Path | str, notes: dict[str, Any] | None = None) -> None:
         """Write a grasp file (Parquet, format version 1); it appears whole or not at all.
+
+        Args:
+            path: The file; an existing one is replaced.
+            notes: Plain values about the making, kept in the file's header for `read_notes`.
 
         Raises:
             OutputError: The path cannot be written.
         """
-        write_table(path, *encode(self))
+        path = check_output(path)
+        with replacing(path) as temporary:
+            temporary.write_bytes(self.to_bytes(notes))
+
+    def to_bytes(self, notes: dict[str, Any] | None = None) -> bytes:
+        """The grasp file that `save` writes."""
+        columns, header = encode(self)
+        return table_bytes(columns, header if notes is None else header | {"notes": notes})
 
     @staticmethod
-    def load(path: Path | str) -> GraspBatch:
-        """Read a grasp file.
+    def load(path: Path | str | BytesIO) -> GraspBatch:
+        """Read a grasp file, from a path or from memory.
 
         Raises:
             GraspFileError: No such file, or a truncated or foreign one, or one of another version.

@@ -15,22 +15,27 @@ HAND_POINTS = 64
 """Surface points that are compared."""
 
 
-def distinct(hand: Hand, grasps: GraspBatch, near: float = NEAR) -> Bool[Tensor, " n"]:
+def distinct(
+    hand: Hand, grasps: GraspBatch, near: float = NEAR, earlier: GraspBatch | None = None
+) -> Bool[Tensor, " n"]:
     """Mask of the grasps that are no near-duplicate of an earlier one of the same object.
 
     Args:
         hand: The grasps' hand.
         grasps: Any grasps of it.
         near: Mean distance between corresponding surface points that makes two grasps one [m].
+        earlier: Grasps that are there already; None for no such.
     """
+    n_earlier = 0 if earlier is None else len(earlier)
+    joined = grasps if earlier is None else GraspBatch.concatenate([earlier.bare(), grasps.bare()])
     thin = hand.with_points(min(HAND_POINTS, hand.n_points))
-    points = thin.points(grasps.joints, grasps.T_object_wrist)
-    keep = torch.ones(len(grasps), dtype=torch.bool)
-    names = sorted(set(grasps.object))
-    owner = torch.tensor([names.index(name) for name in grasps.object])
-    for i in range(1, len(grasps)):
-        earlier = (keep[:i] & (owner[:i] == owner[i])).nonzero()[:, 0]
-        if len(earlier):
-            apart = (points[earlier] - points[i]).norm(dim=-1).mean(-1)
+    points = thin.points(joined.joints, joined.T_object_wrist)
+    keep = torch.ones(len(joined), dtype=torch.bool)
+    names = sorted(set(joined.object))
+    owner = torch.tensor([names.index(name) for name in joined.object])
+    for i in range(max(1, n_earlier), len(joined)):
+        before = (keep[:i] & (owner[:i] == owner[i])).nonzero()[:, 0]
+        if len(before):
+            apart = (points[before] - points[i]).norm(dim=-1).mean(-1)
             keep[i] = bool(apart.min() >= near)
-    return keep
+    return keep[n_earlier:]

@@ -105,7 +105,7 @@ def self_penetration(
 ) -> PointTerm:
     """Overlap of the pairs of spheres that stand for links which may not touch [m], (*b k)."""
     first, second = pairs[:, 0], pairs[:, 1]
-    one_hot = torch.eye(len(radii), dtype=centres.dtype)
+    one_hot = torch.eye(len(radii), dtype=centres.dtype, device=centres.device)
     difference = one_hot[first] - one_hot[second]
     # As plain matrix products, several times faster than gathering and adding by index.
     apart = (centres.mT.reshape(-1, len(radii)) @ difference.T).unflatten(0, (*centres.shape[:-2], 3))

@@ -32,6 +32,9 @@ class ContactConfig:
     """Weight of the palm as a whole, against 1 for a finger, among the contacts not tied to a finger."""
     min_contacts: int = 4
     """Least number of contacts. Source: DexGraspNet (four)."""
+    idle: float = 0.6
+    """Probability that a finger other than the thumb holds nothing, in hands that have a thumb (ours: a hand that
+    always uses all fingers grasps everything alike). The thumb and one more finger always hold."""
 
 
 @dataclass(frozen=True)
@@ -50,13 +53,31 @@ class ContactCandidates:
     """Probability of each candidate in each slot; slots that stay on one finger come first."""
     slot_finger: tuple[int, ...]
     """Finger of each slot; PALM for the free slots."""
+    thumb: int | None
+    """The finger that always holds; None where all of them do."""
 
-    def draw(
-        self, n: int, slots: Int[Tensor, " m"] | None, generator: torch.Generator
-    ) -> Int[Tensor, "n m"]:
-        """Random candidates, one for each grasp and slot (all slots when None)."""
-        weights = self.slot_weights if slots is None else self.slot_weights[slots]
-        return torch.multinomial(weights, n, replacement=True, generator=generator).T
+    def draw(self, n: int, generator: torch.Generator) -> Int[Tensor, "n n_slots"]:
+        """Random candidates, one for each grasp and slot, drawn on the CPU."""
+        return torch.multinomial(self.slot_weights.cpu(), n, replacement=True, generator=generator).T
+
+    def assign(self, n: int, idle: float, generator: torch.Generator) -> Int[Tensor, "n n_slots"]:
+        """The slot whose candidates each contact of each grasp uses: its own, or another where its finger is idle.
+
+        Args:
+            n: How many grasps.
+            idle: Probability that a finger other than the thumb is idle.
+            generator: Source of randomness.
+        """
+        own = torch.arange(len(self.slot_finger)).repeat(n, 1)
+        if self.thumb is None:
+            return own
+        chance = torch.rand(own.shape, generator=generator)
+        fingers = torch.tensor(self.slot_finger)
+        may_rest = (fingers != PALM) & (fingers != self.thumb)
+        partner = torch.where(may_rest, chance, -torch.inf).argmax(-1, keepdim=True)
+        resting = may_rest & (chance < idle) & (own != partner)
+        substitute = torch.multinomial((~resting).float(), own.shape[1], replacement=True, generator=generator)
+        return torch.where(resting, substitute, own)
 
 
 def finger_links(tree: KinematicTree, tips: tuple[int, ...], palm: int) -> Int[Tensor, " n_links"]:
@@ -144,7 +165,8 @@ def contact_candidates(hand: Hand, config: ContactConfig | None = None) -> Conta
     keep = inner.nonzero()[:, 0]
     slots = _slots(finger[keep], weight[keep].clamp_min(1e-6), len(hand.tips), config)
     return ContactCandidates(
-        hand.link_points[keep], hand.link_normals[keep], hand.link_index[keep], finger[keep], *slots
+        hand.link_points[keep], hand.link_normals[keep], hand.link_index[keep], finger[keep], *slots,
+        thumb=find_thumb(hand, config.closing),
     )
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -12,6 +14,8 @@ from dro_grasp.grasps import energies
 from dro_grasp.grasps.field import CloudField, DistanceField
 from dro_grasp.grasps.fingers import ContactCandidates, ContactConfig, contact_candidates, rigid_group
 from dro_grasp.hands.hand import Hand
+
+Record = TypeVar("Record")
 
 TERMS = ("force_closure", "distance", "penetration", "self_penetration", "alignment", "joints")
 """Names of the terms, the order of every table of them."""
@@ -139,7 +143,7 @@ class LinkPoints:
     @staticmethod
     def of(local: Float[Tensor, "p 3"], links: Int[Tensor, " p"], n_links: int) -> LinkPoints:
         """Lay out points given in their links' frames."""
-        members = torch.eye(n_links, dtype=local.dtype)[links]
+        members = torch.eye(n_links, dtype=local.dtype, device=local.device)[links]
         homogeneous = torch.cat([local, torch.ones_like(local[:, :1])], -1)
         layout = (members[:, :, None] * homogeneous[:, None, :]).flatten(1).T.contiguous()
         return LinkPoints(layout, members)
@@ -148,6 +152,15 @@ class LinkPoints:
         """The points in the world [m]."""
         rows = poses[:, :, :3].transpose(1, 2).reshape(3 * len(poses), -1)
         return (rows @ self.layout).unflatten(0, (-1, 3)).mT
+
+
+def on_device(record: Record, device: torch.device | str) -> Record:
+    """A frozen dataclass of tensors and plain values with its tensors on a device; itself where they are there already."""
+    if torch.device(device) == torch.device("cpu"):
+        return record
+    tensors = {f.name: getattr(record, f.name) for f in dataclasses.fields(record)}  # type: ignore[arg-type]
+    moved = {name: value.to(device) for name, value in tensors.items() if isinstance(value, Tensor)}
+    return dataclasses.replace(record, **moved)  # type: ignore[type-var]
 
 
 class GraspEnergy:
@@ -161,6 +174,7 @@ class GraspEnergy:
         length: float,
         config: EnergyConfig | None = None,
         contacts: ContactConfig | None = None,
+        device: torch.device | str = "cpu",
     ) -> None:
         """Prepare everything that does not change from step to step.
 
@@ -171,13 +185,15 @@ class GraspEnergy:
             length: Typical distance of its surface from there [m].
             config: Weights.
             contacts: Where the hand may touch.
+            device: Where the energy is evaluated; hand, field and centre are given on the CPU.
         """
-        self.hand, self.field, self.centre, self.length = hand, field, centre, length
-        self.config = config or EnergyConfig()
-        self.candidates: ContactCandidates = contact_candidates(hand, contacts)
-        self.spheres = link_spheres(hand)
-        thin = hand.with_points(min(self.config.hand_points, hand.n_points))
-        self.one_hot = torch.eye(hand.tree.n_links, dtype=hand.tree.origin.dtype)
+        self.config, self.length = config or EnergyConfig(), length
+        self.candidates: ContactCandidates = on_device(contact_candidates(hand, contacts), device)
+        self.spheres = on_device(link_spheres(hand), device)
+        thin = hand.with_points(min(self.config.hand_points, hand.n_points)).to(device)
+        hand = hand.to(device)
+        self.hand, self.field, self.centre = hand, on_device(field, device), centre.to(device)
+        self.one_hot = torch.eye(hand.tree.n_links, dtype=hand.tree.origin.dtype, device=device)
         self.body = LinkPoints.of(thin.link_points, thin.link_index, hand.tree.n_links)
         self.ball = LinkPoints.of(self.spheres.centres, self.spheres.links, hand.tree.n_links)
         room = self.config.closing_room * (hand.tree.upper - hand.tree.lower) * ~hand.abduction
@@ -227,7 +243,7 @@ class GraspEnergy:
 
     def pivot(self, T_object_wrist: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 3"]:
         """The hand's grasp centre, about which it is turned [m]."""
-        return T_object_wrist[:, :3, :3] @ self.hand.grasp_centre_wrist + T_object_wrist[:, :3, 3]
+        return self.hand.grasp_centres(T_object_wrist)
 
     def _contacts(
         self, poses: Float[Tensor, "n n_links 4 4"], contacts: Int[Tensor, "n c"]
@@ -235,7 +251,7 @@ class GraspEnergy:
         """The terms that depend on contacts, and their wrenches per link."""
         config, candidates = self.config, self.candidates
         links = candidates.links[contacts]
-        chosen = poses[torch.arange(len(poses))[:, None], links]
+        chosen = poses[torch.arange(len(poses), device=links.device)[:, None], links]
         rotation = chosen[..., :3, :3]
         points = (rotation @ candidates.points[contacts][..., None])[..., 0] + chosen[..., :3, 3]
         outward = (rotation @ candidates.normals[contacts][..., None])[..., 0]

@@ -17,10 +17,11 @@ from dro_grasp.hands.hand import Hand
 class StartConfig:
     """How starts are spread. Source of the scheme: DexGraspNet; the numbers are ours."""
 
-    openness: tuple[float, float] = (0.45, 0.85)
+    openness: tuple[float, float] = (0.0, 1.0)
     """Range of the share of the way from closed to open, one draw a grasp."""
-    joint_noise: float = 0.08
-    """Standard deviation of each joint, as a share of its range."""
+    joint_noise: float = 0.6
+    """Standard deviation of each joint, as a share of its range; many joints start at a limit. (Small noise makes all
+    grasps of an object alike: 0.08 halves the spread of the joints and yields no more.)"""
     aim: float = 0.6
     """Largest share of the way from the object's centre to a random surface point at which the palm aims."""
     gap: tuple[float, float] = (0.0, 0.01)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import roma
 import torch
@@ -48,6 +48,8 @@ class SynthesisConfig:
     """Energy increase accepted with probability 1/e at the start; falls to `last_temperature`."""
     last_temperature: float = 0.02
     """The same at the end."""
+    device: str = "cpu"
+    """Where energies are computed. Random numbers are drawn on the CPU, so that a seed means the same everywhere."""
     energy: EnergyConfig = field(default_factory=EnergyConfig)
     """Weights of the terms."""
     starts: StartConfig = field(default_factory=StartConfig)
@@ -66,6 +68,8 @@ class State:
     """Joints [rad or m]."""
     contacts: Int[Tensor, "n c"]
     """Chosen contact candidates."""
+    slots: Int[Tensor, "n c"]
+    """The slot that each contact draws its candidates from."""
     result: Evaluation
     """Energy and gradient there."""
 
@@ -79,7 +83,18 @@ class State:
             choose(a.terms, b.terms), choose(a.by_pose, b.by_pose), choose(a.by_joint, b.by_joint)
         )
         T, q, contacts = (choose(getattr(self, k), getattr(other, k)) for k in ("T", "q", "contacts"))
-        return State(T, q, contacts, result)
+        return State(T, q, contacts, self.slots, result)
+
+
+def field_of(obj: ObjectModel) -> DistanceField:
+    """The signed distances of an object.
+
+    Raises:
+        ObjectError: The object is a bare cloud.
+    """
+    if obj.grid is None:
+        raise ObjectError(f"object '{obj.name}' is a bare point cloud; synthesis needs a mesh")
+    return DistanceField.of(obj.grid)
 
 
 def prepare(hand: Hand, obj: ObjectModel, config: SynthesisConfig | None = None) -> GraspEnergy:
@@ -89,13 +104,10 @@ def prepare(hand: Hand, obj: ObjectModel, config: SynthesisConfig | None = None)
         ObjectError: The object is a bare cloud.
     """
     config = config or SynthesisConfig()
-    grid = obj.grid
-    if grid is None:
-        raise ObjectError(f"object '{obj.name}' is a bare point cloud; synthesis needs a mesh")
     centre = torch.as_tensor(obj.centre_of_mass, dtype=torch.float32)
     surface = torch.as_tensor(obj.cloud, dtype=torch.float32)
     length = float((surface - centre).norm(dim=-1).mean())
-    return GraspEnergy(hand, DistanceField.of(grid), centre, length, config.energy, config.contacts)
+    return GraspEnergy(hand, field_of(obj), centre, length, config.energy, config.contacts, config.device)
 
 
 def synthesize(
@@ -117,20 +129,35 @@ def synthesize(
     if num < 1:
         raise OptionError(f"num is {num}; ask for at least one grasp")
     config = config or SynthesisConfig()
-    energy = prepare(hand, obj, config)
+    energy, field = prepare(hand, obj, config), field_of(obj)
     generator = torch.Generator().manual_seed(seed)
     surface = torch.as_tensor(obj.cloud, dtype=torch.float32)
+    centre = energy.centre.cpu()
     sizes = [min(config.batch_size, num - start) for start in range(0, num, config.batch_size)]
+    T, q, terms, depths = [], [], [], []
     with torch.no_grad():
-        states = [optimise(energy, surface, size, config, generator) for size in sizes]
-    terms = torch.cat([s.result.terms for s in states])
-    batch = GraspBatch.create(
-        hand, obj, torch.cat([s.T for s in states]), torch.cat([s.q for s in states]),
-        score=-terms.sum(-1), seed=seed, provenance=PROVENANCE,
-        extra={"depth": torch.cat([depth(energy, s) for s in states])}
-        | {f"energy_{name}": terms[:, i] for i, name in enumerate(TERMS)},
-    )
-    return _plain(batch).sorted_by_score()
+        for size in sizes:
+            start = starts(hand, field, surface, centre, size, config.starts, generator)
+            end = optimise(energy, *start, config, generator)
+            T, q, terms = [*T, end.T.cpu()], [*q, end.q.cpu()], [*terms, end.result.terms.cpu()]
+            depths.append(depth(energy, end).cpu())
+    return _batch(hand, obj, torch.cat(T), torch.cat(q), torch.cat(terms), torch.cat(depths), seed)
+
+
+def _batch(
+    hand: Hand,
+    obj: ObjectModel,
+    T: Float[Tensor, "n 4 4"],
+    q: Float[Tensor, "n n_dof"],
+    terms: Float[Tensor, "n 6"],
+    depths: Float[Tensor, " n"],
+    seed: int,
+) -> GraspBatch:
+    """Grasps with rotations orthonormal to rounding, lowest energy first."""
+    T[:, :3, :3] = torch.as_tensor(roma.special_procrustes(T[:, :3, :3]))
+    columns = {"depth": depths} | {f"energy_{name}": terms[:, i] for i, name in enumerate(TERMS)}
+    batch = GraspBatch.create(hand, obj, T, q, score=-terms.sum(-1), seed=seed, provenance=PROVENANCE, extra=columns)
+    return batch.sorted_by_score()
 
 
 def depth(energy: GraspEnergy, state: State) -> Float[Tensor, " n"]:
@@ -141,15 +168,25 @@ def depth(energy: GraspEnergy, state: State) -> Float[Tensor, " n"]:
 
 def optimise(
     energy: GraspEnergy,
-    surface: Float[Tensor, "k 3"],
-    n: int,
+    T: Float[Tensor, "n 4 4"],
+    q: Float[Tensor, "n n_dof"],
     config: SynthesisConfig,
     generator: torch.Generator,
 ) -> State:
-    """Run n grasps from random starts to the end of the annealing."""
-    T, q = starts(energy.hand, energy.field, surface, energy.centre, n, config.starts, generator)
-    contacts = energy.candidates.draw(n, None, generator)
-    state = State(T, q, contacts, energy(T, q, contacts))
+    """Run n grasps from where they start to the end of the annealing.
+
+    Args:
+        energy: Of the hand on the object.
+        T: Wrist poses to start from [m], on the CPU.
+        q: Joints to start from [rad or m], on the CPU.
+        config: The optimiser.
+        generator: Source of randomness, on the CPU.
+    """
+    n, device = len(T), energy.centre.device
+    T, q = T.to(device), q.to(device)
+    slots = energy.candidates.assign(n, config.contacts.idle, generator).to(device)
+    contacts = energy.candidates.draw(n, generator).to(device).gather(1, slots)
+    state = State(T, q, contacts, slots, energy(T, q, contacts))
     squares = _squares(state.result)
     steps = config.steps or config.steps_per_contact * max(1, contacts.shape[1] - 3)
     for step in range(steps):
@@ -158,7 +195,7 @@ def optimise(
         temperature = config.last_temperature * (config.temperature / config.last_temperature) ** left
         proposal = propose(energy, state, squares, pace, config, generator)
         rise = proposal.result.total - state.result.total
-        accepted = torch.rand(n, generator=generator) < torch.exp(-rise.clamp_min(0) / temperature)
+        accepted = torch.rand(n, generator=generator).to(device) < torch.exp(-rise.clamp_min(0) / temperature)
         state = state.where(accepted, proposal)
         squares = config.smoothing * squares + (1 - config.smoothing) * _squares(state.result)
     return state
@@ -179,8 +216,8 @@ def propose(
     T = moved(state.T, energy.pivot(state.T), config.translation_step * move, config.rotation_step * turn)
     tree = energy.hand.tree
     q = torch.minimum(torch.maximum(state.q + config.joint_step * bend, tree.lower), tree.upper)
-    contacts = switched(energy, state.contacts, config.switch, generator)
-    return State(T, q, contacts, energy(T, q, contacts))
+    contacts = switched(energy, state, config.switch, generator)
+    return State(T, q, contacts, state.slots, energy(T, q, contacts))
 
 
 def moved(
@@ -198,29 +235,18 @@ def moved(
 
 
 def switched(
-    energy: GraspEnergy, contacts: Int[Tensor, "n c"], probability: float, generator: torch.Generator
+    energy: GraspEnergy, state: State, probability: float, generator: torch.Generator
 ) -> Int[Tensor, "n c"]:
-    """Contacts with one slot of some grasps drawn anew; slots keep to their fingers."""
-    n, c = contacts.shape
+    """Contacts with one of some grasps drawn anew from its slot."""
+    n, c = state.contacts.shape
     slot = torch.randint(c, (n,), generator=generator)
     chance = torch.rand(n, generator=generator) < probability
-    fresh = energy.candidates.draw(n, None, generator)
-    change = chance[:, None] & (torch.arange(c) == slot[:, None])
-    return torch.where(change, fresh, contacts)
+    fresh = energy.candidates.draw(n, generator).to(state.slots.device).gather(1, state.slots)
+    change = (chance[:, None] & (torch.arange(c) == slot[:, None])).to(state.slots.device)
+    return torch.where(change, fresh, state.contacts)
 
 
 def _squares(result: Evaluation) -> Float[Tensor, "n k"]:
     """Squared gradient of each coordinate; the three of a translation or rotation share theirs."""
     move, turn = (part.square().sum(-1, keepdim=True).expand(-1, 3) for part in result.by_pose.split(3, -1))
     return torch.cat([move, turn, result.by_joint.square()], -1)
-
-
-def _plain(batch: GraspBatch) -> GraspBatch:
-    """The batch with ordinary tensors instead of inference ones, with rotations orthonormal to rounding."""
-    T = batch.T_object_wrist.clone()
-    T[:, :3, :3] = torch.as_tensor(roma.special_procrustes(T[:, :3, :3]))
-    return replace(
-        batch, T_object_wrist=T, joints=batch.joints.clone(),
-        score=None if batch.score is None else batch.score.clone(),
-        extra={name: value.clone() for name, value in batch.extra.items()},
-    )

@@ -5,6 +5,7 @@ Knows columns and metadata, nothing about what they mean; `batch` gives them the
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,6 @@ import torch
 from torch import Tensor
 
 from dro_grasp.errors import GraspFileError
-from dro_grasp.files import check_output, replacing
 
 FORMAT_VERSION = 1
 """Version of the grasp file that this code writes and reads."""
@@ -24,32 +24,41 @@ METADATA_KEY = b"dro_grasp"
 """Key of the schema metadata under which the JSON header lies."""
 
 
-def write_table(path: Path | str, columns: dict[str, pa.Array], header: dict[str, Any]) -> None:
-    """Write columns to a Parquet file that appears whole or not at all.
+def table_bytes(columns: dict[str, pa.Array], header: dict[str, Any]) -> bytes:
+    """A grasp file of the given columns.
 
     Args:
-        path: The file; an existing one is replaced.
         columns: Arrow arrays of equal length by name.
         header: JSON-able metadata; the format version is added.
-
-    Raises:
-        OutputError: The path cannot be written.
     """
-    path = check_output(path)
     metadata = {METADATA_KEY: json.dumps({"format_version": FORMAT_VERSION, **header}).encode()}
-    table = pa.table(columns).replace_schema_metadata(metadata)
-    with replacing(path) as temporary:
-        pq.write_table(table, temporary, compression="zstd")
+    table, file = pa.table(columns).replace_schema_metadata(metadata), io.BytesIO()
+    # Bytes of equal weight side by side: floats that were rounded then take half the space.
+    split = [path for path, kind in _leaves(table.schema) if pa.types.is_floating(kind)]
+    texts = [path for path, kind in _leaves(table.schema) if not pa.types.is_floating(kind)]
+    pq.write_table(
+        table, file, compression="zstd", compression_level=9,
+        use_dictionary=texts, use_byte_stream_split=split,  # type: ignore[arg-type]  # the stubs know bool alone
+    )
+    return file.getvalue()
 
 
-def read_table(path: Path | str) -> tuple[pa.Table, dict[str, Any]]:
+def _leaves(schema: pa.Schema) -> list[tuple[str, pa.DataType]]:
+    """Parquet path and type of every column, lists by their elements."""
+    lists = (pa.types.is_list, pa.types.is_fixed_size_list)
+    return [
+        (f"{f.name}.list.element", f.type.value_type) if any(test(f.type) for test in lists) else (f.name, f.type)
+        for f in schema
+    ]
+
+
+def read_table(path: Path | str | io.BytesIO) -> tuple[pa.Table, dict[str, Any]]:
     """Read a grasp file's table and header.
 
     Raises:
         GraspFileError: No such file, a truncated or foreign one, or one of another version.
     """
-    path = Path(path)
-    if not path.is_file():
+    if isinstance(path, (str, Path)) and not Path(path).is_file():
         raise GraspFileError(f"no grasp file {path}; give the path of a .parquet file that dro-grasp wrote")
     try:
         table = pq.read_table(path)
@@ -59,8 +68,8 @@ def read_table(path: Path | str) -> tuple[pa.Table, dict[str, Any]]:
     return table, read_header(path, table.schema)
 
 
-def read_row_count(path: Path | str) -> int:
-    """Number of grasps in a grasp file, from its footer alone.
+def read_footer(path: Path | str) -> tuple[int, dict[str, Any]]:
+    """Number of grasps in a grasp file, and its header, from the footer alone.
 
     Raises:
         GraspFileError: As `read_table`.
@@ -68,12 +77,12 @@ def read_row_count(path: Path | str) -> int:
     try:
         footer = pq.read_metadata(path)
     except (pa.ArrowException, OSError, ValueError) as error:
-        raise GraspFileError(f"{path} cannot be read as a grasp file ({error})") from error
-    read_header(path, footer.schema.to_arrow_schema())
-    return footer.num_rows
+        reason = str(error).splitlines()[0][:200]
+        raise GraspFileError(f"{path} is truncated or no Parquet file ({reason}); write it again") from error
+    return footer.num_rows, read_header(path, footer.schema.to_arrow_schema())
 
 
-def read_header(path: Path | str, schema: pa.Schema) -> dict[str, Any]:
+def read_header(path: Path | str | io.BytesIO, schema: pa.Schema) -> dict[str, Any]:
     """The JSON header of a grasp file's schema.
 
     Raises:

@@ -76,7 +76,7 @@ class Hand:
     @cached_tensor
     def registrable(self) -> Bool[Tensor, " n_links"]:
         """Links whose pose their own points determine."""
-        mask = torch.zeros(self.tree.n_links, dtype=torch.bool)
+        mask = torch.zeros(self.tree.n_links, dtype=torch.bool, device=self.link_points.device)
         for link in self.link_index.unique().tolist():
             points = self.link_points[self.link_index == link]
             if len(points) >= MIN_REGISTRATION_POINTS:
@@ -86,16 +86,16 @@ class Hand:
 
     def canonical_joints(self, openness: float = 0.75) -> Float[Tensor, " n_dof"]:
         """Open-hand joints [rad or m]: this share of the way from the closed to the open end; held joints at rest."""
-        return self._spread_evenly(self._between(torch.full((self.tree.n_dof,), openness)))
+        return self._spread_evenly(self._between(self.rest.new_full((self.tree.n_dof,), openness)))
 
     def random_open_joints(self, n: int, generator: torch.Generator) -> Float[Tensor, "n n_dof"]:
         """Open hands as the network is trained on: openness uniform in 0.65-0.85, one draw per hand."""
-        share = 0.65 + 0.2 * torch.rand(n, 1, generator=generator)
+        share = 0.65 + 0.2 * torch.rand(n, 1, generator=generator).to(self.rest)
         return self._spread_evenly(self._between(share.expand(n, self.tree.n_dof)))
 
     def random_joints(self, n: int, generator: torch.Generator) -> Float[Tensor, "n n_dof"]:
         """Joints uniform within their limits; held joints at rest."""
-        return self._between(torch.rand(n, self.tree.n_dof, generator=generator))
+        return self._between(torch.rand(n, self.tree.n_dof, generator=generator).to(self.rest))
 
     def _spread_evenly(self, q: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_dof"]:
         """Joints that only spread the fingers have no open end: they stand at zero, or a quarter inside their limits."""
@@ -151,6 +151,22 @@ class Hand:
     def palm_direction_wrist(self) -> Float[Tensor, "3"]:
         """palm_direction in the wrist frame."""
         return self.T_wrist_palm_rest[:3, :3] @ self.palm_direction
+
+    def to(self, device: torch.device | str) -> Hand:
+        """The same hand with its tensors on another device; itself where they are there already."""
+        if torch.device(device) == self.link_points.device:
+            return self
+        moved = {f.name: value.to(device) for f in dataclasses.fields(self)
+                 if isinstance(value := getattr(self, f.name), (Tensor, KinematicTree))}
+        return dataclasses.replace(self, **moved)
+
+    def grasp_centres(self, T_world_wrist: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 3"]:
+        """The grasp centre of hands at the given wrist poses [m]."""
+        return T_world_wrist[..., :3, :3] @ self.grasp_centre_wrist + T_world_wrist[..., :3, 3]
+
+    def palm_directions(self, T_world_wrist: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 3"]:
+        """The palm direction of hands at the given wrist poses."""
+        return T_world_wrist[..., :3, :3] @ self.palm_direction_wrist
 
     def with_points(self, count: int) -> Hand:
         """The same hand with fewer points, spread evenly; each link keeps POINTS_PER_LINK where it has them.

@@ -113,13 +113,14 @@ class KinematicTree:
 
         Rodrigues' formula about an axis through the anchor, and a slide, are linear in these.
         """
-        k = _skew(self.axis)
-        revolute, prismatic = self._revolute, torch.tensor(self.kind, device=self.axis.device) == PRISMATIC
+        turns = self._revolute[:, None]
+        slides = torch.tensor(self.kind, device=self.axis.device)[:, None] == PRISMATIC
+        k = _skew(self.axis * turns)
         basis = self.origin.new_zeros(4, self.n_links, 4, 4)
         basis[0] = torch.eye(4)
-        basis[1, revolute, :3, :3], basis[2, revolute, :3, :3] = k[revolute], (k @ k)[revolute]
+        basis[1, :, :3, :3], basis[2, :, :3, :3] = k, k @ k
         basis[1:3, :, :3, 3] = -(basis[1:3, :, :3, :3] @ self.anchor[..., None])[..., 0]
-        basis[3, prismatic, :3, 3] = self.axis[prismatic]
+        basis[3, :, :3, 3] = self.axis * slides
         return basis
 
     @cached_tensor
@@ -139,8 +140,9 @@ class KinematicTree:
     @cached_tensor
     def link_offset(self) -> Float[Tensor, " n_links"]:
         """Value of each link's own joint at q = 0."""
-        values = [0.0 if joint < 0 else float(self.offset[joint]) for joint in self.link_joint]
-        return self.origin.new_tensor(values)
+        joint = torch.tensor(self.link_joint, device=self.offset.device)
+        # The zero at the end is where the -1 of fixed links points.
+        return torch.cat([self.offset, self.offset.new_zeros(1)])[joint]
 
     @cached_tensor
     def descends(self) -> Bool[Tensor, "n_links n_links"]:

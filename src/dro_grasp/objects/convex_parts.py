@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dro_grasp.errors import ObjectError
 from dro_grasp.objects.cache import cached_arrays
 from dro_grasp.objects.repair import OPEN_FILL
 from dro_grasp.objects.shape import Part, signed_distances
@@ -49,10 +50,15 @@ def _run(vertices: np.ndarray, faces: np.ndarray) -> list[Part]:
     import coacd
 
     coacd.set_log_level("error")
-    parts = coacd.run_coacd(
-        coacd.Mesh(mesh.vertices, mesh.faces), threshold=THRESHOLD, max_convex_hull=MAX_PARTS,
-        mcts_iterations=SEARCH, resolution=RESOLUTION, decimate=True, max_ch_vertex=MAX_VERTICES, seed=0,
-    )
+    try:
+        parts = coacd.run_coacd(
+            coacd.Mesh(mesh.vertices, mesh.faces), threshold=THRESHOLD, max_convex_hull=MAX_PARTS,
+            mcts_iterations=SEARCH, resolution=RESOLUTION, decimate=True, max_ch_vertex=MAX_VERTICES, seed=0,
+        )
+    except Exception as error:  # the library's bindings raise what they like
+        raise ObjectError(f"the mesh cannot be cut into convex parts ({error}); repair or simplify it") from error
+    if not parts:
+        raise ObjectError("the mesh cannot be cut into convex parts (CoACD found none); repair or simplify it")
     return [(np.asarray(v), np.asarray(f)) for v, f in parts]
 
 

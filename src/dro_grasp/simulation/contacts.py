@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.simulation.scene import Scene
+from dro_grasp.simulation.scene import PREFIX, Scene
 
 
 @dataclass(frozen=True)
@@ -36,13 +36,14 @@ def measure_penetration(scene: Scene, grasps: GraspBatch) -> Penetration:
     return Penetration(depth, own)
 
 
-def touching_links(scene: Scene, qpos: np.ndarray) -> np.ndarray:
-    """Number of hand links that touch the object in each configuration (n nq)."""
-    counts = np.zeros(len(qpos), np.int64)
-    for i, (bodies, _) in enumerate(_contacts(scene, qpos)):
+def touching_links(scene: Scene, qpos: np.ndarray) -> tuple[tuple[str, ...], ...]:
+    """Names of the hand's links that touch the object in each configuration (n nq), sorted."""
+    names = [scene.model.body(i).name.removeprefix(PREFIX) for i in range(scene.model.nbody)]
+    found = []
+    for bodies, _ in _contacts(scene, qpos):
         touching = bodies[(bodies == scene.object_body).any(1)]
-        counts[i] = len(np.unique(touching[touching != scene.object_body]))
-    return counts
+        found.append(tuple(sorted({names[i] for i in touching[touching != scene.object_body]})))
+    return tuple(found)
 
 
 def _contacts(scene: Scene, qpos: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -34,8 +34,8 @@ class TrialResult:
     """Displacement of the object while the hand closed [m]."""
     closing_rotation: Float[Tensor, " n"]
     """Rotation of the object while the hand closed [rad]."""
-    contacts: Int[Tensor, " n"]
-    """Hand links that touch the object after closing."""
+    contact_links: tuple[tuple[str, ...], ...]
+    """Names of the hand's links that touch the object after closing."""
     penetration: Float[Tensor, " n"]
     """Deepest penetration of hand and object in the grasp as labelled [m]."""
     self_penetration: Float[Tensor, " n"]
@@ -46,13 +46,18 @@ class TrialResult:
     """Name and version."""
 
     @property
+    def contacts(self) -> Int[Tensor, " n"]:
+        """Number of contact_links."""
+        return torch.tensor([len(links) for links in self.contact_links], dtype=torch.int64)
+
+    @property
     def success_rate(self) -> float:
         """Share of successes; NaN without grasps."""
         return float(self.success.float().mean())
 
     def fill(self, grasps: GraspBatch) -> GraspBatch:
         """The tried grasps with their outcome, and the columns `reason` and `contact_links`."""
-        columns = {"reason": list(self.reason), "contact_links": self.contacts}
+        columns = {"reason": list(self.reason), "contact_links": [list(links) for links in self.contact_links]}
         return grasps.with_trial(self).replace(extra=grasps.extra | columns)
 
     @staticmethod
@@ -63,10 +68,18 @@ class TrialResult:
 
         if not results:
             none = np.zeros(0)
-            empty = Measured(Penetration(none, none), none, none, none, none > 0, np.zeros((0, 6)), np.zeros((0, 6)))
+            empty = Measured(Penetration(none, none), none, none, (), none > 0, np.zeros((0, 6)), np.zeros((0, 6)))
             return empty.result((), label)
-        numbers = {n: column(n) for n in TrialResult.__dataclass_fields__ if n not in {"reason", "protocol"}}
-        return TrialResult(**numbers, reason=tuple(x for r in results for x in r.reason), protocol=label)
+        numbers = {n: column(n) for n in TrialResult.__dataclass_fields__ if n not in {"reason", "contact_links", "protocol"}}
+        return TrialResult(
+            **numbers, reason=tuple(x for r in results for x in r.reason),
+            contact_links=tuple(x for r in results for x in r.contact_links), protocol=label,
+        )
+
+
+def kind_of_failure(reason: str) -> str:
+    """A failure's reason without its numbers and directions, for counting."""
+    return reason.split(" by ")[0].split(" under ")[0]
 
 
 @dataclass(frozen=True)
@@ -76,7 +89,7 @@ class Measured:
     penetration: Penetration
     shift: np.ndarray
     turn: np.ndarray
-    contacts: np.ndarray
+    contacts: tuple[tuple[str, ...], ...]
     stable: np.ndarray
     displacement: np.ndarray
     rotation: np.ndarray
@@ -95,7 +108,7 @@ class Measured:
             success=torch.tensor([not r for r in reasons], dtype=torch.bool),
             displacement=tensor(self.displacement, self.stable), rotation=tensor(self.rotation, self.stable),
             closing_shift=tensor(self.shift, self.stable), closing_rotation=tensor(self.turn, self.stable),
-            contacts=torch.from_numpy(self.contacts.astype(np.int64)), penetration=tensor(self.penetration.object),
+            contact_links=self.contacts, penetration=tensor(self.penetration.object),
             self_penetration=tensor(self.penetration.own), reason=reasons, protocol=label,
         )
 

@@ -22,6 +22,8 @@ class Protocol:
     """Makes pregrasp and squeeze where a grasp does not state them."""
     friction: float = 1.0
     """Coefficient between hand and object. (The official release has 3.0.)"""
+    mass_factor: float = 1.0
+    """Multiplies the object's mass, and with it the disturbing forces."""
     torsional_friction: float = 0.02
     """[m]"""
     force: float = 0.5
@@ -86,3 +88,22 @@ def protocol(name: str | Protocol) -> Protocol:
     if name not in PROTOCOLS:
         raise OptionError(f"no protocol is called '{name}'; choose one of {', '.join(PROTOCOLS)}")
     return PROTOCOLS[name]
+
+
+def changed(name: str | Protocol, *, friction: float | None = None, mass_factor: float = 1.0) -> Protocol:
+    """A protocol with another friction or mass.
+
+    Args:
+        name: The protocol.
+        friction: Coefficient between hand and object; None leaves the protocol's.
+        mass_factor: Multiplies the object's mass.
+
+    Raises:
+        OptionError: A value is out of range, or no protocol has the name.
+    """
+    rules = protocol(name)
+    if friction is not None and not 0 < friction <= 10:
+        raise OptionError(f"friction is {friction}; give a coefficient between 0 and 10")
+    if not 0 < mass_factor <= 100:
+        raise OptionError(f"mass_factor is {mass_factor}; give a factor between 0 and 100")
+    return replace(rules, friction=rules.friction if friction is None else friction, mass_factor=mass_factor)

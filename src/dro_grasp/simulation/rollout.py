@@ -84,7 +84,8 @@ class Rollout:
 
     def set_force(self, axis: np.ndarray, rows: np.ndarray) -> None:
         """Force on the object along an axis of the object's frame, as the hand was told of it."""
-        newtons = self.scene.protocol.force * self.scene.obj.mass
+        rules = self.scene.protocol
+        newtons = rules.force * rules.mass_factor * self.scene.obj.mass
         self.force[rows, self.scene.object_body, :3] = newtons * (self.start.rotation[rows] @ axis)
 
     def push(self, closed: ObjectState, alive: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

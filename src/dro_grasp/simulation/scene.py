@@ -30,7 +30,8 @@ EQUALITY_TIME = 0.01
 """Time constant of joint couplings [s], the stiffest that a 5 ms step allows."""
 FAR_AWAY = (0.0, 0.0, 5.0)
 """Where the object waits while the hand is looked at alone [m]."""
-_PREFIX = "hand/"
+PREFIX = "hand/"
+"""Stands before every name of the hand in a scene."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +62,7 @@ class Scene:
     @cached_property
     def actuated(self) -> np.ndarray:
         """Index into the independent joints of each actuator."""
-        names = [self.model.actuator(i).name.removeprefix(_PREFIX) for i in range(self.model.nu)]
+        names = [self.model.actuator(i).name.removeprefix(PREFIX) for i in range(self.model.nu)]
         return np.array([self.hand.tree.joint_names.index(n) for n in names])
 
     def qpos(
@@ -139,8 +140,8 @@ def _hand_spec(hand: Hand, protocol: Protocol) -> mujoco.MjSpec:
 def _attach(scene: mujoco.MjSpec, hand: mujoco.MjSpec) -> None:
     """Put the hand's root at the origin, fixed."""
     # Where some meshes live in memory, MuJoCo 4.0.0 puts the prefix into the file names of the others as well.
-    on_disk = {_PREFIX + mesh.name: mesh.file for mesh in hand.meshes if mesh.file and mesh.file not in hand.assets}
-    scene.attach(hand, prefix=_PREFIX, frame=scene.worldbody.add_frame())
+    on_disk = {PREFIX + mesh.name: mesh.file for mesh in hand.meshes if mesh.file and mesh.file not in hand.assets}
+    scene.attach(hand, prefix=PREFIX, frame=scene.worldbody.add_frame())
     for mesh in scene.meshes:
         mesh.file = on_disk.get(mesh.name, mesh.file)
 
@@ -151,10 +152,10 @@ def _add_servos(scene: mujoco.MjSpec, hand: Hand, protocol: Protocol) -> None:
     They are added to the scene, not to the hand, whose description may set defaults for actuators.
     """
     for joint in scene.joints:
-        if joint.name.removeprefix(_PREFIX) not in hand.tree.joint_names:
+        if joint.name.removeprefix(PREFIX) not in hand.tree.joint_names:
             continue
         lever = _lever(joint, protocol)
-        name = joint.name.removeprefix(_PREFIX)
+        name = joint.name.removeprefix(PREFIX)
         actuator = scene.add_actuator(name=name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.set_to_position(kp=protocol.stiffness / lever**2, kv=protocol.damping / lever**2)
         limit = protocol.force_limit / lever
@@ -198,8 +199,9 @@ def _add_object(scene: mujoco.MjSpec, obj: ObjectModel, protocol: Protocol) -> N
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"part{i}", condim=4, mass=0.0,
                       friction=[protocol.friction, protocol.torsional_friction, 1e-4])
-    inertia = obj.inertia / obj.volume * obj.mass
-    body.explicitinertial, body.mass, body.ipos = True, obj.mass, obj.centre_of_mass
+    mass = protocol.mass_factor * obj.mass
+    inertia = obj.inertia / obj.volume * mass
+    body.explicitinertial, body.mass, body.ipos = True, mass, obj.centre_of_mass
     body.fullinertia = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
 
 
@@ -229,7 +231,7 @@ def _exclude_resting_contacts(scene: mujoco.MjSpec, hand: Hand) -> None:
 
 def _joint_addresses(model: mujoco.MjModel, hand: Hand) -> tuple[np.ndarray, np.ndarray]:
     names = {model.joint(j).name: int(model.jnt_qposadr[j]) for j in range(model.njnt)}
-    pairs = [(names[_PREFIX + n], i) for i, n in enumerate(hand.tree.moving_names) if _PREFIX + n in names]
+    pairs = [(names[PREFIX + n], i) for i, n in enumerate(hand.tree.moving_names) if PREFIX + n in names]
     return np.array([a for a, _ in pairs], int), np.array([i for _, i in pairs], int)
 
 

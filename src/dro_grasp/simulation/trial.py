@@ -6,11 +6,11 @@ Source: paper, evaluation metric details.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
@@ -68,8 +68,9 @@ def settle(
 ) -> GraspBatch:
     """The same grasps relabelled with where hand and object are after closing.
 
-    The joints are those reached, held back by the contact, so that a label touches the surface instead of guessing.
-    A grasp whose simulation is unstable keeps its label.
+    Joints below which a link touches the object take the values reached, held back by the contact, so that a label
+    touches the surface instead of guessing; all others keep theirs, which the closing only drives towards a fist. A
+    grasp whose simulation is unstable keeps its label.
 
     Raises:
         ObjectError: The object is a bare point cloud.
@@ -83,12 +84,23 @@ def settle(
         stable = torch.from_numpy(rollout.close().stable)
         q, T = (torch.from_numpy(x) for x in rollout.poses())
         reached = q.to(grasps.joints.dtype).clamp(hand.tree.lower, hand.tree.upper)
+        held = stable[:, None] & _holding_joints(hand, touching_links(scene, rollout.qpos))
         T_object_wrist = torch.linalg.inv(torch.where(stable[:, None, None], T, torch.eye(4, dtype=T.dtype)))
-        joints.append(torch.where(stable[:, None], reached, chunk.joints))
+        joints.append(torch.where(held, reached, chunk.joints))
         poses.append(torch.where(stable[:, None, None], T_object_wrist.to(reached.dtype), chunk.T_object_wrist))
     return grasps.replace(
         T_object_wrist=torch.cat(poses), joints=torch.cat(joints), pregrasp_joints=None, squeeze_joints=None
     )
+
+
+def _holding_joints(hand: Hand, contact_links: Sequence[Sequence[str]]) -> Bool[Tensor, "n n_dof"]:
+    """Joints that move a link which touches the object."""
+    names = {name: i for i, name in enumerate(hand.tree.link_names)}
+    touching = torch.zeros(len(contact_links), hand.tree.n_links)
+    for row, links in zip(touching, contact_links, strict=True):
+        row[[names[link] for link in links if link in names]] = 1
+    moves = hand.tree.descends.float() @ (hand.tree.link_coupling != 0).float()
+    return touching @ moves > 0
 
 
 def record(

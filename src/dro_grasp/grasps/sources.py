@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dro_grasp.errors import HandError, ObjectError
+from dro_grasp.errors import GraspFileError, HandError, ObjectError
 
 if TYPE_CHECKING:
     from dro_grasp.grasps.batch import GraspBatch
@@ -71,6 +71,25 @@ def object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectMode
     except ObjectError as error:
         raise ObjectError(f"the grasps are of object '{grasps.object[0]}', which cannot be loaded ({error}); give its file "
                           "with --object, and --scale if it had one") from error
+
+
+def require_same(grasps: GraspBatch, hand: Hand, obj: ObjectModel) -> None:
+    """Refuse a hand or an object that has changed since the grasps were made for it.
+
+    Args:
+        grasps: Of one object.
+        hand: The hand found for them.
+        obj: The object found for them.
+
+    Raises:
+        GraspFileError: A hash differs.
+    """
+    for kind, name, stored, found in (
+        ("hand", hand.name, grasps.hand_sha256, hand.sha256), ("object", obj.name, grasps.object_sha256[0], obj.sha256)
+    ):
+        if stored and stored != found:
+            raise GraspFileError(f"the grasps were made for another version of {kind} '{name}' (hash {stored[:12]}, found "
+                                 f"{found[:12]}); bring that version back, or synthesise again")
 
 
 def _remembered(grasps: GraspBatch, column: str) -> str | None:

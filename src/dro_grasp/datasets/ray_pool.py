@@ -1,0 +1,113 @@
+"""Where shards are made: a Ray cluster of any number of machines.
+
+Files travel as bytes, so nodes need no shared folder; hands and objects that are given by path must lie at that path on
+every node, and every node needs the same version of dro-grasp.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+from dro_grasp.datasets.pools import Failed, Outcome, Work, failure_of
+from dro_grasp.datasets.production import Job, Task, make_shard
+from dro_grasp.errors import OptionError
+
+if TYPE_CHECKING:
+    import ray
+
+RETRIES = 3
+"""Times that Ray starts a shard again, elsewhere, when its process or node is gone. Shards are functions of their seed."""
+
+
+class RayPool:
+    """Tasks of a Ray cluster, one CPU each."""
+
+    def __init__(self, job: Job, workers: int, limit: float, address: str | None = None, work: Work = make_shard) -> None:
+        """Join a cluster, or start one on this machine where none is running.
+
+        Args:
+            job: What all shards share.
+            workers: Processes, where a cluster has to be started; a running one is used whole.
+            limit: A shard that takes longer is stopped [s].
+            address: Of the cluster's head, `host:port`; None takes what RAY_ADDRESS or `ray start` say.
+            work: Makes a shard.
+
+        Raises:
+            OptionError: Ray is not installed, or there is no cluster at the address.
+        """
+        try:
+            import ray
+        except ImportError as error:
+            raise OptionError("the engine 'ray' needs Ray: pip install 'dro-grasp[ray]'; or use --engine local") from error
+        self.limit, self.started_here = limit, False
+        if not ray.is_initialized():
+            self.started_here = True
+            _connect(address, workers)
+        self.ray = ray
+        self.job = ray.put(job)
+        options = {"num_cpus": 1, "max_retries": RETRIES, "scheduling_strategy": "SPREAD"}
+        self.start = ray.remote(**options)(_make(work))
+        self.running: dict[ray.ObjectRef, tuple[Task, float]] = {}
+
+    @property
+    def free(self) -> int:
+        """CPUs of the cluster as it is now, less the shards in flight; at least one may wait for a node to come."""
+        cpus = max(1, int(self.ray.cluster_resources().get("CPU", 0)))
+        return max(0, cpus - len(self.running))
+
+    def submit(self, task: Task) -> None:
+        """Hand a shard to the cluster."""
+        self.running[self.start.remote(self.job, task)] = (task, time.monotonic())
+
+    def wait(self, timeout: float) -> list[Outcome]:
+        """Shards made, errors, and shards whose machine is gone for good or that took too long."""
+        done, _ = self.ray.wait(list(self.running), num_returns=1, timeout=timeout)
+        outcomes = [self._collect(ref) for ref in done]
+        for ref in [r for r, (_, since) in self.running.items() if time.monotonic() - since > self.limit]:
+            self.ray.cancel(ref, force=True)
+            outcomes.append((self.running.pop(ref)[0], Failed(f"took longer than {self.limit:.0f} s", died=True)))
+        return outcomes
+
+    def close(self) -> None:
+        """Cancel what runs, and leave the cluster if this pool joined it."""
+        for ref in self.running:
+            self.ray.cancel(ref, force=True)
+        if self.started_here:
+            self.ray.shutdown()
+
+    def _collect(self, ref: ray.ObjectRef) -> Outcome:
+        task = self.running.pop(ref)[0]
+        try:
+            return task, self.ray.get(ref)
+        except self.ray.exceptions.RayError as error:
+            return task, Failed(f"its Ray worker was lost ({type(error).__name__})", died=True)
+
+
+def _connect(address: str | None, workers: int) -> None:
+    """Join the cluster at the address, or the one that is running, or a new one on this machine.
+
+    Raises:
+        OptionError: There is no cluster at the address given.
+    """
+    import ray
+
+    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+    try:
+        ray.init(address=address or "auto", **quiet)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        if address:
+            raise OptionError(f"no Ray cluster answers at {address} ({error}); start its head with `ray start --head`, and "
+                              "give the address that it prints") from error
+        ray.init(num_cpus=workers, include_dashboard=False, **quiet)
+
+
+def _make(work: Work) -> Any:
+    """The task: errors come back as values, so that Ray retries lost machines and nothing else."""
+    def make(job: Job, task: Task) -> Any:
+        try:
+            return work(job, task)
+        except Exception as error:
+            return failure_of(error)
+
+    return make

@@ -1,0 +1,66 @@
+"""What became of the candidates of a shard, a pair or a whole data set: numbers that add up."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Yield:
+    """Counts; every candidate is in exactly one of `ranked_out`, `deep`, `moved`, `failures`, `duplicates`, `valid`."""
+
+    candidates: int = 0
+    """Grasps synthesised."""
+    ranked_out: int = 0
+    """Of these, not tried because their energy was too high."""
+    deep: int = 0
+    """Not tried because they lie too deep in the object."""
+    moved: int = 0
+    """Not tried because closing moved the object too far."""
+    failures: dict[str, int] = field(default_factory=dict)
+    """Tried and failed, by reason."""
+    duplicates: int = 0
+    """Passed, but near-duplicates of an earlier grasp."""
+    valid: int = 0
+    """Passed and stored."""
+    cpu_seconds: float = 0.0
+    """Time of the process for all of it [s]; loading hand and object is not counted."""
+    preparation_seconds: float = 0.0
+    """Time of the process for loading hand and object, convex parts and grid included where not cached [s]."""
+
+    @property
+    def tried(self) -> int:
+        """Candidates that went through a trial."""
+        return sum(self.failures.values()) + self.duplicates + self.valid
+
+    @property
+    def per_cpu_hour(self) -> float:
+        """Valid grasps per hour of one core; 0 without any time."""
+        return 3600 * self.valid / self.cpu_seconds if self.cpu_seconds > 0 else 0.0
+
+    def __add__(self, other: Yield) -> Yield:
+        names = [f.name for f in dataclasses.fields(self) if f.name != "failures"]
+        sums = {name: getattr(self, name) + getattr(other, name) for name in names}
+        return Yield(**sums, failures=dict(Counter(self.failures) + Counter(other.failures)))
+
+    def main_obstacle(self) -> str:
+        """Where most candidates that might have been grasps were lost, in words."""
+        lost = self.failures | {
+            "hand too deep in the object": self.deep, "closing moves the object too far": self.moved,
+        }
+        reason = max(lost, key=lambda name: lost[name], default="")
+        share = lost[reason] / max(1, self.tried + self.deep + self.moved) if reason else 0.0
+        return f"{reason} ({share:.0%} of what was tried)" if share else "nothing was worth a trial"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return dataclasses.asdict(self)
+
+    @staticmethod
+    def from_dict(values: dict[str, Any]) -> Yield:
+        """The inverse of `to_dict`; entries of other versions are ignored."""
+        known = {f.name for f in dataclasses.fields(Yield)}
+        return Yield(**{name: value for name, value in values.items() if name in known})

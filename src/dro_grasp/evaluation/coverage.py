@@ -1,0 +1,139 @@
+"""How a data set's grasps spread: over palm directions, wrist rolls, grasp sizes and joints."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from dro_grasp.datasets.collections import PairGrasps
+from dro_grasp.datasets.yields import Yield
+from dro_grasp.evaluation.metrics import diversity
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.sources import hand_of
+from dro_grasp.hands.hand import Hand
+
+HALF_AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
+"""Order of the counts of palm directions: each counts for the half-axis it is nearest to."""
+ROLL_BINS = 8
+"""Sectors of 45 degrees in which wrist rolls are counted."""
+
+
+@dataclass(frozen=True)
+class PairCoverage:
+    """One hand on one object."""
+
+    object: str
+    made: Yield
+    half_axes: tuple[int, ...]
+    """Grasps whose palm looks along each of HALF_AXES."""
+    rolls: int
+    """Sectors of the wrist's roll that have a grasp, of ROLL_BINS."""
+    size: tuple[float, float]
+    """Smallest and largest grasp size [m]; NaN without grasps."""
+    fingers: tuple[int, int]
+    """Fewest and most links in contact after closing; zero where not recorded."""
+
+    @property
+    def reason(self) -> str:
+        """Why there is no grasp, empty where there is one."""
+        return "" if self.made.valid else self.made.main_obstacle()
+
+
+@dataclass(frozen=True)
+class HandCoverage:
+    """One hand on all its objects."""
+
+    hand: Hand
+    grasps: GraspBatch
+    pairs: tuple[PairCoverage, ...]
+    diversity: dict[str, float]
+    """The paper's measure, pooled over objects: all, wrist, joints."""
+
+    @property
+    def made(self) -> Yield:
+        """What became of all candidates."""
+        return sum((pair.made for pair in self.pairs), Yield())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "hand": self.grasps.hand, "grasps": len(self.grasps), "diversity": self.diversity,
+            "yield": self.made.to_dict(), "per_cpu_hour": self.made.per_cpu_hour,
+            "objects": [
+                {"object": p.object, "grasps": p.made.valid, "per_cpu_hour": p.made.per_cpu_hour, "rolls": p.rolls,
+                 "half_axes": dict(zip(HALF_AXES, p.half_axes, strict=True)), "size": list(p.size), "reason": p.reason}
+                for p in self.pairs
+            ],
+        }
+
+
+def measure_coverage(pairs: Iterable[PairGrasps]) -> list[HandCoverage]:
+    """Coverage of each hand of a data set.
+
+    Raises:
+        HandError: A hand cannot be loaded.
+    """
+    by_hand: dict[str, list[PairGrasps]] = {}
+    for pair in pairs:
+        by_hand.setdefault(pair.grasps.hand, []).append(pair)
+    return [_of_hand(group) for _, group in sorted(by_hand.items())]
+
+
+def _of_hand(pairs: list[PairGrasps]) -> HandCoverage:
+    hand = hand_of(next((p.grasps for p in pairs if len(p.grasps)), pairs[0].grasps), None)
+    grasps = GraspBatch.concatenate([p.grasps for p in pairs])
+    parts = tuple(_of_pair(hand, pair) for pair in sorted(pairs, key=lambda p: p.object))
+    return HandCoverage(hand, grasps, parts, diversity(grasps.T_object_wrist, grasps.joints))
+
+
+def _of_pair(hand: Hand, pair: PairGrasps) -> PairCoverage:
+    grasps = pair.grasps
+    counts = torch.bincount(half_axis(hand.palm_directions(grasps.T_object_wrist)), minlength=6)
+    sector = (wrist_rolls(hand, grasps) / (2 * math.pi) * ROLL_BINS).long() % ROLL_BINS
+    sizes = grasp_sizes(hand, grasps)
+    held = [len(links) for links in grasps.extra.get("contact_links", ()) if isinstance(links, list)]
+    return PairCoverage(
+        grasps.object[0] if len(grasps) else pair.object, pair.made, tuple(counts.tolist()), len(sector.unique()),
+        (float(sizes.min()), float(sizes.max())) if len(grasps) else (math.nan, math.nan),
+        (min(held, default=0), max(held, default=0)),
+    )
+
+
+def half_axis(directions: Float[Tensor, "n 3"]) -> Int[Tensor, " n"]:
+    """Index into HALF_AXES of the half-axis that each direction is nearest to."""
+    axis = directions.abs().argmax(-1)
+    return 2 * axis + (directions.gather(1, axis[:, None])[:, 0] < 0)
+
+
+def wrist_rolls(hand: Hand, grasps: GraspBatch) -> Float[Tensor, " n"]:
+    """Turn of each wrist about its palm direction, from 0 to 2 pi [rad].
+
+    Counted from the shortest rotation that brings the palm from where it looks in the wrist frame to where it looks now.
+    """
+    start, now = hand.palm_direction_wrist, hand.palm_directions(grasps.T_object_wrist)
+    side = torch.linalg.cross(start, start.new_tensor([1.0, 0, 0] if abs(start[0]) < 0.9 else [0, 1.0, 0]), dim=0)
+    side = side / side.norm()
+    axis = torch.linalg.cross(start.expand_as(now), now, dim=-1)
+    cosine = (start * now).sum(-1, keepdim=True)
+    # Rodrigues with sine and cosine in the axis; opposite directions have no shortest way, and any will do.
+    cross = torch.linalg.cross(axis, side.expand_as(axis), dim=-1)
+    carried = cosine * side + cross + axis * (axis * side).sum(-1, keepdim=True) / (1 + cosine).clamp_min(1e-6)
+    actual = grasps.T_object_wrist[:, :3, :3] @ side
+    sine = (torch.linalg.cross(carried, actual, dim=-1) * now).sum(-1)
+    return torch.atan2(sine, (carried * actual).sum(-1)) % (2 * math.pi)
+
+
+def grasp_sizes(hand: Hand, grasps: GraspBatch) -> Float[Tensor, " n"]:
+    """Largest distance between two fingertips of each grasp [m]: small for a pinch, large for a span."""
+    if not len(grasps):
+        return torch.zeros(0)
+    tips = torch.tensor(hand.tips)
+    poses = hand.tree.forward(grasps.joints)[:, tips]
+    points = (poses[..., :3, :3] @ hand.tip_offsets[..., None])[..., 0] + poses[..., :3, 3]
+    return torch.cdist(points, points).amax((-1, -2))

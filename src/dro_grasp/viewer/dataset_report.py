@@ -1,0 +1,210 @@
+"""A data set as one self-contained web page: yields, failures, coverage, spread, energies, and pictures of grasps."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from dro_grasp import __version__
+from dro_grasp.evaluation.coverage import HALF_AXES, ROLL_BINS, HandCoverage, PairCoverage, grasp_sizes, wrist_rolls
+from dro_grasp.files import check_output, replacing
+from dro_grasp.grasps.sources import object_of
+from dro_grasp.viewer.pictures import caption, contact_sheet, draw_grasp
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SHOWN = 8
+"""Grasps drawn for each hand, on different objects."""
+COLOUR, SECOND = "#2a788e", "#d1713b"
+STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; color: #282c34; max-width: 1180px; margin: 2em auto; padding: 0 1em }
+h1, h2 { font-weight: 600 } h2 { margin-top: 2.2em; border-top: 1px solid #ddd; padding-top: 1em }
+table { border-collapse: collapse; font-size: 13px; margin: 1em 0 } td, th { padding: 2px 8px; text-align: right }
+td:first-child, th:first-child, td:last-child.words { text-align: left } tr:nth-child(even) { background: #f6f7f8 }
+td.cell { min-width: 2.2em } img { max-width: 100% } p.note { color: #666 }
+"""
+
+
+def write_report(hands: Sequence[HandCoverage], path: Path, progress: Callable[[int, int], None] | None = None) -> None:
+    """Write the page.
+
+    Args:
+        hands: What to report.
+        path: HTML file.
+        progress: Called with (hands done, hands in all).
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    path = check_output(path)
+    sections = []
+    for i, hand in enumerate(hands):
+        sections.append(_section(hand))
+        if progress is not None:
+            progress(i + 1, len(hands))
+    total = sum(len(h.grasps) for h in hands)
+    text = (f"<!doctype html><meta charset=utf-8><title>Grasp data set</title><style>{STYLE}</style>"
+            f"<h1>{total:,} grasps of {len(hands)} hands</h1>{_overview(hands)}{''.join(sections)}"
+            f"<p class=note>dro-grasp {__version__}</p>")
+    with replacing(path) as temporary:
+        temporary.write_text(text)
+
+
+def _overview(hands: Sequence[HandCoverage]) -> str:
+    rows = [
+        [h.grasps.hand, len(h.grasps), len(h.pairs), sum(not p.made.valid for p in h.pairs), h.made.candidates, h.made.tried,
+         _percent(h.made.valid, h.made.tried), round(h.made.per_cpu_hour), *(f"{h.diversity[k]:.3f}" for k in h.diversity)]
+        for h in hands
+    ]
+    head = ["hand", "grasps", "objects", "without a grasp", "candidates", "tried", "of these valid", "per CPU-hour",
+            "diversity", "of the wrist", "of the joints"]
+    return _table(head, rows) + (
+        "<p class=note>Diversity: standard deviation over all grasps of each of x, y, z, roll, pitch, yaw and joints, then "
+        "the mean. Yields are those of the making; the data set may hold a choice of what was made.</p>")
+
+
+def _section(hand: HandCoverage) -> str:
+    name = html.escape(hand.grasps.hand)
+    parts = [f"<h2>{name}</h2>"]
+    if len(hand.grasps):
+        parts += [_image(_charts(hand), f"charts of {name}"), _picture(hand)]
+    return "".join([*parts, _failures(hand), _pair_table(hand)])
+
+
+def _charts(hand: HandCoverage) -> bytes:
+    """Palm directions, rolls, sizes, energies and joints in one figure."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 6.2), layout="constrained")
+    grid = figure.add_gridspec(2, 3)
+    _directions(figure.add_subplot(grid[0, 0], projection="mollweide"), hand)
+    rolls = figure.add_subplot(grid[0, 1])
+    rolls.hist(torch.rad2deg(wrist_rolls(hand.hand, hand.grasps)).tolist(), bins=24, range=(0, 360), color=COLOUR)
+    rolls.set(title="wrist roll about the palm direction", xlabel="[degrees]", xticks=range(0, 361, 90))
+    sizes = figure.add_subplot(grid[0, 2])
+    sizes.hist((100 * grasp_sizes(hand.hand, hand.grasps)).tolist(), bins=24, color=COLOUR)
+    sizes.set(title="grasp size: widest fingertip distance", xlabel="[cm]")
+    _energies(figure.add_subplot(grid[1, 0]), hand)
+    _joints(figure.add_subplot(grid[1, 1:]), hand)
+    return _png(figure)
+
+
+def _directions(axes: Axes, hand: HandCoverage) -> None:
+    d = hand.hand.palm_directions(hand.grasps.T_object_wrist)
+    axes.scatter(torch.atan2(d[:, 1], d[:, 0]), d[:, 2].clamp(-1, 1).asin(), s=4, alpha=0.4, color=COLOUR, linewidths=0)
+    for label, (x, y) in {"+x": (0, 0), "+y": (math.pi / 2, 0), "-y": (-math.pi / 2, 0), "+z": (0, math.pi / 2.05),
+                          "-z": (0, -math.pi / 2.05), "-x": (math.pi * 0.97, 0)}.items():
+        axes.annotate(label, (x, y), color=SECOND, weight="bold", ha="center", va="center")
+    axes.set(title="palm directions in the object's frame", xticklabels=[], yticklabels=[])
+    axes.grid(alpha=0.3)
+
+
+def _energies(axes: Axes, hand: HandCoverage) -> None:
+    terms = {k.removeprefix("energy_"): v for k, v in hand.grasps.extra.items() if k.startswith("energy_")}
+    if not terms:
+        axes.text(0.5, 0.5, "energies not recorded", ha="center", transform=axes.transAxes)
+        return
+    names = list(terms)
+    axes.boxplot([terms[n].tolist() for n in names], orientation="horizontal", showfliers=False, tick_labels=names,
+                 medianprops={"color": SECOND})
+    axes.set(title="energy terms, weighted")
+
+
+def _joints(axes: Axes, hand: HandCoverage) -> None:
+    tree, q = hand.hand.tree, hand.grasps.joints
+    low, high = (x.tolist() for x in (tree.lower, tree.upper))
+    places = range(tree.n_dof)
+    axes.vlines(places, low, high, color="#ccd", linewidth=7, label="limits")
+    quantiles = torch.quantile(q, torch.tensor([0.1, 0.5, 0.9]), dim=0)
+    axes.vlines(places, quantiles[0].tolist(), quantiles[2].tolist(), color=COLOUR, linewidth=4, label="10 to 90 %")
+    axes.plot(places, quantiles[1].tolist(), "o", color=SECOND, markersize=4, label="median")
+    axes.set_xticks(list(places), [n[:14] for n in tree.joint_names], rotation=60, ha="right", fontsize=7)
+    axes.set(title=f"joints; standard deviation {hand.diversity['joints']:.2f} on average", ylabel="[rad or m]")
+    axes.legend(fontsize=7)
+
+
+def _picture(hand: HandCoverage) -> str:
+    """Grasps on some of the objects, spread over the alphabet."""
+    names = [p.object for p in hand.pairs if p.made.valid]
+    chosen = [names[i * len(names) // min(SHOWN, len(names))] for i in range(min(SHOWN, len(names)))]
+    tiles, captions = [], []
+    for name in chosen:
+        row = hand.grasps.object.index(name)
+        grasps = hand.grasps[row]
+        tiles.append(draw_grasp(hand.hand, object_of(grasps, None, 1.0), grasps, 0))
+        captions.append((name, caption(grasps, 0)[1]))
+    sheet, file = contact_sheet(tiles, captions, f"{hand.grasps.hand}: grasps as stored"), io.BytesIO()
+    sheet.save(file, format="PNG")
+    return _image(file.getvalue(), f"grasps of {hand.grasps.hand}")
+
+
+def _failures(hand: HandCoverage) -> str:
+    made = hand.made
+    if not made.candidates:
+        return ""
+    rows = [["candidates", made.candidates, "100 %"], ["energy too high to try", made.ranked_out, None],
+            ["too deep in the object to try", made.deep, None], ["closing moved the object too far", made.moved, None],
+            *[[reason, n, None] for reason, n in sorted(made.failures.items(), key=lambda item: -item[1])],
+            ["near-duplicates", made.duplicates, None], ["valid", made.valid, None]]
+    return _table(["what became of candidates", "number", "share"], [
+        [name, n, share or _percent(n, made.candidates)] for name, n, share in rows
+    ])
+
+
+def _pair_table(hand: HandCoverage) -> str:
+    head = ["object", "grasps", "candidates", "per CPU-hour", *HALF_AXES, f"rolls of {ROLL_BINS}", "size [cm]",
+            "links in contact", "why none"]
+    return _table(head, [_pair_row(pair) for pair in hand.pairs])
+
+
+def _pair_row(pair: PairCoverage) -> list[object]:
+    size = "" if math.isnan(pair.size[0]) else f"{100 * pair.size[0]:.0f}-{100 * pair.size[1]:.0f}"
+    links = f"{pair.fingers[0]}-{pair.fingers[1]}" if pair.fingers[1] else ""
+    cells = [_Shade(n, max(pair.half_axes)) for n in pair.half_axes]
+    return [pair.object, pair.made.valid, pair.made.candidates or None, round(pair.made.per_cpu_hour) or None, *cells,
+            pair.rolls, size, links, pair.reason]
+
+
+class _Shade:
+    """A count that is shaded by its share of the largest."""
+
+    def __init__(self, count: int, largest: int) -> None:
+        self.count, self.share = count, count / max(1, largest)
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    body = "".join(f"<tr>{''.join(_cell(value) for value in row)}</tr>" for row in rows)
+    return f"<table><tr>{''.join(f'<th>{html.escape(h)}</th>' for h in head)}</tr>{body}</table>"
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, _Shade):
+        colour = f"rgba(42,120,142,{0.65 * value.share:.2f})" if value.count else "#f3d9cc"
+        return f'<td class=cell style="background:{colour}">{value.count}</td>'
+    if isinstance(value, str) and " " in value:
+        return f"<td class=words>{html.escape(value)}</td>"
+    text = "" if value is None else f"{value:,}" if isinstance(value, int) else html.escape(str(value))
+    return f"<td>{text}</td>"
+
+
+def _percent(part: int, whole: int) -> str:
+    return f"{part / whole:.0%}" if whole else ""
+
+
+def _image(png: bytes, description: str) -> str:
+    return f'<p><img alt="{html.escape(description)}" src="data:image/png;base64,{base64.b64encode(png).decode()}"></p>'
+
+
+def _png(figure: Figure) -> bytes:
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=100)
+    return file.getvalue()
