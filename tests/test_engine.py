@@ -123,7 +123,8 @@ def test_a_shard_of_another_version_is_named_and_made_again(tmp_path, monkeypatc
     assert len(GraspBatch.load(path)) == GRASPS
 
 
-@pytest.mark.parametrize(("hand", "obj", "reason"), [("broken", "x", "no hand is called"), ("a", "unsplit", "CoACD found none")])
+@pytest.mark.parametrize(
+    ("hand", "obj", "reason"), [("broken", "x", "no hand is called"), ("a", "unsplit", "CoACD found none")])
 def test_a_failing_pair_is_reported_and_the_others_go_on(tmp_path, hand, obj, reason):
     report, tasks, lines = run(tmp_path, [hand, "good"], [obj, "y"], 10)
     assert all(reason in why for why in report.failures.values())

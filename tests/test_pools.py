@@ -131,7 +131,7 @@ def small_disk(tmp_path):
 
 def test_a_full_disk_ends_the_run_clearly_and_loses_nothing(small_disk):
     folder, enlarge = small_disk
-    with pytest.raises(OutputError, match="No space left on device.*free some space"):
+    with pytest.raises(OutputError, match=r"No space left on device.*free some space"):
         synthesize_dataset(["a"], ["x", "y", "z"], 50, folder, progress=lambda _: None, make_pool=pool(engine_work.easy))
     before = whole(folder)
     assert before > 0

@@ -9,6 +9,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from dro_grasp.datasets.collections import read_collection
+    from dro_grasp.datasets.engine import synthesize_dataset
     from dro_grasp.errors import DroGraspError
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.grasps.synthesis import synthesize
@@ -30,8 +32,10 @@ _EXPORTS = {
     "TrialResult": "simulation.trial",
     "load_hand": "hands.library",
     "load_object": "objects.library",
+    "read_collection": "datasets.collections",
     "simulate": "simulation.trial",
     "synthesize": "grasps.synthesis",
+    "synthesize_dataset": "datasets.engine",
 }
 
 __all__ = [
@@ -44,8 +48,10 @@ __all__ = [
     "__version__",
     "load_hand",
     "load_object",
+    "read_collection",
     "simulate",
     "synthesize",
+    "synthesize_dataset",
 ]
 
 

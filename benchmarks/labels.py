@@ -1,0 +1,80 @@
+"""What labels and starts cost and buy: yield, spread and cleanness of grasps, with and without each choice of the engine.
+
+Settled labels are taken after the hand has closed on the object in simulation; wide starts have joints anywhere within
+their limits; idle fingers are left out of the contacts at random.
+
+    python benchmarks/labels.py [--candidates 128] [--json]
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import time
+
+import torch
+from report import emit
+from synthesis import HANDS, training_objects
+
+from dro_grasp.datasets.production import EngineConfig, valid_grasps
+from dro_grasp.evaluation.metrics import diversity
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.fingers import ContactConfig
+from dro_grasp.grasps.initial import StartConfig
+from dro_grasp.grasps.synthesis import SynthesisConfig
+from dro_grasp.hands.library import load_hand
+from dro_grasp.objects.library import load_object
+
+OBJECTS = 6
+"""Training objects, drawn with seed 1."""
+NARROW = StartConfig(openness=(0.45, 0.85), joint_noise=0.08)
+
+
+def choices(candidates: int) -> dict[str, EngineConfig]:
+    """Configurations by name."""
+    all_hold = ContactConfig(idle=0.0)
+    return {
+        "the engine's": EngineConfig(candidates=candidates),
+        "labels as synthesised": EngineConfig(candidates=candidates, settle=False),
+        "every finger holds": EngineConfig(candidates=candidates, synthesis=SynthesisConfig(contacts=all_hold)),
+        "narrow starts, every finger holds": EngineConfig(
+            candidates=candidates, synthesis=SynthesisConfig(starts=NARROW, contacts=all_hold)),
+    }
+
+
+def measure(hand_name: str, objects: list[str], config: EngineConfig) -> list[object]:
+    """Valid grasps, per CPU-hour, diversity with its parts, median penetration [mm]."""
+    hand, batches, seconds = load_hand(hand_name), [], 0.0
+    for name in objects:
+        obj = load_object(name)
+        _ = obj.grid, obj.parts
+        start = time.process_time()
+        grasps, _ = valid_grasps(hand, obj, 5, "strict", config)
+        seconds += time.process_time() - start
+        batches.append(grasps)
+    joined = GraspBatch.concatenate(batches)
+    spread = diversity(joined.T_object_wrist, joined.joints)
+    assert joined.penetration is not None
+    depth = float(joined.penetration.median()) * 1e3
+    return [len(joined), 3600 * len(joined) / seconds, *(f"{v:.3f}" for v in spread.values()), depth]
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--candidates", type=int, default=128, help="grasps synthesised for each pair")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    objects = random.Random(1).sample(training_objects(), OBJECTS)
+    rows = [
+        [hand, name, *measure(hand, objects, config)]
+        for hand in HANDS for name, config in choices(options.candidates).items()
+    ]
+    emit(f"{options.candidates} candidates on each of {OBJECTS} training objects", rows,
+         ["hand", "choice", "valid", "per CPU-hour", "diversity", "wrist", "joints", "penetration [mm]"],
+         {"rows": [[str(cell) for cell in row] for row in rows]}, options.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,40 @@
+"""What a second worker is worth: the same shards made by one process and by two, starting and loading included.
+
+python benchmarks/workers.py [--json]
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+
+from report import emit
+from synthesis import HANDS
+
+from dro_grasp.datasets.engine import DatasetReport, EngineConfig, synthesize_dataset
+
+OBJECTS = ("sphere", "can", "bottle", "mug")
+"""Built-in objects, one shard for each hand; their geometry is in the cache after the first run."""
+
+
+def run(workers: int) -> DatasetReport:
+    """One shard of every pair."""
+    with tempfile.TemporaryDirectory() as folder:
+        return synthesize_dataset(HANDS, OBJECTS, 1, Path(folder) / "data", workers, config=EngineConfig(barren_rounds=1))
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    options = parser.parse_args()
+    run(2)
+    reports = {workers: run(workers) for workers in (1, 2)}
+    rows = [[n, r.shards, r.grasps, r.seconds, reports[1].seconds / r.seconds] for n, r in reports.items()]
+    emit("The same shards by one worker and by two", rows, ["workers", "shards", "grasps", "time [s]", "times faster"],
+         {"speedup_of_two": reports[1].seconds / reports[2].seconds}, options.json)
+
+
+if __name__ == "__main__":
+    main()
