@@ -200,6 +200,13 @@ def test_impossible_requests_are_refused_before_the_work(tmp_path):
             synthesize_dataset(["a"], ["x"], goal, folder, make_pool=HerePool)
 
 
+def test_a_missing_gpu_is_told_at_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    config = EngineConfig(synthesis=SynthesisConfig(device="cuda"))
+    with pytest.raises(OptionError, match="finds no CUDA device; use --device cpu"):
+        synthesize_dataset(["a"], ["x"], 1, tmp_path, config=config)
+
+
 def test_real_shards_hold_valid_grasps_repeat_and_add_up(tmp_path):
     report, tasks, _ = run(tmp_path, ["barrett"], ["can"], 12, make_shard, config=TINY)
     assert not report.failures

@@ -68,7 +68,7 @@ def test_merged_files_are_collections_with_their_yields(folders, tmp_path, capsy
     pairs = {p.object: p for p in read_collection(out)}
     assert {name: len(p.grasps) for name, p in pairs.items()} == {"can": 5, "sphere": 5}
     assert pairs["sphere"].made.failures == {"slipped": 6}
-    assert pairs["sphere"].made.valid == 5
+    assert pairs["sphere"].made.valid == 12 + 12 + 8  # as the shards' files say, failures included
     assert "reason" not in pairs["can"].grasps.extra
     assert main(["dataset", "info", str(out), "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"total": 10, "hands": {"gripper3": {"can": 5, "sphere": 5}}}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -57,6 +58,18 @@ def test_a_node_that_dies_costs_nothing(tmp_path):
     shards = find_shards(tmp_path / "data")
     assert len({(s.hand, s.object, s.round) for s in shards}) == len(shards) == 24
     assert sum(len(GraspBatch.load(s.path(tmp_path / "data"))) for s in shards) == 120
+
+
+def test_an_address_where_nobody_listens_is_told_at_once():
+    pytest.importorskip("ray")
+    from dro_grasp.datasets.engine import EngineConfig
+    from dro_grasp.datasets.ray_pool import RayPool
+
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))  # and not listening
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(OptionError, match=f"no Ray cluster answers at {address}.*ray start --head"):
+            RayPool(Job(0, "strict", EngineConfig()), 1, 60.0, address)
 
 
 def test_without_ray_the_engine_says_what_to_install(monkeypatch):

@@ -46,6 +46,6 @@ class Report:
                     note="" if self.output is None else f"page: {self.output}")
         for h in hands:
             for pair in h.pairs:
-                if not pair.made.valid:
+                if not pair.grasps:
                     say_aside(f"{h.grasps.hand} on {pair.object}: no grasp, {pair.reason}")
         return 0

@@ -33,9 +33,9 @@ class Synthesize:
     workers: int = 2
     """Processes of one thread each; on a running Ray cluster, all of its CPUs are used instead."""
     engine: Literal["local", "ray"] = "local"
-    """Where the work is done: processes of this machine, or a Ray cluster (the running one, or a new one here)."""
-    ray_address: Annotated[str | None, optional("HOST:PORT", "RAY_ADDRESS, or the running one")] = None
-    """Head of the Ray cluster."""
+    """Where the work is done: processes of this machine, or a Ray cluster."""
+    ray_address: Annotated[str | None, optional("HOST:PORT", "RAY_ADDRESS, or a new one here")] = None
+    """Head of the Ray cluster; `auto` for the one that runs on this machine."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where energies are computed; trials always run on the CPU."""
     scale: float = 1.0

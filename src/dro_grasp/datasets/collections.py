@@ -27,7 +27,8 @@ class PairGrasps:
     grasps: GraspBatch
     """May be none."""
     made: Yield
-    """What became of their candidates; only `valid` where the files do not say."""
+    """What became of their candidates when they were made; a merged file may hold a choice of the valid ones, and of
+    grasps from elsewhere only `valid` is known."""
 
 
 def read_collection(path: Path | str, only_successful: bool = True) -> Iterator[PairGrasps]:
@@ -87,7 +88,8 @@ def _pairs_of_file(path: Path) -> Iterator[PairGrasps]:
     yields = (read_footer(path)[1].get("notes") or {}).get(YIELDS) or {}
     for obj in dict.fromkeys((*grasps.object, *yields)):
         part = rows_of(grasps, obj)
-        yield PairGrasps(grasps.hand, obj, part, replace(Yield.from_dict(yields.get(obj) or {}), valid=len(part)))
+        made = Yield.from_dict(yields[obj]) if obj in yields else Yield(valid=len(part))
+        yield PairGrasps(grasps.hand, obj, part, made)
 
 
 def _pairs_of_shards(folder: Path) -> Iterator[PairGrasps]:

@@ -14,6 +14,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import torch
+
 from dro_grasp.datasets.pools import Failed, LocalPool, Outcome, Pool
 from dro_grasp.datasets.production import EngineConfig, Job, Task
 from dro_grasp.datasets.records import Shard, find_shards, read_yield, remove_leftovers, sole_run
@@ -116,12 +118,14 @@ def synthesize_dataset(
         make_pool: Where shards are made; None makes them in processes of this machine.
 
     Raises:
-        OptionError: A number is not positive.
+        OptionError: A number is not positive, or this machine lacks the device.
         OutputError: The folder cannot be made or written, or another run is filling it.
     """
     if grasps_per_pair < 1 or workers < 1:
         raise OptionError(f"grasps_per_pair is {grasps_per_pair}, workers {workers}; both must be at least 1")
     config = config or EngineConfig()
+    if make_pool is None:
+        require_device(config.synthesis.device)
     folder = make_folder(output_dir)
     say = progress or (lambda line: print(line, file=sys.stderr, flush=True))
     with sole_run(folder):
@@ -134,6 +138,17 @@ def synthesize_dataset(
     total = sum(s.grasps for s in states.values())
     failures = {pair: s.error for pair, s in states.items() if s.error}
     return DatasetReport(total, total - before, shards, time.perf_counter() - started, failures)
+
+
+def require_device(device: str) -> None:
+    """Refuse a device that this machine lacks.
+
+    Raises:
+        OptionError: There is no such device here.
+    """
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise OptionError(f"device is '{device}', but torch {torch.__version__} finds no CUDA device; use --device cpu, which "
+                          "needs none, or install a build of torch with CUDA")
 
 
 def make_folder(path: Path | str) -> Path:

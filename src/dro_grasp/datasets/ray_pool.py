@@ -6,6 +6,8 @@ every node, and every node needs the same version of dro-grasp.
 
 from __future__ import annotations
 
+import os
+import socket
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +18,10 @@ from dro_grasp.errors import OptionError
 if TYPE_CHECKING:
     import ray
 
+CONNECT_TIME = 5.0
+"""Longest wait for a cluster's head to accept a connection [s]."""
+GPU_SHARE = 0.25
+"""Share of a GPU that a shard takes when energies are computed there: trials, on the CPU, take most of its time."""
 RETRIES = 3
 """Times that Ray starts a shard again, elsewhere, when its process or node is gone. Shards are functions of their seed."""
 
@@ -24,13 +30,14 @@ class RayPool:
     """Tasks of a Ray cluster, one CPU each."""
 
     def __init__(self, job: Job, workers: int, limit: float, address: str | None = None, work: Work = make_shard) -> None:
-        """Join a cluster, or start one on this machine where none is running.
+        """Join a cluster, or start one on this machine.
 
         Args:
             job: What all shards share.
             workers: Processes, where a cluster has to be started; a running one is used whole.
             limit: A shard that takes longer is stopped [s].
-            address: Of the cluster's head, `host:port`; None takes what RAY_ADDRESS or `ray start` say.
+            address: Of the cluster's head, `host:port`, or `auto` for the one that runs here; None takes RAY_ADDRESS, and
+                without it starts a cluster on this machine.
             work: Makes a shard.
 
         Raises:
@@ -43,10 +50,12 @@ class RayPool:
         self.limit, self.started_here = limit, False
         if not ray.is_initialized():
             self.started_here = True
-            _connect(address, workers)
+            _connect(address or os.environ.get("RAY_ADDRESS"), workers)
         self.ray = ray
         self.job = ray.put(job)
-        options = {"num_cpus": 1, "max_retries": RETRIES, "scheduling_strategy": "SPREAD"}
+        options: dict[str, Any] = {"num_cpus": 1, "max_retries": RETRIES, "scheduling_strategy": "SPREAD"}
+        if job.config.synthesis.device != "cpu":
+            options["num_gpus"] = GPU_SHARE
         self.start = ray.remote(**options)(_make(work))
         self.running: dict[ray.ObjectRef, tuple[Task, float]] = {}
 
@@ -85,21 +94,34 @@ class RayPool:
 
 
 def _connect(address: str | None, workers: int) -> None:
-    """Join the cluster at the address, or the one that is running, or a new one on this machine.
+    """Join the cluster at the address, or start one on this machine where there is no address.
 
     Raises:
-        OptionError: There is no cluster at the address given.
+        OptionError: There is no cluster at the address.
     """
     import ray
 
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+    if address is None:
+        ray.init(address="local", num_cpus=workers, include_dashboard=False, **quiet)
+        return
     try:
-        ray.init(address=address or "auto", **quiet)
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        if address:
-            raise OptionError(f"no Ray cluster answers at {address} ({error}); start its head with `ray start --head`, and "
-                              "give the address that it prints") from error
-        ray.init(num_cpus=workers, include_dashboard=False, **quiet)
+        _knock(address)
+        ray.init(address=address, **quiet)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise OptionError(f"no Ray cluster answers at {address} ({error}); start its head with `ray start --head`, and "
+                          "give the address that it prints") from error
+
+
+def _knock(address: str) -> None:
+    """Find out in seconds whether anybody listens at `host:port`; Ray itself waits for minutes.
+
+    Raises:
+        OSError: Nobody does.
+    """
+    host, _, port = address.rpartition(":")
+    if host and port.isdecimal():
+        socket.create_connection((host, int(port)), CONNECT_TIME).close()
 
 
 def _make(work: Work) -> Any:

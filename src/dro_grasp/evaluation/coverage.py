@@ -29,7 +29,10 @@ class PairCoverage:
     """One hand on one object."""
 
     object: str
+    grasps: int
+    """In the data set."""
     made: Yield
+    """What became of the candidates in the making, of which the data set may hold a choice."""
     half_axes: tuple[int, ...]
     """Grasps whose palm looks along each of HALF_AXES."""
     rolls: int
@@ -42,7 +45,7 @@ class PairCoverage:
     @property
     def reason(self) -> str:
         """Why there is no grasp, empty where there is one."""
-        return "" if self.made.valid else self.made.main_obstacle()
+        return "" if self.grasps else self.made.main_obstacle()
 
 
 @dataclass(frozen=True)
@@ -66,8 +69,9 @@ class HandCoverage:
             "hand": self.grasps.hand, "grasps": len(self.grasps), "diversity": self.diversity,
             "yield": self.made.to_dict(), "per_cpu_hour": self.made.per_cpu_hour,
             "objects": [
-                {"object": p.object, "grasps": p.made.valid, "per_cpu_hour": p.made.per_cpu_hour, "rolls": p.rolls,
-                 "half_axes": dict(zip(HALF_AXES, p.half_axes, strict=True)), "size": list(p.size), "reason": p.reason}
+                {"object": p.object, "grasps": p.grasps, "yield": p.made.to_dict(), "per_cpu_hour": p.made.per_cpu_hour,
+                 "half_axes": dict(zip(HALF_AXES, p.half_axes, strict=True)), "rolls": p.rolls, "size": list(p.size),
+                 "reason": p.reason}
                 for p in self.pairs
             ],
         }
@@ -99,7 +103,7 @@ def _of_pair(hand: Hand, pair: PairGrasps) -> PairCoverage:
     sizes = grasp_sizes(hand, grasps)
     held = [len(links) for links in grasps.extra.get("contact_links", ()) if isinstance(links, list)]
     return PairCoverage(
-        grasps.object[0] if len(grasps) else pair.object, pair.made, tuple(counts.tolist()), len(sector.unique()),
+        grasps.object[0] if len(grasps) else pair.object, len(grasps), pair.made, tuple(counts.tolist()), len(sector.unique()),
         (float(sizes.min()), float(sizes.max())) if len(grasps) else (math.nan, math.nan),
         (min(held, default=0), max(held, default=0)),
     )

@@ -61,7 +61,7 @@ def write_report(hands: Sequence[HandCoverage], path: Path, progress: Callable[[
 
 def _overview(hands: Sequence[HandCoverage]) -> str:
     rows = [
-        [h.grasps.hand, len(h.grasps), len(h.pairs), sum(not p.made.valid for p in h.pairs), h.made.candidates, h.made.tried,
+        [h.grasps.hand, len(h.grasps), len(h.pairs), sum(not p.grasps for p in h.pairs), h.made.candidates, h.made.tried,
          _percent(h.made.valid, h.made.tried), round(h.made.per_cpu_hour), *(f"{h.diversity[k]:.3f}" for k in h.diversity)]
         for h in hands
     ]
@@ -134,7 +134,7 @@ def _joints(axes: Axes, hand: HandCoverage) -> None:
 
 def _picture(hand: HandCoverage) -> str:
     """Grasps on some of the objects, spread over the alphabet."""
-    names = [p.object for p in hand.pairs if p.made.valid]
+    names = [p.object for p in hand.pairs if p.grasps]
     chosen = [names[i * len(names) // min(SHOWN, len(names))] for i in range(min(SHOWN, len(names)))]
     tiles, captions = [], []
     for name in chosen:
@@ -170,7 +170,7 @@ def _pair_row(pair: PairCoverage) -> list[object]:
     size = "" if math.isnan(pair.size[0]) else f"{100 * pair.size[0]:.0f}-{100 * pair.size[1]:.0f}"
     links = f"{pair.fingers[0]}-{pair.fingers[1]}" if pair.fingers[1] else ""
     cells = [_Shade(n, max(pair.half_axes)) for n in pair.half_axes]
-    return [pair.object, pair.made.valid, pair.made.candidates or None, round(pair.made.per_cpu_hour) or None, *cells,
+    return [pair.object, pair.grasps, pair.made.candidates or None, round(pair.made.per_cpu_hour) or None, *cells,
             pair.rolls, size, links, pair.reason]
 
 

@@ -1,0 +1,49 @@
+"""The counts of docs/data-card.md, from the files themselves, as Markdown.
+
+Run it as `python benchmarks/data_card.py [data/grasps]`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from pathlib import Path
+
+from report import ROOT
+
+from dro_grasp.datasets.collections import read_collection
+from dro_grasp.datasets.yields import Yield
+from dro_grasp.evaluation.coverage import measure_coverage
+
+COLUMNS = ("hand", "grasps", "train", "few_shot", "validate", "objects", "fewest", "without", "of tried valid [%]",
+           "per CPU-hour", "diversity", "wrist", "joints", "all six half-axes [%]", "kB")
+
+
+def row(path: Path) -> list[str]:
+    """One file's counts."""
+    (hand,) = measure_coverage(read_collection(path))
+    made: Yield = hand.made
+    counts = [p.grasps for p in hand.pairs]
+    splits = Counter(hand.grasps.split)
+    cells = [hand.grasps.hand, len(hand.grasps), splits["train"], splits["few_shot"], splits["validate"], len(counts),
+             min(counts), sum(c == 0 for c in counts), f"{100 * made.valid / max(1, made.tried):.0f}",
+             f"{made.per_cpu_hour:,.0f}", *(f"{v:.3f}" for v in hand.diversity.values()),
+             f"{100 * sum(min(p.half_axes) > 0 for p in hand.pairs) / len(hand.pairs):.0f}", path.stat().st_size // 1000]
+    return [f"{c:,}" if isinstance(c, int) else c for c in cells]
+
+
+def main() -> None:
+    """Print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "data" / "grasps", help="merged files")
+    folder = parser.parse_args().folder
+    print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
+    files = sorted(folder.glob("*.parquet"))
+    for path in files:
+        print(f"| {' | '.join(row(path))} |")
+    print(f"\n{sum(len(p.grasps) for p in read_collection(folder)):,} grasps, "
+          f"{sum(path.stat().st_size for path in files) / 1e6:.1f} MB")
+
+
+if __name__ == "__main__":
+    main()
