@@ -231,6 +231,18 @@ def test_real_shards_hold_valid_grasps_repeat_and_add_up(tmp_path):
     assert torch.equal(again.joints, GraspBatch.load(Shard("barrett", "can", 0).path(tmp_path)).joints)
 
 
+@pytest.mark.slow
+def test_the_same_command_makes_the_same_grasps_however_many_work(tmp_path):
+    found = []
+    for workers in (1, 2):
+        folder = tmp_path / str(workers)
+        synthesize_dataset(["barrett"], ["can", "sphere"], 8, folder, workers, config=TINY, progress=lambda _: None)
+        found.append([GraspBatch.load(shard.path(folder)) for shard in find_shards(folder)])
+    for one, two in zip(*found, strict=True):
+        assert torch.equal(one.joints, two.joints)
+        assert torch.equal(one.T_object_wrist, two.T_object_wrist)
+
+
 def test_settled_labels_move_only_joints_that_hold(tmp_path):
     from dro_grasp.simulation.trial import settle, simulate
 

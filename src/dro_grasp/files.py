@@ -30,6 +30,26 @@ def check_output(path: Path | str) -> Path:
     return path
 
 
+def make_folder(path: Path | str) -> Path:
+    """A folder to write into, made when only itself is missing.
+
+    Raises:
+        OutputError: Its parent is missing, it is a file, or there is no permission.
+    """
+    path = Path(path)
+    if path.exists() and not path.is_dir():
+        raise OutputError(f"cannot write into {path}: it is a file; give a folder")
+    if not path.absolute().parent.is_dir():
+        raise OutputError(f"cannot make {path}: no folder {path.absolute().parent}; create it first")
+    try:
+        path.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot make {path}: {error.strerror}; choose another folder") from error
+    if not os.access(path, os.W_OK):
+        raise OutputError(f"cannot write into {path}: no permission; choose another folder")
+    return path
+
+
 @contextmanager
 def replacing(path: Path, what: str = "") -> Iterator[Path]:
     """A temporary path beside `path`, which takes its place when the block has written it; a failure leaves nothing.

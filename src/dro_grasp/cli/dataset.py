@@ -55,8 +55,8 @@ class Merge:
 
     def run(self) -> int:
         """Merge, then write all files."""
-        from dro_grasp.datasets.engine import make_folder
         from dro_grasp.datasets.merging import file_name, merge
+        from dro_grasp.files import make_folder
 
         folder = make_folder(self.output)
         rows = []

@@ -83,8 +83,8 @@ class Filter:
         """Try, keep, write one file a hand."""
         from dro_grasp.datasets.checking import keep_passing
         from dro_grasp.datasets.collections import read_collection
-        from dro_grasp.datasets.engine import make_folder
         from dro_grasp.datasets.merging import file_name
+        from dro_grasp.files import make_folder
         from dro_grasp.grasps.batch import GraspBatch
         from dro_grasp.simulation.protocols import changed
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -20,7 +19,8 @@ from dro_grasp.datasets.pools import Failed, LocalPool, Outcome, Pool
 from dro_grasp.datasets.production import EngineConfig, Job, Task
 from dro_grasp.datasets.records import Shard, find_shards, read_yield, remove_leftovers, sole_run
 from dro_grasp.datasets.yields import Yield
-from dro_grasp.errors import GraspFileError, OptionError, OutputError
+from dro_grasp.errors import GraspFileError, OptionError
+from dro_grasp.files import make_folder
 
 __all__ = ["DatasetReport", "EngineConfig", "synthesize_dataset"]
 
@@ -149,26 +149,6 @@ def require_device(device: str) -> None:
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise OptionError(f"device is '{device}', but torch {torch.__version__} finds no CUDA device; use --device cpu, which "
                           "needs none, or install a build of torch with CUDA")
-
-
-def make_folder(path: Path | str) -> Path:
-    """The output folder, made when only itself is missing.
-
-    Raises:
-        OutputError: Its parent is missing, it is a file, or there is no permission.
-    """
-    path = Path(path)
-    if path.exists() and not path.is_dir():
-        raise OutputError(f"cannot write into {path}: it is a file; give a folder")
-    if not path.absolute().parent.is_dir():
-        raise OutputError(f"cannot make {path}: no folder {path.absolute().parent}; create it first")
-    try:
-        path.mkdir(exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot make {path}: {error.strerror}; choose another folder") from error
-    if not os.access(path, os.W_OK):
-        raise OutputError(f"cannot write into {path}: no permission; choose another folder")
-    return path
 
 
 def resume(folder: Path, states: dict[Pair, PairState], say: Callable[[str], None]) -> None:
