@@ -35,7 +35,7 @@ class EngineConfig:
     """Smallest later shard."""
     largest_shard: int = 768
     """Largest later shard."""
-    tried_share: float = 0.34
+    tried_share: float = 0.7
     """Share of them, lowest energy first, that are tried in simulation."""
     deepest: float = 0.01
     """Candidates that penetrate deeper than this by the signed distances are not tried [m]."""

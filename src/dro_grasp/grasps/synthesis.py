@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dro_grasp import __version__
 from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.field import DistanceField
@@ -18,7 +19,7 @@ from dro_grasp.grasps.initial import StartConfig, starts
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 
-PROVENANCE = "synthesis 1"
+PROVENANCE = f"dro-grasp {__version__}, synthesis 2"
 """What synthesised grasps say of their making; counts up when the method changes."""
 
 
@@ -26,10 +27,8 @@ PROVENANCE = "synthesis 1"
 class SynthesisConfig:
     """The optimiser. Source of the scheme: DexGraspNet's annealed Langevin steps; the numbers are ours."""
 
-    steps: int | None = None
-    """Steps; None takes `steps_per_contact` times the number of contacts beyond the third."""
-    steps_per_contact: int = 200
-    """See `steps`: hands with more fingers need longer."""
+    steps: int = 120
+    """Steps. Longer descents lower the energy further and yield less an hour, since simulation settles the grasps."""
     batch_size: int = 128
     """Grasps optimised at once; the result of a seed depends on it."""
     translation_step: float = 0.003
@@ -188,9 +187,8 @@ def optimise(
     contacts = energy.candidates.draw(n, generator).to(device).gather(1, slots)
     state = State(T, q, contacts, slots, energy(T, q, contacts))
     squares = _squares(state.result)
-    steps = config.steps or config.steps_per_contact * max(1, contacts.shape[1] - 3)
-    for step in range(steps):
-        left = 1 - step / steps
+    for step in range(config.steps):
+        left = 1 - step / config.steps
         pace = config.last_step + (1 - config.last_step) * left
         temperature = config.last_temperature * (config.temperature / config.last_temperature) ** left
         proposal = propose(energy, state, squares, pace, config, generator)
