@@ -11,7 +11,7 @@ import os
 import re
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -102,13 +102,16 @@ def sole_run(folder: Path) -> Iterator[None]:
     with (folder / LOCK).open("a+") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
+        except BlockingIOError as error:
             lock.seek(0)
             raise OutputError(f"another run is filling {folder} (process {lock.read().strip() or 'unknown'}); wait for it, or "
                               "give another folder and join both with `dro-grasp dataset merge`") from error
-        lock.truncate(0)
-        lock.write(str(os.getpid()))
-        lock.flush()
+        except OSError:
+            pass  # a file system without locks
+        with suppress(OSError):  # a full disk is told by what needs the space
+            lock.truncate(0)
+            lock.write(str(os.getpid()))
+            lock.flush()
         yield
 
 
