@@ -99,19 +99,18 @@ def sole_run(folder: Path) -> Iterator[None]:
     Raises:
         OutputError: Another run is filling the folder.
     """
-    with (folder / LOCK).open("a+") as lock:
+    with (folder / LOCK).open("ab+", buffering=0) as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             lock.seek(0)
-            raise OutputError(f"another run is filling {folder} (process {lock.read().strip() or 'unknown'}); wait for it, or "
+            raise OutputError(f"another run is filling {folder} (process {lock.read().decode() or 'unknown'}); wait for it, or "
                               "give another folder and join both with `dro-grasp dataset merge`") from error
         except OSError:
             pass  # a file system without locks
         with suppress(OSError):  # a full disk is told by what needs the space
             lock.truncate(0)
-            lock.write(str(os.getpid()))
-            lock.flush()
+            lock.write(str(os.getpid()).encode())
         yield
 
 
