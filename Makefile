@@ -1,10 +1,10 @@
-# make setup | demo | test | lint | docs-pictures | clean
+# make setup | demo | test | lint | docs-pictures | data | clean
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo test lint docs-pictures clean
+.PHONY: setup demo test lint docs-pictures data clean
 
 setup: $(STAMP)
 
@@ -30,6 +30,18 @@ lint: setup
 
 docs-pictures: setup
 	$(BIN)/dro-grasp generate --hand allegro --object rubber_duck --num 16 --seed 0 --picture docs/pictures/grasps.png
+
+PAPER_HANDS := assets/barrett_multidex assets/allegro_left assets/shadowhand assets/leaphand
+OTHER_HANDS := allegro barrett gripper3 leaphand shadowhand assets/allegro_right
+HELD_OUT_HANDS := assets/inspire assets/ability assets/dclaw assets/ezgripper assets/orca
+PAPER_OBJECTS := assets:train assets:validate
+
+data: setup  # hours; needs DRO_GRASP_ASSETS; can be stopped and started again
+	mkdir -p out
+	$(BIN)/dro-grasp synthesize --hand $(PAPER_HANDS) $(OTHER_HANDS) --object $(PAPER_OBJECTS) --grasps 150 --output out/data
+	$(BIN)/dro-grasp synthesize --hand $(HELD_OUT_HANDS) --object $(PAPER_OBJECTS) --grasps 50 --output out/held_out
+	$(BIN)/dro-grasp dataset merge out/data --output data/grasps --per-pair 150
+	$(BIN)/dro-grasp dataset merge out/held_out --output data/grasps --per-pair 50
 
 clean:
 	rm -rf out build dist

@@ -214,3 +214,16 @@ def test_assets_load_with_parts_that_fill_them(assets_folder: Path, name: str):
     hulls = sum(trimesh.convex.convex_hull(vertices).volume for vertices, _ in obj.parts)
     assert hulls == pytest.approx(obj.volume, rel=0.25)
     assert obj.cloud.shape == obj.cloud_normals.shape == (16384, 3)
+
+
+def test_groups_stand_for_their_members(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, without_assets: None):
+    test = resolve_objects(["builtin:test", "mug"])
+    assert test == [*sorted(n for n, kind in BUILTIN.items() if kind.split == "test"), "mug"]
+    with pytest.raises(ObjectError, match="no object is in 'assets:train'; set DRO_GRASP_ASSETS"):
+        resolve_objects(["assets:train"])
+    monkeypatch.setenv("DRO_GRASP_ASSETS", str(small_assets(tmp_path)))
+    splits = {name: split for name, split in object_names().items() if name not in BUILTIN}
+    for split in set(splits.values()):
+        assert resolve_objects([f"assets:{split}"]) == sorted(n for n, s in splits.items() if s == split)
+    with pytest.raises(ObjectError, match="no object is in 'builtin:nonsense'"):
+        resolve_objects(["builtin:nonsense"])

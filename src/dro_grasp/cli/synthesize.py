@@ -25,7 +25,7 @@ class Synthesize:
     hand: tuple[str, ...]
     """Hands: names or paths."""
     object: tuple[str, ...]
-    """Objects: names, meshes, or folders of meshes."""
+    """Objects: names, meshes, folders of meshes, or groups such as builtin:train and assets:validate."""
     output: Path
     """Folder for the grasp files; its parent must exist."""
     grasps: int = 150

@@ -6,6 +6,7 @@ import difflib
 import json
 import math
 import os
+import re
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     import trimesh
 
 ASSET_PREFIX = "assets/"
+GROUP = re.compile(r"(builtin|assets):(\w+)")
+"""A group of objects: where they come from, and their split."""
 MESH_SUFFIXES = {".obj", ".stl", ".ply", ".glb", ".gltf", ".off", ".dae", ".npy", ".pcd", ".3mf"}
 """Files that count as objects in a folder."""
 
@@ -59,13 +62,16 @@ def object_names() -> dict[str, str]:
 
 
 def resolve_objects(names: list[str]) -> list[str]:
-    """Names with folders replaced by the object files in them.
+    """Names with folders replaced by the object files in them, and groups such as `assets:train` by their members.
 
     Raises:
-        ObjectError: A folder holds no object.
+        ObjectError: A folder or a group holds no object.
     """
     found: list[str] = []
     for name in names:
+        if (group := GROUP.fullmatch(name)) is not None:
+            found.extend(_members(group[1], group[2]))
+            continue
         folder = Path(name).expanduser()
         if name in BUILTIN or not folder.is_dir():
             found.append(name)
@@ -75,6 +81,16 @@ def resolve_objects(names: list[str]) -> list[str]:
             raise ObjectError(f"folder {folder} holds no mesh or point cloud ({', '.join(sorted(MESH_SUFFIXES))})")
         found.extend(files)
     return found
+
+
+def _members(source: str, split: str) -> list[str]:
+    """Objects of a split, sorted."""
+    names = BUILTIN if source == "builtin" else _assets()
+    members = sorted(name for name, kind in object_names().items() if name in names and kind == split)
+    if not members:
+        where = "" if source == "builtin" or _assets() else "; set DRO_GRASP_ASSETS to the assets folder"
+        raise ObjectError(f"no object is in '{source}:{split}'{where} (`dro-grasp objects` lists all with their split)")
+    return members
 
 
 def _assets() -> dict[str, dict[str, Any]]:
