@@ -193,8 +193,20 @@ def test_field_within_a_voxel_is_consistent(beyond_the_grid):
     assert (model.bend.abs().amax((-1, -2)) > 1).any() != beyond_the_grid  # [1/m]
 
 
+def test_cloud_field_has_its_gradient_beyond_the_rims_as_well():
+    normals = unit(random(8, 3))
+    cloud = CloudField.of(RADIUS * normals, normals)
+    points = random(400, 3, seed=4, scale=2 * RADIUS)
+    model = cloud.normals(points)
+    found = numeric(lambda p: cloud.distances(p)[0], points)
+    # Far from a point, a step may cross to its neighbour's side, or from above its plane to below.
+    smooth = (found.norm(dim=-1) < 1.5) & ((model.gradient - found).norm(dim=-1) < 0.5)
+    assert smooth.float().mean() > 0.97
+    torch.testing.assert_close(model.gradient[smooth], found[smooth], rtol=1e-5, atol=1e-5)
+    assert (model.gradient * model.normal).sum(-1)[smooth].min() < 0.9  # the rim's direction, not the normal
+
+
 def test_cloud_field_beside_its_points_is_consistent():
-    # Beyond a point's rim the normal that is given as the gradient only stands in for it.
     normals = unit(random(500, 3))
     cloud = CloudField.of(RADIUS * normals, normals)
     aside, height = random(500, 3, seed=1, scale=0.1 * cloud.spacing), random(500, 1, seed=2, scale=0.003)

@@ -130,22 +130,31 @@ class CloudField:
     def distances(
         self, points: Float[Tensor, "*b 3"]
     ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
-        """Signed distance [m]: to the nearest point's tangent plane beside it, to its rim beyond; and the normal."""
+        """Signed distance [m], to the nearest point's tangent plane beside it and to its rim beyond; and its gradient."""
+        return self._nearest(points)[:2]
+
+    def _nearest(self, points: Float[Tensor, "*b 3"]) -> tuple[Tensor, Tensor, Tensor]:
+        """Distance [m], its gradient, and the nearest point's normal."""
         flat = points.reshape(-1, 3)
         index = torch.cat([torch.cdist(part, self.points).argmin(-1) for part in flat.split(self.chunk)])
         normal = self.point_normals[index].reshape(points.shape)
         apart = points - self.points[index].reshape(points.shape)
-        height = (apart * normal).sum(-1)
-        aside = (apart - height[..., None] * normal).norm(dim=-1)
-        beyond = (aside - self.spacing).clamp_min(0)
-        return torch.where(height < 0, -1.0, 1.0) * (height.square() + beyond.square()).sqrt(), normal
+        height = (apart * normal).sum(-1, keepdim=True)
+        aside = apart - height * normal
+        width = aside.norm(dim=-1, keepdim=True)
+        beyond = (width - self.spacing).clamp_min(0)
+        size = (height.square() + beyond.square()).sqrt()
+        distance = torch.where(height < 0, -size, size)
+        outwards = height * normal + beyond * aside / width.clamp_min(1e-12)
+        gradient = torch.where(size > 1e-9, outwards / torch.where(size > 1e-9, distance, 1.0), normal)
+        return distance[..., 0], gradient, normal
 
     def normals(
         self, points: Float[Tensor, "*b 3"]
     ) -> SurfaceModel:
         """The nearest point's normal, with zero for its derivative, which is unknown."""
-        distance, normal = self.distances(points)
-        return SurfaceModel(distance, normal, normal, normal.new_zeros(*normal.shape, 3))
+        distance, gradient, normal = self._nearest(points)
+        return SurfaceModel(distance, gradient, normal, normal.new_zeros(*normal.shape, 3))
 
 
 def _smooth(values: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:
