@@ -103,7 +103,7 @@ def _segments(hand: Hand, like: Tensor) -> _Segments:
     rows = [(hand.link_index == link).nonzero()[:, 0] for link in links]
     index = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)
     lengths = torch.tensor([len(row) for row in rows])
-    weight = (torch.arange(index.shape[1]) < lengths[:, None]).to(like)
+    weight = (torch.arange(index.shape[1]) < lengths[:, None]).to(device=like.device, dtype=like.dtype)
     local = hand.link_points[index].to(like)
     return _Segments(links.to(like.device), index.to(like.device), weight, local)
 
@@ -135,7 +135,8 @@ def targets(hand: Hand, poses: LinkPoses) -> tuple[Float[Tensor, "*b t 3"], Int[
     links = poses.valid.nonzero()[:, 0]
     tips = torch.tensor(hand.tips, device=device)
     kept = poses.valid[tips]
-    local = torch.cat([hand.tip_offsets.new_zeros(len(links), 3), hand.tip_offsets[kept.cpu()]]).to(device)
+    beyond = hand.tip_offsets.to(device)[kept]
+    local = torch.cat([beyond.new_zeros(len(links), 3), beyond])
     index = torch.cat([links, tips[kept]])
     T = poses.T_world_link[..., index, :, :]
     return (T[..., :3, :3] @ local[..., None])[..., 0] + T[..., :3, 3], index, local

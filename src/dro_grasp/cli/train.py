@@ -44,6 +44,8 @@ class Pretrain:
     """Time limit; the learning rate follows whichever of steps and time is further on."""
     tensorboard: Flag = False
     """Also write the log for TensorBoard."""
+    device: Annotated[str, optional("DEVICE", "cuda where there is one, else cpu")] = "auto"
+    """Where to compute: cpu, cuda, or cuda:1."""
     seed: int = 0
     """Seed of everything."""
     json: Flag = False
@@ -54,6 +56,7 @@ class Pretrain:
         import torch
 
         from dro_grasp.datasets.bundle import load_bundle
+        from dro_grasp.devices import choose_device
         from dro_grasp.files import check_output
         from dro_grasp.models.checkpoints import save_weights
         from dro_grasp.training.config import AugmentationConfig, PretrainConfig, ScheduleConfig
@@ -62,7 +65,10 @@ class Pretrain:
 
         check_output(self.output)
         bundle, network = load_bundle(self.bundle), network_config(self.size)
-        schedule = ScheduleConfig(steps=self.steps, minutes=self.minutes, tensorboard=self.tensorboard, seed=self.seed)
+        schedule = ScheduleConfig(
+            steps=self.steps, minutes=self.minutes, tensorboard=self.tensorboard, device=choose_device(self.device),
+            seed=self.seed,
+        )
         model = pretrain(bundle, network, PretrainConfig(schedule=schedule), self.run_folder)
         about = how_long(self.run_folder) | {"stage": "pretraining", "data": bundle.summary()}
         save_weights(model, self.output, about)
@@ -107,6 +113,8 @@ class Train:
     """Weight of the KL term."""
     partial: float = 0.0
     """Share of samples with half of the object cut away."""
+    device: Annotated[str, optional("DEVICE", "cuda where there is one, else cpu")] = "auto"
+    """Where to compute: cpu, cuda, or cuda:1."""
     seed: int = 0
     """Seed of everything."""
     json: Flag = False
@@ -115,6 +123,7 @@ class Train:
     def run(self) -> int:
         """Train and save."""
         from dro_grasp.datasets.bundle import load_bundle
+        from dro_grasp.devices import choose_device
         from dro_grasp.files import check_output
         from dro_grasp.models.checkpoints import load_weights, save_weights
         from dro_grasp.training.config import AugmentationConfig, LossConfig, ScheduleConfig, TrainConfig
@@ -126,7 +135,7 @@ class Train:
         config = TrainConfig(
             schedule=ScheduleConfig(
                 steps=self.steps, minutes=self.minutes, tensorboard=self.tensorboard, learning_rate=self.learning_rate,
-                seed=self.seed,
+                device=choose_device(self.device), seed=self.seed,
             ),
             losses=LossConfig(divergence=self.divergence), augmentation=AugmentationConfig(partial=self.partial),
         )

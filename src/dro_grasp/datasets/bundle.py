@@ -51,6 +51,10 @@ class HandGrasps:
     object_index: Int[Tensor, " n"]
     """Index into the bundle's object names."""
 
+    def to(self, device: torch.device | str) -> HandGrasps:
+        """The same grasps on another device."""
+        return HandGrasps(self.T_object_wrist.to(device), self.joints.to(device), self.object_index.to(device))
+
 
 @dataclass(frozen=True)
 class Bundle:

@@ -13,12 +13,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import torch
-
 from dro_grasp.datasets.pools import Failed, LocalPool, Outcome, Pool
 from dro_grasp.datasets.production import EngineConfig, Job, Task
 from dro_grasp.datasets.records import Shard, find_shards, read_yield, remove_leftovers, sole_run
 from dro_grasp.datasets.yields import Yield
+from dro_grasp.devices import require_device
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.files import make_folder
 
@@ -138,17 +137,6 @@ def synthesize_dataset(
     total = sum(s.grasps for s in states.values())
     failures = {pair: s.error for pair, s in states.items() if s.error}
     return DatasetReport(total, total - before, shards, time.perf_counter() - started, failures)
-
-
-def require_device(device: str) -> None:
-    """Refuse a device that this machine lacks.
-
-    Raises:
-        OptionError: There is no such device here.
-    """
-    if device.startswith("cuda") and not torch.cuda.is_available():
-        raise OptionError(f"device is '{device}', but torch {torch.__version__} finds no CUDA device; use --device cpu, which "
-                          "needs none, or install a build of torch with CUDA")
 
 
 def resume(folder: Path, states: dict[Pair, PairState], say: Callable[[str], None]) -> None:

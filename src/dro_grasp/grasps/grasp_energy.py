@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
-from typing import TypeVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from dro_grasp.devices import on_device
 from dro_grasp.grasps import energies
 from dro_grasp.grasps.field import CloudField, DistanceField
 from dro_grasp.grasps.fingers import ContactCandidates, ContactConfig, contact_candidates, rigid_group
 from dro_grasp.hands.hand import Hand
-
-Record = TypeVar("Record")
 
 TERMS = ("force_closure", "distance", "penetration", "self_penetration", "alignment", "joints")
 """Names of the terms, the order of every table of them."""
@@ -152,15 +149,6 @@ class LinkPoints:
         """The points in the world [m]."""
         rows = poses[:, :, :3].transpose(1, 2).reshape(3 * len(poses), -1)
         return (rows @ self.layout).unflatten(0, (-1, 3)).mT
-
-
-def on_device(record: Record, device: torch.device | str) -> Record:
-    """A frozen dataclass of tensors and plain values with its tensors on a device; itself where they are there already."""
-    if torch.device(device) == torch.device("cpu"):
-        return record
-    tensors = {f.name: getattr(record, f.name) for f in dataclasses.fields(record)}  # type: ignore[arg-type]
-    moved = {name: value.to(device) for name, value in tensors.items() if isinstance(value, Tensor)}
-    return dataclasses.replace(record, **moved)  # type: ignore[type-var]
 
 
 class GraspEnergy:

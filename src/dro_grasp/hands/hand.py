@@ -90,12 +90,12 @@ class Hand:
 
     def random_open_joints(self, n: int, generator: torch.Generator) -> Float[Tensor, "n n_dof"]:
         """Open hands as the network is trained on: openness uniform in 0.65-0.85, one draw per hand."""
-        share = 0.65 + 0.2 * torch.rand(n, 1, generator=generator).to(self.rest)
+        share = 0.65 + 0.2 * torch.rand(n, 1, generator=generator, device=generator.device).to(self.rest)
         return self._spread_evenly(self._between(share.expand(n, self.tree.n_dof)))
 
     def random_joints(self, n: int, generator: torch.Generator) -> Float[Tensor, "n n_dof"]:
         """Joints uniform within their limits; held joints at rest."""
-        return self._between(torch.rand(n, self.tree.n_dof, generator=generator).to(self.rest))
+        return self._between(torch.rand(n, self.tree.n_dof, generator=generator, device=generator.device).to(self.rest))
 
     def _spread_evenly(self, q: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_dof"]:
         """Joints that only spread the fingers have no open end: they stand at zero, or a quarter inside their limits."""

@@ -58,6 +58,8 @@ class ScheduleConfig:
     """Steps between lines of the log."""
     tensorboard: bool = False
     """Also write the log for TensorBoard, where that is installed."""
+    device: str = "cpu"
+    """Where everything is computed, samples included: `cpu`, `cuda`, `cuda:1`. Another kind draws other samples."""
     seed: int = 0
     """Seed of initial weights and of all samples."""
 

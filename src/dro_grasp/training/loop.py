@@ -35,7 +35,7 @@ def train(
     report: Callable[[Run, dict[str, float]], None] | None = None,
     name: str = "trained",
 ) -> DistanceNetwork:
-    """Train on a bundle, on the CPU.
+    """Train on a bundle.
 
     Args:
         bundle: Hands, objects and grasps.
@@ -47,19 +47,20 @@ def train(
         name: How the weights are called.
 
     Returns:
-        The moving average of the weights, in evaluation mode.
+        The moving average of the weights, on the CPU, in evaluation mode.
 
     Raises:
         TrainingError: A loss is not finite.
     """
     torch.manual_seed(config.schedule.seed)
-    generator = torch.Generator().manual_seed(config.schedule.seed)
-    model = DistanceNetwork(network, name=name)
+    device = torch.device(config.schedule.device)
+    generator = torch.Generator(device).manual_seed(config.schedule.seed)
+    model = DistanceNetwork(network, name=name).to(device)
     frozen = pretrained is not None and config.freeze_hand_encoder
     if pretrained is not None:
         model.hand_encoder.load_state_dict(pretrained.hand_encoder.state_dict())
     model.hand_encoder.requires_grad_(not frozen)
-    source = SampleSource(bundle, network, config.augmentation)
+    source = SampleSource(bundle, network, config.augmentation, device)
     run = Run(folder, model, config.schedule, generator)
     model.train()
     if frozen:
@@ -73,7 +74,7 @@ def train(
     run.train(lambda: step_losses(model, draw(), config), report or console_report("training"))
     model.load_state_dict(run.average.module.state_dict())
     recalibrate(model, lambda: model(*_clouds(draw()), columns=1))
-    return model.eval()
+    return model.cpu().eval()
 
 
 def step_losses(model: DistanceNetwork, groups: list[HandSamples], config: TrainConfig) -> dict[str, Tensor]:

@@ -41,9 +41,10 @@ def pretrain(
         TrainingError: A loss is not finite.
     """
     torch.manual_seed(config.schedule.seed)
-    whole = DistanceNetwork(network, name="pretrained")
-    generator = torch.Generator().manual_seed(config.schedule.seed)
-    source = SampleSource(bundle, network, AugmentationConfig())
+    device = torch.device(config.schedule.device)
+    whole = DistanceNetwork(network, name="pretrained").to(device)
+    generator = torch.Generator(device).manual_seed(config.schedule.seed)
+    source = SampleSource(bundle, network, AugmentationConfig(), device)
     encoder = whole.hand_encoder
     run = Run(folder, encoder, config.schedule, generator)
     encoder.train()
@@ -54,7 +55,7 @@ def pretrain(
     run.train(losses, report or console_report("pretraining"))
     encoder.load_state_dict(run.average.module.state_dict())
     recalibrate(encoder, losses)
-    return whole.eval()
+    return whole.cpu().eval()
 
 
 def contrastive_step(
@@ -63,10 +64,10 @@ def contrastive_step(
     """Loss of one batch: grasps (cloud A) against the open hand (cloud B) with a similar wrist rotation."""
     grasp_clouds, open_clouds = [], []
     for name in source.draw_hands(config.hands_per_step, generator):
-        hand, grasps = source.hands[name], source.bundle.grasps[name]
-        chosen = torch.randint(len(grasps.joints), (config.samples_per_hand,), generator=generator)
+        hand, grasps = source.hands[name], source.grasps[name]
+        chosen = torch.randint(len(grasps.joints), (config.samples_per_hand,), generator=generator, device=generator.device)
         if source.network.frame == "wrist":
-            wrist = torch.eye(3).expand(len(chosen), 3, 3)
+            wrist = torch.eye(3, device=generator.device).expand(len(chosen), 3, 3)
         else:
             wrist = random_rotations(len(chosen), generator)
         turn = wrist @ random_turns(len(chosen), config.rotation, generator)
@@ -85,8 +86,8 @@ def matching_rank(
     """Mean rank, by cosine similarity, of each point's counterpart among the open hand's points; chance is n / 2."""
     ranks = {}
     for name in source.names:
-        hand, grasps = source.hands[name], source.bundle.grasps[name]
-        chosen = torch.randint(len(grasps.joints), (samples,), generator=generator)
+        hand, grasps = source.hands[name], source.grasps[name]
+        chosen = torch.randint(len(grasps.joints), (samples,), generator=generator, device=generator.device)
         a, b = hand.points(grasps.joints[chosen]), hand.points(hand.random_open_joints(samples, generator))
         features = [torch.nn.functional.normalize(encoder(c - c.mean(1, keepdim=True)), dim=-1) for c in (a, b)]
         similarity = features[0] @ features[1].mT

@@ -17,6 +17,7 @@ from torch import nn
 from torch.optim import Adam
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
+from dro_grasp.devices import require_device
 from dro_grasp.errors import OptionError, OutputError, TrainingError
 from dro_grasp.models.precision import fast_products
 from dro_grasp.training.config import ScheduleConfig
@@ -125,7 +126,7 @@ class Run:
         state = {
             "step": self.step, "seconds": self.seconds, "model": self.model.state_dict(),
             "average": self.average.state_dict(), "optimiser": self.optimiser.state_dict(),
-            "generator": self.generator.get_state(), "torch_rng": torch.get_rng_state(), "steps": self.schedule.steps,
+            "generator": self.generator.get_state(), "torch_rng": self._rng_state(), "steps": self.schedule.steps,
         }
         path, temporary = self.folder / CHECKPOINT, self.folder / f"{CHECKPOINT}.part"
         try:
@@ -138,7 +139,7 @@ class Run:
     def _resume(self) -> None:
         path = self.folder / CHECKPOINT
         try:
-            state = torch.load(path, weights_only=True)
+            state = torch.load(path, weights_only=True, map_location="cpu")
             if state["steps"] != self.schedule.steps:
                 raise TrainingError(f"{path} belongs to a run of {state['steps']} steps, {self.schedule.steps} were asked "
                                     "for; use the same number to go on, or another folder")
@@ -147,11 +148,23 @@ class Run:
             self.optimiser.load_state_dict(state["optimiser"])
             self.step, self.seconds = state["step"], state["seconds"]
             self.generator.set_state(state["generator"])
-            torch.set_rng_state(state["torch_rng"])
+            self._set_rng_state(state["torch_rng"])
         except (RuntimeError, LookupError, TypeError, ValueError, EOFError, OSError, UnpicklingError) as error:
             reason = str(error).partition("\n")[0] or "it is empty"
             raise TrainingError(f"{path} does not fit this training ({reason}); use another folder, or the configuration "
                                 "it was made with") from error
+
+    def _rng_state(self) -> torch.Tensor:
+        """State of the generator that the model itself draws from."""
+        device = self.generator.device
+        return torch.cuda.get_rng_state(device) if device.type == "cuda" else torch.get_rng_state()
+
+    def _set_rng_state(self, state: torch.Tensor) -> None:
+        device = self.generator.device
+        if device.type == "cuda":
+            torch.cuda.set_rng_state(state, device)
+        else:
+            torch.set_rng_state(state)
 
     def _cut_log(self) -> None:
         """Drop the log's lines after the checkpoint, all where there is none; a line that was cut short is one of them."""
@@ -193,11 +206,12 @@ def learning_rate_share(step: int, progress: float, schedule: ScheduleConfig) ->
 
 
 def check_schedule(schedule: ScheduleConfig) -> None:
-    """Refuse a schedule without end or without a step.
+    """Refuse a schedule without end or without a step, and a device that is not there.
 
     Raises:
-        OptionError: A number is not positive and finite.
+        OptionError: A number is not positive and finite, or this machine lacks the device.
     """
+    require_device(schedule.device)
     for name in ("steps", "minutes", "learning_rate", "log_every"):
         value = getattr(schedule, name)
         if value is not None and not 0 < value < math.inf:

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from dro_grasp.datasets.bundle import Bundle
 from dro_grasp.errors import BundleError
-from dro_grasp.geometry.point_clouds import partial_view
 from dro_grasp.hands.hand import Hand
 from dro_grasp.models.network import NetworkConfig
 from dro_grasp.training.config import AugmentationConfig
@@ -44,29 +43,47 @@ class HandSamples:
 class SampleSource:
     """Draws samples of the bundle's hands; all randomness comes from one generator."""
 
-    def __init__(self, bundle: Bundle, network: NetworkConfig, augmentation: AugmentationConfig) -> None:
-        self.bundle, self.network, self.augmentation = bundle, network, augmentation
+    def __init__(
+        self,
+        bundle: Bundle,
+        network: NetworkConfig,
+        augmentation: AugmentationConfig,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        """Put everything on the device where samples are made.
+
+        Args:
+            bundle: Hands, objects and grasps.
+            network: Numbers of points, and the frame.
+            augmentation: How a sample differs from the stored grasp.
+            device: Generators that samples are drawn with must be of the same device.
+
+        Raises:
+            BundleError: The bundle holds no grasps.
+        """
+        self.network, self.augmentation = network, augmentation
         if bundle.n_grasps == 0:
             raise BundleError("the bundle holds no grasps; synthesise some first")
-        self.hands = {name: hand.with_points(network.n_hand) for name, hand in bundle.hands.items()}
+        self.hands = {name: hand.with_points(network.n_hand).to(device) for name, hand in bundle.hands.items()}
+        self.grasps = {name: grasps.to(device) for name, grasps in bundle.grasps.items()}
         self.names = [name for name, grasps in bundle.grasps.items() if len(grasps.joints)]
-        self.points = torch.stack([cloud.points for cloud in bundle.objects.values()])
-        self.normals = torch.stack([cloud.normals for cloud in bundle.objects.values()])
+        self.points = torch.stack([cloud.points for cloud in bundle.objects.values()]).to(device)
+        self.normals = torch.stack([cloud.normals for cloud in bundle.objects.values()]).to(device)
 
     def draw_hands(self, count: int, generator: torch.Generator) -> list[str]:
         """Names of the hands of one step, each as often as any other in the long run."""
-        order = torch.randperm(len(self.names), generator=generator)
-        return [self.names[int(order[i % len(order)])] for i in range(count)]
+        order = torch.randperm(len(self.names), generator=generator, device=generator.device).tolist()
+        return [self.names[order[i % len(order)]] for i in range(count)]
 
     def draw(self, name: str, count: int, generator: torch.Generator) -> HandSamples:
         """Samples of one hand."""
-        hand, grasps = self.hands[name], self.bundle.grasps[name]
-        chosen = torch.randint(len(grasps.joints), (count,), generator=generator)
+        hand, grasps = self.hands[name], self.grasps[name]
+        chosen = torch.randint(len(grasps.joints), (count,), generator=generator, device=generator.device)
         T, q = grasps.T_object_wrist[chosen], grasps.joints[chosen]
         points, normals = self._objects(grasps.object_index[chosen], generator)
         centre = points.mean(1)
         T_placed = self._placements(hand, T, generator)
-        axes = T_placed[:, :3, :3] if self.network.frame == "wrist" else torch.eye(3).expand(count, 3, 3)
+        axes = T_placed[:, :3, :3] if self.network.frame == "wrist" else torch.eye(3, device=T.device).expand(count, 3, 3)
         T_frame_object = _frame(axes, centre)
         opened = hand.random_open_joints(count, generator)
         T_frame_wrist = T_frame_object @ T
@@ -83,23 +100,25 @@ class SampleSource:
 
     def _objects(self, index: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Random object points with noise, and their normals (b m 3)."""
-        m = self.network.n_object
-        picks = torch.stack([self._pick(int(i), m, generator) for i in index])
+        m, device = self.network.n_object, generator.device
+        # A partial view keeps the nearer half of twice as many points, in the order in which they were drawn.
+        twice = torch.randint(self.points.shape[1], (len(index), 2 * m), generator=generator, device=device)
+        direction = torch.randn(len(index), 3, 1, generator=generator, device=device)
+        height = (self.points[index[:, None], twice] @ direction)[..., 0]
+        partial = torch.rand(len(index), 1, generator=generator, device=device) < self.augmentation.partial
+        first = torch.arange(2 * m, device=device) < m
+        kept = torch.where(partial, height > height.median(-1, keepdim=True).values, first)
+        order = (~kept).to(torch.int8).argsort(dim=-1, stable=True)[:, :m]
+        picks = twice.gather(1, order)
         points, normals = self.points[index[:, None], picks], self.normals[index[:, None], picks]
-        noise = torch.randn(points.shape, generator=generator) * self.augmentation.object_noise
+        noise = torch.randn(points.shape, generator=generator, device=device) * self.augmentation.object_noise
         return points + noise, normals
-
-    def _pick(self, index: int, count: int, generator: torch.Generator) -> Tensor:
-        if float(torch.rand((), generator=generator)) < self.augmentation.partial:
-            picked = partial_view(self.points[index], count, generator)
-            return picked[torch.randperm(count, generator=generator)]
-        return torch.randint(self.points.shape[1], (count,), generator=generator)
 
     def _placements(self, hand: Hand, T: Float[Tensor, "b 4 4"], generator: torch.Generator) -> Float[Tensor, "b 4 4"]:
         """Wrist poses near the true ones: turned about the grasp centre, and shifted."""
         turn = random_turns(len(T), self.augmentation.placement_rotation, generator)
         centre = hand.grasp_centre_wrist
-        shift = torch.randn(len(T), 3, generator=generator) * self.augmentation.placement_shift
+        shift = torch.randn(len(T), 3, generator=generator, device=generator.device) * self.augmentation.placement_shift
         placed = T.clone()
         placed[:, :3, :3] = T[:, :3, :3] @ turn
         placed[:, :3, 3] += (T[:, :3, :3] @ (centre - turn @ centre)[..., None])[..., 0] + shift
@@ -108,7 +127,7 @@ class SampleSource:
 
 def _frame(axes: Float[Tensor, "b 3 3"], centre: Float[Tensor, "b 3"]) -> Float[Tensor, "b 4 4"]:
     """T_frame_object of a frame with these axes at this place."""
-    T = torch.eye(4).repeat(len(axes), 1, 1)
+    T = torch.eye(4, device=axes.device).repeat(len(axes), 1, 1)
     T[:, :3, :3] = axes.mT
     T[:, :3, 3] = -(axes.mT @ centre[..., None])[..., 0]
     return T
@@ -116,11 +135,12 @@ def _frame(axes: Float[Tensor, "b 3 3"], centre: Float[Tensor, "b 3"]) -> Float[
 
 def random_turns(count: int, largest: float, generator: torch.Generator) -> Float[Tensor, "count 3 3"]:
     """Rotations about random axes by angles uniform up to the largest [rad]."""
-    axis = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
-    return roma.rotvec_to_rotmat(axis * torch.rand(count, 1, generator=generator) * largest)
+    axis = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, device=generator.device), dim=-1)
+    angle = torch.rand(count, 1, generator=generator, device=generator.device) * largest
+    return roma.rotvec_to_rotmat(axis * angle)
 
 
 def random_rotations(count: int, generator: torch.Generator) -> Float[Tensor, "count 3 3"]:
     """Rotations uniform on SO(3)."""
-    quaternion = torch.nn.functional.normalize(torch.randn(count, 4, generator=generator), dim=-1)
-    return roma.unitquat_to_rotmat(quaternion)
+    quaternion = torch.randn(count, 4, generator=generator, device=generator.device)
+    return roma.unitquat_to_rotmat(torch.nn.functional.normalize(quaternion, dim=-1))
