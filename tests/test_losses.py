@@ -15,7 +15,7 @@ from dro_grasp.training.losses import (
     contrastive_loss,
     distance_loss,
     divergence,
-    official_divergence,
+    divergence_loss,
     penetration_loss,
     placement_loss,
     pose_loss,
@@ -93,12 +93,24 @@ def test_penetration_equals_a_loop() -> None:
 
 
 def test_divergence_equals_pytorchs() -> None:
-    mean, log_variance = torch.randn(2, 3, 5)
-    expected = kl_divergence(Normal(mean, (0.5 * log_variance).exp()), Normal(0.0, 1.0)).sum(-1)
-    torch.testing.assert_close(divergence(mean, log_variance), expected, rtol=1e-5, atol=1e-6)
-    x = float(expected.sum())
-    assert float(official_divergence(mean, log_variance)) == pytest.approx(math.sqrt(1 + x * x) - 1, rel=1e-5)
-    assert float(official_divergence(torch.zeros(2, 3), torch.zeros(2, 3))) == 0
+    mean, log_variance, prior_mean, prior_log_variance = torch.randn(4, 3, 5)
+    posterior = Normal(mean, (0.5 * log_variance).exp())
+    standard = kl_divergence(posterior, Normal(0.0, 1.0))
+    torch.testing.assert_close(divergence(mean, log_variance), standard, rtol=1e-5, atol=1e-6)
+    learned = kl_divergence(posterior, Normal(prior_mean, (0.5 * prior_log_variance).exp()))
+    torch.testing.assert_close(divergence(mean, log_variance, prior_mean, prior_log_variance), learned, rtol=1e-4, atol=1e-5)
+
+
+def test_forms_of_the_divergence_loss() -> None:
+    nats = torch.tensor([[0.5, 0.0, 3.0], [0.1, 0.2, 1.0]])
+    assert float(divergence_loss(nats, "batch_mean")) == pytest.approx(float(nats.sum()) / 2)
+    assert float(divergence_loss(nats, "official")) == pytest.approx(math.sqrt(1 + 4.8**2) - 1)
+    assert float(divergence_loss(torch.zeros(2, 3), "official")) == 0
+    # Dimension means are 0.3, 0.1 and 2: the first two cost what is free.
+    assert float(divergence_loss(nats, "batch_mean", free_bits=0.4)) == pytest.approx(0.4 + 0.4 + 2.0)
+    free = nats.clone().requires_grad_()
+    divergence_loss(free, "batch_mean", free_bits=0.4).backward()
+    assert free.grad.tolist() == [[0, 0, 0.5], [0, 0, 0.5]]
 
 
 def naive_contrastive(a: np.ndarray, b: np.ndarray, p: np.ndarray, temperature: float, sharpness: float) -> float:

@@ -149,6 +149,26 @@ def test_latents_change_the_prediction_and_temperature_scales_them() -> None:
     torch.testing.assert_close(cold.sample_latent(2, torch.Generator().manual_seed(1)), z * 0.5)
 
 
+def test_a_learned_prior_and_a_point_latent_change_nothing_before_training_and_much_after() -> None:
+    torch.manual_seed(0)
+    paper = DistanceNetwork(SMALL).eval()
+    forms = {"prior": "learned", "latent_form": "points"}
+    ours = DistanceNetwork(NetworkConfig.from_dict({**SMALL.__dict__, **forms})).eval()
+    assert not ours.load_state_dict(paper.state_dict(), strict=False).unexpected_keys
+    hand, obj, noise = torch.randn(3, 40, 3) * 0.1, torch.randn(3, 32, 3) * 0.1, torch.randn(3, 8)
+    torch.testing.assert_close(ours.predict(hand, obj, noise), paper.predict(hand, obj, noise))
+    out = ours(hand, obj, hand)
+    assert not out.prior_mean.any()
+    with torch.no_grad():
+        for layer in (ours.prior.last, ours.point_latent.last):
+            layer.weight.normal_(0, 0.3)
+    still, moved = (ours.predict(hand, obj, n) for n in (torch.zeros(3, 8), noise))
+    assert (still - paper.predict(hand, obj, torch.zeros(3, 8))).abs().max() > 1e-3  # the prior's mean is no longer zero
+    change = (moved - still).mean(-1)
+    assert change.std(-1).min() > 1e-4  # z moves the points of one hand differently
+    assert ours(hand, obj, hand).prior_mean.abs().min() > 0
+
+
 def test_prediction_does_not_depend_on_the_batch() -> None:
     torch.manual_seed(0)
     network = DistanceNetwork(SMALL).eval()

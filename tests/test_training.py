@@ -330,12 +330,24 @@ def test_learning_rate_warms_up_and_falls_to_zero() -> None:
 def test_total_is_the_weighted_sum(bundle: Bundle, form: str) -> None:
     torch.manual_seed(0)
     source, generator = SampleSource(bundle, TINY, AugmentationConfig(partial=0.5)), torch.Generator().manual_seed(0)
-    weights = LossConfig(2.0, 3.0, 5.0, 7.0, form, 11.0)
-    values = loop.step_losses(
-        DistanceNetwork(TINY), [source.draw("toy", 3, generator)], TrainConfig(losses=weights, columns=24)
-    )
-    values = {name: float(value.detach()) for name, value in values.items()}
-    assert values["total"] == pytest.approx(sum(getattr(weights, n) * v for n, v in values.items() if n != "total"))
+    weights = LossConfig(2.0, 3.0, 5.0, 7.0, form, divergence_warmup=0.5, free_bits=0.1, placement=11.0)
+    model, groups = DistanceNetwork(TINY), [source.draw("toy", 3, generator)]
+    for progress, share in ((0.0, 0.0), (0.1, 0.2), (0.5, 1.0), (0.9, 1.0)):
+        values = loop.step_losses(model, groups, TrainConfig(losses=weights, columns=24), progress)
+        found = {name: float(value.detach()) for name, value in values.items()}
+        expected = sum(getattr(weights, n) * v for n, v in found.items() if n not in {"total", "nats", "divergence"})
+        assert found["total"] == pytest.approx(expected + share * weights.divergence * found["divergence"])
+        assert found["nats"] > 0
+
+
+def test_a_learned_prior_learns(bundle: Bundle) -> None:
+    torch.manual_seed(0)
+    network = dataclasses.replace(TINY, prior="learned", latent_form="points")
+    source, generator = SampleSource(bundle, network, AugmentationConfig()), torch.Generator().manual_seed(0)
+    model = DistanceNetwork(network)
+    loop.step_losses(model, [source.draw("toy", 3, generator)], TrainConfig(columns=24))["total"].backward()
+    assert model.prior.last.weight.grad.abs().max() > 0
+    assert model.point_latent.last.weight.grad.abs().max() > 0
 
 
 def test_tensorboard_gets_the_log_where_it_is_installed(

@@ -38,6 +38,49 @@ class LatentEncoder(nn.Module):
         return mean, log_variance.clamp(-MAX_LOG_VARIANCE, MAX_LOG_VARIANCE)
 
 
+class ConditionalPrior(nn.Module):
+    """p(z | hand, object): a Gaussian read off the features of both clouds; N(0, I) before training.
+
+    Differs from the paper, whose prior is N(0, I) whatever hand and object are.
+    """
+
+    def __init__(self, features: int, latent: int, width: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Linear(4 * features, width), nn.LeakyReLU(SLOPE), nn.Linear(width, width), nn.LeakyReLU(SLOPE))
+        self.last = nn.Linear(width, 2 * latent)
+        nn.init.zeros_(self.last.weight)
+        nn.init.zeros_(self.last.bias)
+
+    def forward(
+        self, hand: Float[Tensor, "b n c"], obj: Float[Tensor, "b m c"]
+    ) -> tuple[Float[Tensor, "b latent"], Float[Tensor, "b latent"]]:
+        """Mean and log-variance of the prior."""
+        pooled = torch.cat([hand.amax(1), hand.mean(1), obj.amax(1), obj.mean(1)], -1)
+        mean, log_variance = self.last(self.layers(pooled)).chunk(2, -1)
+        return mean, log_variance.clamp(-MAX_LOG_VARIANCE, MAX_LOG_VARIANCE)
+
+
+class PointLatent(nn.Module):
+    """z changes the features of every hand point, each in its own way; nothing before training.
+
+    Differs from the paper, where z reaches the kernel alone, as one bias for all pairs: too little to tell one finger to
+    open and another to close.
+    """
+
+    def __init__(self, features: int, latent: int) -> None:
+        super().__init__()
+        self.first = nn.Linear(features + latent, features)
+        self.last = nn.Linear(features, features)
+        nn.init.zeros_(self.last.weight)
+        nn.init.zeros_(self.last.bias)
+
+    def forward(self, features: Float[Tensor, "b n c"], z: Float[Tensor, "b latent"]) -> Float[Tensor, "b n c"]:
+        """Features of the hand's points that know z."""
+        joined = torch.cat([features, z[:, None].expand(-1, features.shape[1], -1)], -1)
+        return features + self.last(nn.functional.leaky_relu(self.first(joined), SLOPE))
+
+
 def sample_posterior(
     mean: Float[Tensor, "b latent"], log_variance: Float[Tensor, "b latent"]
 ) -> Float[Tensor, "b latent"]:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from dro_grasp.models.attention import CrossTransformer
 from dro_grasp.models.distance_head import DistanceHead
 from dro_grasp.models.encoder import StaticGraphEncoder
-from dro_grasp.models.latent import LatentEncoder, sample_posterior
+from dro_grasp.models.latent import ConditionalPrior, LatentEncoder, PointLatent, sample_posterior
 from dro_grasp.models.placement import PlacementPrior
 from dro_grasp.models.precision import fast_products
 
@@ -43,6 +43,10 @@ class NetworkConfig:
     """Fully connected layers of the latent encoder."""
     latent_neighbours: int = 20
     """K of the latent encoder's graph."""
+    prior: Literal["standard", "learned"] = "standard"
+    """What z is drawn from at inference: N(0, I) (the paper's form), or a Gaussian learned from hand and object."""
+    latent_form: Literal["kernel", "points"] = "kernel"
+    """Where z enters: the kernel alone (the paper's form), or the features of every hand point as well."""
     kernel_hidden: tuple[int, int] = (300, 100)
     """Hidden layers of the kernel."""
     initial_distance: float = 0.1
@@ -94,6 +98,10 @@ class NetworkOutput:
     """Mean of the posterior of z."""
     log_variance: Float[Tensor, "b latent"]
     """Its log-variance."""
+    prior_mean: Float[Tensor, "b latent"]
+    """Mean of the prior of z; zero in the paper's form."""
+    prior_log_variance: Float[Tensor, "b latent"]
+    """Its log-variance; zero in the paper's form."""
     hand_feature: Float[Tensor, "b width"]
     """Mean feature of the open hand, for the placement prior."""
 
@@ -110,6 +118,8 @@ class DistanceNetwork(nn.Module):
         self.hand_transformer = CrossTransformer(c.width, c.heads, c.attention_hidden)
         self.object_transformer = CrossTransformer(c.width, c.heads, c.attention_hidden)
         self.latent_encoder = LatentEncoder(c.width, c.latent, c.latent_widths, c.latent_head, c.latent_neighbours)
+        self.prior = ConditionalPrior(c.width, c.latent, c.latent_head[1]) if c.prior == "learned" else None
+        self.point_latent = PointLatent(c.width, c.latent) if c.latent_form == "points" else None
         self.head = DistanceHead(c.width + c.latent, c.kernel_hidden, c.initial_distance)
         self.place = nn.Linear(3, c.width) if c.placed else None
         self.placement = PlacementPrior(c.width, c.placement_width, c.placement_components)
@@ -146,15 +156,24 @@ class DistanceNetwork(nn.Module):
         mean, log_variance = self.latent_encoder(torch.cat([grasp, obj], 1), torch.cat([psi_hand, psi_object], 1))
         z = sample_posterior(mean, log_variance)
         distances = self._distances(psi_hand, psi_object[:, :columns], z, hand, obj[:, :columns])
-        return NetworkOutput(distances, mean, log_variance, summary)
+        return NetworkOutput(distances, mean, log_variance, *self._prior(psi_hand, psi_object), summary)
 
     def predict(
-        self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], z: Float[Tensor, "b latent"]
+        self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], noise: Float[Tensor, "b latent"]
     ) -> Float[Tensor, "b n m"]:
-        """D(R,O) [m] for given latents; see `forward` for the clouds."""
+        """D(R,O) [m] for draws of `sample_latent`, which the prior turns into z; see `forward` for the clouds."""
         with fast_products():
             psi_hand, psi_object, _ = self.features(hand, obj)
+            mean, log_variance = self._prior(psi_hand, psi_object)
+            z = mean + (0.5 * log_variance).exp() * noise
             return self._distances(psi_hand, psi_object, z, hand, obj)
+
+    def _prior(self, psi_hand: Tensor, psi_object: Tensor) -> tuple[Float[Tensor, "b latent"], Float[Tensor, "b latent"]]:
+        """Mean and log-variance of z before the grasp is known."""
+        if self.prior is not None:
+            return self.prior(psi_hand, psi_object)
+        zero = psi_hand.new_zeros(len(psi_hand), self.config.latent)
+        return zero, zero
 
     def _distances(
         self, psi_hand: Tensor, psi_object: Tensor, z: Tensor, hand: Tensor, obj: Tensor
@@ -162,6 +181,8 @@ class DistanceNetwork(nn.Module):
         def joined(features: Tensor) -> Tensor:
             return torch.cat([features, z[:, None].expand(-1, features.shape[1], -1)], -1)
 
+        if self.point_latent is not None:
+            psi_hand = self.point_latent(psi_hand, z)
         # The matrix-product form of cdist loses half of the digits.
         exact = "donot_use_mm_for_euclid_dist"
         base = torch.cdist(hand, obj, compute_mode=exact) if self.config.residual else None
@@ -181,7 +202,7 @@ class DistanceNetwork(nn.Module):
         return centred @ rotation if self.config.frame == "wrist" else centred
 
     def sample_latent(self, num: int, generator: torch.Generator) -> Float[Tensor, "num latent"]:
-        """Draws of z from the prior."""
+        """Draws that `predict` turns into z; in the paper's form they are z."""
         return torch.randn(num, self.config.latent, generator=generator) * self.config.latent_temperature
 
     def sample_placements(

@@ -32,6 +32,10 @@ class LossConfig:
     divergence: float = 0.01
     divergence_form: Literal["batch_mean", "official"] = "batch_mean"
     """Sum over latents and mean over the batch, or the release's sum over all and sqrt(1 + x^2) - 1."""
+    divergence_warmup: float = 0.0
+    """Share of the schedule over which the divergence's weight grows from zero, so that z is used before it costs."""
+    free_bits: float = 0.0
+    """Divergence of each latent dimension that costs nothing [nat]."""
     placement: float = 0.01
     """Weight of the placement prior's own loss; it shares no parameter with the rest."""
 

@@ -12,11 +12,11 @@ from dro_grasp import distance_matrix
 from dro_grasp.datasets.bundle import Bundle
 from dro_grasp.models.network import DistanceNetwork, NetworkConfig, NetworkOutput
 from dro_grasp.training.batch_statistics import recalibrate
-from dro_grasp.training.config import LossConfig, TrainConfig
+from dro_grasp.training.config import TrainConfig
 from dro_grasp.training.losses import (
     distance_loss,
     divergence,
-    official_divergence,
+    divergence_loss,
     penetration_loss,
     placement_loss,
     pose_loss,
@@ -71,14 +71,23 @@ def train(
         names = source.draw_hands(config.hands_per_step, generator)
         return [source.draw(hand, config.samples_per_hand, generator) for hand in names]
 
-    run.train(lambda: step_losses(model, draw(), config), report or console_report("training"))
+    run.train(lambda: step_losses(model, draw(), config, run.progress), report or console_report("training"))
     model.load_state_dict(run.average.module.state_dict())
     recalibrate(model, lambda: model(*_clouds(draw()), columns=1))
     return model.cpu().eval()
 
 
-def step_losses(model: DistanceNetwork, groups: list[HandSamples], config: TrainConfig) -> dict[str, Tensor]:
-    """All losses of one batch, by name, with their weighted sum as `total`."""
+def step_losses(
+    model: DistanceNetwork, groups: list[HandSamples], config: TrainConfig, progress: float = 1.0
+) -> dict[str, Tensor]:
+    """All losses of one batch, by name, with their weighted sum as `total`, and the plain divergence as `nats`.
+
+    Args:
+        model: The network, in training mode.
+        groups: Samples of one or several hands.
+        config: Weights.
+        progress: How much of the schedule is behind, from 0 to 1.
+    """
     placed, obj, grasp = _clouds(groups)
     output = model(placed, obj, grasp, columns=config.columns)
     anchors = obj[:, : config.columns]
@@ -94,11 +103,14 @@ def step_losses(model: DistanceNetwork, groups: list[HandSamples], config: Train
         start = rows.stop
     parts["pose"] = torch.cat(poses).mean()
     parts["penetration"] = torch.cat(penetrations).mean()
-    parts["divergence"] = _divergence(output, config.losses)
+    nats = divergence(output.mean, output.log_variance, output.prior_mean, output.prior_log_variance)
+    parts["divergence"] = divergence_loss(nats, config.losses.divergence_form, config.losses.free_bits)
     parts["placement"] = _placement(model, groups, output)
-    weights = config.losses
-    total = torch.stack([getattr(weights, name) * value for name, value in parts.items()]).sum()
-    return {"total": total, **parts}
+    weights = {name: getattr(config.losses, name) for name in parts}
+    if progress < config.losses.divergence_warmup:
+        weights["divergence"] *= progress / config.losses.divergence_warmup
+    total = torch.stack([weights[name] * value for name, value in parts.items()]).sum()
+    return {"total": total, **parts, "nats": nats.sum(-1).mean()}
 
 
 def _clouds(groups: list[HandSamples]) -> tuple[Tensor, Tensor, Tensor]:
@@ -112,12 +124,6 @@ def _posed_points(group: HandSamples, decoded: distance_matrix.LinkPoses) -> Ten
     kept = decoded.valid[group.hand.link_index]
     T = decoded.T_world_link[:, group.hand.link_index[kept]]
     return (T[..., :3, :3] @ group.hand.link_points[kept][..., None])[..., 0] + T[..., :3, 3]
-
-
-def _divergence(output: NetworkOutput, config: LossConfig) -> Tensor:
-    if config.divergence_form == "official":
-        return official_divergence(output.mean, output.log_variance)
-    return divergence(output.mean, output.log_variance).mean()
 
 
 def _placement(model: DistanceNetwork, groups: list[HandSamples], output: NetworkOutput) -> Tensor:

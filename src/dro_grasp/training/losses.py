@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -53,14 +55,32 @@ def penetration_loss(
     return functional.relu(-signed).mean(-1)
 
 
-def divergence(mean: Float[Tensor, "b d"], log_variance: Float[Tensor, "b d"]) -> Float[Tensor, " b"]:
-    """KL divergence of the posterior from N(0, I) [nat], one per grasp."""
-    return 0.5 * (log_variance.exp() + mean.square() - 1 - log_variance).sum(-1)
+def divergence(
+    mean: Float[Tensor, "b d"],
+    log_variance: Float[Tensor, "b d"],
+    prior_mean: Float[Tensor, "b d"] | float = 0.0,
+    prior_log_variance: Float[Tensor, "b d"] | float = 0.0,
+) -> Float[Tensor, "b d"]:
+    """KL divergence of the posterior from the prior, N(0, I) by default [nat], per grasp and latent dimension."""
+    log_ratio = log_variance - prior_log_variance
+    shift = (mean - prior_mean).square() * torch.exp(-torch.as_tensor(prior_log_variance))
+    return 0.5 * (log_ratio.exp() + shift - 1 - log_ratio)
 
 
-def official_divergence(mean: Float[Tensor, "b d"], log_variance: Float[Tensor, "b d"]) -> Float[Tensor, ""]:
-    """The official release's form: summed over the whole batch, then sqrt(1 + x^2) - 1."""
-    return (1 + divergence(mean, log_variance).sum().square()).sqrt() - 1
+def divergence_loss(
+    divergence: Float[Tensor, "b d"], form: Literal["batch_mean", "official"], free_bits: float = 0.0
+) -> Float[Tensor, ""]:
+    """One number out of the divergences of a batch.
+
+    Args:
+        divergence: Per grasp and latent dimension [nat].
+        form: `batch_mean` sums over latents and takes the mean over the batch; `official` is the release's, summed over
+            the whole batch, then sqrt(1 + x^2) - 1.
+        free_bits: Nats of each dimension that cost nothing, on average over the batch. Source: Kingma et al. 2016.
+    """
+    if form == "official":
+        return (1 + divergence.sum().square()).sqrt() - 1
+    return divergence.mean(0).clamp_min(free_bits).sum()
 
 
 def contrastive_loss(
