@@ -109,8 +109,16 @@ class Train:
     """Also write the log for TensorBoard."""
     learning_rate: float = 1e-3
     """Peak of the learning rate."""
+    prior: Literal["standard", "learned"] = "standard"
+    """What z is drawn from: N(0, I), the paper's form, or a Gaussian learned from hand and object."""
+    latent_form: Literal["kernel", "points"] = "kernel"
+    """Where z enters: the kernel alone, the paper's form, or the features of every hand point as well."""
     divergence: float = 0.01
     """Weight of the KL term."""
+    divergence_warmup: float = 0.0
+    """Share of the schedule over which that weight grows from zero."""
+    free_bits: float = 0.0
+    """KL of each latent dimension that costs nothing [nat]."""
     partial: float = 0.0
     """Share of samples with half of the object cut away."""
     device: Annotated[str, optional("DEVICE", "cuda where there is one, else cpu")] = "auto"
@@ -122,6 +130,8 @@ class Train:
 
     def run(self) -> int:
         """Train and save."""
+        import dataclasses
+
         from dro_grasp.datasets.bundle import load_bundle
         from dro_grasp.devices import choose_device
         from dro_grasp.files import check_output
@@ -137,9 +147,12 @@ class Train:
                 steps=self.steps, minutes=self.minutes, tensorboard=self.tensorboard, learning_rate=self.learning_rate,
                 device=choose_device(self.device), seed=self.seed,
             ),
-            losses=LossConfig(divergence=self.divergence), augmentation=AugmentationConfig(partial=self.partial),
+            losses=LossConfig(
+                divergence=self.divergence, divergence_warmup=self.divergence_warmup, free_bits=self.free_bits),
+            augmentation=AugmentationConfig(partial=self.partial),
         )
-        model = train(bundle, network_config(self.size), config, self.run_folder, pretrained, name=self.output.stem)
+        network = dataclasses.replace(network_config(self.size), prior=self.prior, latent_form=self.latent_form)
+        model = train(bundle, network, config, self.run_folder, pretrained, name=self.output.stem)
         about = how_long(self.run_folder) | {
             "stage": "training", "pretrained": self.pretrained is not None, "data": bundle.summary(),
         }
