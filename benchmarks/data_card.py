@@ -1,6 +1,6 @@
 """The counts of docs/data-card.md, from the files themselves, as Markdown.
 
-Run it as `python benchmarks/data_card.py [data/grasps]`.
+Run it as `python benchmarks/data_card.py [data/grasps] [--pictures docs/pictures]`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,10 @@ from report import ROOT
 from dro_grasp.datasets.collections import read_collection
 from dro_grasp.datasets.yields import Yield
 from dro_grasp.evaluation.coverage import measure_coverage
+from dro_grasp.viewer.dataset_report import charts, grasps_drawn
 
+PICTURED = "shadowhand.parquet"
+"""The hand of the pictures."""
 COLUMNS = ("hand", "grasps", "train", "few_shot", "validate", "objects", "fewest", "without", "of tried valid [%]",
            "per CPU-hour", "diversity", "wrist", "joints", "all six half-axes [%]", "kB")
 
@@ -36,7 +39,13 @@ def main() -> None:
     """Print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "data" / "grasps", help="merged files")
-    folder = parser.parse_args().folder
+    parser.add_argument("--pictures", type=Path, help="folder for pictures of one hand")
+    options = parser.parse_args()
+    folder = options.folder
+    if options.pictures is not None:
+        (hand,) = measure_coverage(read_collection(folder / PICTURED))
+        (options.pictures / "data-charts.png").write_bytes(charts(hand))
+        (options.pictures / "data-grasps.png").write_bytes(grasps_drawn(hand))
     print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
     files = sorted(folder.glob("*.parquet"))
     for path in files:

@@ -108,7 +108,7 @@ def test_the_page_names_everything_and_holds_its_pictures(pairs, tmp_path, capsy
     assert told["hands"][0]["grasps"] == 60
     assert {o["object"]: o["reason"] for o in told["hands"][0]["objects"]}["wall"].startswith("lost")
     text = page.read_text()
-    assert "60 grasps of 1 hands" in text
+    assert "60 grasps of 1 hand<" in text
     assert text.count("data:image/png;base64,") == 2
     for word in ("barrett", "can", "wall", "slipped", "energy too high to try", "lost (100% of what was tried)"):
         assert word in text

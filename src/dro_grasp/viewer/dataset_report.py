@@ -51,9 +51,9 @@ def write_report(hands: Sequence[HandCoverage], path: Path, progress: Callable[[
         sections.append(_section(hand))
         if progress is not None:
             progress(i + 1, len(hands))
-    total = sum(len(h.grasps) for h in hands)
+    title = f"{sum(len(h.grasps) for h in hands):,} grasps of {len(hands)} hand{'' if len(hands) == 1 else 's'}"
     text = (f"<!doctype html><meta charset=utf-8><title>Grasp data set</title><style>{STYLE}</style>"
-            f"<h1>{total:,} grasps of {len(hands)} hands</h1>{_overview(hands)}{''.join(sections)}"
+            f"<h1>{title}</h1>{_overview(hands)}{''.join(sections)}"
             f"<p class=note>dro-grasp {__version__}</p>")
     with replacing(path) as temporary:
         temporary.write_text(text)
@@ -76,12 +76,12 @@ def _section(hand: HandCoverage) -> str:
     name = html.escape(hand.grasps.hand)
     parts = [f"<h2>{name}</h2>"]
     if len(hand.grasps):
-        parts += [_image(_charts(hand), f"charts of {name}"), _picture(hand)]
+        parts += [_image(charts(hand), f"charts of {name}"), _image(grasps_drawn(hand), f"grasps of {name}")]
     return "".join([*parts, _failures(hand), _pair_table(hand)])
 
 
-def _charts(hand: HandCoverage) -> bytes:
-    """Palm directions, rolls, sizes, energies and joints in one figure."""
+def charts(hand: HandCoverage) -> bytes:
+    """Palm directions, rolls, sizes, energies and joints of a hand with grasps, as one PNG."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 6.2), layout="constrained")
@@ -103,7 +103,8 @@ def _directions(axes: Axes, hand: HandCoverage) -> None:
     axes.scatter(torch.atan2(d[:, 1], d[:, 0]), d[:, 2].clamp(-1, 1).asin(), s=4, alpha=0.4, color=COLOUR, linewidths=0)
     for label, (x, y) in {"+x": (0, 0), "+y": (math.pi / 2, 0), "-y": (-math.pi / 2, 0), "+z": (0, math.pi / 2.05),
                           "-z": (0, -math.pi / 2.05), "-x": (math.pi * 0.97, 0)}.items():
-        axes.annotate(label, (x, y), color=SECOND, weight="bold", ha="center", va="center")
+        box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": SECOND, "linewidth": 0.8}
+        axes.annotate(label, (x, y), color=SECOND, weight="bold", fontsize=8, ha="center", va="center", bbox=box, zorder=5)
     axes.set(title="palm directions in the object's frame", xticklabels=[], yticklabels=[])
     axes.grid(alpha=0.3)
 
@@ -129,11 +130,11 @@ def _joints(axes: Axes, hand: HandCoverage) -> None:
     axes.plot(places, quantiles[1].tolist(), "o", color=SECOND, markersize=4, label="median")
     axes.set_xticks(list(places), [n[:14] for n in tree.joint_names], rotation=60, ha="right", fontsize=7)
     axes.set(title=f"joints; standard deviation {hand.diversity['joints']:.2f} on average", ylabel="[rad or m]")
-    axes.legend(fontsize=7)
+    axes.legend(fontsize=7, loc="lower right")
 
 
-def _picture(hand: HandCoverage) -> str:
-    """Grasps on some of the objects, spread over the alphabet."""
+def grasps_drawn(hand: HandCoverage) -> bytes:
+    """Grasps on some of the objects, spread over the alphabet, as one PNG."""
     names = [p.object for p in hand.pairs if p.grasps]
     chosen = [names[i * len(names) // min(SHOWN, len(names))] for i in range(min(SHOWN, len(names)))]
     tiles, captions = [], []
@@ -144,7 +145,7 @@ def _picture(hand: HandCoverage) -> str:
         captions.append((name, caption(grasps, 0)[1]))
     sheet, file = contact_sheet(tiles, captions, f"{hand.grasps.hand}: grasps as stored"), io.BytesIO()
     sheet.save(file, format="PNG")
-    return _image(file.getvalue(), f"grasps of {hand.grasps.hand}")
+    return file.getvalue()
 
 
 def _failures(hand: HandCoverage) -> str:
