@@ -218,7 +218,7 @@ def test_real_shards_hold_valid_grasps_repeat_and_add_up(tmp_path):
     assert found.penetration.max() < 0.005  # [m]
     assert set(found.split) == {"train"}
     assert set(found.protocol) == {"strict/1"}
-    assert all(links for links in found.extra["contact_links"])
+    assert all(len(links) >= 2 for links in found.extra["contact_links"])
     assert {name for name in found.extra if name.startswith("energy_")} >= {"energy_force_closure", "energy_penetration"}
     assert made.candidates == sum(t.candidates for t in tasks)
     assert made.candidates == made.ranked_out + made.deep + made.moved + made.tried
@@ -241,6 +241,17 @@ def test_the_same_command_makes_the_same_grasps_however_many_work(tmp_path):
     for one, two in zip(*found, strict=True):
         assert torch.equal(one.joints, two.joints)
         assert torch.equal(one.T_object_wrist, two.T_object_wrist)
+
+
+def test_a_success_that_hardly_anything_touches_is_not_kept():
+    hand, can = load_hand("barrett"), load_object("can")
+    kept, made = valid_grasps(hand, can, 3, "strict", TINY)
+    strict, fewer = valid_grasps(hand, can, 3, "strict", replace(TINY, least_contacts=5))
+    held = [len(links) for links in kept.extra["contact_links"]]
+    assert min(held) < 5 <= max(held)
+    assert made.failures.get("held by too few links", 0) == 0
+    assert fewer.failures["held by too few links"] == sum(n < 5 for n in held)
+    assert len(strict) == sum(n >= 5 for n in held)
 
 
 def test_settled_labels_move_only_joints_that_hold(tmp_path):

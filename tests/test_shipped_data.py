@@ -37,7 +37,7 @@ def test_there_is_enough_of_it_and_it_is_small():
     sizes = [f.stat().st_size for f in FILES]
     assert max(sizes) < 4_000_000
     assert sum(sizes) <= 16_000_000
-    assert sum(read_footer(f)[0] for f in FILES) >= 60_000
+    assert sum(read_footer(f)[0] for f in FILES) >= 34_000
 
 
 def test_every_file_says_how_it_was_made():
@@ -60,7 +60,7 @@ def test_every_grasp_passed_strict_and_says_what_it_is_made_of(grasps):
     assert set(grasps.protocol) == {"strict/1"}
     assert float(grasps.penetration.max()) < 0.005 + 1e-5  # [m], rounded
     assert float(grasps.displacement.max()) < 0.1
-    assert all(grasps.extra["contact_links"])
+    assert min(map(len, grasps.extra["contact_links"])) >= 2
     assert {f"energy_{t}" for t in ("force_closure", "distance", "penetration", "self_penetration")} <= set(grasps.extra)
     assert all("synthesis 2" in p for p in set(grasps.provenance))
     assert bool(grasps.seed.bool().all())

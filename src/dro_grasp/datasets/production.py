@@ -24,6 +24,9 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.outcome import kind_of_failure
 from dro_grasp.simulation.trial import settle, simulate
 
+LOOSE = "held by too few links"
+"""Reason against grasps that pass the trial without enough contact."""
+
 
 @dataclass(frozen=True)
 class EngineConfig:
@@ -43,6 +46,8 @@ class EngineConfig:
     """Take the labels after the hand has closed on the object in simulation, which drives out penetration."""
     farthest: float = 0.03
     """Candidates that the closing moves farther than this relative to the object are not tried [m]."""
+    least_contacts: int = 2
+    """Links that must touch the object after closing; with fewer, a success is a cage or luck."""
     barren_rounds: int = 3
     """A pair is given up after this many rounds without a single valid grasp."""
     most_candidates: int = 8192
@@ -154,9 +159,12 @@ def valid_grasps(
         grasps = closed[shift < config.farthest]
     trial = simulate(hand, obj, grasps, protocol, workers=1)
     tried = trial.fill(grasps)
-    passed = tried[trial.success]
+    loose = trial.success & (trial.contacts < config.least_contacts)
+    passed = tried[trial.success & ~loose]
     new = distinct(hand, passed, earlier=earlier)
     failures = Counter(kind_of_failure(reason) for reason in trial.reason if reason)
+    if loose.any():
+        failures[LOOSE] += int(loose.sum())
     made = dataclasses.replace(
         made, failures=dict(failures), duplicates=int((~new).sum()), valid=int(new.sum())
     )
