@@ -6,7 +6,6 @@ import dataclasses
 from typing import TypeVar
 
 import torch
-from torch import Tensor
 
 from dro_grasp.errors import OptionError
 
@@ -37,9 +36,7 @@ def require_device(device: str) -> None:
 
 
 def on_device(record: Record, device: torch.device | str) -> Record:
-    """A frozen dataclass of tensors and plain values with its tensors on a device; itself where they are there already."""
-    if torch.device(device) == torch.device("cpu"):
-        return record
-    tensors = {f.name: getattr(record, f.name) for f in dataclasses.fields(record)}  # type: ignore[arg-type]
-    moved = {name: value.to(device) for name, value in tensors.items() if isinstance(value, Tensor)}
+    """A frozen dataclass with whatever it holds that can move, tensors and records with a `to`, on a device."""
+    values = {f.name: getattr(record, f.name) for f in dataclasses.fields(record)}  # type: ignore[arg-type]
+    moved = {name: value.to(device) for name, value in values.items() if hasattr(value, "to")}
     return dataclasses.replace(record, **moved)  # type: ignore[type-var]

@@ -20,6 +20,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from dro_grasp.datasets.splits import TRAINING
+from dro_grasp.devices import on_device
 from dro_grasp.errors import BundleError
 from dro_grasp.files import replacing
 from dro_grasp.grasps.batch import GraspBatch
@@ -53,7 +54,7 @@ class HandGrasps:
 
     def to(self, device: torch.device | str) -> HandGrasps:
         """The same grasps on another device."""
-        return HandGrasps(self.T_object_wrist.to(device), self.joints.to(device), self.object_index.to(device))
+        return on_device(self, device)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dro_grasp.devices import on_device
 from dro_grasp.geometry.point_clouds import farthest_points
 from dro_grasp.kinematics.tree import KinematicTree, cached_tensor
 
@@ -156,9 +157,7 @@ class Hand:
         """The same hand with its tensors on another device; itself where they are there already."""
         if torch.device(device) == self.link_points.device:
             return self
-        moved = {f.name: value.to(device) for f in dataclasses.fields(self)
-                 if isinstance(value := getattr(self, f.name), (Tensor, KinematicTree))}
-        return dataclasses.replace(self, **moved)
+        return on_device(self, device)
 
     def grasp_centres(self, T_world_wrist: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 3"]:
         """The grasp centre of hands at the given wrist poses [m]."""
