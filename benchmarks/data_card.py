@@ -16,7 +16,7 @@ from dro_grasp.datasets.yields import Yield
 from dro_grasp.evaluation.coverage import measure_coverage
 from dro_grasp.viewer.dataset_report import charts, grasps_drawn
 
-PICTURED = "shadowhand.parquet"
+PICTURED = "assets-shadowhand.parquet"
 """The hand of the pictures."""
 COLUMNS = ("hand", "grasps", "train", "few_shot", "validate", "objects", "fewest", "without", "of tried valid [%]",
            "per CPU-hour", "diversity", "wrist", "joints", "all six half-axes [%]", "kB")

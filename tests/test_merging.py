@@ -119,7 +119,7 @@ def test_versions_are_not_mixed(hand, tmp_path):
 
 
 def test_files_are_named_after_hands():
-    assert [file_name(n) for n in ("allegro", "assets/allegro_left")] == ["allegro.parquet", "allegro_left.parquet"]
+    assert [file_name(n) for n in ("allegro", "assets/allegro_left")] == ["allegro.parquet", "assets-allegro_left.parquet"]
 
 
 def test_yields_add_up_and_name_the_obstacle():

@@ -10,6 +10,7 @@ import torch
 
 from dro_grasp.datasets.checking import check
 from dro_grasp.datasets.collections import YIELDS, read_collection
+from dro_grasp.datasets.merging import file_name
 from dro_grasp.datasets.splits import FEW_SHOT, HELD_OUT_HANDS
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.duplicates import NEAR
@@ -102,6 +103,6 @@ def test_objects_are_those_of_the_assets(assets_folder):
 @pytest.mark.assets
 @pytest.mark.parametrize("hand", PAPER_HANDS)
 def test_a_sample_holds_again(assets_folder, hand):
-    pairs = [p for p in read_collection(FOLDER / f"{hand.rsplit('/')[-1]}.parquet") if p.object.endswith(("apple", "cup"))]
+    pairs = [p for p in read_collection(FOLDER / file_name(hand)) if p.object.endswith(("apple", "cup"))]
     found = check(pairs, 12, changed("strict"))
     assert found.agreed >= 11, found.reasons

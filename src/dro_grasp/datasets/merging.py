@@ -70,8 +70,8 @@ def merge(paths: Sequence[Path | str], per_pair: int | None = None) -> list[Merg
 
 
 def file_name(hand: str) -> str:
-    """Name of a merged file: the hand's, without the folder it came from."""
-    return f"{hand.rsplit('/', 1)[-1]}.parquet"
+    """Name of a merged file: the hand's, with its source, as hands of two sources may have one name."""
+    return f"{hand.replace('/', '-')}.parquet"
 
 
 def _name(pair: PairGrasps) -> str:
