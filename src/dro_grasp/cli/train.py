@@ -109,8 +109,8 @@ class Train:
     """Also write the log for TensorBoard."""
     learning_rate: float = 1e-3
     """Peak of the learning rate."""
-    prior: Literal["standard", "learned"] = "standard"
-    """What z is drawn from: N(0, I), the paper's form, or a Gaussian learned from hand and object."""
+    prior: Literal["standard", "learned", "flow"] = "standard"
+    """What z is drawn from: N(0, I), the paper's form, or a Gaussian or a flow learned from hand and object."""
     latent_form: Literal["kernel", "points"] = "kernel"
     """Where z enters: the kernel alone, the paper's form, or the features of every hand point as well."""
     divergence: float = 0.01

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from dro_grasp.models.attention import CrossTransformer
 from dro_grasp.models.distance_head import DistanceHead
 from dro_grasp.models.encoder import StaticGraphEncoder
-from dro_grasp.models.latent import ConditionalPrior, LatentEncoder, PointLatent, sample_posterior
+from dro_grasp.models.latent import ConditionalPrior, FlowPrior, LatentEncoder, PointLatent, sample_posterior
 from dro_grasp.models.placement import PlacementPrior
 from dro_grasp.models.precision import fast_products
 
@@ -43,8 +43,9 @@ class NetworkConfig:
     """Fully connected layers of the latent encoder."""
     latent_neighbours: int = 20
     """K of the latent encoder's graph."""
-    prior: Literal["standard", "learned"] = "standard"
-    """What z is drawn from at inference: N(0, I) (the paper's form), or a Gaussian learned from hand and object."""
+    prior: Literal["standard", "learned", "flow"] = "standard"
+    """What z is drawn from at inference: N(0, I) (the paper's form), a Gaussian learned from hand and object, or any
+    distribution that a flow learns from them."""
     latent_form: Literal["kernel", "points"] = "kernel"
     """Where z enters: the kernel alone (the paper's form), or the features of every hand point as well."""
     kernel_hidden: tuple[int, int] = (300, 100)
@@ -102,6 +103,8 @@ class NetworkOutput:
     """Mean of the prior of z; zero in the paper's form."""
     prior_log_variance: Float[Tensor, "b latent"]
     """Its log-variance; zero in the paper's form."""
+    flow_error: Float[Tensor, " b"]
+    """Squared velocity error of the flow to z; zero without a flow."""
     hand_feature: Float[Tensor, "b width"]
     """Mean feature of the open hand, for the placement prior."""
 
@@ -119,6 +122,7 @@ class DistanceNetwork(nn.Module):
         self.object_transformer = CrossTransformer(c.width, c.heads, c.attention_hidden)
         self.latent_encoder = LatentEncoder(c.width, c.latent, c.latent_widths, c.latent_head, c.latent_neighbours)
         self.prior = ConditionalPrior(c.width, c.latent, c.latent_head[1]) if c.prior == "learned" else None
+        self.flow = FlowPrior(c.width, c.latent, c.latent_head[0]) if c.prior == "flow" else None
         self.point_latent = PointLatent(c.width, c.latent) if c.latent_form == "points" else None
         self.head = DistanceHead(c.width + c.latent, c.kernel_hidden, c.initial_distance)
         self.place = nn.Linear(3, c.width) if c.placed else None
@@ -156,7 +160,9 @@ class DistanceNetwork(nn.Module):
         mean, log_variance = self.latent_encoder(torch.cat([grasp, obj], 1), torch.cat([psi_hand, psi_object], 1))
         z = sample_posterior(mean, log_variance)
         distances = self._distances(psi_hand, psi_object[:, :columns], z, hand, obj[:, :columns])
-        return NetworkOutput(distances, mean, log_variance, *self._prior(psi_hand, psi_object), summary)
+        prior_mean, prior_log_variance = self._prior(psi_hand, psi_object)
+        flow_error = z.new_zeros(len(z)) if self.flow is None else self.flow.loss(z, self.flow.read(psi_hand, psi_object))
+        return NetworkOutput(distances, mean, log_variance, prior_mean, prior_log_variance, flow_error, summary)
 
     def predict(
         self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], noise: Float[Tensor, "b latent"]
@@ -164,12 +170,15 @@ class DistanceNetwork(nn.Module):
         """D(R,O) [m] for draws of `sample_latent`, which the prior turns into z; see `forward` for the clouds."""
         with fast_products():
             psi_hand, psi_object, _ = self.features(hand, obj)
-            mean, log_variance = self._prior(psi_hand, psi_object)
-            z = mean + (0.5 * log_variance).exp() * noise
+            if self.flow is not None:
+                z = self.flow(noise, self.flow.read(psi_hand, psi_object))
+            else:
+                mean, log_variance = self._prior(psi_hand, psi_object)
+                z = mean + (0.5 * log_variance).exp() * noise
             return self._distances(psi_hand, psi_object, z, hand, obj)
 
     def _prior(self, psi_hand: Tensor, psi_object: Tensor) -> tuple[Float[Tensor, "b latent"], Float[Tensor, "b latent"]]:
-        """Mean and log-variance of z before the grasp is known."""
+        """Mean and log-variance that the divergence is taken from: of z before the grasp is known, but for a flow."""
         if self.prior is not None:
             return self.prior(psi_hand, psi_object)
         zero = psi_hand.new_zeros(len(psi_hand), self.config.latent)

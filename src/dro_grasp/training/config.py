@@ -36,6 +36,8 @@ class LossConfig:
     """Share of the schedule over which the divergence's weight grows from zero, so that z is used before it costs."""
     free_bits: float = 0.0
     """Divergence of each latent dimension that costs nothing [nat]."""
+    flow: float = 0.01
+    """Weight of the flow to z, where the network has one."""
     placement: float = 0.01
     """Weight of the placement prior's own loss; it shares no parameter with the rest."""
 

@@ -105,6 +105,7 @@ def step_losses(
     parts["penetration"] = torch.cat(penetrations).mean()
     nats = divergence(output.mean, output.log_variance, output.prior_mean, output.prior_log_variance)
     parts["divergence"] = divergence_loss(nats, config.losses.divergence_form, config.losses.free_bits)
+    parts["flow"] = output.flow_error.mean()
     parts["placement"] = _placement(model, groups, output)
     weights = {name: getattr(config.losses, name) for name in parts}
     if progress < config.losses.divergence_warmup:
