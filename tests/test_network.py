@@ -10,6 +10,7 @@ from torch.nn import functional
 from dro_grasp.models import precision
 from dro_grasp.models.attention import Attention
 from dro_grasp.models.encoder import SLOPE, EdgeLayer, StaticGraphEncoder, nearest_neighbours
+from dro_grasp.models.latent import FlowPrior
 from dro_grasp.models.network import DistanceNetwork, NetworkConfig
 from dro_grasp.models.precision import fast_products
 
@@ -149,24 +150,61 @@ def test_latents_change_the_prediction_and_temperature_scales_them() -> None:
     torch.testing.assert_close(cold.sample_latent(2, torch.Generator().manual_seed(1)), z * 0.5)
 
 
-def test_a_learned_prior_and_a_point_latent_change_nothing_before_training_and_much_after() -> None:
+def test_a_learned_prior_changes_nothing_before_training_and_much_after() -> None:
     torch.manual_seed(0)
     paper = DistanceNetwork(SMALL).eval()
-    forms = {"prior": "learned", "latent_form": "points"}
-    ours = DistanceNetwork(NetworkConfig.from_dict({**SMALL.__dict__, **forms})).eval()
+    ours = DistanceNetwork(NetworkConfig.from_dict({**SMALL.__dict__, "prior": "learned"})).eval()
     assert not ours.load_state_dict(paper.state_dict(), strict=False).unexpected_keys
     hand, obj, noise = torch.randn(3, 40, 3) * 0.1, torch.randn(3, 32, 3) * 0.1, torch.randn(3, 8)
     torch.testing.assert_close(ours.predict(hand, obj, noise), paper.predict(hand, obj, noise))
-    out = ours(hand, obj, hand)
-    assert not out.prior_mean.any()
+    assert not ours(hand, obj, hand).prior_mean.any()
     with torch.no_grad():
-        for layer in (ours.prior.last, ours.point_latent.last):
-            layer.weight.normal_(0, 0.3)
-    still, moved = (ours.predict(hand, obj, n) for n in (torch.zeros(3, 8), noise))
-    assert (still - paper.predict(hand, obj, torch.zeros(3, 8))).abs().max() > 1e-3  # the prior's mean is no longer zero
-    change = (moved - still).mean(-1)
-    assert change.std(-1).min() > 1e-4  # z moves the points of one hand differently
+        ours.prior.last.weight.normal_(0, 0.3)
+    assert (ours.predict(hand, obj, noise * 0) - paper.predict(hand, obj, noise * 0)).abs().max() > 1e-4
     assert ours(hand, obj, hand).prior_mean.abs().min() > 0
+
+
+def test_a_flow_learns_a_distribution_of_two_modes_that_depends_on_the_condition() -> None:
+    torch.manual_seed(0)
+    flow, width = FlowPrior(latent=2, width=32), 32
+    optimiser = torch.optim.Adam(flow.parameters(), lr=3e-3)
+    apart = torch.tensor([[1.5, 0.0], [0.0, 1.5]])  # of the modes from their middle, for each of two conditions
+
+    def condition(kind: Tensor) -> Tensor:
+        return 3 * torch.nn.functional.one_hot(kind, width).float()
+
+    for _ in range(400):
+        kind = torch.randint(2, (128,))
+        side = torch.randint(2, (128, 1)) * 2.0 - 1
+        z = side * apart[kind] + 0.2 * torch.randn(128, 2)
+        optimiser.zero_grad()
+        flow.loss(z, condition(kind)).mean().backward()
+        optimiser.step()
+    for kind in range(2):
+        with torch.no_grad():
+            found = flow(torch.randn(2000, 2), condition(torch.full((2000,), kind)))
+        along, across = (found @ a / a.norm() for a in (apart[kind], apart[1 - kind]))
+        assert abs(float((along > 0).float().mean()) - 0.5) < 0.1
+        assert float(along.abs().mean()) == pytest.approx(1.5, abs=0.15)
+        assert float(along.abs().std()) < 0.4
+        assert float(across.std()) < 0.4
+
+
+def test_a_latent_that_moves_the_hand_moves_its_points_apart() -> None:
+    torch.manual_seed(0)
+    forms = {"latent_form": "motion", "prior": "flow", "placed": True, "residual": True}
+    network = DistanceNetwork(NetworkConfig.from_dict({**SMALL.__dict__, **forms})).eval()
+    hand, obj, grasp = torch.randn(3, 40, 3) * 0.1, torch.randn(3, 32, 3) * 0.1, torch.randn(3, 40, 3) * 0.1
+    features = network.hand_encoder(hand - hand.mean(1, keepdim=True))
+    z = torch.randn(2, 3, 8)
+    moved = [network.motion(features, hand, one) for one in z]
+    assert (moved[0] - moved[1]).norm(dim=-1).std(-1).min() > 1e-3
+    mean, _ = network.motion.encode(features, hand, grasp)
+    other, _ = network.motion.encode(features, hand, hand)
+    assert (mean - other).norm(dim=-1).min() > 1e-2  # the code sees where the hand goes
+    turned, _ = network.motion.encode(features[:, torch.arange(39, -1, -1)], hand.flip(1), grasp.flip(1))
+    torch.testing.assert_close(turned, mean, rtol=1e-4, atol=1e-5)  # and not the order of its points
+    assert network(hand, obj, grasp).flow_error.min() > 0
 
 
 def test_prediction_does_not_depend_on_the_batch() -> None:

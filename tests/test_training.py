@@ -6,6 +6,7 @@ import copy
 import dataclasses
 import json
 import math
+import os
 import signal
 import subprocess
 import sys
@@ -21,9 +22,10 @@ from dro_grasp.datasets.bundle import Bundle
 from dro_grasp.errors import OptionError, OutputError, TrainingError
 from dro_grasp.models.network import DistanceNetwork, NetworkConfig
 from dro_grasp.training import batch_statistics, loop, pretraining
-from dro_grasp.training.config import AugmentationConfig, LossConfig, PretrainConfig, ScheduleConfig, TrainConfig
+from dro_grasp.training.config import AugmentationConfig, LossConfig, MotionConfig, PretrainConfig, ScheduleConfig, TrainConfig
 from dro_grasp.training.loop import train
-from dro_grasp.training.pretraining import contrastive_step, matching_rank, pretrain
+from dro_grasp.training.pretraining import contrastive_step, matching_rank, pretrain, pretrain_motion
+from dro_grasp.training.processes import Processes
 from dro_grasp.training.runs import CHECKPOINT, LOG, Run, learning_rate_share
 from dro_grasp.training.samples import SampleSource
 from tests.tiny_bundle import TINY, tiny_bundle
@@ -31,7 +33,16 @@ from tests.tiny_bundle import TINY, tiny_bundle
 SCHEDULE = ScheduleConfig(
     steps=10, warmup_steps=3, learning_rate=3e-3, average_decay=0.9, checkpoint_seconds=0, log_every=2
 )
+SHARDED = dataclasses.replace(SCHEDULE, shards=2)
 STAGES = ["train", "pretrain"]
+ROOT = Path(__file__).parents[1]
+SHARED = """
+import sys
+from pathlib import Path
+from dro_grasp.datasets.bundle import load_bundle
+from tests.test_training import SHARDED, run_stage
+run_stage("train", load_bundle(Path(sys.argv[1]) / "bundle.safetensors"), Path(sys.argv[1]) / "shared", SHARDED)
+"""
 # Dies at step 6: after the log line and before its checkpoint, or with the checkpoint half written.
 KILLED = """
 import os, signal, sys
@@ -178,7 +189,7 @@ def damage(path: Path, how: str) -> None:
         torch.save([1, 2, 3], path)
     else:
         state = torch.load(path, weights_only=True)
-        torch.save({k: v for k, v in state.items() if k != "generator"}, path)
+        torch.save({k: v for k, v in state.items() if k != "optimiser"}, path)
 
 
 @pytest.mark.parametrize("how", ["truncated", "empty", "foreign", "incomplete"])
@@ -192,7 +203,7 @@ def test_a_damaged_checkpoint_is_refused(bundle: Bundle, finished: dict[str, Pat
 
 
 def test_a_checkpoint_of_another_training_is_refused(bundle: Bundle, finished: dict[str, Path]) -> None:
-    with pytest.raises(TrainingError, match="a run of 10 steps, 12 were asked for"):
+    with pytest.raises(TrainingError, match="a run with steps 10, 12 was asked for"):
         run_stage("train", bundle, finished["train"], dataclasses.replace(SCHEDULE, steps=12))
     with pytest.raises(TrainingError, match="does not fit this training"):
         run_stage("train", bundle, finished["train"], network=dataclasses.replace(TINY, width=20))
@@ -201,7 +212,8 @@ def test_a_checkpoint_of_another_training_is_refused(bundle: Bundle, finished: d
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("steps", 0), ("steps", -5), ("minutes", 0.0), ("learning_rate", math.nan), ("log_every", 0)]
+    ("name", "value"),
+    [("steps", 0), ("steps", -5), ("minutes", 0.0), ("learning_rate", math.nan), ("log_every", 0), ("shards", 0)],
 )
 def test_an_impossible_schedule_is_refused(bundle: Bundle, tmp_path: Path, name: str, value: float) -> None:
     with pytest.raises(OptionError, match=f"{name} is {value}"):
@@ -342,12 +354,54 @@ def test_total_is_the_weighted_sum(bundle: Bundle, form: str) -> None:
 
 def test_a_learned_prior_learns(bundle: Bundle) -> None:
     torch.manual_seed(0)
-    network = dataclasses.replace(TINY, prior="learned", latent_form="points")
+    network = dataclasses.replace(TINY, prior="learned", latent_form="motion")
     source, generator = SampleSource(bundle, network, AugmentationConfig()), torch.Generator().manual_seed(0)
     model = DistanceNetwork(network)
     loop.step_losses(model, [source.draw("toy", 3, generator)], TrainConfig(columns=24))["total"].backward()
     assert model.prior.last.weight.grad.abs().max() > 0
-    assert model.point_latent.last.weight.grad.abs().max() > 0
+    assert model.motion.last.weight.grad.abs().max() > 0
+
+
+def test_a_motion_is_learned_before_objects_are_seen(bundle: Bundle, tmp_path: Path) -> None:
+    network = dataclasses.replace(TINY, prior="flow", latent_form="motion", latent=8)
+    fresh = DistanceNetwork(network)
+    encoder = copy.deepcopy(fresh.hand_encoder.state_dict())
+    schedule = dataclasses.replace(SCHEDULE, steps=200, log_every=10)
+    learnt = pretrain_motion(fresh, bundle, MotionConfig(schedule, hands_per_step=1), tmp_path / "motion", quiet)
+    lines = curve(tmp_path / "motion")
+    assert lines[-1]["distance"] < 0.6 * lines[0]["distance"]
+    assert all(torch.equal(encoder[k], v) for k, v in learnt.hand_encoder.state_dict().items())
+    config = TrainConfig(SCHEDULE, hands_per_step=1, columns=24)
+    train(bundle, network, config, tmp_path / "fresh", report=quiet)
+    train(bundle, network, config, tmp_path / "taken", learnt, quiet)
+    assert curve(tmp_path / "taken")[0]["motion"] < 0.7 * curve(tmp_path / "fresh")[0]["motion"]
+    with pytest.raises(TrainingError, match="latent_form is 'kernel'"):
+        pretrain_motion(DistanceNetwork(TINY), bundle, MotionConfig(schedule), tmp_path / "none", quiet)
+
+
+def test_two_processes_descend_the_curve_of_one(home: Path, bundle: Bundle, tmp_path: Path) -> None:
+    (tmp_path / "bundle.safetensors").symlink_to(home / "bundle.safetensors")
+    (tmp_path / "shared.py").write_text(SHARED)
+    subprocess.run(
+        [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", tmp_path / "shared.py",
+         str(tmp_path)],
+        check=True, capture_output=True, text=True, timeout=120,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"})
+    alone = run_stage("train", bundle, tmp_path / "alone", SHARDED)
+    assert [line["step"] for line in curve(tmp_path / "shared")] == [2, 4, 6, 8, 10]
+    assert curve(tmp_path / "shared") == [pytest.approx(line, rel=1e-4, abs=1e-7) for line in curve(tmp_path / "alone")]
+    shared = torch.load(tmp_path / "shared" / CHECKPOINT, weights_only=True)["model"]
+    whole = torch.load(tmp_path / "alone" / CHECKPOINT, weights_only=True)["model"]
+    for name in alone.state_dict():
+        if "running" not in name and "tracked" not in name:  # those of training are each process's own
+            torch.testing.assert_close(shared[name], whole[name], rtol=1e-4, atol=1e-5)
+    run_stage("train", bundle, tmp_path / "other", SCHEDULE)
+    assert curve(tmp_path / "other")[0] != pytest.approx(curve(tmp_path / "alone")[0], rel=1e-4), "two shards see more"
+
+
+def test_shards_that_cannot_be_shared_out_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match=r"3 shards .* 2 processes; give a multiple of 2"):
+        Run(tmp_path / "run", nn.Linear(1, 1), dataclasses.replace(SCHEDULE, shards=3), torch.Generator(), Processes(0, 2))
 
 
 def test_tensorboard_gets_the_log_where_it_is_installed(

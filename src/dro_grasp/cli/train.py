@@ -111,8 +111,8 @@ class Train:
     """Peak of the learning rate."""
     prior: Literal["standard", "learned", "flow"] = "standard"
     """What z is drawn from: N(0, I), the paper's form, or a Gaussian or a flow learned from hand and object."""
-    latent_form: Literal["kernel", "points"] = "kernel"
-    """Where z enters: the kernel alone, the paper's form, or the features of every hand point as well."""
+    latent_form: Literal["kernel", "motion"] = "kernel"
+    """What z does: it enters the kernel alone, the paper's form, or also moves the placed open hand."""
     divergence: float = 0.01
     """Weight of the KL term."""
     divergence_warmup: float = 0.0

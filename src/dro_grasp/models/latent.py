@@ -5,11 +5,14 @@ from __future__ import annotations
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional
 
 from dro_grasp.models.encoder import SLOPE, EdgeLayer, PointLayer, nearest_neighbours
 
 MAX_LOG_VARIANCE = 8.0
 """Log-variances are kept within plus and minus this."""
+CERTAIN = -4.0
+"""Log-variance that the code of a motion starts with."""
 
 
 class LatentEncoder(nn.Module):
@@ -38,26 +41,51 @@ class LatentEncoder(nn.Module):
         return mean, log_variance.clamp(-MAX_LOG_VARIANCE, MAX_LOG_VARIANCE)
 
 
-class ConditionalPrior(nn.Module):
-    """p(z | hand, object): a Gaussian read off the features of both clouds; N(0, I) before training.
+class Condition(nn.Module):
+    """What a prior of z has to know: the object as it lies before the placed open hand, and which hand it is."""
+
+    SCALE = 0.1
+    """Size of a cloud that networks see as 1 [m]."""
+
+    def __init__(self, features: int, width: int) -> None:
+        super().__init__()
+        self.points = nn.Sequential(
+            nn.Linear(features + 3, width), nn.LeakyReLU(SLOPE), nn.Linear(width, width), nn.LeakyReLU(SLOPE),
+            nn.Linear(width, width))
+        self.join = nn.Sequential(
+            nn.Linear(2 * width + 2 * features, width), nn.LeakyReLU(SLOPE), nn.Linear(width, width))
+
+    def forward(
+        self, hand_features: Float[Tensor, "b n c"], obj_features: Float[Tensor, "b m c"], hand: Float[Tensor, "b n 3"],
+        obj: Float[Tensor, "b m 3"],
+    ) -> Float[Tensor, "b width"]:
+        """One vector out of the encoders' features and both clouds [m], in one frame."""
+        x = self.points(torch.cat([obj_features, (obj - hand.mean(1, keepdim=True)) / self.SCALE], -1))
+        return self.join(torch.cat([x.amax(1), x.mean(1), hand_features.amax(1), hand_features.mean(1)], -1))
+
+
+class GaussianPrior(nn.Module):
+    """p(z | hand, object) as a Gaussian; N(0, I) before training.
 
     Differs from the paper, whose prior is N(0, I) whatever hand and object are.
     """
 
-    def __init__(self, features: int, latent: int, width: int) -> None:
+    def __init__(self, latent: int, width: int) -> None:
         super().__init__()
-        self.layers = nn.Sequential(
-            nn.Linear(4 * features, width), nn.LeakyReLU(SLOPE), nn.Linear(width, width), nn.LeakyReLU(SLOPE))
+        self.layers = nn.Sequential(nn.LeakyReLU(SLOPE), nn.Linear(width, width), nn.LeakyReLU(SLOPE))
         self.last = nn.Linear(width, 2 * latent)
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(self.last.bias)
 
-    def forward(
-        self, hand: Float[Tensor, "b n c"], obj: Float[Tensor, "b m c"]
-    ) -> tuple[Float[Tensor, "b latent"], Float[Tensor, "b latent"]]:
-        """Mean and log-variance of the prior."""
-        mean, log_variance = self.last(self.layers(pooled(hand, obj))).chunk(2, -1)
+    def moments(self, condition: Float[Tensor, "b width"]) -> tuple[Float[Tensor, "b latent"], Float[Tensor, "b latent"]]:
+        """Mean and log-variance."""
+        mean, log_variance = self.last(self.layers(condition)).chunk(2, -1)
         return mean, log_variance.clamp(-MAX_LOG_VARIANCE, MAX_LOG_VARIANCE)
+
+    def forward(self, noise: Float[Tensor, "b latent"], condition: Float[Tensor, "b width"]) -> Float[Tensor, "b latent"]:
+        """Turn standard normal noise into z."""
+        mean, log_variance = self.moments(condition)
+        return mean + (0.5 * log_variance).exp() * noise
 
 
 class FlowPrior(nn.Module):
@@ -72,18 +100,13 @@ class FlowPrior(nn.Module):
     DRAWS = 8
     """Times and noises that each z is trained with at once; they are cheap beside the encoders."""
 
-    def __init__(self, features: int, latent: int, width: int) -> None:
+    def __init__(self, latent: int, width: int) -> None:
         super().__init__()
-        self.condition = nn.Sequential(nn.Linear(4 * features, width), nn.LeakyReLU(SLOPE), nn.Linear(width, width))
         self.enter = nn.Linear(latent + 2, width)
         self.layers = nn.ModuleList(
             nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.SiLU(), nn.Linear(2 * width, width))
             for _ in range(3))
         self.leave = nn.Linear(width, latent)
-
-    def read(self, hand: Float[Tensor, "b n c"], obj: Float[Tensor, "b m c"]) -> Float[Tensor, "b width"]:
-        """What the flow has to know of hand and object."""
-        return self.condition(pooled(hand, obj))
 
     def velocity(
         self, z: Float[Tensor, "b latent"], time: Float[Tensor, "b 1"], condition: Float[Tensor, "b width"]
@@ -103,10 +126,8 @@ class FlowPrior(nn.Module):
         error = self.velocity(on_the_way, time, condition.repeat_interleave(self.DRAWS, 0)) - (goal - noise)
         return error.square().mean(-1).unflatten(0, (-1, self.DRAWS)).mean(-1)
 
-    def forward(
-        self, noise: Float[Tensor, "b latent"], condition: Float[Tensor, "b width"]
-    ) -> Float[Tensor, "b latent"]:
-        """z of standard normal noise, by the midpoint rule."""
+    def forward(self, noise: Float[Tensor, "b latent"], condition: Float[Tensor, "b width"]) -> Float[Tensor, "b latent"]:
+        """Turn standard normal noise into z, by the midpoint rule."""
         z, step = noise, 1 / self.STEPS
         for i in range(self.STEPS):
             time = torch.full_like(noise[:, :1], i * step)
@@ -115,29 +136,71 @@ class FlowPrior(nn.Module):
         return z
 
 
-class PointLatent(nn.Module):
-    """z changes the features of every hand point, each in its own way; nothing before training.
+class HandMotion(nn.Module):
+    """z as a code of how the open hand moves into the grasp: read off both poses, and turned back into shifts of points.
 
-    Differs from the paper, where z reaches the kernel alone, as one bias for all pairs: too little to tell one finger to
-    open and another to close.
+    Knows the hand only, so it learns from any joint angles, before there are grasps; what motion suits an object is for
+    the prior to say. Differs from the paper, where z reaches the kernel alone, as one bias for all pairs: too little to tell
+    one finger to open and another to close.
     """
 
-    def __init__(self, features: int, latent: int) -> None:
+    SCALE = 0.05
+    """Size of a shift that networks see as 1 [m]."""
+
+    def __init__(self, features: int, latent: int, width: int) -> None:
         super().__init__()
-        self.first = nn.Linear(features + latent, features)
-        self.last = nn.Linear(features, features)
-        nn.init.zeros_(self.last.weight)
-        nn.init.zeros_(self.last.bias)
+        self.seen = Modulated(features + 3, 3, width)
+        self.code = nn.Sequential(
+            nn.Linear(2 * width, width), nn.LeakyReLU(SLOPE), nn.Linear(width, width), nn.LeakyReLU(SLOPE),
+            nn.Linear(width, 2 * latent))
+        self.shift = Modulated(features + 3, latent, width)
+        self.last = nn.Linear(width, 3)
+        last = self.code[-1]
+        assert isinstance(last, nn.Linear)
+        with torch.no_grad():
+            # Noise as large as what is coded would hide what z is good for.
+            last.bias[latent:] = CERTAIN
 
-    def forward(self, features: Float[Tensor, "b n c"], z: Float[Tensor, "b latent"]) -> Float[Tensor, "b n c"]:
-        """Features of the hand's points that know z."""
-        joined = torch.cat([features, z[:, None].expand(-1, features.shape[1], -1)], -1)
-        return features + self.last(nn.functional.leaky_relu(self.first(joined), SLOPE))
+    def encode(
+        self, features: Float[Tensor, "b n c"], hand: Float[Tensor, "b n 3"], grasp: Float[Tensor, "b n 3"]
+    ) -> tuple[Float[Tensor, "b latent"], Float[Tensor, "b latent"]]:
+        """Mean and log-variance of the posterior, from the encoder's features and both poses of the hand [m]."""
+        x = self.seen(self._points(features, hand), (grasp - hand) / self.SCALE)
+        mean, log_variance = self.code(torch.cat([x.amax(1), x.mean(1)], -1)).chunk(2, -1)
+        return mean, log_variance.clamp(-MAX_LOG_VARIANCE, MAX_LOG_VARIANCE)
+
+    def forward(
+        self, features: Float[Tensor, "b n c"], hand: Float[Tensor, "b n 3"], z: Float[Tensor, "b latent"]
+    ) -> Float[Tensor, "b n 3"]:
+        """The hand's points after the motion [m]."""
+        return hand + self.SCALE * self.last(self.shift(self._points(features, hand), z[:, None]))
+
+    def _points(self, features: Float[Tensor, "b n c"], hand: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n d"]:
+        return torch.cat([features, (hand - hand.mean(1, keepdim=True)) / self.SCALE], -1)
 
 
-def pooled(hand: Float[Tensor, "b n c"], obj: Float[Tensor, "b m c"]) -> Float[Tensor, "b 4*c"]:
-    """Largest and mean features of both clouds."""
-    return torch.cat([hand.amax(1), hand.mean(1), obj.amax(1), obj.mean(1)], -1)
+class Modulated(nn.Module):
+    """Layers on points whose values a second input scales and shifts: what moves how far is a product, not a sum.
+
+    Source: feature-wise linear modulation, Perez et al. 2018.
+    """
+
+    def __init__(self, inputs: int, control: int, width: int, depth: int = 3) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(nn.Linear(inputs if i == 0 else width, width) for i in range(depth))
+        self.controls = nn.ModuleList(nn.Linear(control, 2 * width) for _ in range(depth))
+
+    def forward(self, x: Float[Tensor, "b n c"], control: Float[Tensor, "b k d"]) -> Float[Tensor, "b n width"]:
+        """Values of the points; the control is one for all or one for each of them."""
+        for layer, modulation in zip(self.layers, self.controls, strict=True):
+            scale, shift = modulation(control).chunk(2, -1)
+            x = functional.leaky_relu(layer(x) * (1 + scale) + shift, SLOPE)
+        return x
+
+
+def with_latent(features: Float[Tensor, "b n c"], z: Float[Tensor, "b latent"]) -> Float[Tensor, "b n d"]:
+    """Features of points that know z."""
+    return torch.cat([features, z[:, None].expand(-1, features.shape[1], -1)], -1)
 
 
 def sample_posterior(

@@ -12,7 +12,15 @@ from torch import Tensor, nn
 from dro_grasp.models.attention import CrossTransformer
 from dro_grasp.models.distance_head import DistanceHead
 from dro_grasp.models.encoder import StaticGraphEncoder
-from dro_grasp.models.latent import ConditionalPrior, FlowPrior, LatentEncoder, PointLatent, sample_posterior
+from dro_grasp.models.latent import (
+    Condition,
+    FlowPrior,
+    GaussianPrior,
+    HandMotion,
+    LatentEncoder,
+    sample_posterior,
+    with_latent,
+)
 from dro_grasp.models.placement import PlacementPrior
 from dro_grasp.models.precision import fast_products
 
@@ -46,8 +54,8 @@ class NetworkConfig:
     prior: Literal["standard", "learned", "flow"] = "standard"
     """What z is drawn from at inference: N(0, I) (the paper's form), a Gaussian learned from hand and object, or any
     distribution that a flow learns from them."""
-    latent_form: Literal["kernel", "points"] = "kernel"
-    """Where z enters: the kernel alone (the paper's form), or the features of every hand point as well."""
+    latent_form: Literal["kernel", "motion"] = "kernel"
+    """What z does: it enters the kernel alone (the paper's form), or also moves the placed open hand; needs `residual`."""
     kernel_hidden: tuple[int, int] = (300, 100)
     """Hidden layers of the kernel."""
     initial_distance: float = 0.1
@@ -105,6 +113,8 @@ class NetworkOutput:
     """Its log-variance; zero in the paper's form."""
     flow_error: Float[Tensor, " b"]
     """Squared velocity error of the flow to z; zero without a flow."""
+    moved: Float[Tensor, "b n 3"]
+    """The placed hand, moved as z says where z says so [m]."""
     hand_feature: Float[Tensor, "b width"]
     """Mean feature of the open hand, for the placement prior."""
 
@@ -120,26 +130,34 @@ class DistanceNetwork(nn.Module):
         self.object_encoder = StaticGraphEncoder(c.encoder_widths, c.width, c.neighbours)
         self.hand_transformer = CrossTransformer(c.width, c.heads, c.attention_hidden)
         self.object_transformer = CrossTransformer(c.width, c.heads, c.attention_hidden)
-        self.latent_encoder = LatentEncoder(c.width, c.latent, c.latent_widths, c.latent_head, c.latent_neighbours)
-        self.prior = ConditionalPrior(c.width, c.latent, c.latent_head[1]) if c.prior == "learned" else None
-        self.flow = FlowPrior(c.width, c.latent, c.latent_head[0]) if c.prior == "flow" else None
-        self.point_latent = PointLatent(c.width, c.latent) if c.latent_form == "points" else None
+        prior_width = c.latent_head[0]
+        self.motion = HandMotion(c.width, c.latent, c.latent_head[0]) if c.latent_form == "motion" else None
+        self.latent_encoder = None if self.motion is not None else LatentEncoder(
+            c.width, c.latent, c.latent_widths, c.latent_head, c.latent_neighbours)
+        self.condition = None if c.prior == "standard" else Condition(c.width, prior_width)
+        self.prior = (
+            FlowPrior(c.latent, prior_width) if c.prior == "flow"
+            else GaussianPrior(c.latent, prior_width) if c.prior == "learned" else None)
         self.head = DistanceHead(c.width + c.latent, c.kernel_hidden, c.initial_distance)
         self.place = nn.Linear(3, c.width) if c.placed else None
         self.placement = PlacementPrior(c.width, c.placement_width, c.placement_components)
 
-    def features(
+    def encode(
         self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"]
-    ) -> tuple[Float[Tensor, "b n width"], Float[Tensor, "b m width"], Float[Tensor, "b width"]]:
-        """Correlated point features of both clouds, and the mean feature of the open hand."""
-        centred = hand - hand.mean(1, keepdim=True)
-        phi_hand, phi_object = self.hand_encoder(centred), self.object_encoder(obj)
-        summary = phi_hand.mean(1)
+    ) -> tuple[Float[Tensor, "b n width"], Float[Tensor, "b m width"]]:
+        """Features of the points of each cloud by itself."""
+        return self.hand_encoder(hand - hand.mean(1, keepdim=True)), self.object_encoder(obj)
+
+    def relate(
+        self, hand_features: Float[Tensor, "b n width"], obj_features: Float[Tensor, "b m width"], hand: Float[Tensor, "b n 3"]
+    ) -> tuple[Float[Tensor, "b n width"], Float[Tensor, "b m width"]]:
+        """Features that know of the other cloud, and of where the hand [m] is if the configuration says so."""
         if self.place is not None:
-            phi_hand = phi_hand + self.place(hand * 10)
-        psi_hand = self.hand_transformer(phi_hand, phi_object) + phi_hand
-        psi_object = self.object_transformer(phi_object, phi_hand) + phi_object
-        return psi_hand, psi_object, summary
+            hand_features = hand_features + self.place(hand * 10)
+        return (
+            self.hand_transformer(hand_features, obj_features) + hand_features,
+            self.object_transformer(obj_features, hand_features) + obj_features,
+        )
 
     def forward(
         self,
@@ -156,46 +174,49 @@ class DistanceNetwork(nn.Module):
             grasp: The hand in the grasp pose, in the same frame [m].
             columns: Compute distances to this many leading object points only; the order must be random.
         """
-        psi_hand, psi_object, summary = self.features(hand, obj)
-        mean, log_variance = self.latent_encoder(torch.cat([grasp, obj], 1), torch.cat([psi_hand, psi_object], 1))
-        z = sample_posterior(mean, log_variance)
-        distances = self._distances(psi_hand, psi_object[:, :columns], z, hand, obj[:, :columns])
-        prior_mean, prior_log_variance = self._prior(psi_hand, psi_object)
-        flow_error = z.new_zeros(len(z)) if self.flow is None else self.flow.loss(z, self.flow.read(psi_hand, psi_object))
-        return NetworkOutput(distances, mean, log_variance, prior_mean, prior_log_variance, flow_error, summary)
+        phi_hand, phi_object = self.encode(hand, obj)
+        if self.motion is not None:
+            mean, log_variance = self.motion.encode(phi_hand, hand, grasp)
+            z = sample_posterior(mean, log_variance)
+            moved = self.motion(phi_hand, hand, z)
+            psi_hand, psi_object = self.relate(phi_hand, phi_object, moved)
+        else:
+            psi_hand, psi_object = self.relate(phi_hand, phi_object, hand)
+            assert self.latent_encoder is not None
+            mean, log_variance = self.latent_encoder(
+                torch.cat([grasp, obj], 1), torch.cat([psi_hand, psi_object], 1))
+            z, moved = sample_posterior(mean, log_variance), hand
+        distances = self._distances(psi_hand, psi_object[:, :columns], z, moved, obj[:, :columns])
+        prior_mean, prior_log_variance, flow_error = torch.zeros_like(z), torch.zeros_like(z), z.new_zeros(len(z))
+        if self.condition is not None:
+            condition = self.condition(phi_hand, phi_object, hand, obj)
+            if isinstance(self.prior, FlowPrior):
+                flow_error = self.prior.loss(z, condition)
+            elif self.prior is not None:
+                prior_mean, prior_log_variance = self.prior.moments(condition)
+        return NetworkOutput(
+            distances, mean, log_variance, prior_mean, prior_log_variance, flow_error, moved, phi_hand.mean(1))
 
     def predict(
         self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], noise: Float[Tensor, "b latent"]
     ) -> Float[Tensor, "b n m"]:
         """D(R,O) [m] for draws of `sample_latent`, which the prior turns into z; see `forward` for the clouds."""
         with fast_products():
-            psi_hand, psi_object, _ = self.features(hand, obj)
-            if self.flow is not None:
-                z = self.flow(noise, self.flow.read(psi_hand, psi_object))
-            else:
-                mean, log_variance = self._prior(psi_hand, psi_object)
-                z = mean + (0.5 * log_variance).exp() * noise
-            return self._distances(psi_hand, psi_object, z, hand, obj)
-
-    def _prior(self, psi_hand: Tensor, psi_object: Tensor) -> tuple[Float[Tensor, "b latent"], Float[Tensor, "b latent"]]:
-        """Mean and log-variance that the divergence is taken from: of z before the grasp is known, but for a flow."""
-        if self.prior is not None:
-            return self.prior(psi_hand, psi_object)
-        zero = psi_hand.new_zeros(len(psi_hand), self.config.latent)
-        return zero, zero
+            phi_hand, phi_object = self.encode(hand, obj)
+            z = noise
+            if self.condition is not None and self.prior is not None:
+                z = self.prior(noise, self.condition(phi_hand, phi_object, hand, obj))
+            moved = hand if self.motion is None else self.motion(phi_hand, hand, z)
+            psi_hand, psi_object = self.relate(phi_hand, phi_object, moved)
+            return self._distances(psi_hand, psi_object, z, moved, obj)
 
     def _distances(
         self, psi_hand: Tensor, psi_object: Tensor, z: Tensor, hand: Tensor, obj: Tensor
     ) -> Float[Tensor, "b n m"]:
-        def joined(features: Tensor) -> Tensor:
-            return torch.cat([features, z[:, None].expand(-1, features.shape[1], -1)], -1)
-
-        if self.point_latent is not None:
-            psi_hand = self.point_latent(psi_hand, z)
         # The matrix-product form of cdist loses half of the digits.
         exact = "donot_use_mm_for_euclid_dist"
         base = torch.cdist(hand, obj, compute_mode=exact) if self.config.residual else None
-        return self.head(joined(psi_hand), joined(psi_object), base)
+        return self.head(with_latent(psi_hand, z), with_latent(psi_object, z), base)
 
     def to_frame(
         self, points: Float[Tensor, "b n 3"], centre: Float[Tensor, "b 3"], rotation: Float[Tensor, "b 3 3"]

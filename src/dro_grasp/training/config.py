@@ -36,6 +36,8 @@ class LossConfig:
     """Share of the schedule over which the divergence's weight grows from zero, so that z is used before it costs."""
     free_bits: float = 0.0
     """Divergence of each latent dimension that costs nothing [nat]."""
+    motion: float = 1.0
+    """Weight of the mean distance between the hand as z moves it and the true grasp, where z moves it."""
     flow: float = 0.01
     """Weight of the flow to z, where the network has one."""
     placement: float = 0.01
@@ -60,6 +62,8 @@ class ScheduleConfig:
     """Decay of the moving average of the weights, which is what is saved."""
     checkpoint_seconds: float = 60.0
     """A checkpoint is written this often [s]."""
+    shards: int = 1
+    """Independent parts of a step's batch, each as large as the configuration says; processes share them out."""
     log_every: int = 20
     """Steps between lines of the log."""
     tensorboard: bool = False
@@ -100,3 +104,15 @@ class PretrainConfig:
     """lambda of the tanh weights [1/m]. Source: paper section III-B."""
     rotation: float = math.radians(15)
     """Largest rotation between the two clouds' wrists [rad]."""
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """Pretraining of the z that says how hands move."""
+
+    schedule: ScheduleConfig = ScheduleConfig(steps=5_000)
+    augmentation: AugmentationConfig = AugmentationConfig()
+    hands_per_step: int = 4
+    samples_per_hand: int = 16
+    divergence: float = 1e-4
+    """Weight of the divergence of z from N(0, I) [m/nat]."""

@@ -21,6 +21,7 @@ from dro_grasp.training.losses import (
     placement_loss,
     pose_loss,
 )
+from dro_grasp.training.processes import together
 from dro_grasp.training.reports import console_report
 from dro_grasp.training.runs import Run
 from dro_grasp.training.samples import HandSamples, SampleSource
@@ -52,29 +53,37 @@ def train(
     Raises:
         TrainingError: A loss is not finite.
     """
-    torch.manual_seed(config.schedule.seed)
-    device = torch.device(config.schedule.device)
-    generator = torch.Generator(device).manual_seed(config.schedule.seed)
-    model = DistanceNetwork(network, name=name).to(device)
-    frozen = pretrained is not None and config.freeze_hand_encoder
-    if pretrained is not None:
-        model.hand_encoder.load_state_dict(pretrained.hand_encoder.state_dict())
-    model.hand_encoder.requires_grad_(not frozen)
-    source = SampleSource(bundle, network, config.augmentation, device)
-    run = Run(folder, model, config.schedule, generator)
-    model.train()
-    if frozen:
-        # train() would put the frozen encoder's BatchNorm back into training mode.
-        model.hand_encoder.eval()
+    with together(config.schedule.device) as (processes, device):
+        torch.manual_seed(config.schedule.seed)
+        generator = torch.Generator(device)
+        model = DistanceNetwork(network, name=name).to(device)
+        frozen = pretrained is not None and config.freeze_hand_encoder
+        if pretrained is not None:
+            start_from(model, pretrained)
+        model.hand_encoder.requires_grad_(not frozen)
+        source = SampleSource(bundle, network, config.augmentation, device)
+        run = Run(folder, model, config.schedule, generator, processes)
+        model.train()
+        if frozen:
+            # train() would put the frozen encoder's BatchNorm back into training mode.
+            model.hand_encoder.eval()
 
-    def draw() -> list[HandSamples]:
-        names = source.draw_hands(config.hands_per_step, generator)
-        return [source.draw(hand, config.samples_per_hand, generator) for hand in names]
+        def draw() -> list[HandSamples]:
+            names = source.draw_hands(config.hands_per_step, generator)
+            return [source.draw(hand, config.samples_per_hand, generator) for hand in names]
 
-    run.train(lambda: step_losses(model, draw(), config, run.progress), report or console_report("training"))
-    model.load_state_dict(run.average.module.state_dict())
-    recalibrate(model, lambda: model(*_clouds(draw()), columns=1))
+        run.train(lambda: step_losses(model, draw(), config, run.progress), report or console_report("training"))
+        model.load_state_dict(run.average.module.state_dict())
+        run.seed_shard()
+        recalibrate(model, lambda: model(*_clouds(draw()), columns=1))
     return model.cpu().eval()
+
+
+def start_from(model: DistanceNetwork, pretrained: DistanceNetwork) -> None:
+    """Take over what was pretrained: the hand encoder, and the motion that z codes where both networks have one."""
+    model.hand_encoder.load_state_dict(pretrained.hand_encoder.state_dict())
+    if model.motion is not None and pretrained.motion is not None:
+        model.motion.load_state_dict(pretrained.motion.state_dict())
 
 
 def step_losses(
@@ -105,6 +114,8 @@ def step_losses(
     parts["penetration"] = torch.cat(penetrations).mean()
     nats = divergence(output.mean, output.log_variance, output.prior_mean, output.prior_log_variance)
     parts["divergence"] = divergence_loss(nats, config.losses.divergence_form, config.losses.free_bits)
+    if model.motion is not None:
+        parts["motion"] = (output.moved - grasp).norm(dim=-1).mean()
     parts["flow"] = output.flow_error.mean()
     parts["placement"] = _placement(model, groups, output)
     weights = {name: getattr(config.losses, name) for name in parts}

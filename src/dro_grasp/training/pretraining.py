@@ -8,11 +8,14 @@ from pathlib import Path
 import torch
 
 from dro_grasp.datasets.bundle import Bundle
+from dro_grasp.errors import TrainingError
 from dro_grasp.models.encoder import StaticGraphEncoder
+from dro_grasp.models.latent import HandMotion, sample_posterior
 from dro_grasp.models.network import DistanceNetwork, NetworkConfig
 from dro_grasp.training.batch_statistics import recalibrate
-from dro_grasp.training.config import AugmentationConfig, PretrainConfig
-from dro_grasp.training.losses import contrastive_loss
+from dro_grasp.training.config import AugmentationConfig, MotionConfig, PretrainConfig
+from dro_grasp.training.losses import contrastive_loss, divergence
+from dro_grasp.training.processes import together
 from dro_grasp.training.reports import console_report
 from dro_grasp.training.runs import Run
 from dro_grasp.training.samples import SampleSource, random_rotations, random_turns
@@ -40,22 +43,77 @@ def pretrain(
     Raises:
         TrainingError: A loss is not finite.
     """
-    torch.manual_seed(config.schedule.seed)
-    device = torch.device(config.schedule.device)
-    whole = DistanceNetwork(network, name="pretrained").to(device)
-    generator = torch.Generator(device).manual_seed(config.schedule.seed)
-    source = SampleSource(bundle, network, AugmentationConfig(), device)
-    encoder = whole.hand_encoder
-    run = Run(folder, encoder, config.schedule, generator)
-    encoder.train()
+    with together(config.schedule.device) as (processes, device):
+        torch.manual_seed(config.schedule.seed)
+        whole = DistanceNetwork(network, name="pretrained").to(device)
+        generator = torch.Generator(device)
+        source = SampleSource(bundle, network, AugmentationConfig(), device)
+        encoder = whole.hand_encoder
+        run = Run(folder, encoder, config.schedule, generator, processes)
+        encoder.train()
 
-    def losses() -> dict[str, torch.Tensor]:
-        return {"total": contrastive_step(encoder, source, config, generator)}
+        def losses() -> dict[str, torch.Tensor]:
+            return {"total": contrastive_step(encoder, source, config, generator)}
 
-    run.train(losses, report or console_report("pretraining"))
-    encoder.load_state_dict(run.average.module.state_dict())
-    recalibrate(encoder, losses)
+        run.train(losses, report or console_report("pretraining"))
+        encoder.load_state_dict(run.average.module.state_dict())
+        run.seed_shard()
+        recalibrate(encoder, losses)
     return whole.cpu().eval()
+
+
+def pretrain_motion(
+    model: DistanceNetwork,
+    bundle: Bundle,
+    config: MotionConfig,
+    folder: Path,
+    report: Callable[[Run, dict[str, float]], None] | None = None,
+) -> DistanceNetwork:
+    """Teach z to say how hands move, before any object is seen; the hand encoder stays as it is.
+
+    Args:
+        model: A network whose z moves the hand, with a pretrained hand encoder.
+        bundle: Hands and grasps.
+        config: Loss and schedule.
+        folder: Run folder; a checkpoint in it is taken up.
+        report: Called now and then; the console by default.
+
+    Returns:
+        The same network, on the CPU, in evaluation mode.
+
+    Raises:
+        TrainingError: A loss is not finite, or z does not move the hand in this network.
+    """
+    if model.motion is None:
+        raise TrainingError(f"latent_form is '{model.config.latent_form}'; only with 'motion' is there a motion to pretrain")
+    with together(config.schedule.device) as (processes, device):
+        motion, encoder = model.motion.to(device), model.hand_encoder.to(device).eval()
+        generator = torch.Generator(device)
+        source = SampleSource(bundle, model.config, config.augmentation, device)
+        run = Run(folder, motion, config.schedule, generator, processes)
+        motion.train()
+
+        def losses() -> dict[str, torch.Tensor]:
+            return motion_losses(motion, encoder, source, config, generator)
+
+        run.train(losses, report or console_report("motion"))
+        motion.load_state_dict(run.average.module.state_dict())
+    return model.cpu().eval()
+
+
+def motion_losses(
+    motion: HandMotion, encoder: StaticGraphEncoder, source: SampleSource, config: MotionConfig, generator: torch.Generator
+) -> dict[str, torch.Tensor]:
+    """Mean distance of moved points from where they should be [m], and the divergence [nat]."""
+    names = source.draw_hands(config.hands_per_step, generator)
+    drawn = [source.draw_motions(name, config.samples_per_hand, generator) for name in names]
+    hand, goal = (torch.cat(clouds) for clouds in zip(*drawn, strict=True))
+    with torch.no_grad():
+        features = encoder(hand - hand.mean(1, keepdim=True))
+    mean, log_variance = motion.encode(features, hand, goal)
+    distance = (motion(features, hand, sample_posterior(mean, log_variance)) - goal).norm(dim=-1).mean()
+    nats = divergence(mean, log_variance).sum(-1).mean()
+    return {"total": distance + config.divergence * nats, "distance": distance, "nats": nats}
 
 
 def contrastive_step(

@@ -33,12 +33,12 @@ def console_report(title: str) -> Callable[[Run, dict[str, float]], None]:
     return report
 
 
-def tensorboard_report(folder: Path) -> Callable[[Run, dict[str, float]], None] | None:
-    """Writes losses for TensorBoard; None where it is not installed."""
+def tensorboard_reports(folder: Path) -> list[Callable[[Run, dict[str, float]], None]]:
+    """One that writes losses for TensorBoard; none where it is not installed."""
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
-        return None
+        return []
     writer = SummaryWriter(str(folder))
 
     def report(run: Run, means: dict[str, float]) -> None:
@@ -47,4 +47,4 @@ def tensorboard_report(folder: Path) -> Callable[[Run, dict[str, float]], None] 
         if run.progress >= 1:
             writer.close()
 
-    return report
+    return [report]

@@ -98,6 +98,29 @@ class SampleSource:
             position=((centre_of_grasp - centre)[:, None] @ T[:, :3, :3])[:, 0],
         )
 
+    def draw_motions(
+        self, name: str, count: int, generator: torch.Generator
+    ) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b n 3"]]:
+        """Placed open hands, and what they move to [m]: any joint angles, about the same wrist; in axes of the placed wrist.
+
+        Half of the joint angles are those of grasps, the others uniform within the limits.
+        """
+        hand, grasps = self.hands[name], self.grasps[name]
+        chosen = torch.randint(len(grasps.joints), (count,), generator=generator, device=generator.device)
+        lower, upper = hand.tree.lower, hand.tree.upper
+        share = torch.rand(count, len(lower), generator=generator, device=generator.device)
+        known = torch.rand(count, 1, generator=generator, device=generator.device) < 0.5
+        q = torch.where(known, grasps.joints[chosen], lower + share * (upper - lower))
+        wrist = torch.eye(4, device=generator.device).expand(count, 4, 4)
+        T = torch.linalg.inv(self._placements(hand, wrist, generator))
+        if self.network.frame == "object":
+            turn = random_rotations(count, generator)
+            T[:, :3] = turn @ T[:, :3]
+            wrist = wrist.clone()
+            wrist[:, :3, :3] = turn
+        opened = hand.random_open_joints(count, generator)
+        return hand.points(opened, wrist), hand.points(q, T)
+
     def _objects(self, index: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Random object points with noise, and their normals (b m 3)."""
         m, device = self.network.n_object, generator.device

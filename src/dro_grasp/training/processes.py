@@ -1,0 +1,74 @@
+"""Training in several processes, as torchrun starts them: who is who, and sums over all of them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, distributed
+
+from dro_grasp.errors import OptionError
+
+
+@dataclass(frozen=True)
+class Processes:
+    """This process among those that train together; alone by default."""
+
+    rank: int = 0
+    """Which one this is; the first one writes files and speaks."""
+    count: int = 1
+    """How many there are."""
+
+    @property
+    def first(self) -> bool:
+        """Whether this is the one that writes files and speaks."""
+        return self.rank == 0
+
+    def add_up(self, tensors: Iterable[Tensor]) -> None:
+        """Replace every tensor by its sum over all processes, in one message."""
+        tensors = list(tensors)
+        if self.count == 1 or not tensors:
+            return
+        message = torch.cat([t.flatten() for t in tensors])
+        distributed.all_reduce(message)
+        for tensor, part in zip(tensors, message.split([t.numel() for t in tensors]), strict=True):
+            tensor.copy_(part.view_as(tensor))
+
+    def from_first(self, value: Any) -> Any:
+        """What the first process holds, in all of them; it alone may have read it from a disk."""
+        if self.count == 1:
+            return value
+        box = [value]
+        distributed.broadcast_object_list(box)
+        return box[0]
+
+
+@contextmanager
+def together(device: str) -> Iterator[tuple[Processes, str]]:
+    """Join the processes that torchrun started, and take a device of one's own; alone where it started none.
+
+    Args:
+        device: `cpu`, or `cuda` for the GPU with this process's number on its machine.
+
+    Raises:
+        OptionError: torchrun started more processes on this machine than it has GPUs.
+    """
+    count = int(os.environ.get("WORLD_SIZE", "1"))
+    if count == 1:
+        yield Processes(), device
+        return
+    if device == "cuda":
+        number, there = int(os.environ.get("LOCAL_RANK", "0")), torch.cuda.device_count()
+        if number >= there:
+            raise OptionError(f"process {number} finds no GPU of its own, there are {there} here; use --nproc-per-node {there}")
+        device = f"cuda:{number}"
+        torch.cuda.set_device(number)
+    distributed.init_process_group("nccl" if device.startswith("cuda") else "gloo")
+    try:
+        yield Processes(distributed.get_rank(), distributed.get_world_size()), device
+    finally:
+        distributed.destroy_process_group()
