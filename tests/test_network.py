@@ -248,3 +248,24 @@ def test_inaccurate_processors_keep_full_precision(monkeypatch: pytest.MonkeyPat
     before = torch.get_float32_matmul_precision()
     with fast_products():
         assert torch.get_float32_matmul_precision() == before
+
+
+@pytest.mark.parametrize("form", ["kernel", "motion"])
+def test_mixed_precision_stays_near_single_precision(form: str) -> None:
+    torch.manual_seed(0)
+    forms = {"latent_form": form, "placed": True, "residual": True}
+    network = DistanceNetwork(NetworkConfig.from_dict({**SMALL.__dict__, **forms})).train()
+    hand, obj, grasp = torch.randn(4, 40, 3) * 0.05, torch.randn(4, 32, 3) * 0.05, torch.randn(4, 40, 3) * 0.05
+    found = {}
+    for mixed in (False, True):
+        network.mixed = mixed
+        network.zero_grad()
+        torch.manual_seed(1)
+        distances = network(hand, obj, grasp).distances
+        assert distances.dtype == torch.float32
+        (distances - torch.cdist(grasp, obj)).abs().mean().backward()
+        weights = [p for n, p in network.named_parameters() if n.startswith("object_transformer") and p.grad is not None]
+        found[mixed] = distances.detach(), torch.cat([p.grad.flatten() for p in weights])
+    apart = (found[True][0] - found[False][0]).abs()
+    assert 0 < apart.max() < 2e-3  # [m]
+    assert torch.nn.functional.cosine_similarity(found[True][1], found[False][1], dim=0) > 0.95

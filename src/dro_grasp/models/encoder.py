@@ -41,7 +41,8 @@ class EdgeLayer(nn.Module):
     def forward(self, x: Float[Tensor, "b n c"], index: Int[Tensor, "b n k"]) -> Float[Tensor, "b n d"]:
         """Features of the next layer."""
         difference, centre = self.linear.weight.chunk(2, 1)
-        neighbour, own = (x @ torch.cat([difference, centre - difference]).T).chunk(2, -1)
+        # Single precision from here on: statistics are sums over very many edges.
+        neighbour, own = (x @ torch.cat([difference, centre - difference]).T).float().chunk(2, -1)
         if self.norm.training:
             mean, variance = self._batch_statistics(neighbour, own, index)
         else:

@@ -125,6 +125,8 @@ class DistanceNetwork(nn.Module):
     def __init__(self, config: NetworkConfig, name: str = "untrained") -> None:
         super().__init__()
         self.config, self.name = config, name
+        self.mixed = False
+        """Whether encoders and transformers multiply in bfloat16; distances are always computed in single precision."""
         c = config
         self.hand_encoder = StaticGraphEncoder(c.encoder_widths, c.width, c.neighbours)
         self.object_encoder = StaticGraphEncoder(c.encoder_widths, c.width, c.neighbours)
@@ -146,7 +148,9 @@ class DistanceNetwork(nn.Module):
         self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"]
     ) -> tuple[Float[Tensor, "b n width"], Float[Tensor, "b m width"]]:
         """Features of the points of each cloud by itself."""
-        return self.hand_encoder(hand - hand.mean(1, keepdim=True)), self.object_encoder(obj)
+        with self._products(hand):
+            features = self.hand_encoder(hand - hand.mean(1, keepdim=True)), self.object_encoder(obj)
+        return features[0].float(), features[1].float()
 
     def relate(
         self, hand_features: Float[Tensor, "b n width"], obj_features: Float[Tensor, "b m width"], hand: Float[Tensor, "b n 3"]
@@ -154,10 +158,12 @@ class DistanceNetwork(nn.Module):
         """Features that know of the other cloud, and of where the hand [m] is if the configuration says so."""
         if self.place is not None:
             hand_features = hand_features + self.place(hand * 10)
-        return (
-            self.hand_transformer(hand_features, obj_features) + hand_features,
-            self.object_transformer(obj_features, hand_features) + obj_features,
-        )
+        with self._products(hand):
+            related = self.hand_transformer(hand_features, obj_features), self.object_transformer(obj_features, hand_features)
+        return related[0].float() + hand_features, related[1].float() + obj_features
+
+    def _products(self, like: Tensor) -> torch.autocast:
+        return torch.autocast(like.device.type, torch.bfloat16, enabled=self.mixed)
 
     def forward(
         self,
@@ -183,8 +189,10 @@ class DistanceNetwork(nn.Module):
         else:
             psi_hand, psi_object = self.relate(phi_hand, phi_object, hand)
             assert self.latent_encoder is not None
-            mean, log_variance = self.latent_encoder(
-                torch.cat([grasp, obj], 1), torch.cat([psi_hand, psi_object], 1))
+            with self._products(hand):
+                mean, log_variance = self.latent_encoder(
+                    torch.cat([grasp, obj], 1), torch.cat([psi_hand, psi_object], 1))
+            mean, log_variance = mean.float(), log_variance.float()
             z, moved = sample_posterior(mean, log_variance), hand
         distances = self._distances(psi_hand, psi_object[:, :columns], z, moved, obj[:, :columns])
         prior_mean, prior_log_variance, flow_error = torch.zeros_like(z), torch.zeros_like(z), z.new_zeros(len(z))

@@ -61,6 +61,7 @@ def train(
         if pretrained is not None:
             start_from(model, pretrained)
         model.hand_encoder.requires_grad_(not frozen)
+        model.mixed = config.schedule.mixed
         source = SampleSource(bundle, network, config.augmentation, device)
         run = Run(folder, model, config.schedule, generator, processes)
         model.train()
@@ -76,6 +77,7 @@ def train(
         model.load_state_dict(run.average.module.state_dict())
         run.seed_shard()
         recalibrate(model, lambda: model(*_clouds(draw()), columns=1))
+        model.mixed = False
     return model.cpu().eval()
 
 
