@@ -38,9 +38,11 @@ PAPER_OBJECTS := assets:train assets:validate
 
 data: setup  # hours; needs DRO_GRASP_ASSETS; can be stopped and started again
 	mkdir -p out
-	$(BIN)/dro-grasp synthesize --hand $(PAPER_HANDS) $(OTHER_HANDS) --object $(PAPER_OBJECTS) --grasps 150 --output out/data
+	$(BIN)/dro-grasp synthesize --hand $(PAPER_HANDS) --object $(PAPER_OBJECTS) --grasps 150 --output out/data
+	$(BIN)/dro-grasp synthesize --hand $(OTHER_HANDS) --object $(PAPER_OBJECTS) --grasps 75 --output out/other
 	$(BIN)/dro-grasp synthesize --hand $(HELD_OUT_HANDS) --object $(PAPER_OBJECTS) --grasps 50 --output out/held_out
 	$(BIN)/dro-grasp dataset merge out/data --output data/grasps --per-pair 150
+	$(BIN)/dro-grasp dataset merge out/other --output data/grasps --per-pair 75
 	$(BIN)/dro-grasp dataset merge out/held_out --output data/grasps --per-pair 50
 
 clean:
