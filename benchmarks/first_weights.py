@@ -51,7 +51,7 @@ PROTOCOLS = {
 def grasps_of(row: str, hand: Hand, obj: ObjectModel, bundle: Bundle, predictor: GraspPredictor, num: int) -> GraspBatch:
     """The grasps of one row of the table."""
     if row == ROWS[0]:
-        return predictor.predict(hand, obj, num=num, seed=0)
+        return predictor.predict(hand, obj, num=num, seed=0, refine=False)
     if row == ROWS[1]:
         return mean_grasps(hand, obj, mean_grasp(bundle, hand.name), num, seed=0)
     if row == ROWS[2]:

@@ -131,7 +131,7 @@ def test_generate_reports_and_saves_what_it_counts(generate, tmp_path: Path) -> 
     path = tmp_path / "grasps.parquet"
     report = generate("--output", str(path))
     assert report.keys() >= KEYS
-    assert set(report["seconds"]) == {"load", "network", "decode", "rank", "trial"}
+    assert set(report["seconds"]) == {"load", "network", "decode", "refine", "rank", "trial"}
     assert (report["num"], report["candidates"], report["protocol"]) == (3, 3, "dro")
     assert report["success_rate"] == pytest.approx(report["success"] / 3)
     grasps = GraspBatch.load(path)

@@ -95,7 +95,7 @@ def test_json_example_has_the_keys_of_generate() -> None:
     example = json.loads(text)
     source = (ROOT / "src" / "dro_grasp" / "cli" / "generate.py").read_text()
     assert all(f'"{key}":' in source for key in example)
-    assert list(example["seconds"]) == ["load", "network", "decode", "rank", "trial"]
+    assert list(example["seconds"]) == ["load", "network", "decode", "refine", "rank", "trial"]
 
 
 def test_public_names_of_the_readme_demo_exist() -> None:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.refinement import ScoreConfig, nearest_contacts, score_energy, score_grasps
+from dro_grasp.grasps.refinement import ScoreConfig, nearest_contacts, object_energy, score_grasps
 from dro_grasp.grasps.synthesis import SynthesisConfig, synthesize
 from dro_grasp.objects.library import load_object
 from dro_grasp.objects.shape import ObjectModel
@@ -63,7 +63,7 @@ def test_mesh_and_cloud_agree(grasps):
 
 
 def test_nearest_contacts_agree_with_a_plain_search(grasps):
-    energy = score_energy(HAND, load_object("sphere"), ScoreConfig())
+    energy = object_energy(HAND, load_object("sphere"), ScoreConfig().energy)
     chosen = nearest_contacts(energy, grasps.T_object_wrist, grasps.joints)
     candidates = energy.candidates
     for i in range(len(grasps)):

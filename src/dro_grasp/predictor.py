@@ -20,7 +20,7 @@ from dro_grasp import distance_matrix
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
-from dro_grasp.grasps.refinement import score_grasps
+from dro_grasp.grasps.refinement import refine_grasps, score_grasps
 from dro_grasp.hands.hand import Hand
 from dro_grasp.models.checkpoints import load_weights
 from dro_grasp.models.network import DistanceNetwork
@@ -64,7 +64,7 @@ class GraspPredictor:
     """Where the network runs."""
     config: PredictorConfig = field(default_factory=PredictorConfig)
     timings: dict[str, float] = field(default_factory=dict, init=False)
-    """Seconds of the last call: network, decode, rank."""
+    """Seconds of the last call: network, decode, refine, rank."""
     candidates: int = field(default=0, init=False)
     """Grasps decoded in the last call, those below a table included."""
     predicted_points: Float[Tensor, "n n_hand 3"] | None = field(default=None, init=False)
@@ -85,6 +85,7 @@ class GraspPredictor:
         seed: int = 0,
         direction: tuple[float, float, float] | None = None,
         table: float | None = None,
+        refine: bool = True,
         progress: Callable[[int, int], None] | None = None,
     ) -> GraspBatch:
         """Predict grasps, best score first.
@@ -97,6 +98,7 @@ class GraspPredictor:
             direction: Palm direction asked for, in the object's frame; any length but zero.
             table: Height [m] of a plane in the object's frame; grasps whose hand goes below it in the pregrasp or
                 in the grasp are dropped and sampling goes on.
+            refine: Polish the network's grasps on the object's geometry, near where they were predicted.
             progress: Called with (grasps decoded, grasps wanted).
 
         Returns:
@@ -106,13 +108,16 @@ class GraspPredictor:
             OptionError: `num` is not positive, `direction` is zero, or too few grasps stay above the table.
         """
         check_request(num, direction)
-        self.timings = {"network": 0.0, "decode": 0.0, "rank": 0.0}
+        self.timings = {"network": 0.0, "decode": 0.0, "refine": 0.0, "rank": 0.0}
         self.candidates = 0
         generator = torch.Generator().manual_seed(seed)
         kept: list[GraspBatch] = []
         for _ in range(self.config.table_rounds if table is not None else 1):
             batch = self._sample(hand, obj, num, seed, direction, generator, progress)
             self.candidates += len(batch)
+            if refine:
+                with _timed(self.timings, "refine"):
+                    batch = refine_grasps(hand, obj, batch)
             kept.append(batch if table is None else batch[above_table(hand, batch, table)])
             if sum(map(len, kept)) >= num:
                 break

@@ -45,6 +45,8 @@ class Generate:
     """Palm direction in the object's frame: 0 0 -1 grasps from above."""
     table: Annotated[float | None, optional("Z", "no table")] = None
     """Height [m] of a table in the object's frame; no hand goes below it."""
+    refine: bool = True
+    """Polish the network's grasps on the object's geometry, near where they were predicted."""
     scale: float = 1.0
     """Multiplies the object's coordinates; 0.001 for files in millimetres."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
@@ -104,7 +106,7 @@ class Generate:
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
         with progress_bar("predicting", self.json) as progress:
-            grasps = predictor.predict(hand, obj, self.num, self.seed, self.direction, self.table, progress)
+            grasps = predictor.predict(hand, obj, self.num, self.seed, self.direction, self.table, self.refine, progress)
         points, timings = predictor.predicted_points, dict(predictor.timings)
         begin = time.perf_counter()
         result, protocol = self._try(hand, obj, grasps)

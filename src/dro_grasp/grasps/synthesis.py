@@ -36,7 +36,7 @@ class SynthesisConfig:
     rotation_step: float = 0.03
     """First step of its rotation [rad]."""
     joint_step: float = 0.04
-    """First step of each joint [rad; for sliding joints times 0.03 m]."""
+    """First step of each joint [rad; for sliding joints in their tree's unit]."""
     last_step: float = 0.15
     """Step length at the end, as a share of the first."""
     smoothing: float = 0.9
@@ -213,7 +213,8 @@ def propose(
     bend = -pace * state.result.by_joint * scale[:, 6:]
     T = moved(state.T, energy.pivot(state.T), config.translation_step * move, config.rotation_step * turn)
     tree = energy.hand.tree
-    q = torch.minimum(torch.maximum(state.q + config.joint_step * bend, tree.lower), tree.upper)
+    step = config.joint_step * tree.joint_unit
+    q = torch.minimum(torch.maximum(state.q + step * bend, tree.lower), tree.upper)
     contacts = switched(energy, state, config.switch, generator)
     return State(T, q, contacts, state.slots, energy(T, q, contacts))
 

@@ -15,6 +15,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
+SLIDING_UNIT = 0.03
+"""Travel of a sliding joint that moves a hand about as much as 1 rad of a turning one [m]."""
 
 
 class cached_tensor(cached_property):  # type: ignore[type-arg]  # reads like the decorator it extends
@@ -65,6 +67,15 @@ class KinematicTree:
     def n_dof(self) -> int:
         """Number of independent joints."""
         return len(self.joint_names)
+
+    @cached_tensor
+    def joint_unit(self) -> Float[Tensor, " n_dof"]:
+        """Motion of each independent joint that counts as 1 rad: 1 rad where it turns links, SLIDING_UNIT where it slides."""
+        turns = torch.zeros(self.n_dof, dtype=torch.bool, device=self.origin.device)
+        for kind, joint in zip(self.kind, self.link_joint, strict=True):
+            if kind == REVOLUTE:
+                turns |= self.coupling[joint] != 0
+        return torch.where(turns, 1.0, SLIDING_UNIT).to(self.origin)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> KinematicTree:
         """The same tree with its tensors on another device or in another precision."""
