@@ -36,7 +36,7 @@ def same(a: TrialResult, b: TrialResult) -> None:
     assert a.reason == b.reason
 
 
-@pytest.mark.parametrize("name", ["dro", "strict", "dro_static"])
+@pytest.mark.parametrize("name", ["dro", "strict", "dro_static", "dexgraspbench"])
 def test_power_grasp_holds_a_ball(hand, obj, name):
     grasps = power_grasp(hand, obj, 3)
     if name == "dro_static":
@@ -74,6 +74,37 @@ def test_a_free_object_falls_by_half_a_t_squared(hand, obj):
     poses, _ = record(hand, obj, grasps_of(hand, obj, T, torch.zeros(1, 8)), 0, rules, stride=200)
     moved = T[0, :3, :3] @ (poses[2, :3, 3] - poses[1, :3, 3])
     np.testing.assert_allclose(moved, [expected, 0, 0], atol=1e-5)
+
+
+def test_dexgraspbench_pushes_each_way_anew(hand, obj):
+    """Every force moves a free object by F t^2 / 2m from where it was, whatever the object's own mass."""
+    rules = replace(protocol("dexgraspbench"), force=0.02)
+    result = simulate(hand, obj, grasps_of(hand, obj, wrist_below(0.6), torch.zeros(1, 8)), rules)
+    expected = 0.5 * 0.02 * rules.force_time**2 * (1 + rules.timestep / rules.force_time)
+    torch.testing.assert_close(result.displacement[0], torch.full((6,), expected), rtol=1e-3, atol=0)
+    assert result.success.tolist() == [True]  # 4 cm are less than 5
+    lost = simulate(hand, obj, grasps_of(hand, obj, wrist_below(0.6), torch.zeros(1, 8)), "dexgraspbench")
+    assert lost.reason == ("no contact after closing",)
+
+
+def test_dexgraspbench_limits_rotation_and_the_worst_of_all_forces(hand, obj):
+    grasps = power_grasp(hand, obj, 2)
+    rules = protocol("dexgraspbench")
+    turned = simulate(hand, obj, grasps, rules).rotation.amax(1)
+    one_of_six = replace(rules, max_rotation=float(turned.max()) * 0.99)
+    again = simulate(hand, obj, grasps, one_of_six)
+    assert again.success.tolist() == (turned < one_of_six.max_rotation).tolist()
+    assert "turned by" in again.reason[int(turned.argmax())]
+
+
+def test_a_gradual_protocol_leads_the_hand_through_the_grasp(hand, obj):
+    grasps = grasps_of(hand, obj, wrist_below(0.6), torch.full((1, 8), 0.1)).replace(
+        pregrasp_joints=torch.zeros(1, 8), squeeze_joints=torch.full((1, 8), 0.2))
+    _, joints = record(hand, obj, grasps, 0, "dexgraspbench", stride=10)
+    assert joints[0] == pytest.approx(torch.zeros(8))
+    assert float(joints[10].mean()) == pytest.approx(0.1, abs=0.02)
+    assert float(joints[20].mean()) == pytest.approx(0.2, abs=0.03)
+    assert len(joints) == 1 + 20 + 6 * 50
 
 
 def test_one_finger_pushes_the_object_away(hand, obj):

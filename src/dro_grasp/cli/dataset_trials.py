@@ -22,7 +22,7 @@ class Check:
     """Folders that `dro-grasp synthesize` filled, folders of grasp files, or grasp files."""
     sample: int = 100
     """Grasps to try, drawn evenly from all."""
-    protocol: Literal["strict", "dro", "dro_static"] = "strict"
+    protocol: Literal["strict", "dro", "dro_static", "dexgraspbench"] = "strict"
     """The trial."""
     friction: Annotated[float | None, optional("MU", "the protocol's")] = None
     """Friction between hand and object."""
@@ -72,7 +72,7 @@ class Filter:
     """Folders that `dro-grasp synthesize` filled, folders of grasp files, or grasp files."""
     output: Path
     """Folder for the files, one a hand; made when only itself is missing."""
-    protocol: Literal["strict", "dro", "dro_static"] = "strict"
+    protocol: Literal["strict", "dro", "dro_static", "dexgraspbench"] = "strict"
     """The trial."""
     friction: Annotated[float | None, optional("MU", "the protocol's")] = None
     """Friction between hand and object."""

@@ -23,7 +23,7 @@ class Evaluate:
 
     file: tyro.conf.Positional[Path]
     """Grasp file."""
-    protocol: Literal["dro", "strict", "dro_static"] = "dro"
+    protocol: Literal["dro", "strict", "dro_static", "dexgraspbench"] = "dro"
     """The trial."""
     friction: float = 1.0
     """Friction coefficient between hand and object; the official release has 3."""

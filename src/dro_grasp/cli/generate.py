@@ -52,8 +52,8 @@ class Generate:
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Name of shipped weights (see `dro-grasp weights`) or the path of a weights file."""
     protocol: Annotated[
-        Literal["dro", "strict", "dro_static", "none"] | None,
-        optional("{dro,strict,dro_static,none}", "dro for a mesh, none for a bare point cloud"),
+        Literal["dro", "strict", "dro_static", "dexgraspbench", "none"] | None,
+        optional("{dro,strict,dro_static,dexgraspbench,none}", "dro for a mesh, none for a bare point cloud"),
     ] = None
     """Trial that each grasp goes through."""
     only_successful: Flag = False

@@ -122,10 +122,14 @@ class Measured:
             return "simulation unstable"
         if self.shift[i] > min(rules.max_closing_shift, GIVE_UP) or self.turn[i] > rules.max_closing_rotation:
             return "object pushed away while closing"
-        if self.displacement[i, -1] < rules.max_displacement:
+        counted = slice(None) if rules.reset else slice(-1, None)
+        moved, turned = self.displacement[i, counted].max(), self.rotation[i, counted].max()
+        if moved < rules.max_displacement and turned < rules.max_rotation:
             return ""
         if not self.contacts[i]:
             return "no contact after closing"
         if len(lost):
             return f"lost under force {DIRECTIONS[lost[0]]}"
-        return f"slipped by {self.displacement[i, -1] * 1e3:.0f} mm"
+        if moved < rules.max_displacement:
+            return f"turned by {np.degrees(turned):.0f} degrees"
+        return f"slipped by {moved * 1e3:.0f} mm"

@@ -22,6 +22,8 @@ class Protocol:
     """Makes pregrasp and squeeze where a grasp does not state them."""
     friction: float = 1.0
     """Coefficient between hand and object. (The official release has 3.0.)"""
+    mass: float | None = None
+    """Mass of every object [kg]; None leaves the object's own."""
     mass_factor: float = 1.0
     """Multiplies the object's mass, and with it the disturbing forces."""
     torsional_friction: float = 0.02
@@ -30,10 +32,18 @@ class Protocol:
     """Disturbing force per object mass [m/s^2]. Source: paper, evaluation metric details."""
     closing_time: float = 1.0
     """[s]"""
+    gradual: bool = False
+    """Lead the hand from the pregrasp through the grasp to the squeeze, half of the closing time each; otherwise the
+    squeeze is the target from the start."""
+    reset: bool = False
+    """Begin each force where the closing ended; otherwise each begins where the one before it ended. The object's
+    motion then counts from the labelled grasp, not from the end of closing, and every force must be withstood."""
     force_time: float = 1.0
     """Duration of the force along each of +x +y +z -x -y -z of the object's frame [s]."""
     max_displacement: float = 0.02
     """Largest displacement of the object after all forces [m]. Source: paper, evaluation metric."""
+    max_rotation: float = math.inf
+    """Largest rotation of the object after all forces [rad]."""
     max_closing_shift: float = math.inf
     """Largest displacement of the object while the hand closes [m]."""
     max_closing_rotation: float = math.inf
@@ -46,6 +56,8 @@ class Protocol:
     """[s]; 5 ms agrees with 1 ms on 97 % of verdicts."""
     impratio: float = 10.0
     """Friction to normal impedance; at 1 objects creep."""
+    noslip: int = 0
+    """Iterations of the solver that removes what slip is left."""
     stiffness: float = 3.0
     """Gain of the position servos [Nm/rad]; 100 ejects objects."""
     damping: float = 0.3
@@ -73,6 +85,11 @@ PROTOCOLS = {
         max_self_penetration=0.005,
     ),
     "dro_static": Protocol("dro_static", closing=False),
+    "dexgraspbench": Protocol(
+        "dexgraspbench", friction=0.6, mass=0.1, force=10.0, closing_time=0.8, gradual=True, reset=True, force_time=2.0,
+        max_displacement=0.05, max_rotation=math.radians(15), max_penetration=0.01, timestep=0.004, noslip=2, stiffness=5.0,
+        force_limit=3.0,
+    ),
 }
 """Every protocol by name."""
 

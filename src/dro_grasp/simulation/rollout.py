@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 
 import mujoco
 import mujoco.batch
@@ -18,10 +19,14 @@ from dro_grasp.grasps.controller import pregrasp_and_squeeze
 from dro_grasp.hands.hand import Hand
 from dro_grasp.simulation.outcome import GIVE_UP
 from dro_grasp.simulation.protocols import Protocol
-from dro_grasp.simulation.scene import Scene
+from dro_grasp.simulation.scene import Scene, object_mass
 
 FORCES = np.concatenate([np.eye(3), -np.eye(3)])
 """Directions of the forces, in the object's frame."""
+RAMP = 10
+"""Steps in which the servos' targets are led from one pose of the hand to the next."""
+STATE = ("qpos", "qvel", "qacc_warmstart")
+"""What a trial must get back to go on from an earlier moment."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +74,10 @@ class Rollout:
         self.batch = mujoco.batch.Batch(scene.model, nsim=self.size, nthread=min(workers, self.size))
         self.qpos, self.ctrl, self.force = (self.batch.bind(n) for n in ("qpos", "ctrl", "xfrc_applied"))
         self.qpos[:] = scene.qpos(grasps.T_object_wrist, start)
-        self.ctrl[:] = target.numpy()[:, scene.actuated]
+        # Where the servos are led, one after the other.
+        way = [start, grasps.joints, target] if scene.protocol.gradual else [target]
+        self.way = [joints.numpy()[:, scene.actuated] for joints in way]
+        self.ctrl[:] = self.way[0]
         self.start = self.observe()
 
     def steps(self, seconds: float) -> int:
@@ -78,18 +86,38 @@ class Rollout:
 
     def close(self) -> ObjectState:
         """Move to the target for the protocol's closing time."""
-        with quiet():
-            self.batch.step(nstep=self.steps(self.scene.protocol.closing_time))
+        for steps in self.closing():
+            with quiet():
+                self.batch.step(nstep=steps)
         return self.observe()
+
+    def closing(self) -> Iterator[int]:
+        """Sets the servos' targets, one after the other, and says for how many time steps each of them holds."""
+        steps = self.steps(self.scene.protocol.closing_time)
+        if len(self.way) == 1:
+            yield steps
+        for begin, end in pairwise(self.way):
+            for i in range(RAMP):
+                self.ctrl[:] = begin + (i + 1) / RAMP * (end - begin)
+                yield steps // (RAMP * (len(self.way) - 1))
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything that moves, as it is now."""
+        return {name: np.array(self.batch.bind(name)) for name in STATE}
+
+    def restore(self, state: dict[str, np.ndarray], rows: np.ndarray) -> None:
+        """Put some trials back to an earlier state."""
+        for name, values in state.items():
+            self.batch.bind(name)[rows] = values[rows]
 
     def set_force(self, axis: np.ndarray, rows: np.ndarray) -> None:
         """Force on the object along an axis of the object's frame, as the hand was told of it."""
         rules = self.scene.protocol
-        newtons = rules.force * rules.mass_factor * self.scene.obj.mass
+        newtons = rules.force * object_mass(self.scene.obj, rules)
         self.force[rows, self.scene.object_body, :3] = newtons * (self.start.rotation[rows] @ axis)
 
     def push(self, closed: ObjectState, alive: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """All forces in turn without reset, on the trials that are alive; objects that are gone are left alone.
+        """All forces in turn on the trials that are alive; objects that are gone are left alone.
 
         Returns:
             Displacement (n 6) [m] and rotation (n 6) [rad] after each force, NaN where none was applied; whether
@@ -97,18 +125,21 @@ class Rollout:
         """
         displacement, rotation = np.full((self.size, 6), np.nan), np.full((self.size, 6), np.nan)
         stable, alive = closed.stable.copy(), alive & closed.stable
-        steps = self.steps(self.scene.protocol.force_time)
+        rules, steps = self.scene.protocol, self.steps(self.scene.protocol.force_time)
+        origin = self.start if rules.reset else closed
+        state = self.state() if rules.reset else {}
         for k, axis in enumerate(FORCES):
             rows = np.flatnonzero(alive)
             if not len(rows):
                 break
+            self.restore(state, rows)
             self.set_force(axis, rows)
             with quiet():
                 self.batch.step(rows.tolist(), nstep=steps)
             now = self.observe(rows)
             # Later columns keep these values unless the trial goes on.
-            displacement[rows, k:] = now.shift(closed.rows(rows))[:, None]
-            rotation[rows, k:] = now.turn(closed.rows(rows))[:, None]
+            displacement[rows, k:] = now.shift(origin.rows(rows))[:, None]
+            rotation[rows, k:] = now.turn(origin.rows(rows))[:, None]
             stable[rows] = now.stable
             alive[rows] = now.stable & (displacement[rows, k] < GIVE_UP)
         return displacement, rotation, stable

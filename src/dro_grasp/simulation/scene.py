@@ -110,7 +110,7 @@ def _empty_scene(protocol: Protocol) -> mujoco.MjSpec:
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     # The sparse Newton solver of MuJoCo 4.0.0 can be wrong.
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-    option.iterations = SOLVER_ITERATIONS
+    option.iterations, option.noslip_iterations = SOLVER_ITERATIONS, protocol.noslip
     return scene
 
 
@@ -199,10 +199,15 @@ def _add_object(scene: mujoco.MjSpec, obj: ObjectModel, protocol: Protocol) -> N
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"part{i}", condim=4, mass=0.0,
                       friction=[protocol.friction, protocol.torsional_friction, 1e-4])
-    mass = protocol.mass_factor * obj.mass
+    mass = object_mass(obj, protocol)
     inertia = obj.inertia / obj.volume * mass
     body.explicitinertial, body.mass, body.ipos = True, mass, obj.centre_of_mass
     body.fullinertia = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
+
+
+def object_mass(obj: ObjectModel, protocol: Protocol) -> float:
+    """What an object weighs in a protocol [kg]."""
+    return protocol.mass_factor * (obj.mass if protocol.mass is None else protocol.mass)
 
 
 def _exclude_resting_contacts(scene: mujoco.MjSpec, hand: Hand) -> None:

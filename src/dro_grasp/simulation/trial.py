@@ -45,7 +45,7 @@ def simulate(
         hand: The hand of the grasps.
         obj: Their object; it needs a mesh.
         grasps: Poses, and pregrasp and squeeze joints where they are not to be made by the controller.
-        protocol: `dro`, `strict`, `dro_static`, or a Protocol of your own.
+        protocol: `dro`, `strict`, `dro_static`, `dexgraspbench`, or a Protocol of your own.
         workers: Threads; all cores by default. The result does not depend on it.
         progress: Called with (grasps tried, grasps in all).
 
@@ -113,14 +113,22 @@ def record(
         OptionError: The grasps are of another hand, or the protocol does not exist.
     """
     scene = _scene(hand, obj, grasps, protocol)
-    rollout = Rollout(scene, hand, grasps[index], workers=1)
+    rollout, only = Rollout(scene, hand, grasps[index], workers=1), np.arange(1)
     rules, frames = scene.protocol, [rollout.poses()]
-    for axis, seconds in [(np.zeros(3), rules.closing_time), *((axis, rules.force_time) for axis in FORCES)]:
-        rollout.set_force(axis, np.arange(1))
-        for _ in range(math.ceil(rollout.steps(seconds) / stride)):
+
+    def advance(steps: int) -> None:
+        for _ in range(math.ceil(steps / stride)):
             with quiet():
-                rollout.batch.step(nstep=stride)
+                rollout.batch.step(nstep=min(stride, steps))
             frames.append(rollout.poses())
+
+    for steps in rollout.closing():
+        advance(steps)
+    closed = rollout.state() if rules.reset else {}
+    for axis in FORCES:
+        rollout.restore(closed, only)
+        rollout.set_force(axis, only)
+        advance(rollout.steps(rules.force_time))
     joints, poses = (torch.from_numpy(np.concatenate(part).astype(np.float32)) for part in zip(*frames, strict=True))
     return poses, joints
 
