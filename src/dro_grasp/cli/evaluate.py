@@ -25,7 +25,7 @@ class Evaluate:
     """Grasp file."""
     protocol: Literal["dro", "strict", "dro_static", "dexgraspbench"] = "dro"
     """The trial."""
-    friction: float = 1.0
+    friction: Annotated[float | None, optional("MU", "the protocol's")] = None
     """Friction coefficient between hand and object; the official release has 3."""
     hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Hand to use instead of the one that the file names or remembers."""

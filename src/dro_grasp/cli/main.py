@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import tyro
 
 from dro_grasp import __version__
+from dro_grasp.cli.benchmark import Benchmark
 from dro_grasp.cli.dataset import Dataset
 from dro_grasp.cli.evaluate import Evaluate
 from dro_grasp.cli.generate import Generate
@@ -27,6 +28,7 @@ named = tyro.conf.subcommand
 Command = (
     Annotated[Generate, named("generate")]
     | Annotated[Evaluate, named("evaluate")]
+    | Annotated[Benchmark, named("benchmark")]
     | Annotated[Synthesize, named("synthesize")]
     | Annotated[Dataset, named("dataset")]
     | Annotated[Pretrain, named("pretrain")]

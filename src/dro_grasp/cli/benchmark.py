@@ -1,0 +1,101 @@
+"""`dro-grasp benchmark`: success rates of weights beside their controls."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from dro_grasp.cli.output import optional, print_json, progress_bar, say
+
+if TYPE_CHECKING:
+    from dro_grasp.evaluation.benchmark import Row
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """Try grasps of the network and of its controls, before and after ranking and refinement.
+
+    Example: dro-grasp benchmark --hands allegro barrett --objects builtin:test --num 20 --bundle bundle.safetensors
+    """
+
+    hands: tuple[str, ...] = ("allegro", "barrett", "shadowhand")
+    """Names or paths of hands."""
+    objects: tuple[str, ...] = ("builtin:test",)
+    """Objects with meshes: names, paths, folders, or groups such as assets:validate."""
+    num: int = 100
+    """Grasps of each hand on each object, of which ranking keeps the best quarter."""
+    stages: tuple[Literal["raw", "ranked", "refined"], ...] = ("raw", "ranked", "refined")
+    """What becomes of the grasps before they are tried; refined ones are tried all, and the best quarter apart."""
+    protocols: tuple[Literal["dro", "strict", "dro_static", "dexgraspbench"], ...] = ("dro", "strict", "dexgraspbench")
+    """Trials; displacement, rotation and diversity are those of successes of the first."""
+    weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
+    """Weights to measure."""
+    controls: bool = True
+    """Also try unoptimised starts, synthesised grasps and, with a bundle, the mean grasp."""
+    bundle: Annotated[Path | None, optional("PATH", "no mean grasp")] = None
+    """Training bundle that the mean grasp is the mean of."""
+    seed: int = 0
+    """The same seed gives the same grasps."""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print one JSON object instead of a Markdown table."""
+
+    def run(self) -> int:
+        """Load everything, measure, print."""
+        from dro_grasp.datasets.bundle import load_bundle
+        from dro_grasp.errors import ObjectError, OptionError
+        from dro_grasp.evaluation.benchmark import BEST, BenchmarkConfig, benchmark
+        from dro_grasp.hands.library import load_hand
+        from dro_grasp.objects.library import load_object, resolve_objects
+        from dro_grasp.predictor import GraspPredictor, check_request
+        from dro_grasp.simulation.protocols import protocol
+
+        check_request(self.num, None)
+        for name in ("hands", "objects", "stages", "protocols"):
+            if not getattr(self, name):
+                raise OptionError(f"--{name} is empty; name at least one")
+        begin = time.perf_counter()
+        bundle = None if self.bundle is None else load_bundle(self.bundle)
+        predictor = GraspPredictor(self.weights)
+        hands = [load_hand(name) for name in self.hands]
+        objects = [load_object(name) for name in resolve_objects(list(self.objects))]
+        if clouds := [obj.name for obj in objects if obj.is_cloud]:
+            raise ObjectError(f"{', '.join(clouds)}: bare point clouds cannot be tried; give meshes")
+        stages = (*self.stages, BEST) if "refined" in self.stages else self.stages
+        config = BenchmarkConfig(
+            num=self.num, stages=stages, protocols=tuple(protocol(p) for p in self.protocols), controls=self.controls,
+            seed=self.seed,
+        )
+        with progress_bar("pairs", self.json) as progress:
+            rows = benchmark(hands, objects, predictor, config, bundle, progress)
+        seconds = time.perf_counter() - begin
+        if self.json:
+            print_json({
+                "weights": predictor.weights_name, "objects": [obj.name for obj in objects], "num": self.num,
+                "seed": self.seed, "seconds": round(seconds, 1), "rows": [dataclasses.asdict(row) for row in rows],
+            })
+            return 0
+        title = f"weights '{predictor.weights_name}', {self.num} grasps of each hand on each of {len(objects)} objects"
+        columns = ["grasps", "stage", "hand", "n", *rows[0].success, "shift [mm]", "turn [deg]", "diversity", "ROC area",
+                   "ms a grasp"]
+        say(title + "; success in % with 95 % intervals; ROC area of the score for the last protocol\n")
+        for line in [columns, ["---"] * len(columns), *map(cells, rows)]:
+            say("| " + " | ".join(map(str, line)) + " |")
+        say(f"\n{seconds:.0f} s")
+        return 0
+
+
+def cells(row: Row) -> list[object]:
+    """A row's cells for people."""
+    rates = [f"{100 * p:.1f} [{100 * low:.0f}-{100 * high:.0f}]" for p, low, high in row.success.values()]
+    area = list(row.ranking.values())[-1]
+    parts = " + ".join(f"{1e3 * seconds:.0f} {name}" for name, seconds in row.seconds.items())
+    return [
+        row.grasps, row.stage, row.hand, row.num, *rates, f"{1e3 * row.displacement:.1f}",
+        f"{math.degrees(row.rotation):.1f}", f"{row.diversity:.3f}", f"{area:.2f}", parts,
+    ]
