@@ -263,6 +263,21 @@ def test_a_frozen_encoder_stays_as_it_was(bundle: Bundle, tmp_path: Path) -> Non
     assert all("tracked" in name or not torch.equal(before[name], value) for name, value in free.items())
 
 
+def test_fine_tuning_goes_on_from_given_weights(
+    bundle: Bundle, results: dict[str, DistanceNetwork], finished: dict[str, Path], tmp_path: Path
+) -> None:
+    config = TrainConfig(SCHEDULE, hands_per_step=1, columns=24)
+    tuned = train(bundle, TINY, config, tmp_path / "run", initial=results["train"], report=quiet)
+    assert curve(tmp_path / "run")[0]["distance"] < curve(finished["train"])[0]["distance"]
+    before, after = (m.hand_encoder.state_dict() for m in (results["train"], tuned))
+    assert all(torch.equal(before[name], value) for name, value in after.items()), "the hand encoder is kept"
+    wider = DistanceNetwork(dataclasses.replace(TINY, latent=6))
+    fresh = loop.take_over(wider, results["train"])
+    assert "head.first.weight" in fresh
+    assert "place.weight" not in fresh
+    assert torch.equal(wider.place.weight, results["train"].place.weight)
+
+
 def test_recalibration_measures_what_the_weights_make_of_the_data(bundle: Bundle) -> None:
     torch.manual_seed(0)
     encoder, source = DistanceNetwork(TINY).hand_encoder.train(), SampleSource(bundle, TINY, AugmentationConfig())

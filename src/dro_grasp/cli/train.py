@@ -99,6 +99,8 @@ class Train:
     """Weights file to write."""
     pretrained: Annotated[str | None, optional("PATH", "none")] = None
     """Weights from `dro-grasp pretrain`; without them the hand encoder is trained along."""
+    initial: Annotated[str | None, optional("NAME|PATH", "none")] = None
+    """Weights to go on from: fine-tunes them on the bundle. The hand encoder stays as it is in them."""
     size: Literal["slim", "paper"] = "slim"
     """Network size."""
     steps: int = 10_000
@@ -141,7 +143,7 @@ class Train:
 
         check_output(self.output)
         bundle = load_bundle(self.bundle)
-        pretrained = None if self.pretrained is None else load_weights(self.pretrained)
+        pretrained, initial = (None if name is None else load_weights(name) for name in (self.pretrained, self.initial))
         config = TrainConfig(
             schedule=ScheduleConfig(
                 steps=self.steps, minutes=self.minutes, tensorboard=self.tensorboard, learning_rate=self.learning_rate,
@@ -152,9 +154,9 @@ class Train:
             augmentation=AugmentationConfig(partial=self.partial),
         )
         network = dataclasses.replace(network_config(self.size), prior=self.prior, latent_form=self.latent_form)
-        model = train(bundle, network, config, self.run_folder, pretrained, name=self.output.stem)
+        model = train(bundle, network, config, self.run_folder, pretrained, initial, name=self.output.stem)
         about = how_long(self.run_folder) | {
-            "stage": "training", "pretrained": self.pretrained is not None, "data": bundle.summary(),
+            "stage": "training", "pretrained": self.pretrained is not None, "initial": self.initial, "data": bundle.summary(),
         }
         save_weights(model, self.output, about)
         report = {"output": str(self.output), "steps": about["steps"], "log": str(self.run_folder / "log.jsonl")}

@@ -33,6 +33,7 @@ def train(
     config: TrainConfig,
     folder: Path,
     pretrained: DistanceNetwork | None = None,
+    initial: DistanceNetwork | None = None,
     report: Callable[[Run, dict[str, float]], None] | None = None,
     name: str = "trained",
 ) -> DistanceNetwork:
@@ -43,7 +44,8 @@ def train(
         network: Sizes and forms.
         config: Losses, augmentation and schedule.
         folder: Run folder; a checkpoint in it is taken up, to the same curve.
-        pretrained: Where the hand encoder comes from; without it the encoder is trained along.
+        pretrained: Where the hand encoder comes from; without it, and without `initial`, the encoder is trained along.
+        initial: Weights to go on from, as in fine-tuning; what the network has of another shape starts afresh.
         report: Called now and then; the console by default.
         name: How the weights are called.
 
@@ -57,9 +59,13 @@ def train(
         torch.manual_seed(config.schedule.seed)
         generator = torch.Generator(device)
         model = DistanceNetwork(network, name=name).to(device)
-        frozen = pretrained is not None and config.freeze_hand_encoder
+        frozen = (pretrained is not None or initial is not None) and config.freeze_hand_encoder
+        if initial is not None:
+            take_over(model, initial)
         if pretrained is not None:
-            start_from(model, pretrained)
+            model.hand_encoder.load_state_dict(pretrained.hand_encoder.state_dict())
+            if model.motion is not None and pretrained.motion is not None:
+                model.motion.load_state_dict(pretrained.motion.state_dict())
         model.hand_encoder.requires_grad_(not frozen)
         model.mixed = config.schedule.mixed
         source = SampleSource(bundle, network, config.augmentation, device)
@@ -81,11 +87,12 @@ def train(
     return model.cpu().eval()
 
 
-def start_from(model: DistanceNetwork, pretrained: DistanceNetwork) -> None:
-    """Take over what was pretrained: the hand encoder, and the motion that z codes where both networks have one."""
-    model.hand_encoder.load_state_dict(pretrained.hand_encoder.state_dict())
-    if model.motion is not None and pretrained.motion is not None:
-        model.motion.load_state_dict(pretrained.motion.state_dict())
+def take_over(model: DistanceNetwork, other: DistanceNetwork) -> list[str]:
+    """Copy the tensors that both networks have in the same shape; returns the names of the others, which stay."""
+    theirs, ours = other.state_dict(), model.state_dict()
+    same = {name: value for name, value in theirs.items() if name in ours and value.shape == ours[name].shape}
+    model.load_state_dict(same, strict=False)
+    return sorted(set(ours) - set(same))
 
 
 def step_losses(
