@@ -38,10 +38,14 @@ class Pretrain:
     """Weights file to write."""
     size: Literal["slim", "paper"] = "slim"
     """Network size."""
+    latent_form: Literal["kernel", "motion"] = "kernel"
+    """With `motion`, z also learns to say how hands move, after the encoder and in a folder of its own in the run folder."""
     steps: int = 3000
     """Optimiser steps."""
+    motion_steps: int = 5000
+    """Those of the motion."""
     minutes: Annotated[float | None, optional("MINUTES", "no limit")] = None
-    """Time limit; the learning rate follows whichever of steps and time is further on."""
+    """Time limit of each; the learning rate follows whichever of steps and time is further on."""
     tensorboard: Flag = False
     """Also write the log for TensorBoard."""
     device: Annotated[str, optional("DEVICE", "cuda where there is one, else cpu")] = "auto"
@@ -53,23 +57,29 @@ class Pretrain:
 
     def run(self) -> int:
         """Pretrain, save, and report the matching rank."""
+        import dataclasses
+
         import torch
 
         from dro_grasp.datasets.bundle import load_bundle
         from dro_grasp.devices import choose_device
         from dro_grasp.files import check_output
         from dro_grasp.models.checkpoints import save_weights
-        from dro_grasp.training.config import AugmentationConfig, PretrainConfig, ScheduleConfig
-        from dro_grasp.training.pretraining import matching_rank, pretrain
+        from dro_grasp.training.config import AugmentationConfig, MotionConfig, PretrainConfig, ScheduleConfig
+        from dro_grasp.training.pretraining import matching_rank, pretrain, pretrain_motion
         from dro_grasp.training.samples import SampleSource
 
         check_output(self.output)
-        bundle, network = load_bundle(self.bundle), network_config(self.size)
+        bundle = load_bundle(self.bundle)
+        network = dataclasses.replace(network_config(self.size), latent_form=self.latent_form)
         schedule = ScheduleConfig(
             steps=self.steps, minutes=self.minutes, tensorboard=self.tensorboard, device=choose_device(self.device),
             seed=self.seed,
         )
         model = pretrain(bundle, network, PretrainConfig(schedule=schedule), self.run_folder)
+        if self.latent_form == "motion":
+            motion = MotionConfig(dataclasses.replace(schedule, steps=self.motion_steps))
+            model = pretrain_motion(model, bundle, motion, self.run_folder / "motion")
         about = how_long(self.run_folder) | {"stage": "pretraining", "data": bundle.summary()}
         save_weights(model, self.output, about)
         source = SampleSource(bundle, network, AugmentationConfig())

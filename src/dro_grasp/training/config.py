@@ -116,5 +116,5 @@ class MotionConfig:
     augmentation: AugmentationConfig = AugmentationConfig()
     hands_per_step: int = 4
     samples_per_hand: int = 16
-    divergence: float = 1e-4
-    """Weight of the divergence of z from N(0, I) [m/nat]."""
+    divergence: float = 1e-5
+    """Weight of the divergence of z from N(0, I) [m/nat]; main training, which weighs it more, takes away what objects tell."""
