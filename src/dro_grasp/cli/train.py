@@ -164,7 +164,7 @@ class Train:
             augmentation=AugmentationConfig(partial=self.partial),
         )
         network = dataclasses.replace(network_config(self.size), prior=self.prior, latent_form=self.latent_form)
-        model = train(bundle, network, config, self.run_folder, pretrained, initial, name=self.output.stem)
+        model = train(bundle, network, config, self.run_folder, pretrained, name=self.output.stem, initial=initial)
         about = how_long(self.run_folder) | {
             "stage": "training", "pretrained": self.pretrained is not None, "initial": self.initial, "data": bundle.summary(),
         }

@@ -78,6 +78,10 @@ def partial_view(
     if len(points) < 2 * count:
         raise ValueError(f"a partial view of {count} points needs a cloud of {2 * count}, got {len(points)}")
     drawn = torch.randperm(len(points), generator=generator)[: 2 * count]
-    direction = torch.randn(3, generator=generator).to(points)
-    along = (points[drawn] - points[drawn].mean(0)) @ (direction / direction.norm())
-    return drawn[along.argsort(descending=True)[:count]]
+    return drawn[nearer_half(points[drawn], torch.randn(3, generator=generator).to(points))]
+
+
+def nearer_half(points: Float[Tensor, "*b n 3"], direction: Float[Tensor, "*b 3"]) -> Int[Tensor, "*b half"]:
+    """Indices of the half of the points that is farthest along a direction, in the order of the points."""
+    along = (points @ direction[..., None])[..., 0]
+    return along.topk(points.shape[-2] // 2, dim=-1).indices.sort(dim=-1).values

@@ -33,9 +33,9 @@ def train(
     config: TrainConfig,
     folder: Path,
     pretrained: DistanceNetwork | None = None,
-    initial: DistanceNetwork | None = None,
     report: Callable[[Run, dict[str, float]], None] | None = None,
     name: str = "trained",
+    initial: DistanceNetwork | None = None,
 ) -> DistanceNetwork:
     """Train on a bundle.
 
@@ -45,9 +45,9 @@ def train(
         config: Losses, augmentation and schedule.
         folder: Run folder; a checkpoint in it is taken up, to the same curve.
         pretrained: Where the hand encoder comes from; without it, and without `initial`, the encoder is trained along.
-        initial: Weights to go on from, as in fine-tuning; what the network has of another shape starts afresh.
         report: Called now and then; the console by default.
         name: How the weights are called.
+        initial: Weights to go on from, as in fine-tuning; what the network has of another shape starts afresh.
 
     Returns:
         The moving average of the weights, on the CPU, in evaluation mode.

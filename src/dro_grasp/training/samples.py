@@ -11,6 +11,7 @@ from torch import Tensor
 
 from dro_grasp.datasets.bundle import Bundle
 from dro_grasp.errors import BundleError
+from dro_grasp.geometry.point_clouds import nearer_half
 from dro_grasp.hands.hand import Hand
 from dro_grasp.models.network import NetworkConfig
 from dro_grasp.training.config import AugmentationConfig
@@ -124,15 +125,11 @@ class SampleSource:
     def _objects(self, index: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Random object points with noise, and their normals (b m 3)."""
         m, device = self.network.n_object, generator.device
-        # A partial view keeps the nearer half of twice as many points, in the order in which they were drawn.
         twice = torch.randint(self.points.shape[1], (len(index), 2 * m), generator=generator, device=device)
-        direction = torch.randn(len(index), 3, 1, generator=generator, device=device)
-        height = (self.points[index[:, None], twice] @ direction)[..., 0]
+        direction = torch.randn(len(index), 3, generator=generator, device=device)
         partial = torch.rand(len(index), 1, generator=generator, device=device) < self.augmentation.partial
-        first = torch.arange(2 * m, device=device) < m
-        kept = torch.where(partial, height > height.median(-1, keepdim=True).values, first)
-        order = (~kept).to(torch.int8).argsort(dim=-1, stable=True)[:, :m]
-        picks = twice.gather(1, order)
+        half = nearer_half(self.points[index[:, None], twice], direction)
+        picks = twice.gather(1, torch.where(partial, half, torch.arange(m, device=device)))
         points, normals = self.points[index[:, None], picks], self.normals[index[:, None], picks]
         noise = torch.randn(points.shape, generator=generator, device=device) * self.augmentation.object_noise
         return points + noise, normals
