@@ -41,7 +41,9 @@ import sys
 from pathlib import Path
 from dro_grasp.datasets.bundle import load_bundle
 from tests.test_training import SHARDED, run_stage
-run_stage("train", load_bundle(Path(sys.argv[1]) / "bundle.safetensors"), Path(sys.argv[1]) / "shared", SHARDED)
+bundle = load_bundle(Path(sys.argv[1]) / "bundle.safetensors")
+run_stage("pretrain", bundle, Path(sys.argv[1]) / "before", SHARDED)
+run_stage("train", bundle, Path(sys.argv[1]) / "shared", SHARDED)
 """
 # Dies at step 6: after the log line and before its checkpoint, or with the checkpoint half written.
 KILLED = """
@@ -410,6 +412,8 @@ def test_two_processes_descend_the_curve_of_one(home: Path, bundle: Bundle, tmp_
     for name in alone.state_dict():
         if "running" not in name and "tracked" not in name:  # those of training are each process's own
             torch.testing.assert_close(shared[name], whole[name], rtol=1e-4, atol=1e-5)
+    run_stage("pretrain", bundle, tmp_path / "alone before", SHARDED)
+    assert curve(tmp_path / "before") == [pytest.approx(x, rel=1e-4) for x in curve(tmp_path / "alone before")]
     run_stage("train", bundle, tmp_path / "other", SCHEDULE)
     assert curve(tmp_path / "other")[0] != pytest.approx(curve(tmp_path / "alone")[0], rel=1e-4), "two shards see more"
 

@@ -46,6 +46,8 @@ class Pretrain:
     """Those of the motion."""
     minutes: Annotated[float | None, optional("MINUTES", "no limit")] = None
     """Time limit of each; the learning rate follows whichever of steps and time is further on."""
+    shards: int = 1
+    """Independent parts of a step's batch, of 16 samples each; processes that torchrun starts share them out."""
     tensorboard: Flag = False
     """Also write the log for TensorBoard."""
     device: Annotated[str, optional("DEVICE", "cuda where there is one, else cpu")] = "auto"
@@ -67,19 +69,22 @@ class Pretrain:
         from dro_grasp.models.checkpoints import save_weights
         from dro_grasp.training.config import AugmentationConfig, MotionConfig, PretrainConfig, ScheduleConfig
         from dro_grasp.training.pretraining import matching_rank, pretrain, pretrain_motion
+        from dro_grasp.training.processes import is_first
         from dro_grasp.training.samples import SampleSource
 
         check_output(self.output)
         bundle = load_bundle(self.bundle)
         network = dataclasses.replace(network_config(self.size), latent_form=self.latent_form)
         schedule = ScheduleConfig(
-            steps=self.steps, minutes=self.minutes, tensorboard=self.tensorboard, device=choose_device(self.device),
-            seed=self.seed,
+            steps=self.steps, minutes=self.minutes, shards=self.shards, tensorboard=self.tensorboard,
+            device=choose_device(self.device), seed=self.seed,
         )
         model = pretrain(bundle, network, PretrainConfig(schedule=schedule), self.run_folder)
         if self.latent_form == "motion":
             motion = MotionConfig(dataclasses.replace(schedule, steps=self.motion_steps))
             model = pretrain_motion(model, bundle, motion, self.run_folder / "motion")
+        if not is_first():
+            return 0
         about = how_long(self.run_folder) | {"stage": "pretraining", "data": bundle.summary()}
         save_weights(model, self.output, about)
         source = SampleSource(bundle, network, AugmentationConfig())
@@ -117,6 +122,8 @@ class Train:
     """Optimiser steps."""
     minutes: Annotated[float | None, optional("MINUTES", "no limit")] = None
     """Time limit; the learning rate follows whichever of steps and time is further on."""
+    shards: int = 1
+    """Independent parts of a step's batch, of 16 samples each; processes that torchrun starts share them out."""
     tensorboard: Flag = False
     """Also write the log for TensorBoard."""
     learning_rate: float = 1e-3
@@ -131,6 +138,12 @@ class Train:
     """Share of the schedule over which that weight grows from zero."""
     free_bits: float = 0.0
     """KL of each latent dimension that costs nothing [nat]."""
+    samples_per_hand: int = 4
+    """Grasps of each of the four hands in a part of a step's batch."""
+    columns: int = 48
+    """Object points to which distances are predicted in a step; a GPU affords 128."""
+    mixed: Flag = False
+    """Multiply in bfloat16 where that is safe; for GPUs."""
     partial: float = 0.0
     """Share of samples with half of the object cut away."""
     device: Annotated[str, optional("DEVICE", "cuda where there is one, else cpu")] = "auto"
@@ -150,21 +163,25 @@ class Train:
         from dro_grasp.models.checkpoints import load_weights, save_weights
         from dro_grasp.training.config import AugmentationConfig, LossConfig, ScheduleConfig, TrainConfig
         from dro_grasp.training.loop import train
+        from dro_grasp.training.processes import is_first
 
         check_output(self.output)
         bundle = load_bundle(self.bundle)
         pretrained, initial = (None if name is None else load_weights(name) for name in (self.pretrained, self.initial))
         config = TrainConfig(
             schedule=ScheduleConfig(
-                steps=self.steps, minutes=self.minutes, tensorboard=self.tensorboard, learning_rate=self.learning_rate,
-                device=choose_device(self.device), seed=self.seed,
+                steps=self.steps, minutes=self.minutes, shards=self.shards, tensorboard=self.tensorboard,
+                learning_rate=self.learning_rate, mixed=self.mixed, device=choose_device(self.device), seed=self.seed,
             ),
+            samples_per_hand=self.samples_per_hand, columns=self.columns,
             losses=LossConfig(
                 divergence=self.divergence, divergence_warmup=self.divergence_warmup, free_bits=self.free_bits),
             augmentation=AugmentationConfig(partial=self.partial),
         )
         network = dataclasses.replace(network_config(self.size), prior=self.prior, latent_form=self.latent_form)
         model = train(bundle, network, config, self.run_folder, pretrained, name=self.output.stem, initial=initial)
+        if not is_first():
+            return 0
         about = how_long(self.run_folder) | {
             "stage": "training", "pretrained": self.pretrained is not None, "initial": self.initial, "data": bundle.summary(),
         }

@@ -21,7 +21,7 @@ from dro_grasp.training.losses import (
     placement_loss,
     pose_loss,
 )
-from dro_grasp.training.processes import together
+from dro_grasp.training.processes import join
 from dro_grasp.training.reports import console_report
 from dro_grasp.training.runs import Run
 from dro_grasp.training.samples import HandSamples, SampleSource
@@ -55,35 +55,35 @@ def train(
     Raises:
         TrainingError: A loss is not finite.
     """
-    with together(config.schedule.device) as (processes, device):
-        torch.manual_seed(config.schedule.seed)
-        generator = torch.Generator(device)
-        model = DistanceNetwork(network, name=name).to(device)
-        frozen = (pretrained is not None or initial is not None) and config.freeze_hand_encoder
-        if initial is not None:
-            take_over(model, initial)
-        if pretrained is not None:
-            model.hand_encoder.load_state_dict(pretrained.hand_encoder.state_dict())
-            if model.motion is not None and pretrained.motion is not None:
-                model.motion.load_state_dict(pretrained.motion.state_dict())
-        model.hand_encoder.requires_grad_(not frozen)
-        model.mixed = config.schedule.mixed
-        source = SampleSource(bundle, network, config.augmentation, device)
-        run = Run(folder, model, config.schedule, generator, processes)
-        model.train()
-        if frozen:
-            # train() would put the frozen encoder's BatchNorm back into training mode.
-            model.hand_encoder.eval()
+    processes, device = join(config.schedule.device)
+    torch.manual_seed(config.schedule.seed)
+    generator = torch.Generator(device)
+    model = DistanceNetwork(network, name=name).to(device)
+    frozen = (pretrained is not None or initial is not None) and config.freeze_hand_encoder
+    if initial is not None:
+        take_over(model, initial)
+    if pretrained is not None:
+        model.hand_encoder.load_state_dict(pretrained.hand_encoder.state_dict())
+        if model.motion is not None and pretrained.motion is not None:
+            model.motion.load_state_dict(pretrained.motion.state_dict())
+    model.hand_encoder.requires_grad_(not frozen)
+    model.mixed = config.schedule.mixed
+    source = SampleSource(bundle, network, config.augmentation, device)
+    run = Run(folder, model, config.schedule, generator, processes)
+    model.train()
+    if frozen:
+        # train() would put the frozen encoder's BatchNorm back into training mode.
+        model.hand_encoder.eval()
 
-        def draw() -> list[HandSamples]:
-            names = source.draw_hands(config.hands_per_step, generator)
-            return [source.draw(hand, config.samples_per_hand, generator) for hand in names]
+    def draw() -> list[HandSamples]:
+        names = source.draw_hands(config.hands_per_step, generator)
+        return [source.draw(hand, config.samples_per_hand, generator) for hand in names]
 
-        run.train(lambda: step_losses(model, draw(), config, run.progress), report or console_report("training"))
-        model.load_state_dict(run.average.module.state_dict())
-        run.seed_shard()
-        recalibrate(model, lambda: model(*_clouds(draw()), columns=1))
-        model.mixed = False
+    run.train(lambda: step_losses(model, draw(), config, run.progress), report or console_report("training"))
+    model.load_state_dict(run.average.module.state_dict())
+    run.seed_shard()
+    recalibrate(model, lambda: model(*_clouds(draw()), columns=1))
+    model.mixed = False
     return model.cpu().eval()
 
 

@@ -15,7 +15,7 @@ from dro_grasp.models.network import DistanceNetwork, NetworkConfig
 from dro_grasp.training.batch_statistics import recalibrate
 from dro_grasp.training.config import AugmentationConfig, MotionConfig, PretrainConfig
 from dro_grasp.training.losses import contrastive_loss, divergence
-from dro_grasp.training.processes import together
+from dro_grasp.training.processes import join
 from dro_grasp.training.reports import console_report
 from dro_grasp.training.runs import Run
 from dro_grasp.training.samples import SampleSource, random_rotations, random_turns
@@ -43,22 +43,22 @@ def pretrain(
     Raises:
         TrainingError: A loss is not finite.
     """
-    with together(config.schedule.device) as (processes, device):
-        torch.manual_seed(config.schedule.seed)
-        whole = DistanceNetwork(network, name="pretrained").to(device)
-        generator = torch.Generator(device)
-        source = SampleSource(bundle, network, AugmentationConfig(), device)
-        encoder = whole.hand_encoder
-        run = Run(folder, encoder, config.schedule, generator, processes)
-        encoder.train()
+    processes, device = join(config.schedule.device)
+    torch.manual_seed(config.schedule.seed)
+    whole = DistanceNetwork(network, name="pretrained").to(device)
+    generator = torch.Generator(device)
+    source = SampleSource(bundle, network, AugmentationConfig(), device)
+    encoder = whole.hand_encoder
+    run = Run(folder, encoder, config.schedule, generator, processes)
+    encoder.train()
 
-        def losses() -> dict[str, torch.Tensor]:
-            return {"total": contrastive_step(encoder, source, config, generator)}
+    def losses() -> dict[str, torch.Tensor]:
+        return {"total": contrastive_step(encoder, source, config, generator)}
 
-        run.train(losses, report or console_report("pretraining"))
-        encoder.load_state_dict(run.average.module.state_dict())
-        run.seed_shard()
-        recalibrate(encoder, losses)
+    run.train(losses, report or console_report("pretraining"))
+    encoder.load_state_dict(run.average.module.state_dict())
+    run.seed_shard()
+    recalibrate(encoder, losses)
     return whole.cpu().eval()
 
 
@@ -86,18 +86,18 @@ def pretrain_motion(
     """
     if model.motion is None:
         raise TrainingError(f"latent_form is '{model.config.latent_form}'; only with 'motion' is there a motion to pretrain")
-    with together(config.schedule.device) as (processes, device):
-        motion, encoder = model.motion.to(device), model.hand_encoder.to(device).eval()
-        generator = torch.Generator(device)
-        source = SampleSource(bundle, model.config, config.augmentation, device)
-        run = Run(folder, motion, config.schedule, generator, processes)
-        motion.train()
+    processes, device = join(config.schedule.device)
+    motion, encoder = model.motion.to(device), model.hand_encoder.to(device).eval()
+    generator = torch.Generator(device)
+    source = SampleSource(bundle, model.config, config.augmentation, device)
+    run = Run(folder, motion, config.schedule, generator, processes)
+    motion.train()
 
-        def losses() -> dict[str, torch.Tensor]:
-            return motion_losses(motion, encoder, source, config, generator)
+    def losses() -> dict[str, torch.Tensor]:
+        return motion_losses(motion, encoder, source, config, generator)
 
-        run.train(losses, report or console_report("motion"))
-        motion.load_state_dict(run.average.module.state_dict())
+    run.train(losses, report or console_report("motion"))
+    motion.load_state_dict(run.average.module.state_dict())
     return model.cpu().eval()
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
 import os
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,9 +47,15 @@ class Processes:
         return box[0]
 
 
-@contextmanager
-def together(device: str) -> Iterator[tuple[Processes, str]]:
+def is_first() -> bool:
+    """Whether this process writes files and speaks, by what torchrun tells it; true without torchrun."""
+    return os.environ.get("RANK", "0") == "0"
+
+
+def join(device: str) -> tuple[Processes, str]:
     """Join the processes that torchrun started, and take a device of one's own; alone where it started none.
+
+    They stay together until they end: a stage that follows another finds them as they are.
 
     Args:
         device: `cpu`, or `cuda` for the GPU with this process's number on its machine.
@@ -57,18 +63,15 @@ def together(device: str) -> Iterator[tuple[Processes, str]]:
     Raises:
         OptionError: torchrun started more processes on this machine than it has GPUs.
     """
-    count = int(os.environ.get("WORLD_SIZE", "1"))
-    if count == 1:
-        yield Processes(), device
-        return
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        return Processes(), device
     if device == "cuda":
         number, there = int(os.environ.get("LOCAL_RANK", "0")), torch.cuda.device_count()
         if number >= there:
             raise OptionError(f"process {number} finds no GPU of its own, there are {there} here; use --nproc-per-node {there}")
         device = f"cuda:{number}"
         torch.cuda.set_device(number)
-    distributed.init_process_group("nccl" if device.startswith("cuda") else "gloo")
-    try:
-        yield Processes(distributed.get_rank(), distributed.get_world_size()), device
-    finally:
-        distributed.destroy_process_group()
+    if not distributed.is_initialized():
+        distributed.init_process_group("nccl" if device.startswith("cuda") else "gloo")
+        atexit.register(distributed.destroy_process_group)
+    return Processes(distributed.get_rank(), distributed.get_world_size()), device
