@@ -32,7 +32,8 @@ def blocks(language: str) -> list[tuple[str, str]]:
 
 def commands() -> list[str]:
     """Every line of shell in the documents, and of the examples in --help."""
-    lines = [line.split("#")[0].strip() for _, text in blocks("bash") for line in text.splitlines()]
+    texts = [text.replace("\\\n", " ") for _, text in blocks("bash")]
+    lines = [line.split("#")[0].strip() for text in texts for line in text.splitlines()]
     for file in (ROOT / "src" / "dro_grasp" / "cli").glob("*.py"):
         for example in re.findall(r"Example: (.*?)\n    (?:\"\"\"|\n)", file.read_text(), re.DOTALL):
             lines.append(" ".join(example.split()))
@@ -42,6 +43,8 @@ def commands() -> list[str]:
 @pytest.mark.parametrize("command", commands())
 def test_commands_are_understood(command: str) -> None:
     words = shlex.split(command)
+    if words[0] == "torchrun":
+        words = words[words.index("--no-python") + 1 :]
     if words[0] == "make":
         assert words[1] in MAKE_TARGET.findall((ROOT / "Makefile").read_text())
     elif words[0] == "dro-grasp":
