@@ -1,10 +1,10 @@
-# make setup | demo | test | lint | docs-pictures | data | clean
+# make setup | demo | test | test-slow | lint | docs-pictures | data | clean
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo test lint docs-pictures data clean
+.PHONY: setup demo test test-slow lint docs-pictures data clean
 
 setup: $(STAMP)
 
@@ -22,6 +22,9 @@ demo: setup
 
 test: setup
 	$(BIN)/python -m pytest -n 2 -q
+
+test-slow: setup  # what takes a minute each, such as a Ray cluster that loses a node
+	$(BIN)/python -m pytest -q -m slow
 
 lint: setup
 	$(BIN)/ruff check .

@@ -56,6 +56,7 @@ def ray_starts() -> None:
         pytest.skip(f"Ray starts no node on this machine: {error}")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("ray_starts")
 def test_a_node_that_dies_costs_nothing(tmp_path):
     script = tmp_path / "cluster.py"
