@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dro_grasp.errors import OptionError
 from dro_grasp.models import precision
 from dro_grasp.models.attention import Attention
 from dro_grasp.models.encoder import SLOPE, EdgeLayer, StaticGraphEncoder, nearest_neighbours
@@ -188,6 +189,11 @@ def test_a_flow_learns_a_distribution_of_two_modes_that_depends_on_the_condition
         assert float(along.abs().mean()) == pytest.approx(1.5, abs=0.15)
         assert float(along.abs().std()) < 0.4
         assert float(across.std()) < 0.4
+
+
+def test_a_motion_needs_to_be_told_where_the_hand_is() -> None:
+    with pytest.raises(OptionError, match="set placed and residual"):
+        DistanceNetwork(NetworkConfig.from_dict({**SMALL.__dict__, "latent_form": "motion"}))
 
 
 def test_a_latent_that_moves_the_hand_moves_its_points_apart() -> None:

@@ -69,17 +69,7 @@ class Tried:
 
     def rows(self, index: Int[Tensor, " k"]) -> Tried:
         """Some of the grasps; a trial's outcome depends on nothing but the grasp."""
-        kept = index.tolist()
-        results = tuple(
-            replace(
-                r, **{n: getattr(r, n)[index] for n in NUMBERS}, reason=tuple(r.reason[i] for i in kept),
-                contact_links=tuple(r.contact_links[i] for i in kept))
-            for r in self.results
-        )
-        return Tried(self.grasps[index], results, self.seconds)
-
-
-NUMBERS = ("success", "displacement", "rotation", "closing_shift", "closing_rotation", "penetration", "self_penetration")
+        return Tried(self.grasps[index], tuple(r.rows(index) for r in self.results), self.seconds)
 
 
 @dataclass(frozen=True)

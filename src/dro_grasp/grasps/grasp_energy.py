@@ -183,6 +183,7 @@ class GraspEnergy:
         self.hand, self.field, self.centre = hand, on_device(field, device), centre.to(device)
         self.one_hot = torch.eye(hand.tree.n_links, dtype=hand.tree.origin.dtype, device=device)
         self.body = LinkPoints.of(thin.link_points, thin.link_index, hand.tree.n_links)
+        self.contact_points = LinkPoints.of(self.candidates.points, self.candidates.links, hand.tree.n_links)
         self.ball = LinkPoints.of(self.spheres.centres, self.spheres.links, hand.tree.n_links)
         room = self.config.closing_room * (hand.tree.upper - hand.tree.lower) * ~hand.abduction
         self.lower = torch.where(hand.opening > 0, hand.tree.lower + room, hand.tree.lower)

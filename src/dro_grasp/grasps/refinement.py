@@ -16,7 +16,7 @@ from torch import Tensor
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
 from dro_grasp.grasps.field import CloudField, DistanceField
-from dro_grasp.grasps.grasp_energy import EnergyConfig, Evaluation, GraspEnergy, LinkPoints
+from dro_grasp.grasps.grasp_energy import EnergyConfig, Evaluation, GraspEnergy
 from dro_grasp.grasps.synthesis import moved
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
@@ -193,8 +193,7 @@ def nearest_contacts(
     """
     candidates = energy.candidates
     poses = T_object_wrist[:, None] @ energy.hand.tree.forward(q)
-    points = LinkPoints.of(candidates.points, candidates.links, energy.hand.tree.n_links).place(poses)
-    distance = energy.field.distances(points)[0].abs()
+    distance = energy.field.distances(energy.contact_points.place(poses))[0].abs()
     taken = torch.zeros_like(distance)
     allowed = candidates.slot_weights > 0
     nearest = torch.where(allowed, distance[:, None], torch.inf).amin(-1)

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from dro_grasp.errors import OptionError
 from dro_grasp.models.attention import CrossTransformer
 from dro_grasp.models.distance_head import DistanceHead
 from dro_grasp.models.encoder import StaticGraphEncoder
@@ -55,7 +56,8 @@ class NetworkConfig:
     """What z is drawn from at inference: N(0, I) (the paper's form), a Gaussian learned from hand and object, or any
     distribution that a flow learns from them."""
     latent_form: Literal["kernel", "motion"] = "kernel"
-    """What z does: it enters the kernel alone (the paper's form), or also moves the placed open hand; needs `residual`."""
+    """What z does: it enters the kernel alone (the paper's form), or also moves the placed open hand, which needs
+    `placed` and `residual`."""
     kernel_hidden: tuple[int, int] = (300, 100)
     """Hidden layers of the kernel."""
     initial_distance: float = 0.1
@@ -132,14 +134,17 @@ class DistanceNetwork(nn.Module):
         self.object_encoder = StaticGraphEncoder(c.encoder_widths, c.width, c.neighbours)
         self.hand_transformer = CrossTransformer(c.width, c.heads, c.attention_hidden)
         self.object_transformer = CrossTransformer(c.width, c.heads, c.attention_hidden)
-        prior_width = c.latent_head[0]
-        self.motion = HandMotion(c.width, c.latent, c.latent_head[0]) if c.latent_form == "motion" else None
+        if c.latent_form == "motion" and not (c.placed and c.residual):
+            raise OptionError("latent_form 'motion' moves the placed open hand, of which this network is not told; use the "
+                              "size slim, or set placed and residual")
+        latent_width = c.latent_head[0]
+        self.motion = HandMotion(c.width, c.latent, latent_width) if c.latent_form == "motion" else None
         self.latent_encoder = None if self.motion is not None else LatentEncoder(
             c.width, c.latent, c.latent_widths, c.latent_head, c.latent_neighbours)
-        self.condition = None if c.prior == "standard" else Condition(c.width, prior_width)
+        self.condition = None if c.prior == "standard" else Condition(c.width, latent_width)
         self.prior = (
-            FlowPrior(c.latent, prior_width) if c.prior == "flow"
-            else GaussianPrior(c.latent, prior_width) if c.prior == "learned" else None)
+            FlowPrior(c.latent, latent_width) if c.prior == "flow"
+            else GaussianPrior(c.latent, latent_width) if c.prior == "learned" else None)
         self.head = DistanceHead(c.width + c.latent, c.kernel_hidden, c.initial_distance)
         self.place = nn.Linear(3, c.width) if c.placed else None
         self.placement = PlacementPrior(c.width, c.placement_width, c.placement_components)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -60,6 +60,13 @@ class TrialResult:
         columns = {"reason": list(self.reason), "contact_links": [list(links) for links in self.contact_links]}
         return grasps.with_trial(self).replace(extra=grasps.extra | columns)
 
+    def rows(self, index: Int[Tensor, " k"]) -> TrialResult:
+        """The outcome of some of the grasps."""
+        kept = index.tolist()
+        return replace(
+            self, **{name: getattr(self, name)[index] for name in NUMBERS}, reason=tuple(self.reason[i] for i in kept),
+            contact_links=tuple(self.contact_links[i] for i in kept))
+
     @staticmethod
     def join(results: Sequence[TrialResult], label: str) -> TrialResult:
         """One result after the other, all of the same protocol."""
@@ -70,11 +77,14 @@ class TrialResult:
             none = np.zeros(0)
             empty = Measured(Penetration(none, none), none, none, (), none > 0, np.zeros((0, 6)), np.zeros((0, 6)))
             return empty.result((), label)
-        numbers = {n: column(n) for n in TrialResult.__dataclass_fields__ if n not in {"reason", "contact_links", "protocol"}}
         return TrialResult(
-            **numbers, reason=tuple(x for r in results for x in r.reason),
+            **{name: column(name) for name in NUMBERS}, reason=tuple(x for r in results for x in r.reason),
             contact_links=tuple(x for r in results for x in r.contact_links), protocol=label,
         )
+
+
+NUMBERS = tuple(n for n in TrialResult.__dataclass_fields__ if n not in {"reason", "contact_links", "protocol"})
+"""Fields of a TrialResult that are tensors."""
 
 
 def kind_of_failure(reason: str) -> str:

@@ -102,9 +102,10 @@ class SampleSource:
     def draw_motions(
         self, name: str, count: int, generator: torch.Generator
     ) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b n 3"]]:
-        """Placed open hands, and what they move to [m]: any joint angles, about the same wrist; in axes of the placed wrist.
+        """Placed open hands, and the same hands with other joint angles and a wrist as far off as placements are [m].
 
-        Half of the joint angles are those of grasps, the others uniform within the limits.
+        Half of the joint angles are those of grasps, the others uniform within the limits. Axes are those of the placed
+        wrist, or random ones where the network works in the object's.
         """
         hand, grasps = self.hands[name], self.grasps[name]
         chosen = torch.randint(len(grasps.joints), (count,), generator=generator, device=generator.device)
