@@ -10,15 +10,18 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
+from dro_grasp.cli.main import main
 from dro_grasp.errors import OutputError, WeightsError
 from dro_grasp.models import checkpoints
 from dro_grasp.models.checkpoints import (
+    CHECKSUMS,
     KEY,
     SHIPPED_FOLDER,
     describe_weights,
     load_weights,
     locate_weights,
     save_weights,
+    verify_weights,
     weights_names,
 )
 from dro_grasp.models.network import DistanceNetwork, NetworkConfig
@@ -155,3 +158,27 @@ def test_shipped_weights_load() -> None:
     assert locate_weights(None) == locate_weights("slim") == SHIPPED_FOLDER / "slim.safetensors"
     assert load_weights().name == "slim"
     assert all(bool(v.isfinite().all()) for v in load_weights("slim").state_dict().values())
+
+
+def test_shipped_weights_are_as_they_were_shipped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    lines = dict(reversed(line.split()) for line in (SHIPPED_FOLDER / CHECKSUMS).read_text().splitlines())
+    assert set(lines) == {f"{name}.safetensors" for name in weights_names()}
+    for name in weights_names():
+        assert verify_weights(name) == lines[f"{name}.safetensors"] == describe_weights(name)["sha256"]
+    for file in SHIPPED_FOLDER.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    monkeypatch.setattr(checkpoints, "SHIPPED_FOLDER", tmp_path)
+    save_weights(load_weights("slim"), tmp_path / "slim.safetensors", {"about": "made anew"})
+    with pytest.raises(WeightsError, match="shipped was"):
+        verify_weights("slim")
+
+
+def test_verify_checks_files_of_the_user_as_well(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["weights", "verify", str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["weights"][0]["sha256"] == describe_weights(path)["sha256"]
+    path.write_bytes(path.read_bytes()[:-100])
+    assert main(["weights", "verify", str(path), "slim"]) == 2
+    said = capsys.readouterr()
+    assert "cut short" in said.err
+    assert "slim" in said.out
+    assert main(["weights", "verify"]) == 0

@@ -50,7 +50,7 @@ class Generate:
     scale: float = 1.0
     """Multiplies the object's coordinates; 0.001 for files in millimetres."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
-    """Name of shipped weights (see `dro-grasp weights`) or the path of a weights file."""
+    """Name of shipped weights (see `dro-grasp weights list`) or the path of a weights file."""
     protocol: Annotated[
         Literal["dro", "strict", "dro_static", "dexgraspbench", "none"] | None,
         optional("{dro,strict,dro_static,dexgraspbench,none}", "dro for a mesh, none for a bare point cloud"),

@@ -1,4 +1,4 @@
-"""`dro-grasp hands`, `objects` and `weights`: what there is."""
+"""`dro-grasp hands` and `objects`: what there is."""
 
 from __future__ import annotations
 
@@ -48,24 +48,4 @@ class Objects:
         else:
             print_table("objects", ["name", "split"], [[n, s] for n, s in names.items()],
                         note="or the path of a mesh or point cloud")
-        return 0
-
-
-@dataclass(frozen=True)
-class Weights:
-    """List the shipped weights: size, checksum, and what they were trained on."""
-
-    json: Flag = False
-    """Print one JSON object."""
-
-    def run(self) -> int:
-        """Print what each file says of itself."""
-        from dro_grasp.models.checkpoints import describe_weights, weights_names
-
-        found = [describe_weights(name) for name in weights_names()]
-        if self.json:
-            print_json({"weights": found})
-        else:
-            rows = [[w["name"], w["parameters"], w["bytes"] / 1e6, w["sha256"][:16]] for w in found]
-            print_table("weights", ["name", "parameters", "MB", "sha256"], rows)
         return 0

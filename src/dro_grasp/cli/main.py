@@ -15,10 +15,11 @@ from dro_grasp.cli.dataset import Dataset
 from dro_grasp.cli.evaluate import Evaluate
 from dro_grasp.cli.generate import Generate
 from dro_grasp.cli.hand import HandCommand
-from dro_grasp.cli.listing import Hands, Objects, Weights
+from dro_grasp.cli.listing import Hands, Objects
 from dro_grasp.cli.synthesize import Synthesize
 from dro_grasp.cli.train import Pretrain, Train
 from dro_grasp.cli.view import View
+from dro_grasp.cli.weights import Weights
 from dro_grasp.errors import DroGraspError
 
 DONE, OUR_FAULT, BAD_INPUT = 0, 1, 2

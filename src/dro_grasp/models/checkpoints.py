@@ -23,6 +23,8 @@ KEY = "dro_grasp_weights"
 """Metadata entry that marks a file as ours."""
 PICKLES = (b"PK", b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")
 """How zipped and bare pickles begin."""
+CHECKSUMS = "SHA256SUMS"
+"""File beside the shipped weights with their checksums, as `sha256sum` writes it."""
 DEFAULT = "slim"
 """Weights that are used when none are named."""
 
@@ -98,6 +100,23 @@ def describe_weights(name: str | Path | None = None) -> dict[str, Any]:
         "name": path.stem, "parameters": sum(t.numel() for t in tensors.values()), "bytes": path.stat().st_size,
         "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "config": header["config"], "about": header["about"],
     }
+
+
+def verify_weights(name: str | Path | None = None) -> str:
+    """SHA-256 of a weights file that loads and, if it is a shipped one, is as it was shipped.
+
+    Raises:
+        WeightsError: As in `load_weights`; or shipped weights are not those that were shipped.
+    """
+    path = locate_weights(name)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    if path.parent == SHIPPED_FOLDER:
+        lines = (SHIPPED_FOLDER / CHECKSUMS).read_text().splitlines()
+        expected = {file: known for known, file in (line.split() for line in lines)}.get(path.name, "none")
+        if digest != expected:
+            raise WeightsError(f"{path} has SHA-256 {digest}, shipped was {expected}; install the package again")
+    load_weights(path)
+    return digest
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:

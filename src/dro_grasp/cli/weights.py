@@ -1,0 +1,87 @@
+"""`dro-grasp weights`: what ships, what it was trained on, and whether it is unharmed."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import tyro
+
+from dro_grasp.cli.output import print_json, print_table
+
+Flag = tyro.conf.FlagCreatePairsOff[bool]
+
+
+@dataclass(frozen=True)
+class List:
+    """List the shipped weights: size, checksum, and what they were trained on."""
+
+    json: Flag = False
+    """Print one JSON object."""
+
+    def run(self) -> int:
+        """Print what each file says of itself."""
+        from dro_grasp.models.checkpoints import DEFAULT, describe_weights, weights_names
+
+        found = [describe_weights(name) for name in weights_names()]
+        if self.json:
+            print_json({"weights": found})
+        else:
+            rows = [[w["name"], w["parameters"], w["bytes"] / 1e6, trained_on(w["about"]), w["sha256"][:16]] for w in found]
+            print_table("weights", ["name", "parameters", "MB", "trained on", "sha256"], rows,
+                        note=f"'{DEFAULT}' is used when none are named; `dro-grasp weights verify` checks the files")
+        return 0
+
+
+@dataclass(frozen=True)
+class Verify:
+    """Compare weights with the checksums that ship beside them, and load them.
+
+    Example: dro-grasp weights verify
+    """
+
+    names: tyro.conf.Positional[tuple[str, ...]] = ()
+    """Names of shipped weights, or paths of weights files, whose checksum is printed; all shipped ones when none is given."""
+    json: Flag = False
+    """Print one JSON object."""
+
+    def run(self) -> int:
+        """Check each file, then report on all; code 2 if one is not what it should be."""
+        from dro_grasp.errors import WeightsError
+        from dro_grasp.models.checkpoints import verify_weights, weights_names
+
+        rows = []
+        for name in self.names or weights_names():
+            try:
+                rows.append({"name": name, "sha256": verify_weights(name), "error": None})
+            except WeightsError as error:
+                rows.append({"name": name, "sha256": None, "error": str(error)})
+        harmed = [row for row in rows if row["error"]]
+        if self.json:
+            print_json({"ok": not harmed, "weights": rows})
+        else:
+            print_table("weights", ["name", "sha256"], [[row["name"], row["sha256"]] for row in rows if not row["error"]])
+            for row in harmed:
+                print(f"error: {row['error']}", file=sys.stderr)
+        return 2 if harmed else 0
+
+
+@dataclass(frozen=True)
+class Weights:
+    """List and check trained weights."""
+
+    command: Annotated[List, tyro.conf.subcommand("list")] | Annotated[Verify, tyro.conf.subcommand("verify")]
+
+    def run(self) -> int:
+        """Run the subcommand."""
+        return self.command.run()
+
+
+def trained_on(about: dict[str, Any]) -> str:
+    """One line out of what a file says of its training."""
+    data = about.get("data", {})
+    if not data:
+        return "-"
+    hands = data.get("hands", {})
+    return f"{data.get('grasps', 0):,} grasps, {len(hands)} hands, {data.get('objects', 0)} objects"
