@@ -22,3 +22,30 @@ def assets_folder() -> Path:
     if not folder or not Path(folder).is_dir():
         pytest.skip("needs the development assets: set DRO_GRASP_ASSETS to their folder")
     return Path(folder)
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the tiny bundle and the runs on it lie."""
+    return tmp_path_factory.mktemp("training")
+
+
+@pytest.fixture(scope="module")
+def bundle(home: Path):
+    from tests.tiny_bundle import tiny_bundle
+
+    return tiny_bundle(home / "bundle.safetensors")
+
+
+@pytest.fixture(scope="module")
+def results(home: Path, bundle) -> dict:
+    """What uninterrupted runs of both stages of training return, by stage."""
+    from tests.training_stages import STAGES, run_stage
+
+    return {stage: run_stage(stage, bundle, home / stage) for stage in STAGES}
+
+
+@pytest.fixture(scope="module")
+def finished(home: Path, results: dict) -> dict[str, Path]:
+    """The folders of these runs."""
+    return {stage: home / stage for stage in results}

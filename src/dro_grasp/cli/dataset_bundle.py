@@ -28,8 +28,9 @@ class BundleCommand:
     """Folders that `dro-grasp synthesize` filled, folders of grasp files, or grasp files."""
     output: Path
     """The bundle to write."""
-    split: Literal["train", "few_shot"] = "train"
-    """What goes in: grasps that may be trained on, or those of held-out hands for fine-tuning studies."""
+    split: Literal["train", "few_shot", "validate"] = "train"
+    """What goes in: grasps that may be trained on, those of held-out hands for fine-tuning studies, or those on objects that
+    no weights are trained on, to measure weights with."""
     hands: tuple[str, ...] = ()
     """Only these hands; all when none is named."""
     per_pair: Annotated[int | None, optional("N", "all")] = None

@@ -148,6 +148,8 @@ class Train:
     """Share of samples with half of the object cut away."""
     device: Annotated[str, optional("DEVICE", "cuda where there is one, else cpu")] = "auto"
     """Where to compute: cpu, cuda, or cuda:1."""
+    validation: Annotated[Path | None, optional("PATH", "no errors")] = None
+    """Bundle of grasps that are not trained on, of which the weights' distance errors are reported in the end."""
     seed: int = 0
     """Seed of everything."""
     json: Flag = False
@@ -159,6 +161,7 @@ class Train:
 
         from dro_grasp.datasets.bundle import load_bundle
         from dro_grasp.devices import choose_device
+        from dro_grasp.evaluation.distance_error import distance_errors
         from dro_grasp.files import check_output
         from dro_grasp.models.checkpoints import load_weights, save_weights
         from dro_grasp.training.config import AugmentationConfig, LossConfig, ScheduleConfig, TrainConfig
@@ -167,6 +170,7 @@ class Train:
 
         check_output(self.output)
         bundle = load_bundle(self.bundle)
+        validation = None if self.validation is None else load_bundle(self.validation)
         pretrained, initial = (None if name is None else load_weights(name) for name in (self.pretrained, self.initial))
         config = TrainConfig(
             schedule=ScheduleConfig(
@@ -186,11 +190,15 @@ class Train:
             "stage": "training", "pretrained": self.pretrained is not None, "initial": self.initial, "data": bundle.summary(),
         }
         save_weights(model, self.output, about)
+        errors = [] if validation is None else distance_errors(load_weights(self.output), validation)
         report = {"output": str(self.output), "steps": about["steps"], "log": str(self.run_folder / "log.jsonl")}
         if self.json:
-            print_json(report)
-        else:
-            print_table("training", ["steps", "weights", "log"], [[report["steps"], report["output"], report["log"]]])
+            print_json(report | {"distance_errors": [dataclasses.asdict(e) for e in errors]})
+            return 0
+        print_table("training", ["steps", "weights", "log"], [[report["steps"], report["output"], report["log"]]])
+        if errors:
+            rows = [[e.hand, 1e3 * e.posterior, 1e3 * e.prior, e.divergence] for e in errors]
+            print_table("distance error", ["hand", "posterior z [mm]", "prior z [mm]", "divergence [nat]"], rows)
         return 0
 
 

@@ -8,7 +8,7 @@ FEW_SHOT = "few_shot"
 """Split of a held-out hand's grasps on training objects: for fine-tuning studies, never for shipped weights."""
 TRAINING = frozenset({"train", ""})
 """Splits that a training bundle takes; the empty one is an object of the user's own."""
-SPLITS = {"train": TRAINING, "few_shot": frozenset({FEW_SHOT})}
+SPLITS = {"train": TRAINING, "few_shot": frozenset({FEW_SHOT}), "validate": frozenset({"validate"})}
 """What a bundle may be made of, by name."""
 
 
