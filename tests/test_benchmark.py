@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from dro_grasp.cli.main import main
+from dro_grasp.evaluation import benchmark as evaluated
 from dro_grasp.evaluation.benchmark import (
     ALL,
     BEST,
@@ -20,15 +21,19 @@ from dro_grasp.evaluation.benchmark import (
     STAGES,
     START,
     SYNTHESISED,
+    TOP,
     BenchmarkConfig,
     Row,
     benchmark,
 )
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.refinement import refine_grasps, score_grasps
+from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.library import load_object
+from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predictor import GraspPredictor
+from dro_grasp.simulation.outcome import TrialResult
 from dro_grasp.simulation.protocols import protocol
 from dro_grasp.simulation.trial import simulate
 
@@ -54,12 +59,14 @@ def test_every_source_has_its_stages_for_every_hand_and_on_average(rows: list[Ro
     assert len(rows) == len(names) * 3
     assert {r.num for r in rows if r.stage in {RAW, REFINED} and r.hand != ALL} == {16}
     assert {r.num for r in rows if r.stage in {RANKED, BEST} and r.hand != ALL} == {4}
+    assert {(r.stage, r.num) for r in rows if r.stage in TOP and r.hand != ALL} == {
+        ("refined, top 5", 10), ("refined, top 1", 2)}
 
 
 def test_raw_and_ranked_rows_are_what_single_trials_say(rows: list[Row]) -> None:
     hand, predictor = load_hand("barrett"), GraspPredictor()
     for stage, best in ((RAW, RANKED), (REFINED, BEST)):
-        passed, passed_best, held = [], [], []
+        passed, passed_best, passed_first, held = [], [], [], []
         for name in OBJECTS:
             obj = load_object(name)
             grasps = predictor.predict(hand, obj, num=8, seed=0, refine=False)
@@ -68,10 +75,14 @@ def test_raw_and_ranked_rows_are_what_single_trials_say(rows: list[Row]) -> None
             passed.append(simulate(hand, obj, grasps, "strict").success)
             order = score_grasps(hand, obj, grasps).argsort(descending=True)[:2]
             passed_best.append(simulate(hand, obj, grasps[order], "strict").success)
+            passed_first.append(simulate(hand, obj, grasps[order[:1]], "strict").success)
             first = simulate(hand, obj, grasps, "dro")
             held.append(first.displacement[first.success, -1])
         assert find(rows, NETWORK, stage, "barrett").success["strict/1"][0] == float(torch.cat(passed).float().mean())
         assert find(rows, NETWORK, best, "barrett").success["strict/1"][0] == float(torch.cat(passed_best).float().mean())
+        if stage == REFINED:
+            alone = find(rows, NETWORK, "refined, top 1", "barrett").success["strict/1"][0]
+            assert alone == float(torch.cat(passed_first).float().mean())
         assert find(rows, NETWORK, stage, "barrett").displacement == pytest.approx(float(torch.cat(held).mean()))
 
 
@@ -108,6 +119,35 @@ def test_grasps_that_all_fail_have_no_means(monkeypatch: pytest.MonkeyPatch) -> 
     assert row.success["dro/1"][0] == 0
     assert math.isnan(row.displacement)
     assert row.diversity == 0
+
+
+@pytest.mark.parametrize("view", ["half", "depth"])
+def test_a_view_hides_the_object_from_the_network_alone(view: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown, tried = [], []
+    honest_predict, honest_simulate = GraspPredictor.predict, simulate
+
+    def predict(self: GraspPredictor, hand: Hand, obj: ObjectModel, **options: object) -> GraspBatch:
+        shown.append(obj)
+        return honest_predict(self, hand, obj, **options)
+
+    def trial(hand: Hand, obj: ObjectModel, grasps: GraspBatch, *rest: object, **options: object) -> TrialResult:
+        tried.append(obj)
+        return honest_simulate(hand, obj, grasps, *rest, **options)
+
+    monkeypatch.setattr(GraspPredictor, "predict", predict)
+    monkeypatch.setattr(evaluated, "simulate", trial)
+    config = dataclasses.replace(CONFIG, num=2, stages=(REFINED,), controls=False, protocols=(protocol("dro"),), view=view)
+    objects = [load_object(n) for n in OBJECTS]
+    benchmark([load_hand("gripper3")], objects, GraspPredictor(), config)
+    assert [o.is_cloud for o in shown] == [True, True]
+    assert tried == objects
+    ball = torch.from_numpy(shown[0].cloud)
+    towards = ball.mean(0) / ball.mean(0).norm()
+    along = ball @ towards / ball.norm(dim=1).mean()
+    # The far half of a sphere about the origin is hidden; noise and the camera's nearness move the border.
+    assert -0.15 < float(along.min()) < 0.3
+    normals = torch.from_numpy(shown[0].cloud_normals)
+    assert float((normals * torch.nn.functional.normalize(ball, dim=1)).sum(1).quantile(0.1)) > 0.7
 
 
 def test_the_command_prints_rows_and_json(capsys: pytest.CaptureFixture[str]) -> None:

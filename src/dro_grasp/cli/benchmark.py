@@ -31,7 +31,7 @@ class Benchmark:
     num: int = 100
     """Grasps of each hand on each object, of which ranking keeps the best quarter."""
     stages: tuple[Literal["raw", "ranked", "refined"], ...] = ("raw", "ranked", "refined")
-    """What becomes of the grasps before they are tried; refined ones are tried all, and the best quarter apart."""
+    """What becomes of the grasps before they are tried; refined ones are tried all, and the best of them apart."""
     protocols: tuple[Literal["dro", "strict", "dro_static", "dexgraspbench"], ...] = ("dro", "strict", "dexgraspbench")
     """Trials; displacement, rotation and diversity are those of successes of the first."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
@@ -40,8 +40,10 @@ class Benchmark:
     """Also try unoptimised starts, synthesised grasps and, with a bundle, the mean grasp."""
     bundle: Annotated[Path | None, optional("PATH", "no mean grasp")] = None
     """Training bundle that the mean grasp is the mean of."""
+    view: Literal["whole", "half", "depth"] = "whole"
+    """What the network, refinement and ranking see: the whole object, the paper's half of its points, or a depth image."""
     seed: int = 0
-    """The same seed gives the same grasps."""
+    """The same seed gives the same grasps and views."""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print one JSON object instead of a Markdown table."""
 
@@ -49,7 +51,7 @@ class Benchmark:
         """Load everything, measure, print."""
         from dro_grasp.datasets.bundle import load_bundle
         from dro_grasp.errors import ObjectError, OptionError
-        from dro_grasp.evaluation.benchmark import BEST, BenchmarkConfig, benchmark
+        from dro_grasp.evaluation.benchmark import BEST, TOP, BenchmarkConfig, benchmark
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.library import load_object, resolve_objects
         from dro_grasp.predictor import GraspPredictor, check_request
@@ -66,10 +68,10 @@ class Benchmark:
         objects = [load_object(name) for name in resolve_objects(list(self.objects))]
         if clouds := [obj.name for obj in objects if obj.is_cloud]:
             raise ObjectError(f"{', '.join(clouds)}: bare point clouds cannot be tried; give meshes")
-        stages = (*self.stages, BEST) if "refined" in self.stages else self.stages
+        stages = (*self.stages, BEST, *TOP) if "refined" in self.stages else self.stages
         config = BenchmarkConfig(
             num=self.num, stages=stages, protocols=tuple(protocol(p) for p in self.protocols), controls=self.controls,
-            seed=self.seed,
+            seed=self.seed, view=self.view,
         )
         with progress_bar("pairs", self.json) as progress:
             rows = benchmark(hands, objects, predictor, config, bundle, progress)
@@ -77,10 +79,13 @@ class Benchmark:
         if self.json:
             print_json({
                 "weights": predictor.weights_name, "objects": [obj.name for obj in objects], "num": self.num,
-                "seed": self.seed, "seconds": round(seconds, 1), "rows": [dataclasses.asdict(row) for row in rows],
+                "view": self.view, "seed": self.seed, "seconds": round(seconds, 1),
+                "rows": [dataclasses.asdict(row) for row in rows],
             })
             return 0
         title = f"weights '{predictor.weights_name}', {self.num} grasps of each hand on each of {len(objects)} objects"
+        if self.view != "whole":
+            title += f", view '{self.view}'"
         columns = ["grasps", "stage", "hand", "n", *rows[0].success, "shift [mm]", "turn [deg]", "diversity", "ROC area",
                    "ms a grasp"]
         say(title + "; success in % with 95 % intervals; ROC area of the score for the last protocol\n")

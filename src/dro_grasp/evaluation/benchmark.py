@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import zlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -17,6 +18,7 @@ from torch import Tensor
 from dro_grasp.datasets.bundle import Bundle
 from dro_grasp.evaluation.controls import mean_grasp, mean_grasps, palm_facing_starts
 from dro_grasp.evaluation.metrics import diversity, roc_area, wilson_interval
+from dro_grasp.evaluation.views import View, seen
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.refinement import refine_grasps, score_grasps
 from dro_grasp.grasps.synthesis import synthesize
@@ -28,8 +30,10 @@ from dro_grasp.simulation.protocols import Protocol
 from dro_grasp.simulation.trial import settle, simulate
 
 RAW, RANKED, REFINED, BEST = "raw", "ranked", "refined", "refined, ranked"
-STAGES = (RAW, RANKED, REFINED, BEST)
-"""As they come; the best of them by score; polished; polished, then the best of them by score."""
+TOP = {f"refined, top {count}": count for count in (5, 1)}
+"""Stages that keep the few best by score of the polished grasps of a pair, and how many."""
+STAGES = (RAW, RANKED, REFINED, BEST, *TOP)
+"""As they come; the best quarter by score; polished; polished, then the best quarter, the best five, the best one."""
 NETWORK, MEAN, START, SYNTHESISED = "network", "mean grasp", "unoptimised start", "synthesised"
 ALL = "average"
 """Name of the row over all hands."""
@@ -51,6 +55,8 @@ class BenchmarkConfig:
     """Trials that every grasp goes through."""
     controls: bool = True
     """Also the rows that success means nothing without."""
+    view: View = "whole"
+    """What the network, refinement and ranking see of the object, from one side per pair; controls see all of it."""
     seed: int = 0
     """Of all grasps."""
     workers: int | None = None
@@ -119,9 +125,8 @@ def benchmark(
     for hand in hands:
         found: dict[tuple[str, str], list[Tried]] = {}
         for obj in objects:
-            for source, grasps, seconds in _sources(hand, obj, predictor, config, bundle):
-                stages = [RAW] if source in {START, SYNTHESISED} else list(config.stages)
-                for stage, tried in _stages(hand, obj, grasps, seconds, stages, config):
+            for source, grasps, seconds, known in _sources(hand, obj, predictor, config, bundle):
+                for stage, tried in _stages(hand, obj, known, source, grasps, seconds, config):
                     found.setdefault((source, stage), []).append(tried)
             done += 1
             if progress is not None:
@@ -137,41 +142,51 @@ def benchmark(
 
 def _sources(
     hand: Hand, obj: ObjectModel, predictor: GraspPredictor, config: BenchmarkConfig, bundle: Bundle | None
-) -> Iterator[tuple[str, GraspBatch, dict[str, float]]]:
-    """Grasps by where they come from, unpolished, with the time that one of them took [s]."""
+) -> Iterator[tuple[str, GraspBatch, dict[str, float], ObjectModel]]:
+    """Grasps by where they come from, unpolished, the time that one of them took [s], and what was seen of the object."""
     num, seed = config.num, config.seed
-    grasps = predictor.predict(hand, obj, num=num, seed=seed, refine=False)
-    yield NETWORK, grasps, {k: predictor.timings[k] / num for k in ("network", "decode")}
+    known = seen(obj, config.view, seed + zlib.crc32(f"{hand.name} {obj.name}".encode()))
+    grasps = predictor.predict(hand, known, num=num, seed=seed, refine=False)
+    yield NETWORK, grasps, {k: predictor.timings[k] / num for k in ("network", "decode")}, known
     if not config.controls:
         return
     if bundle is not None and hand.name in bundle.grasps:
-        yield MEAN, mean_grasps(hand, obj, mean_grasp(bundle, hand.name), num, seed), {}
-    yield START, palm_facing_starts(hand, obj, num, seed), {}
+        yield MEAN, mean_grasps(hand, obj, mean_grasp(bundle, hand.name), num, seed), {}, obj
+    yield START, palm_facing_starts(hand, obj, num, seed), {}, obj
     begin = time.perf_counter()
     made = settle(hand, obj, synthesize(hand, obj, CANDIDATES * num, seed)[slice(0, num)], workers=config.workers)
-    yield SYNTHESISED, made, {"synthesis": (time.perf_counter() - begin) / num}
+    yield SYNTHESISED, made, {"synthesis": (time.perf_counter() - begin) / num}, obj
 
 
 def _stages(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, seconds: dict[str, float], stages: Iterable[str], config: BenchmarkConfig
+    hand: Hand,
+    obj: ObjectModel,
+    known: ObjectModel,
+    source: str,
+    grasps: GraspBatch,
+    seconds: dict[str, float],
+    config: BenchmarkConfig,
 ) -> Iterator[tuple[str, Tried]]:
-    """The stages asked for; what two of them share is made once."""
-    for whole, best in ((RAW, RANKED), (REFINED, BEST)):
-        wanted = {whole, best} & set(stages)
+    """The stages asked for; what several of them share is made once."""
+    asked = {RAW} if source in {START, SYNTHESISED} else set(config.stages)
+    quarter = max(1, round(KEPT * len(grasps)))
+    for whole, best in ((RAW, {RANKED: quarter}), (REFINED, {BEST: quarter, **TOP})):
+        wanted = {whole, *best} & asked
         if not wanted:
             continue
         if whole == REFINED:
             begin = time.perf_counter()
-            grasps = refine_grasps(hand, obj, grasps)
+            grasps = refine_grasps(hand, known, grasps)
             seconds = seconds | {"refine": (time.perf_counter() - begin) / len(grasps)}
-        grasps = grasps.replace(score=score_grasps(hand, obj, grasps))
+        grasps = grasps.replace(score=score_grasps(hand, known, grasps))
         assert grasps.score is not None
         results = tuple(simulate(hand, obj, grasps, rules, workers=config.workers) for rules in config.protocols)
         tried = Tried(grasps, results, seconds)
         if whole in wanted:
             yield whole, tried
-        if best in wanted:
-            yield best, tried.rows(grasps.score.topk(max(1, round(KEPT * len(grasps)))).indices)
+        for stage, count in best.items():
+            if stage in wanted:
+                yield stage, tried.rows(grasps.score.topk(min(count, len(grasps))).indices)
 
 
 def _row(source: str, stage: str, tries: list[Tried], protocols: Sequence[Protocol]) -> Row:

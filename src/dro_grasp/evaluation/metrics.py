@@ -25,7 +25,8 @@ def wilson_interval(success: int, total: int) -> tuple[float, float]:
     rate, z2 = success / total, CONFIDENCE**2
     centre = (rate + z2 / (2 * total)) / (1 + z2 / total)
     half = CONFIDENCE / (1 + z2 / total) * math.sqrt(rate * (1 - rate) / total + z2 / (4 * total**2))
-    return max(0.0, centre - half), min(1.0, centre + half)
+    # Rounding may leave the rate itself outside.
+    return max(0.0, min(rate, centre - half)), min(1.0, max(rate, centre + half))
 
 
 def diversity(
