@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.refinement import score_grasps
+from dro_grasp.grasps.ranking import score_grasps
 from dro_grasp.objects.library import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predictor import GraspPredictor, PredictorConfig, rotation_between
@@ -115,6 +115,28 @@ def test_a_direction_must_point_somewhere(
 ) -> None:
     with pytest.raises(OptionError, match="has no direction"):
         predictor.predict(HAND, ball, num=1, direction=direction)
+
+
+@pytest.mark.parametrize("temperature", [-0.1, math.nan, 3.0])
+def test_a_temperature_out_of_range_is_refused(weights: str, ball: ObjectModel, temperature: float) -> None:
+    with pytest.raises(OptionError, match=f"temperature is {temperature}; give 0"):
+        GraspPredictor(weights, config=PredictorConfig(temperature=temperature)).predict(HAND, ball, num=1)
+
+
+def test_the_temperature_scales_what_z_is_made_of(weights: str, ball: ObjectModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: dict[float | None, torch.Tensor] = {}
+    for temperature in (None, 0.0, 0.5):
+        predictor = GraspPredictor(weights, config=PredictorConfig(temperature=temperature))
+        honest = predictor.network.predict
+
+        def predict(hand: torch.Tensor, obj: torch.Tensor, noise: torch.Tensor, at=temperature, honest=honest) -> torch.Tensor:
+            drawn[at] = noise
+            return honest(hand, obj, noise)
+
+        monkeypatch.setattr(predictor.network, "predict", predict)
+        predictor.predict(HAND, ball, num=3, seed=5)
+    assert float(drawn[0.0].abs().max()) == 0
+    torch.testing.assert_close(drawn[0.5], 0.5 * drawn[None])
 
 
 @pytest.mark.parametrize("direction", [(0.0, 0.0, -5.0), (0.0, 0.0, 1e-3), (1.0, 2.0, 2.0)])

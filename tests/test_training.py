@@ -12,11 +12,12 @@ from torch import nn
 
 from dro_grasp.datasets.bundle import Bundle
 from dro_grasp.errors import TrainingError
+from dro_grasp.evaluation.correspondence import matching_rank
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.training import batch_statistics, loop
 from dro_grasp.training.config import AugmentationConfig, LossConfig, MotionConfig, PretrainConfig, TrainConfig
 from dro_grasp.training.loop import train
-from dro_grasp.training.pretraining import contrastive_step, matching_rank, pretrain_motion
+from dro_grasp.training.pretraining import contrastive_step, pretrain_motion
 from dro_grasp.training.samples import SampleSource
 from tests.tiny_bundle import TINY
 from tests.training_stages import SCHEDULE, STAGES, curve, quiet, run_stage
@@ -27,7 +28,7 @@ def test_losses_go_down_and_the_encoder_learns_to_match(bundle: Bundle, tmp_path
     learnt = run_stage("pretrain", bundle, tmp_path / "pre", schedule)
     assert curve(tmp_path / "pre")[-1]["total"] < 0.6 * curve(tmp_path / "pre")[0]["total"]
     source = SampleSource(bundle, TINY, AugmentationConfig())
-    rank = matching_rank(learnt.hand_encoder, source, 16, torch.Generator().manual_seed(0))["toy"]
+    rank = matching_rank(learnt.hand_encoder, source, torch.Generator().manual_seed(0), 16)["toy"]
     assert rank < 0.3 * TINY.n_hand / 2, "chance is half the number of points"
     run_stage("train", bundle, tmp_path / "main", schedule)
     first, last = curve(tmp_path / "main")[0], curve(tmp_path / "main")[-1]

@@ -20,7 +20,8 @@ from dro_grasp import distance_matrix
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
-from dro_grasp.grasps.refinement import refine_grasps, score_grasps
+from dro_grasp.grasps.ranking import score_grasps
+from dro_grasp.grasps.refinement import refine_grasps
 from dro_grasp.hands.hand import Hand
 from dro_grasp.models.checkpoints import load_weights
 from dro_grasp.models.network import DistanceNetwork
@@ -28,6 +29,10 @@ from dro_grasp.objects.shape import ObjectModel
 
 PREDICTED = "predicted_points"
 """Column that carries the multilaterated points through selection and sorting; no file holds it."""
+
+
+HOTTEST = 2.0
+"""Largest temperature that is taken."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +45,9 @@ class PredictorConfig:
     """The same with a direction: rolls about it."""
     direction_spread: float = math.radians(5.0)
     """Standard deviation of the palm direction around the one asked for [rad]."""
+    temperature: float | None = None
+    """Spread of z: at 0 the likeliest grasp of each placement, at 1 as varied as the training grasps; None leaves it to the
+    weights."""
     batch_size: int = 16
     """Grasps that are decoded at once."""
     network_batch_size: int = 4
@@ -105,9 +113,10 @@ class GraspPredictor:
             `num` grasps with pregrasp, squeeze and score. Results do not depend on the batch size.
 
         Raises:
-            OptionError: `num` is not positive, `direction` is zero, or too few grasps stay above the table.
+            OptionError: `num` is not positive, `direction` is zero, the temperature is out of range, or too few grasps stay
+                above the table.
         """
-        check_request(num, direction)
+        check_request(num, direction, self.config.temperature)
         self.timings = {"network": 0.0, "decode": 0.0, "refine": 0.0, "rank": 0.0}
         self.candidates = 0
         generator = torch.Generator().manual_seed(seed)
@@ -151,13 +160,14 @@ class GraspPredictor:
         with _timed(self.timings, "network"):
             T_object_wrist = self._placements(small, points, num, direction, generator)
             joints = small.random_open_joints(num, generator)
-            latent = network.sample_latent(num, generator)
+            latent = network.sample_latent(num, generator, self.config.temperature)
         poses, solved, predicted = [], [], []
         for start in range(0, num, self.config.batch_size):
             part = slice(start, min(start + self.config.batch_size, num))
             with _timed(self.timings, "network"):
                 placed = small.points(joints[part], T_object_wrist[part])
-                distances = self._distances(placed, points, T_object_wrist[part], latent[part])
+                rotation = T_object_wrist[part, :3, :3] @ network.config.axes(small)
+                distances = self._distances(placed, points, rotation, latent[part])
             with _timed(self.timings, "decode"):
                 anchors = points.expand(len(placed), -1, -1)
                 links = distance_matrix.decode(small, distances, anchors)
@@ -185,29 +195,29 @@ class GraspPredictor:
     ) -> Float[Tensor, "num 4 4"]:
         """Wrist poses near which grasps are asked for, in the object's frame."""
         per_grasp = self.config.rotations_per_grasp if direction is None else self.config.rolls_per_grasp
-        candidates = self._rotations(hand, num * per_grasp, direction, generator)
-        opened = hand.points(hand.canonical_joints())
+        axes = self.network.config.axes(hand)
+        candidates = self._rotations(hand, num * per_grasp, direction, generator) @ axes
+        opened = hand.points(hand.canonical_joints()) @ axes
         rotation, position = self.network.sample_placements(opened, points, candidates, num, generator)
         T = torch.eye(4).repeat(num, 1, 1)
-        T[:, :3, :3] = rotation
-        T[:, :3, 3] = points.mean(0) + (rotation @ (position - hand.grasp_centre_wrist)[..., None])[..., 0]
+        T[:, :3, :3] = rotation @ axes.mT
+        T[:, :3, 3] = points.mean(0) + (rotation @ (position - hand.grasp_centre_wrist @ axes)[..., None])[..., 0]
         return T
 
     def _distances(
         self,
         placed: Float[Tensor, "b n 3"],
         points: Float[Tensor, "m 3"],
-        T_object_wrist: Float[Tensor, "b 4 4"],
+        rotation: Float[Tensor, "b 3 3"],
         latent: Float[Tensor, "b latent"],
     ) -> Float[Tensor, "b n m"]:
-        """D(R,O) of a batch of placed hands; distances do not depend on the frame, so none needs to be undone."""
+        """D(R,O) of a batch of placed hands whose axes are turned so; distances are the same in every frame."""
         found = []
         size = self.config.network_batch_size
-        for clouds, T, z in zip(placed.split(size), T_object_wrist.split(size), latent.split(size), strict=True):
-            rotation = T[:, :3, :3]
+        for clouds, axes, z in zip(placed.split(size), rotation.split(size), latent.split(size), strict=True):
             centre = points.mean(0).expand(len(clouds), 3)
-            hand = self.network.to_frame(clouds, centre, rotation)
-            obj = self.network.to_frame(points.expand(len(clouds), -1, -1), centre, rotation)
+            hand = self.network.to_frame(clouds, centre, axes)
+            obj = self.network.to_frame(points.expand(len(clouds), -1, -1), centre, axes)
             found.append(self.network.predict(hand, obj, z).float())
         return torch.cat(found)
 
@@ -246,11 +256,11 @@ def above_table(hand: Hand, grasps: GraspBatch, table: float) -> Tensor:
     return lowest > table
 
 
-def check_request(num: int, direction: tuple[float, float, float] | None) -> None:
+def check_request(num: int, direction: tuple[float, float, float] | None, temperature: float | None = None) -> None:
     """Refuse impossible requests before any work.
 
     Raises:
-        OptionError: `num` is not positive, or `direction` is zero or not finite.
+        OptionError: `num` is not positive, `direction` is zero or not finite, or `temperature` is out of range.
     """
     if num < 1:
         raise OptionError(f"num is {num}; ask for at least one grasp (--num 16)")
@@ -261,6 +271,9 @@ def check_request(num: int, direction: tuple[float, float, float] | None) -> Non
                 f"direction {direction} has no direction; give the palm direction in the object's frame, for example "
                 "--direction 0 0 -1 to grasp from above"
             )
+    if temperature is not None and not 0 <= temperature <= HOTTEST:
+        raise OptionError(f"temperature is {temperature}; give 0 for the likeliest grasps, 1 for the most varied, or a number "
+                          f"between (at most {HOTTEST:g})")
 
 
 class _timed:

@@ -65,10 +65,11 @@ class Pretrain:
 
         from dro_grasp.datasets.bundle import load_bundle
         from dro_grasp.devices import choose_device
+        from dro_grasp.evaluation.correspondence import matching_rank
         from dro_grasp.files import check_output
         from dro_grasp.models.checkpoints import save_weights
         from dro_grasp.training.config import AugmentationConfig, MotionConfig, PretrainConfig, ScheduleConfig
-        from dro_grasp.training.pretraining import matching_rank, pretrain, pretrain_motion
+        from dro_grasp.training.pretraining import pretrain, pretrain_motion
         from dro_grasp.training.processes import is_first
         from dro_grasp.training.samples import SampleSource
 
@@ -88,7 +89,7 @@ class Pretrain:
         about = how_long(self.run_folder) | {"stage": "pretraining", "data": bundle.summary()}
         save_weights(model, self.output, about)
         source = SampleSource(bundle, network, AugmentationConfig())
-        ranks = matching_rank(model.hand_encoder, source, 32, torch.Generator().manual_seed(1))
+        ranks = matching_rank(model.hand_encoder, source, torch.Generator().manual_seed(1))
         report = {"output": str(self.output), "steps": about["steps"], "mean_rank": ranks, "chance": network.n_hand / 2}
         if self.json:
             print_json(report)

@@ -17,6 +17,8 @@ from dro_grasp.kinematics.tree import KinematicTree, cached_tensor
 if TYPE_CHECKING:
     from dro_grasp.kinematics.loader import Description
 
+MIN_FINGER_OFFSET = 0.005
+"""Fingers whose middle is nearer than this to the palm's axis surround it [m]."""
 MIN_REGISTRATION_POINTS = 4
 """A link with fewer points, or with collinear ones, has no pose of its own to be read off its points."""
 POINTS_PER_LINK = 6
@@ -152,6 +154,24 @@ class Hand:
     def palm_direction_wrist(self) -> Float[Tensor, "3"]:
         """palm_direction in the wrist frame."""
         return self.T_wrist_palm_rest[:3, :3] @ self.palm_direction
+
+    @cached_tensor
+    def palm_axes_wrist(self) -> Float[Tensor, "3 3"]:
+        """Axes that mean the same for every hand, as columns in the wrist frame: along the fingers, across, and palm direction.
+
+        Along the fingers is where the open hand's fingers lie as seen from the palm's middle; for fingers that surround the
+        palm evenly, as those of some grippers, it is one of many alike.
+        """
+        points = self.points(self.canonical_joints())
+        palm = self.link_index == self.palm
+        fingers = torch.isin(self.link_index, torch.tensor(self.touching, device=points.device)) & ~palm
+        z = torch.nn.functional.normalize(self.palm_direction_wrist, dim=0)
+        offset = points[fingers].mean(0) - points[palm].mean(0)
+        helper = torch.eye(3, device=z.device)[z.abs().argmin()]
+        along = offset - (offset @ z) * z
+        along = along if float(along.norm()) > MIN_FINGER_OFFSET else helper - (helper @ z) * z
+        x = torch.nn.functional.normalize(along, dim=0)
+        return torch.stack([x, torch.linalg.cross(z, x), z], -1)
 
     def to(self, device: torch.device | str) -> Hand:
         """The same hand with its tensors on another device; itself where they are there already."""

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from dro_grasp.errors import OptionError
+from dro_grasp.hands.hand import Hand
 from dro_grasp.models.attention import CrossTransformer
 from dro_grasp.models.distance_head import DistanceHead
 from dro_grasp.models.encoder import StaticGraphEncoder
@@ -62,8 +63,9 @@ class NetworkConfig:
     """Hidden layers of the kernel."""
     initial_distance: float = 0.1
     """Distance that an untrained kernel predicts [m]; softplus alone starts at 0.69."""
-    frame: Literal["object", "wrist"] = "object"
-    """Axes of both clouds: the object's (the paper's form), or the given wrist's."""
+    frame: Literal["object", "wrist", "palm"] = "object"
+    """Axes of both clouds: the object's (the paper's form), the given wrist's, which each description chooses as it likes, or
+    those of the palm there, which mean the same for every hand."""
     placed: bool = False
     """Tell the network where the open hand is; the paper discards it by zero-centring."""
     residual: bool = False
@@ -77,6 +79,10 @@ class NetworkConfig:
     placement_temperature: float = 0.7
     """Scales the spread of placements drawn at inference."""
 
+    def axes(self, hand: Hand) -> Float[Tensor, "3 3"]:
+        """Axes that the network works in, as columns in the wrist frame; those of the wrist where it works in the object's."""
+        return hand.palm_axes_wrist if self.frame == "palm" else torch.eye(3, device=hand.link_points.device)
+
     @staticmethod
     def paper() -> NetworkConfig:
         """The paper's network, about 14 M parameters."""
@@ -84,11 +90,11 @@ class NetworkConfig:
 
     @staticmethod
     def slim() -> NetworkConfig:
-        """A small one that trains on a CPU: the same code, narrower, in the wrist frame, with placement."""
+        """A small one that trains on a CPU: the same code, narrower, in the palm's axes, with placement."""
         return NetworkConfig(
             n_hand=160, n_object=128, width=128, encoder_widths=(32, 32, 64, 128), neighbours=16,
             attention_hidden=256, latent=64, latent_widths=(32, 32, 64), latent_head=(128, 128), latent_neighbours=12,
-            kernel_hidden=(128, 64), frame="wrist", placed=True, residual=True,
+            kernel_hidden=(128, 64), frame="palm", placed=True, residual=True,
             placement_temperature=0.3,
         )
 
@@ -239,14 +245,17 @@ class DistanceNetwork(nn.Module):
         Args:
             points: In the object's frame [m].
             centre: Mean of the object's cloud [m].
-            rotation: Of the given wrist in the object's frame.
+            rotation: Of the given hand's axes (`NetworkConfig.axes`) in the object's frame.
         """
         centred = points - centre[:, None]
-        return centred @ rotation if self.config.frame == "wrist" else centred
+        return centred if self.config.frame == "object" else centred @ rotation
 
-    def sample_latent(self, num: int, generator: torch.Generator) -> Float[Tensor, "num latent"]:
-        """Draws that `predict` turns into z; in the paper's form they are z."""
-        return torch.randn(num, self.config.latent, generator=generator) * self.config.latent_temperature
+    def sample_latent(
+        self, num: int, generator: torch.Generator, temperature: float | None = None
+    ) -> Float[Tensor, "num latent"]:
+        """Draws that `predict` turns into z; in the paper's form they are z. Without a temperature, the configuration's."""
+        scale = self.config.latent_temperature if temperature is None else temperature
+        return torch.randn(num, self.config.latent, generator=generator) * scale
 
     def sample_placements(
         self,
@@ -256,12 +265,12 @@ class DistanceNetwork(nn.Module):
         num: int,
         generator: torch.Generator,
     ) -> tuple[Float[Tensor, "num 3 3"], Float[Tensor, "num 3"]]:
-        """Wrist rotations, and positions of the grasp centre in wrist axes about the object's centre [m].
+        """Rotations of the hand's axes, and positions of the grasp centre in them about the object's centre [m].
 
         Args:
-            hand: The open hand in the wrist frame [m].
+            hand: The open hand in its axes (`NetworkConfig.axes`) [m].
             obj: The object's cloud in its own frame [m].
-            rotations: Candidate wrist rotations.
+            rotations: Candidate rotations of these axes.
             num: How many placements.
             generator: Source of randomness.
         """

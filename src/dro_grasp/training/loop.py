@@ -150,7 +150,7 @@ def _posed_points(group: HandSamples, decoded: distance_matrix.LinkPoses) -> Ten
 def _placement(model: DistanceNetwork, groups: list[HandSamples], output: NetworkOutput) -> Tensor:
     feature = output.hand_feature.detach()
     obj, other, position = (
-        torch.cat([getattr(g, n) for g in groups]) for n in ("obj_wrist", "obj_random", "position")
+        torch.cat([getattr(g, n) for g in groups]) for n in ("obj_hand", "obj_random", "position")
     )
     density, score = model.placement.log_density(obj, feature, position)
     other_score = model.placement(other, feature)[3]

@@ -124,10 +124,10 @@ def contrastive_step(
     for name in source.draw_hands(config.hands_per_step, generator):
         hand, grasps = source.hands[name], source.grasps[name]
         chosen = torch.randint(len(grasps.joints), (config.samples_per_hand,), generator=generator, device=generator.device)
-        if source.network.frame == "wrist":
-            wrist = torch.eye(3, device=generator.device).expand(len(chosen), 3, 3)
-        else:
+        if source.network.frame == "object":
             wrist = random_rotations(len(chosen), generator)
+        else:
+            wrist = source.network.axes(hand).mT.expand(len(chosen), 3, 3)
         turn = wrist @ random_turns(len(chosen), config.rotation, generator)
         grasp_clouds.append(hand.points(grasps.joints[chosen]) @ turn.mT)
         open_clouds.append(hand.points(hand.random_open_joints(len(chosen), generator)) @ wrist.mT)
@@ -135,20 +135,3 @@ def contrastive_step(
     features = encoder(torch.cat([c - c.mean(1, keepdim=True) for c in (a, b)]))
     features_a, features_b = features.chunk(2)
     return contrastive_loss(features_a, features_b, b, config.temperature, config.sharpness).mean()
-
-
-@torch.no_grad()
-def matching_rank(
-    encoder: StaticGraphEncoder, source: SampleSource, samples: int, generator: torch.Generator
-) -> dict[str, float]:
-    """Mean rank, by cosine similarity, of each point's counterpart among the open hand's points; chance is n / 2."""
-    ranks = {}
-    for name in source.names:
-        hand, grasps = source.hands[name], source.grasps[name]
-        chosen = torch.randint(len(grasps.joints), (samples,), generator=generator, device=generator.device)
-        a, b = hand.points(grasps.joints[chosen]), hand.points(hand.random_open_joints(samples, generator))
-        features = [torch.nn.functional.normalize(encoder(c - c.mean(1, keepdim=True)), dim=-1) for c in (a, b)]
-        similarity = features[0] @ features[1].mT
-        own = similarity.diagonal(dim1=1, dim2=2)[..., None]
-        ranks[name] = float((similarity > own).sum(-1).float().mean() + 1)
-    return ranks

@@ -33,12 +33,12 @@ class HandSamples:
     """Its normals."""
     T_frame_link: Float[Tensor, "b l 4 4"]
     """True poses of all links in the grasp."""
-    obj_wrist: Float[Tensor, "b m 3"]
-    """The object in the axes of the true wrist [m], for the placement prior."""
+    obj_hand: Float[Tensor, "b m 3"]
+    """The object in the axes of the true hand [m], for the placement prior."""
     obj_random: Float[Tensor, "b m 3"]
-    """The object in the axes of a random wrist [m], for the placement prior."""
+    """The object in the axes of a random hand [m], for the placement prior."""
     position: Float[Tensor, "b 3"]
-    """True position of the grasp centre in wrist axes [m]."""
+    """True position of the grasp centre in the hand's axes [m]."""
 
 
 class SampleSource:
@@ -84,7 +84,9 @@ class SampleSource:
         points, normals = self._objects(grasps.object_index[chosen], generator)
         centre = points.mean(1)
         T_placed = self._placements(hand, T, generator)
-        axes = T_placed[:, :3, :3] if self.network.frame == "wrist" else torch.eye(3, device=T.device).expand(count, 3, 3)
+        own = self.network.axes(hand)
+        world = torch.eye(3, device=T.device).expand(count, 3, 3)
+        axes = world if self.network.frame == "object" else T_placed[:, :3, :3] @ own
         T_frame_object = _frame(axes, centre)
         opened = hand.random_open_joints(count, generator)
         T_frame_wrist = T_frame_object @ T
@@ -94,9 +96,9 @@ class SampleSource:
             hand=hand, placed=hand.points(opened, T_frame_object @ T_placed), grasp=hand.points(q, T_frame_wrist),
             obj=about_centre @ axes, normals=normals @ axes,
             T_frame_link=T_frame_wrist[:, None] @ hand.tree.forward(q),
-            obj_wrist=about_centre @ T[:, :3, :3],
+            obj_hand=about_centre @ (T[:, :3, :3] @ own),
             obj_random=about_centre @ random_rotations(count, generator),
-            position=((centre_of_grasp - centre)[:, None] @ T[:, :3, :3])[:, 0],
+            position=((centre_of_grasp - centre)[:, None] @ (T[:, :3, :3] @ own))[:, 0],
         )
 
     def draw_motions(
@@ -104,8 +106,8 @@ class SampleSource:
     ) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b n 3"]]:
         """Placed open hands, and the same hands with other joint angles and a wrist as far off as placements are [m].
 
-        Half of the joint angles are those of grasps, the others uniform within the limits. Axes are those of the placed
-        wrist, or random ones where the network works in the object's.
+        Half of the joint angles are those of grasps, the others uniform within the limits. Axes are those that the network
+        works in, random ones where these are the object's.
         """
         hand, grasps = self.hands[name], self.grasps[name]
         chosen = torch.randint(len(grasps.joints), (count,), generator=generator, device=generator.device)
@@ -113,15 +115,13 @@ class SampleSource:
         share = torch.rand(count, len(lower), generator=generator, device=generator.device)
         known = torch.rand(count, 1, generator=generator, device=generator.device) < 0.5
         q = torch.where(known, grasps.joints[chosen], lower + share * (upper - lower))
-        wrist = torch.eye(4, device=generator.device).expand(count, 4, 4)
-        T = torch.linalg.inv(self._placements(hand, wrist, generator))
-        if self.network.frame == "object":
-            turn = random_rotations(count, generator)
+        wrist = torch.eye(4, device=generator.device).repeat(count, 1, 1)
+        moved = torch.linalg.inv(self._placements(hand, wrist, generator))
+        turn = random_rotations(count, generator) if self.network.frame == "object" else self.network.axes(hand).mT
+        for T in (wrist, moved):
             T[:, :3] = turn @ T[:, :3]
-            wrist = wrist.clone()
-            wrist[:, :3, :3] = turn
         opened = hand.random_open_joints(count, generator)
-        return hand.points(opened, wrist), hand.points(q, T)
+        return hand.points(opened, wrist), hand.points(q, moved)
 
     def _objects(self, index: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Random object points with noise, and their normals (b m 3)."""

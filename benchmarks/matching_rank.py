@@ -1,0 +1,83 @@
+"""How well the hand encoder knows a point again: in another pose of its hand, and on other hands.
+
+    python benchmarks/matching_rank.py [--weights NAME|PATH] [--picture PNG] [--json]
+
+Within a hand the counterpart is the point itself; across hands it is the nearest one after both open hands are laid on each
+other. Ranks are means over points and grasps on validate objects; chance is half of the number of points. The picture gives
+each point of every hand, grasping, the colour of the most similar point of the first hand, open. Needs the development assets.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+from distance_error import validation_bundle
+from PIL import Image
+from report import emit
+from synthesis import HANDS
+
+from dro_grasp.evaluation.correspondence import matching_rank, matching_rank_between, most_similar
+from dro_grasp.geometry.rasterizer import Camera, dots, render
+from dro_grasp.models.checkpoints import load_weights
+from dro_grasp.models.encoder import StaticGraphEncoder
+from dro_grasp.training.config import AugmentationConfig
+from dro_grasp.training.samples import SampleSource
+from dro_grasp.viewer.pictures import contact_sheet
+
+TILE = (300, 300)
+"""Width and height of a hand's picture [pixels]."""
+
+
+def draw(encoder: StaticGraphEncoder, source: SampleSource, path: Path) -> None:
+    """The colour-matching picture: the first hand open and grasping, then the others grasping."""
+    first = source.hands[source.names[0]]
+    axes = source.network.axes
+    reference = first.points(first.canonical_joints()) @ axes(first)
+    span = reference.amax(0) - reference.amin(0)
+    colours = ((reference - reference.amin(0)) / span.clamp_min(1e-6)).mul(0.85).add(0.1)
+    tiles, captions = [tile(reference, colours)], [(f"{first.name}, open", None)]
+    for name in source.names:
+        hand, grasps = source.hands[name], source.grasps[name]
+        points = hand.points(grasps.joints[0]) @ axes(hand)
+        tiles.append(tile(points, colours[most_similar(encoder, points, reference)]))
+        captions.append((f"{name}, grasping", None))
+    sheet = contact_sheet(tiles, captions, "each point in the colour of the most similar point of the first hand", len(tiles))
+    Image.Image.save(sheet, path)
+
+
+def tile(points: torch.Tensor, colours: torch.Tensor) -> np.ndarray:
+    """One hand as coloured dots."""
+    cloud = points.numpy()
+    meshes = [dots(p[None], tuple(c), radius=0.004) for p, c in zip(cloud, colours.tolist(), strict=True)]
+    return render(meshes, Camera.around(cloud, (0.6, -1.0, 0.5)), *TILE)
+
+
+def main() -> None:
+    """Measure, draw and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--weights", default=None, help="name of shipped weights, or a weights file")
+    parser.add_argument("--picture", type=Path, default=None, help="PNG to draw")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    network = load_weights(options.weights)
+    source = SampleSource(validation_bundle(list(HANDS)), network.config, AugmentationConfig())
+    generator = torch.Generator().manual_seed(0)
+    within = matching_rank(network.hand_encoder, source, generator)
+    rows = []
+    for a in source.names:
+        across = [within[a] if a == b else matching_rank_between(network.hand_encoder, source, a, b, generator)
+                  for b in source.names]
+        rows.append([a, *across])
+    if options.picture is not None:
+        draw(network.hand_encoder, source, options.picture)
+    emit(f"mean rank of counterparts, weights '{network.name}'; chance is {network.config.n_hand / 2:.0f}", rows,
+         ["grasping", *(f"{name}, open" for name in source.names)],
+         {str(row[0]): dict(zip(source.names, row[1:], strict=True)) for row in rows}, options.json)
+
+
+if __name__ == "__main__":
+    main()
