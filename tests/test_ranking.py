@@ -7,11 +7,15 @@ import dataclasses
 import pytest
 import torch
 
+from dro_grasp.evaluation.metrics import roc_area
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.refinement import ScoreConfig, nearest_contacts, object_energy, score_grasps
+from dro_grasp.grasps.object_energy import nearest_contacts, object_energy
+from dro_grasp.grasps.ranking import ScoreConfig, score_grasps
 from dro_grasp.grasps.synthesis import SynthesisConfig, synthesize
 from dro_grasp.objects.library import load_object
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.simulation.trial import settle, simulate
+from tests.loaded_hands import loaded_hand
 from tests.toy_hand import toy_hand
 
 HAND = toy_hand()
@@ -42,9 +46,23 @@ def spoilt(grasps: GraspBatch, how: str) -> GraspBatch:
 
 
 @pytest.mark.parametrize("how", ["too far", "too deep", "open"])
-def test_spoilt_grasps_score_worse(obj, grasps, how):
-    good, bad = score_grasps(HAND, obj, grasps), score_grasps(HAND, obj, spoilt(grasps, how))
+def test_spoilt_grasps_have_more_energy(obj, grasps, how):
+    good, bad = (score_grasps(HAND, obj, g, ScoreConfig(by="energy")) for g in (grasps, spoilt(grasps, how)))
     assert (good > bad).float().mean() > 0.9
+
+
+def test_scores_tell_what_holds_from_what_does_not():
+    """Of grasps of a hand and an object, as they are and spoilt, those that hold score higher."""
+    hand, can = loaded_hand("allegro"), load_object("can")
+    made = settle(hand, can, synthesize(hand, can, 64, 0)[slice(0, 12)])
+    T = made.T_object_wrist.clone()
+    T[:, :3, 3] -= 0.03 * hand.palm_directions(T)
+    opened = hand.canonical_joints(1.0).expand_as(made.joints)
+    bare = {"pregrasp_joints": None, "squeeze_joints": None}
+    mixed = GraspBatch.concatenate([made, made.replace(T_object_wrist=T, **bare), made.replace(joints=opened, **bare)])
+    held = simulate(hand, can, mixed, "strict").success
+    assert 4 < int(held.sum()) < 30
+    assert roc_area(score_grasps(hand, can, mixed), held) > 0.75
 
 
 def test_score_does_not_depend_on_the_batch(obj, grasps):

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.refinement import RefineConfig, evaluate_nearest, nearest_contacts, object_energy, refine_grasps
+from dro_grasp.grasps.object_energy import evaluate_nearest, nearest_contacts, object_energy
+from dro_grasp.grasps.refinement import RefineConfig, refine_grasps
 from dro_grasp.grasps.synthesis import SynthesisConfig, synthesize
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.library import load_object

@@ -11,7 +11,8 @@ from dro_grasp.grasps.duplicates import distinct
 from dro_grasp.grasps.fingers import PALM, contact_candidates, find_thumb, finger_links
 from dro_grasp.grasps.grasp_energy import link_spheres
 from dro_grasp.grasps.initial import StartConfig, starts
-from dro_grasp.grasps.synthesis import SynthesisConfig, depth, optimise, prepare, synthesize
+from dro_grasp.grasps.object_energy import object_energy
+from dro_grasp.grasps.synthesis import SynthesisConfig, depth, optimise, synthesize
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.library import load_object
 from dro_grasp.objects.shape import ObjectModel
@@ -69,7 +70,7 @@ def test_spheres_lie_in_their_links_and_may_not_meet_across_fingers():
 
 def test_starts_face_the_object_from_all_sides_and_touch_nothing(ball):
     hand = toy_hand()
-    energy = prepare(hand, ball)
+    energy = object_energy(hand, ball)
     surface, config = torch.from_numpy(ball.cloud), StartConfig(gap=(0.002, 0.01))
     T, q = starts(hand, energy.field, surface, energy.centre, 256, config, torch.Generator().manual_seed(0))
     clearance = energy.field.distances(hand.points(q, T))[0].amin(-1)
@@ -84,7 +85,7 @@ def test_starts_face_the_object_from_all_sides_and_touch_nothing(ball):
 
 def test_energy_falls_and_limits_hold(ball):
     hand = toy_hand()
-    energy, surface = prepare(hand, ball, SHORT), torch.from_numpy(ball.cloud)
+    energy, surface = object_energy(hand, ball, SHORT.energy, SHORT.contacts), torch.from_numpy(ball.cloud)
     generator = torch.Generator().manual_seed(0)
     start = starts(hand, energy.field, surface, energy.centre, 32, SHORT.starts, generator)
     before = optimise(energy, *start, SynthesisConfig(steps=1), generator)
@@ -138,7 +139,7 @@ def test_idle_fingers_hold_nothing_and_two_always_hold():
 
 def test_energy_runs_wholly_on_the_device_it_is_told(ball):
     hand = toy_hand()
-    here, there = (prepare(hand, ball, SynthesisConfig(device=device)) for device in ("cpu", "meta"))
+    here, there = (object_energy(hand, ball, device=device) for device in ("cpu", "meta"))
     T, q = torch.eye(4).repeat(5, 1, 1), torch.zeros(5, hand.tree.n_dof)
     contacts = torch.zeros(5, 4, dtype=torch.int64)
     expected, found = here(T, q, contacts), there(T.to("meta"), q.to("meta"), contacts.to("meta"))

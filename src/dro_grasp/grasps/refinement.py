@@ -1,6 +1,6 @@
-"""Rank grasps, however they were made, by the grasp energy, and polish them by a short descent of it.
+"""Polish grasps, however they were made, by a short descent of the grasp energy that stays near them.
 
-Source: the paper's appendix ranks predictions by DexGraspNet's energy and reports the best; the release does not.
+Differs from the paper, which takes grasps as its solver leaves them.
 """
 
 from __future__ import annotations
@@ -10,56 +10,16 @@ from dataclasses import dataclass, field
 
 import roma
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
-from dro_grasp.grasps.field import CloudField, DistanceField
 from dro_grasp.grasps.grasp_energy import EnergyConfig, Evaluation, GraspEnergy
+from dro_grasp.grasps.object_energy import nearest_contacts, object_energy
 from dro_grasp.grasps.synthesis import moved
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-
-
-@dataclass(frozen=True)
-class ScoreConfig:
-    """How grasps are judged that the optimiser did not make."""
-
-    energy: EnergyConfig = field(default_factory=lambda: EnergyConfig(penetration=30.0))
-    """Weights; predictions penetrate more than synthesised grasps, which closing partly repairs."""
-    cloud_points: int = 4096
-    """Points of a bare cloud that distances are measured to."""
-    batch_size: int = 64
-    """Grasps judged at once."""
-
-
-def score_grasps(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, config: ScoreConfig | None = None
-) -> Float[Tensor, " n"]:
-    """Minus the grasp energy: higher is better, comparable among grasps of one hand and one object.
-
-    Distances are read off the object's grid, or measured to the points and normals of a bare cloud. The contacts are
-    taken to be each finger's candidate that is nearest to the surface.
-
-    Args:
-        hand: The grasps' hand.
-        obj: Their object.
-        grasps: Any grasps of the two.
-        config: Weights and sizes.
-    """
-    config = config or ScoreConfig()
-    if not len(grasps):
-        return torch.zeros(0)
-    with torch.no_grad():
-        energy = object_energy(hand, obj, config.energy, config.cloud_points)
-        parts = [
-            evaluate_nearest(energy, T, q).total
-            for T, q in zip(
-                grasps.T_object_wrist.split(config.batch_size), grasps.joints.split(config.batch_size), strict=True
-            )
-        ]
-    return -torch.cat(parts).clone()
 
 
 @dataclass(frozen=True)
@@ -160,48 +120,3 @@ def _descend(
 def _within(vector: Float[Tensor, "n 3"], length: float) -> Float[Tensor, "n 3"]:
     """Vectors shortened to a length where they are longer."""
     return vector * (length / vector.norm(dim=-1, keepdim=True).clamp_min(1e-9)).clamp_max(1.0)
-
-
-def object_energy(hand: Hand, obj: ObjectModel, config: EnergyConfig, cloud_points: int = 4096) -> GraspEnergy:
-    """The energy on the mesh's grid of signed distances, or on the cloud where there is no mesh."""
-    surface = torch.as_tensor(obj.cloud, dtype=torch.float32)
-    grid = obj.grid
-    if grid is None:
-        step = max(1, len(surface) // cloud_points)
-        normals = torch.as_tensor(obj.cloud_normals, dtype=torch.float32)
-        surroundings: DistanceField | CloudField = CloudField.of(surface[::step], normals[::step])
-    else:
-        surroundings = DistanceField.of(grid)
-    centre = torch.as_tensor(obj.centre_of_mass, dtype=torch.float32)
-    length = float((surface - centre).norm(dim=-1).mean())
-    return GraspEnergy(hand, surroundings, centre, length, config)
-
-
-def evaluate_nearest(
-    energy: GraspEnergy, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"]
-) -> Evaluation:
-    """The energy with each slot's contact at its candidate nearest to the surface."""
-    return energy(T_object_wrist, q, nearest_contacts(energy, T_object_wrist, q))
-
-
-def nearest_contacts(
-    energy: GraspEnergy, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], reach: float = math.inf
-) -> Int[Tensor, "n c"]:
-    """For each slot its candidate nearest to the surface; slots do not share a candidate.
-
-    A slot that has none within `reach` [m] takes one of the slot that is nearest of all.
-    """
-    candidates = energy.candidates
-    poses = T_object_wrist[:, None] @ energy.hand.tree.forward(q)
-    distance = energy.field.distances(energy.contact_points.place(poses))[0].abs()
-    taken = torch.zeros_like(distance)
-    allowed = candidates.slot_weights > 0
-    nearest = torch.where(allowed, distance[:, None], torch.inf).amin(-1)
-    chosen = []
-    for slot in range(len(allowed)):
-        own = allowed[slot].expand(len(T_object_wrist), -1)
-        own = torch.where(nearest[:, slot, None] > reach, allowed[nearest.argmin(-1)], own)
-        index = (distance + taken + torch.where(own, 0.0, torch.inf)).argmin(-1, keepdim=True)
-        taken = taken.scatter(-1, index, 1.0)
-        chosen.append(index)
-    return torch.cat(chosen, -1)

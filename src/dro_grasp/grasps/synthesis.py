@@ -16,6 +16,7 @@ from dro_grasp.grasps.field import DistanceField
 from dro_grasp.grasps.fingers import ContactConfig
 from dro_grasp.grasps.grasp_energy import TERMS, EnergyConfig, Evaluation, GraspEnergy
 from dro_grasp.grasps.initial import StartConfig, starts
+from dro_grasp.grasps.object_energy import object_energy
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 
@@ -96,19 +97,6 @@ def field_of(obj: ObjectModel) -> DistanceField:
     return DistanceField.of(obj.grid)
 
 
-def prepare(hand: Hand, obj: ObjectModel, config: SynthesisConfig | None = None) -> GraspEnergy:
-    """The energy of a hand on an object, with the object's grid read and the hand's contacts found.
-
-    Raises:
-        ObjectError: The object is a bare cloud.
-    """
-    config = config or SynthesisConfig()
-    centre = torch.as_tensor(obj.centre_of_mass, dtype=torch.float32)
-    surface = torch.as_tensor(obj.cloud, dtype=torch.float32)
-    length = float((surface - centre).norm(dim=-1).mean())
-    return GraspEnergy(hand, field_of(obj), centre, length, config.energy, config.contacts, config.device)
-
-
 def synthesize(
     hand: Hand, obj: ObjectModel, num: int, seed: int = 0, config: SynthesisConfig | None = None
 ) -> GraspBatch:
@@ -128,7 +116,8 @@ def synthesize(
     if num < 1:
         raise OptionError(f"num is {num}; ask for at least one grasp")
     config = config or SynthesisConfig()
-    energy, field = prepare(hand, obj, config), field_of(obj)
+    field = field_of(obj)
+    energy = object_energy(hand, obj, config.energy, config.contacts, config.device)
     generator = torch.Generator().manual_seed(seed)
     surface = torch.as_tensor(obj.cloud, dtype=torch.float32)
     centre = energy.centre.cpu()

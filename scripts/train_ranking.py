@@ -1,0 +1,177 @@
+"""Train the network that ranks grasps, on the outcome of trials of grasps that the weights predict for training objects.
+
+    python scripts/train_ranking.py --folder FOLDER [--num N] [--objects N] [--collect-only]
+
+Grasps are drawn at several temperatures and tried as they are, polished, and shaken; a part of them is judged as seen in a
+depth image or as half of a cloud. Trials of one hand are remembered in the folder, so that the script can be stopped and
+started again. The network that is best on objects left out is written to the package. Needs the development assets.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import random
+from pathlib import Path
+from typing import Any
+
+import roma
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from dro_grasp.evaluation.metrics import roc_area
+from dro_grasp.evaluation.views import seen
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.object_energy import evaluate_nearest, object_energy
+from dro_grasp.grasps.quality import grasp_features
+from dro_grasp.grasps.ranking import ScoreConfig
+from dro_grasp.grasps.refinement import refine_grasps
+from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.library import load_hand
+from dro_grasp.models.quality import SHIPPED, QualityNetwork
+from dro_grasp.objects.library import load_object, resolve_objects
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.predictor import GraspPredictor
+from dro_grasp.simulation.trial import simulate
+
+HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand", "assets/leaphand", "assets/allegro_right",
+         "allegro", "barrett", "gripper3", "leaphand", "shadowhand")
+TRIALS = ("strict", "dexgraspbench")
+"""Trials whose outcome is predicted; the score is the mean of their log-odds."""
+TEMPERATURES = (0.2, 0.5, 0.8, 1.0)
+SHAKE = (0.01, 0.15, 0.2)
+"""Standard deviations of a shaken grasp's shift [m], turn [rad] and joints [rad], times a number up to 2."""
+LEFT_OUT = 6
+"""Training objects that the network is chosen by."""
+STEPS, BATCH, RATE, DECAY = 4000, 256, 2e-3, 0.05
+
+
+def shaken(hand: Hand, grasps: GraspBatch, generator: torch.Generator) -> GraspBatch:
+    """Grasps moved a little in every way; what goes wrong is worth knowing as well."""
+    T, n = grasps.T_object_wrist.clone(), len(grasps)
+    strength = 2 * torch.rand(n, 1, generator=generator)
+    move, turn, bend = (
+        torch.randn(n, k, generator=generator) * s * strength for k, s in zip((3, 3, hand.tree.n_dof), SHAKE, strict=True))
+    T[:, :3, :3] = roma.rotvec_to_rotmat(turn) @ T[:, :3, :3]
+    T[:, :3, 3] += hand.grasp_centres(grasps.T_object_wrist) - hand.grasp_centres(T) + move
+    q = (grasps.joints + bend * hand.tree.joint_unit * hand.movable).clamp(hand.tree.lower, hand.tree.upper)
+    return grasps.replace(T_object_wrist=T, joints=q, pregrasp_joints=None, squeeze_joints=None, score=None)
+
+
+@torch.no_grad()
+def tried(hand: Hand, obj: ObjectModel, grasps: GraspBatch, known: ObjectModel) -> dict[str, Tensor]:
+    """Features of grasps, as far as the object is known, and their outcomes."""
+    energy = object_energy(hand, known, ScoreConfig().energy)
+    features = grasp_features(energy, grasps, evaluate_nearest(energy, grasps.T_object_wrist, grasps.joints).terms)
+    outcomes = torch.stack([simulate(hand, obj, grasps, rules).success for rules in TRIALS], 1)
+    return {**features._asdict(), "outcomes": outcomes.float()}
+
+
+def collect(predictor: GraspPredictor, name: str, objects: int, num: int, seed: int) -> list[dict[str, Any]]:
+    """Trials of one hand on some training objects."""
+    hand, rng = load_hand(name), random.Random(f"{name} {seed}")
+    generator, parts = torch.Generator().manual_seed(seed), []
+    for label in rng.sample(resolve_objects(["assets:train"]), objects):
+        obj = load_object(label)
+        predictor.config = dataclasses.replace(predictor.config, temperature=rng.choice(TEMPERATURES))
+        view = rng.choice(("whole", "whole", "half", "depth"))
+        known = seen(obj, view, rng.randrange(10**6))
+        raw = predictor.predict(hand, known, num, seed=rng.randrange(10**6), refine=False)
+        polished = refine_grasps(hand, known, raw)
+        some = polished[slice(0, num // 8)]
+        opened = hand.canonical_joints(1.0).expand_as(some.joints)
+        groups = {
+            "raw": raw[slice(0, num // 4)], "refined": polished,
+            "shaken": shaken(hand, polished[slice(0, num // 2)], generator),
+            "opened": some.replace(joints=opened, pregrasp_joints=None, squeeze_joints=None, score=None),
+        }
+        parts += [{"hand": name, "object": label, "kind": kind, "view": view, **tried(hand, obj, grasps, known)}
+                  for kind, grasps in groups.items()]
+    return parts
+
+
+def joined(parts: list[dict[str, Any]]) -> dict[str, Tensor]:
+    """All grasps in one table; links that a hand does not have count for nothing."""
+    most = max(part["links"].shape[1] for part in parts)
+    columns = {}
+    for key in ("links", "nearness", "whole", "outcomes"):
+        rows = [part[key] for part in parts]
+        if key == "links":
+            # The maximum over links must not see the missing ones: they repeat the first.
+            rows = [torch.cat([r, r[:, :1].expand(-1, most - r.shape[1], -1)], 1) for r in rows]
+        if key == "nearness":
+            rows = [functional.pad(r, (0, most - r.shape[1])) for r in rows]
+        columns[key] = torch.cat(rows)
+    return columns
+
+
+def areas(network: QualityNetwork, parts: list[dict[str, Any]]) -> list[float]:
+    """Mean area under the ROC curve within groups, per kind of trial."""
+    with torch.no_grad():
+        found = [[roc_area(network(p["links"], p["nearness"], p["whole"])[:, k], p["outcomes"][:, k] > 0.5) for p in parts]
+                 for k in range(len(TRIALS))]
+    return [sum(x for x in a if x == x) / max(1, sum(x == x for x in a)) for a in found]
+
+
+def fit(parts: list[dict[str, Any]], left_out: set[str], seed: int) -> tuple[QualityNetwork, list[float], float]:
+    """The network at its best on objects left out, with its areas and its loss there."""
+    torch.manual_seed(seed)
+    train = joined([p for p in parts if p["object"] not in left_out])
+    others = [p for p in parts if p["object"] in left_out]
+    check = joined(others)
+    network = QualityNetwork(len(TRIALS))
+    optimiser = torch.optim.AdamW(network.parameters(), RATE, weight_decay=DECAY)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=STEPS)
+    best, best_state = float("inf"), network.state_dict()
+    for step in range(1, STEPS + 1):
+        rows = torch.randint(len(train["whole"]), (BATCH,))
+        links, nearness, whole, outcomes = (train[k][rows] for k in ("links", "nearness", "whole", "outcomes"))
+        links = links + 0.05 * torch.randn_like(links)
+        loss = functional.binary_cross_entropy_with_logits(network(links, nearness, whole), outcomes)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+        if step % 100 == 0:
+            with torch.no_grad():
+                now = float(functional.binary_cross_entropy_with_logits(
+                    network(check["links"], check["nearness"], check["whole"]), check["outcomes"]))
+            if now < best:
+                best, best_state = now, {k: v.clone() for k, v in network.state_dict().items()}
+    network.load_state_dict(best_state)
+    return network.eval(), areas(network, [p for p in others if p["kind"] == "refined"]), best
+
+
+def main() -> None:
+    """Collect, fit, save."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--folder", type=Path, required=True, help="where trials are remembered")
+    parser.add_argument("--weights", default=None, help="weights whose grasps are tried; the shipped ones by default")
+    parser.add_argument("--hands", nargs="+", default=list(HANDS), help="hands to collect trials of")
+    parser.add_argument("--objects", type=int, default=16, help="training objects of each hand")
+    parser.add_argument("--num", type=int, default=16, help="predicted grasps of each")
+    parser.add_argument("--seed", type=int, default=0, help="of everything")
+    parser.add_argument("--collect-only", action="store_true", help="do not fit")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    options.folder.mkdir(exist_ok=True)
+    for name in options.hands:
+        path = options.folder / f"{name.replace('/', '-')}-{options.seed}.pt"
+        if not path.exists():
+            torch.save(collect(GraspPredictor(options.weights), name, options.objects, options.num, options.seed), path)
+            print(name, flush=True)
+    if options.collect_only:
+        return
+    parts = [part for path in sorted(options.folder.glob("*.pt")) for part in torch.load(path, weights_only=True)]
+    names = sorted({part["object"] for part in parts})
+    left_out = set(random.Random(0).sample(names, LEFT_OUT))
+    network, found, loss = fit(parts, left_out, options.seed)
+    print(f"{sum(len(p['whole']) for p in parts)} grasps; objects left out: loss {loss:.3f}, ROC area of refined grasps "
+          + ", ".join(f"{rules} {area:.3f}" for rules, area in zip(TRIALS, found, strict=True)))
+    SHIPPED.parent.mkdir(exist_ok=True)
+    network.save(SHIPPED)
+
+
+if __name__ == "__main__":
+    main()
