@@ -27,7 +27,8 @@ from dro_grasp.evaluation.benchmark import (
     benchmark,
 )
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.refinement import refine_grasps, score_grasps
+from dro_grasp.grasps.ranking import score_grasps
+from dro_grasp.grasps.refinement import refine_grasps
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.library import load_object
@@ -142,10 +143,9 @@ def test_a_view_hides_the_object_from_the_network_alone(view: str, monkeypatch: 
     assert [o.is_cloud for o in shown] == [True, True]
     assert tried == objects
     ball = torch.from_numpy(shown[0].cloud)
-    towards = ball.mean(0) / ball.mean(0).norm()
-    along = ball @ towards / ball.norm(dim=1).mean()
-    # The far half of a sphere about the origin is hidden; noise and the camera's nearness move the border.
-    assert -0.15 < float(along.min()) < 0.3
+    radius = float(ball.norm(dim=1).median())
+    # The hidden side of a sphere about the origin is made up from the seen one.
+    assert float(((ball.norm(dim=1) - radius).abs() / radius).quantile(0.9)) < 0.2
     normals = torch.from_numpy(shown[0].cloud_normals)
     assert float((normals * torch.nn.functional.normalize(ball, dim=1)).sum(1).quantile(0.1)) > 0.7
 

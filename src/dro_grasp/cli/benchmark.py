@@ -36,6 +36,8 @@ class Benchmark:
     """Trials; displacement, rotation and diversity are those of successes of the first."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Weights to measure."""
+    temperature: Annotated[float | None, optional("T", "as the weights say")] = None
+    """How varied the grasps of one placement are, from 0 to 1."""
     controls: bool = True
     """Also try unoptimised starts, synthesised grasps and, with a bundle, the mean grasp."""
     bundle: Annotated[Path | None, optional("PATH", "no mean grasp")] = None
@@ -54,16 +56,16 @@ class Benchmark:
         from dro_grasp.evaluation.benchmark import BEST, TOP, BenchmarkConfig, benchmark
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.library import load_object, resolve_objects
-        from dro_grasp.predictor import GraspPredictor, check_request
+        from dro_grasp.predictor import GraspPredictor, PredictorConfig, check_request
         from dro_grasp.simulation.protocols import protocol
 
-        check_request(self.num, None)
+        check_request(self.num, None, self.temperature)
         for name in ("hands", "objects", "stages", "protocols"):
             if not getattr(self, name):
                 raise OptionError(f"--{name} is empty; name at least one")
         begin = time.perf_counter()
         bundle = None if self.bundle is None else load_bundle(self.bundle)
-        predictor = GraspPredictor(self.weights)
+        predictor = GraspPredictor(self.weights, config=PredictorConfig(temperature=self.temperature))
         hands = [load_hand(name) for name in self.hands]
         objects = [load_object(name) for name in resolve_objects(list(self.objects))]
         if clouds := [obj.name for obj in objects if obj.is_cloud]:

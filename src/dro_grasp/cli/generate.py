@@ -45,8 +45,13 @@ class Generate:
     """Palm direction in the object's frame: 0 0 -1 grasps from above."""
     table: Annotated[float | None, optional("Z", "no table")] = None
     """Height [m] of a table in the object's frame; no hand goes below it."""
+    camera: Annotated[Path | None, optional("JSON", "the object's own frame")] = None
+    """File with {"frame": "base", "T_frame_camera": 4x4}: the object is a cloud in that camera's frame, and is cleaned; grasps,
+    direction and table are in the frame named."""
     refine: bool = True
     """Polish the network's grasps on the object's geometry, near where they were predicted."""
+    temperature: Annotated[float | None, optional("T", "as the weights say")] = None
+    """How varied the grasps of one placement are: 0 takes the likeliest, 1 all that the weights have learned."""
     scale: float = 1.0
     """Multiplies the object's coordinates; 0.001 for files in millimetres."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
@@ -71,9 +76,9 @@ class Generate:
         """Check everything that can be checked before the work, then do it."""
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.library import resolve_objects
-        from dro_grasp.predictor import GraspPredictor, check_request
+        from dro_grasp.predictor import GraspPredictor, PredictorConfig, check_request
 
-        check_request(self.num, self.direction)
+        check_request(self.num, self.direction, self.temperature)
         check_seed(self.seed)
         names = resolve_objects([self.object])
         several = names != [self.object]
@@ -81,7 +86,7 @@ class Generate:
         pictures = paths_per_object(self.picture, names, several, ".png")
         begin = time.perf_counter()
         hand = load_hand(self.hand)
-        predictor = GraspPredictor(self.weights)
+        predictor = GraspPredictor(self.weights, config=PredictorConfig(temperature=self.temperature))
         load = time.perf_counter() - begin
         jobs = zip(names, outputs, pictures, strict=True)
         done = [self._one(predictor, hand, name, output, picture, load) for name, output, picture in jobs]
@@ -101,7 +106,7 @@ class Generate:
         from dro_grasp.objects.library import load_object
 
         begin = time.perf_counter()
-        obj = load_object(name, scale=self.scale)
+        obj = load_object(name, scale=self.scale) if self.camera is None else load_scan(name, self.camera, self.scale)
         load += time.perf_counter() - begin
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
@@ -173,6 +178,25 @@ class Done:
     """The grasps that were kept."""
     predicted_points: Tensor | None
     """Their hand points as the network placed them."""
+
+
+def load_scan(path: str, camera: Path, scale: float) -> ObjectModel:
+    """The object that a camera has seen, in the frame of the file that says where the camera is.
+
+    Raises:
+        ObjectError: It is no cloud, or none of an object's size.
+        OptionError: The file says nothing of the kind.
+    """
+    from dro_grasp.errors import ObjectError
+    from dro_grasp.geometry.rigid_motion import read_motion
+    from dro_grasp.objects.library import load_object
+    from dro_grasp.objects.scan import scanned_object
+
+    _, T_frame_camera = read_motion(camera, "T_frame_camera")
+    seen = load_object(path, scale=scale)
+    if not seen.is_cloud:
+        raise ObjectError(f"{path} is a mesh, which no camera has seen; leave out --camera, or give a cloud (PLY, NPY, PCD)")
+    return scanned_object(seen.name, seen.cloud, T_frame_camera.double().numpy())
 
 
 def check_seed(seed: int) -> None:

@@ -20,7 +20,8 @@ from dro_grasp.evaluation.controls import mean_grasp, mean_grasps, palm_facing_s
 from dro_grasp.evaluation.metrics import diversity, roc_area, wilson_interval
 from dro_grasp.evaluation.views import View, seen
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.refinement import refine_grasps, score_grasps
+from dro_grasp.grasps.ranking import score_grasps
+from dro_grasp.grasps.refinement import refine_grasps
 from dro_grasp.grasps.synthesis import synthesize
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel

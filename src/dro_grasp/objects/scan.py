@@ -1,0 +1,124 @@
+"""Objects as a depth camera sees them: from its image or its cloud to an object in the frame that grasps are wanted in."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Num
+
+from dro_grasp.errors import ObjectError
+from dro_grasp.objects.loading import cloud_object, estimate_normals
+from dro_grasp.objects.shape import ObjectModel
+
+NEIGHBOURS = 12
+"""Points that decide whether a point is an outlier."""
+TOLERANCE = 2.5
+"""Outliers are farther from their neighbours than the mean by this many standard deviations."""
+RIM = 0.02
+"""Share of points that may lie behind the mirror."""
+FARTHEST = 10.0
+"""Depths beyond this are in another unit [m]."""
+
+
+def depth_points(
+    depth: Num[np.ndarray, "h w"], intrinsics: Float[np.ndarray, "3 3"], mask: Bool[np.ndarray, "rows columns"] | None = None
+) -> Float[np.ndarray, "n 3"]:
+    """Points of a depth image in the camera's frame: x right, y down, z forward [m].
+
+    Args:
+        depth: Depth along z [m]; 0 and NaN where nothing was measured.
+        intrinsics: Pinhole matrix: focal lengths and principal point [pixels].
+        mask: The object's pixels; all that have a depth when None.
+
+    Raises:
+        ObjectError: Mask and image differ in shape, nothing is left, or depths are not in metres.
+    """
+    if mask is not None and mask.shape != depth.shape:
+        raise ObjectError(f"the mask has shape {mask.shape}, the depth image {depth.shape}; give one of the same size")
+    with np.errstate(invalid="ignore"):
+        seen = np.isfinite(depth) & (depth > 0)
+    seen = seen if mask is None else seen & mask
+    if not seen.any():
+        raise ObjectError("no pixel of the depth image has a depth" + ("" if mask is None else " within the mask")
+                          + "; give depths in metres, and a mask that is true on the object")
+    if float(np.median(depth[seen])) > FARTHEST:
+        raise ObjectError(f"the median depth is {np.median(depth[seen]):g}, too far for metres; divide millimetres by 1000")
+    row, column = np.nonzero(seen)
+    z = depth[seen].astype(np.float64)
+    rays = np.linalg.solve(intrinsics.astype(np.float64), np.stack([column, row, np.ones_like(row)]).astype(np.float64))
+    return (rays / rays[2] * z).T
+
+
+def scanned_object(
+    name: str,
+    points: Float[np.ndarray, "n 3"],
+    T_frame_camera: Float[np.ndarray, "4 4"] | None = None,
+    denoise: bool = True,
+    complete: bool = True,
+) -> ObjectModel:
+    """An object from points that a camera at the origin has seen; grasps of it are in the frame given.
+
+    Args:
+        name: What to call it.
+        points: In the camera's frame [m].
+        T_frame_camera: The camera's pose in the wanted frame, in which up, `direction` and `table` mean something; the
+            camera's own when None.
+        denoise: Drop points that lie apart from all others.
+        complete: Add a mirror image for the side that the camera does not see; leave it out for a scan from all sides.
+
+    Raises:
+        ObjectError: Too few points are left, or they are not in metres.
+    """
+    kept = np.asarray(points, np.float64)
+    kept = kept[np.isfinite(kept).all(1)]
+    if denoise and len(kept) > NEIGHBOURS:
+        kept = without_outliers(kept)
+    if len(kept) < NEIGHBOURS:
+        raise ObjectError(f"{name} has {len(kept)} points after cleaning; give a denser cloud or a larger mask")
+    normals = estimate_normals(kept.astype(np.float32)).astype(np.float64)
+    # What a camera sees looks at it.
+    normals *= np.where((normals * kept).sum(1) > 0, -1.0, 1.0)[:, None]
+    if complete:
+        middle = kept.mean(0)
+        kept, normals = completed(kept, normals, -middle / max(float(np.linalg.norm(middle)), 1e-9))
+    if T_frame_camera is not None:
+        R = T_frame_camera[:3, :3]
+        kept, normals = kept @ R.T + T_frame_camera[:3, 3], normals @ R.T
+    return cloud_object(name, np.concatenate([kept, normals], 1), origin=name)
+
+
+def completed(
+    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], towards: Float[np.ndarray, "3"] | None = None
+) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
+    """Points and normals of both sides of an object of which one was seen: the other is taken to mirror it.
+
+    The mirror is at right angles to the view. It stands behind where the seen side ends, by as much as a round object goes on
+    from there: the more its rim still faces the camera, the farther, up to the half of its smaller width.
+
+    Args:
+        points: Of the seen side [m].
+        normals: Outward unit normals there.
+        towards: Unit vector to the camera; without it the mean normal, which of a closed surface is zero.
+    """
+    if towards is None:
+        mean = normals.mean(0)
+        towards = mean / max(float(np.linalg.norm(mean)), 1e-9)
+    along = points @ towards
+    # A few of the last points belong to grazing or noisy pixels.
+    last, edge = np.quantile(along, (RIM, 5 * RIM))
+    facing = float(np.clip((normals[along <= edge] @ towards).mean(), 0, 1))
+    helper = np.eye(3)[np.abs(towards).argmin()]
+    side = np.cross(towards, helper) / np.linalg.norm(np.cross(towards, helper))
+    across = np.stack([points @ side, points @ np.cross(towards, side)])
+    axes = np.linalg.eigh(np.cov(across))[1]
+    width = float(np.ptp(axes.T @ across, axis=1).min())
+    behind = points + 2 * (last - facing * width / 2 - along)[:, None] * towards
+    mirrored = normals - 2 * (normals @ towards)[:, None] * towards
+    return np.concatenate([points, behind]), np.concatenate([normals, mirrored])
+
+
+def without_outliers(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
+    """Points whose mean distance to their neighbours is like the others'. Source: Rusu et al. 2008."""
+    from scipy.spatial import KDTree
+
+    distance = KDTree(points).query(points, k=min(NEIGHBOURS, len(points) - 1) + 1)[0][:, 1:].mean(1)
+    return points[distance <= distance.mean() + TOLERANCE * distance.std()]
