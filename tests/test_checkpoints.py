@@ -154,10 +154,10 @@ def test_description_counts_and_names(path: Path, network: DistanceNetwork) -> N
 
 
 def test_shipped_weights_load() -> None:
-    assert "slim" in weights_names()
-    assert locate_weights(None) == locate_weights("slim") == SHIPPED_FOLDER / "slim.safetensors"
-    assert load_weights().name == "slim"
-    assert all(bool(v.isfinite().all()) for v in load_weights("slim").state_dict().values())
+    assert "multi" in weights_names()
+    assert locate_weights(None) == locate_weights("multi") == SHIPPED_FOLDER / "multi.safetensors"
+    assert load_weights().name == "multi"
+    assert all(bool(v.isfinite().all()) for v in load_weights("multi").state_dict().values())
 
 
 def test_shipped_weights_are_as_they_were_shipped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -165,20 +165,20 @@ def test_shipped_weights_are_as_they_were_shipped(monkeypatch: pytest.MonkeyPatc
     assert set(lines) == {f"{name}.safetensors" for name in weights_names()}
     for name in weights_names():
         assert verify_weights(name) == lines[f"{name}.safetensors"] == describe_weights(name)["sha256"]
-    for file in SHIPPED_FOLDER.iterdir():
+    for file in (f for f in SHIPPED_FOLDER.iterdir() if f.is_file()):
         (tmp_path / file.name).write_bytes(file.read_bytes())
     monkeypatch.setattr(checkpoints, "SHIPPED_FOLDER", tmp_path)
-    save_weights(load_weights("slim"), tmp_path / "slim.safetensors", {"about": "made anew"})
+    save_weights(load_weights("multi"), tmp_path / "multi.safetensors", {"about": "made anew"})
     with pytest.raises(WeightsError, match="shipped was"):
-        verify_weights("slim")
+        verify_weights("multi")
 
 
 def test_verify_checks_files_of_the_user_as_well(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["weights", "verify", str(path), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["weights"][0]["sha256"] == describe_weights(path)["sha256"]
     path.write_bytes(path.read_bytes()[:-100])
-    assert main(["weights", "verify", str(path), "slim"]) == 2
+    assert main(["weights", "verify", str(path), "multi"]) == 2
     said = capsys.readouterr()
     assert "cut short" in said.err
-    assert "slim" in said.out
+    assert "multi" in said.out
     assert main(["weights", "verify"]) == 0

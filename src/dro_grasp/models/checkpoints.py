@@ -25,7 +25,7 @@ PICKLES = (b"PK", b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")
 """How zipped and bare pickles begin."""
 CHECKSUMS = "SHA256SUMS"
 """File beside the shipped weights with their checksums, as `sha256sum` writes it."""
-DEFAULT = "slim"
+DEFAULT = "multi"
 """Weights that are used when none are named."""
 
 
