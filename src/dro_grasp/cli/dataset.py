@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from dro_grasp.cli.dataset_bundle import BundleCommand
+from dro_grasp.cli.dataset_import import Import
 from dro_grasp.cli.dataset_report import Report
 from dro_grasp.cli.dataset_trials import Check, Filter
 from dro_grasp.cli.output import optional, print_json, print_table
@@ -78,6 +79,7 @@ class Dataset:
 
     command: (
         Annotated[Info, tyro.conf.subcommand("info")]
+        | Annotated[Import, tyro.conf.subcommand("import")]
         | Annotated[Report, tyro.conf.subcommand("report")]
         | Annotated[Merge, tyro.conf.subcommand("merge")]
         | Annotated[Check, tyro.conf.subcommand("check")]

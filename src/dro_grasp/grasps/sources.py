@@ -64,13 +64,19 @@ def object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectMode
 
     if given is not None:
         return load_object(given, scale=scale)
-    source = _remembered(grasps, OBJECT_FILE)
-    own_scale = float(grasps.extra[OBJECT_SCALE][0]) if source and OBJECT_SCALE in grasps.extra else scale
     try:
-        return load_object(source or grasps.object[0], scale=own_scale)
+        source, own_scale = object_source(grasps, scale)
+        return load_object(source, scale=own_scale)
     except ObjectError as error:
         raise ObjectError(f"the grasps are of object '{grasps.object[0]}', which cannot be loaded ({error}); give its file "
                           "with --object, and --scale if it had one") from error
+
+
+def object_source(grasps: GraspBatch, scale: float = 1.0) -> tuple[str, float]:
+    """File or name, and scale, of the object of one object's grasps; the scale given is that of a name."""
+    source = _remembered(grasps, OBJECT_FILE)
+    own_scale = float(grasps.extra[OBJECT_SCALE][0]) if source and OBJECT_SCALE in grasps.extra else scale
+    return source or grasps.object[0], own_scale
 
 
 def require_same(grasps: GraspBatch, hand: Hand, obj: ObjectModel) -> None:

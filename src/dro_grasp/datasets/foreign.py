@@ -1,0 +1,154 @@
+"""Grasps of other projects' data sets: the official CMapDataset, DexGraspNet and DexGraspBench.
+
+Their files are pickles, which can run code; here nothing is built but numbers, names and arrays. Sources: the loaders of
+the official D(R,O) release (roll, pitch and yaw turn about moving axes), the data set's description of DexGraspNet (about fixed
+axes), the readme of DexGraspBench.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from dro_grasp.errors import GraspFileError
+
+Format = Literal["cmap", "dexgraspnet", "dexgraspbench"]
+WRIST = ("WRJTx", "WRJTy", "WRJTz", "WRJRx", "WRJRy", "WRJRz")
+"""Names of the wrist's six coordinates in DexGraspNet."""
+HARMLESS = {
+    ("numpy.core.multiarray", "_reconstruct"), ("numpy._core.multiarray", "_reconstruct"), ("numpy", "ndarray"),
+    ("numpy", "dtype"), ("numpy.core.multiarray", "scalar"), ("numpy._core.multiarray", "scalar"),
+    ("collections", "OrderedDict"),
+}
+"""All that a file may name."""
+
+
+@dataclass(frozen=True)
+class ForeignGrasp:
+    """One grasp as a file has it."""
+
+    hand: str
+    """Name of the hand, empty where the format has none."""
+    object: str
+    """Name of the object, empty where the format has none."""
+    scale: float
+    """Of the object."""
+    T_object_wrist: np.ndarray
+    """(4 4) [m]"""
+    joints: dict[str, float] | np.ndarray
+    """By name, or in the order of the hand's moving joints [rad or m]."""
+
+
+def read_foreign(path: Path, kind: Format) -> list[ForeignGrasp]:
+    """All grasps of a file.
+
+    Args:
+        path: `cmap_dataset.pt`, or an npy file.
+        kind: Whose format it is.
+
+    Raises:
+        GraspFileError: No such file, one that holds something else, or one that wants to run code.
+    """
+    readers = {"cmap": _cmap, "dexgraspnet": _dexgraspnet, "dexgraspbench": _dexgraspbench}
+    try:
+        return list(readers[kind](path))
+    except (OSError, pickle.UnpicklingError, EOFError, KeyError, ValueError, TypeError, IndexError, AttributeError,
+            RuntimeError) as error:
+        raise GraspFileError(f"{path} is no {kind} file that can be read ({str(error).splitlines()[0]}); expected what that "
+                             "project publishes, holding numbers and names only") from error
+
+
+def _cmap(path: Path) -> Iterator[ForeignGrasp]:
+    content = torch.load(path, weights_only=True, map_location="cpu")
+    from scipy.spatial.transform import Rotation
+
+    for q, obj, hand in content["metadata"]:
+        values = np.asarray(q, np.float64)
+        T = np.eye(4)
+        T[:3, 3], T[:3, :3] = values[:3], Rotation.from_euler("XYZ", values[3:6]).as_matrix()
+        yield ForeignGrasp(str(hand), str(obj), 1.0, T, values[6:])
+
+
+def _dexgraspnet(path: Path) -> Iterator[ForeignGrasp]:
+    from scipy.spatial.transform import Rotation
+
+    for entry in _load_npy(path):
+        qpos = {str(name): float(value) for name, value in entry["qpos"].items()}
+        position = [qpos.pop(name) for name in WRIST[:3]]
+        angles = [qpos.pop(name) for name in WRIST[3:]]
+        T = np.eye(4)
+        T[:3, 3], T[:3, :3] = position, Rotation.from_euler("xyz", angles).as_matrix()
+        yield ForeignGrasp("", path.stem, float(entry["scale"]), T, qpos)
+
+
+def _dexgraspbench(path: Path) -> Iterator[ForeignGrasp]:
+    from scipy.spatial.transform import Rotation
+
+    def pose(row: np.ndarray) -> np.ndarray:
+        T = np.eye(4)
+        T[:3, 3], T[:3, :3] = row[:3], Rotation.from_quat(row[3:7], scalar_first=True).as_matrix()
+        return T
+
+    entry = _load_npy(path).item()
+    rows = np.atleast_2d(np.asarray(entry["grasp_qpos"], np.float64))
+    obj = np.atleast_2d(np.asarray(entry.get("obj_pose", [0, 0, 0, 1, 0, 0, 0]), np.float64))
+    for row, place in zip(rows, np.broadcast_to(obj, (len(rows), 7)), strict=True):
+        T = np.linalg.inv(pose(place)) @ pose(row)
+        scale = float(np.ravel(entry.get("obj_scale", 1.0))[0])
+        names = entry.get("joint_names")
+        joints = row[7:] if names is None else dict(zip(map(str, names), row[7:].tolist(), strict=True))
+        yield ForeignGrasp(str(entry.get("hand", "")), Path(str(entry.get("obj_path", ""))).name, scale, T, joints)
+
+
+class _Harmless(pickle.Unpickler):
+    """Builds arrays, numbers, strings and containers, and refuses everything else."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) not in HARMLESS:
+            raise pickle.UnpicklingError(f"it names {module}.{name}, which could run code")
+        return super().find_class(module, name)
+
+
+def _load_npy(path: Path) -> np.ndarray:
+    """An array of objects from a npy file."""
+    with path.open("rb") as file:
+        version = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(file)
+        if not dtype.hasobject:
+            raise ValueError(f"it is an array of {dtype}, not of grasps")
+        loaded = _Harmless(file).load()
+    return np.asarray(loaded, dtype=object).reshape(shape)
+
+
+def in_order(grasp: ForeignGrasp, moving: Sequence[str], independent: Sequence[str]) -> list[float]:
+    """A grasp's independent joints.
+
+    Args:
+        grasp: Of any format.
+        moving: Names of all the hand's moving joints, followers included, in the order of the description.
+        independent: Names of the joints that others follow.
+
+    Raises:
+        GraspFileError: The grasp has other joints.
+    """
+    give = "give the description that the data was made with (--hands)"
+    if isinstance(grasp.joints, dict):
+        # Names of MuJoCo's Shadow hand begin with the robot's.
+        values = {**grasp.joints, **{name.rpartition(":")[2]: value for name, value in grasp.joints.items()}}
+        if missing := [name for name in independent if name not in values]:
+            raise GraspFileError(
+                f"the grasp has no joint {', '.join(missing[:4])} among {', '.join(list(grasp.joints)[:6])}; {give}")
+        return [values[name] for name in independent]
+    names = moving if len(grasp.joints) == len(moving) else independent
+    if len(grasp.joints) != len(names):
+        raise GraspFileError(f"the grasp has {len(grasp.joints)} joints, the hand {len(moving)} that move, {len(independent)} "
+                             f"of them independent; {give}")
+    by_name = dict(zip(names, grasp.joints.tolist(), strict=True))
+    return [by_name[name] for name in independent]
