@@ -30,6 +30,8 @@ class Synthesize:
     """Folder for the grasp files; its parent must exist."""
     grasps: int = 150
     """Valid grasps of each hand and object; a rerun with more adds the rest."""
+    minutes: Annotated[float | None, optional("MINUTES", "no limit")] = None
+    """Begin no more work after this time; a rerun goes on."""
     workers: int = 2
     """Processes of one thread each; on a running Ray cluster, all of its CPUs are used instead."""
     engine: Literal["local", "ray"] = "local"
@@ -61,6 +63,7 @@ class Synthesize:
             self.hand, objects, self.grasps, self.output, workers=self.workers, seed=self.seed, protocol=self.protocol,
             config=EngineConfig(synthesis=SynthesisConfig(device=self.device)), scale=self.scale, progress=say_aside,
             make_pool=self._ray_pool if self.engine == "ray" else None,
+            seconds=None if self.minutes is None else 60 * self.minutes,
         )
         failures = [{"hand": h, "object": o, "reason": why} for (h, o), why in report.failures.items()]
         values = {"output": str(self.output), "grasps": report.grasps, "added": report.added, "shards": report.shards,

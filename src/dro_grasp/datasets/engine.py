@@ -98,6 +98,7 @@ def synthesize_dataset(
     scale: float = 1.0,
     progress: Callable[[str], None] | None = None,
     make_pool: Callable[[Job], Pool] | None = None,
+    seconds: float | None = None,
 ) -> DatasetReport:
     """Fill a folder with valid grasps of every hand on every object.
 
@@ -115,6 +116,7 @@ def synthesize_dataset(
         scale: Multiplies the coordinates of all objects.
         progress: Called with a line of text now and then; None prints to stderr.
         make_pool: Where shards are made; None makes them in processes of this machine.
+        seconds: No shard is begun after this time [s]; those in the making are finished.
 
     Raises:
         OptionError: A number is not positive, or this machine lacks the device.
@@ -133,7 +135,8 @@ def synthesize_dataset(
         before, started = sum(s.grasps for s in states.values()), time.perf_counter()
         job = Job(seed, protocol, config, scale)
         pool = make_pool(job) if make_pool else LocalPool(job, workers, config.shard_limit)
-        shards = Run(pool, folder, states, grasps_per_pair, config, say).finish()
+        end = math.inf if seconds is None else started + seconds
+        shards = Run(pool, folder, states, grasps_per_pair, config, say, end).finish()
     total = sum(s.grasps for s in states.values())
     failures = {pair: s.error for pair, s in states.items() if s.error}
     return DatasetReport(total, total - before, shards, time.perf_counter() - started, failures)
@@ -187,6 +190,8 @@ class Run:
     goal: int
     config: EngineConfig
     say: Callable[[str], None]
+    end: float = math.inf
+    """When no more shards are begun, by the performance counter [s]."""
     busy: set[Pair] = field(default_factory=set)
     made: int = 0
 
@@ -207,7 +212,7 @@ class Run:
 
     def _fill(self) -> bool:
         """Start shards while there is room; false when none is left and none in flight."""
-        while self.pool.free > 0:
+        while self.pool.free > 0 and time.perf_counter() < self.end:
             pair = next_pair(self.states, self.busy, self.goal, self.config)
             if pair is None:
                 break

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import io
 import math
@@ -12,26 +11,18 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from dro_grasp import __version__
 from dro_grasp.evaluation.coverage import HALF_AXES, ROLL_BINS, HandCoverage, PairCoverage, grasp_sizes, wrist_rolls
-from dro_grasp.files import check_output, replacing
+from dro_grasp.files import check_output
 from dro_grasp.grasps.sources import object_of
+from dro_grasp.viewer.page import Shade, image, png_bytes, table, write_page
 from dro_grasp.viewer.pictures import caption, contact_sheet, draw_grasp
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 SHOWN = 8
 """Grasps drawn for each hand, on different objects."""
 COLOUR, SECOND = "#2a788e", "#d1713b"
-STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #282c34; max-width: 1180px; margin: 2em auto; padding: 0 1em }
-h1, h2 { font-weight: 600 } h2 { margin-top: 2.2em; border-top: 1px solid #ddd; padding-top: 1em }
-table { border-collapse: collapse; font-size: 13px; margin: 1em 0 } td, th { padding: 2px 8px; text-align: right }
-td:first-child, th:first-child, td:last-child.words { text-align: left } tr:nth-child(even) { background: #f6f7f8 }
-td.cell { min-width: 2.2em } img { max-width: 100% } p.note { color: #666 }
-"""
 
 
 def write_report(hands: Sequence[HandCoverage], path: Path, progress: Callable[[int, int], None] | None = None) -> None:
@@ -52,11 +43,7 @@ def write_report(hands: Sequence[HandCoverage], path: Path, progress: Callable[[
         if progress is not None:
             progress(i + 1, len(hands))
     title = f"{sum(len(h.grasps) for h in hands):,} grasps of {len(hands)} hand{'' if len(hands) == 1 else 's'}"
-    text = (f"<!doctype html><meta charset=utf-8><title>Grasp data set</title><style>{STYLE}</style>"
-            f"<h1>{title}</h1>{_overview(hands)}{''.join(sections)}"
-            f"<p class=note>dro-grasp {__version__}</p>")
-    with replacing(path) as temporary:
-        temporary.write_text(text)
+    write_page(path, "Grasp data set", f"<h1>{title}</h1>{_overview(hands)}{''.join(sections)}")
 
 
 def _overview(hands: Sequence[HandCoverage]) -> str:
@@ -67,7 +54,7 @@ def _overview(hands: Sequence[HandCoverage]) -> str:
     ]
     head = ["hand", "grasps", "objects", "without a grasp", "candidates", "tried", "of these valid", "per CPU-hour",
             "diversity", "of the wrist", "of the joints"]
-    return _table(head, rows) + (
+    return table(head, rows) + (
         "<p class=note>Diversity: standard deviation over all grasps of each of x, y, z, roll, pitch, yaw and joints, then "
         "the mean. Yields are those of the making; the data set may hold a choice of what was made.</p>")
 
@@ -76,7 +63,7 @@ def _section(hand: HandCoverage) -> str:
     name = html.escape(hand.grasps.hand)
     parts = [f"<h2>{name}</h2>"]
     if len(hand.grasps):
-        parts += [_image(charts(hand), f"charts of {name}"), _image(grasps_drawn(hand), f"grasps of {name}")]
+        parts += [image(charts(hand), f"charts of {name}"), image(grasps_drawn(hand), f"grasps of {name}")]
     return "".join([*parts, _failures(hand), _pair_table(hand)])
 
 
@@ -95,7 +82,7 @@ def charts(hand: HandCoverage) -> bytes:
     sizes.set(title="grasp size: widest fingertip distance", xlabel="[cm]")
     _energies(figure.add_subplot(grid[1, 0]), hand)
     _joints(figure.add_subplot(grid[1, 1:]), hand)
-    return _png(figure)
+    return png_bytes(figure)
 
 
 def _directions(axes: Axes, hand: HandCoverage) -> None:
@@ -156,7 +143,7 @@ def _failures(hand: HandCoverage) -> str:
             ["too deep in the object to try", made.deep, None], ["closing moved the object too far", made.moved, None],
             *[[reason, n, None] for reason, n in sorted(made.failures.items(), key=lambda item: -item[1])],
             ["near-duplicates", made.duplicates, None], ["valid", made.valid, None]]
-    return _table(["what became of candidates", "number", "share"], [
+    return table(["what became of candidates", "number", "share"], [
         [name, n, share or _percent(n, made.candidates)] for name, n, share in rows
     ])
 
@@ -164,48 +151,16 @@ def _failures(hand: HandCoverage) -> str:
 def _pair_table(hand: HandCoverage) -> str:
     head = ["object", "grasps", "candidates", "per CPU-hour", *HALF_AXES, f"rolls of {ROLL_BINS}", "size [cm]",
             "links in contact", "why none"]
-    return _table(head, [_pair_row(pair) for pair in hand.pairs])
+    return table(head, [_pair_row(pair) for pair in hand.pairs])
 
 
 def _pair_row(pair: PairCoverage) -> list[object]:
     size = "" if math.isnan(pair.size[0]) else f"{100 * pair.size[0]:.0f}-{100 * pair.size[1]:.0f}"
     links = f"{pair.fingers[0]}-{pair.fingers[1]}" if pair.fingers[1] else ""
-    cells = [_Shade(n, max(pair.half_axes)) for n in pair.half_axes]
+    cells = [Shade(n, max(pair.half_axes)) for n in pair.half_axes]
     return [pair.object, pair.grasps, pair.made.candidates or None, round(pair.made.per_cpu_hour) or None, *cells,
             pair.rolls, size, links, pair.reason]
 
 
-class _Shade:
-    """A count that is shaded by its share of the largest."""
-
-    def __init__(self, count: int, largest: int) -> None:
-        self.count, self.share = count, count / max(1, largest)
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    body = "".join(f"<tr>{''.join(_cell(value) for value in row)}</tr>" for row in rows)
-    return f"<table><tr>{''.join(f'<th>{html.escape(h)}</th>' for h in head)}</tr>{body}</table>"
-
-
-def _cell(value: object) -> str:
-    if isinstance(value, _Shade):
-        colour = f"rgba(42,120,142,{0.65 * value.share:.2f})" if value.count else "#f3d9cc"
-        return f'<td class=cell style="background:{colour}">{value.count}</td>'
-    if isinstance(value, str) and " " in value:
-        return f"<td class=words>{html.escape(value)}</td>"
-    text = "" if value is None else f"{value:,}" if isinstance(value, int) else html.escape(str(value))
-    return f"<td>{text}</td>"
-
-
 def _percent(part: int, whole: int) -> str:
     return f"{part / whole:.0%}" if whole else ""
-
-
-def _image(png: bytes, description: str) -> str:
-    return f'<p><img alt="{html.escape(description)}" src="data:image/png;base64,{base64.b64encode(png).decode()}"></p>'
-
-
-def _png(figure: Figure) -> bytes:
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=100)
-    return file.getvalue()

@@ -1,0 +1,63 @@
+"""`dro-grasp onboard`: a new hand in one command."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from dro_grasp.cli.output import optional, print_json, say, say_aside
+
+
+@dataclass(frozen=True)
+class Onboard:
+    """Check a hand, make grasps for it, fine-tune weights on them, and report what they hold, before and after.
+
+    Example: dro-grasp onboard my_hand.urdf --output my_hand --minutes 30
+    """
+
+    hand: tyro.conf.Positional[str]
+    """The path of its URDF or MJCF file, or a name."""
+    output: Path
+    """Folder for data, weights and report; a rerun goes on in it."""
+    objects: tuple[str, ...] = ("builtin:train",)
+    """Objects that grasps are made of: names, meshes, folders, or groups."""
+    held_out: tuple[str, ...] = ("builtin:test",)
+    """Objects that the weights are tried on, and never trained on."""
+    minutes: float = 30.0
+    """Time for data, training and trials together."""
+    num: int = 10
+    """Grasps of each held-out object that are tried."""
+    weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
+    """Weights to fine-tune."""
+    workers: int = 2
+    """Processes that make grasps."""
+    seed: int = 0
+    """Of everything."""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print one JSON object at the end."""
+
+    def run(self) -> int:
+        """All steps, then the report."""
+        from dro_grasp.objects.library import resolve_objects
+        from dro_grasp.onboarding.report import write_report
+        from dro_grasp.onboarding.steps import WEIGHTS, OnboardingConfig, onboard
+
+        config = OnboardingConfig(
+            self.minutes, self.objects, self.held_out, self.num, self.weights, self.workers, seed=self.seed)
+        done = onboard(self.hand, self.output, config, say_aside)
+        report = write_report(done, resolve_objects(list(self.held_out)))
+        rates = {step: {row["stage"]: {k: v[0] for k, v in row["success"].items()} for row in done.steps[step]["rows"]}
+                 for step in ("before", "after")}
+        if self.json:
+            print_json({"hand": self.hand, "weights": str(self.output / WEIGHTS), "report": str(report), **rates,
+                        "grasps": done.steps["training"]["grasps"],
+                        "seconds": {name: round(step["seconds"], 1) for name, step in done.steps.items()}})
+            return 0
+        for step in ("before", "after"):
+            say(f"{step}: {done.steps[step]['said']}")
+        say(f"weights: {self.output / WEIGHTS}")
+        say(f"report: {report}")
+        return 0

@@ -1,0 +1,87 @@
+"""What became of a new hand, as one web page."""
+
+from __future__ import annotations
+
+import html
+from pathlib import Path
+from typing import Any
+
+from dro_grasp.evaluation.benchmark import RAW, REFINED
+from dro_grasp.hands.library import load_hand
+from dro_grasp.objects.library import load_object
+from dro_grasp.onboarding.steps import DATA, PICTURE, REPORT, WEIGHTS, Onboarded
+from dro_grasp.predictor import GraspPredictor
+from dro_grasp.viewer.page import image, table, write_page
+from dro_grasp.viewer.pictures import draw_grasps
+
+SHOWN, OBJECTS = 8, 3
+"""Grasps drawn of each object, and objects drawn."""
+
+
+def write_report(done: Onboarded, held_out: list[str]) -> Path:
+    """Write the page into the hand's folder; returns its path.
+
+    Args:
+        done: All steps.
+        held_out: Objects that the weights were tried on, some of which are drawn.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    path, name = done.folder / REPORT, html.escape(done.hand)
+    parts = [
+        f"<h1>{name}</h1>", _summary(done), _rates(done), "<h2>What it grasps now</h2>", _drawn(done, held_out),
+        "<h2>The description</h2>", image((done.folder / PICTURE).read_bytes(), f"{name}, open and closed"),
+        f"<pre>{html.escape(chr(10).join(done.steps['check']['lines']))}</pre>", "<h2>The grasps it learned from</h2>",
+        _data(done.steps["data"]), "<h2>To go on</h2>", _commands(done),
+    ]
+    write_page(path, f"{done.hand} onboarded", "".join(parts))
+    return path
+
+
+def _summary(done: Onboarded) -> str:
+    before, after = (done.rate(step, REFINED, "dro/1") for step in ("before", "after"))
+    minutes = sum(step["seconds"] for step in done.steps.values()) / 60
+    return (f"<p>On objects that it was never trained on, {before:.0%} of its refined grasps held under protocol <i>dro</i> "
+            f"before, and {after:.0%} after fine-tuning on {done.steps['training']['grasps']:,} grasps of its own; all steps "
+            f"took {minutes:.0f} minutes.</p>")
+
+
+def _rates(done: Onboarded) -> str:
+    rows = []
+    for step in ("before", "after"):
+        for row in done.steps[step]["rows"]:
+            rates = [f"{100 * p:.0f} % [{100 * low:.0f}-{100 * high:.0f}]" for p, low, high in row["success"].values()]
+            rows.append([step, "network alone" if row["stage"] == RAW else row["stage"], row["num"], *rates,
+                         f"{row['diversity']:.2f}"])
+    labels = list(done.steps["after"]["rows"][0]["success"])
+    return table(["weights", "grasps", "tried", *labels, "diversity"], rows) + (
+        "<p class=note>Success with 95 % intervals. dro is the paper's trial and lenient; strict also limits pushing while the "
+        "hand closes and penetration.</p>")
+
+
+def _drawn(done: Onboarded, held_out: list[str]) -> str:
+    hand, predictor = load_hand(done.hand), GraspPredictor(str(done.folder / WEIGHTS))
+    parts = []
+    for name in held_out[:OBJECTS]:
+        obj = load_object(name)
+        path = done.folder / f"{Path(name).stem}.png"
+        draw_grasps(hand, obj, predictor.predict(hand, obj, SHOWN), path)
+        parts.append(image(path.read_bytes(), f"grasps of {name}"))
+    return "".join(parts)
+
+
+def _data(step: dict[str, Any]) -> str:
+    rows = [[name, count, step["failures"].get(name, "")] for name, count in sorted(step["counts"].items())]
+    missing = [[name, 0, why] for name, why in step["failures"].items() if name not in step["counts"]]
+    return table(["object", "grasps", "given up because"], [*rows, *missing])
+
+
+def _commands(done: Onboarded) -> str:
+    lines = [
+        f"dro-grasp generate --hand {done.hand} --object my_mesh.stl --weights {done.folder / WEIGHTS} --output grasps.parquet",
+        "dro-grasp evaluate grasps.parquet --protocol strict",
+        "dro-grasp export grasps.parquet --format isaac_grasp --output grasps.yaml --only-successful",
+        f"dro-grasp dataset report {done.folder / DATA} --output data.html",
+    ]
+    return f"<pre>{html.escape(chr(10).join(lines))}</pre>"

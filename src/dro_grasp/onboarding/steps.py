@@ -1,0 +1,185 @@
+"""The way of a new hand: check, measure, synthesise, fine-tune, measure again. Each step is done once; a rerun goes on."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dro_grasp.datasets.bundle import load_bundle
+from dro_grasp.datasets.bundling import make_bundle
+from dro_grasp.datasets.collections import count_collection
+from dro_grasp.datasets.engine import synthesize_dataset
+from dro_grasp.datasets.splits import FEW_SHOT, split_of
+from dro_grasp.errors import BundleError, OptionError
+from dro_grasp.evaluation.benchmark import RAW, REFINED, BenchmarkConfig, benchmark
+from dro_grasp.files import make_folder, replacing
+from dro_grasp.hands.check import check_hand, picture
+from dro_grasp.hands.library import load_hand
+from dro_grasp.models.checkpoints import load_weights, save_weights
+from dro_grasp.objects.library import load_object, resolve_objects
+from dro_grasp.predictor import GraspPredictor
+from dro_grasp.simulation.protocols import protocol
+from dro_grasp.training.config import ScheduleConfig, TrainConfig
+from dro_grasp.training.loop import train
+
+STATE, WEIGHTS, REPORT, DATA, PICTURE = "onboarding.json", "weights.safetensors", "report.html", "data", "hand.png"
+"""What lies in the folder."""
+DATA_SHARE, TRAINING_SHARE = 0.45, 0.40
+"""Shares of the time for making grasps and for fine-tuning; the rest is for trying before and after."""
+MOST_GRASPS = 400
+"""Grasps of an object beyond which time is better spent on training."""
+
+
+@dataclass(frozen=True)
+class OnboardingConfig:
+    """How much is done."""
+
+    minutes: float = 30.0
+    """Time for data, training and trials together [min]."""
+    objects: tuple[str, ...] = ("builtin:train",)
+    """Objects that grasps are made of."""
+    held_out: tuple[str, ...] = ("builtin:test",)
+    """Objects that the weights are tried on, before and after, and never trained on."""
+    num: int = 10
+    """Grasps of each held-out object in each trial."""
+    weights: str | None = None
+    """Weights that are fine-tuned; the shipped ones by default."""
+    workers: int = 2
+    """Processes that make grasps."""
+    learning_rate: float = 3e-4
+    """Peak rate of fine-tuning; that of training from nothing forgets what the weights know."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be done."""
+        if self.minutes <= 0 or self.num < 1 or self.workers < 1:
+            raise OptionError(f"minutes is {self.minutes}, num {self.num}, workers {self.workers}; all must be positive")
+
+
+@dataclass(frozen=True)
+class Onboarded:
+    """What came of it."""
+
+    hand: str
+    folder: Path
+    steps: dict[str, dict[str, Any]]
+    """Result of each step by name, with its seconds: check, before, data, training, after."""
+
+    def rate(self, step: str, stage: str, label: str) -> float:
+        """Success rate on the held-out objects, `before` or `after`."""
+        (row,) = (r for r in self.steps[step]["rows"] if r["stage"] == stage)
+        return row["success"][label][0]
+
+
+def onboard(
+    hand: str, folder: Path | str, config: OnboardingConfig | None = None, say: Callable[[str], None] = print
+) -> Onboarded:
+    """Bring a hand from its description to weights of its own.
+
+    Args:
+        hand: Name or path of the description.
+        folder: Where everything is kept; made when only itself is missing.
+        config: How much is done.
+        say: Called with a line about each step.
+
+    Raises:
+        HandError: The description cannot be used.
+        OptionError: Training and held-out objects overlap, or the folder is another hand's.
+        BundleError: No grasp of the hand holds, so there is nothing to train on.
+    """
+    config = config or OnboardingConfig()
+    path, objects, held_out = make_folder(folder), resolve_objects(list(config.objects)), resolve_objects(list(config.held_out))
+    if both := sorted(set(objects) & set(held_out)):
+        raise OptionError(f"{', '.join(both)} would be trained on and tried as unseen; name other --objects or --held-out")
+    way = _Way(hand, path, config, objects, held_out, say)
+    for name in ("check", "before", "data", "training", "after"):
+        way.step(name, getattr(way, f"_{name}"))
+    return Onboarded(hand, path, way.steps)
+
+
+class _Way:
+    """One hand's way, with the state that a rerun takes up."""
+
+    def __init__(
+        self, hand: str, folder: Path, config: OnboardingConfig, objects: list[str], held_out: list[str],
+        say: Callable[[str], None],
+    ) -> None:
+        self.name, self.folder, self.config, self.say = hand, folder, config, say
+        self.objects, self.held_out = objects, held_out
+        self.hand = load_hand(hand)
+        self.steps: dict[str, dict[str, Any]] = {}
+        state = folder / STATE
+        if state.exists():
+            known = json.loads(state.read_text())
+            if known["sha256"] != self.hand.sha256:
+                raise OptionError(f"{folder} belongs to hand '{known['hand']}', whose description is another one; name another "
+                                  "folder, or bring that description back")
+            self.steps = known["steps"]
+
+    def step(self, name: str, work: Callable[[], dict[str, Any]]) -> None:
+        """Do a step that is not done yet, and remember its result."""
+        if name in self.steps:
+            self.say(f"{name}: done before")
+            return
+        begin = time.perf_counter()
+        result = work()
+        self.steps[name] = {**result, "seconds": time.perf_counter() - begin}
+        content = {"hand": self.hand.name, "sha256": self.hand.sha256, "steps": self.steps}
+        with replacing(self.folder / STATE) as temporary:
+            temporary.write_text(json.dumps(content))
+        self.say(f"{name}: {result['said']} ({self.steps[name]['seconds']:.0f} s)")
+
+    def _check(self) -> dict[str, Any]:
+        report = check_hand(self.name)
+        picture(report.hand, self.folder / PICTURE)
+        warnings = sum(note.level == "warning" for note in report.notes)
+        return {"facts": report.to_dict(), "lines": report.lines(), "said": f"{self.hand.tree.n_dof} joints, "
+                f"{len(self.hand.tips)} fingertips, {warnings} warnings"}
+
+    def _before(self) -> dict[str, Any]:
+        return self._tried(GraspPredictor(self.config.weights))
+
+    def _after(self) -> dict[str, Any]:
+        return self._tried(GraspPredictor(str(self.folder / WEIGHTS)))
+
+    def _tried(self, predictor: GraspPredictor) -> dict[str, Any]:
+        """Success on held-out objects."""
+        rules = tuple(protocol(name) for name in ("dro", "strict"))
+        config = BenchmarkConfig(self.config.num, (RAW, REFINED), rules, controls=False, seed=self.config.seed)
+        rows = benchmark([self.hand], [load_object(name) for name in self.held_out], predictor, config)
+        told = "; ".join(f"{r.stage}: " + ", ".join(f"{k} {v[0]:.0%}" for k, v in r.success.items()) for r in rows)
+        return {"rows": [dataclasses.asdict(row) for row in rows], "said": f"{predictor.weights_name}, {told}"}
+
+    def _data(self) -> dict[str, Any]:
+        report = synthesize_dataset(
+            [self.name], self.objects, MOST_GRASPS, self.folder / DATA, workers=self.config.workers, seed=self.config.seed,
+            progress=self.say, seconds=60 * self.config.minutes * DATA_SHARE)
+        counts = next(iter(count_collection(self.folder / DATA).values()), {})
+        failures = {obj: why for (_, obj), why in report.failures.items()}
+        if not sum(counts.values()):
+            why = "; ".join(dict.fromkeys(failures.values())) or "too little time (--minutes)"
+            raise BundleError(f"no grasp of {self.name} held, so there is nothing to train on; look at "
+                              f"{self.folder / PICTURE}, and at why: {why}")
+        return {"counts": counts, "failures": failures, "said": f"{sum(counts.values())} grasps that hold under strict, of "
+                f"{sum(n > 0 for n in counts.values())} of {len(self.objects)} objects"}
+
+    def _training(self) -> dict[str, Any]:
+        path = self.folder / "bundle.safetensors"
+        split = FEW_SHOT if split_of(self.hand.name, "train") == FEW_SHOT else "train"
+        make_bundle([self.folder / DATA], path, split)
+        bundle, initial = load_bundle(path), load_weights(self.config.weights)
+        schedule = ScheduleConfig(
+            steps=10**6, minutes=self.config.minutes * TRAINING_SHARE, learning_rate=self.config.learning_rate,
+            seed=self.config.seed)
+        config = TrainConfig(schedule, hands_per_step=1, samples_per_hand=16)
+        model = train(bundle, initial.config, config, self.folder / "run", name=self.folder.name, initial=initial,
+                      report=lambda run, means: self.say(f"step {run.step}: distance {1e3 * means['distance']:.1f} mm"))
+        about = {"stage": "fine-tuning", "initial": initial.name, "data": bundle.summary(), "minutes": self.config.minutes}
+        save_weights(model, self.folder / WEIGHTS, about)
+        said = f"{initial.name} fine-tuned on {bundle.n_grasps} grasps"
+        return {"grasps": bundle.n_grasps, "initial": initial.name, "said": said}
