@@ -17,7 +17,18 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.library import load_object
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.viewer.pictures import CAPTION, HEADER, TILE, caption, draw_grasp, draw_grasps, heading
+from dro_grasp.viewer.pictures import (
+    CAPTION,
+    HEADER,
+    TILE,
+    TOUCH,
+    PictureStyle,
+    caption,
+    draw_grasp,
+    draw_grasps,
+    heading,
+    touching_points,
+)
 from dro_grasp.viewer.scene import (
     OBJECT_COLOUR,
     best_camera,
@@ -135,3 +146,22 @@ def test_unwritable_path_and_no_grasps_are_refused(hand, obj, grasps, tmp_path: 
         draw_grasps(hand, obj, grasps, tmp_path / "nowhere" / "a.png", count=1)
     with pytest.raises(OutputError, match="no grasp"):
         draw_grasps(hand, obj, grasps[slice(0, 0)], tmp_path / "a.png")
+
+
+def test_a_transparent_object_is_between_none_and_a_solid_one(hand, obj, grasps) -> None:
+    solid, half, none = (draw_grasp(hand, obj, grasps, 0, PictureStyle(opacity=a)).astype(int) for a in (1.0, 0.5, 0.0))
+    assert np.abs(2 * half - solid - none).max() <= 2
+    assert (np.abs(solid - none).max(-1) > 20).mean() > 0.02, "the object fills a part of the picture"
+
+
+def test_touching_points_lie_on_the_ball(hand, obj, grasps) -> None:
+    near = touching_points(hand, obj, grasps.joints[0], grasps.T_object_wrist[0])
+    points = hand.points(grasps.joints[0], grasps.T_object_wrist[0]).numpy()
+    radius = np.linalg.norm(obj.vertices, axis=1).mean()
+    expected = np.abs(np.linalg.norm(points, axis=1) - radius) < TOUCH
+    assert abs(len(near) - expected.sum()) <= 0.4 * expected.sum() + 3
+    assert (np.abs(np.linalg.norm(near, axis=1) - radius) < TOUCH + 0.001).all()
+    marked = draw_grasp(hand, obj, grasps, 0, PictureStyle(contacts=True, size=(64, 48)))
+    assert marked.shape == (48, 64, 3)
+    assert len(touching_points(hand, dataclasses.replace(obj, vertices=None, faces=None), grasps.joints[0],
+                               grasps.T_object_wrist[0])) == 0

@@ -1,26 +1,31 @@
-"""`dro-grasp view`: look at the grasps of a file."""
+"""`dro-grasp view` and `picture`: look at the grasps of a file."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from dro_grasp.cli.output import load_grasps, optional, say
 from dro_grasp.grasps.sources import hand_of, object_of
 
+if TYPE_CHECKING:
+    from dro_grasp.grasps.batch import GraspBatch
+    from dro_grasp.hands.hand import Hand
+    from dro_grasp.objects.shape import ObjectModel
+
 
 @dataclass(frozen=True)
 class View:
-    """Look at the grasps of a file in the browser (localhost only), or as a picture.
+    """Look at the grasps of a file in the browser; without a file, make grasps there.
 
     Example: dro-grasp view grasps.parquet
     """
 
-    file: tyro.conf.Positional[Path]
-    """Grasp file."""
+    file: tyro.conf.Positional[Path | None] = None
+    """Grasp file; without one the page lets you pick or upload a hand and an object, generate, watch trials and export."""
     hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Hand to use instead of the one that the file names or remembers."""
     object: Annotated[str | None, optional("NAME|PATH", "the names in the file")] = None
@@ -28,28 +33,86 @@ class View:
     scale: float = 1.0
     """Scale of the mesh given with --object."""
     port: int = 8080
-    """Port on localhost; the next free one is taken."""
-    picture: Annotated[Path | None, optional("PNG", "none")] = None
-    """Write a PNG instead of opening the viewer."""
+    """Port; the next free one is taken."""
+    host: str = "127.0.0.1"
+    """Who may connect: this machine alone. 0.0.0.0 lets the whole network in."""
+    weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
+    """Weights that the page generates with."""
 
     def run(self) -> int:
-        """Load the file and show the grasps of one object."""
-        from dro_grasp.files import check_output
+        """Show the grasps of one object of the file, or the page that makes some."""
+        if self.file is None:
+            from dro_grasp.viewer.studio import serve_studio
 
-        if self.picture is not None:
-            check_output(self.picture)
-        grasps = load_grasps(self.file)
-        hand = hand_of(grasps, self.hand)
-        name = self.object if self.object in grasps.object else grasps.object[0]
-        chosen = grasps[[i for i, o in enumerate(grasps.object) if o == name]]
-        obj = object_of(chosen, None if self.object == name else self.object, self.scale)
-        if self.picture is not None:
-            from dro_grasp.viewer.pictures import draw_grasps
-
-            draw_grasps(hand, obj, chosen, self.picture)
-            say(f"picture: {self.picture}")
+            serve_studio(self.weights, self.port, self.host)
             return 0
         from dro_grasp.viewer.app import view_grasps
 
-        view_grasps(hand, obj, chosen, port=self.port)
+        view_grasps(*of_one_object(self.file, self.hand, self.object, self.scale), port=self.port, host=self.host)
         return 0
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Draw the grasps of a file on one sheet, without browser or OpenGL.
+
+    Example: dro-grasp picture grasps.parquet --output sheet.png --opacity 0.5 --contacts
+    """
+
+    file: tyro.conf.Positional[Path]
+    """Grasp file."""
+    output: Path
+    """PNG to write."""
+    count: int = 16
+    """Most grasps drawn, the first of the file."""
+    columns: int = 4
+    """Pictures side by side."""
+    size: tuple[int, int] = (320, 280)
+    """Width and height of one picture in pixels."""
+    opacity: float = 1.0
+    """Of the object: at 0.5 the hand shows through it."""
+    contacts: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Mark in red where the hand touches."""
+    only_successful: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Leave out grasps that failed their trial or had none."""
+    hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
+    """Hand to use instead of the one that the file names or remembers."""
+    object: Annotated[str | None, optional("NAME|PATH", "the names in the file")] = None
+    """Object to look at: a name in the file, or the mesh to use for its only object."""
+    scale: float = 1.0
+    """Scale of the mesh given with --object."""
+
+    def run(self) -> int:
+        """Load the file and draw the grasps of one object."""
+        from dro_grasp.errors import GraspFileError, OptionError
+        from dro_grasp.files import check_output
+        from dro_grasp.viewer.pictures import PictureStyle, draw_grasps
+
+        check_output(self.output)
+        if min(self.count, self.columns, *self.size) < 1 or not 0 <= self.opacity <= 1:
+            raise OptionError(f"count is {self.count}, columns {self.columns}, size {self.size}, opacity {self.opacity}; "
+                              "numbers must be positive and opacity between 0 and 1")
+        hand, obj, grasps = of_one_object(self.file, self.hand, self.object, self.scale)
+        if self.only_successful:
+            if grasps.success is None or not bool((grasps.success & grasps.tried).any()):
+                raise GraspFileError(f"no grasp in {self.file} has succeeded in a trial; leave out --only-successful")
+            grasps = grasps[grasps.success & grasps.tried]
+        style = PictureStyle(self.size, self.opacity, self.contacts)
+        draw_grasps(hand, obj, grasps, self.output, self.count, self.columns, style)
+        say(f"picture: {self.output}")
+        return 0
+
+
+def of_one_object(
+    file: Path, hand_name: str | None, object_name: str | None, scale: float
+) -> tuple[Hand, ObjectModel, GraspBatch]:
+    """The hand, one object and its grasps of a file: the object named, or the first.
+
+    Raises:
+        DroGraspError: The file, its hand or its object cannot be had.
+    """
+    grasps = load_grasps(file)
+    hand = hand_of(grasps, hand_name)
+    name = object_name if object_name in grasps.object else grasps.object[0]
+    chosen = grasps[[i for i, o in enumerate(grasps.object) if o == name]]
+    return hand, object_of(chosen, None if object_name == name else object_name, scale), chosen

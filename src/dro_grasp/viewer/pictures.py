@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
 
 from dro_grasp.errors import OutputError
-from dro_grasp.geometry.rasterizer import render
+from dro_grasp.geometry.rasterizer import dots, render
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
@@ -20,13 +23,34 @@ TILE = (320, 280)
 MOST = 16
 """Grasps on one sheet, unless told otherwise."""
 COLUMNS = 4
+TOUCH = 0.002
+"""Hand points nearer than this to the surface touch it [m]."""
+TOUCH_COLOUR, TOUCH_RADIUS = (0.86, 0.10, 0.16), 0.0022
 CAPTION, HEADER = 26, 44
 """Heights of the line under each picture and of the title [pixels]."""
 INK, FAINT = (40, 44, 52), (120, 126, 136)
 
 
+@dataclass(frozen=True)
+class PictureStyle:
+    """How a grasp is drawn."""
+
+    size: tuple[int, int] = TILE
+    """Width and height [pixels]."""
+    opacity: float = 1.0
+    """Of the object; below 1 the hand shows through it."""
+    contacts: bool = False
+    """Mark where the hand touches the object, through whatever stands before."""
+
+
 def draw_grasps(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, path: Path | str, count: int = MOST, columns: int = COLUMNS
+    hand: Hand,
+    obj: ObjectModel,
+    grasps: GraspBatch,
+    path: Path | str,
+    count: int = MOST,
+    columns: int = COLUMNS,
+    style: PictureStyle | None = None,
 ) -> None:
     """Write a PNG with pictures of the first `count` grasps, captioned with score and trial outcome.
 
@@ -37,6 +61,7 @@ def draw_grasps(
         path: PNG to write.
         count: Most grasps drawn.
         columns: Pictures side by side.
+        style: Size, transparency and contact points.
 
     Raises:
         OutputError: The file cannot be written, or there is no grasp to draw.
@@ -44,7 +69,7 @@ def draw_grasps(
     if len(grasps) == 0:
         raise OutputError(f"no grasp to draw into {path}; ask for at least one")
     shown = min(count, len(grasps))
-    tiles = [draw_grasp(hand, obj, grasps, i) for i in range(shown)]
+    tiles = [draw_grasp(hand, obj, grasps, i, style) for i in range(shown)]
     sheet = contact_sheet(tiles, [caption(grasps, i) for i in range(shown)], heading(hand, obj, grasps), columns)
     try:
         sheet.save(path, format="PNG")
@@ -53,14 +78,33 @@ def draw_grasps(
 
 
 def draw_grasp(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, index: int, size: tuple[int, int] = TILE
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, index: int, style: PictureStyle | None = None
 ) -> np.ndarray:
     """The picture (height width 3) of one grasp, from the viewpoint that hides least."""
+    style = style or PictureStyle()
     joints, T = grasps.joints[index].float(), grasps.T_object_wrist[index].float()
     with torch.no_grad():
-        meshes = [*object_meshes(obj), *hand_meshes(hand, joints, T, above_palm=False)]
-        camera = best_camera(hand, joints, T, obj, aspect=size[0] / size[1])
-    return render(meshes, camera, *size)
+        fingers = hand_meshes(hand, joints, T, above_palm=False)
+        camera = best_camera(hand, joints, T, obj, aspect=style.size[0] / style.size[1])
+        touching = touching_points(hand, obj, joints, T) if style.contacts else np.zeros((0, 3))
+    whole = render([*object_meshes(obj), *fingers], camera, *style.size)
+    if style.opacity < 1:
+        behind = render(fingers, camera, *style.size)
+        whole = (style.opacity * whole + (1 - style.opacity) * behind + 0.5).astype(np.uint8)
+    if len(touching):
+        marks = render([dots(touching, TOUCH_COLOUR, TOUCH_RADIUS)], camera, *style.size)
+        whole = np.where((marks < 250).any(-1, keepdims=True), marks, whole)
+    return whole
+
+
+def touching_points(
+    hand: Hand, obj: ObjectModel, joints: Float[Tensor, " n_dof"], T_object_wrist: Float[Tensor, "4 4"]
+) -> Float[np.ndarray, "k 3"]:
+    """Points of the posed hand at the object's surface [m]; none for a bare cloud."""
+    if obj.grid is None:
+        return np.zeros((0, 3))
+    points = hand.points(joints, T_object_wrist)
+    return points[obj.grid.query(points)[0].abs() < TOUCH].double().numpy()
 
 
 def heading(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> str:

@@ -1,0 +1,114 @@
+"""A hand and an object in the browser: their meshes, put where they belong."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import viser
+import viser.transforms
+from jaxtyping import Float
+from torch import Tensor
+
+from dro_grasp.geometry.rasterizer import Colour
+from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.viewer.scene import (
+    OBJECT_COLOUR,
+    SOLVED_COLOUR,
+    best_camera,
+    link_colours,
+    link_shapes,
+    object_meshes,
+    success_colour,
+)
+
+POINT_SIZE = 0.0022
+"""[m]"""
+CAMERA_DISTANCE = 1.15
+"""How much farther than a picture's camera the viewer starts."""
+BELOW = 0.12
+"""Height of the object above the grid [m]."""
+
+
+class Stage:
+    """One hand and one object of a server; `set_pair` replaces them."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        """An empty one."""
+        self.server = server
+        self.hand: Hand | None = None
+        server.scene.set_up_direction("+z")
+        self._root = 0
+
+    def set_pair(self, hand: Hand, obj: ObjectModel, joints: Float[Tensor, " n_dof"], T: Float[Tensor, "4 4"]) -> None:
+        """Show another hand and object, and look at them from where most is seen.
+
+        Args:
+            hand: With its description, for shapes.
+            obj: Mesh or cloud.
+            joints: First posture [rad or m].
+            T: First wrist pose in the object's frame [m].
+        """
+        scene, name = self.server.scene, f"/pair{self._root}"
+        if self.hand is not None:
+            scene.remove_by_name(name)
+            self._root += 1
+            name = f"/pair{self._root}"
+        self.hand = hand
+        self._object = scene.add_frame(f"{name}/object", show_axes=False)
+        for i, mesh in enumerate(object_meshes(obj)):
+            colour = rgb(OBJECT_COLOUR)
+            scene.add_mesh_simple(f"{name}/object/{i}", mesh.vertices, mesh.faces, color=colour, side="double")
+        colours = link_colours(hand)
+        self.links = [scene.add_frame(f"{name}/hand/{i}", show_axes=False) for i in range(hand.tree.n_links)]
+        for k, (link, vertices, faces) in enumerate(link_shapes(hand)):
+            scene.add_mesh_simple(f"{name}/hand/{link}/{k}", vertices, faces, color=rgb(colours[link]), side="double")
+        self.solved = self.cloud("solved", np.zeros((1, 3)), SOLVED_COLOUR)
+        position = (*obj.cloud.mean(0)[:2].tolist(), float(obj.cloud.min(0)[2]) - BELOW)
+        self._grid = scene.add_grid(f"{name}/grid", width=0.4, height=0.4, cell_size=0.05, section_size=0.1, position=position)
+        camera = best_camera(hand, joints, T, obj)
+        start, target = np.asarray(camera.position), np.asarray(camera.target)
+        position = tuple((target + CAMERA_DISTANCE * (start - target)).tolist())
+        initial = self.server.initial_camera
+        initial.position, initial.look_at, initial.fov = position, camera.target, camera.field_of_view
+        for client in self.server.get_clients().values():
+            client.camera.position, client.camera.look_at, client.camera.fov = position, camera.target, camera.field_of_view
+        self.show(joints, T)
+
+    def cloud(self, name: str, points: np.ndarray, colour: Colour) -> viser.PointCloudHandle:
+        """Points that are hidden at first."""
+        return self.server.scene.add_point_cloud(
+            f"/pair{self._root}/{name}", points.astype(np.float32), colors=rgb(colour), point_size=POINT_SIZE,
+            point_shape="circle", precision="float32", visible=False,
+        )
+
+    def show(
+        self, joints: Float[Tensor, " n_dof"], T: Float[Tensor, "4 4"], T_object: Float[Tensor, "4 4"] | None = None
+    ) -> None:
+        """Put the hand into a pose, and the object where it was moved to."""
+        assert self.hand is not None
+        with torch.no_grad():
+            poses = (T @ self.hand.tree.forward(joints)).double().numpy()
+            points = self.hand.points(joints, T).numpy()
+        moved = np.eye(4) if T_object is None else T_object.double().numpy()
+        with self.server.atomic():
+            for frame, pose in zip([self._object, *self.links], [moved, *poses], strict=True):
+                frame.position = pose[:3, 3]
+                frame.wxyz = viser.transforms.SO3.from_matrix(pose[:3, :3]).wxyz
+            self.solved.points = points.astype(np.float32)
+
+    def colour_grid(self, success: bool | None) -> None:
+        """Say by the grid's colour whether the grasp held."""
+        self._grid.cell_color = self._grid.section_color = rgb(success_colour(success))
+
+    def show_shapes(self, visible: bool) -> None:
+        """Show or hide the hand's shapes."""
+        with self.server.atomic():
+            for frame in self.links:
+                frame.visible = visible
+
+
+def rgb(colour: Colour) -> tuple[int, int, int]:
+    """Whole numbers to 255."""
+    red, green, blue = (round(255 * c) for c in colour)
+    return red, green, blue

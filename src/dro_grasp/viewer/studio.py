@@ -1,0 +1,318 @@
+"""The whole tool in a page: pick or upload a hand and an object, make grasps, watch their trials, take them away."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import torch
+import viser
+from jaxtyping import Bool
+from torch import Tensor
+
+from dro_grasp.errors import DroGraspError
+from dro_grasp.evaluation.coverage import HALF_AXES, half_axis
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.formats import Frame, csv_table, isaac_grasp, moveit_grasps
+from dro_grasp.grasps.ranking import score_grasps
+from dro_grasp.grasps.refinement import refine_grasps
+from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.library import hand_names, load_hand
+from dro_grasp.objects.library import load_object, object_names
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.predictor import GraspPredictor, PredictorConfig
+from dro_grasp.simulation.protocols import PROTOCOLS
+from dro_grasp.simulation.trial import record, simulate
+from dro_grasp.viewer.app import HOST, POSTURES, Posture, describe, outcome, postures_of
+from dro_grasp.viewer.stage import Stage
+from dro_grasp.viewer.uploads import store_upload
+
+FRAME_TIME = 0.04
+"""Time between two pictures of a trial [s]."""
+ANY = "any"
+EXPORTS = {
+    "grasp file (Parquet)": ".parquet", "isaac_grasp (YAML)": ".yaml", "MoveIt (YAML)": ".moveit.yaml", "table (CSV)": ".csv"}
+"""What can be taken away, with the ending of its file."""
+MOST = 64
+"""Most grasps made at once."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """What the page shows."""
+
+    hand: Hand
+    obj: ObjectModel
+    raw: GraspBatch
+    """As the network predicted them, in the order of the others."""
+    refined: GraspBatch
+    """Polished and tried."""
+
+
+class Studio:
+    """A running page; `stop()` ends it.
+
+    Example:
+        >>> studio = Studio()
+        >>> studio.generate("allegro", "mug", num=8)
+    """
+
+    def __init__(
+        self,
+        hand: str = "allegro",
+        obj: str = "rubber_duck",
+        weights: str | None = None,
+        port: int = 8080,
+        host: str = HOST,
+    ) -> None:
+        """Start serving.
+
+        Args:
+            hand: Picked at first.
+            obj: Picked at first.
+            weights: Name or path of weights.
+            port: The next free one is taken.
+            host: Only this machine by default; 0.0.0.0 lets the network in.
+        """
+        self.predictor = GraspPredictor(weights)
+        self.made: Made | None = None
+        self.shown: list[int] = []
+        self._folder = tempfile.TemporaryDirectory(prefix="dro-grasp-")
+        self._busy = threading.Lock()
+        self._uploads = 0
+        with contextlib.redirect_stdout(sys.stderr):
+            self.server = viser.ViserServer(host=host, port=port, verbose=False)
+        self.stage = Stage(self.server)
+        self._add_choices(hand, obj)
+        self._add_looks()
+        self._say("Pick a hand and an object, or upload your own, and press *Generate*.")
+
+    @property
+    def url(self) -> str:
+        """Where to point the browser."""
+        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+
+    def stop(self) -> None:
+        """Stop serving, and delete what was uploaded."""
+        self.server.stop()
+        self._folder.cleanup()
+
+    def generate(
+        self,
+        hand: str,
+        obj: str,
+        num: int = 12,
+        direction: str = ANY,
+        temperature: float | None = None,
+        protocol: str = "strict",
+    ) -> Made:
+        """Predict, polish, rank and try, then show the best.
+
+        Args:
+            hand: Name or path.
+            obj: Name or path.
+            num: How many.
+            direction: One of HALF_AXES, or `any`.
+            temperature: Of z; None leaves it to the weights.
+            protocol: Trial; bare clouds get none.
+
+        Raises:
+            DroGraspError: Something given cannot be used.
+        """
+        loaded, target = load_hand(hand), load_object(obj)
+        self.predictor.config = PredictorConfig(temperature=temperature)
+        along = None if direction == ANY else axis_of(direction)
+        raw = self.predictor.predict(loaded, target, num, direction=along, refine=False)
+        refined = refine_grasps(loaded, target, raw)
+        refined = refined.replace(score=score_grasps(loaded, target, refined))
+        assert refined.score is not None
+        order = refined.score.argsort(descending=True)
+        raw, refined = raw[order], refined[order]
+        if not target.is_cloud:
+            refined = refined.with_trial(simulate(loaded, target, refined, protocol))
+            raw = raw.with_trial(simulate(loaded, target, raw, protocol))
+        self.made = Made(loaded, target, raw, refined)
+        self.stage.set_pair(loaded, target, refined.joints[0].float(), refined.T_object_wrist[0].float())
+        self._filter()
+        return self.made
+
+    def _add_choices(self, hand: str, obj: str) -> None:
+        gui = self.server.gui
+        with gui.add_folder("Hand and object"):
+            self.hand = gui.add_dropdown("Hand", tuple(hand_names()), initial_value=hand)
+            hand_file = gui.add_upload_button("Upload a hand (URDF, MJCF, ZIP)", mime_type=".urdf,.xml,.zip")
+            self.object = gui.add_dropdown("Object", tuple(object_names()), initial_value=obj)
+            kinds = ".stl,.obj,.ply,.glb,.off,.npy,.pcd"
+            object_file = gui.add_upload_button("Upload an object (STL, OBJ, PLY)", mime_type=kinds)
+        with gui.add_folder("Generate"):
+            self.num = gui.add_slider("Grasps", 1, MOST, 1, 12)
+            self.direction = gui.add_dropdown(
+                "Palm direction", (ANY, *HALF_AXES), initial_value=ANY, hint="-z grasps from above.")
+            self.temperature = gui.add_slider(
+                "Variety", 0.0, 1.0, 0.05, min(1.0, self.predictor.network.config.latent_temperature),
+                hint="0: the likeliest grasp of each placement.")
+            self.protocol = gui.add_dropdown("Trial", tuple(PROTOCOLS), initial_value="strict")
+            self.button = gui.add_button("Generate", color="green")
+        self.status = gui.add_markdown("")
+        hand_file.on_upload(lambda _: self._guarded(lambda: self._take(hand_file.value, self.hand)))
+        object_file.on_upload(lambda _: self._guarded(lambda: self._take(object_file.value, self.object)))
+        self.button.on_click(lambda _: self._guarded(self._generate))
+
+    def _add_looks(self) -> None:
+        gui = self.server.gui
+        with gui.add_folder("Look"):
+            self.success = gui.add_dropdown("Show", ("all", "succeeded", "failed"), initial_value="all")
+            self.palm = gui.add_dropdown("Palm along", (ANY, *HALF_AXES), initial_value=ANY)
+            self.slider = gui.add_slider("Grasp", 0, 1, 1, 0, disabled=True, hint="Best score first.")
+            self.stage_of = gui.add_button_group("Stage", ("network", "refined"))
+            self.posture = gui.add_button_group("Posture", POSTURES)
+            self.play = gui.add_button("Play the trial", disabled=True)
+            self.text = gui.add_markdown("")
+        with gui.add_folder("Take away"):
+            self.format = gui.add_dropdown("Format", tuple(EXPORTS), initial_value=next(iter(EXPORTS)))
+            self.download = gui.add_button("Download what is shown", disabled=True)
+        self.stage_of.value = "refined"
+        self.posture.value = "grasp"
+        for choice in (self.success, self.palm):
+            choice.on_update(lambda _: self._filter())
+        self.slider.on_update(lambda _: self._show())
+        self.stage_of.on_click(lambda _: self._show())
+        self.posture.on_click(lambda _: self._show())
+        self.play.on_click(lambda _: self._guarded(self._play))
+        self.download.on_click(lambda event: self._guarded(lambda: self._send(event)))
+
+    def _guarded(self, work: Callable[[], None]) -> None:
+        """Do one thing at a time, and show errors on the page."""
+        if not self._busy.acquire(blocking=False):
+            self._say("Still at work; one moment.")
+            return
+        try:
+            work()
+        except DroGraspError as error:
+            self._say(f"**Error:** {error}")
+        finally:
+            self._busy.release()
+
+    def _say(self, text: str) -> None:
+        self.status.content = text
+
+    def _take(self, upload: viser.UploadedFile, choice: viser.GuiDropdownHandle[str]) -> None:
+        """Store an upload and pick it."""
+        self._uploads += 1
+        folder = Path(self._folder.name) / str(self._uploads)
+        folder.mkdir()
+        path = store_upload(upload.name, upload.content, folder)
+        choice.options = (*choice.options, str(path))
+        choice.value = str(path)
+        self._say(f"{upload.name} is picked.")
+
+    def _generate(self) -> None:
+        self._say("Generating ...")
+        begin = time.perf_counter()
+        made = self.generate(
+            self.hand.value, self.object.value, int(self.num.value), self.direction.value, float(self.temperature.value),
+            self.protocol.value)
+        held = "" if made.refined.success is None else (
+            f", **{int(made.refined.success.sum())}** held under *{self.protocol.value}*")
+        self._say(f"{len(made.refined)} grasps{held}; {time.perf_counter() - begin:.1f} s")
+
+    def _filter(self) -> None:
+        """Show only what was asked for."""
+        if self.made is None:
+            return
+        keep = chosen(self.made.hand, self.made.refined, self.success.value, self.palm.value)
+        self.shown = keep.nonzero()[:, 0].tolist()
+        some = bool(self.shown)
+        self.slider.max = max(1, len(self.shown) - 1)
+        self.slider.disabled = len(self.shown) < 2
+        self.play.disabled = self.download.disabled = not some or self.made.obj.is_cloud
+        self.download.disabled = not some
+        self.slider.value = 0
+        if some:
+            self._show()
+        else:
+            self.text.content = "No grasp is like that."
+
+    def _batch(self) -> GraspBatch:
+        assert self.made is not None
+        return self.made.raw if self.stage_of.value == "network" else self.made.refined
+
+    def _show(self) -> None:
+        """Put the hand into the picked grasp."""
+        if self.made is None or not self.shown:
+            return
+        index, grasps = self.shown[min(int(self.slider.value), len(self.shown) - 1)], self._batch()
+        joints = postures_of(self.made.hand, self.made.obj, grasps[index])[cast(Posture, self.posture.value)][0]
+        with self.server.atomic():
+            self.stage.show(joints, grasps.T_object_wrist[index].float())
+            self.stage.colour_grid(outcome(grasps, index))
+            self.text.content = describe(grasps, index)
+
+    def _play(self) -> None:
+        """Show the trial of the picked grasp as it went."""
+        assert self.made is not None
+        index, grasps = self.shown[int(self.slider.value)], self._batch()
+        T = grasps.T_object_wrist[index].float()
+        self._say("Playing: closing, then six pushes.")
+        poses, joints = record(self.made.hand, self.made.obj, grasps, index, self.protocol.value)
+        for pose, q in zip(poses, joints, strict=True):
+            self.stage.show(q, T, T @ pose)
+            time.sleep(FRAME_TIME)
+        time.sleep(0.5)
+        self._show()
+        self._say("Played.")
+
+    def _send(self, event: viser.GuiEvent) -> None:
+        """Hand the shown grasps to the browser."""
+        name, content = self.exported(self.format.value)
+        if event.client is not None:
+            event.client.send_file_download(name, content, save_immediately=True)
+        self._say(f"{name}: {len(self.shown)} grasps.")
+
+    def exported(self, kind: str) -> tuple[str, bytes]:
+        """Name and content of a file with the grasps that are shown, in one of EXPORTS."""
+        assert self.made is not None
+        grasps = self._batch()[self.shown]
+        name = f"{Path(self.made.hand.name).name}_{Path(self.made.obj.name).name}{EXPORTS[kind]}"
+        if EXPORTS[kind] == ".parquet":
+            return name, grasps.to_bytes()
+        text = (isaac_grasp(grasps, Frame()) if EXPORTS[kind] == ".yaml" else
+                csv_table(grasps, Frame()) if EXPORTS[kind] == ".csv" else moveit_grasps(grasps, self.made.hand, Frame()))
+        return name, text.encode()
+
+
+def chosen(hand: Hand, grasps: GraspBatch, success: str, palm: str) -> Bool[Tensor, " n"]:
+    """Grasps with an outcome (`all`, `succeeded`, `failed`) whose palm looks along a half-axis (or `any`)."""
+    keep = torch.ones(len(grasps), dtype=torch.bool)
+    if success != "all":
+        held = grasps.tried & (grasps.success if grasps.success is not None else False)
+        keep &= held if success == "succeeded" else grasps.tried & ~held
+    if palm != ANY:
+        keep &= half_axis(hand.palm_directions(grasps.T_object_wrist)) == HALF_AXES.index(palm)
+    return keep
+
+
+def axis_of(name: str) -> tuple[float, float, float]:
+    """The direction that one of HALF_AXES names."""
+    sign = 1.0 if name[0] == "+" else -1.0
+    x, y, z = (sign if letter == name[1] else 0.0 for letter in "xyz")
+    return x, y, z
+
+
+def serve_studio(weights: str | None, port: int, host: str) -> None:
+    """Serve the page until Ctrl-C."""
+    studio = Studio(weights=weights, port=port, host=host)
+    print(f"viewer: {studio.url} (Ctrl-C ends it)", file=sys.stderr, flush=True)
+    try:
+        studio.server.sleep_forever()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        studio.stop()
