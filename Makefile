@@ -1,10 +1,10 @@
-# make setup | demo | test | test-slow | lint | docs-pictures | data | clean
+# make setup | demo | test | test-slow | lint | docs | rehearse | docs-pictures | data | clean
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo test test-slow lint docs-pictures data clean
+.PHONY: setup demo test test-slow lint docs rehearse docs-pictures data clean
 
 setup: $(STAMP)
 
@@ -30,6 +30,21 @@ lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/pyright
+
+docs: setup  # the documents as a site in out/site; fails on unknown names and broken links
+	$(BIN)/zensical build --strict --clean
+
+REHEARSAL := out/rehearsal
+rehearse: setup  # training at paper size as on a GPU machine, small enough for two minutes here: killed once, then finished
+	rm -rf $(REHEARSAL) && mkdir -p $(REHEARSAL)/out
+	$(BIN)/dro-grasp synthesize --hand barrett gripper3 --object can torus --grasps 8 --output $(REHEARSAL)/data
+	$(BIN)/dro-grasp dataset bundle $(REHEARSAL)/data --output $(REHEARSAL)/bundle.safetensors
+	export PATH=$(abspath $(BIN)):$$PATH OMP_NUM_THREADS=1 PROCESSES=2 RUNS=$(REHEARSAL)/runs OUT=$(REHEARSAL)/out \
+		BUNDLE=$(REHEARSAL)/bundle.safetensors VALIDATION=$(REHEARSAL)/bundle.safetensors \
+		PRETRAIN='--size paper --steps 2' TRAIN='--size paper --steps 3 --samples-per-hand 1'; \
+	timeout --signal KILL 30 scripts/train_on_bare_machine.sh; scripts/train_on_bare_machine.sh
+	cd $(REHEARSAL)/out && cat multi.safetensors.* > multi.safetensors && sha256sum --check multi.sha256
+	$(BIN)/dro-grasp weights verify $(REHEARSAL)/out/multi.safetensors
 
 docs-pictures: setup
 	$(BIN)/dro-grasp generate --hand allegro --object rubber_duck --num 16 --seed 0 --picture docs/pictures/grasps.png

@@ -18,8 +18,10 @@ from tests.weights import untrained_weights
 
 COMMANDS = [
     [], ["generate"], ["evaluate"], ["synthesize"], ["dataset"], ["dataset", "bundle"], ["dataset", "info"],
-    ["pretrain"], ["train"], ["view"], ["hand"], ["hand", "check"], ["hands"], ["objects"],
+    ["dataset", "import"],
+    ["pretrain"], ["train"], ["view"], ["picture"], ["hand"], ["hand", "check"], ["hands"], ["objects"],
     ["weights"], ["weights", "list"], ["weights", "verify"], ["benchmark"],
+    ["export"], ["onboard"],
 ]
 KEYS = {
     "hand", "object", "num", "candidates", "seed", "weights", "protocol", "success", "success_rate", "seconds",
@@ -210,7 +212,7 @@ def test_evaluate_and_view_take_the_file_that_generate_wrote(generate, tmp_path:
     assert report["num"] == 2
     assert report["interval_95"][0] <= report["success_rate"] <= report["interval_95"][1]
     assert set(GraspBatch.load(tried).protocol) == {"strict/1"}
-    assert main(["view", str(tried), "--picture", str(picture)]) == 0
+    assert main(["picture", str(tried), "--output", str(picture)]) == 0
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
@@ -262,5 +264,5 @@ def test_own_files_are_found_again(
     assert main(["evaluate", "../grasps.parquet", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["success"] == made["success"]
     (tmp_path / "mine.urdf").unlink()
-    assert main(["view", "../grasps.parquet", "--picture", "a.png"]) == 2
+    assert main(["picture", "../grasps.parquet", "--output", "a.png"]) == 2
     assert "give its file with --hand" in capsys.readouterr().err

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binomtest, mannwhitneyu
 
 from dro_grasp.datasets.bundle import Bundle
-from dro_grasp.evaluation.controls import mean_grasp, mean_grasps, median_angle, palm_facing_starts
+from dro_grasp.evaluation.controls import mean_grasp, mean_grasps, palm_facing_starts
+from dro_grasp.evaluation.coverage import palm_angles
 from dro_grasp.evaluation.metrics import diversity, roc_area, wilson_interval
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.shape import ObjectModel
@@ -116,11 +117,11 @@ def test_controls_know_no_network(bundle: Bundle, monkeypatch: pytest.MonkeyPatc
     mean_grasps(HAND, obj, mean_grasp(bundle, "toy"), 8, 1)
 
 
-def test_median_angle_is_scipys() -> None:
+def test_palm_angles_are_scipys() -> None:
     grasps = made_up_grasps(HAND, count=15)
     asked = np.array([1.0, 2.0, -2.0])
     turned = Rotation.from_matrix(grasps.T_object_wrist[:, :3, :3].numpy()).apply(HAND.palm_direction_wrist.numpy())
-    expected = np.median(np.arccos(turned @ asked / 3))
-    assert median_angle(HAND, grasps, (1.0, 2.0, -2.0)) == pytest.approx(expected, abs=1e-4)
+    np.testing.assert_allclose(palm_angles(HAND, grasps, (1.0, 2.0, -2.0)), np.arccos(turned @ asked / 3), atol=1e-5)
     twice = dataclasses.replace(grasps[[0]], T_object_wrist=torch.eye(4)[None])
-    assert median_angle(HAND, twice, tuple((-HAND.palm_direction_wrist).tolist())) == pytest.approx(math.pi, abs=1e-3)
+    opposite = tuple((-HAND.palm_direction_wrist).tolist())
+    assert float(palm_angles(HAND, twice, opposite)) == pytest.approx(math.pi, abs=1e-5)

@@ -13,12 +13,14 @@ from dro_grasp import __version__
 from dro_grasp.cli.benchmark import Benchmark
 from dro_grasp.cli.dataset import Dataset
 from dro_grasp.cli.evaluate import Evaluate
+from dro_grasp.cli.export import Export
 from dro_grasp.cli.generate import Generate
 from dro_grasp.cli.hand import HandCommand
 from dro_grasp.cli.listing import Hands, Objects
+from dro_grasp.cli.onboard import Onboard
 from dro_grasp.cli.synthesize import Synthesize
 from dro_grasp.cli.train import Pretrain, Train
-from dro_grasp.cli.view import View
+from dro_grasp.cli.view import Picture, View
 from dro_grasp.cli.weights import Weights
 from dro_grasp.errors import DroGraspError
 
@@ -29,12 +31,15 @@ named = tyro.conf.subcommand
 Command = (
     Annotated[Generate, named("generate")]
     | Annotated[Evaluate, named("evaluate")]
+    | Annotated[Export, named("export")]
     | Annotated[Benchmark, named("benchmark")]
+    | Annotated[Onboard, named("onboard")]
     | Annotated[Synthesize, named("synthesize")]
     | Annotated[Dataset, named("dataset")]
     | Annotated[Pretrain, named("pretrain")]
     | Annotated[Train, named("train")]
     | Annotated[View, named("view")]
+    | Annotated[Picture, named("picture")]
     | Annotated[HandCommand, named("hand")]
     | Annotated[Hands, named("hands")]
     | Annotated[Objects, named("objects")]

@@ -5,7 +5,6 @@ A lenient trial is passed by grasps that never looked at the object; these are t
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import roma
@@ -89,10 +88,3 @@ def _complete(hand: Hand, obj: ObjectModel, T: Tensor, joints: Tensor, seed: int
 def _random_rotations(num: int, generator: torch.Generator) -> Float[Tensor, "num 3 3"]:
     quaternion = torch.nn.functional.normalize(torch.randn(num, 4, generator=generator), dim=-1)
     return roma.unitquat_to_rotmat(quaternion)
-
-
-def median_angle(hand: Hand, grasps: GraspBatch, direction: tuple[float, float, float]) -> float:
-    """Median angle between the palm directions of grasps and the one asked for [rad]."""
-    asked = torch.tensor(direction) / math.sqrt(sum(x * x for x in direction))
-    obtained = grasps.T_object_wrist[:, :3, :3] @ hand.palm_direction_wrist
-    return float(torch.acos((obtained @ asked).clamp(-1, 1)).median())

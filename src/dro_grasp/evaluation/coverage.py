@@ -115,6 +115,13 @@ def half_axis(directions: Float[Tensor, "n 3"]) -> Int[Tensor, " n"]:
     return 2 * axis + (directions.gather(1, axis[:, None])[:, 0] < 0)
 
 
+def palm_angles(hand: Hand, grasps: GraspBatch, direction: tuple[float, float, float]) -> Float[Tensor, " n"]:
+    """Angle between the palm direction of each grasp and the one asked for, of any length [rad]."""
+    obtained, asked = hand.palm_directions(grasps.T_object_wrist), torch.tensor(direction)
+    sine = torch.linalg.cross(obtained, asked.expand_as(obtained), dim=-1).norm(dim=-1)
+    return torch.atan2(sine, obtained @ asked)
+
+
 def wrist_rolls(hand: Hand, grasps: GraspBatch) -> Float[Tensor, " n"]:
     """Turn of each wrist about its palm direction, from 0 to 2 pi [rad].
 

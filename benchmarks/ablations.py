@@ -1,0 +1,206 @@
+"""What each part of training buys: the slim network, trained anew for every row on equally many samples, then tried.
+
+    python benchmarks/ablations.py --output FOLDER [--rows ROW ...] [--steps N] [--num N] [--json]
+
+Rows are trained one after the other and remembered in the folder: run it again, with more rows or after an interruption, and
+only what is missing is done; two runs with different rows may share a folder. Every row's hands get the same number of grasps a
+pair; the benchmark tries them on the validate objects. Needs the development assets.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from report import ROOT, emit
+from synthesis import HANDS
+
+from dro_grasp.cli.main import main as command
+from dro_grasp.datasets.bundle import Bundle, load_bundle
+from dro_grasp.evaluation.benchmark import ALL, RAW, REFINED, BenchmarkConfig, benchmark
+from dro_grasp.evaluation.distance_error import distance_errors
+from dro_grasp.hands.library import load_hand
+from dro_grasp.models.checkpoints import load_weights, save_weights
+from dro_grasp.models.network import DistanceNetwork, NetworkConfig
+from dro_grasp.objects.library import load_object, resolve_objects
+from dro_grasp.predictor import GraspPredictor
+from dro_grasp.simulation.protocols import protocol
+from dro_grasp.training.config import (
+    AugmentationConfig,
+    LossConfig,
+    MotionConfig,
+    PretrainConfig,
+    ScheduleConfig,
+    TrainConfig,
+)
+from dro_grasp.training.loop import train
+from dro_grasp.training.pretraining import pretrain, pretrain_motion
+
+HELD_OUT = ("assets/inspire", "assets/ability", "assets/dclaw", "assets/orca", "assets/ezgripper")
+FEW_SHOT = ("assets/inspire", "assets/dclaw", "assets/orca")
+OTHERS = ("assets/leaphand", "assets/allegro_right", "allegro", "barrett", "gripper3", "leaphand", "shadowhand")
+PER_PAIR = 100
+"""Grasps of a hand on an object in the bundles."""
+PRETRAINING_STEPS, MOTION_STEPS = 1000, 1000
+
+
+@dataclass(frozen=True)
+class Ablation:
+    """One training."""
+
+    hands: tuple[str, ...] = HANDS
+    """Hands trained on."""
+    tried: tuple[str, ...] = HANDS
+    """Hands that the weights are tried with."""
+    pretrained: bool = True
+    network: dict[str, Any] = field(default_factory=dict)
+    """Settings that differ from the slim network's."""
+    losses: LossConfig = field(default_factory=LossConfig)
+    partial: float = 0.0
+    fine_tuned: bool = False
+    """The shipped weights are trained further, instead of new ones."""
+    grasps: int | None = None
+    """Only so many grasps of the hand, of all objects; all by default."""
+    share: float = 1.0
+    """Of the steps of the other rows."""
+    view: str = "whole"
+
+
+MOTION = {"latent_form": "motion", "latent": 32}
+ROWS = {
+    "three hands": Ablation(),
+    "without pretraining": Ablation(pretrained=False),
+    "barrett alone": Ablation(hands=HANDS[:1]),
+    "allegro alone": Ablation(hands=HANDS[1:2]),
+    "shadow alone": Ablation(hands=HANDS[2:]),
+    "half clouds": Ablation(partial=1.0, view="half"),
+    "z: official divergence": Ablation(losses=LossConfig(divergence=0.001, divergence_form="official")),
+    "z: divergence 0.0003": Ablation(losses=LossConfig(divergence=0.0003)),
+    "z: warm-up, free bits": Ablation(losses=LossConfig(divergence_warmup=0.5, free_bits=0.1)),
+    "z: learned prior": Ablation(network={"prior": "learned"}, losses=LossConfig(divergence=0.0003)),
+    "z: flow": Ablation(network={"prior": "flow"}, losses=LossConfig(divergence=0.0003)),
+    "z: motion, flow": Ablation(network={"prior": "flow", **MOTION}, losses=LossConfig(divergence=0.0003)),
+    "z: motion, flow, 0.001": Ablation(network={"prior": "flow", **MOTION}, losses=LossConfig(divergence=0.001)),
+    "ten hands, wrist axes": Ablation(hands=(*HANDS, *OTHERS), tried=HELD_OUT),
+    "ten hands, palm axes": Ablation(hands=(*HANDS, *OTHERS), tried=HELD_OUT, network={"frame": "palm"}),
+    **{
+        f"{hand.split('/')[1]}, {count} grasps": Ablation(
+            hands=(hand,), tried=(hand,), fine_tuned=True, grasps=count, share=0.3)
+        for hand in FEW_SHOT for count in (0, 50, 200, 1000)
+    },
+}
+
+
+def bundle_of(ablation: Ablation, folder: Path) -> Bundle:
+    """Training grasps of the row's hands, made once for all rows that share it."""
+    split = "few_shot" if set(ablation.hands) <= set(HELD_OUT) else "train"
+    path = folder / f"{'+'.join(name.replace('/', '-') for name in ablation.hands)}.safetensors"
+    if not path.exists():
+        code = command(["dataset", "bundle", str(ROOT / "data" / "grasps"), "--split", split, "--hands", *ablation.hands,
+                        "--per-pair", str(PER_PAIR), "--output", str(path), "--json"])
+        assert code == 0, "the bundle could not be made"
+    bundle = load_bundle(path)
+    if ablation.grasps is None:
+        return bundle
+    (name,) = bundle.grasps
+    known = bundle.grasps[name]
+    kept = torch.randperm(len(known.joints), generator=torch.Generator().manual_seed(0))[: ablation.grasps]
+    fewer = type(known)(known.T_object_wrist[kept], known.joints[kept], known.object_index[kept])
+    return Bundle(bundle.hands, bundle.objects, {name: fewer})
+
+
+def trained(name: str, ablation: Ablation, folder: Path, steps: int) -> tuple[DistanceNetwork, float]:
+    """The row's network and the seconds that its training took; its run folder lets it go on after an interruption."""
+    begin = time.perf_counter()
+    if ablation.grasps == 0:
+        return load_weights(), 0.0
+    bundle, place = bundle_of(ablation, folder), folder / name.replace(" ", "_")
+    network = dataclasses.replace(NetworkConfig.slim(), **ablation.network)
+    initial = load_weights() if ablation.fine_tuned else None
+    first = None
+    if ablation.pretrained and initial is None:
+        first = pretrain(bundle, network, PretrainConfig(ScheduleConfig(steps=PRETRAINING_STEPS)), folder / f"{place.name}_pre")
+        if network.latent_form == "motion":
+            config = MotionConfig(ScheduleConfig(steps=MOTION_STEPS))
+            first = pretrain_motion(first, bundle, config, folder / f"{place.name}_motion")
+    rate = 1e-3 if initial is None else 3e-4
+    config = TrainConfig(
+        ScheduleConfig(steps=round(ablation.share * steps), learning_rate=rate), ablation.losses,
+        AugmentationConfig(partial=ablation.partial))
+    network = network if initial is None else initial.config
+    model = train(bundle, network, config, place, first, name=name, initial=initial)
+    save_weights(model, folder / f"{place.name}.safetensors", {})
+    return model, time.perf_counter() - begin
+
+
+def measured(name: str, ablation: Ablation, folder: Path, steps: int, num: int) -> dict[str, Any]:
+    """Train and try one row."""
+    model, seconds = trained(name, ablation, folder, steps)
+    predictor = GraspPredictor()
+    predictor.network, predictor.weights_name = model, name
+    objects = [load_object(o) for o in resolve_objects(["assets:validate"])]
+    config = BenchmarkConfig(num, (RAW, REFINED), (protocol("dro"), protocol("strict")), controls=False, view=ablation.view)
+    rows = benchmark([load_hand(h) for h in ablation.tried], objects, predictor, config)
+    errors = []
+    if set(ablation.tried) <= set(HANDS):
+        validate = folder / "validate.safetensors"
+        if not validate.exists():
+            command(["dataset", "bundle", str(ROOT / "data" / "grasps"), "--split", "validate", "--hands", *HANDS, "--output",
+                     str(validate), "--json"])
+        errors = [dataclasses.asdict(e) for e in distance_errors(model, load_bundle(validate))]
+    return {"row": name, "seconds": seconds, "rows": [dataclasses.asdict(r) for r in rows], "errors": errors}
+
+
+def cells(result: dict[str, Any]) -> list[list[object]]:
+    """Lines of the table: one a hand, and their average."""
+    by_hand: dict[str, dict[str, Any]] = {}
+    for row in result["rows"]:
+        by_hand.setdefault(row["hand"], {})[row["stage"]] = row
+    errors = {e["hand"].rpartition("/")[2]: e for e in result["errors"]}
+    if errors:
+        errors[ALL] = {k: sum(e[k] for e in errors.values()) / len(errors) for k in ("posterior", "prior", "divergence")}
+    lines: list[list[object]] = []
+    for hand, stages in by_hand.items():
+        rates = [f"{100 * rate[0]:.1f}" for s in (RAW, REFINED) for rate in stages[s]["success"].values()]
+        error = errors.get(hand.rpartition("/")[2])
+        far = ["", "", ""] if error is None else [
+            f"{1e3 * error['posterior']:.1f}", f"{1e3 * error['prior']:.1f}", f"{error['divergence']:.2g}"]
+        lines.append([result["row"], hand, stages[RAW]["num"], *rates, f"{stages[REFINED]['diversity']:.3f}", *far,
+                      f"{result['seconds'] / 60:.0f}"])
+    return lines
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Train, try and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--output", type=Path, required=True, help="folder for weights and results")
+    parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS), help="rows to train")
+    parser.add_argument("--steps", type=int, default=800, help="training steps of 16 samples")
+    parser.add_argument("--num", type=int, default=10, help="grasps of each hand on each object")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    options = parser.parse_args(argv)
+    torch.set_num_threads(1)
+    options.output.mkdir(exist_ok=True)
+    results = []
+    for name in options.rows:
+        stored = options.output / f"{name.replace(' ', '_')}.json"
+        if not stored.exists():
+            result = measured(name, ROWS[name], options.output, options.steps, options.num)
+            stored.write_text(json.dumps(result))
+        results.append(json.loads(stored.read_text()))
+    columns = ["row", "hand", "n", "dro raw", "strict raw", "dro refined", "strict refined", "diversity", "posterior [mm]",
+               "prior [mm]", "nats", "minutes"]
+    emit(f"{options.steps} steps of 16 samples, {options.num} grasps of each hand on each validate object",
+         [line for result in results for line in cells(result)], columns,
+         {result["row"]: result for result in results}, options.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,54 @@
+"""How well grasps keep the palm direction that was asked for, and how directions spread when none is.
+
+    python benchmarks/directions.py [--weights NAME|PATH] [--num N] [--json]
+
+Each of the six half-axes is asked for on each validate object; angles are those of the refined grasps. Without a direction,
+each grasp counts for the half-axis that it is nearest to; even is 16.7 %. Needs the development assets.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import torch
+from report import emit
+from synthesis import HANDS
+
+from dro_grasp.evaluation.coverage import HALF_AXES, half_axis, palm_angles
+from dro_grasp.hands.library import load_hand
+from dro_grasp.objects.library import load_object, resolve_objects
+from dro_grasp.predictor import GraspPredictor
+
+KEPT = 20.0
+"""Angle within which a direction counts as kept [degrees]."""
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--weights", default=None, help="name of shipped weights, or a weights file")
+    parser.add_argument("--num", type=int, default=16, help="grasps of each hand on each object in each direction")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    predictor = GraspPredictor(options.weights)
+    objects = [load_object(name) for name in resolve_objects(["assets:validate"])]
+    axes = [tuple(sign * x for x in axis) for axis in torch.eye(3).tolist() for sign in (1.0, -1.0)]
+    rows = []
+    for name in HANDS:
+        hand = load_hand(name)
+        asked = torch.cat([
+            palm_angles(hand, predictor.predict(hand, obj, options.num, direction=axis), axis)
+            for obj in objects for axis in axes]).rad2deg()
+        free = torch.cat([
+            hand.palm_directions(predictor.predict(hand, obj, 6 * options.num).T_object_wrist) for obj in objects])
+        shares = 100 * torch.bincount(half_axis(free), minlength=6) / len(free)
+        rows.append([name, len(asked), float(asked.median()), float(asked.quantile(0.95)),
+                     float((asked <= KEPT).float().mean()) * 100, *shares.tolist()])
+    columns = ["hand", "n", "median [deg]", "95 % [deg]", f"within {KEPT:.0f} deg [%]", *(f"{axis} [%]" for axis in HALF_AXES)]
+    emit(f"palm directions of weights '{predictor.weights_name}'", rows, columns,
+         {str(row[0]): dict(zip(columns[1:], row[1:], strict=True)) for row in rows}, options.json)
+
+
+if __name__ == "__main__":
+    main()
