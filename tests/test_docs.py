@@ -12,13 +12,14 @@ import pytest
 
 import dro_grasp as dro
 from dro_grasp.cli.main import parse
+from dro_grasp.geometry.rigid_motion import read_motion
 from tests.weights import untrained_weights
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
-FILE = re.compile(r"`((?:benchmarks|docs|tests|geometry|kinematics|models|src)/[\w/.-]+\.\w+)`")
+FILE = re.compile(r"`((?:benchmarks|docs|scripts|tests|geometry|kinematics|models|src)/[\w/.-]+\.\w+)`")
 MAKE_TARGET = re.compile(r"^([\w-]+):", re.MULTILINE)
 
 
@@ -43,12 +44,22 @@ def commands() -> list[str]:
 @pytest.mark.parametrize("command", commands())
 def test_commands_are_understood(command: str) -> None:
     words = shlex.split(command)
+    variables = {}
+    while "=" in words[0]:
+        name, _, value = words.pop(0).partition("=")
+        variables[name] = value
+    for name in {"PRETRAIN", "TRAIN"} & variables.keys():
+        files = ["--bundle", "b", "--run-folder", "r", "--output", "o"]
+        parse([name.lower(), *files, *shlex.split(variables[name])])
     if words[0] == "torchrun":
         words = words[words.index("--no-python") + 1 :]
     if words[0] == "make":
         assert words[1] in MAKE_TARGET.findall((ROOT / "Makefile").read_text())
     elif words[0] == "dro-grasp":
         parse(words[1:])
+    elif words[0].startswith("scripts/"):
+        assert (ROOT / words[0]).stat().st_mode & 0o100, "not executable"
+        assert variables.keys() <= set(re.findall(r"^#   ([A-Z]+) ", (ROOT / words[0]).read_text(), re.MULTILINE))
     else:
         assert words[0] in {"mkdir", "git", "cd", "pip"}, command
 
@@ -94,11 +105,17 @@ def test_the_snippets_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
 
 
 def test_json_example_has_the_keys_of_generate() -> None:
-    (_, text), *_ = blocks("json")
-    example = json.loads(text)
+    (example,) = (e for e in (json.loads(text) for _, text in blocks("json")) if "seconds" in e)
     source = (ROOT / "src" / "dro_grasp" / "cli" / "generate.py").read_text()
     assert all(f'"{key}":' in source for key in example)
     assert list(example["seconds"]) == ["load", "network", "decode", "refine", "rank", "trial"]
+
+
+@pytest.mark.parametrize(("document", "key"), [("export.md", "T_frame_object"), ("own-object.md", "T_frame_camera")])
+def test_frame_examples_are_frames(tmp_path: Path, document: str, key: str) -> None:
+    (text,) = (text for name, text in blocks("json") if name == document)
+    (tmp_path / "frame.json").write_text(text)
+    assert read_motion(tmp_path / "frame.json", key)[0] == "base_link"
 
 
 def test_public_names_of_the_readme_demo_exist() -> None:

@@ -1,0 +1,39 @@
+"""The wheel: built, installed elsewhere, and run far from the repository."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_all_that_grasping_needs(tmp_path: Path) -> None:
+    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    subprocess.run([*pip, "wheel", str(ROOT), "--no-deps", "--wheel-dir", str(tmp_path)], check=True, timeout=300)
+    (wheel,) = tmp_path.glob("dro_grasp-*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    kinds = ("weights/**/*.safetensors", "weights/SHA256SUMS", "hands/builtin/*", "py.typed")
+    shipped = {str(p.relative_to(ROOT / "src")) for kind in kinds for p in (ROOT / "src" / "dro_grasp").glob(kind)}
+    assert len(shipped) > 8
+    assert shipped <= names
+    assert not any(name.startswith(("tests/", "benchmarks/", "data/")) for name in names)
+    site = tmp_path / "site"
+    subprocess.run([*pip, "install", "--no-deps", "--target", str(site), str(wheel)], check=True, timeout=300)
+    away = tmp_path / "away"
+    away.mkdir()
+    code = "import sys, dro_grasp.cli.main as m; print(m.__file__, file=sys.stderr); sys.exit(m.main())"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "generate", "--hand", "gripper3", "--object", "can", "--num", "2", "--json"],
+        cwd=away, env=os.environ | {"PYTHONPATH": str(site)}, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert str(site) in done.stderr
+    assert json.loads(done.stdout)["num"] == 2
