@@ -12,10 +12,10 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from dro_grasp.cli.dataset_bundle import sources
 from dro_grasp.cli.main import main
 from dro_grasp.datasets import bundle as bundle_module
 from dro_grasp.datasets.bundle import ObjectCloud, load_bundle, write_bundle
+from dro_grasp.datasets.bundling import sources
 from dro_grasp.datasets.records import Shard
 from dro_grasp.datasets.splits import SPLITS, split_of
 from dro_grasp.errors import BundleError, GraspFileError, OutputError

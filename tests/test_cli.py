@@ -135,7 +135,7 @@ def test_generate_reports_and_saves_what_it_counts(generate, tmp_path: Path) -> 
     report = generate("--output", str(path))
     assert report.keys() >= KEYS
     assert set(report["seconds"]) == {"load", "network", "decode", "refine", "rank", "trial"}
-    assert (report["num"], report["candidates"], report["protocol"]) == (3, 3, "dro")
+    assert (report["num"], report["candidates"], report["protocol"]) == (3, 12, "dro")
     assert report["success_rate"] == pytest.approx(report["success"] / 3)
     grasps = GraspBatch.load(path)
     assert len(grasps) == 3

@@ -117,6 +117,18 @@ def test_a_direction_must_point_somewhere(
         predictor.predict(HAND, ball, num=1, direction=direction)
 
 
+def test_of_several_candidates_the_best_are_kept(predictor: GraspPredictor, ball: ObjectModel) -> None:
+    many = predictor.predict(HAND, ball, num=12, seed=4)
+    best = predictor.predict(HAND, ball, num=3, seed=4, candidates=4)
+    assert predictor.candidates == 12
+    torch.testing.assert_close(best.T_object_wrist, many.T_object_wrist[:3])
+    torch.testing.assert_close(best.score, many.score[:3])
+    assert predictor.predicted_points is not None
+    assert len(predictor.predicted_points) == 3
+    with pytest.raises(OptionError, match="candidates is 0"):
+        predictor.predict(HAND, ball, num=1, candidates=0)
+
+
 @pytest.mark.parametrize("temperature", [-0.1, math.nan, 3.0])
 def test_a_temperature_out_of_range_is_refused(weights: str, ball: ObjectModel, temperature: float) -> None:
     with pytest.raises(OptionError, match=f"temperature is {temperature}; give 0"):

@@ -95,6 +95,7 @@ class GraspPredictor:
         table: float | None = None,
         refine: bool = True,
         progress: Callable[[int, int], None] | None = None,
+        candidates: int = 1,
     ) -> GraspBatch:
         """Predict grasps, best score first.
 
@@ -108,15 +109,17 @@ class GraspPredictor:
                 in the grasp are dropped and sampling goes on.
             refine: Polish the network's grasps on the object's geometry, near where they were predicted.
             progress: Called with (grasps decoded, grasps wanted).
+            candidates: Grasps that are predicted for each one returned; the best by score are kept.
 
         Returns:
             `num` grasps with pregrasp, squeeze and score. Results do not depend on the batch size.
 
         Raises:
-            OptionError: `num` is not positive, `direction` is zero, the temperature is out of range, or too few grasps stay
-                above the table.
+            OptionError: `num` or `candidates` is not positive, `direction` is zero, the temperature is out of range, or too
+                few grasps stay above the table.
         """
-        check_request(num, direction, self.config.temperature)
+        check_request(num, direction, self.config.temperature, candidates)
+        wanted, num = num, num * candidates
         self.timings = {"network": 0.0, "decode": 0.0, "refine": 0.0, "rank": 0.0}
         self.candidates = 0
         generator = torch.Generator().manual_seed(seed)
@@ -131,15 +134,15 @@ class GraspPredictor:
             if sum(map(len, kept)) >= num:
                 break
         found = GraspBatch.concatenate(kept)[slice(0, num)]
-        if len(found) < num:
+        if len(found) < wanted:
             raise OptionError(
-                f"only {len(found)} of {self.candidates} grasps keep the hand above table {table} m, {num} were asked "
+                f"only {len(found)} of {self.candidates} grasps keep the hand above table {table} m, {wanted} were asked "
                 f"for; lower --table (the object spans z = {float(obj.cloud[:, 2].min()):.3f} to "
                 f"{float(obj.cloud[:, 2].max()):.3f} m), or ask for a --direction from above (0 0 -1)"
             )
         with _timed(self.timings, "rank"):
             scored = found.replace(score=score_grasps(hand, obj, found))
-        ranked = scored.sorted_by_score()
+        ranked = scored.sorted_by_score()[slice(0, wanted)]
         self.predicted_points = ranked.extra[PREDICTED].unflatten(1, (-1, 3))
         return ranked.replace(extra={k: v for k, v in ranked.extra.items() if k != PREDICTED})
 
@@ -256,14 +259,18 @@ def above_table(hand: Hand, grasps: GraspBatch, table: float) -> Tensor:
     return lowest > table
 
 
-def check_request(num: int, direction: tuple[float, float, float] | None, temperature: float | None = None) -> None:
+def check_request(
+    num: int, direction: tuple[float, float, float] | None, temperature: float | None = None, candidates: int = 1
+) -> None:
     """Refuse impossible requests before any work.
 
     Raises:
-        OptionError: `num` is not positive, `direction` is zero or not finite, or `temperature` is out of range.
+        OptionError: `num` or `candidates` is not positive, `direction` is zero or not finite, or `temperature` is out of range.
     """
     if num < 1:
         raise OptionError(f"num is {num}; ask for at least one grasp (--num 16)")
+    if candidates < 1:
+        raise OptionError(f"candidates is {candidates}; predict at least one for each grasp")
     if direction is not None:
         length = math.sqrt(sum(x * x for x in direction))
         if not math.isfinite(length) or length < 1e-9:

@@ -39,6 +39,8 @@ class Generate:
     """An object's name (see `dro-grasp objects`), a mesh, a point cloud (PLY, NPY, PCD), or a folder of them."""
     num: int = 16
     """How many grasps of each object."""
+    candidates: int = 4
+    """Grasps that are predicted for each one that is kept; the best by score are. 1 is quickest."""
     seed: int = 0
     """The same seed gives the same grasps."""
     direction: Annotated[tuple[float, float, float] | None, optional("X Y Z", "any direction")] = None
@@ -78,7 +80,7 @@ class Generate:
         from dro_grasp.objects.library import resolve_objects
         from dro_grasp.predictor import GraspPredictor, PredictorConfig, check_request
 
-        check_request(self.num, self.direction, self.temperature)
+        check_request(self.num, self.direction, self.temperature, self.candidates)
         check_seed(self.seed)
         names = resolve_objects([self.object])
         several = names != [self.object]
@@ -111,7 +113,8 @@ class Generate:
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
         with progress_bar("predicting", self.json) as progress:
-            grasps = predictor.predict(hand, obj, self.num, self.seed, self.direction, self.table, self.refine, progress)
+            grasps = predictor.predict(
+                hand, obj, self.num, self.seed, self.direction, self.table, self.refine, progress, self.candidates)
         points, timings = predictor.predicted_points, dict(predictor.timings)
         begin = time.perf_counter()
         result, protocol = self._try(hand, obj, grasps)

@@ -24,7 +24,7 @@ class View:
     Example: dro-grasp view grasps.parquet
     """
 
-    file: tyro.conf.Positional[Path | None] = None
+    file: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[FILE]")] = None
     """Grasp file; without one the page lets you pick or upload a hand and an object, generate, watch trials and export."""
     hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Hand to use instead of the one that the file names or remembers."""
