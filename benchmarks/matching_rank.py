@@ -51,8 +51,8 @@ def draw(encoder: StaticGraphEncoder, source: SampleSource, path: Path) -> None:
 def tile(points: torch.Tensor, colours: torch.Tensor) -> np.ndarray:
     """One hand as coloured dots."""
     cloud = points.numpy()
-    meshes = [dots(p[None], tuple(c), radius=0.004) for p, c in zip(cloud, colours.tolist(), strict=True)]
-    return render(meshes, Camera.around(cloud, (0.6, -1.0, 0.5)), *TILE)
+    meshes = [dots(p[None], tuple(c), radius=0.005) for p, c in zip(cloud, colours.tolist(), strict=True)]
+    return render(meshes, Camera.around(cloud, (0.6, -1.0, 0.5), aspect=TILE[0] / TILE[1]), *TILE)
 
 
 def main() -> None:
