@@ -99,20 +99,19 @@ def completed(
         normals: Outward unit normals there.
         towards: Unit vector to the camera; without it the mean normal, which of a closed surface is zero.
     """
-    if towards is None:
-        mean = normals.mean(0)
-        towards = mean / max(float(np.linalg.norm(mean)), 1e-9)
-    along = points @ towards
+    mean = normals.mean(0)
+    view: np.ndarray = mean / max(float(np.linalg.norm(mean)), 1e-9) if towards is None else towards
+    along = points @ view
     # A few of the last points belong to grazing or noisy pixels.
     last, edge = np.quantile(along, (RIM, 5 * RIM))
-    facing = float(np.clip((normals[along <= edge] @ towards).mean(), 0, 1))
-    helper = np.eye(3)[np.abs(towards).argmin()]
-    side = np.cross(towards, helper) / np.linalg.norm(np.cross(towards, helper))
-    across = np.stack([points @ side, points @ np.cross(towards, side)])
+    facing = float(np.clip((normals[along <= edge] @ view).mean(), 0, 1))
+    helper = np.eye(3)[np.abs(view).argmin()]
+    side = np.cross(view, helper) / np.linalg.norm(np.cross(view, helper))
+    across = np.stack([points @ side, points @ np.cross(view, side)])
     axes = np.linalg.eigh(np.cov(across))[1]
     width = float(np.ptp(axes.T @ across, axis=1).min())
-    behind = points + 2 * (last - facing * width / 2 - along)[:, None] * towards
-    mirrored = normals - 2 * (normals @ towards)[:, None] * towards
+    behind = points + 2 * (last - facing * width / 2 - along)[:, None] * view
+    mirrored = normals - 2 * (normals @ view)[:, None] * view
     return np.concatenate([points, behind]), np.concatenate([normals, mirrored])
 
 
