@@ -41,7 +41,7 @@ rehearse: setup  # training at paper size as on a GPU machine, small enough for 
 	$(BIN)/dro-grasp dataset bundle $(REHEARSAL)/data --output $(REHEARSAL)/bundle.safetensors
 	export PATH=$(abspath $(BIN)):$$PATH OMP_NUM_THREADS=1 PROCESSES=2 RUNS=$(REHEARSAL)/runs OUT=$(REHEARSAL)/out \
 		BUNDLE=$(REHEARSAL)/bundle.safetensors VALIDATION=$(REHEARSAL)/bundle.safetensors \
-		PRETRAIN='--size paper --steps 2' TRAIN='--size paper --steps 3 --samples-per-hand 1'; \
+		PRETRAIN='--size paper --steps 2' TRAIN='--size paper --steps 3 --samples-per-hand 1 --validation-samples 4'; \
 	timeout --signal KILL 30 scripts/train_on_bare_machine.sh; scripts/train_on_bare_machine.sh
 	cd $(REHEARSAL)/out && cat multi.safetensors.* > multi.safetensors && sha256sum --check multi.sha256
 	$(BIN)/dro-grasp weights verify $(REHEARSAL)/out/multi.safetensors

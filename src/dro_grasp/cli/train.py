@@ -151,6 +151,8 @@ class Train:
     """Where to compute: cpu, cuda, or cuda:1."""
     validation: Annotated[Path | None, optional("PATH", "no errors")] = None
     """Bundle of grasps that are not trained on, of which the weights' distance errors are reported in the end."""
+    validation_samples: int = 400
+    """Of these, for each hand."""
     seed: int = 0
     """Seed of everything."""
     json: Flag = False
@@ -191,7 +193,7 @@ class Train:
             "stage": "training", "pretrained": self.pretrained is not None, "initial": self.initial, "data": bundle.summary(),
         }
         save_weights(model, self.output, about)
-        errors = [] if validation is None else distance_errors(load_weights(self.output), validation)
+        errors = [] if validation is None else distance_errors(load_weights(self.output), validation, self.validation_samples)
         report = {"output": str(self.output), "steps": about["steps"], "log": str(self.run_folder / "log.jsonl")}
         if self.json:
             print_json(report | {"distance_errors": [dataclasses.asdict(e) for e in errors]})
