@@ -35,14 +35,14 @@ docs: setup  # the documents as a site in out/site; fails on unknown names and b
 	$(BIN)/zensical build --strict --clean
 
 REHEARSAL := out/rehearsal
-rehearse: setup  # training at paper size as on a GPU machine, small enough for two minutes here: killed once, then finished
+rehearse: setup  # the training of a GPU machine with the slim network, in two minutes here: killed once, then finished
 	rm -rf $(REHEARSAL) && mkdir -p $(REHEARSAL)/out
 	$(BIN)/dro-grasp synthesize --hand barrett gripper3 --object can torus --grasps 8 --output $(REHEARSAL)/data
 	$(BIN)/dro-grasp dataset bundle $(REHEARSAL)/data --output $(REHEARSAL)/bundle.safetensors
 	export PATH=$(abspath $(BIN)):$$PATH OMP_NUM_THREADS=1 PROCESSES=2 RUNS=$(REHEARSAL)/runs OUT=$(REHEARSAL)/out \
 		BUNDLE=$(REHEARSAL)/bundle.safetensors VALIDATION=$(REHEARSAL)/bundle.safetensors \
-		PRETRAIN='--size paper --steps 2' TRAIN='--size paper --steps 3 --samples-per-hand 1 --validation-samples 4'; \
-	timeout --signal KILL 30 scripts/train_on_bare_machine.sh; scripts/train_on_bare_machine.sh
+		PRETRAIN='--size slim --steps 4' TRAIN='--size slim --steps 10 --validation-samples 20'; \
+	timeout --signal KILL 20 scripts/train_on_bare_machine.sh; scripts/train_on_bare_machine.sh
 	cd $(REHEARSAL)/out && cat multi.safetensors.* > multi.safetensors && sha256sum --check multi.sha256
 	$(BIN)/dro-grasp weights verify $(REHEARSAL)/out/multi.safetensors
 
