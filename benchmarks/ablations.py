@@ -24,6 +24,7 @@ from synthesis import HANDS
 
 from dro_grasp.cli.main import main as command
 from dro_grasp.datasets.bundle import Bundle, load_bundle
+from dro_grasp.datasets.splits import HELD_OUT_HANDS
 from dro_grasp.evaluation.benchmark import ALL, RAW, REFINED, BenchmarkConfig, benchmark
 from dro_grasp.evaluation.distance_error import distance_errors
 from dro_grasp.hands.library import load_hand
@@ -43,7 +44,7 @@ from dro_grasp.training.config import (
 from dro_grasp.training.loop import train
 from dro_grasp.training.pretraining import pretrain, pretrain_motion
 
-HELD_OUT = ("assets/inspire", "assets/ability", "assets/dclaw", "assets/orca", "assets/ezgripper")
+HELD_OUT = tuple(sorted(HELD_OUT_HANDS))
 FEW_SHOT = ("assets/inspire", "assets/dclaw", "assets/orca")
 OTHERS = ("assets/leaphand", "assets/allegro_right", "allegro", "barrett", "gripper3", "leaphand", "shadowhand")
 PER_PAIR = 100
@@ -88,8 +89,8 @@ ROWS = {
     "z: flow": Ablation(network={"prior": "flow"}, losses=LossConfig(divergence=0.0003)),
     "z: motion, flow": Ablation(network={"prior": "flow", **MOTION}, losses=LossConfig(divergence=0.0003)),
     "z: motion, flow, 0.001": Ablation(network={"prior": "flow", **MOTION}, losses=LossConfig(divergence=0.001)),
-    "ten hands, wrist axes": Ablation(hands=(*HANDS, *OTHERS), tried=HELD_OUT),
-    "ten hands, palm axes": Ablation(hands=(*HANDS, *OTHERS), tried=HELD_OUT, network={"frame": "palm"}),
+    "ten hands, wrist axes": Ablation(hands=(*HANDS, *OTHERS), tried=HELD_OUT, network={"frame": "wrist"}),
+    "ten hands, palm axes": Ablation(hands=(*HANDS, *OTHERS), tried=HELD_OUT),
     **{
         f"{hand.split('/')[1]}, {count} grasps": Ablation(
             hands=(hand,), tried=(hand,), fine_tuned=True, grasps=count, share=0.3)

@@ -14,7 +14,7 @@ import torch
 from report import emit
 from synthesis import HANDS
 
-from dro_grasp.evaluation.coverage import HALF_AXES, half_axis, palm_angles
+from dro_grasp.evaluation.coverage import HALF_AXES, half_axis, half_axis_direction, palm_angles
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.library import load_object, resolve_objects
 from dro_grasp.predictor import GraspPredictor
@@ -33,7 +33,7 @@ def main() -> None:
     torch.set_num_threads(1)
     predictor = GraspPredictor(options.weights)
     objects = [load_object(name) for name in resolve_objects(["assets:validate"])]
-    axes = [tuple(sign * x for x in axis) for axis in torch.eye(3).tolist() for sign in (1.0, -1.0)]
+    axes = [half_axis_direction(name) for name in HALF_AXES]
     rows = []
     for name in HANDS:
         hand = load_hand(name)

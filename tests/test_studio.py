@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import subprocess
-import sys
 import time
 import zipfile
 from pathlib import Path
@@ -16,14 +14,14 @@ import viser
 import yaml
 
 from dro_grasp.errors import OptionError
-from dro_grasp.evaluation.coverage import HALF_AXES
+from dro_grasp.evaluation.coverage import HALF_AXES, half_axis_direction
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import BUILTIN_FOLDER
 from dro_grasp.objects.library import load_object
 from dro_grasp.viewer import studio as module
-from dro_grasp.viewer.studio import EXPORTS, Studio, axis_of, chosen
+from dro_grasp.viewer.studio import EXPORTS, Studio, chosen
 from dro_grasp.viewer.uploads import MOST_BYTES, store_upload
-from tests.test_viewer import CHROMIUM, FLAGS, free_port
+from tests.browser import free_port, page_of
 from tests.weights import untrained_weights
 
 pytestmark = pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")
@@ -72,7 +70,7 @@ def test_filters_keep_what_they_say(studio: Studio, made: module.Made) -> None:
     for axis in HALF_AXES:
         keep = chosen(made.hand, half, "all", axis)
         counts += int(keep.sum())
-        assert bool((palms[keep] @ torch.tensor(axis_of(axis)) > 0.57).all())
+        assert bool((palms[keep] @ torch.tensor(half_axis_direction(axis)) > 0.57).all())
     assert counts == 6
     studio.palm.value = next(a for a in HALF_AXES if not chosen(made.hand, made.refined, "all", a).any())
     studio._filter()
@@ -163,48 +161,30 @@ def test_uploads_that_could_harm_are_refused(name: str, content: bytes, word: st
 
 @pytest.mark.slow
 def test_a_browser_goes_all_the_way(tmp_path: Path) -> None:
-    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install -e '.[browser]'")
-    if CHROMIUM is None:
-        pytest.skip("needs a browser: install chromium")
-    port = free_port()
     mesh, urdf = tmp_path / "block.stl", tmp_path / "mine.urdf"
     urdf.write_bytes((BUILTIN_FOLDER / "gripper3.urdf").read_bytes())
     import trimesh
 
     box = load_object("sphere")
     trimesh.Trimesh(box.vertices, box.faces).export(mesh)
-    start = "from dro_grasp.cli.main import main; main()"
-    server = subprocess.Popen([sys.executable, "-c", start, "view", "--port", str(port)], stderr=subprocess.PIPE, text=True)
-    try:
-        assert server.stderr is not None
-        while "viewer: http" not in server.stderr.readline():
-            assert server.poll() is None
-        with playwright.sync_playwright() as play:
-            browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-            page = browser.new_page(viewport={"width": 1280, "height": 860})
-            page.goto(f"http://127.0.0.1:{port}")
-            page.wait_for_selector("canvas", timeout=60_000)
-            inputs = page.locator("input[type=file]")
-            inputs.nth(0).set_input_files(urdf)
-            page.get_by_text("mine.urdf is picked").wait_for(timeout=60_000)
-            inputs.nth(1).set_input_files(mesh)
-            page.get_by_text("block.stl is picked").wait_for(timeout=60_000)
-            page.get_by_role("button", name="Generate", exact=True).click(timeout=60_000)
-            page.get_by_text("held under").wait_for(timeout=180_000)
-            page.get_by_role("button", name="network", exact=True).click(timeout=60_000)
-            page.get_by_role("button", name="refined", exact=True).click(timeout=60_000)
-            page.get_by_role("button", name="Play the trial").click(timeout=60_000)
-            page.get_by_text("Played.").wait_for(timeout=180_000)
-            time.sleep(1)
-            with page.expect_download(timeout=60_000) as download:
-                page.get_by_role("button", name="Download what is shown").click()
-            saved = tmp_path / "taken.parquet"
-            download.value.save_as(saved)
-            time.sleep(3)
-            page.screenshot(path=tmp_path / "page.png")
-            browser.close()
-        assert len(GraspBatch.load(saved)) == 12
-        assert (tmp_path / "page.png").stat().st_size > 20_000
-    finally:
-        server.terminate()
-        server.wait(timeout=20)
+    with page_of(size=(1280, 860)) as page:
+        inputs = page.locator("input[type=file]")
+        inputs.nth(0).set_input_files(urdf)
+        page.get_by_text("mine.urdf is picked").wait_for(timeout=60_000)
+        inputs.nth(1).set_input_files(mesh)
+        page.get_by_text("block.stl is picked").wait_for(timeout=60_000)
+        page.get_by_role("button", name="Generate", exact=True).click(timeout=60_000)
+        page.get_by_text("held under").wait_for(timeout=180_000)
+        page.get_by_role("button", name="network", exact=True).click(timeout=60_000)
+        page.get_by_role("button", name="refined", exact=True).click(timeout=60_000)
+        page.get_by_role("button", name="Play the trial").click(timeout=60_000)
+        page.get_by_text("Played.").wait_for(timeout=180_000)
+        time.sleep(1)
+        with page.expect_download(timeout=60_000) as download:
+            page.get_by_role("button", name="Download what is shown").click()
+        saved = tmp_path / "taken.parquet"
+        download.value.save_as(saved)
+        time.sleep(3)
+        page.screenshot(path=tmp_path / "page.png")
+    assert len(GraspBatch.load(saved)) == 12
+    assert (tmp_path / "page.png").stat().st_size > 20_000

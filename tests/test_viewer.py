@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import shutil
-import socket
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -21,16 +17,9 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.library import load_object
 from dro_grasp.viewer.app import HOST, GraspViewer, describe
 from dro_grasp.viewer.scene import success_colour
+from tests.browser import free_port, page_of
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-FLAGS = ["--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 pytestmark = pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind((HOST, 0))
-        return probe.getsockname()[1]
 
 
 @pytest.fixture(scope="module")
@@ -111,36 +100,14 @@ def test_nothing_to_show_and_foreign_hands_are_refused(grasps: GraspBatch) -> No
 
 @pytest.mark.slow
 def test_a_browser_shows_the_grasp(grasps: GraspBatch, tmp_path: Path) -> None:
-    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install -e '.[browser]'")
-    if CHROMIUM is None:
-        pytest.skip("needs a browser: install chromium")
-    file, port = tmp_path / "grasps.parquet", free_port()
+    file = tmp_path / "grasps.parquet"
     grasps.save(file)
-    # A process of its own: the server's event loop and playwright's do not share one well.
-    start = "from dro_grasp.cli.main import main; main()"
-    command = [sys.executable, "-c", start, "view", str(file), "--port", str(port)]
-    server = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    try:
-        assert server.stderr is not None
-        while "viewer: http" not in server.stderr.readline():
-            assert server.poll() is None
-        with playwright.sync_playwright() as play:
-            browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-            page = browser.new_page(viewport={"width": 1000, "height": 700})
-            errors: list[str] = []
-            page.on("console", lambda m: errors.append(m.text) if m.type == "error" else None)
-            page.goto(f"http://{HOST}:{port}")
-            page.wait_for_selector("canvas", timeout=60_000)
-            page.get_by_text("success under dro/1").wait_for(timeout=60_000)
-            page.get_by_role("button", name="open", exact=True).click(timeout=60_000)
-            page.get_by_text("Solved hand points").click(timeout=60_000)
-            time.sleep(4)
-            page.screenshot(path=str(tmp_path / "viewer.png"))
-            browser.close()
-        assert errors == []
-    finally:
-        server.terminate()
-        server.communicate(timeout=20)
+    with page_of(str(file), size=(1000, 700)) as page:
+        page.get_by_text("success under dro/1").wait_for(timeout=60_000)
+        page.get_by_role("button", name="open", exact=True).click(timeout=60_000)
+        page.get_by_text("Solved hand points").click(timeout=60_000)
+        time.sleep(4)
+        page.screenshot(path=str(tmp_path / "viewer.png"))
     from PIL import Image
 
     with Image.open(tmp_path / "viewer.png") as file_:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -16,11 +16,21 @@ if TYPE_CHECKING:
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 
 
-def network_config(size: str) -> NetworkConfig:
-    """The network configuration of a size."""
+def network_config(size: str, latent: int | None, **changes: Any) -> NetworkConfig:
+    """The network configuration of a size, with another number of latents if one is given, and other changes.
+
+    Raises:
+        OptionError: The number is not positive.
+    """
+    import dataclasses
+
+    from dro_grasp.errors import OptionError
     from dro_grasp.models.network import NetworkConfig
 
-    return NetworkConfig.slim() if size == "slim" else NetworkConfig.paper()
+    network = NetworkConfig.slim() if size == "slim" else NetworkConfig.paper()
+    if latent is not None and latent < 1:
+        raise OptionError(f"latent is {latent}; z needs at least one number")
+    return dataclasses.replace(network, latent=network.latent if latent is None else latent, **changes)
 
 
 @dataclass(frozen=True)
@@ -38,6 +48,8 @@ class Pretrain:
     """Weights file to write."""
     size: Literal["slim", "paper"] = "slim"
     """Network size."""
+    latent: Annotated[int | None, optional("N", "the size's")] = None
+    """Numbers in z."""
     latent_form: Literal["kernel", "motion"] = "kernel"
     """With `motion`, z also learns to say how hands move, after the encoder and in a folder of its own in the run folder."""
     steps: int = 3000
@@ -75,7 +87,7 @@ class Pretrain:
 
         check_output(self.output)
         bundle = load_bundle(self.bundle)
-        network = dataclasses.replace(network_config(self.size), latent_form=self.latent_form)
+        network = network_config(self.size, self.latent, latent_form=self.latent_form)
         schedule = ScheduleConfig(
             steps=self.steps, minutes=self.minutes, shards=self.shards, tensorboard=self.tensorboard,
             device=choose_device(self.device), seed=self.seed,
@@ -131,6 +143,8 @@ class Train:
     """Peak of the learning rate."""
     prior: Literal["standard", "learned", "flow"] = "standard"
     """What z is drawn from: N(0, I), the paper's form, or a Gaussian or a flow learned from hand and object."""
+    latent: Annotated[int | None, optional("N", "the size's")] = None
+    """Numbers in z."""
     latent_form: Literal["kernel", "motion"] = "kernel"
     """What z does: it enters the kernel alone, the paper's form, or also moves the placed open hand."""
     divergence: float = 0.01
@@ -185,7 +199,7 @@ class Train:
                 divergence=self.divergence, divergence_warmup=self.divergence_warmup, free_bits=self.free_bits),
             augmentation=AugmentationConfig(partial=self.partial),
         )
-        network = dataclasses.replace(network_config(self.size), prior=self.prior, latent_form=self.latent_form)
+        network = network_config(self.size, self.latent, prior=self.prior, latent_form=self.latent_form)
         model = train(bundle, network, config, self.run_folder, pretrained, name=self.output.stem, initial=initial)
         if not is_first():
             return 0

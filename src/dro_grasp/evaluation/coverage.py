@@ -115,6 +115,13 @@ def half_axis(directions: Float[Tensor, "n 3"]) -> Int[Tensor, " n"]:
     return 2 * axis + (directions.gather(1, axis[:, None])[:, 0] < 0)
 
 
+def half_axis_direction(name: str) -> tuple[float, float, float]:
+    """The unit vector that one of HALF_AXES names."""
+    sign = 1.0 if name[0] == "+" else -1.0
+    x, y, z = (sign if letter == name[1] else 0.0 for letter in "xyz")
+    return x, y, z
+
+
 def palm_angles(hand: Hand, grasps: GraspBatch, direction: tuple[float, float, float]) -> Float[Tensor, " n"]:
     """Angle between the palm direction of each grasp and the one asked for, of any length [rad]."""
     obtained, asked = hand.palm_directions(grasps.T_object_wrist), torch.tensor(direction)

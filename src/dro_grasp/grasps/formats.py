@@ -30,7 +30,6 @@ APPROACH, SHORTEST_APPROACH = 0.10, 0.02
 """Wished and least way of the hand along its palm direction before the grasp [m]."""
 RETREAT, SHORTEST_RETREAT = 0.10, 0.02
 """Wished and least way up after it [m]."""
-POSTURES = ("pregrasp", "grasp", "squeeze")
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ class Frame:
 def isaac_grasp(grasps: GraspBatch, frame: Frame) -> str:
     """An isaac_grasp YAML file, format version 1.0, of grasps of one object, with pregrasps."""
     position, quaternion = frame.place(grasps)
-    pregrasp, _ = _postures(grasps)
+    pregrasp = _postures(grasps)["pregrasp"]
     entries = {}
     for i in range(len(grasps)):
         w, *xyz = _plain(quaternion[i])
@@ -79,7 +78,7 @@ def moveit_grasps(grasps: GraspBatch, hand: Hand, frame: Frame) -> str:
     The hand approaches along its palm direction and retreats along z of the frame, which is up in a robot's base.
     """
     position, quaternion = frame.place(grasps)
-    pregrasp, squeeze = _postures(grasps)
+    postures = _postures(grasps)
     header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": _frame_of(grasps, frame)}
     at_wrist = {**header, "frame_id": grasps.wrist_link}
 
@@ -97,7 +96,8 @@ def moveit_grasps(grasps: GraspBatch, hand: Hand, frame: Frame) -> str:
         orientation = dict(zip("wxyz", _plain(quaternion[i]), strict=True))
         pose = {"position": dict(zip("xyz", _plain(position[i]), strict=True)), "orientation": orientation}
         messages.append({
-            "id": f"grasp_{i}", "pre_grasp_posture": posture(pregrasp[i]), "grasp_posture": posture(squeeze[i]),
+            "id": f"grasp_{i}", "pre_grasp_posture": posture(postures["pregrasp"][i]),
+            "grasp_posture": posture(postures["squeeze"][i]),
             "grasp_pose": {"header": header, "pose": pose}, "grasp_quality": _confidence(grasps, i),
             "pre_grasp_approach": way(at_wrist, hand.palm_direction_wrist, APPROACH, SHORTEST_APPROACH),
             "post_grasp_retreat": way(header, torch.tensor([0.0, 0.0, 1.0]), RETREAT, SHORTEST_RETREAT),
@@ -110,11 +110,11 @@ def moveit_grasps(grasps: GraspBatch, hand: Hand, frame: Frame) -> str:
 def csv_table(grasps: GraspBatch, frame: Frame) -> str:
     """One line a grasp: pose, score, outcome and the joints of all postures, after comment lines."""
     position, quaternion = frame.place(grasps)
-    postures = dict(zip(POSTURES, (_postures(grasps)[0], grasps.joints, _postures(grasps)[1]), strict=True))
+    postures = _postures(grasps)
     text = io.StringIO()
     text.write(_comment(grasps, frame))
     writer = csv.writer(text, lineterminator="\n")
-    names = [f"{posture}:{joint}" for posture in POSTURES for joint in grasps.joint_names]
+    names = [f"{posture}:{joint}" for posture in postures for joint in grasps.joint_names]
     writer.writerow(["object", "x", "y", "z", "qw", "qx", "qy", "qz", "score", "success", "protocol", *names])
     for i in range(len(grasps)):
         tried = grasps.success is not None and bool(grasps.tried[i])
@@ -135,14 +135,13 @@ def dexgraspbench(grasps: GraspBatch, frame: Frame, object_path: str, scale: flo
     as well.
     """
     position, quaternion = frame.place(grasps)
-    pregrasp, squeeze = _postures(grasps)
+    postures = _postures(grasps)
     turn = roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(frame.T_frame_object[:3, :3].double()))
     pose = torch.cat([frame.T_frame_object[:3, 3].double(), turn])
     found = []
     for i in range(len(grasps)):
         wrist = torch.cat([position[i], quaternion[i]])
-        qpos = {f"{name}_qpos": torch.cat([wrist, joints[i].double()]).numpy()
-                for name, joints in zip(POSTURES, (pregrasp, grasps.joints, squeeze), strict=True)}
+        qpos = {f"{name}_qpos": torch.cat([wrist, joints[i].double()]).numpy() for name, joints in postures.items()}
         found.append({
             **qpos, "obj_scale": scale, "obj_pose": pose.numpy(), "obj_path": object_path, "hand": grasps.hand,
             "wrist_link": grasps.wrist_link, "joint_names": list(grasps.joint_names), "frame": _frame_of(grasps, frame),
@@ -151,15 +150,15 @@ def dexgraspbench(grasps: GraspBatch, frame: Frame, object_path: str, scale: flo
     return found
 
 
-def _postures(grasps: GraspBatch) -> tuple[Tensor, Tensor]:
-    """Joints of pregrasp and squeeze.
+def _postures(grasps: GraspBatch) -> dict[str, Float[Tensor, "n n_dof"]]:
+    """Joints of pregrasp, grasp and squeeze, in the order in which a hand goes through them.
 
     Raises:
         OptionError: The grasps have none.
     """
     if grasps.pregrasp_joints is None or grasps.squeeze_joints is None:
         raise OptionError("these grasps have no pregrasp and squeeze; `dro-grasp export` makes them")
-    return grasps.pregrasp_joints, grasps.squeeze_joints
+    return {"pregrasp": grasps.pregrasp_joints, "grasp": grasps.joints, "squeeze": grasps.squeeze_joints}
 
 
 def _confidence(grasps: GraspBatch, i: int) -> float:

@@ -14,7 +14,7 @@ from dro_grasp.datasets.bundle import load_bundle
 from dro_grasp.datasets.bundling import make_bundle
 from dro_grasp.datasets.collections import count_collection
 from dro_grasp.datasets.engine import synthesize_dataset
-from dro_grasp.datasets.splits import FEW_SHOT, split_of
+from dro_grasp.datasets.splits import split_of
 from dro_grasp.errors import BundleError, OptionError
 from dro_grasp.evaluation.benchmark import RAW, REFINED, BenchmarkConfig, benchmark
 from dro_grasp.files import make_folder, replacing
@@ -170,8 +170,7 @@ class _Way:
 
     def _training(self) -> dict[str, Any]:
         path = self.folder / "bundle.safetensors"
-        split = FEW_SHOT if split_of(self.hand.name, "train") == FEW_SHOT else "train"
-        make_bundle([self.folder / DATA], path, split)
+        make_bundle([self.folder / DATA], path, split_of(self.hand.name, "train"))
         bundle, initial = load_bundle(path), load_weights(self.config.weights)
         schedule = ScheduleConfig(
             steps=10**6, minutes=self.config.minutes * TRAINING_SHARE, learning_rate=self.config.learning_rate,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from typing import Literal, cast
+from typing import Literal, Protocol, cast, runtime_checkable
 
 import numpy as np
 import torch
@@ -123,14 +123,33 @@ def view_grasps(
     host: str = HOST,
 ) -> None:
     """Serve the viewer until Ctrl-C; arguments as for `GraspViewer`."""
-    viewer = GraspViewer(hand, obj, grasps, predicted_points, port, host)
-    print(f"viewer: {viewer.url} (Ctrl-C ends it)", file=sys.stderr, flush=True)
+    serve(GraspViewer(hand, obj, grasps, predicted_points, port, host))
+
+
+@runtime_checkable
+class Page(Protocol):
+    """What is served: a viewer or a studio."""
+
+    server: viser.ViserServer
+
+    @property
+    def url(self) -> str:
+        """Where to point the browser."""
+        ...
+
+    def stop(self) -> None:
+        """Stop serving."""
+
+
+def serve(page: Page) -> None:
+    """Say where the page is, and serve it until Ctrl-C."""
+    print(f"viewer: {page.url} (Ctrl-C ends it)", file=sys.stderr, flush=True)
     try:
-        viewer.server.sleep_forever()
+        page.server.sleep_forever()
     except KeyboardInterrupt:
         pass
     finally:
-        viewer.stop()
+        page.stop()
 
 
 def outcome(grasps: GraspBatch, index: int) -> bool | None:

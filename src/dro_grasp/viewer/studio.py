@@ -18,7 +18,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from dro_grasp.errors import DroGraspError
-from dro_grasp.evaluation.coverage import HALF_AXES, half_axis
+from dro_grasp.evaluation.coverage import HALF_AXES, half_axis, half_axis_direction
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.formats import Frame, csv_table, isaac_grasp, moveit_grasps
 from dro_grasp.grasps.ranking import score_grasps
@@ -30,7 +30,7 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predictor import GraspPredictor, PredictorConfig
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.trial import record, simulate
-from dro_grasp.viewer.app import HOST, POSTURES, Posture, describe, outcome, postures_of
+from dro_grasp.viewer.app import HOST, POSTURES, Posture, describe, outcome, postures_of, serve
 from dro_grasp.viewer.stage import Stage
 from dro_grasp.viewer.uploads import store_upload
 
@@ -128,7 +128,7 @@ class Studio:
         """
         loaded, target = load_hand(hand), load_object(obj)
         self.predictor.config = PredictorConfig(temperature=temperature)
-        along = None if direction == ANY else axis_of(direction)
+        along = None if direction == ANY else half_axis_direction(direction)
         raw = self.predictor.predict(loaded, target, num, direction=along, refine=False)
         refined = refine_grasps(loaded, target, raw)
         refined = refined.replace(score=score_grasps(loaded, target, refined))
@@ -232,7 +232,7 @@ class Studio:
         some = bool(self.shown)
         self.slider.max = max(1, len(self.shown) - 1)
         self.slider.disabled = len(self.shown) < 2
-        self.play.disabled = self.download.disabled = not some or self.made.obj.is_cloud
+        self.play.disabled = not some or self.made.obj.is_cloud
         self.download.disabled = not some
         self.slider.value = 0
         if some:
@@ -299,20 +299,6 @@ def chosen(hand: Hand, grasps: GraspBatch, success: str, palm: str) -> Bool[Tens
     return keep
 
 
-def axis_of(name: str) -> tuple[float, float, float]:
-    """The direction that one of HALF_AXES names."""
-    sign = 1.0 if name[0] == "+" else -1.0
-    x, y, z = (sign if letter == name[1] else 0.0 for letter in "xyz")
-    return x, y, z
-
-
 def serve_studio(weights: str | None, port: int, host: str) -> None:
     """Serve the page until Ctrl-C."""
-    studio = Studio(weights=weights, port=port, host=host)
-    print(f"viewer: {studio.url} (Ctrl-C ends it)", file=sys.stderr, flush=True)
-    try:
-        studio.server.sleep_forever()
-    except KeyboardInterrupt:
-        pass
-    finally:
-        studio.stop()
+    serve(Studio(weights=weights, port=port, host=host))

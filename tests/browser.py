@@ -1,0 +1,54 @@
+"""A headless browser on a page that a process of its own serves."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+HOST = "127.0.0.1"
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+FLAGS = ["--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind((HOST, 0))
+        return probe.getsockname()[1]
+
+
+@contextmanager
+def page_of(*arguments: str, size: tuple[int, int]) -> Iterator[Any]:
+    """The page that `dro-grasp view` serves with these arguments; its console must stay without errors.
+
+    The server runs in a process of its own: its event loop and playwright's do not share one well.
+    """
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install -e '.[browser]'")
+    if CHROMIUM is None:
+        pytest.skip("needs a browser: install chromium")
+    port = free_port()
+    command = [sys.executable, "-m", "dro_grasp", "view", *arguments, "--port", str(port)]
+    server = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    try:
+        assert server.stderr is not None
+        while "viewer: http" not in server.stderr.readline():
+            assert server.poll() is None
+        with playwright.sync_playwright() as play:
+            browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+            page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+            errors: list[str] = []
+            page.on("console", lambda m: errors.append(m.text) if m.type == "error" else None)
+            page.goto(f"http://{HOST}:{port}")
+            page.wait_for_selector("canvas", timeout=60_000)
+            yield page
+            browser.close()
+        assert errors == []
+    finally:
+        server.terminate()
+        server.communicate(timeout=20)
