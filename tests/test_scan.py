@@ -14,9 +14,8 @@ from scipy.spatial.transform import Rotation
 from dro_grasp.cli.main import main
 from dro_grasp.errors import ObjectError
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.objects.camera import DepthCamera, visible_points
 from dro_grasp.objects.library import load_object
-from dro_grasp.objects.scan import completed, depth_points, scanned_object, without_outliers
+from dro_grasp.objects.scan import depth_points, scanned_object, without_outliers
 from dro_grasp.objects.shape import ObjectModel
 from tests.weights import untrained_weights
 
@@ -84,30 +83,6 @@ def test_a_scan_is_in_the_frame_asked_for_and_looks_at_the_camera(
     own = np.cross(*(mug.vertices[mug.faces[face, k]] - mug.vertices[mug.faces[face, 0]] for k in (1, 2)))
     own /= np.linalg.norm(own, axis=1, keepdims=True)
     assert np.median((own * scan.cloud_normals).sum(1)) > 0.95
-
-
-@pytest.mark.parametrize("known", [True, False], ids=["camera known", "camera unknown"])
-def test_the_side_that_is_not_seen_of_a_ball_is_round_as_well(known: bool) -> None:
-    generator = torch.Generator().manual_seed(0)
-    ball = load_object("sphere")
-    radius = float(np.linalg.norm(ball.vertices, axis=1).mean())
-    seen = visible_points(ball, torch.tensor([0.0, 0.0, 1.0]), generator, DepthCamera(noise=0)).double().numpy()
-    normals = seen / np.linalg.norm(seen, axis=1, keepdims=True)
-    points, outward = completed(seen, normals, np.array([0.0, 0.0, 1.0]) if known else None)
-    assert len(points) == 2 * len(seen)
-    off = np.abs(np.linalg.norm(points, axis=1) - radius)
-    assert np.quantile(off, 0.95) < 0.12 * radius
-    assert abs(points[:, 2].min() + radius) < 0.12 * radius, "as thick as it is wide"
-    assert np.mean((outward * points).sum(1) / np.linalg.norm(points, axis=1)) > 0.98
-    assert np.linalg.norm(points.mean(0)) < 0.1 * radius < np.linalg.norm(seen.mean(0))
-
-
-def test_a_face_alone_becomes_as_thick_as_its_smaller_half() -> None:
-    x, y = np.meshgrid(np.linspace(-0.03, 0.03, 25), np.linspace(-0.05, 0.05, 40))
-    face = np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.4)], 1)
-    points, normals = completed(face, np.tile([0.0, 0.0, -1.0], (len(face), 1)), np.array([0.0, 0.0, -1.0]))
-    assert np.ptp(points[:, 2]) == pytest.approx(0.06, abs=1e-6)
-    assert set(np.unique(normals[:, 2])) == {-1.0, 1.0}
 
 
 @pytest.mark.parametrize(

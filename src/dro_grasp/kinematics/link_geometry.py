@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dro_grasp.kinematics.tree_reading import quaternion_matrix
+
 if TYPE_CHECKING:
     import trimesh
 
@@ -47,7 +49,7 @@ def read_geometry(model: Any, link_of_body: dict[int, int]) -> tuple[LinkGeometr
         mesh = _mesh_of(model, g, hull=collides)
         if mesh is None:
             continue
-        rotation, position = _rotation(model.geom_quat[g]), model.geom_pos[g]
+        rotation, position = quaternion_matrix(model.geom_quat[g]), model.geom_pos[g]
         vertices = np.asarray(mesh.vertices) @ rotation.T + position
         visual = not collides or body not in visual_bodies
         shapes.append(LinkGeometry(link_of_body[body], vertices, np.asarray(mesh.faces), collides, visual))
@@ -81,13 +83,3 @@ def _mesh_of(model: Any, g: int, hull: bool) -> trimesh.Trimesh | None:
     if kind == BOX:
         return trimesh.creation.box(extents=2 * size)
     return None
-
-
-def _rotation(quaternion: np.ndarray) -> np.ndarray:
-    """Rotation matrix of a unit quaternion WXYZ."""
-    w, x, y, z = quaternion
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])

@@ -45,7 +45,7 @@ def read_tree(model: mujoco.MjModel, couplings: tuple[Coupling, ...], path: Path
             parent.append(above)
             T = np.eye(4)
             if order == 0 and b > 1:
-                T[:3, :3] = _quaternion_matrix(model.body_quat[b])
+                T[:3, :3] = quaternion_matrix(model.body_quat[b])
                 T[:3, 3] = model.body_pos[b]
             link_joint.append(j)
             slide = j >= 0 and model.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE
@@ -76,7 +76,7 @@ def _minus_reference(model: mujoco.MjModel, j: int) -> np.ndarray:
         T[:3, 3] = x * axis
         return T
     quaternion = np.concatenate([[math.cos(x / 2)], math.sin(x / 2) * axis])
-    T[:3, :3] = _quaternion_matrix(quaternion)
+    T[:3, :3] = quaternion_matrix(quaternion)
     T[:3, 3] = anchor - T[:3, :3] @ anchor
     return T
 
@@ -97,7 +97,8 @@ def _limits(model: mujoco.MjModel, free: list[int], coupling: np.ndarray, offset
     return lower, upper
 
 
-def _quaternion_matrix(quaternion: np.ndarray) -> np.ndarray:
+def quaternion_matrix(quaternion: np.ndarray) -> np.ndarray:
+    """Rotation matrix (3 3) of a unit quaternion WXYZ."""
     matrix = np.zeros(9)
     mujoco.mju_quat2Mat(matrix, np.asarray(quaternion, float))
     return matrix.reshape(3, 3)

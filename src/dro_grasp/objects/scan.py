@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Num
 
 from dro_grasp.errors import ObjectError
+from dro_grasp.objects.completion import completed
 from dro_grasp.objects.loading import cloud_object, estimate_normals
 from dro_grasp.objects.shape import ObjectModel
 
@@ -13,8 +14,6 @@ NEIGHBOURS = 12
 """Points that decide whether a point is an outlier."""
 TOLERANCE = 2.5
 """Outliers are farther from their neighbours than the mean by this many standard deviations."""
-RIM = 0.02
-"""Share of points that may lie behind the mirror."""
 FARTHEST = 10.0
 """Depths beyond this are in another unit [m]."""
 
@@ -63,7 +62,7 @@ def scanned_object(
         T_frame_camera: The camera's pose in the wanted frame, in which up, `direction` and `table` mean something; the
             camera's own when None.
         denoise: Drop points that lie apart from all others.
-        complete: Add a mirror image for the side that the camera does not see; leave it out for a scan from all sides.
+        complete: Add the side that the camera does not see, by symmetry; leave it out for a scan from all sides.
 
     Raises:
         ObjectError: Too few points are left, or they are not in metres.
@@ -84,35 +83,6 @@ def scanned_object(
         R = T_frame_camera[:3, :3]
         kept, normals = kept @ R.T + T_frame_camera[:3, 3], normals @ R.T
     return cloud_object(name, np.concatenate([kept, normals], 1), origin=name)
-
-
-def completed(
-    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], towards: Float[np.ndarray, "3"] | None = None
-) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
-    """Points and normals of both sides of an object of which one was seen: the other is taken to mirror it.
-
-    The mirror is at right angles to the view. It stands behind where the seen side ends, by as much as a round object goes on
-    from there: the more its rim still faces the camera, the farther, up to the half of its smaller width.
-
-    Args:
-        points: Of the seen side [m].
-        normals: Outward unit normals there.
-        towards: Unit vector to the camera; without it the mean normal, which of a closed surface is zero.
-    """
-    mean = normals.mean(0)
-    view: np.ndarray = mean / max(float(np.linalg.norm(mean)), 1e-9) if towards is None else towards
-    along = points @ view
-    # A few of the last points belong to grazing or noisy pixels.
-    last, edge = np.quantile(along, (RIM, 5 * RIM))
-    facing = float(np.clip((normals[along <= edge] @ view).mean(), 0, 1))
-    helper = np.eye(3)[np.abs(view).argmin()]
-    side = np.cross(view, helper) / np.linalg.norm(np.cross(view, helper))
-    across = np.stack([points @ side, points @ np.cross(view, side)])
-    axes = np.linalg.eigh(np.cov(across))[1]
-    width = float(np.ptp(axes.T @ across, axis=1).min())
-    behind = points + 2 * (last - facing * width / 2 - along)[:, None] * view
-    mirrored = normals - 2 * (normals @ view)[:, None] * view
-    return np.concatenate([points, behind]), np.concatenate([normals, mirrored])
 
 
 def without_outliers(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:

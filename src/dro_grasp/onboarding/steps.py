@@ -16,7 +16,7 @@ from dro_grasp.datasets.collections import count_collection
 from dro_grasp.datasets.engine import synthesize_dataset
 from dro_grasp.datasets.splits import split_of
 from dro_grasp.errors import BundleError, OptionError
-from dro_grasp.evaluation.benchmark import RAW, REFINED, BenchmarkConfig, benchmark
+from dro_grasp.evaluation.benchmark import BEST, RAW, REFINED, BenchmarkConfig, benchmark
 from dro_grasp.files import make_folder, replacing
 from dro_grasp.hands.check import check_hand, picture
 from dro_grasp.hands.library import load_hand
@@ -150,7 +150,7 @@ class _Way:
     def _tried(self, predictor: GraspPredictor) -> dict[str, Any]:
         """Success on held-out objects."""
         rules = tuple(protocol(name) for name in ("dro", "strict"))
-        config = BenchmarkConfig(self.config.num, (RAW, REFINED), rules, controls=False, seed=self.config.seed)
+        config = BenchmarkConfig(self.config.num, (RAW, REFINED, BEST), rules, controls=False, seed=self.config.seed)
         rows = benchmark([self.hand], [load_object(name) for name in self.held_out], predictor, config)
         told = "; ".join(f"{r.stage}: " + ", ".join(f"{k} {v[0]:.0%}" for k, v in r.success.items()) for r in rows)
         return {"rows": [dataclasses.asdict(row) for row in rows], "said": f"{predictor.weights_name}, {told}"}
