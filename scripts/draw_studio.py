@@ -2,7 +2,7 @@
 
     python -m scripts.draw_studio docs/pictures/studio.png
 
-Needs playwright (`pip install -e '.[browser]'`) and Chromium.
+Needs Chromium.
 """
 
 from __future__ import annotations

@@ -8,9 +8,9 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import pytest
+from playwright.sync_api import Page, sync_playwright
 
 HOST = "127.0.0.1"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -24,12 +24,11 @@ def free_port() -> int:
 
 
 @contextmanager
-def page_of(*arguments: str, size: tuple[int, int]) -> Iterator[Any]:
+def page_of(*arguments: str, size: tuple[int, int]) -> Iterator[Page]:
     """The page that `dro-grasp view` serves with these arguments; its console must stay without errors.
 
     The server runs in a process of its own: its event loop and playwright's do not share one well.
     """
-    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install -e '.[browser]'")
     if CHROMIUM is None:
         pytest.skip("needs a browser: install chromium")
     port = free_port()
@@ -39,7 +38,7 @@ def page_of(*arguments: str, size: tuple[int, int]) -> Iterator[Any]:
         assert server.stderr is not None
         while "viewer: http" not in server.stderr.readline():
             assert server.poll() is None
-        with playwright.sync_playwright() as play:
+        with sync_playwright() as play:
             browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
             page = browser.new_page(viewport={"width": size[0], "height": size[1]})
             errors: list[str] = []
