@@ -186,5 +186,5 @@ def test_a_browser_goes_all_the_way(tmp_path: Path) -> None:
         download.value.save_as(saved)
         time.sleep(3)
         page.screenshot(path=tmp_path / "page.png")
-    assert len(GraspBatch.load(saved)) == 12
+    assert len(GraspBatch.load(saved)) == 16
     assert (tmp_path / "page.png").stat().st_size > 20_000

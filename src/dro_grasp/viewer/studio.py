@@ -108,7 +108,7 @@ class Studio:
         self,
         hand: str,
         obj: str,
-        num: int = 12,
+        num: int = 16,
         direction: str = ANY,
         temperature: float | None = None,
         protocol: str = "strict",
@@ -152,7 +152,7 @@ class Studio:
             kinds = ".stl,.obj,.ply,.glb,.off,.npy,.pcd"
             object_file = gui.add_upload_button("Upload an object (STL, OBJ, PLY)", mime_type=kinds)
         with gui.add_folder("Generate"):
-            self.num = gui.add_slider("Grasps", 1, MOST, 1, 12)
+            self.num = gui.add_slider("Grasps", 1, MOST, 1, 16)
             self.direction = gui.add_dropdown(
                 "Palm direction", (ANY, *HALF_AXES), initial_value=ANY, hint="-z grasps from above.")
             self.temperature = gui.add_slider(
