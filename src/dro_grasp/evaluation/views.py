@@ -38,13 +38,14 @@ def seen(obj: ObjectModel, view: View, seed: int, camera: DepthCamera | None = N
 def seen_side(
     obj: ObjectModel, view: Literal["half", "depth"], seed: int, camera: DepthCamera | None = None
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Float[np.ndarray, "3"] | None]:
-    """What is seen alone: points [m], normals, and the direction to the camera where one is known; arguments as for `seen`."""
+    """What is seen alone: points [m], normals, and where the camera stands if that is known [m]; arguments as for `seen`."""
     generator = torch.Generator().manual_seed(seed)
     if view == "half":
         half = cloud_object(obj.name, obj.sample_partial(POINTS, generator).numpy(), origin=obj.name)
         return half.cloud.astype(np.float64), half.cloud_normals.astype(np.float64), None
     direction = torch.nn.functional.normalize(torch.randn(3, generator=generator), dim=0)
-    towards = direction.numpy().astype(np.float64)
-    points = visible_points(obj, direction, generator, camera).numpy()
-    normals = estimate_normals(points).astype(np.float64)
-    return points.astype(np.float64), normals * np.where(normals @ towards < 0, -1.0, 1.0)[:, None], towards
+    camera = camera or DepthCamera()
+    points = visible_points(obj, direction, generator, camera).numpy().astype(np.float64)
+    place = camera.place(obj, direction)
+    normals = estimate_normals(points.astype(np.float32)).astype(np.float64)
+    return points, normals * np.where(((place - points) * normals).sum(1) < 0, -1.0, 1.0)[:, None], place

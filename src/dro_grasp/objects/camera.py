@@ -37,6 +37,11 @@ class DepthCamera:
             raise OptionError(f"{self} cannot see: distance and pixel must be positive, noise at least 0, and lost "
                               "at least 0 and below 1")
 
+    def place(self, obj: ObjectModel, direction: Float[Tensor, " 3"]) -> Float[np.ndarray, "3"]:
+        """Where it stands when it sees an object from a direction, of any length, in the object's frame [m]."""
+        towards = direction.double().numpy()
+        return _middle(obj) + self.distance * towards / np.linalg.norm(towards)
+
 
 def visible_points(
     obj: ObjectModel, direction: Float[Tensor, " 3"], generator: torch.Generator, camera: DepthCamera | None = None
@@ -59,14 +64,18 @@ def visible_points(
     if not np.isfinite(length) or length < 1e-9:
         raise OptionError(f"direction is {direction.tolist()}; give a vector from the object to the camera, as 0 0 1")
     low, high = obj.cloud.min(0).astype(np.float64), obj.cloud.max(0).astype(np.float64)
-    middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    radius = float(np.linalg.norm(high - low)) / 2
     if camera.distance <= radius:
         raise OptionError(f"a camera at {camera.distance:g} m stands within the object, {radius:.3g} m in radius; "
                           "move it away")
-    T_object_camera = _looking_at(middle, direction.double().numpy() / length, camera.distance)
+    T_object_camera = _looking_at(_middle(obj), direction.double().numpy() / length, camera.distance)
     see = _depth_of_cloud if obj.is_cloud else _depth_of_mesh
     rays, depth = see(obj, T_object_camera, radius, camera)
     return _measured(rays, depth, T_object_camera, camera, generator)
+
+
+def _middle(obj: ObjectModel) -> np.ndarray:
+    return (obj.cloud.min(0).astype(np.float64) + obj.cloud.max(0)) / 2
 
 
 def _looking_at(middle: np.ndarray, towards: np.ndarray, distance: float) -> np.ndarray:

@@ -21,8 +21,10 @@ DEPTHS = (-0.1, -0.05, 0.0, 0.05, 0.1, 0.2, 0.3, 0.5)
 """Centres that are tried, behind the rim of the seen side, in widths of the object."""
 TILTS, TURNS = (0.3, 0.6, 0.9), 8
 """Angles between mirror planes and the image that are tried [rad], and directions of the tilt; half turns have as many axes."""
-VISIBLE, GAP, KINK = 2.0, 1.0, 0.5
-"""Weights of what should have been seen, of gaps at the rim, and of kinks there."""
+VISIBLE, GAP = 3.0, 1.0
+"""Weights of what should have been seen, and of gaps at the rim."""
+KINK, SEEN_KINK = 0.5, 0.1
+"""Weights of kinks at the rim: of a cut, and of an image, where normals are less sure."""
 WORST = 0.5
 """Distances beyond this count no more, in widths."""
 TOLERANCE = 0.003
@@ -31,12 +33,12 @@ LAST, CUT = 0.02, 0.12
 """Shares of points that may lie behind where the seen side ends, and that are its rim when no camera is known."""
 RIM, LOPSIDED, FEWEST = 0.12, 0.35, 8
 """With a camera, rim points are those whose neighbours, within so many widths, lie so far aside; and the fewest of them."""
-ROUND = 0.3
-"""Where the rim faces the camera by less than this, the surface is turning away, and goes on as a circle."""
+ROUND = 0.35
+"""Cosine between the normal and the ray below which a surface at the rim is taken to turn away, not to end at an edge."""
 
 
 def completed(
-    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], towards: Float[np.ndarray, "3"] | None = None
+    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None = None
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
     """Points and normals of both sides of an object of which one was seen.
 
@@ -46,17 +48,18 @@ def completed(
     Args:
         points: Of the seen side [m].
         normals: Outward unit normals there.
-        towards: Unit vector to the camera. Without it the points are taken to be all that lies on one side of a plane, whose
-            normal is then the mean of theirs.
+        camera: Where it stands [m]. Without it the points are taken to be all that lies on one side of a plane, whose normal is
+            then the mean of theirs.
     """
-    mean = normals.mean(0)
-    view = mean / max(float(np.linalg.norm(mean)), 1e-9) if towards is None else towards
-    axes = _image_axes(view)
-    side = _SeenSide.of(points @ axes, normals @ axes, towards is not None)
+    middle = points.mean(0)
+    view = normals.mean(0) if camera is None else camera - middle
+    away = float(np.linalg.norm(view))
+    axes = _image_axes(view / max(away, 1e-9))
+    side = _SeenSide.of((points - middle) @ axes, normals @ axes, None if camera is None else away)
     linear, centre = min(side.symmetries(), key=lambda symmetry: side.cost(*symmetry))
-    behind = (points @ axes - centre) @ linear.T + centre
-    return (np.concatenate([points, behind @ axes.T]),
-            np.concatenate([normals, normals @ axes @ linear.T @ axes.T]))
+    behind = (side.points - centre) @ linear.T + centre
+    return (np.concatenate([points, behind @ axes.T + middle]),
+            np.concatenate([normals, side.normals @ linear.T @ axes.T]))
 
 
 def _image_axes(view: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
@@ -73,48 +76,59 @@ def _tree(points: Float[np.ndarray, "n d"]) -> KDTree:
     return KDTree(points)
 
 
+def _projected(points: Float[np.ndarray, "n 3"], away: float | None) -> Float[np.ndarray, "n 2"]:
+    """Where points are in the image of a camera so far along z, in metres at the height 0."""
+    return points[:, :2] if away is None else points[:, :2] / (1 - points[:, 2:] / away)
+
+
 @dataclass(frozen=True)
 class _SeenSide:
     """What was seen, with z to the camera."""
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
+    away: float | None
+    """Distance of the camera along z, where one is known [m]."""
     sample: Int[np.ndarray, " sample"]
     """Indices of the points that symmetries are judged by."""
     rim: Int[np.ndarray, " rim"]
     """Indices of those where the seen side ends."""
     expected: Float[np.ndarray, " rim"]
     """Gap that is to be left at each rim point [m]: the thickness of what is seen face on."""
+    smooth: Float[np.ndarray, " rim"]
+    """Weight of kinks there: how sure it is that the surface goes on without an edge."""
     width: float
     end: float
     """Height below which nothing was seen [m]."""
-    by_camera: bool
 
     @classmethod
-    def of(cls, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], by_camera: bool) -> _SeenSide:
-        """Find the rim."""
-        image, height = points[:, :2], points[:, 2]
+    def of(cls, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], away: float | None) -> _SeenSide:
+        """Find the rim, and how the surface goes on there."""
+        image, height = _projected(points, away), points[:, 2]
         angles = np.linspace(0, np.pi, 16, endpoint=False)
         width = float(np.ptp(image @ np.stack([np.cos(angles), np.sin(angles)]), axis=0).min())
         end, top = np.quantile(height, (LAST, 1 - LAST))
         shuffled = np.random.default_rng(0).permutation(len(points))
-        if by_camera:
+        if away is None:
+            rim = shuffled[height[shuffled] <= np.quantile(height, CUT)][:SAMPLE]
+            rays, flat = np.array([[0.0, 0.0, 1.0]]), 0.0
+        else:
             some = shuffled[:MOST]
             near = _tree(image).query_ball_point(image[some], RIM * width)
             aside = np.array([np.linalg.norm(image[i].mean(0) - image[k]) for i, k in zip(near, some, strict=True)])
             rim = some[aside >= min(LOPSIDED * RIM * width, np.sort(aside)[-min(FEWEST, len(aside))])]
-        else:
-            rim = shuffled[height[shuffled] <= np.quantile(height, CUT)][:SAMPLE]
-        facing = np.clip(normals[rim, 2], 0, 1)
-        flat = max(0.0, width - (top - end)) if by_camera else 0.0
+            rays, flat = np.array([0.0, 0.0, away]) - points[rim], max(0.0, width - float(top - end))
+        facing = np.clip((normals[rim] * rays).sum(1) / np.linalg.norm(rays, axis=1), 0, 1)
+        # A surface that turns away goes on as a circle; one that faces the camera ends at an edge.
         expected = facing * np.where(facing < ROUND, width, flat)
-        return cls(points, normals, shuffled[:SAMPLE], rim, expected, width, float(end), by_camera)
+        smooth = KINK * (1 - facing) if away is None else SEEN_KINK * np.clip(1 - facing / ROUND, 0, 1)
+        return cls(points, normals, away, shuffled[:SAMPLE], rim, expected, smooth, width, float(end))
 
     def symmetries(self) -> list[tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]]:
         """Linear parts and fixed points of the motions that are tried."""
-        image = self.points[:, :2]
-        axes = np.linalg.eigh(np.cov(image.T))[1]
-        along = image @ axes
+        across = self.points[:, :2]
+        axes = np.linalg.eigh(np.cov(across.T))[1]
+        along = across @ axes
         middle = axes @ (along.max(0) + along.min(0)) / 2
         turns = np.arange(TURNS) * 2 * np.pi / TURNS
         half_turns = [np.array([np.cos(a / 2), np.sin(a / 2), 0.0]) for a in turns]
@@ -129,13 +143,14 @@ class _SeenSide:
         """How little a symmetry agrees with what was seen; 0 is best."""
         wrong = self._shown((self.points[self.sample] - centre) @ linear.T + centre)
         # Every motion that is tried is its own inverse: what it takes to the rim is where it takes the rim.
-        gap, nearest = self._space.query((self.points[self.rim] - centre) @ linear.T + centre)
+        taken = (self.points[self.rim] - centre) @ linear.T + centre
+        gap, nearest = self._space.query(taken)
+        # Before the seen side instead of behind it, the object would be thinner than nothing.
+        gap = gap * np.where(taken[:, 2] > self.points[nearest, 2], -1.0, 1.0)
         kink = 1 - (self.normals[nearest] @ linear.T * self.normals[self.rim]).sum(1)
-        # What faces the camera ends at an edge, and says nothing of how it goes on.
-        kink = kink * (1 - np.clip(self.normals[self.rim, 2], 0, 1))
         most = WORST * self.width
-        return float(VISIBLE * np.minimum(wrong, most).mean() / self.width
-                     + GAP * np.minimum(np.abs(gap - self.expected), most).mean() / self.width + KINK * kink.mean())
+        far = VISIBLE * np.minimum(wrong, most).mean() + GAP * np.minimum(np.abs(gap - self.expected), most).mean()
+        return float(far / self.width + (kink * self.smooth).mean())
 
     @cached_property
     def _space(self) -> KDTree:
@@ -143,12 +158,12 @@ class _SeenSide:
 
     @cached_property
     def _image(self) -> KDTree:
-        return _tree(self.points[:, :2])
+        return _tree(_projected(self.points, self.away))
 
     def _shown(self, moved: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
         """How far points lie from where they would have been hidden [m]."""
-        if not self.by_camera:
+        if self.away is None:
             return np.where(moved[:, 2] > self.end, self._space.query(moved)[0], 0.0)
-        aside, nearest = self._image.query(moved[:, :2])
+        aside, nearest = self._image.query(_projected(moved, self.away))
         before = moved[:, 2] - self.points[nearest, 2]
         return np.hypot(np.maximum(0, aside - TOLERANCE), np.maximum(0, before - TOLERANCE))

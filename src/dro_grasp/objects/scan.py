@@ -77,8 +77,7 @@ def scanned_object(
     # What a camera sees looks at it.
     normals *= np.where((normals * kept).sum(1) > 0, -1.0, 1.0)[:, None]
     if complete:
-        middle = kept.mean(0)
-        kept, normals = completed(kept, normals, -middle / max(float(np.linalg.norm(middle)), 1e-9))
+        kept, normals = completed(kept, normals, np.zeros(3))
     if T_frame_camera is not None:
         R = T_frame_camera[:3, :3]
         kept, normals = kept @ R.T + T_frame_camera[:3, 3], normals @ R.T
