@@ -103,5 +103,5 @@ def test_a_ball_in_a_real_depth_image() -> None:
     both, outward = completed(points, normals, DepthCamera().place(ball, view))
     off = np.abs(np.linalg.norm(both, axis=1) - radius)
     assert np.mean(off) < 0.1 * radius
-    assert np.quantile(off, 0.95) < 0.2 * radius
+    assert np.quantile(off, 0.95) < 0.25 * radius
     assert np.mean((outward * both).sum(1) / np.linalg.norm(both, axis=1)) > 0.95
