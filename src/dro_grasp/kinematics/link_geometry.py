@@ -74,8 +74,7 @@ def _mesh_of(model: Any, g: int, hull: bool) -> trimesh.Trimesh | None:
     if kind == SPHERE:
         return trimesh.creation.icosphere(subdivisions=2, radius=size[0])
     if kind == CAPSULE:
-        return trimesh.creation.capsule(height=2 * size[1], radius=size[0], count=(16, 16)).apply_translation(
-            [0, 0, 0])
+        return trimesh.creation.capsule(height=2 * size[1], radius=size[0], count=(16, 16))
     if kind == ELLIPSOID:
         return trimesh.creation.icosphere(subdivisions=2).apply_scale(size)
     if kind == CYLINDER:
