@@ -11,11 +11,12 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.library import load_object
 from dro_grasp.onboarding.steps import DATA, PICTURE, REPORT, WEIGHTS, Onboarded
 from dro_grasp.predictor import GraspPredictor
+from dro_grasp.simulation.trial import simulate
 from dro_grasp.viewer.page import image, table, write_page
 from dro_grasp.viewer.pictures import draw_grasps
 
-SHOWN, OBJECTS = 8, 3
-"""Grasps drawn of each object, and objects drawn."""
+SHOWN, OBJECTS, CANDIDATES = 8, 3, 4
+"""Grasps drawn of each object, objects drawn, and grasps of which the best one is."""
 
 
 def write_report(done: Onboarded, held_out: list[str]) -> Path:
@@ -28,14 +29,15 @@ def write_report(done: Onboarded, held_out: list[str]) -> Path:
     Raises:
         OutputError: It cannot be written.
     """
-    path, name = done.folder / REPORT, html.escape(done.hand)
+    path, name = done.folder / REPORT, html.escape(Path(done.hand).stem)
     parts = [
         f"<h1>{name}</h1>", _summary(done), _rates(done), "<h2>What it grasps now</h2>", _drawn(done, held_out),
-        "<h2>The description</h2>", image((done.folder / PICTURE).read_bytes(), f"{name}, open and closed"),
+        f"<h2>The description</h2><p class=note>{html.escape(done.hand)}</p>",
+        image((done.folder / PICTURE).read_bytes(), f"{name}, open and closed"),
         f"<pre>{html.escape(chr(10).join(done.steps['check']['lines']))}</pre>", "<h2>The grasps it learned from</h2>",
         _data(done.steps["data"]), "<h2>To go on</h2>", _commands(done),
     ]
-    write_page(path, f"{done.hand} onboarded", "".join(parts))
+    write_page(path, f"{Path(done.hand).stem} onboarded", "".join(parts))
     return path
 
 
@@ -45,8 +47,7 @@ def _summary(done: Onboarded) -> str:
     minutes = sum(step["seconds"] for step in done.steps.values()) / 60
     return (f"<p>On objects that it was never trained on, {before:.0%} of its refined grasps held under protocol <i>dro</i> "
             f"before, and {after:.0%} after fine-tuning on {done.steps['training']['grasps']:,} grasps of its own; of the best "
-            f"quarter by score {best:.0%}. All steps "
-            f"took {minutes:.0f} minutes.</p>")
+            f"quarter by score {best:.0%}. All steps took {minutes:.0f} minutes.</p>")
 
 
 def _rates(done: Onboarded) -> str:
@@ -68,7 +69,8 @@ def _drawn(done: Onboarded, held_out: list[str]) -> str:
     for name in held_out[:OBJECTS]:
         obj = load_object(name)
         path = done.folder / f"{Path(name).stem}.png"
-        draw_grasps(hand, obj, predictor.predict(hand, obj, SHOWN), path)
+        grasps = predictor.predict(hand, obj, SHOWN, candidates=CANDIDATES)
+        draw_grasps(hand, obj, grasps.with_trial(simulate(hand, obj, grasps, "strict")), path)
         parts.append(image(path.read_bytes(), f"grasps of {name}"))
     return "".join(parts)
 
