@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dro_grasp.geometry.signed_distance import SignedDistanceGrid
 from dro_grasp.grasps import energies
-from dro_grasp.grasps.field import CloudField, DistanceField
+from dro_grasp.grasps.field import DistanceField
 from dro_grasp.grasps.synthesis import moved
 from dro_grasp.kinematics.tree import PRISMATIC, REVOLUTE, KinematicTree
 from tests.energy_samples import precise, rounded_box
@@ -193,43 +193,7 @@ def test_field_within_a_voxel_is_consistent(beyond_the_grid):
     assert (model.bend.abs().amax((-1, -2)) > 1).any() != beyond_the_grid  # [1/m]
 
 
-def test_cloud_field_has_its_gradient_beyond_the_rims_as_well():
-    normals = unit(random(8, 3))
-    cloud = CloudField.of(RADIUS * normals, normals)
-    points = random(400, 3, seed=4, scale=2 * RADIUS)
-    model = cloud.normals(points)
-    found = numeric(lambda p: cloud.distances(p)[0], points)
-    # Far from a point, a step may cross to its neighbour's side, or from above its plane to below.
-    smooth = (found.norm(dim=-1) < 1.5) & ((model.gradient - found).norm(dim=-1) < 0.5)
-    assert smooth.float().mean() > 0.97
-    torch.testing.assert_close(model.gradient[smooth], found[smooth], rtol=1e-5, atol=1e-5)
-    assert (model.gradient * model.normal).sum(-1)[smooth].min() < 0.9  # the rim's direction, not the normal
-
-
-def test_cloud_field_beside_its_points_is_consistent():
-    normals = unit(random(500, 3))
-    cloud = CloudField.of(RADIUS * normals, normals)
-    aside, height = random(500, 3, seed=1, scale=0.1 * cloud.spacing), random(500, 1, seed=2, scale=0.003)
-    points = cloud.points + aside + height * normals
-    model = cloud.normals(points)
-    torch.testing.assert_close(model.gradient, numeric(lambda p: cloud.distances(p)[0], points), rtol=1e-6, atol=1e-6)
-    bend = torch.stack([numeric(lambda p, k=k: cloud.normals(p).normal[:, k], points) for k in range(3)], -2)
-    assert (model.bend == 0).all()
-    assert (bend == 0).all()
-    assert (model.distance > 0).any()
-    assert (model.distance < 0).any()
-
-
 def test_field_grows_beyond_the_grid():
     field = DistanceField.from_grid(sphere_grid(), torch.float64)
     points = unit(random(50, 3)) * 0.3
     assert field.distances(points)[0].min() > 0.15  # [m]
-
-
-def test_cloud_field_agrees_with_the_grid_near_the_surface():
-    normals = unit(random(20000, 3))
-    cloud = CloudField.of(RADIUS * normals, normals)
-    points = unit(random(100, 3, seed=3)) * (RADIUS + 0.01 * torch.linspace(-0.5, 0.5, 100).double()[:, None])
-    distance, normal = cloud.distances(points)
-    torch.testing.assert_close(distance, points.norm(dim=-1) - RADIUS, atol=5e-4, rtol=0)  # [m]
-    assert (normal * unit(points)).sum(-1).min() > 0.99

@@ -163,5 +163,6 @@ def test_touching_points_lie_on_the_ball(hand, obj, grasps) -> None:
     assert (np.abs(np.linalg.norm(near, axis=1) - radius) < TOUCH + 0.001).all()
     marked = draw_grasp(hand, obj, grasps, 0, PictureStyle(contacts=True, size=(64, 48)))
     assert marked.shape == (48, 64, 3)
-    assert len(touching_points(hand, dataclasses.replace(obj, vertices=None, faces=None), grasps.joints[0],
-                               grasps.T_object_wrist[0])) == 0
+    bare = touching_points(
+        hand, dataclasses.replace(obj, vertices=None, faces=None), grasps.joints[0], grasps.T_object_wrist[0])
+    assert abs(len(bare) - expected.sum()) <= 0.4 * expected.sum() + 3, "of a cloud as well"

@@ -107,56 +107,6 @@ class DistanceField:
 _FIELDS: WeakKeyDictionary[SignedDistanceGrid, DistanceField] = WeakKeyDictionary()
 
 
-@dataclass(frozen=True)
-class CloudField:
-    """The same queries on a bare cloud: distance to the nearest point, its normal deciding the side."""
-
-    points: Float[Tensor, "m 3"]
-    """Surface points [m]."""
-    point_normals: Float[Tensor, "m 3"]
-    """Outward unit normals there."""
-    spacing: float
-    """Distance between neighbouring points [m]: nearer to a point than this, its tangent plane is the surface."""
-    chunk: int = 4096
-    """Queries answered at once."""
-
-    @staticmethod
-    def of(points: Float[Tensor, "m 3"], normals: Float[Tensor, "m 3"]) -> CloudField:
-        """The field of a cloud, with its spacing measured on some of its points."""
-        some = points[:: max(1, len(points) // 256)]
-        nearest = torch.cdist(some, points).topk(min(7, len(points)), largest=False).values
-        return CloudField(points, normals, float(nearest[:, -1].median()))
-
-    def distances(
-        self, points: Float[Tensor, "*b 3"]
-    ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
-        """Signed distance [m], to the nearest point's tangent plane beside it and to its rim beyond; and its gradient."""
-        return self._nearest(points)[:2]
-
-    def _nearest(self, points: Float[Tensor, "*b 3"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Distance [m], its gradient, and the nearest point's normal."""
-        flat = points.reshape(-1, 3)
-        index = torch.cat([torch.cdist(part, self.points).argmin(-1) for part in flat.split(self.chunk)])
-        normal = self.point_normals[index].reshape(points.shape)
-        apart = points - self.points[index].reshape(points.shape)
-        height = (apart * normal).sum(-1, keepdim=True)
-        aside = apart - height * normal
-        width = aside.norm(dim=-1, keepdim=True)
-        beyond = (width - self.spacing).clamp_min(0)
-        size = (height.square() + beyond.square()).sqrt()
-        distance = torch.where(height < 0, -size, size)
-        outwards = height * normal + beyond * aside / width.clamp_min(1e-12)
-        gradient = torch.where(size > 1e-9, outwards / torch.where(size > 1e-9, distance, 1.0), normal)
-        return distance[..., 0], gradient, normal
-
-    def normals(
-        self, points: Float[Tensor, "*b 3"]
-    ) -> SurfaceModel:
-        """The nearest point's normal, with zero for its derivative, which is unknown."""
-        distance, gradient, normal = self._nearest(points)
-        return SurfaceModel(distance, gradient, normal, normal.new_zeros(*normal.shape, 3))
-
-
 def _smooth(values: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:
     kernel = values.new_tensor(BLUR)
     result = values[None, None]

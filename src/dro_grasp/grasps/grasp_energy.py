@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dro_grasp.devices import on_device
 from dro_grasp.grasps import energies
-from dro_grasp.grasps.field import CloudField, DistanceField
+from dro_grasp.grasps.field import DistanceField
 from dro_grasp.grasps.fingers import ContactCandidates, ContactConfig, contact_candidates, rigid_group
 from dro_grasp.hands.hand import Hand
 
@@ -157,7 +157,7 @@ class GraspEnergy:
     def __init__(
         self,
         hand: Hand,
-        field: DistanceField | CloudField,
+        field: DistanceField,
         centre: Float[Tensor, 3],
         length: float,
         config: EnergyConfig | None = None,

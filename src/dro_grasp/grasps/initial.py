@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.grasps.field import CloudField, DistanceField
+from dro_grasp.grasps.field import DistanceField
 from dro_grasp.hands.hand import Hand
 
 
@@ -54,7 +54,7 @@ def start_joints(
 
 def starts(
     hand: Hand,
-    field: DistanceField | CloudField,
+    field: DistanceField,
     surface: Float[Tensor, "k 3"],
     centre: Float[Tensor, 3],
     n: int,

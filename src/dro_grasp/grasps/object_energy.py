@@ -8,14 +8,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dro_grasp.grasps.field import CloudField, DistanceField
+from dro_grasp.grasps.field import DistanceField
 from dro_grasp.grasps.fingers import ContactConfig
 from dro_grasp.grasps.grasp_energy import EnergyConfig, Evaluation, GraspEnergy
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-
-CLOUD_POINTS = 4096
-"""Most points of a bare cloud that distances are measured to."""
 
 
 def object_energy(
@@ -25,7 +22,7 @@ def object_energy(
     contacts: ContactConfig | None = None,
     device: torch.device | str = "cpu",
 ) -> GraspEnergy:
-    """The energy on the mesh's grid of signed distances, or on the cloud where there is no mesh.
+    """The energy on the object's grid of signed distances.
 
     Args:
         hand: The hand.
@@ -35,16 +32,9 @@ def object_energy(
         device: Where the energy is evaluated.
     """
     surface = torch.as_tensor(obj.cloud, dtype=torch.float32)
-    grid = obj.grid
-    if grid is None:
-        step = max(1, len(surface) // CLOUD_POINTS)
-        normals = torch.as_tensor(obj.cloud_normals, dtype=torch.float32)
-        surroundings: DistanceField | CloudField = CloudField.of(surface[::step], normals[::step])
-    else:
-        surroundings = DistanceField.of(grid)
     centre = torch.as_tensor(obj.centre_of_mass, dtype=torch.float32)
     length = float((surface - centre).norm(dim=-1).mean())
-    return GraspEnergy(hand, surroundings, centre, length, config, contacts, device)
+    return GraspEnergy(hand, DistanceField.of(obj.grid), centre, length, config, contacts, device)
 
 
 def evaluate_nearest(

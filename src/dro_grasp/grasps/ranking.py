@@ -40,8 +40,7 @@ def score_grasps(
 ) -> Float[Tensor, " n"]:
     """A score each: higher is better, comparable among grasps of one hand and one object.
 
-    Distances are read off the object's grid, or measured to the points and normals of a bare cloud. The contacts are
-    taken to be each finger's candidate that is nearest to the surface.
+    The contacts are taken to be each finger's candidate that is nearest to the surface.
 
     Args:
         hand: The grasps' hand.

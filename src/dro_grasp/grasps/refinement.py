@@ -57,8 +57,7 @@ def refine_grasps(
 ) -> GraspBatch:
     """The same grasps after a descent of the grasp energy that stays near them; none ends with a higher energy.
 
-    Distances are read off the object's grid, or measured to a bare cloud. Pregrasp and squeeze are made anew, scores are
-    dropped: they belong to the grasps before.
+    Pregrasp and squeeze are made anew, scores are dropped: they belong to the grasps before.
 
     Args:
         hand: The grasps' hand.

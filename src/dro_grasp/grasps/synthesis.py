@@ -92,7 +92,7 @@ def field_of(obj: ObjectModel) -> DistanceField:
     Raises:
         ObjectError: The object is a bare cloud.
     """
-    if obj.grid is None:
+    if obj.is_cloud:
         raise ObjectError(f"object '{obj.name}' is a bare point cloud; synthesis needs a mesh")
     return DistanceField.of(obj.grid)
 

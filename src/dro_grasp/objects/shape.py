@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import torch
@@ -23,6 +24,8 @@ GRID_SPACING = 0.003
 """Spacing of the signed-distance grid [m]."""
 GRID_PADDING = 0.04
 """How far the grid reaches beyond the object [m]."""
+DISC_NEIGHBOURS = 7
+"""Points of a bare cloud, itself counted, that the disc around each of them reaches to."""
 LARGEST_GRID = 8_000_000
 """Grid points beyond which the spacing grows."""
 
@@ -88,15 +91,17 @@ class ObjectModel:
         return decompose(vertices, faces, self.sha256)
 
     @cached_property
-    def grid(self) -> SignedDistanceGrid | None:
-        """Signed distances around the mesh, cached on disk; None for a bare cloud."""
+    def grid(self) -> SignedDistanceGrid:
+        """Signed distances around the object, cached on disk for a mesh."""
         if self.vertices is None or self.faces is None:
-            return None
-        vertices, faces = self.vertices, self.faces
-        key = f"grid-{self.sha256[:24]}-{GRID_SPACING * 1e6:.0f}"
-        stored = cached_arrays(key, lambda: bake_grid(vertices, faces))
-        values, origin = (torch.from_numpy(stored[name].astype(np.float32)) for name in ("values", "origin"))
-        return SignedDistanceGrid.from_values(values, origin, float(stored["spacing"]))
+            cloud, normals = self.cloud.astype(np.float64), self.cloud_normals.astype(np.float64)
+            made = bake_grid(cloud, partial(cloud_distances, cloud, normals))
+        else:
+            vertices, faces = self.vertices, self.faces
+            key = f"grid-{self.sha256[:24]}-{GRID_SPACING * 1e6:.0f}"
+            made = cached_arrays(key, lambda: bake_grid(vertices, partial(signed_distances, vertices, faces)))
+        values, origin = (torch.from_numpy(made[name].astype(np.float32)) for name in ("values", "origin"))
+        return SignedDistanceGrid.from_values(values, origin, float(made["spacing"]))
 
     def sample_points(self, count: int, generator: torch.Generator) -> Float[Tensor, "count 3"]:
         """Random points of the stored cloud [m]; with repetition where the cloud has too few."""
@@ -119,15 +124,36 @@ class ObjectModel:
         return self.vertices, self.faces
 
 
-def bake_grid(vertices: np.ndarray, faces: np.ndarray) -> dict[str, np.ndarray]:
-    """Signed distances on a grid around a mesh: `values` (nx ny nz), `origin` (3) and `spacing` [m]."""
-    low, high = vertices.min(0) - GRID_PADDING, vertices.max(0) + GRID_PADDING
+def bake_grid(surface: np.ndarray, distance: Callable[[np.ndarray], np.ndarray]) -> dict[str, np.ndarray]:
+    """Signed distances on a grid around a surface (n 3): `values` (nx ny nz), `origin` (3) and `spacing` [m].
+
+    Args:
+        surface: Points that the grid reaches beyond.
+        distance: Signed distances of points (n 3).
+    """
+    low, high = surface.min(0) - GRID_PADDING, surface.max(0) + GRID_PADDING
     spacing = max(GRID_SPACING, float((np.prod(high - low) / LARGEST_GRID) ** (1 / 3)))
     counts = np.ceil((high - low) / spacing).astype(int) + 1
     axes = [low[i] + spacing * np.arange(counts[i]) for i in range(3)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    distance = signed_distances(vertices, faces, points)
-    return {"values": distance.reshape(counts).astype(np.float32), "origin": low, "spacing": np.array(spacing)}
+    return {"values": distance(points).reshape(counts).astype(np.float32), "origin": low, "spacing": np.array(spacing)}
+
+
+def cloud_distances(cloud: np.ndarray, normals: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Distance of each point (n 3) to the disc around the nearest point of a cloud (m 3) [m], negative behind it.
+
+    Discs lie across the normals and reach to the neighbours, so that a surface is closed and a rim is a rim.
+    """
+    from scipy.spatial import KDTree
+
+    tree = KDTree(cloud)
+    some = cloud[:: max(1, len(cloud) // 256)]
+    reach = float(np.median(tree.query(some, k=min(DISC_NEIGHBOURS, len(cloud)))[0][:, -1]))
+    index = tree.query(points)[1]
+    apart = points - cloud[index]
+    height = (apart * normals[index]).sum(1)
+    beyond = np.maximum(0, np.linalg.norm(apart - height[:, None] * normals[index], axis=1) - reach)
+    return np.where(height < 0, -1.0, 1.0) * np.hypot(height, beyond)
 
 
 def signed_distances(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:

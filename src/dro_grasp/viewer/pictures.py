@@ -100,9 +100,7 @@ def draw_grasp(
 def touching_points(
     hand: Hand, obj: ObjectModel, joints: Float[Tensor, " n_dof"], T_object_wrist: Float[Tensor, "4 4"]
 ) -> Float[np.ndarray, "k 3"]:
-    """Points of the posed hand at the object's surface [m]; none for a bare cloud."""
-    if obj.grid is None:
-        return np.zeros((0, 3))
+    """Points of the posed hand at the object's surface [m]."""
     points = hand.points(joints, T_object_wrist)
     return points[obj.grid.query(points)[0].abs() < TOUCH].double().numpy()
 
