@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import igl
 import numpy as np
 import pytest
 import torch
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from dro_grasp.objects.camera import DepthCamera, visible_points
@@ -105,3 +107,22 @@ def test_a_ball_in_a_real_depth_image() -> None:
     assert np.mean(off) < 0.1 * radius
     assert np.quantile(off, 0.95) < 0.25 * radius
     assert np.mean((outward * both).sum(1) / np.linalg.norm(both, axis=1)) > 0.95
+
+
+def test_what_stands_is_completed_upright() -> None:
+    """A flower pot seen from above and aside: inverted, it would stand on its head."""
+    pot = trimesh.creation.revolve(np.array([[0, 0], [0.03, 0], [0.048, 0.11], [0, 0.11]]), sections=64)
+    points, face = trimesh.sample.sample_surface(pot, 6000, seed=0)
+    normals = np.asarray(pot.face_normals[face])
+    anyhow = []
+    for seed in range(6):
+        towards = np.array([np.cos(1.3 * seed), np.sin(1.3 * seed), 0.5]) / np.sqrt(1.25)
+        shown = normals @ towards > 0.15
+        n = int(shown.sum())
+        both, outward = completed(points[shown], normals[shown], 100 * towards, np.array([0.0, 0.0, 1.0]))
+        off = np.abs(igl.signed_distance(both[n:], pot.vertices, pot.faces)[0])
+        assert off.mean() < 0.003
+        assert abs((outward[n:, 2] - normals[shown, 2]).mean()) < 1e-6, "as much looks up as before"
+        other, _ = completed(points[shown], normals[shown], 100 * towards)
+        anyhow.append(np.abs(igl.signed_distance(other[n:], pot.vertices, pot.faces)[0]).mean())
+    assert max(anyhow) > 0.01, "without knowing what is up it is not always guessed"

@@ -25,6 +25,8 @@ VISIBLE, GAP = 3.0, 1.0
 """Weights of what should have been seen, and of gaps at the rim."""
 KINK, SEEN_KINK = 0.5, 0.1
 """Weights of kinks at the rim: of a cut, and of an image, where normals are less sure."""
+LEANING, FLAT = 0.1, 0.999
+"""Cost of symmetries that do not keep the vertical; cosine to the view from which a camera looks straight down."""
 WORST = 0.5
 """Distances beyond this count no more, in widths."""
 TOLERANCE = 0.003
@@ -38,7 +40,8 @@ ROUND = 0.35
 
 
 def completed(
-    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None = None
+    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None = None,
+    up: Float[np.ndarray, "3"] | None = None,
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
     """Points and normals of both sides of an object of which one was seen.
 
@@ -50,13 +53,15 @@ def completed(
         normals: Outward unit normals there.
         camera: Where it stands [m]. Without it the points are taken to be all that lies on one side of a plane, whose normal is
             then the mean of theirs.
+        up: Unit vector along which the object stands, if it does: what stands is rather turned or mirrored upright.
     """
     middle = points.mean(0)
     view = normals.mean(0) if camera is None else camera - middle
     away = float(np.linalg.norm(view))
     axes = _image_axes(view / max(away, 1e-9))
     side = _SeenSide.of((points - middle) @ axes, normals @ axes, None if camera is None else away)
-    linear, centre = min(side.symmetries(), key=lambda symmetry: side.cost(*symmetry))
+    upright = None if up is None else up @ axes
+    linear, centre = min(side.symmetries(upright), key=lambda motion: side.cost(*motion) + _lean(motion[0], upright))
     behind = (side.points - centre) @ linear.T + centre
     return (np.concatenate([points, behind @ axes.T + middle]),
             np.concatenate([normals, side.normals @ linear.T @ axes.T]))
@@ -67,6 +72,11 @@ def _image_axes(view: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     helper = np.eye(3)[np.abs(view).argmin()]
     across = np.cross(view, helper) / np.linalg.norm(np.cross(view, helper))
     return np.stack([across, np.cross(view, across), view], 1)
+
+
+def _lean(linear: Float[np.ndarray, "3 3"], up: Float[np.ndarray, "3"] | None) -> float:
+    """Cost of a motion that does not keep the vertical."""
+    return 0.0 if up is None or np.allclose(linear @ up, up, atol=1e-6) else LEANING
 
 
 def _tree(points: Float[np.ndarray, "n d"]) -> KDTree:
@@ -124,16 +134,25 @@ class _SeenSide:
         smooth = KINK * (1 - facing) if away is None else SEEN_KINK * np.clip(1 - facing / ROUND, 0, 1)
         return cls(points, normals, away, shuffled[:SAMPLE], rim, expected, smooth, width, float(end))
 
-    def symmetries(self) -> list[tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]]:
+    def symmetries(self, up: Float[np.ndarray, "3"] | None) -> list[tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]]:
         """Linear parts and fixed points of the motions that are tried."""
         across = self.points[:, :2]
         axes = np.linalg.eigh(np.cov(across.T))[1]
+        if up is not None and abs(up[2]) < FLAT:
+            # What stands has its middle along the horizon; of what lies anyhow, the principal axes are the best guess.
+            axes = np.array([[up[1], up[0]], [-up[0], up[1]]]) / np.hypot(up[0], up[1])
         along = across @ axes
         middle = axes @ (along.max(0) + along.min(0)) / 2
         turns = np.arange(TURNS) * 2 * np.pi / TURNS
         half_turns = [np.array([np.cos(a / 2), np.sin(a / 2), 0.0]) for a in turns]
         mirrors = [np.array([0.0, 0.0, 1.0])] + [
             np.array([np.sin(tilt) * np.cos(a), np.sin(tilt) * np.sin(a), np.cos(tilt)]) for tilt in TILTS for a in turns]
+        if up is not None:
+            # Of what is upright, the half turn and the mirrors that the image's axes do not offer.
+            half_turns.append(up)
+            ahead = np.array([0.0, 0.0, 1.0]) - up[2] * up if abs(up[2]) < FLAT else np.cross(up, [1.0, 0.0, 0.0])
+            ahead /= np.linalg.norm(ahead)
+            mirrors += [np.cos(a) * ahead + np.sin(a) * np.cross(up, ahead) for t in (0.0, *TILTS) for a in {t, -t}]
         linear = [-np.eye(3), *(2 * np.outer(a, a) - np.eye(3) for a in half_turns),
                   *(np.eye(3) - 2 * np.outer(m, m) for m in mirrors)]
         start = self.points[self.rim, 2].mean()

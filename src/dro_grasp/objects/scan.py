@@ -77,7 +77,8 @@ def scanned_object(
     # What a camera sees looks at it.
     normals *= np.where((normals * kept).sum(1) > 0, -1.0, 1.0)[:, None]
     if complete:
-        kept, normals = completed(kept, normals, np.zeros(3))
+        up = None if T_frame_camera is None else T_frame_camera[2, :3].astype(np.float64)
+        kept, normals = completed(kept, normals, np.zeros(3), up)
     if T_frame_camera is not None:
         R = T_frame_camera[:3, :3]
         kept, normals = kept @ R.T + T_frame_camera[:3, 3], normals @ R.T
