@@ -136,19 +136,21 @@ def test_a_temperature_out_of_range_is_refused(weights: str, ball: ObjectModel, 
 
 
 def test_the_temperature_scales_what_z_is_made_of(weights: str, ball: ObjectModel, monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn: dict[float | None, torch.Tensor] = {}
-    for temperature in (None, 0.0, 0.5):
+    drawn: dict[object, Tensor] = {}
+    cloud = dataclasses.replace(ball, vertices=None, faces=None)
+    for temperature, obj in ((None, ball), (0.0, ball), (0.5, ball), (None, cloud)):
         predictor = GraspPredictor(weights, config=PredictorConfig(temperature=temperature))
         honest = predictor.network.predict
 
-        def predict(hand: torch.Tensor, obj: torch.Tensor, noise: torch.Tensor, at=temperature, honest=honest) -> torch.Tensor:
+        def predict(hand: Tensor, points: Tensor, noise: Tensor, at=(temperature, obj), honest=honest) -> Tensor:
             drawn[at] = noise
-            return honest(hand, obj, noise)
+            return honest(hand, points, noise)
 
         monkeypatch.setattr(predictor.network, "predict", predict)
-        predictor.predict(HAND, ball, num=3, seed=5)
-    assert float(drawn[0.0].abs().max()) == 0
-    torch.testing.assert_close(drawn[0.5], 0.5 * drawn[None])
+        predictor.predict(HAND, obj, num=3, seed=5)
+    assert float(drawn[0.0, ball].abs().max()) == 0
+    torch.testing.assert_close(drawn[0.5, ball], 0.5 * drawn[None, ball])
+    torch.testing.assert_close(drawn[None, cloud], drawn[0.5, ball], msg="bare clouds get surer grasps")
 
 
 @pytest.mark.parametrize("direction", [(0.0, 0.0, -5.0), (0.0, 0.0, 1e-3), (1.0, 2.0, 2.0)])
@@ -202,7 +204,8 @@ def test_an_impossible_table_is_told(weights: str, ball: ObjectModel) -> None:
         predictor.predict(HAND, ball, num=3, table=5.0)
 
 
-def test_a_bare_cloud_is_grasped(predictor: GraspPredictor, ball: ObjectModel) -> None:
+def test_a_bare_cloud_is_grasped(weights: str, ball: ObjectModel) -> None:
+    predictor = GraspPredictor(weights, config=PredictorConfig(temperature=1.0))
     cloud = dataclasses.replace(ball, vertices=None, faces=None)
     made = predictor.predict(HAND, cloud, num=7, seed=3)
     assert made.score is not None

@@ -33,6 +33,8 @@ PREDICTED = "predicted_points"
 
 HOTTEST = 2.0
 """Largest temperature that is taken."""
+CLOUD_TEMPERATURE = 0.5
+"""Of bare clouds, unless another is asked for: where the object is less sure, grasps should be surer."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,7 @@ class PredictorConfig:
     """Standard deviation of the palm direction around the one asked for [rad]."""
     temperature: float | None = None
     """Spread of z: at 0 the likeliest grasp of each placement, at 1 as varied as the training grasps; None leaves it to the
-    weights."""
+    weights, but takes at most CLOUD_TEMPERATURE for a bare cloud."""
     batch_size: int = 16
     """Grasps that are decoded at once."""
     network_batch_size: int = 4
@@ -163,7 +165,10 @@ class GraspPredictor:
         with _timed(self.timings, "network"):
             T_object_wrist = self._placements(small, points, num, direction, generator)
             joints = small.random_open_joints(num, generator)
-            latent = network.sample_latent(num, generator, self.config.temperature)
+            temperature = self.config.temperature
+            if temperature is None and obj.is_cloud:
+                temperature = min(CLOUD_TEMPERATURE, network.config.latent_temperature)
+            latent = network.sample_latent(num, generator, temperature)
         poses, solved, predicted = [], [], []
         for start in range(0, num, self.config.batch_size):
             part = slice(start, min(start + self.config.batch_size, num))
