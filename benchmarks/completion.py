@@ -32,10 +32,11 @@ GREY, SEEN, ADDED = (0.82, 0.83, 0.85), (0.16, 0.38, 0.78), (0.93, 0.50, 0.13)
 
 
 def mirrored(
-    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], towards: Float[np.ndarray, "3"] | None
+    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None
 ) -> Float[np.ndarray, "n 3"]:
     """The naive other side."""
-    view = normals.mean(0) / np.linalg.norm(normals.mean(0)) if towards is None else towards
+    view = normals.mean(0) if camera is None else camera - points.mean(0)
+    view = view / np.linalg.norm(view)
     along = points @ view
     return points + 2 * (np.quantile(along, 0.02) - along)[:, None] * view
 
@@ -88,12 +89,12 @@ def main() -> None:
                 obj = load_object(name)
                 surface = KDTree(obj.cloud)
                 for seed in range(options.views):
-                    points, normals, towards = seen_side(obj, view, seed)
+                    points, normals, camera = seen_side(obj, view, seed)
                     begin = time.perf_counter()
-                    both, _ = completed(points, normals, towards)
+                    both, _ = completed(points, normals, camera)
                     seconds += time.perf_counter() - begin
                     found.append(1e3 * surface.query(both[len(points):])[0].mean())
-                    naive.append(1e3 * surface.query(mirrored(points, normals, towards))[0].mean())
+                    naive.append(1e3 * surface.query(mirrored(points, normals, camera))[0].mean())
             rows.append([view, group, len(found), float(np.mean(naive)), float(np.mean(found)), float(np.median(found)),
                          1e3 * seconds / len(found)])
     columns = ["view", "objects", "views", "mirror, mean [mm]", "symmetry, mean [mm]", "symmetry, median [mm]", "time [ms]"]
