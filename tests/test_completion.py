@@ -109,6 +109,15 @@ def test_a_ball_in_a_real_depth_image() -> None:
     assert np.mean((outward * both).sum(1) / np.linalg.norm(both, axis=1)) > 0.95
 
 
+@pytest.mark.parametrize("end", [(0.05, 0.0, 0.5), (0.0, 0.0, 0.6)], ids=["across", "along the ray"])
+def test_a_line_is_no_reason_to_stumble(end: tuple[float, float, float]) -> None:
+    line = np.linspace((0.0, 0.0, 0.5), end, 40)
+    both, outward = completed(line, np.tile([0.0, 0.0, -1.0], (40, 1)), np.zeros(3))
+    np.testing.assert_array_equal(both[:40], line)
+    assert np.isfinite(both).all()
+    assert np.isfinite(outward).all()
+
+
 def test_what_stands_is_completed_upright() -> None:
     """A flower pot seen from above and aside: inverted, it would stand on its head."""
     pot = trimesh.creation.revolve(np.array([[0, 0], [0.03, 0], [0.048, 0.11], [0, 0.11]]), sections=64)

@@ -27,6 +27,8 @@ KINK, SEEN_KINK = 0.5, 0.1
 """Weights of kinks at the rim: of a cut, and of an image, where normals are less sure."""
 LEANING, FLAT = 0.1, 0.999
 """Cost of symmetries that do not keep the vertical; cosine to the view from which a camera looks straight down."""
+THINNEST = 1e-4
+"""Width in the image below which nothing can be said of the other side [m]."""
 WORST = 0.5
 """Distances beyond this count no more, in widths."""
 TOLERANCE = 0.003
@@ -47,6 +49,7 @@ def completed(
 
     The other side is the seen one, inverted, turned by half or mirrored: the way that shows least where the camera saw nothing,
     and that continues the seen side at its rim without gap or kink. What is seen face on is taken to be as thick as wide.
+    Of a line to the camera nothing is added.
 
     Args:
         points: Of the seen side [m].
@@ -60,6 +63,8 @@ def completed(
     away = float(np.linalg.norm(view))
     axes = _image_axes(view / max(away, 1e-9))
     side = _SeenSide.of((points - middle) @ axes, normals @ axes, None if camera is None else away)
+    if side.width < THINNEST:
+        return points, normals
     upright = None if up is None else up @ axes
     linear, centre = min(side.symmetries(upright), key=lambda motion: side.cost(*motion) + _lean(motion[0], upright))
     behind = (side.points - centre) @ linear.T + centre
