@@ -1,7 +1,7 @@
 """How long one grasp takes, and one of sixteen, from loaded hand and object to joints, pregrasp and score.
 
 The paper-size network has random weights, so its distances are no distances of a grasp and the joint solver needs more
-steps than it would: its times are an upper bound. `slim` are the shipped weights. Each figure is the median over hands
+steps than it would: its times are an upper bound. `multi` are the shipped weights. Each figure is the median over hands
 and repetitions; loading of hands, objects and weights is not counted, one prediction before the clock starts is.
 
     python benchmarks/inference.py [--json] [--full] [--threads N] [--seed 0]
@@ -30,7 +30,7 @@ HANDS = ("barrett", "allegro", "shadowhand")
 """Built-in versions of the paper's hands."""
 OBJECT = "rubber_duck"
 RUNS, FULL = 3, 15
-PARTS = ("network", "decode", "rank")
+PARTS = ("network", "decode", "refine", "rank")
 
 
 def paper_size(folder: Path, seed: int) -> Path:
@@ -68,7 +68,7 @@ def main() -> None:
     runs = FULL if options.full else RUNS
     rows, seconds = [], {}
     with tempfile.TemporaryDirectory() as folder:
-        predictors = {"paper": GraspPredictor(paper_size(Path(folder), options.seed)), "slim": GraspPredictor("slim")}
+        predictors = {"paper": GraspPredictor(paper_size(Path(folder), options.seed)), "multi": GraspPredictor()}
     for size, predictor in predictors.items():
         for num in (1, 16):
             times = measure(predictor, num, runs, options.seed)
@@ -82,8 +82,8 @@ def main() -> None:
         f"thread(s), seed {options.seed}; times per grasp",
         rows, ["network", "grasps", "whole [ms]", *(f"{part} [ms]" for part in PARTS), "slowest [ms]"],
         {
-            "latency_paper": seconds["paper", 1], "latency_slim": seconds["slim", 1],
-            "batch16_per_grasp_paper": seconds["paper", 16] / 16, "batch16_per_grasp_slim": seconds["slim", 16] / 16,
+            "latency_paper": seconds["paper", 1], "latency_multi": seconds["multi", 1],
+            "batch16_per_grasp_paper": seconds["paper", 16] / 16, "batch16_per_grasp_multi": seconds["multi", 16] / 16,
             "threads": options.threads,
         }, options.json,
     )
