@@ -47,5 +47,4 @@ def seen_side(
     camera = camera or DepthCamera()
     points = visible_points(obj, direction, generator, camera).numpy().astype(np.float64)
     place = camera.place(obj, direction)
-    normals = estimate_normals(points.astype(np.float32)).astype(np.float64)
-    return points, normals * np.where(((place - points) * normals).sum(1) < 0, -1.0, 1.0)[:, None], place
+    return points, estimate_normals(points.astype(np.float32), place).astype(np.float64), place

@@ -158,14 +158,15 @@ def cloud_object(name: str, points: np.ndarray, *, origin: str, scale: float = 1
     )
 
 
-def estimate_normals(points: np.ndarray) -> np.ndarray:
-    """Unit normals of a cloud (n 3) by local principal axes, turned away from the middle of the cloud."""
+def estimate_normals(points: np.ndarray, camera: np.ndarray | None = None) -> np.ndarray:
+    """Unit normals of a cloud (n 3) by local principal axes, turned to the camera (3), or away from the cloud's middle."""
     from scipy.spatial import KDTree
 
     neighbours = KDTree(points).query(points, k=min(NEIGHBOURS, len(points)))[1]
     local = points[neighbours] - points[neighbours].mean(1, keepdims=True)
     normals = np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))[1][:, :, 0]
-    outward = ((points - points.mean(0)) * normals).sum(1) >= 0
+    towards = points - points.mean(0) if camera is None else camera - points
+    outward = (towards * normals).sum(1) >= 0
     return np.where(outward[:, None], normals, -normals).astype(np.float32)
 
 

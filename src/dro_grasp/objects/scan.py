@@ -73,12 +73,11 @@ def scanned_object(
         kept = without_outliers(kept)
     if len(kept) < NEIGHBOURS:
         raise ObjectError(f"{name} has {len(kept)} points after cleaning; give a denser cloud or a larger mask")
-    normals = estimate_normals(kept.astype(np.float32)).astype(np.float64)
-    # What a camera sees looks at it.
-    normals *= np.where((normals * kept).sum(1) > 0, -1.0, 1.0)[:, None]
+    camera = np.zeros(3)
+    normals = estimate_normals(kept.astype(np.float32), camera).astype(np.float64)
     if complete:
         up = None if T_frame_camera is None else T_frame_camera[2, :3].astype(np.float64)
-        kept, normals = completed(kept, normals, np.zeros(3), up)
+        kept, normals = completed(kept, normals, camera, up)
     if T_frame_camera is not None:
         R = T_frame_camera[:3, :3]
         kept, normals = kept @ R.T + T_frame_camera[:3, 3], normals @ R.T

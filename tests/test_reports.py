@@ -1,0 +1,33 @@
+"""What a run of training says on the console."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import pytest
+
+from dro_grasp.training import reports
+from dro_grasp.training.config import ScheduleConfig
+from dro_grasp.training.reports import console_report
+
+
+@dataclass
+class FakeRun:
+    step: int
+    progress: float
+    schedule: ScheduleConfig = field(default_factory=lambda: ScheduleConfig(steps=100))
+
+
+def test_a_line_now_and_then_with_the_time_that_is_left(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = [1000.0]
+    monkeypatch.setattr(reports.time, "monotonic", lambda: clock[0])
+    report = console_report("training")
+    for step, seconds in ((10, 0.0), (11, 1.0), (50, 60.0), (100, 61.0)):
+        clock[0] = 1000.0 + seconds
+        report(FakeRun(step, step / 100), {"total": 0.5})  # type: ignore[arg-type]
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split()[1] for line in lines] == ["10/100", "50/100", "100/100"], "not within ten seconds, but at the end"
+    assert lines[1].endswith("  1 min left"), "four tenths took a minute, so the other half takes 1.25"
+    assert "total 0.5000" in lines[0]
