@@ -44,5 +44,6 @@ def test_links_without_mass_get_some() -> None:
 
 
 def test_ball_joints_are_refused() -> None:
-    with pytest.raises(HandError, match="is a ball joint; expected hinges"):
-        reduced(f"<body name='palm'><geom size='.02'/>{FINGER.replace('<joint ', "<joint type='ball' ")}</body>")
+    finger = FINGER.replace("<joint name='bend' axis='0 1 0'", "<joint name='bend' type='ball'")
+    with pytest.raises(HandError, match="joint 'bend' is a ball joint; expected hinges"):
+        reduced(f"<body name='palm'><geom size='.02'/>{finger}</body>")

@@ -128,8 +128,11 @@ def _check_joints(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
         limited = joint.limited == mujoco.mjtLimited.mjLIMITED_TRUE or (
             joint.limited == mujoco.mjtLimited.mjLIMITED_AUTO and joint.range[0] < joint.range[1])
         if not limited:
-            limit = SLIDE_LIMIT if joint.type == mujoco.mjtJoint.mjJNT_SLIDE else CONTINUOUS_LIMIT
-            joint.range = [-limit, limit]
+            slides = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
+            limit = SLIDE_LIMIT if slides else CONTINUOUS_LIMIT
+            # Angles are in the unit of the file, and compiled from there.
+            stated = math.degrees(limit) if spec.compiler.degree and not slides else limit
+            joint.range = [-stated, stated]
             joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
             notes.append(Note("warning", joint.name, f"states no limits; taken as +-{limit:.2f}"))
 
