@@ -27,6 +27,7 @@ from dro_grasp.datasets.bundle import Bundle, load_bundle
 from dro_grasp.datasets.splits import HELD_OUT_HANDS
 from dro_grasp.evaluation.benchmark import ALL, RAW, REFINED, BenchmarkConfig, benchmark
 from dro_grasp.evaluation.distance_error import distance_errors
+from dro_grasp.evaluation.views import View
 from dro_grasp.hands.library import load_hand
 from dro_grasp.models.checkpoints import load_weights, save_weights
 from dro_grasp.models.network import DistanceNetwork, NetworkConfig
@@ -71,7 +72,7 @@ class Ablation:
     """Only so many grasps of the hand, of all objects; all by default."""
     share: float = 1.0
     """Of the steps of the other rows."""
-    view: str = "whole"
+    view: View = "whole"
 
 
 MOTION = {"latent_form": "motion", "latent": 32}

@@ -68,7 +68,7 @@ def main() -> None:
     runs = FULL if options.full else RUNS
     rows, seconds = [], {}
     with tempfile.TemporaryDirectory() as folder:
-        predictors = {"paper": GraspPredictor(paper_size(Path(folder), options.seed)), "multi": GraspPredictor()}
+        predictors = {"paper": GraspPredictor(str(paper_size(Path(folder), options.seed))), "multi": GraspPredictor()}
     for size, predictor in predictors.items():
         for num in (1, 16):
             times = measure(predictor, num, runs, options.seed)

@@ -90,12 +90,13 @@ class ConvexStep:
         self.problem = cp.Problem(
             cp.Minimize(cp.sum(cp.norm(left, axis=0))), [self.step >= self.low, self.step <= self.high]
         )
-        assert self.problem.is_dcp(dpp=True)
+        assert self.problem.is_dpp()
 
     def solve(self, jacobian: np.ndarray, residual: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """The optimal step."""
         self.jacobian.value, self.residual.value, self.low.value, self.high.value = jacobian, residual, low, high
         self.problem.solve(solver=cp.CLARABEL)
+        assert self.step.value is not None
         return self.step.value
 
 

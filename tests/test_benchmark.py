@@ -122,7 +122,7 @@ def test_grasps_that_all_fail_have_no_means(monkeypatch: pytest.MonkeyPatch) -> 
     assert row.diversity == 0
 
 
-@pytest.mark.parametrize("view", ["half", "depth"])
+@pytest.mark.parametrize("view", ["cloud", "half", "depth"])
 def test_a_view_hides_the_object_from_the_network_alone(view: str, monkeypatch: pytest.MonkeyPatch) -> None:
     shown, tried = [], []
     honest_predict, honest_simulate = GraspPredictor.predict, simulate

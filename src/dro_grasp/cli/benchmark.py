@@ -42,8 +42,8 @@ class Benchmark:
     """Also try unoptimised starts, synthesised grasps and, with a bundle, the mean grasp."""
     bundle: Annotated[Path | None, optional("PATH", "no mean grasp")] = None
     """Training bundle that the mean grasp is the mean of."""
-    view: Literal["whole", "half", "depth"] = "whole"
-    """What the network, refinement and ranking see: the whole object, the paper's half of its points, or a depth image."""
+    view: Literal["whole", "cloud", "half", "depth"] = "whole"
+    """What the network, refinement and ranking see: the mesh, its points, the paper's half of them, or a depth image."""
     seed: int = 0
     """The same seed gives the same grasps and views."""
     json: tyro.conf.FlagCreatePairsOff[bool] = False

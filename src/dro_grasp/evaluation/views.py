@@ -1,4 +1,4 @@
-"""What a hand that stands before an object sees of it: all, the paper's half, or one depth image."""
+"""What a hand that stands before an object sees of it: all of it, all of its points, the paper's half, or one depth image."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from dro_grasp.objects.completion import completed
 from dro_grasp.objects.loading import cloud_object, estimate_normals
 from dro_grasp.objects.shape import ObjectModel
 
-View = Literal["whole", "half", "depth"]
-"""The mesh; half of the surface points; the points of a depth image."""
+View = Literal["whole", "cloud", "half", "depth"]
+"""The mesh; all of the surface points, without the mesh; half of them; the points of a depth image."""
 POINTS = 1024
 """Points of the paper's half of a cloud."""
 
@@ -24,14 +24,17 @@ def seen(obj: ObjectModel, view: View, seed: int, camera: DepthCamera | None = N
 
     Args:
         obj: An object with a mesh.
-        view: `half` keeps the half of the points farthest along a random direction, as in the paper's appendix, and knows
-            nothing of the camera; `depth` is one noisy depth image from a random direction, with normals towards the camera.
+        view: `cloud` keeps all points and normals, to which nothing is added; `half` keeps the half of the points farthest
+            along a random direction, as in the paper's appendix, and knows nothing of the camera; `depth` is one noisy depth
+            image from a random direction, with normals towards the camera.
         seed: Of direction and noise.
         camera: Place and quality of the depth camera.
     """
     if view == "whole":
         return obj
     name = f"{obj.name}, {view} seen"
+    if view == "cloud":
+        return cloud_object(name, np.concatenate([obj.cloud, obj.cloud_normals], 1), origin=name)
     return cloud_object(name, np.concatenate(completed(*seen_side(obj, view, seed, camera)), 1), origin=name)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from dro_grasp.geometry.rasterizer import Camera, Mesh, arrow, render
+from dro_grasp.geometry.triangles import enclosed_volume
 from dro_grasp.hands.build import build_hand
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand_description
@@ -117,15 +118,10 @@ def _shape_notes(hand: Hand, description: Description) -> list[Note]:
         shapes = [g for g in description.geometry if g.link == link]
         if shapes and not any(g.collides for g in shapes):
             notes.append(Note("warning", name, "has a visual but no collision shape; it cannot touch anything"))
-        volume = sum(_volume(g.vertices[g.faces]) for g in shapes)
+        volume = sum(abs(enclosed_volume(g.vertices[g.faces])) for g in shapes)
         if shapes and volume < THIN_VOLUME:
             notes.append(Note("warning", name, "has shapes without volume"))
     return notes
-
-
-def _volume(triangles: np.ndarray) -> float:
-    """What a closed surface (n 3 3) encloses [m^3]."""
-    return abs(float((triangles[:, 0] * np.cross(triangles[:, 1], triangles[:, 2])).sum())) / 6
 
 
 def _point_notes(hand: Hand) -> list[Note]:

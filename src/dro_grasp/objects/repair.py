@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dro_grasp.errors import ObjectError
+from dro_grasp.geometry.triangles import enclosed_volume
 
 if TYPE_CHECKING:
     import trimesh
@@ -112,8 +113,7 @@ def _join(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
 
 def _volume(mesh: trimesh.Trimesh) -> float:
     """Signed volume [m^3]; trimesh's own divides by it to find the centre of mass."""
-    a, b, c = mesh.triangles.transpose(1, 0, 2)
-    return float(np.einsum("ni,ni->", a, np.cross(b, c)) / 6)
+    return enclosed_volume(mesh.triangles)
 
 
 def _is_solid(mesh: trimesh.Trimesh) -> bool:

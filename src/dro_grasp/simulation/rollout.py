@@ -17,6 +17,7 @@ from torch import Tensor
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinematics.tree_reading import quaternion_matrix
 from dro_grasp.simulation.outcome import GIVE_UP
 from dro_grasp.simulation.protocols import Protocol
 from dro_grasp.simulation.scene import Scene, object_mass
@@ -200,7 +201,4 @@ def _ignore(message: str) -> None:
 
 def _matrices(quaternions: np.ndarray) -> np.ndarray:
     """Rotation matrices (n 3 3) of quaternions WXYZ (n 4)."""
-    matrices = np.zeros((len(quaternions), 9))
-    for quaternion, matrix in zip(quaternions, matrices, strict=True):
-        mujoco.mju_quat2Mat(matrix, quaternion)
-    return matrices.reshape(-1, 3, 3)
+    return np.array([quaternion_matrix(quaternion) for quaternion in quaternions]).reshape(-1, 3, 3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -125,7 +126,7 @@ def caption(grasps: GraspBatch, index: int) -> tuple[str, bool | None]:
 
 
 def contact_sheet(
-    tiles: list[np.ndarray], captions: list[tuple[str, bool | None]], title: str, columns: int = COLUMNS
+    tiles: list[np.ndarray], captions: Sequence[tuple[str, bool | None]], title: str, columns: int = COLUMNS
 ) -> Image.Image:
     """Pictures in a grid, each with a caption, under a title."""
     height, width = tiles[0].shape[:2]
