@@ -12,8 +12,9 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import random
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import roma
 import torch
@@ -21,7 +22,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dro_grasp.evaluation.metrics import roc_area
-from dro_grasp.evaluation.views import seen
+from dro_grasp.evaluation.views import View, seen
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.object_energy import evaluate_nearest, object_energy
 from dro_grasp.grasps.quality import grasp_features
@@ -68,14 +69,16 @@ def tried(hand: Hand, obj: ObjectModel, grasps: GraspBatch, known: ObjectModel) 
     return {**features._asdict(), "outcomes": outcomes.float()}
 
 
-def collect(predictor: GraspPredictor, name: str, objects: int, num: int, seed: int) -> list[dict[str, Any]]:
+def collect(
+    predictor: GraspPredictor, name: str, objects: int, num: int, seed: int, views: Sequence[View]
+) -> list[dict[str, Any]]:
     """Trials of one hand on some training objects."""
     hand, rng = load_hand(name), random.Random(f"{name} {seed}")
     generator, parts = torch.Generator().manual_seed(seed), []
     for label in rng.sample(resolve_objects(["assets:train"]), objects):
         obj = load_object(label)
         predictor.config = dataclasses.replace(predictor.config, temperature=rng.choice(TEMPERATURES))
-        view = rng.choice(("whole", "whole", "half", "depth"))
+        view = rng.choice(views)
         known = seen(obj, view, rng.randrange(10**6))
         raw = predictor.predict(hand, known, num, seed=rng.randrange(10**6), refine=False)
         polished = refine_grasps(hand, known, raw)
@@ -151,6 +154,8 @@ def main() -> None:
     parser.add_argument("--hands", nargs="+", default=list(HANDS), help="hands to collect trials of")
     parser.add_argument("--objects", type=int, default=16, help="training objects of each hand")
     parser.add_argument("--num", type=int, default=16, help="predicted grasps of each")
+    parser.add_argument("--views", nargs="+", choices=get_args(View), default=["whole", "whole", "half", "depth"],
+                        help="what is seen of the objects, each as often as it is named")
     parser.add_argument("--seed", type=int, default=0, help="of everything")
     parser.add_argument("--collect-only", action="store_true", help="do not fit")
     options = parser.parse_args()
@@ -159,7 +164,9 @@ def main() -> None:
     for name in options.hands:
         path = options.folder / f"{name.replace('/', '-')}-{options.seed}.pt"
         if not path.exists():
-            torch.save(collect(GraspPredictor(options.weights), name, options.objects, options.num, options.seed), path)
+            found = collect(
+                GraspPredictor(options.weights), name, options.objects, options.num, options.seed, options.views)
+            torch.save(found, path)
             print(name, flush=True)
     if options.collect_only:
         return

@@ -90,7 +90,7 @@ class Benchmark:
             title += f", view '{self.view}'"
         columns = ["grasps", "stage", "hand", "n", *rows[0].success, "shift [mm]", "turn [deg]", "diversity", "ROC area",
                    "ms a grasp"]
-        say(title + "; success in % with 95 % intervals; ROC area of the score for the last protocol\n")
+        say(title + "; success in % with 95 % intervals; ROC area of the score for each protocol\n")
         for line in [columns, ["---"] * len(columns), *map(cells, rows)]:
             say("| " + " | ".join(map(str, line)) + " |")
         say(f"\n{seconds:.0f} s")
@@ -100,9 +100,9 @@ class Benchmark:
 def cells(row: Row) -> list[object]:
     """A row's cells for people."""
     rates = [f"{100 * p:.1f} [{100 * low:.0f}-{100 * high:.0f}]" for p, low, high in row.success.values()]
-    area = list(row.ranking.values())[-1]
+    areas = " / ".join("-" if math.isnan(area) else f"{area:.2f}" for area in row.ranking.values())
     parts = " + ".join(f"{1e3 * seconds:.0f} {name}" for name, seconds in row.seconds.items())
     return [
         row.grasps, row.stage, row.hand, row.num, *rates, f"{1e3 * row.displacement:.1f}",
-        f"{math.degrees(row.rotation):.1f}", f"{row.diversity:.3f}", f"{area:.2f}", parts,
+        f"{math.degrees(row.rotation):.1f}", f"{row.diversity:.3f}", areas, parts,
     ]

@@ -28,7 +28,7 @@ class Onboard:
     """Objects that the weights are tried on, and never trained on."""
     minutes: float = 30.0
     """Time for data, training and trials together."""
-    num: int = 10
+    num: int = 20
     """Grasps of each held-out object that are tried."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Weights to fine-tune."""

@@ -45,7 +45,7 @@ class OnboardingConfig:
     """Objects that grasps are made of."""
     held_out: tuple[str, ...] = ("builtin:test",)
     """Objects that the weights are tried on, before and after, and never trained on."""
-    num: int = 10
+    num: int = 20
     """Grasps of each held-out object in each trial."""
     weights: str | None = None
     """Weights that are fine-tuned; the shipped ones by default."""
