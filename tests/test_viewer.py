@@ -15,8 +15,9 @@ from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.library import load_object
-from dro_grasp.viewer.app import HOST, GraspViewer, describe
+from dro_grasp.viewer.app import GraspViewer, describe
 from dro_grasp.viewer.scene import success_colour
+from dro_grasp.viewer.serving import HOST, ServedPage
 from tests.browser import free_port, page_of
 
 pytestmark = pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")
@@ -81,6 +82,15 @@ def test_postures_open_and_close(viewer: GraspViewer, grasps: GraspBatch) -> Non
 def test_only_this_machine_is_served(viewer: GraspViewer) -> None:
     assert viewer.server.get_host() == HOST == "127.0.0.1"
     assert viewer.url.startswith("http://127.0.0.1:")
+
+
+@pytest.mark.parametrize(("port", "host", "cause"), [
+    (0, HOST, "port is 0"), (-1, HOST, "port is -1"), (65536, HOST, "65536"), (8080, "999.1.1.1", "999.1.1.1"),
+    (8080, "192.0.2.1", "192.0.2.1"),
+])
+def test_impossible_addresses_are_refused_at_once(port: int, host: str, cause: str) -> None:
+    with pytest.raises(OptionError, match=cause):
+        ServedPage(port, host)
 
 
 def test_text_says_what_is_known(grasps: GraspBatch) -> None:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
-import sys
-from typing import Literal, Protocol, cast, runtime_checkable
+from typing import Literal, cast
 
 import numpy as np
 import torch
-import viser
 from jaxtyping import Float
 from torch import Tensor
 
@@ -18,15 +15,14 @@ from dro_grasp.grasps.controller import pregrasp_and_squeeze
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.viewer.scene import PREDICTED_COLOUR
+from dro_grasp.viewer.serving import HOST, ServedPage, serve
 from dro_grasp.viewer.stage import Stage
 
-HOST = "127.0.0.1"
-"""Nobody else on the network can connect."""
 POSTURES = ("open", "pregrasp", "grasp", "squeeze")
 Posture = Literal["open", "pregrasp", "grasp", "squeeze"]
 
 
-class GraspViewer:
+class GraspViewer(ServedPage):
     """A running viewer; `stop()` ends it.
 
     Example:
@@ -54,7 +50,7 @@ class GraspViewer:
             host: Only this machine by default; 0.0.0.0 lets the network in.
 
         Raises:
-            OptionError: There is no grasp.
+            OptionError: There is no grasp, no such port or host.
             GraspFileError: The grasps are of another hand.
         """
         if len(grasps) == 0:
@@ -64,9 +60,7 @@ class GraspViewer:
         self.index = 0
         self.posture: Posture = "grasp"
         self._joints = postures_of(hand, obj, grasps)
-        # The server prints a banner on stdout, where commands promise a table or one JSON object.
-        with contextlib.redirect_stdout(sys.stderr):
-            self.server = viser.ViserServer(host=host, port=port, verbose=False)
+        super().__init__(port, host)
         self.stage = Stage(self.server)
         self.stage.set_pair(hand, obj, self._joints["grasp"][0], grasps.T_object_wrist[0].float())
         self._predicted = None
@@ -74,11 +68,6 @@ class GraspViewer:
             self._predicted = self.stage.cloud("predicted", predicted_points[0].numpy(), PREDICTED_COLOUR)
         self._add_controls()
         self.show(0, "grasp")
-
-    @property
-    def url(self) -> str:
-        """Where to point the browser."""
-        return f"http://{self.server.get_host()}:{self.server.get_port()}"
 
     def show(self, index: int, posture: Posture | None = None) -> None:
         """Show one grasp, in the current posture or another."""
@@ -90,10 +79,6 @@ class GraspViewer:
                 self._predicted.points = self.predicted_points[index].numpy().astype(np.float32)
             self.stage.colour_grid(outcome(self.grasps, index))
             self._text.content = describe(self.grasps, index)
-
-    def stop(self) -> None:
-        """Stop serving and free the port."""
-        self.server.stop()
 
     def _add_controls(self) -> None:
         gui = self.server.gui
@@ -124,32 +109,6 @@ def view_grasps(
 ) -> None:
     """Serve the viewer until Ctrl-C; arguments as for `GraspViewer`."""
     serve(GraspViewer(hand, obj, grasps, predicted_points, port, host))
-
-
-@runtime_checkable
-class Page(Protocol):
-    """What is served: a viewer or a studio."""
-
-    server: viser.ViserServer
-
-    @property
-    def url(self) -> str:
-        """Where to point the browser."""
-        ...
-
-    def stop(self) -> None:
-        """Stop serving."""
-
-
-def serve(page: Page) -> None:
-    """Say where the page is, and serve it until Ctrl-C."""
-    print(f"viewer: {page.url} (Ctrl-C ends it)", file=sys.stderr, flush=True)
-    try:
-        page.server.sleep_forever()
-    except KeyboardInterrupt:
-        pass
-    finally:
-        page.stop()
 
 
 def outcome(grasps: GraspBatch, index: int) -> bool | None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import sys
 import tempfile
 import threading
 import time
@@ -30,7 +28,8 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predictor import GraspPredictor, PredictorConfig
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.trial import record, simulate
-from dro_grasp.viewer.app import HOST, POSTURES, Posture, describe, outcome, postures_of, serve
+from dro_grasp.viewer.app import POSTURES, Posture, describe, outcome, postures_of
+from dro_grasp.viewer.serving import HOST, ServedPage, serve
 from dro_grasp.viewer.stage import Stage
 from dro_grasp.viewer.uploads import store_upload
 
@@ -56,7 +55,7 @@ class Made:
     """Polished and tried."""
 
 
-class Studio:
+class Studio(ServedPage):
     """A running page; `stop()` ends it.
 
     Example:
@@ -87,21 +86,15 @@ class Studio:
         self._folder = tempfile.TemporaryDirectory(prefix="dro-grasp-")
         self._busy = threading.Lock()
         self._uploads = 0
-        with contextlib.redirect_stdout(sys.stderr):
-            self.server = viser.ViserServer(host=host, port=port, verbose=False)
+        super().__init__(port, host)
         self.stage = Stage(self.server)
         self._add_choices(hand, obj)
         self._add_looks()
         self._say("Pick a hand and an object, or upload your own, and press *Generate*.")
 
-    @property
-    def url(self) -> str:
-        """Where to point the browser."""
-        return f"http://{self.server.get_host()}:{self.server.get_port()}"
-
     def stop(self) -> None:
         """Stop serving, and delete what was uploaded."""
-        self.server.stop()
+        super().stop()
         self._folder.cleanup()
 
     def generate(

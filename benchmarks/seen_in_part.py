@@ -1,0 +1,78 @@
+"""Where success is lost on objects that are seen in part: in the prediction, or in polishing and ranking on a guessed surface.
+
+    python benchmarks/seen_in_part.py [--views cloud half depth] [--num N] [--json]
+
+Grasps of the paper's hands on the validate objects are predicted from the view or from the mesh, polished and ranked on the
+view's cloud or on the mesh, and tried on the mesh, always at the temperature of bare clouds. Needs the development assets.
+"""
+
+from __future__ import annotations
+
+import argparse
+import zlib
+from typing import get_args
+
+import torch
+from report import emit
+from synthesis import HANDS
+
+from dro_grasp.evaluation.benchmark import KEPT
+from dro_grasp.evaluation.views import View, seen
+from dro_grasp.grasps.object_energy import object_energy
+from dro_grasp.grasps.ranking import score_grasps
+from dro_grasp.grasps.refinement import refine_grasps
+from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.library import load_hand
+from dro_grasp.objects.library import load_object, resolve_objects
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.predictor import CLOUD_TEMPERATURE, GraspPredictor, PredictorConfig
+from dro_grasp.simulation.trial import simulate
+
+PROTOCOLS = ("dro", "strict")
+DEEP = 0.003
+"""Penetration of the opened hand beyond which a trial begins inside the object [m]."""
+
+
+def tried(hand: Hand, obj: ObjectModel, shown: ObjectModel, judged: ObjectModel, num: int) -> dict[str, torch.Tensor]:
+    """Outcomes of grasps predicted from what is shown, polished and ranked on what is judged: all, and the best quarter."""
+    predictor = GraspPredictor(config=PredictorConfig(temperature=CLOUD_TEMPERATURE))
+    grasps = refine_grasps(hand, judged, predictor.predict(hand, shown, num, refine=False))
+    best = score_grasps(hand, judged, grasps).topk(round(KEPT * num)).indices
+    found = {}
+    for name in PROTOCOLS:
+        success = simulate(hand, obj, grasps, name).success.float()
+        found |= {name: success, f"{name}, ranked": success[best]}
+    assert grasps.pregrasp_joints is not None
+    points = hand.points(grasps.pregrasp_joints, grasps.T_object_wrist)
+    inside = -object_energy(hand, obj).field.distances(points)[0].amin(1) > DEEP
+    return found | {"begins inside": inside.float()}
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--views", nargs="+", choices=get_args(View), default=["cloud", "half", "depth"])
+    parser.add_argument("--num", type=int, default=24, help="grasps of each pair, of which the best quarter is kept")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    found: dict[tuple[str, str, str], list[dict[str, torch.Tensor]]] = {}
+    for hand in map(load_hand, HANDS):
+        for obj in map(load_object, resolve_objects(["assets:validate"])):
+            for view in options.views:
+                part = seen(obj, view, zlib.crc32(f"{hand.name} {obj.name}".encode()))
+                for shown, judged in (("view", "view"), ("view", "mesh"), ("mesh", "view")):
+                    models = {"view": part, "mesh": obj}
+                    outcome = tried(hand, obj, models[shown], models[judged], options.num)
+                    found.setdefault((view, shown, judged), []).append(outcome)
+    rows = []
+    for key, parts in found.items():
+        rates = {name: 100 * float(torch.cat([p[name] for p in parts]).mean()) for name in parts[0]}
+        rows.append([*key, sum(len(p["dro"]) for p in parts), *rates.values()])
+    columns = ["view", "predicted from", "polished and ranked on", "n", *next(iter(found.values()))[0]]
+    emit(f"objects seen in part, {options.num} grasps of each hand on each object; per cent", rows, columns,
+         {" / ".join(row[:3]): dict(zip(columns[3:], row[3:], strict=True)) for row in rows}, options.json)
+
+
+if __name__ == "__main__":
+    main()
