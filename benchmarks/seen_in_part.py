@@ -9,14 +9,13 @@ view's cloud or on the mesh, and tried on the mesh, always at the temperature of
 from __future__ import annotations
 
 import argparse
-import zlib
 from typing import get_args
 
 import torch
 from report import emit
 from synthesis import HANDS
 
-from dro_grasp.evaluation.benchmark import KEPT
+from dro_grasp.evaluation.benchmark import KEPT, pair_seed
 from dro_grasp.evaluation.views import View, seen
 from dro_grasp.grasps.object_energy import object_energy
 from dro_grasp.grasps.ranking import score_grasps
@@ -33,10 +32,12 @@ DEEP = 0.003
 """Penetration of the opened hand beyond which a trial begins inside the object [m]."""
 
 
-def tried(hand: Hand, obj: ObjectModel, shown: ObjectModel, judged: ObjectModel, num: int) -> dict[str, torch.Tensor]:
+def tried(
+    hand: Hand, obj: ObjectModel, shown: ObjectModel, judged: ObjectModel, num: int
+) -> dict[str, torch.Tensor]:
     """Outcomes of grasps predicted from what is shown, polished and ranked on what is judged: all, and the best quarter."""
     predictor = GraspPredictor(config=PredictorConfig(temperature=CLOUD_TEMPERATURE))
-    grasps = refine_grasps(hand, judged, predictor.predict(hand, shown, num, refine=False))
+    grasps = refine_grasps(hand, judged, predictor.predict(hand, shown, num, pair_seed(0, hand, obj), refine=False))
     best = score_grasps(hand, judged, grasps).topk(round(KEPT * num)).indices
     found = {}
     for name in PROTOCOLS:
@@ -60,7 +61,7 @@ def main() -> None:
     for hand in map(load_hand, HANDS):
         for obj in map(load_object, resolve_objects(["assets:validate"])):
             for view in options.views:
-                part = seen(obj, view, zlib.crc32(f"{hand.name} {obj.name}".encode()))
+                part = seen(obj, view, pair_seed(0, hand, obj))
                 for shown, judged in (("view", "view"), ("view", "mesh"), ("mesh", "view")):
                     models = {"view": part, "mesh": obj}
                     outcome = tried(hand, obj, models[shown], models[judged], options.num)

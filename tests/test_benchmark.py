@@ -25,6 +25,7 @@ from dro_grasp.evaluation.benchmark import (
     BenchmarkConfig,
     Row,
     benchmark,
+    pair_seed,
 )
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.ranking import score_grasps
@@ -70,7 +71,7 @@ def test_raw_and_ranked_rows_are_what_single_trials_say(rows: list[Row]) -> None
         passed, passed_best, passed_first, held = [], [], [], []
         for name in OBJECTS:
             obj = load_object(name)
-            grasps = predictor.predict(hand, obj, num=8, seed=0, refine=False)
+            grasps = predictor.predict(hand, obj, num=8, seed=pair_seed(0, hand, obj), refine=False)
             if stage == REFINED:
                 grasps = refine_grasps(hand, obj, grasps)
             passed.append(simulate(hand, obj, grasps, "strict").success)
@@ -85,6 +86,13 @@ def test_raw_and_ranked_rows_are_what_single_trials_say(rows: list[Row]) -> None
             alone = find(rows, NETWORK, "refined, top 1", "barrett").success["strict/1"][0]
             assert alone == float(torch.cat(passed_first).float().mean())
         assert find(rows, NETWORK, stage, "barrett").displacement == pytest.approx(float(torch.cat(held).mean()))
+
+
+def test_pairs_share_no_random_numbers() -> None:
+    hands, objects = [load_hand(n) for n in HANDS], [load_object(n) for n in OBJECTS]
+    seeds = {pair_seed(7, hand, obj) for hand in hands for obj in objects}
+    assert len(seeds) == len(HANDS) * len(OBJECTS)
+    assert seeds == {pair_seed(6, hand, obj) + 1 for hand in hands for obj in objects}
 
 
 def test_the_average_is_over_hands(rows: list[Row]) -> None:

@@ -59,7 +59,7 @@ class BenchmarkConfig:
     view: View = "whole"
     """What the network, refinement and ranking see of the object, from one side per pair; controls see all of it."""
     seed: int = 0
-    """Of all grasps."""
+    """Of all grasps and views; each pair's are derived from it."""
     workers: int | None = None
     """Threads of the trials; all cores by default."""
 
@@ -141,12 +141,17 @@ def benchmark(
     return rows
 
 
+def pair_seed(seed: int, hand: Hand, obj: ObjectModel) -> int:
+    """Seed of one pair: the same z on all objects would pass for independent grasps."""
+    return seed + zlib.crc32(f"{hand.name} {obj.name}".encode())
+
+
 def _sources(
     hand: Hand, obj: ObjectModel, predictor: GraspPredictor, config: BenchmarkConfig, bundle: Bundle | None
 ) -> Iterator[tuple[str, GraspBatch, dict[str, float], ObjectModel]]:
     """Grasps by where they come from, unpolished, the time that one of them took [s], and what was seen of the object."""
-    num, seed = config.num, config.seed
-    known = seen(obj, config.view, seed + zlib.crc32(f"{hand.name} {obj.name}".encode()))
+    num, seed = config.num, pair_seed(config.seed, hand, obj)
+    known = seen(obj, config.view, seed)
     grasps = predictor.predict(hand, known, num=num, seed=seed, refine=False)
     yield NETWORK, grasps, {k: predictor.timings[k] / num for k in ("network", "decode")}, known
     if not config.controls:
