@@ -6,13 +6,21 @@ import torch
 import dro_grasp as dro
 from dro_grasp.objects.camera import DepthCamera, visible_points
 
-# A rendered view stands in for the camera: its points, seen from the side and above.
+# A rendered view stands in for the camera. The duck's frame plays the robot's base; the camera looks at it from one metre
+# away, from the side and above, with z along its view, x to the right and y down, as drivers of depth cameras have it.
 duck = dro.load_object("rubber_duck")
-seen = visible_points(duck, torch.tensor([1.0, 0.3, 1.2]), torch.Generator().manual_seed(0), DepthCamera(noise=0.001)).numpy()
-
-# With a real one: points = dro.depth_points(depth, intrinsics, mask), in the camera's frame, and its pose in the base's.
+direction, camera = torch.tensor([1.0, 0.3, 1.2]), DepthCamera(distance=1.0, noise=0.001)
+ahead = -direction.double().numpy() / float(direction.norm())
+right = np.cross(ahead, [0.0, 0.0, 1.0])
+right /= np.linalg.norm(right)
 T_base_camera = np.eye(4)
-obj = dro.scanned_object("seen", seen - seen.mean(0) + [0.0, 0.0, 0.6], T_base_camera)
+T_base_camera[:3, :3] = np.stack([right, np.cross(ahead, right), ahead], 1)
+T_base_camera[:3, 3] = camera.place(duck, direction)
+in_base = visible_points(duck, direction, torch.Generator().manual_seed(0), camera).double().numpy()
+
+# With a real camera: points = dro.depth_points(depth, intrinsics, mask), and its pose from the calibration.
+points = (in_base - T_base_camera[:3, 3]) @ T_base_camera[:3, :3]
+obj = dro.scanned_object("seen", points, T_base_camera)
 
 table = float(obj.cloud[:, 2].min()) - 0.04
 grasps = dro.GraspPredictor().predict(dro.load_hand("allegro"), obj, num=8, direction=(0.0, 0.0, -1.0), table=table)

@@ -10,6 +10,7 @@ import trimesh
 
 import dro_grasp as dro
 from dro_grasp.cli.main import main
+from dro_grasp.errors import HandError
 from dro_grasp.hands.check import check_hand, hand_side, picture
 from tests.claw_urdf import LIMIT, PALM, claw, joint, link, meshed, written
 
@@ -17,6 +18,13 @@ from tests.claw_urdf import LIMIT, PALM, claw, joint, link, meshed, written
 def test_a_lost_mesh_is_named_and_the_rest_is_used(tmp_path: Path) -> None:
     report = check_hand(written(tmp_path, meshed("package://x/lost.stl")))
     assert any(n.subject == "left" and "'package://x/lost.stl' was not found" in n.text for n in report.notes)
+
+
+def test_a_hand_whose_moving_links_lost_their_meshes_says_which(tmp_path: Path) -> None:
+    gone = '<mesh filename="package://x/lost.stl"/>'
+    text = claw(links=link("left", gone) + link("right", gone))
+    with pytest.raises(HandError, match=r"no fingertip.*package://x/lost.stl' was not found"):
+        check_hand(written(tmp_path, text))
 
 
 def notes(folder: Path, text: str) -> dict[str, str]:

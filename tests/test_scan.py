@@ -12,10 +12,12 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from dro_grasp.cli.main import main
-from dro_grasp.errors import ObjectError
+from dro_grasp.errors import ObjectError, OptionError
+from dro_grasp.geometry.rigid_motion import read_motion
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.sources import object_of
 from dro_grasp.objects.library import load_object
-from dro_grasp.objects.scan import depth_points, scanned_object, without_outliers
+from dro_grasp.objects.scan import depth_points, load_scan, scanned_object, without_outliers
 from dro_grasp.objects.shape import ObjectModel
 from tests.weights import untrained_weights
 
@@ -135,5 +137,54 @@ def test_grasps_of_a_cloud_are_in_the_frame_of_the_camera_file(
     capsys.readouterr()
     mesh = [a if not a.endswith("scan.npy") else "mug" for a in base]
     assert main(mesh) == 2
-    assert "which no camera has seen" in capsys.readouterr().err
+    assert "no camera has seen" in capsys.readouterr().err
     assert torch.isfinite(palms).all()
+
+
+def test_a_file_remembers_the_frame_and_where_the_camera_stood(
+    depth: np.ndarray, T_object_camera: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Read again, the object stands where the grasps are; every export names their frame."""
+    points, file = depth_points(depth, INTRINSICS), tmp_path / "g.parquet"
+    np.save(tmp_path / "scan.npy", points)
+    (tmp_path / "camera.json").write_text(json.dumps({"frame": "base", "T_frame_camera": T_object_camera.tolist()}))
+    made = ["generate", "--hand", "gripper3", "--object", str(tmp_path / "scan.npy"), "--num", "2", "--weights",
+            str(untrained_weights(tmp_path)), "--camera", str(tmp_path / "camera.json"), "--output", str(file), "--json"]
+    assert main(made) == 0
+    assert json.loads(capsys.readouterr().out)["frame"] == "base"
+    grasps = GraspBatch.load(file)
+    again = object_of(grasps, None, 1.0)
+    assert again.sha256 == grasps.object_sha256[0] == load_scan(
+        tmp_path / "scan.npy", read_motion(tmp_path / "camera.json", "T_frame_camera").T.double().numpy()).sha256
+    seen = points @ T_object_camera[:3, :3].T + T_object_camera[:3, 3]
+    assert np.abs(again.cloud.mean(0) - seen.mean(0)).max() < 0.05
+    for form, ending in (("isaac_grasp", "yaml"), ("moveit", "moveit.yaml"), ("csv", "csv")):
+        target = tmp_path / f"out.{ending}"
+        assert main(["export", str(file), "--format", form, "--output", str(target)]) == 0
+        assert "in frame 'base'" in target.read_text().splitlines()[0]
+    assert "object_frame_link: base" in (tmp_path / "out.yaml").read_text()
+    assert "frame_id: base" in (tmp_path / "out.moveit.yaml").read_text()
+
+
+def test_what_depth_cameras_leave_behind_is_dropped(
+    mug: ObjectModel, depth: np.ndarray, T_object_camera: np.ndarray, tmp_path: Path
+) -> None:
+    """Pixels without depth as NaN, as organised clouds have them, and a stray far beyond the size of any object."""
+    points = depth_points(depth, INTRINSICS)
+    np.save(tmp_path / "raw.npy", np.concatenate([points, np.full((50, 3), np.nan), [[0.3, 0.2, 1.9]]]))
+    obj = load_scan(tmp_path / "raw.npy", T_object_camera)
+    assert float(np.ptp(obj.cloud, axis=0).max()) < 0.2
+    assert np.quantile(off_surface(mug, obj.cloud.astype(float)), 0.5) < 0.003
+
+
+@pytest.mark.parametrize(("content", "word"), [
+    ({"T_frame_camera": np.eye(4).tolist()}, "no entry 'frame'"),
+    ({"frame": "base"}, "no entry 'T_frame_camera'"),
+    ({"frame": "", "T_frame_camera": np.eye(4).tolist()}, "no name"),
+    ({"frame": 5, "T_frame_camera": np.eye(4).tolist()}, "no name"),
+    ({"frame": "base", "T_frame_camera": [[1, 0, 0, 400], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, "millimetres"),
+])
+def test_frames_that_mean_nothing_are_refused(content: dict[str, object], word: str, tmp_path: Path) -> None:
+    (tmp_path / "frame.json").write_text(json.dumps(content))
+    with pytest.raises(OptionError, match=word):
+        read_motion(tmp_path / "frame.json", "T_frame_camera")

@@ -31,6 +31,8 @@ PREDICTED = "predicted_points"
 """Column that carries the multilaterated points through selection and sorting; no file holds it."""
 
 
+MOST = 100_000
+"""Most grasps predicted in one call, those that ranking drops included."""
 HOTTEST = 2.0
 """Largest temperature that is taken."""
 CLOUD_TEMPERATURE = 0.5
@@ -121,6 +123,9 @@ class GraspPredictor:
                 few grasps stay above the table.
         """
         check_request(num, direction, self.config.temperature, candidates)
+        if table is not None and not table < float(obj.cloud[:, 2].max()):
+            raise OptionError(f"a table at {table} m leaves nothing of the object, which ends at z = "
+                              f"{float(obj.cloud[:, 2].max()):.3f} m; give --table in metres in the frame of the grasps")
         wanted, num = num, num * candidates
         self.timings = {"network": 0.0, "decode": 0.0, "refine": 0.0, "rank": 0.0}
         self.candidates = 0
@@ -276,6 +281,9 @@ def check_request(
         raise OptionError(f"num is {num}; ask for at least one grasp (--num 16)")
     if candidates < 1:
         raise OptionError(f"candidates is {candidates}; predict at least one for each grasp")
+    if num * candidates > MOST:
+        raise OptionError(f"{num} grasps of {candidates} candidates each do not fit memory; predict at most {MOST} at once, "
+                          "with another --seed for more")
     if direction is not None:
         length = math.sqrt(sum(x * x for x in direction))
         if not math.isfinite(length) or length < 1e-9:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -76,12 +77,14 @@ class Generate:
 
     def run(self) -> int:
         """Check everything that can be checked before the work, then do it."""
+        from dro_grasp.errors import DroGraspError
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.library import resolve_objects
         from dro_grasp.predictor import GraspPredictor, PredictorConfig, check_request
 
         check_request(self.num, self.direction, self.temperature, self.candidates)
         check_seed(self.seed)
+        check_table(self.table)
         names = resolve_objects([self.object])
         several = names != [self.object]
         outputs = paths_per_object(self.output, names, several, ".parquet")
@@ -91,24 +94,38 @@ class Generate:
         predictor = GraspPredictor(self.weights, config=PredictorConfig(temperature=self.temperature))
         load = time.perf_counter() - begin
         jobs = zip(names, outputs, pictures, strict=True)
-        done = [self._one(predictor, hand, name, output, picture, load) for name, output, picture in jobs]
+        done, failed = [], []
+        for name, output, picture in jobs:
+            try:
+                done.append(self._one(predictor, hand, name, output, picture, load))
+            except DroGraspError as error:
+                if not several:
+                    raise
+                say_aside(f"error: {name}: {error}")
+                failed.append({"object": name, "error": str(error)})
         if self.json:
-            print_json({"results": [d.report for d in done]} if several else done[0].report)
+            print_json({"results": [d.report for d in done], "failed": failed} if several else done[0].report)
         if self.view:
             from dro_grasp.viewer.app import view_grasps
 
             for d in done:
                 view_grasps(hand, d.obj, d.grasps, d.predicted_points)
-        return 0
+        return 2 if failed else 0
 
     def _one(
         self, predictor: GraspPredictor, hand: Hand, name: str, output: Path | None, picture: Path | None, load: float
     ) -> Done:
         """One object, start to end."""
+        from dro_grasp.geometry.rigid_motion import read_motion
         from dro_grasp.objects.library import load_object
+        from dro_grasp.objects.scan import load_scan
 
         begin = time.perf_counter()
-        obj = load_object(name, scale=self.scale) if self.camera is None else load_scan(name, self.camera, self.scale)
+        camera = None if self.camera is None else read_motion(self.camera, "T_frame_camera")
+        if camera is None:
+            obj = load_object(name, scale=self.scale)
+        else:
+            obj = load_scan(Path(name).expanduser(), camera.T.double().numpy(), self.scale)
         load += time.perf_counter() - begin
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
@@ -127,12 +144,13 @@ class Generate:
             "success_rate": None if result is None else result.success_rate,
             "seconds": {k: round(v, 4) for k, v in seconds.items()},
             "output": None if output is None else str(output),
+            "frame": "object" if camera is None else camera.frame,
         }
         kept = grasps
         if result is not None and self.only_successful:
             kept, points = grasps[result.success], None if points is None else points[result.success]
         if output is not None:
-            with_sources(kept, self.hand, name, self.scale).save(output)
+            with_sources(kept, self.hand, name, self.scale, camera).save(output)
         if picture is not None:
             from dro_grasp.viewer.pictures import draw_grasps
 
@@ -183,31 +201,20 @@ class Done:
     """Their hand points as the network placed them."""
 
 
-def load_scan(path: str, camera: Path, scale: float) -> ObjectModel:
-    """The object that a camera has seen, in the frame of the file that says where the camera is.
-
-    Raises:
-        ObjectError: It is no cloud, or none of an object's size.
-        OptionError: The file says nothing of the kind.
-    """
-    from dro_grasp.errors import ObjectError
-    from dro_grasp.geometry.rigid_motion import read_motion
-    from dro_grasp.objects.library import load_object
-    from dro_grasp.objects.scan import scanned_object
-
-    _, T_frame_camera = read_motion(camera, "T_frame_camera")
-    seen = load_object(path, scale=scale)
-    if not seen.is_cloud:
-        raise ObjectError(f"{path} is a mesh, which no camera has seen; leave out --camera, or give a cloud (PLY, NPY, PCD)")
-    return scanned_object(seen.name, seen.cloud, T_frame_camera.double().numpy())
-
-
 def check_seed(seed: int) -> None:
     """Refuse seeds that the random generators cannot take."""
     from dro_grasp.errors import OptionError
 
     if not 0 <= seed < 2**63:
         raise OptionError(f"seed is {seed}; give an integer from 0 to 2^63 - 1")
+
+
+def check_table(table: float | None) -> None:
+    """Refuse a height that is no number."""
+    from dro_grasp.errors import OptionError
+
+    if table is not None and not math.isfinite(table):
+        raise OptionError(f"table is {table}; give the height in metres, for example --table 0")
 
 
 def paths_per_object(path: Path | None, names: list[str], several: bool, suffix: str) -> list[Path | None]:
@@ -217,6 +224,9 @@ def paths_per_object(path: Path | None, names: list[str], several: bool, suffix:
 
     if path is None:
         return [None] * len(names)
+    if not several and path.suffix.lower() not in {"", suffix}:
+        raise OutputError(f"{path} would hold {suffix[1:]} under another ending; call it {path.with_suffix(suffix).name}"
+                          + ("; `dro-grasp export` writes other formats" if suffix == ".parquet" else ""))
     if not several:
         return [check_output(path)]
     if not path.is_dir():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -11,8 +12,19 @@ from torch import Tensor
 
 from dro_grasp.errors import OptionError
 
+LONGEST = 100.0
+"""Translations beyond this are in another unit [m]."""
 
-def read_motion(path: Path, key: str) -> tuple[str, Float[Tensor, "4 4"]]:
+
+class NamedMotion(NamedTuple):
+    """Where something stands in a frame."""
+
+    frame: str
+    T: Float[Tensor, "4 4"]
+    """Takes its coordinates to those of the frame [m]."""
+
+
+def read_motion(path: Path, key: str) -> NamedMotion:
     """A frame's name and a matrix from a JSON file `{"frame": NAME, key: 4x4}`.
 
     Args:
@@ -25,12 +37,18 @@ def read_motion(path: Path, key: str) -> tuple[str, Float[Tensor, "4 4"]]:
     wanted = f'{path} must hold {{"frame": NAME, "{key}": [4 rows of 4 numbers]}}, in metres'
     try:
         values = json.loads(path.read_text())
-        name, T = str(values["frame"]), torch.tensor(values[key], dtype=torch.float64)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        name, T = values["frame"], torch.tensor(values[key], dtype=torch.float64)
+    except KeyError as error:
+        raise OptionError(f"{wanted}; it has no entry {error}") from error
+    except (OSError, ValueError, TypeError) as error:
         raise OptionError(f"{wanted}; it does not ({error})") from error
+    if not isinstance(name, str) or not name:
+        raise OptionError(f"{wanted}; its frame is {name!r}, which is no name")
     if T.shape != (4, 4) or not bool(T.isfinite().all()) or T[3].tolist() != [0, 0, 0, 1]:
         raise OptionError(f"{wanted}; its matrix has shape {tuple(T.shape)} or a last row other than 0 0 0 1")
     R = T[:3, :3]
     if float((R @ R.T - torch.eye(3)).abs().max()) > 1e-3 or float(torch.linalg.det(R)) < 0:
         raise OptionError(f"{wanted}; the upper left 3x3 of its matrix is no rotation (scaled, or mirrored)")
-    return name, T.float()
+    if float(T[:3, 3].norm()) > LONGEST:
+        raise OptionError(f"{wanted}; its translation is {float(T[:3, 3].norm()):g} m long; divide millimetres by 1000")
+    return NamedMotion(name, T.float())

@@ -22,6 +22,7 @@ from torch import Tensor
 from dro_grasp.errors import OptionError
 from dro_grasp.geometry.rigid_motion import read_motion
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.sources import frame_of
 from dro_grasp.hands.hand import Hand
 
 OBJECT = "object"
@@ -168,11 +169,12 @@ def _confidence(grasps: GraspBatch, i: int) -> float:
 
 
 def _frame_of(grasps: GraspBatch, frame: Frame) -> str:
-    return grasps.object[0] if frame.name == OBJECT else frame.name
+    return frame.name if frame.name != OBJECT else frame_of(grasps) or grasps.object[0]
 
 
 def _comment(grasps: GraspBatch, frame: Frame) -> str:
-    where = f"the mesh frame of object '{grasps.object[0]}'" if frame.name == OBJECT else f"frame '{frame.name}'"
+    own = frame.name == OBJECT and frame_of(grasps) is None
+    where = f"the mesh frame of object '{grasps.object[0]}'" if own else f"frame '{_frame_of(grasps, frame)}'"
     return (
         f"# Grasps by hand '{grasps.hand}': poses of link '{grasps.wrist_link}' in {where}.\n"
         "# Metres and radians; quaternions by name or WXYZ. Joints are the independent ones; mimic joints follow them.\n"

@@ -8,16 +8,29 @@ from typing import TYPE_CHECKING
 from dro_grasp.errors import GraspFileError, HandError, ObjectError
 
 if TYPE_CHECKING:
+    from dro_grasp.geometry.rigid_motion import NamedMotion
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.hands.hand import Hand
     from dro_grasp.objects.shape import ObjectModel
 
 HAND_FILE, OBJECT_FILE, OBJECT_SCALE = "hand_file", "object_file", "object_scale"
 """Columns of grasps whose hand or object came from a file of the user's own."""
+FRAME, CAMERA = "frame", "T_frame_camera"
+"""Columns of grasps of what a camera has seen: the frame of the poses, and the camera's pose in it, row by row."""
 
 
-def with_sources(grasps: GraspBatch, hand: str, obj: str, scale: float) -> GraspBatch:
-    """Grasps that remember which files they were made from; names need no remembering."""
+def with_sources(
+    grasps: GraspBatch, hand: str, obj: str, scale: float, camera: NamedMotion | None = None
+) -> GraspBatch:
+    """Grasps that remember which files they were made from; names need no remembering.
+
+    Args:
+        grasps: Of one object.
+        hand: Name or path.
+        obj: Name or path.
+        scale: Of that path.
+        camera: Where the camera stood that has seen the object, in the frame of the grasps.
+    """
     import torch
 
     from dro_grasp.hands.library import locate_hand
@@ -28,6 +41,9 @@ def with_sources(grasps: GraspBatch, hand: str, obj: str, scale: float) -> Grasp
     if Path(obj).expanduser().is_file():
         extra[OBJECT_FILE] = (str(Path(obj).expanduser().resolve()),) * n
         extra[OBJECT_SCALE] = torch.full((n,), scale)
+    if camera is not None:
+        extra[FRAME] = (camera.frame,) * n
+        extra[CAMERA] = camera.T.reshape(1, 16).expand(n, 16)
     return grasps.replace(extra=extra)
 
 
@@ -61,11 +77,15 @@ def object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectMode
         ObjectError: It cannot be found; the message asks for --object.
     """
     from dro_grasp.objects.library import load_object
+    from dro_grasp.objects.scan import load_scan
 
     if given is not None:
         return load_object(given, scale=scale)
     try:
         source, own_scale = object_source(grasps, scale)
+        if (frame := frame_of(grasps)) is not None:
+            pose = grasps.extra[CAMERA][grasps.extra[FRAME].index(frame)].reshape(4, 4)
+            return load_scan(Path(source), pose.double().numpy(), own_scale)
         return load_object(source, scale=own_scale)
     except ObjectError as error:
         raise ObjectError(f"the grasps are of object '{grasps.object[0]}', which cannot be loaded ({error}); give its file "
@@ -77,6 +97,11 @@ def object_source(grasps: GraspBatch, scale: float = 1.0) -> tuple[str, float]:
     source = _remembered(grasps, OBJECT_FILE)
     own_scale = float(grasps.extra[OBJECT_SCALE][0]) if source and OBJECT_SCALE in grasps.extra else scale
     return source or grasps.object[0], own_scale
+
+
+def frame_of(grasps: GraspBatch) -> str | None:
+    """The frame of grasps of what a camera has seen; None for those in the object's own frame."""
+    return _remembered(grasps, FRAME)
 
 
 def require_same(grasps: GraspBatch, hand: Hand, obj: ObjectModel) -> None:

@@ -46,7 +46,11 @@ def build_hand(description: Description, *, name: str | None = None, seed: int =
     shaped = sorted({g.link for g in description.geometry})
     if not shaped:
         raise HandError(f"{description.path} has no visual or collision shape; nothing can be sampled or touch")
-    tips = find_tips(tree, shaped)
+    try:
+        tips = find_tips(tree, shaped)
+    except HandError as error:
+        lost = [note.text for note in description.notes if note.level == "warning"]
+        raise HandError(f"{description.path}: {error}" + "".join(f"; {text}" for text in lost[:3])) from error
     palm = find_palm_link(tree, tips, shaped)
     below = [link for link in range(tree.n_links) if bool(tree.descends[link, palm])]
     held = _held_joints(tree, palm)
@@ -95,7 +99,8 @@ def find_tips(tree: KinematicTree, shaped: list[int]) -> tuple[int, ...]:
         if solid and not moved_further:
             tips.append(max(solid, key=lambda i: int(tree.descends[i].sum())))
     if not tips:
-        raise HandError("no moving joint of this description carries a shape, so it has no fingertip")
+        raise HandError("no moving joint of this description carries a shape, so it has no fingertip; give its moving links a "
+                        "visual or collision shape")
     return tuple(tips)
 
 

@@ -50,6 +50,26 @@ def load_file(path: Path, *, scale: float = 1.0) -> ObjectModel:
     return mesh_object(path.stem, geometry, origin=str(path), scale=scale)
 
 
+def read_points(path: Path) -> np.ndarray:
+    """Points (n 3) of a cloud file as float64 [its unit, metres where it states one], as they are: NaN and strays as well.
+
+    Raises:
+        ObjectError: There is no such file, it is damaged, or it holds a mesh.
+    """
+    if not path.is_file():
+        raise ObjectError(f"no file at {path}; with --camera give a cloud (PLY, NPY, PCD). What has a name is a mesh, which no "
+                          "camera has seen")
+    if path.suffix.lower() in CLOUD_SUFFIXES:
+        points = read_cloud(path)
+        if points.ndim != 2 or points.shape[1] < 3:
+            raise ObjectError(f"{path} holds an array of shape {points.shape}; expected (n, 3) points")
+        return points[:, :3]
+    geometry, unit = read_geometry(path)
+    if not isinstance(geometry, np.ndarray):
+        raise ObjectError(f"{path} is a mesh, which no camera has seen; leave out --camera, or give a cloud (PLY, NPY, PCD)")
+    return geometry * unit
+
+
 def read_geometry(path: Path) -> tuple[trimesh.Trimesh | np.ndarray, float]:
     """One mesh, scenes merged, or the points (n 3) of a file without faces; and its stated unit [m].
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from jaxtyping import Bool, Float, Num
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.objects.completion import completed
-from dro_grasp.objects.loading import cloud_object, estimate_normals
-from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.objects.loading import cloud_object, estimate_normals, read_points
+from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
 
 NEIGHBOURS = 12
 """Points that decide whether a point is an outlier."""
@@ -47,6 +49,20 @@ def depth_points(
     return (rays / rays[2] * z).T
 
 
+def load_scan(path: Path, T_frame_camera: Float[np.ndarray, "4 4"], scale: float = 1.0) -> ObjectModel:
+    """The object that a camera has seen, from a cloud file in the camera's frame; as `scanned_object` makes it.
+
+    Args:
+        path: PLY, NPY or PCD; points that are NaN, as organised clouds have them, and strays are dropped.
+        T_frame_camera: The camera's pose in the wanted frame.
+        scale: Multiplies the points; 0.001 for millimetres.
+
+    Raises:
+        ObjectError: It is no cloud, or none of an object's size.
+    """
+    return scanned_object(path.stem, read_points(path) * scale, T_frame_camera)
+
+
 def scanned_object(
     name: str,
     points: Float[np.ndarray, "n 3"],
@@ -69,6 +85,8 @@ def scanned_object(
     """
     kept = np.asarray(points, np.float64)
     kept = kept[np.isfinite(kept).all(1)]
+    if len(kept) > CLOUD_POINTS:
+        kept = kept[np.random.default_rng(0).permutation(len(kept))[:CLOUD_POINTS]]
     if denoise and len(kept) > NEIGHBOURS:
         kept = without_outliers(kept)
     if len(kept) < NEIGHBOURS:
