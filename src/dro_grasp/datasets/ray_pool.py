@@ -46,7 +46,7 @@ class RayPool:
         try:
             import ray
         except ImportError as error:
-            raise OptionError("the engine 'ray' needs Ray: pip install 'dro-grasp[ray]'; or use --engine local") from error
+            raise OptionError("the engine 'ray' needs Ray: pip install 'ray>=2.40'; or use --engine local") from error
         self.limit, self.started_here = limit, False
         if not ray.is_initialized():
             self.started_here = True
