@@ -270,3 +270,25 @@ def test_held_out_hands_enter_few_shot_bundles_only(path: Path) -> None:
     assert write_bundle(path, [HAND], BALL, [grasps], SPLITS["few_shot"]).n_grasps == 3
     with pytest.raises(BundleError, match="held out"):
         write_bundle(path, [HAND], BALL, [made_up_grasps(HAND, "ball", 3)], SPLITS["few_shot"])
+
+
+def test_what_cannot_be_bundled_is_counted_by_split(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def refused(*more: str) -> str:
+        output = tmp_path / "b.safetensors"
+        assert main(["dataset", "bundle", str(tmp_path / "mug.parquet"), "--output", str(output), *more]) == 2
+        assert not output.exists()
+        return capsys.readouterr().err
+
+    tested = made_up_grasps(HAND, count=3, split="test")
+    held = tested.replace(success=torch.ones(3, dtype=torch.bool), protocol=("strict/1",) * 3)
+    held.save(tmp_path / "mug.parquet")
+    told = refused()
+    assert "no grasps of split 'train' were given, but 3 of split 'test'" in told
+    assert "objects for training" in told
+    assert "choose --split" not in told
+    assert "no grasps of other were given, but of toy" in refused("--hands", "other")
+    held.replace(split=("validate", "validate", "test")).save(tmp_path / "mug.parquet")
+    told = refused()
+    assert "but 1 of split 'test', 2 of split 'validate'; choose --split validate, or" in told
+    held.replace(success=torch.zeros(3, dtype=torch.bool)).save(tmp_path / "mug.parquet")
+    assert "no grasps that held in a trial" in refused("--hands", "toy")

@@ -25,7 +25,7 @@ COMMANDS = [
 ]
 KEYS = {
     "hand", "object", "num", "candidates", "seed", "weights", "protocol", "success", "success_rate", "seconds",
-    "output",
+    "output", "frame",
 }
 
 
@@ -74,6 +74,10 @@ def test_help_loads_nothing_heavy() -> None:
     [
         (["--num", "0"], "num is 0"),
         (["--num", "-1"], "num is -1"),
+        (["--num", "1000000000"], "at most"),
+        (["--table", "nan"], "table is nan"),
+        (["--output", "grasps.csv"], "grasps.parquet"),
+        (["--picture", "grasps.svg"], "grasps.png"),
         (["--direction", "0", "0", "0"], "direction"),
         (["--seed", "-1"], "seed is -1"),
         (["--hand", "allegr"], "allegro"),
@@ -180,6 +184,28 @@ def test_folder_of_objects_gets_a_file_each(generate, tmp_path: Path) -> None:
     assert sorted(f.name for f in results.iterdir()) == ["a_ply.parquet", "a_stl.parquet"]
 
 
+def test_a_bad_object_in_a_folder_costs_only_its_own_grasps(
+    weights: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import trimesh
+
+    objects, results = tmp_path / "objects", tmp_path / "results"
+    objects.mkdir(), results.mkdir()
+    trimesh.creation.icosphere(radius=0.03).export(objects / "a.stl")
+    trimesh.creation.icosphere(radius=30.0).export(objects / "huge.stl")
+    trimesh.creation.box((0.05, 0.05, 0.05)).export(objects / "z.stl")
+    base = ["generate", "--hand", "gripper3", "--object", str(objects), "--weights", weights, "--num", "2"]
+    assert main([*base, "--protocol", "none", "--output", str(results), "--json"]) == 2
+    said = capsys.readouterr()
+    report = json.loads(said.out)
+    assert [r["object"] for r in report["results"]] == ["a", "z"]
+    (failed,) = report["failed"]
+    assert failed["object"].endswith("huge.stl")
+    assert "too large" in failed["error"]
+    assert "huge.stl" in said.err
+    assert sorted(f.name for f in results.iterdir()) == ["a.parquet", "z.parquet"]
+
+
 def test_folder_of_objects_needs_a_folder_for_results(weights: str, tmp_path: Path, capsys) -> None:
     (tmp_path / "a.stl").write_text("")
     (tmp_path / "b.stl").write_text("")
@@ -201,7 +227,7 @@ def test_table_keeps_hands_above_it(generate, tmp_path: Path) -> None:
 def test_impossible_table_says_so(weights: str, capsys: pytest.CaptureFixture[str]) -> None:
     base = ["generate", "--hand", "gripper3", "--object", "sphere", "--weights", weights, "--num", "2"]
     assert main([*base, "--table", "5"]) == 2
-    assert "--table" in capsys.readouterr().err
+    assert "leaves nothing of the object" in capsys.readouterr().err
 
 
 def test_evaluate_and_view_take_the_file_that_generate_wrote(generate, tmp_path: Path, capsys) -> None:
@@ -266,3 +292,13 @@ def test_own_files_are_found_again(
     (tmp_path / "mine.urdf").unlink()
     assert main(["picture", "../grasps.parquet", "--output", "a.png"]) == 2
     assert "give its file with --hand" in capsys.readouterr().err
+
+
+def test_verify_prints_no_empty_table(weights: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "bad.safetensors").write_bytes(b"no weights")
+    assert main(["weights", "verify", str(tmp_path / "bad.safetensors")]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "bad.safetensors" in said.err
+    assert main(["weights", "verify", str(tmp_path / "bad.safetensors"), weights]) == 2
+    assert "sha256" in capsys.readouterr().out

@@ -9,7 +9,8 @@ import pytest
 import torch
 import trimesh
 
-from dro_grasp.datasets import production
+from dro_grasp.cli.main import main
+from dro_grasp.datasets import engine, production
 from dro_grasp.datasets.collections import read_collection
 from dro_grasp.datasets.engine import EngineConfig, PairState, next_pair, synthesize_dataset
 from dro_grasp.datasets.pools import Outcome, Work, failure_of
@@ -304,3 +305,35 @@ def test_grasps_of_files_remember_them(tmp_path):
     assert set(pair.grasps.extra["object_file"]) == {str(tmp_path / "ball.stl")}
     assert pair.grasps.extra["object_scale"].unique().tolist() == [pytest.approx(1.2)]
     assert set(pair.grasps.split) == {""}
+
+
+@pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_time_that_is_none_is_refused(tmp_path, seconds):
+    with pytest.raises(OptionError, match="seconds is "):
+        synthesize_dataset(["a"], ["x"], 1, tmp_path / "data", make_pool=HerePool, seconds=seconds)
+    assert not (tmp_path / "data").exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("--hand", "nowhere.urdf"), ("--hand", "barret"), ("--object", "nope.stl"), ("--object", "mugg"), ("--minutes", "-1"),
+     ("--minutes", "0"), ("--minutes", "nan"), ("--grasps", "0"), ("--workers", "0"), ("--scale", "nan")],
+)
+def test_the_command_refuses_before_it_starts(tmp_path, monkeypatch, capsys, option, value):
+    monkeypatch.setattr(engine, "synthesize_dataset", None)
+    given = {"--hand": "barrett", "--object": "mug", "--output": str(tmp_path / "sy"), option: value}
+    assert main(["synthesize", *(word for pair in given.items() for word in pair)]) == 2
+    told = capsys.readouterr().err
+    assert value in told
+    assert told.startswith(f"error: {option} is " if option not in {"--hand", "--object"} else "error: no")
+    assert not (tmp_path / "sy").exists()
+
+
+@pytest.mark.parametrize(("grasps", "failures", "code"), [(0, True, 2), (3, True, 0), (0, False, 0)])
+@pytest.mark.parametrize("more", [[], ["--json"]])
+def test_the_command_fails_when_nothing_came_of_it(tmp_path, monkeypatch, capsys, grasps, failures, code, more):
+    report = engine.DatasetReport(grasps, grasps, 1, 1.0, {("barrett", "mug"): "slipped"} if failures else {})
+    monkeypatch.setattr(engine, "synthesize_dataset", lambda *_, **__: report)
+    assert main(["synthesize", "--hand", "barrett", "--object", "mug", "--output", str(tmp_path), *more]) == code
+    said = capsys.readouterr()
+    assert ("slipped" in said.out + said.err) == failures

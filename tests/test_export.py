@@ -172,7 +172,8 @@ def test_missing_pregrasps_are_made(grasps: GraspBatch, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "word"),
     [
-        ("not json", "it does not"), ("{}", "it does not"), ('{"frame": "a", "T_frame_object": [[1, 0], [0, 1]]}', "shape"),
+        ("not json", "it does not"), ("{}", "no entry 'frame'"),
+        ('{"frame": "a", "T_frame_object": [[1, 0], [0, 1]]}', "shape"),
         ('{"frame": "a", "T_frame_object": [[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]}', "no rotation"),
         ('{"frame": "a", "T_frame_object": [[-1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}', "no rotation"),
         ('{"frame": "a", "T_frame_object": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[1,0,0,1]]}', "last row"),
@@ -203,3 +204,27 @@ def test_the_frame_of_the_object_changes_nothing(grasps: GraspBatch) -> None:
     position, quaternion = Frame().place(grasps)
     np.testing.assert_allclose(position, grasps.T_object_wrist[:, :3, 3], atol=1e-7)
     assert bool((quaternion[:, 0] >= 0).all())
+
+
+@pytest.mark.parametrize("old", ["9.npy", "mug/0.npy"])
+def test_old_and_new_npy_files_are_not_mixed(
+    grasps: GraspBatch, tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str
+) -> None:
+    grasps.save(tmp_path / "all.parquet")
+    (tmp_path / "out" / old).parent.mkdir(parents=True)
+    (tmp_path / "out" / old).write_bytes(b"old")
+    assert export(tmp_path / "all.parquet", "--format", "dexgraspbench", "--output", tmp_path / "out") == 2
+    told = capsys.readouterr().err
+    assert f"into {tmp_path / 'out'}: it holds npy files already ({old})" in told
+    assert "choose an empty folder" in told
+    assert [p for p in (tmp_path / "out").rglob("*") if p.is_file()] == [tmp_path / "out" / old]
+    (tmp_path / "out" / old).unlink()
+    assert export(tmp_path / "all.parquet", "--format", "dexgraspbench", "--output", tmp_path / "out") == 0
+
+
+def test_a_failed_export_leaves_no_folder(grasps: GraspBatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    grasps.replace(pregrasp_joints=None).save(tmp_path / "all.parquet")
+    bad = ("--format", "dexgraspbench", "--hand", "nowhere.urdf", "--output", tmp_path / "out")
+    assert export(tmp_path / "all.parquet", *bad) == 2
+    assert "nowhere.urdf" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

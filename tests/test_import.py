@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -133,3 +134,77 @@ def test_other_joints_are_told(made, tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "has no joint" in capsys.readouterr().err
     assert imported(tmp_path / "can.npy", "--format", "dexgraspnet", "--output", tmp_path / "out") == 2
     assert "--hands" in capsys.readouterr().err
+
+
+def test_no_file_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert main(["dataset", "import", "--format", "cmap", "--output", str(out)]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "name at least one cmap file" in said.err
+    assert imported(tmp_path / "missing.pt", "--format", "cmap", "--output", out) == 2
+    assert f"error: no file {tmp_path / 'missing.pt'}; " in capsys.readouterr().err
+    assert imported(tmp_path, "--format", "cmap", "--output", out) == 2
+    assert "is a folder" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_no_grasp_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = [str(tmp_path / "cmap.pt"), "--format", "cmap", "--output", str(tmp_path / "out")]
+    torch.save({"metadata": [(torch.zeros(11), "nothing+here", HAND)]}, tmp_path / "cmap.pt")
+    assert main(["dataset", "import", *given]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "--object" in said.err
+    torch.save({"metadata": []}, tmp_path / "cmap.pt")
+    assert main(["dataset", "import", *given]) == 2
+    assert "cmap.pt holds none" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("plain", [True, False])
+def test_a_refused_pickle_is_told_without_advice_to_open_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], recwarn: pytest.WarningsRecorder, plain: bool
+) -> None:
+    path = tmp_path / "bad.pt"
+    if plain:
+        path.write_bytes(pickle.dumps({"metadata": []}, protocol=4))
+    else:
+        torch.save({"metadata": np.zeros(3)}, path)
+    assert imported(path, "--format", "cmap", "--output", tmp_path / "out") == 2
+    told = capsys.readouterr().err
+    assert "bad.pt holds more than tensors (it " in told
+    assert "not opened, for safety" in told
+    assert "save its grasps again" in told
+    assert "weights_only" not in told
+    assert not list(recwarn)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("kind", "content", "missing", "expected"),
+    [
+        ("dexgraspbench", {"pose": 1}, "grasp_qpos", "joint_names"),
+        ("dexgraspnet", [{"scale": 1.0}], "qpos", "WRJTx"),
+        ("dexgraspnet", [{"scale": 1.0, "qpos": {"j": 0.0}}], "WRJTx", "each with 'scale'"),
+        ("cmap", {"info": {}}, "metadata", "a list of (wrist and joints, object, hand)"),
+    ],
+)
+def test_a_missing_entry_is_named(kind: str, content: object, missing: str, expected: str, tmp_path: Path) -> None:
+    path = tmp_path / "wrong.file"
+    with path.open("wb") as file:
+        if kind == "cmap":
+            torch.save(content, file)
+        else:
+            np.save(file, np.array(content, dtype=object), allow_pickle=True)
+    with pytest.raises(GraspFileError, match=f"it has no entry '{missing}'; expected ") as told:
+        read_foreign(path, kind)  # type: ignore[arg-type]
+    assert expected in str(told.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"hello world"])
+def test_files_of_nothing_are_told(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(content)
+    for kind in ("cmap", "dexgraspnet", "dexgraspbench"):
+        with pytest.raises(GraspFileError, match=f"is no {kind} file that can be read"):
+            read_foreign(tmp_path / "a", kind)  # type: ignore[arg-type]

@@ -89,3 +89,23 @@ def test_a_hand_that_grasps_nothing_is_told(
     monkeypatch.setattr(steps, "count_collection", lambda _: {})
     assert main([*command(home), "--output", str(home / "empty")]) == 2
     assert "every candidate penetrates" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "word"),
+    [("--minutes", "nan", "error: minutes is nan; give a positive number, for example --minutes 30\n"),
+     ("--minutes", "inf", "error: minutes is inf; "), ("--num", "0", "error: num is 0; give at least 1 (--num)\n"),
+     ("--workers", "0", "error: workers is 0; "), ("--held-out", "cann", "no object is called 'cann'"),
+     ("--held-out", "nowhere.stl", "nowhere.stl"), ("--objects", "spher", "no object is called 'spher'"),
+     ("--weights", "nowhere", "no weights at 'nowhere'"), ("hand", "nothand.urdf", "nothand.urdf"),
+     ("hand", "missing.urdf", "missing.urdf")],
+)
+def test_what_is_refused_leaves_no_folder(
+    home: Path, option: str, value: str, word: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (home / "nothand.urdf").write_text("<robot name='a'><link name='b'/></robot>")
+    more = ["--output", str(home / "new")]
+    line = command(home, *more, hand=value) if option == "hand" else command(home, *more, option, value)
+    assert main(line) == 2
+    assert word in capsys.readouterr().err
+    assert not (home / "new").exists()

@@ -10,6 +10,8 @@ import pytest
 import torch
 from PIL import Image
 
+from dro_grasp.cli import view
+from dro_grasp.cli.main import main
 from dro_grasp.errors import OutputError
 from dro_grasp.geometry.rasterizer import Camera, render
 from dro_grasp.grasps.batch import GraspBatch
@@ -17,6 +19,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.library import load_object
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.viewer import pictures
 from dro_grasp.viewer.pictures import (
     CAPTION,
     HEADER,
@@ -166,3 +169,42 @@ def test_touching_points_lie_on_the_ball(hand, obj, grasps) -> None:
     bare = touching_points(
         hand, dataclasses.replace(obj, vertices=None, faces=None), grasps.joints[0], grasps.T_object_wrist[0])
     assert abs(len(bare) - expected.sum()) <= 0.4 * expected.sum() + 3, "of a cloud as well"
+
+
+@pytest.fixture(scope="module")
+def file(grasps: GraspBatch, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("pictures") / "grasps.parquet"
+    grasps.save(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["--count", "0"], "error: --count is 0; give at least 1\n"),
+        (["--columns", "-1"], "error: --columns is -1; give at least 1\n"),
+        (["--size", "100000", "100000"], "error: --size is 100000 100000; give a width and a height of 1 to 4096 pixels\n"),
+        (["--size", "0", "100"], "error: --size is 0 100; "),
+        (["--opacity", "nan"], "error: --opacity is nan; give a number from 0 to 1\n"),
+        (["--output", "p.svg"], "p.svg: pictures are PNG; give a name that ends in .png\n"),
+        (["--output", "p"], "p: pictures are PNG; "),
+    ],
+)
+def test_the_command_names_the_option_that_is_wrong(
+    file: Path, arguments: list[str], word: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(file.parent)
+    monkeypatch.setattr(pictures, "draw_grasps", None)
+    assert main(["picture", file.name, "--output", "p.png", *arguments]) == 2
+    assert word in capsys.readouterr().err
+    assert [p.name for p in file.parent.iterdir()] == [file.name]
+
+
+def test_a_sheet_of_too_many_pixels_is_refused(
+    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(view, "MOST_PIXELS", 3 * 64 * 48 - 1)
+    given = ["picture", str(file), "--output", str(file.parent / "Sheet.PNG"), "--size", "64", "48"]
+    assert main(given) == 2
+    assert "3 pictures of 64 x 48 are" in capsys.readouterr().err
+    assert main([*given, "--count", "2"]) == 0

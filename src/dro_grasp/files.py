@@ -30,8 +30,8 @@ def check_output(path: Path | str) -> Path:
     return path
 
 
-def make_folder(path: Path | str) -> Path:
-    """A folder to write into, made when only itself is missing.
+def check_folder(path: Path | str) -> Path:
+    """Refuse a folder that cannot be made or written into, without making it.
 
     Raises:
         OutputError: Its parent is missing, it is a file, or there is no permission.
@@ -39,14 +39,25 @@ def make_folder(path: Path | str) -> Path:
     path = Path(path)
     if path.exists() and not path.is_dir():
         raise OutputError(f"cannot write into {path}: it is a file; give a folder")
-    if not path.absolute().parent.is_dir():
-        raise OutputError(f"cannot make {path}: no folder {path.absolute().parent}; create it first")
+    parent = path.absolute().parent
+    if not parent.is_dir():
+        raise OutputError(f"cannot make {path}: no folder {parent}; create it first")
+    if not os.access(path if path.exists() else parent, os.W_OK):
+        raise OutputError(f"cannot write into {path if path.exists() else parent}: no permission; choose another folder")
+    return path
+
+
+def make_folder(path: Path | str) -> Path:
+    """A folder to write into, made when only itself is missing.
+
+    Raises:
+        OutputError: Its parent is missing, it is a file, or there is no permission.
+    """
+    path = check_folder(path)
     try:
         path.mkdir(exist_ok=True)
     except OSError as error:
         raise OutputError(f"cannot make {path}: {error.strerror}; choose another folder") from error
-    if not os.access(path, os.W_OK):
-        raise OutputError(f"cannot write into {path}: no permission; choose another folder")
     return path
 
 

@@ -35,13 +35,20 @@ class Import:
         """Read all files, find hands and objects, write."""
         from dro_grasp.datasets.importing import import_grasps
         from dro_grasp.datasets.merging import file_name
-        from dro_grasp.files import make_folder
+        from dro_grasp.errors import GraspFileError
+        from dro_grasp.files import check_folder, make_folder
 
+        check_folder(self.output)
         here = {theirs: ours for theirs, _, ours in (pair.rpartition("=") for pair in self.hands)}
-        folder = make_folder(self.output)
         by_hand, missing = import_grasps(self.inputs, self.format, here, self.object)
         for obj, why in missing.items():
             say_aside(f"grasps of {obj} are left out: {why}")
+        if not (by_hand or self.json):
+            raise GraspFileError(
+                "no grasp was imported; name the object of all grasps with --object, or set DRO_GRASP_ASSETS to the folder "
+                "with the data set's objects" if missing else
+                f"no grasp was imported: {', '.join(map(str, self.inputs))} holds none; name other files")
+        folder = make_folder(self.output) if by_hand else self.output
         rows = []
         for grasps in by_hand.values():
             path = folder / file_name(grasps.hand)

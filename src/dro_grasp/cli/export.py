@@ -47,7 +47,7 @@ class Export:
     def run(self) -> int:
         """Complete the grasps, then write a file for each object."""
         from dro_grasp.errors import GraspFileError
-        from dro_grasp.files import check_output, make_folder
+        from dro_grasp.files import check_folder, check_output, make_folder
         from dro_grasp.grasps.formats import Frame
         from dro_grasp.grasps.sources import hand_of
 
@@ -61,13 +61,17 @@ class Export:
             grasps = grasps[kept]
         names = list(dict.fromkeys(grasps.object))
         folder = self.format == "dexgraspbench" or len(names) > 1
-        target = make_folder(self.output) if folder else check_output(self.output)
+        target = check_folder(self.output) if folder else check_output(self.output)
+        if self.format == "dexgraspbench":
+            refuse_mixing(target)
         hand = hand_of(grasps, self.hand) if self.format == "moveit" or grasps.pregrasp_joints is None else None
+        parts = [self._complete(grasps[[i for i, o in enumerate(grasps.object) if o == name]], hand) for name in names]
+        if folder:
+            make_folder(target)
         written = []
-        for name in names:
-            part = grasps[[i for i, o in enumerate(grasps.object) if o == name]]
+        for name, part in zip(names, parts, strict=True):
             path = target / f"{name.replace('/', '-')}{SUFFIXES[self.format]}" if len(names) > 1 else target
-            written += self._write(path, self._complete(part, hand), hand, frame)
+            written += self._write(path, part, hand, frame)
         if self.json:
             print_json({"format": self.format, "frame": frame.name, "num": len(grasps), "files": [str(p) for p in written]})
         else:
@@ -113,3 +117,17 @@ class Export:
         with replacing(path) as temporary:
             temporary.write_text(text)
         return [path]
+
+
+def refuse_mixing(folder: Path) -> None:
+    """Refuse a folder that holds npy files, itself or one level down: a reader could not tell old grasps from new.
+
+    Raises:
+        OutputError: It holds some.
+    """
+    from dro_grasp.errors import OutputError
+
+    old = next((path for pattern in ("*.npy", "*/*.npy") for path in folder.glob(pattern)), None)
+    if old is not None:
+        raise OutputError(f"cannot write grasps into {folder}: it holds npy files already ({old.relative_to(folder)}), and old "
+                          "and new grasps would be mixed; choose an empty folder or a new one")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -50,15 +51,14 @@ class Synthesize:
     """Print one JSON object instead of a table."""
 
     def run(self) -> int:
-        """Check names first, then fill the folder."""
-        from dro_grasp.datasets.engine import EngineConfig, synthesize_dataset
+        """Check numbers and names first, then fill the folder; code 2 if it holds no grasp because every pair failed."""
+        from dro_grasp.datasets.engine import EngineConfig, require_known, synthesize_dataset
         from dro_grasp.grasps.synthesis import SynthesisConfig
-        from dro_grasp.hands.library import locate_hand
         from dro_grasp.objects.library import resolve_objects
 
-        for name in self.hand:
-            locate_hand(name)
+        self._check_numbers()
         objects = resolve_objects(list(self.object))
+        require_known(self.hand, objects)
         report = synthesize_dataset(
             self.hand, objects, self.grasps, self.output, workers=self.workers, seed=self.seed, protocol=self.protocol,
             config=EngineConfig(synthesis=SynthesisConfig(device=self.device)), scale=self.scale, progress=say_aside,
@@ -68,14 +68,29 @@ class Synthesize:
         failures = [{"hand": h, "object": o, "reason": why} for (h, o), why in report.failures.items()]
         values = {"output": str(self.output), "grasps": report.grasps, "added": report.added, "shards": report.shards,
                   "seconds": round(report.seconds, 2), "failures": failures}
+        code = 2 if failures and not report.grasps else 0
         if self.json:
             print_json(values)
-            return 0
+            return code
         print_table("synthesis", ["grasps", "added", "shards", "seconds"],
                     [[report.grasps, report.added, report.shards, report.seconds]])
         for failure in failures:
             say_aside(f"{failure['hand']} on {failure['object']}: {failure['reason']}")
-        return 0
+        if code:
+            say_aside("error: no grasp was made, for the reasons above")
+        return code
+
+    def _check_numbers(self) -> None:
+        """Refuse numbers that nothing can be made with, by the names of their options."""
+        from dro_grasp.errors import OptionError
+
+        for option, value in (("--grasps", self.grasps), ("--workers", self.workers)):
+            if value < 1:
+                raise OptionError(f"{option} is {value}; give at least 1")
+        if self.minutes is not None and not (math.isfinite(self.minutes) and self.minutes > 0):
+            raise OptionError(f"--minutes is {self.minutes}; give a positive number, or leave it out for no limit")
+        if not (math.isfinite(self.scale) and self.scale > 0):
+            raise OptionError(f"--scale is {self.scale}; give a positive number, for example 0.001 for millimetres")
 
     def _ray_pool(self, job: Job) -> Pool:
         from dro_grasp.datasets.ray_pool import RayPool

@@ -16,6 +16,11 @@ if TYPE_CHECKING:
     from dro_grasp.hands.hand import Hand
     from dro_grasp.objects.shape import ObjectModel
 
+MOST_SIDE = 4096
+"""Largest width and height of one picture [pixels]."""
+MOST_PIXELS = 100_000_000
+"""Of all pictures of a sheet together."""
+
 
 @dataclass(frozen=True)
 class View:
@@ -62,13 +67,13 @@ class Picture:
     file: tyro.conf.Positional[Path]
     """Grasp file."""
     output: Path
-    """PNG to write."""
+    """PNG to write; its name ends in .png."""
     count: int = 16
     """Most grasps drawn, the first of the file."""
     columns: int = 4
     """Pictures side by side."""
     size: tuple[int, int] = (320, 280)
-    """Width and height of one picture in pixels."""
+    """Width and height of one picture in pixels, at most 4096 each."""
     opacity: float = 1.0
     """Of the object: at 0.5 the hand shows through it."""
     contacts: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -88,19 +93,35 @@ class Picture:
         from dro_grasp.files import check_output
         from dro_grasp.viewer.pictures import PictureStyle, draw_grasps
 
+        self._check_options()
         check_output(self.output)
-        if min(self.count, self.columns, *self.size) < 1 or not 0 <= self.opacity <= 1:
-            raise OptionError(f"count is {self.count}, columns {self.columns}, size {self.size}, opacity {self.opacity}; "
-                              "numbers must be positive and opacity between 0 and 1")
         hand, obj, grasps = of_one_object(self.file, self.hand, self.object, self.scale)
         if self.only_successful:
             if grasps.success is None or not bool((grasps.success & grasps.tried).any()):
                 raise GraspFileError(f"no grasp in {self.file} has succeeded in a trial; leave out --only-successful")
             grasps = grasps[grasps.success & grasps.tried]
+        shown = min(self.count, len(grasps))
+        if (pixels := shown * self.size[0] * self.size[1]) > MOST_PIXELS:
+            raise OptionError(f"{shown} pictures of {self.size[0]} x {self.size[1]} are {pixels / 1e6:.0f} million pixels; a "
+                              f"sheet has at most {MOST_PIXELS // 10**6} million: give a smaller --size or --count")
         style = PictureStyle(self.size, self.opacity, self.contacts)
         draw_grasps(hand, obj, grasps, self.output, self.count, self.columns, style)
         say(f"picture: {self.output}")
         return 0
+
+    def _check_options(self) -> None:
+        """Refuse what cannot be drawn, naming only the option that is wrong."""
+        from dro_grasp.errors import OptionError, OutputError
+
+        if self.output.suffix.lower() != ".png":
+            raise OutputError(f"cannot write {self.output}: pictures are PNG; give a name that ends in .png")
+        for option, value in (("--count", self.count), ("--columns", self.columns)):
+            if value < 1:
+                raise OptionError(f"{option} is {value}; give at least 1")
+        if not (min(self.size) >= 1 and max(self.size) <= MOST_SIDE):
+            raise OptionError(f"--size is {self.size[0]} {self.size[1]}; give a width and a height of 1 to {MOST_SIDE} pixels")
+        if not 0 <= self.opacity <= 1:
+            raise OptionError(f"--opacity is {self.opacity}; give a number from 0 to 1")
 
 
 def of_one_object(

@@ -61,7 +61,8 @@ class Verify:
         if self.json:
             print_json({"ok": not harmed, "weights": rows})
         else:
-            print_table("weights", ["name", "sha256"], [[row["name"], row["sha256"]] for row in rows if not row["error"]])
+            if sound := [[row["name"], row["sha256"]] for row in rows if not row["error"]]:
+                print_table("weights", ["name", "sha256"], sound)
             for row in harmed:
                 print(f"error: {row['error']}", file=sys.stderr)
         return 2 if harmed else 0

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Sequence, Set
 from pathlib import Path
 
 import torch
@@ -36,18 +37,38 @@ def make_bundle(
         OutputError: It cannot be written.
     """
     allowed, kept, left_out = SPLITS[split], [], 0
+    seen: Counter[str] = Counter()
+    hands_seen: set[str] = set()
     for pair in (pair for path in inputs for pair in read_collection(path)):
+        hands_seen |= {pair.hand, pair.grasps.hand}
         if hands and pair.hand not in hands and pair.grasps.hand not in hands:
             continue
         grasps = pair.grasps[[i for i, name in enumerate(pair.grasps.split) if name in allowed]]
+        seen.update(pair.grasps.split)
         left_out += len(pair.grasps) - len(grasps)
         if len(grasps):
             kept.append(grasps)
+    if not kept:
+        raise BundleError(_why_none(split, seen, hands, hands_seen))
     found, clouds = sources(kept)
     if per_pair is not None:
         by_hash = {hand.sha256: hand for hand in found}
         kept = [grasps[spread(by_hash[grasps.hand_sha256], grasps, per_pair)] for grasps in kept]
     return write_bundle(output, found, clouds, kept, allowed), left_out
+
+
+def _why_none(split: str, seen: Counter[str], hands: Sequence[str], hands_seen: Set[str]) -> str:
+    """What was there instead of grasps of a split, and what to do."""
+    if not seen:
+        if hands and not hands_seen & set(hands):
+            return (f"no grasps of {', '.join(hands)} were given, but of {', '.join(sorted(hands_seen))}; name one of these "
+                    "with --hands, or leave it out")
+        return "no grasps that held in a trial were given; `dro-grasp synthesize` makes some, `dro-grasp evaluate` tries others"
+    counts = ", ".join(f"{number} of split '{name}'" for name, number in sorted(seen.items()))
+    fitting = sorted(name for name, allowed in SPLITS.items() if allowed & set(seen))
+    advice = f"choose --split {' or '.join(fitting)}" if fitting else "grasps on test objects are never bundled"
+    where = "hands and objects for training" if split == "train" else f"hands and objects of split '{split}'"
+    return f"no grasps of split '{split}' were given, but {counts}; {advice}, or make grasps of {where} (`dro-grasp objects`)"
 
 
 def sources(batches: list[GraspBatch]) -> tuple[list[Hand], dict[str, ObjectCloud]]:

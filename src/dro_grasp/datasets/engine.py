@@ -20,8 +20,10 @@ from dro_grasp.datasets.yields import Yield
 from dro_grasp.devices import require_device
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.files import make_folder
+from dro_grasp.hands.library import load_hand, locate_hand
+from dro_grasp.objects.library import ASSET_PREFIX, load_object, object_names
 
-__all__ = ["DatasetReport", "EngineConfig", "synthesize_dataset"]
+__all__ = ["DatasetReport", "EngineConfig", "require_known", "synthesize_dataset"]
 
 REPORT_EVERY = 10.0
 """Time between lines of progress [s]."""
@@ -119,11 +121,13 @@ def synthesize_dataset(
         seconds: No shard is begun after this time [s]; those in the making are finished.
 
     Raises:
-        OptionError: A number is not positive, or this machine lacks the device.
+        OptionError: A number is not positive, the time is not finite, or this machine lacks the device.
         OutputError: The folder cannot be made or written, or another run is filling it.
     """
     if grasps_per_pair < 1 or workers < 1:
         raise OptionError(f"grasps_per_pair is {grasps_per_pair}, workers {workers}; both must be at least 1")
+    if seconds is not None and not (math.isfinite(seconds) and seconds > 0):
+        raise OptionError(f"seconds is {seconds}; give a positive number, or None for no limit")
     config = config or EngineConfig()
     if make_pool is None:
         require_device(config.synthesis.device)
@@ -140,6 +144,26 @@ def synthesize_dataset(
     total = sum(s.grasps for s in states.values())
     failures = {pair: s.error for pair, s in states.items() if s.error}
     return DatasetReport(total, total - before, shards, time.perf_counter() - started, failures)
+
+
+def require_known(hands: Sequence[str], objects: Sequence[str]) -> None:
+    """Refuse names that stand for nothing and files that do not exist, without reading any that do.
+
+    Args:
+        hands: Names or paths of hands.
+        objects: Names or paths of objects, without folders and groups.
+
+    Raises:
+        HandError: A hand's name or file is missing.
+        ObjectError: Likewise of an object.
+    """
+    for hand in hands:
+        if not locate_hand(hand)[0].expanduser().is_file():
+            load_hand(hand)  # says what is wrong
+    names = object_names()
+    for obj in objects:
+        if obj.removeprefix(ASSET_PREFIX) not in names and not Path(obj).expanduser().is_file():
+            load_object(obj)  # likewise
 
 
 def resume(folder: Path, states: dict[Pair, PairState], say: Callable[[str], None]) -> None:

@@ -8,6 +8,8 @@ axes), the readme of DexGraspBench.
 from __future__ import annotations
 
 import pickle
+import re
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +29,12 @@ HARMLESS = {
     ("collections", "OrderedDict"),
 }
 """All that a file may name."""
+EXPECTED = {
+    "cmap": "'metadata', a list of (wrist and joints, object, hand)",
+    "dexgraspnet": "a list of grasps, each with 'scale' and 'qpos', and in that WRJTx to WRJRz and the joints",
+    "dexgraspbench": "'grasp_qpos', and where it applies 'joint_names', 'obj_pose', 'obj_scale', 'obj_path' and 'hand'",
+}
+"""Entries of each format."""
 
 
 @dataclass(frozen=True)
@@ -56,19 +64,68 @@ def read_foreign(path: Path, kind: Format) -> list[ForeignGrasp]:
         GraspFileError: No such file, one that holds something else, or one that wants to run code.
     """
     readers = {"cmap": _cmap, "dexgraspnet": _dexgraspnet, "dexgraspbench": _dexgraspbench}
+    if path.is_dir():
+        raise GraspFileError(f"{path} is a folder; name the {kind} files in it")
+    if not path.exists():
+        raise GraspFileError(f"no file {path}; give the path of a {kind} file")
     try:
         return list(readers[kind](path))
+    except _MoreThanData as error:
+        raise GraspFileError(f"{path} holds more than tensors ({error}) and is not opened, for safety: it could run code; take "
+                             "the file that the project publishes, or save its grasps again with tensors or arrays, numbers "
+                             "and names only") from error
+    except _NoEntry as error:
+        raise GraspFileError(f"{path} is no {kind} file: it has no entry '{error}'; expected {EXPECTED[kind]}") from error
     except (OSError, pickle.UnpicklingError, EOFError, KeyError, ValueError, TypeError, IndexError, AttributeError,
             RuntimeError) as error:
-        raise GraspFileError(f"{path} is no {kind} file that can be read ({str(error).splitlines()[0]}); expected what that "
-                             "project publishes, holding numbers and names only") from error
+        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        raise GraspFileError(f"{path} is no {kind} file that can be read ({reason}); expected {EXPECTED[kind]}; download it "
+                             "again if it is damaged") from error
+
+
+class _MoreThanData(Exception):
+    """A pickle that wants to build something else than data; the text names it."""
+
+
+class _NoEntry(Exception):
+    """An entry is missing; the text is its name."""
+
+
+def _entry(entries: dict[str, Any], name: str) -> Any:
+    """One entry of a file's dictionary.
+
+    Raises:
+        _NoEntry: It is missing.
+        TypeError: It is no dictionary.
+    """
+    if not isinstance(entries, dict):
+        raise TypeError(f"it holds a {type(entries).__name__} where named entries should be")
+    if name not in entries:
+        raise _NoEntry(name)
+    return entries[name]
+
+
+def _load_tensors(path: Path) -> Any:
+    """What torch reads without building anything but tensors and containers.
+
+    Raises:
+        _MoreThanData: There is something else.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return torch.load(path, weights_only=True, map_location="cpu")
+    except pickle.UnpicklingError as error:
+        named = re.search(r"GLOBAL ([\w.]+)", str(error))
+        raise _MoreThanData(f"it names {named[1]}" if named else "it is a pickle that cannot be checked") from error
+    except KeyError as error:
+        raise ValueError("it is no file that torch.save wrote") from error
 
 
 def _cmap(path: Path) -> Iterator[ForeignGrasp]:
-    content = torch.load(path, weights_only=True, map_location="cpu")
     from scipy.spatial.transform import Rotation
 
-    for q, obj, hand in content["metadata"]:
+    for q, obj, hand in _entry(_load_tensors(path), "metadata"):
         values = np.asarray(q, np.float64)
         T = np.eye(4)
         T[:3, 3], T[:3, :3] = values[:3], Rotation.from_euler("XYZ", values[3:6]).as_matrix()
@@ -79,12 +136,13 @@ def _dexgraspnet(path: Path) -> Iterator[ForeignGrasp]:
     from scipy.spatial.transform import Rotation
 
     for entry in _load_npy(path):
-        qpos = {str(name): float(value) for name, value in entry["qpos"].items()}
-        position = [qpos.pop(name) for name in WRIST[:3]]
-        angles = [qpos.pop(name) for name in WRIST[3:]]
+        qpos = {str(name): float(value) for name, value in _entry(entry, "qpos").items()}
+        position = [_entry(qpos, name) for name in WRIST[:3]]
+        angles = [_entry(qpos, name) for name in WRIST[3:]]
+        joints = {name: value for name, value in qpos.items() if name not in WRIST}
         T = np.eye(4)
         T[:3, 3], T[:3, :3] = position, Rotation.from_euler("xyz", angles).as_matrix()
-        yield ForeignGrasp("", path.stem, float(entry["scale"]), T, qpos)
+        yield ForeignGrasp("", path.stem, float(_entry(entry, "scale")), T, joints)
 
 
 def _dexgraspbench(path: Path) -> Iterator[ForeignGrasp]:
@@ -96,7 +154,7 @@ def _dexgraspbench(path: Path) -> Iterator[ForeignGrasp]:
         return T
 
     entry = _load_npy(path).item()
-    rows = np.atleast_2d(np.asarray(entry["grasp_qpos"], np.float64))
+    rows = np.atleast_2d(np.asarray(_entry(entry, "grasp_qpos"), np.float64))
     obj = np.atleast_2d(np.asarray(entry.get("obj_pose", [0, 0, 0, 1, 0, 0, 0]), np.float64))
     for row, place in zip(rows, np.broadcast_to(obj, (len(rows), 7)), strict=True):
         T = np.linalg.inv(pose(place)) @ pose(row)
@@ -111,7 +169,7 @@ class _Harmless(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in HARMLESS:
-            raise pickle.UnpicklingError(f"it names {module}.{name}, which could run code")
+            raise _MoreThanData(f"it names {module}.{name}")
         return super().find_class(module, name)
 
 

@@ -31,10 +31,12 @@ def import_grasps(
         Grasps by hand, and why objects are missing, by their names.
 
     Raises:
-        OptionError: A file names no hand or no object, and nor do the arguments.
+        OptionError: No file is given, or one names no hand or no object, and nor do the arguments.
         HandError: A hand cannot be loaded.
         GraspFileError: A file cannot be read, or its grasps are of other joints.
     """
+    if not paths:
+        raise OptionError(f"no file to import was given; name at least one {kind} file")
     groups: dict[tuple[str, str, float], list[ForeignGrasp]] = {}
     for path in paths:
         for grasp in read_foreign(path, kind):

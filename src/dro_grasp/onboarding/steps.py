@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,14 +14,14 @@ from typing import Any
 from dro_grasp.datasets.bundle import load_bundle
 from dro_grasp.datasets.bundling import make_bundle
 from dro_grasp.datasets.collections import count_collection
-from dro_grasp.datasets.engine import synthesize_dataset
+from dro_grasp.datasets.engine import require_known, synthesize_dataset
 from dro_grasp.datasets.splits import split_of
 from dro_grasp.errors import BundleError, OptionError
 from dro_grasp.evaluation.benchmark import BEST, RAW, REFINED, BenchmarkConfig, benchmark
-from dro_grasp.files import make_folder, replacing
+from dro_grasp.files import check_folder, make_folder, replacing
 from dro_grasp.hands.check import check_hand, picture
 from dro_grasp.hands.library import load_hand
-from dro_grasp.models.checkpoints import load_weights, save_weights
+from dro_grasp.models.checkpoints import load_weights, locate_weights, save_weights
 from dro_grasp.objects.library import load_object, resolve_objects
 from dro_grasp.predictor import GraspPredictor
 from dro_grasp.simulation.protocols import protocol
@@ -57,8 +58,11 @@ class OnboardingConfig:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be done."""
-        if self.minutes <= 0 or self.num < 1 or self.workers < 1:
-            raise OptionError(f"minutes is {self.minutes}, num {self.num}, workers {self.workers}; all must be positive")
+        if not (math.isfinite(self.minutes) and self.minutes > 0):
+            raise OptionError(f"minutes is {self.minutes}; give a positive number, for example --minutes 30")
+        for name, value in (("num", self.num), ("workers", self.workers)):
+            if value < 1:
+                raise OptionError(f"{name} is {value}; give at least 1 (--{name})")
 
 
 @dataclass(frozen=True)
@@ -89,14 +93,21 @@ def onboard(
 
     Raises:
         HandError: The description cannot be used.
+        ObjectError: An object does not exist.
+        WeightsError: No weights have the name.
+        OutputError: The folder cannot be made or written.
         OptionError: Training and held-out objects overlap, or the folder is another hand's.
         BundleError: No grasp of the hand holds, so there is nothing to train on.
     """
     config = config or OnboardingConfig()
-    path, objects, held_out = make_folder(folder), resolve_objects(list(config.objects)), resolve_objects(list(config.held_out))
+    path = check_folder(folder)
+    objects, held_out = resolve_objects(list(config.objects)), resolve_objects(list(config.held_out))
     if both := sorted(set(objects) & set(held_out)):
         raise OptionError(f"{', '.join(both)} would be trained on and tried as unseen; name other --objects or --held-out")
+    require_known([hand], [*objects, *held_out])
+    locate_weights(config.weights)
     way = _Way(hand, path, config, objects, held_out, say)
+    make_folder(path)
     for name in ("check", "before", "data", "training", "after"):
         way.step(name, getattr(way, f"_{name}"))
     return Onboarded(hand, path, way.steps)
