@@ -242,6 +242,15 @@ def test_evaluate_and_view_take_the_file_that_generate_wrote(generate, tmp_path:
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+def test_grasps_tried_on_another_object_are_told(generate, tmp_path: Path, capsys) -> None:
+    path = tmp_path / "grasps.parquet"
+    generate("--output", str(path), "--protocol", "none")
+    assert main(["evaluate", str(path)]) == 0
+    assert "made for another" not in capsys.readouterr().err
+    assert main(["evaluate", str(path), "--object", "can"]) == 0
+    assert "made for another 'sphere' than the one they are tried on, can" in capsys.readouterr().err
+
+
 def test_foreign_and_empty_grasp_files_are_status_2(generate, tmp_path: Path, capsys) -> None:
     foreign, empty = tmp_path / "foreign.parquet", tmp_path / "empty.parquet"
     foreign.write_bytes(b"PAR1 not really")

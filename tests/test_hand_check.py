@@ -27,6 +27,12 @@ def test_a_hand_whose_moving_links_lost_their_meshes_says_which(tmp_path: Path) 
         check_hand(written(tmp_path, text))
 
 
+def test_a_single_finger_is_warned_of(tmp_path: Path) -> None:
+    one = claw(links=link("left"), joints=joint("a", "palm", "left", "-0.035 0 0.01"))
+    assert "is the only fingertip" in notes(tmp_path, one)["left"]
+    assert not any("only fingertip" in text for text in notes(tmp_path, claw()).values())
+
+
 def notes(folder: Path, text: str) -> dict[str, str]:
     """What `hand check` finds, by link or joint."""
     return {note.subject: note.text for note in check_hand(written(folder, text)).notes}

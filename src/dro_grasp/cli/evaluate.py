@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from dro_grasp.cli.output import load_grasps, optional, print_json, print_table, progress_bar
+from dro_grasp.cli.output import load_grasps, optional, print_json, print_table, progress_bar, say_aside
 from dro_grasp.grasps.sources import hand_of, object_of
 
 
@@ -62,6 +62,8 @@ class Evaluate:
                 index = [i for i, o in enumerate(grasps.object) if o == name]
                 part = grasps[index]
                 obj = object_of(part, self.object, self.scale)
+                if part.object_sha256[0] not in {"", obj.sha256}:
+                    say_aside(f"the grasps were made for another '{name}' than the one they are tried on, {obj.name}")
                 result = simulate(hand, obj, part, rules, progress=progress)
                 tried.append(part.with_trial(result))
                 reasons.update(r for r in result.reason if r)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 class Synthesize:
     """Make grasps from geometry alone and keep those that pass a trial; a rerun goes on where it stopped.
 
-    Example: dro-grasp synthesize --hand my_hand.urdf --object mug bottle --grasps 50 --output data
+    Example: dro-grasp synthesize --hand my_hand.urdf --object bottle can --grasps 50 --output data
     """
 
     hand: tuple[str, ...]

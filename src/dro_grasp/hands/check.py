@@ -59,7 +59,7 @@ def check_hand(name: str | Path) -> HandReport:
     """
     description, label = load_hand_description(name)
     hand = build_hand(description, name=label)
-    notes = (*description.notes, *_shape_notes(hand, description), *_point_notes(hand))
+    notes = (*description.notes, *_finger_notes(hand), *_shape_notes(hand, description), *_point_notes(hand))
     return HandReport(hand, _facts(hand, description), notes)
 
 
@@ -107,6 +107,12 @@ def hand_side(hand: Hand) -> str:
     aside = torch.linalg.cross(others - palm, hand.palm_direction_wrist)
     handed = float(torch.nn.functional.cosine_similarity(aside, tips[thumb] - palm, dim=0))
     return "none" if abs(handed) < SIDEWAYS else "right" if handed > 0 else "left"
+
+
+def _finger_notes(hand: Hand) -> list[Note]:
+    """A finger alone closes on nothing but the palm."""
+    text = "is the only fingertip; what it holds, it presses against the palm. Is a finger missing?"
+    return [Note("warning", hand.tree.link_names[tip], text) for tip in hand.tips if len(hand.tips) == 1]
 
 
 def _shape_notes(hand: Hand, description: Description) -> list[Note]:

@@ -146,7 +146,8 @@ def _check_links(root: ET.Element, path: Path) -> str:
     joints = root.findall("joint")
     moving = [j for j in joints if j.get("type") in MOVING]
     if not links:
-        raise HandError(f"{path} has no <link>; expected a robot hand description")
+        raise HandError(f"{path} has no <link>; expected a robot hand description. Expand a xacro file first: xacro {path} > "
+                        "hand.urdf")
     if not moving:
         raise HandError(f"{path} has no moving joint ({len(joints)} fixed); a hand needs at least one revolute or "
                         "prismatic joint")

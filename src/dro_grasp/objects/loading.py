@@ -211,5 +211,5 @@ def _check_size(extents: np.ndarray, origin: str, scale: float) -> None:
         raise ObjectError(f"{origin} is a single point; give a mesh or cloud that has an extent")
     size = f"{largest:.4g} m, too large" if largest > LARGEST else f"{largest * 1000:.3g} mm, too small"
     power = 10.0 ** math.ceil(math.log10(USUAL / largest))
-    raise ObjectError(f"{origin} measures {size} for a hand to grasp; if its unit is not the metre, give --scale: "
-                      f"0.001 for millimetres, or {scale * power:.3g}, which makes it {largest * power * 100:.2g} cm")
+    raise ObjectError(f"{origin} measures {size} for a hand to grasp; if its unit is not the metre, give --scale: 0.001 "
+                      f"for millimetres; {scale * power:.3g} makes it {largest * power * 100:.2g} cm")
