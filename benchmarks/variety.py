@@ -14,6 +14,7 @@ from report import ROOT, emit
 from synthesis import HANDS
 
 from dro_grasp.datasets.merging import file_name
+from dro_grasp.evaluation.benchmark import pair_seed
 from dro_grasp.evaluation.metrics import diversity
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand
@@ -37,7 +38,8 @@ def main() -> None:
         hand = load_hand(name)
         stored = GraspBatch.load(ROOT / "data" / "grasps" / file_name(name))
         stored = stored[torch.tensor([split == "validate" for split in stored.split])]
-        made = GraspBatch.concatenate([predictor.predict(hand, obj, options.num, refine=False) for obj in objects])
+        made = GraspBatch.concatenate([
+            predictor.predict(hand, obj, options.num, pair_seed(0, hand, obj), refine=False) for obj in objects])
         for kind, grasps in (("stored", stored), ("predicted", made)):
             spread = diversity(grasps.T_object_wrist, grasps.joints)
             rows.append([hand.name, kind, len(grasps), spread["wrist"], spread["joints"], spread["all"]])
