@@ -88,5 +88,5 @@ def test_without_ray_the_engine_says_what_to_install(monkeypatch):
     from dro_grasp.datasets.ray_pool import RayPool
 
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(OptionError, match=r"pip install 'dro-grasp\[ray\]'"):
+    with pytest.raises(OptionError, match=r"pip install 'ray"):
         RayPool(Job(0, "strict", EngineConfig()), 1, 60.0)
