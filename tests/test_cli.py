@@ -206,6 +206,17 @@ def test_a_bad_object_in_a_folder_costs_only_its_own_grasps(
     assert sorted(f.name for f in results.iterdir()) == ["a.parquet", "z.parquet"]
 
 
+def test_a_bad_camera_file_is_refused_once_for_all_objects(weights: str, tmp_path: Path, capsys) -> None:
+    for name in ("a.npy", "b.npy"):
+        np.save(tmp_path / name, np.zeros((3, 3)))
+    base = ["generate", "--hand", "gripper3", "--object", str(tmp_path), "--weights", weights]
+    assert main([*base, "--camera", str(tmp_path / "nowhere.json"), "--json"]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith("error: ")
+    assert said.err.count("nowhere.json must hold") == 1
+
+
 def test_folder_of_objects_needs_a_folder_for_results(weights: str, tmp_path: Path, capsys) -> None:
     (tmp_path / "a.stl").write_text("")
     (tmp_path / "b.stl").write_text("")

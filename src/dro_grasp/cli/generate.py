@@ -16,6 +16,7 @@ from dro_grasp.grasps.sources import with_sources
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from dro_grasp.geometry.rigid_motion import NamedMotion
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.hands.hand import Hand
     from dro_grasp.objects.shape import ObjectModel
@@ -78,6 +79,7 @@ class Generate:
     def run(self) -> int:
         """Check everything that can be checked before the work, then do it."""
         from dro_grasp.errors import DroGraspError
+        from dro_grasp.geometry.rigid_motion import read_motion
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.library import resolve_objects
         from dro_grasp.predictor import GraspPredictor, PredictorConfig, check_request
@@ -89,6 +91,7 @@ class Generate:
         several = names != [self.object]
         outputs = paths_per_object(self.output, names, several, ".parquet")
         pictures = paths_per_object(self.picture, names, several, ".png")
+        camera = None if self.camera is None else read_motion(self.camera, "T_frame_camera")
         begin = time.perf_counter()
         hand = load_hand(self.hand)
         predictor = GraspPredictor(self.weights, config=PredictorConfig(temperature=self.temperature))
@@ -97,7 +100,7 @@ class Generate:
         done, failed = [], []
         for name, output, picture in jobs:
             try:
-                done.append(self._one(predictor, hand, name, output, picture, load))
+                done.append(self._one(predictor, hand, name, camera, output, picture, load))
             except DroGraspError as error:
                 if not several:
                     raise
@@ -113,15 +116,14 @@ class Generate:
         return 2 if failed else 0
 
     def _one(
-        self, predictor: GraspPredictor, hand: Hand, name: str, output: Path | None, picture: Path | None, load: float
+        self, predictor: GraspPredictor, hand: Hand, name: str, camera: NamedMotion | None, output: Path | None,
+        picture: Path | None, load: float,
     ) -> Done:
         """One object, start to end."""
-        from dro_grasp.geometry.rigid_motion import read_motion
         from dro_grasp.objects.library import load_object
         from dro_grasp.objects.scan import load_scan
 
         begin = time.perf_counter()
-        camera = None if self.camera is None else read_motion(self.camera, "T_frame_camera")
         if camera is None:
             obj = load_object(name, scale=self.scale)
         else:
