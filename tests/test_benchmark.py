@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -93,6 +94,30 @@ def test_pairs_share_no_random_numbers() -> None:
     seeds = {pair_seed(7, hand, obj) for hand in hands for obj in objects}
     assert len(seeds) == len(HANDS) * len(OBJECTS)
     assert seeds == {pair_seed(6, hand, obj) + 1 for hand in hands for obj in objects}
+
+
+def test_each_look_is_from_another_side_with_grasps_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[ObjectModel] = []
+    honest = GraspPredictor.predict
+
+    def predict(self: GraspPredictor, hand: Hand, obj: ObjectModel, **options: Any) -> GraspBatch:
+        shown.append(obj)
+        return honest(self, hand, obj, **options)
+
+    monkeypatch.setattr(GraspPredictor, "predict", predict)
+    hand, obj = load_hand("gripper3"), load_object("can")
+    config = dataclasses.replace(CONFIG, num=4, stages=(RANKED,), controls=False, view="half")
+    three = benchmark([hand], [obj], GraspPredictor(), dataclasses.replace(config, looks=3))
+    seen_one_by_one = list(shown)
+    # The best quarter of each look, not of all of them together.
+    assert three[0].num == 3
+    assert len({o.sha256 for o in seen_one_by_one}) == 3
+    passed = []
+    for k in range(3):
+        (row,) = benchmark([hand], [obj], GraspPredictor(), dataclasses.replace(config, seed=k))
+        assert shown[-1].sha256 == seen_one_by_one[k].sha256
+        passed.append(row.success["strict/1"][0])
+    assert three[0].success["strict/1"][0] == pytest.approx(sum(passed) / 3)
 
 
 def test_the_average_is_over_hands(rows: list[Row]) -> None:

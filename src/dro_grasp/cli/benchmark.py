@@ -44,6 +44,8 @@ class Benchmark:
     """Training bundle that the mean grasp is the mean of."""
     view: Literal["whole", "cloud", "half", "depth"] = "whole"
     """What the network, refinement and ranking see: the mesh, its points, the paper's half of them, or a depth image."""
+    looks: int = 1
+    """From how many sides each object is seen, with --num grasps from each."""
     seed: int = 0
     """The same seed gives the same grasps and views."""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -60,6 +62,8 @@ class Benchmark:
         from dro_grasp.simulation.protocols import protocol
 
         check_request(self.num, None, self.temperature)
+        if self.looks < 1:
+            raise OptionError(f"--looks is {self.looks}; give at least 1")
         for name in ("hands", "objects", "stages", "protocols"):
             if not getattr(self, name):
                 raise OptionError(f"--{name} is empty; name at least one")
@@ -73,7 +77,7 @@ class Benchmark:
         stages = (*self.stages, BEST, *TOP) if "refined" in self.stages else self.stages
         config = BenchmarkConfig(
             num=self.num, stages=stages, protocols=tuple(protocol(p) for p in self.protocols), controls=self.controls,
-            seed=self.seed, view=self.view,
+            seed=self.seed, view=self.view, looks=self.looks,
         )
         with progress_bar("pairs", self.json) as progress:
             rows = benchmark(hands, objects, predictor, config, bundle, progress)
@@ -81,13 +85,15 @@ class Benchmark:
         if self.json:
             print_json({
                 "weights": predictor.weights_name, "objects": [obj.name for obj in objects], "num": self.num,
-                "view": self.view, "seed": self.seed, "seconds": round(seconds, 1),
+                "view": self.view, "looks": self.looks, "seed": self.seed, "seconds": round(seconds, 1),
                 "rows": [dataclasses.asdict(row) for row in rows],
             })
             return 0
         title = f"weights '{predictor.weights_name}', {self.num} grasps of each hand on each of {len(objects)} objects"
         if self.view != "whole":
             title += f", view '{self.view}'"
+        if self.looks > 1:
+            title += f", {self.looks} times"
         columns = ["grasps", "stage", "hand", "n", *rows[0].success, "shift [mm]", "turn [deg]", "diversity", "ROC area",
                    "ms a grasp"]
         say(title + "; success in % with 95 % intervals; ROC area of the score for each protocol\n")

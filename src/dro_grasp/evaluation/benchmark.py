@@ -57,7 +57,9 @@ class BenchmarkConfig:
     controls: bool = True
     """Also the rows that success means nothing without."""
     view: View = "whole"
-    """What the network, refinement and ranking see of the object, from one side per pair; controls see all of it."""
+    """What the network, refinement and ranking see of the object; controls see all of it."""
+    looks: int = 1
+    """How often each pair is taken up, with other random numbers and seen from another side, for `num` grasps each time."""
     seed: int = 0
     """Of all grasps and views; each pair's are derived from it."""
     workers: int | None = None
@@ -126,9 +128,10 @@ def benchmark(
     for hand in hands:
         found: dict[tuple[str, str], list[Tried]] = {}
         for obj in objects:
-            for source, grasps, seconds, known in _sources(hand, obj, predictor, config, bundle):
-                for stage, tried in _stages(hand, obj, known, source, grasps, seconds, config):
-                    found.setdefault((source, stage), []).append(tried)
+            for seed in look_seeds(config, hand, obj):
+                for source, grasps, seconds, known in _sources(hand, obj, predictor, config, bundle, seed):
+                    for stage, tried in _stages(hand, obj, known, source, grasps, seconds, config):
+                        found.setdefault((source, stage), []).append(tried)
             done += 1
             if progress is not None:
                 progress(done, pairs)
@@ -146,11 +149,17 @@ def pair_seed(seed: int, hand: Hand, obj: ObjectModel) -> int:
     return seed + zlib.crc32(f"{hand.name} {obj.name}".encode())
 
 
+def look_seeds(config: BenchmarkConfig, hand: Hand, obj: ObjectModel) -> range:
+    """Seeds of a pair's looks; the first is the pair's."""
+    first = pair_seed(config.seed, hand, obj)
+    return range(first, first + config.looks)
+
+
 def _sources(
-    hand: Hand, obj: ObjectModel, predictor: GraspPredictor, config: BenchmarkConfig, bundle: Bundle | None
+    hand: Hand, obj: ObjectModel, predictor: GraspPredictor, config: BenchmarkConfig, bundle: Bundle | None, seed: int
 ) -> Iterator[tuple[str, GraspBatch, dict[str, float], ObjectModel]]:
     """Grasps by where they come from, unpolished, the time that one of them took [s], and what was seen of the object."""
-    num, seed = config.num, pair_seed(config.seed, hand, obj)
+    num = config.num
     known = seen(obj, config.view, seed)
     grasps = predictor.predict(hand, known, num=num, seed=seed, refine=False)
     yield NETWORK, grasps, {k: predictor.timings[k] / num for k in ("network", "decode")}, known
