@@ -1,9 +1,11 @@
-"""How far the side that is added to what was seen of an object lies from its surface, beside a mirror where the seen side ends.
+"""How well the side that is added to what was seen of an object matches it, beside what a mirror and a symmetry would add.
 
     python benchmarks/completion.py [--views N] [--picture PNG] [--json]
 
-The picture shows depth images of the validate objects from the side: blue was seen, orange was added, grey is the object.
-Needs the development assets.
+Two errors: how far added points are from the object's surface, and how far its surface that was not seen is from them. The
+mirror is where the seen side ends; the symmetry is the one that agrees best with what was seen, without the network. The picture
+shows depth images of the validate objects from the side: blue was seen, orange was added, grey is the object. Needs the
+development assets.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from PIL import Image
 from report import emit
@@ -20,14 +23,16 @@ from scipy.spatial import KDTree
 
 from dro_grasp.evaluation.views import seen_side
 from dro_grasp.geometry.rasterizer import Camera, Mesh, dots, render
-from dro_grasp.objects.completion import completed
 from dro_grasp.objects.library import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.perception.completion import completed, looked_at
 from dro_grasp.viewer.pictures import contact_sheet
 
 GROUPS = ("assets:train", "assets:validate")
 TILE, COLUMNS, DRAWN = (260, 240), 5, 500
 """Size of a picture [pixels], pictures in a row, points drawn of each side."""
+AWAY = 0.006
+"""Surface that is this far from all seen points was not seen [m]."""
 GREY, SEEN, ADDED = (0.82, 0.83, 0.85), (0.16, 0.38, 0.78), (0.93, 0.50, 0.13)
 
 
@@ -41,6 +46,24 @@ def mirrored(
     return points + 2 * (np.quantile(along, 0.02) - along)[:, None] * view
 
 
+def likeliest(
+    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None
+) -> Float[np.ndarray, "k 3"]:
+    """The other side by the best symmetry alone."""
+    side, axes, middle = looked_at(points, normals, camera)
+    return side.guesses(None, 1)[0].points[len(side.points):] @ axes.T + middle
+
+
+def errors(
+    obj: ObjectModel, seen: Float[np.ndarray, "n 3"], added: Float[np.ndarray, "k 3"]
+) -> tuple[float, float]:
+    """How far added points are from the surface, and the surface away from all seen points from seen and added ones [mm]."""
+    unseen = obj.cloud[KDTree(seen).query(obj.cloud)[0] > AWAY]
+    wrong = obj.grid.query(torch.from_numpy(added).float())[0].abs() if len(added) else torch.zeros(1)
+    missing = KDTree(np.concatenate([seen, added])).query(unseen)[0] if len(unseen) else np.zeros(1)
+    return 1e3 * float(wrong.mean()), 1e3 * float(missing.mean())
+
+
 def draw(path: Path) -> None:
     """One depth image of each validate object, seen with the camera to the left."""
     tiles, captions = [], []
@@ -48,7 +71,7 @@ def draw(path: Path) -> None:
         obj = load_object(name)
         tiles.append(tile(obj))
         captions.append((obj.name.rpartition("+")[2], None))
-    sheet = contact_sheet(tiles, captions, "what a camera on the left saw (blue), and what symmetry adds (orange)", COLUMNS)
+    sheet = contact_sheet(tiles, captions, "what a camera on the left saw (blue), and what is added (orange)", COLUMNS)
     Image.Image.save(sheet, path)
 
 
@@ -56,16 +79,15 @@ def tile(obj: ObjectModel) -> np.ndarray:
     """One object, half transparent, with the points that were seen and added."""
     points, normals, camera = seen_side(obj, "depth", 0)
     assert camera is not None
-    both, _ = completed(points, normals, camera)
+    whole = completed(points, normals, camera)
     towards = (camera - points.mean(0)) / np.linalg.norm(camera - points.mean(0))
     across = np.cross(towards, np.eye(3)[np.abs(towards).argmin()])
     across /= np.linalg.norm(across)
-    n = len(points)
     rng = np.random.default_rng(0)
-    marks = [dots(part[rng.permutation(n)[:DRAWN]], colour, radius=0.0012)
-             for part, colour in ((both[:n], SEEN), (both[n:], ADDED))]
+    marks = [dots(rng.permutation(part)[:DRAWN], colour, radius=0.0012)
+             for part, colour in ((points, SEEN), (whole.points[whole.added], ADDED))]
     view = Camera.around(
-        np.concatenate([obj.cloud, both]), tuple(across), up=tuple(np.cross(towards, across)), aspect=TILE[0] / TILE[1])
+        np.concatenate([obj.cloud, whole.points]), tuple(across), up=tuple(np.cross(towards, across)), aspect=TILE[0] / TILE[1])
     assert obj.vertices is not None
     assert obj.faces is not None
     solid, clear = (render([*more, *marks], view, *TILE).astype(float) for more in ([Mesh(obj.vertices, obj.faces, GREY)], []))
@@ -84,21 +106,25 @@ def main() -> None:
     rows = []
     for view in ("half", "depth"):
         for group in GROUPS:
-            found, naive, seconds = [], [], 0.0
+            found: dict[str, list[tuple[float, float]]] = {"mirror": [], "symmetry": [], "network": []}
+            seconds = 0.0
             for name in resolve_objects([group]):
                 obj = load_object(name)
-                surface = KDTree(obj.cloud)
                 for seed in range(options.views):
                     points, normals, camera = seen_side(obj, view, seed)
                     begin = time.perf_counter()
-                    both, _ = completed(points, normals, camera)
+                    whole = completed(points, normals, camera)
                     seconds += time.perf_counter() - begin
-                    found.append(1e3 * surface.query(both[len(points):])[0].mean())
-                    naive.append(1e3 * surface.query(mirrored(points, normals, camera))[0].mean())
-            rows.append([view, group, len(found), float(np.mean(naive)), float(np.mean(found)), float(np.median(found)),
-                         1e3 * seconds / len(found)])
-    columns = ["view", "objects", "views", "mirror, mean [mm]", "symmetry, mean [mm]", "symmetry, median [mm]", "time [ms]"]
-    emit("distance of the added side from the surface", rows, columns,
+                    added = {"mirror": mirrored(points, normals, camera), "symmetry": likeliest(points, normals, camera),
+                             "network": whole.points[whole.added]}
+                    for kind, other in added.items():
+                        found[kind].append(errors(obj, points, other))
+            count = len(found["network"])
+            cells = [value for kind in found.values() for value in np.mean(kind, axis=0).tolist()]
+            rows.append([view, group, count, *cells, 1e3 * seconds / count])
+    columns = ["view", "objects", "views", *(f"{kind}, {what} [mm]" for kind in ("mirror", "symmetry", "network")
+                                             for what in ("added off", "missing")), "time [ms]"]
+    emit("how far the added side is off the surface, and the unseen surface off it", rows, columns,
          {f"{row[0]} {row[1]}": dict(zip(columns[2:], row[2:], strict=True)) for row in rows}, options.json)
 
 

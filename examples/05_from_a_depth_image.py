@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 import dro_grasp as dro
-from dro_grasp.objects.camera import DepthCamera, visible_points
+from dro_grasp.perception.camera import DepthCamera, visible_points
 
 # A rendered view stands in for the camera. The duck's frame plays the robot's base; the camera looks at it from one metre
 # away, from the side and above, with z along its view, x to the right and y down, as drivers of depth cameras have it.

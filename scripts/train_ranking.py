@@ -31,6 +31,7 @@ from dro_grasp.grasps.refinement import refine_grasps
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.models.quality import SHIPPED, QualityNetwork
+from dro_grasp.models.small import save_small
 from dro_grasp.objects.library import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predictor import GraspPredictor
@@ -177,7 +178,7 @@ def main() -> None:
     print(f"{sum(len(p['whole']) for p in parts)} grasps; objects left out: loss {loss:.3f}, ROC area of refined grasps "
           + ", ".join(f"{rules} {area:.3f}" for rules, area in zip(TRIALS, found, strict=True)))
     SHIPPED.parent.mkdir(exist_ok=True)
-    network.save(SHIPPED)
+    save_small(network, SHIPPED)
 
 
 if __name__ == "__main__":

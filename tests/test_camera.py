@@ -6,9 +6,9 @@ import torch
 import trimesh
 
 from dro_grasp.errors import OptionError
-from dro_grasp.objects.camera import DepthCamera, visible_points
 from dro_grasp.objects.loading import cloud_object, mesh_object
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.perception.camera import DepthCamera, visible_points
 
 CLEAR = DepthCamera(noise=0.0)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ from dro_grasp.models.checkpoints import (
     CHECKSUMS,
     KEY,
     SHIPPED_FOLDER,
+    SMALL,
     describe_weights,
     load_weights,
     locate_weights,
@@ -162,15 +164,26 @@ def test_shipped_weights_load() -> None:
 
 def test_shipped_weights_are_as_they_were_shipped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     lines = dict(reversed(line.split()) for line in (SHIPPED_FOLDER / CHECKSUMS).read_text().splitlines())
-    assert set(lines) == {f"{name}.safetensors" for name in weights_names()}
+    assert set(lines) == {f.relative_to(SHIPPED_FOLDER).as_posix() for f in SHIPPED_FOLDER.rglob("*.safetensors")}
+    assert set(lines) == {f"{name}.safetensors" for name in (*weights_names(), *SMALL)}
     for name in weights_names():
         assert verify_weights(name) == lines[f"{name}.safetensors"] == describe_weights(name)["sha256"]
-    for file in (f for f in SHIPPED_FOLDER.iterdir() if f.is_file()):
-        (tmp_path / file.name).write_bytes(file.read_bytes())
-    monkeypatch.setattr(checkpoints, "SHIPPED_FOLDER", tmp_path)
-    save_weights(load_weights("multi"), tmp_path / "multi.safetensors", {"about": "made anew"})
+    for name in SMALL:
+        assert verify_weights(name) == lines[f"{name}.safetensors"]
+    folder = tmp_path / "weights"
+    shutil.copytree(SHIPPED_FOLDER, folder)
+    monkeypatch.setattr(checkpoints, "SHIPPED_FOLDER", folder)
+    save_weights(load_weights("multi"), folder / "multi.safetensors", {"about": "made anew"})
     with pytest.raises(WeightsError, match="shipped was"):
         verify_weights("multi")
+    harmed = bytearray((folder / "ranking" / "quality.safetensors").read_bytes())
+    harmed[-1] ^= 1
+    (folder / "ranking" / "quality.safetensors").write_bytes(harmed)
+    with pytest.raises(WeightsError, match="shipped was"):
+        verify_weights("ranking/quality")
+    (folder / "completion" / "surface.safetensors").unlink()
+    with pytest.raises(WeightsError, match="No such file"):
+        verify_weights("completion/surface")
 
 
 def test_verify_checks_files_of_the_user_as_well(path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,6 +13,7 @@ from dro_grasp.grasps.controller import pregrasp_and_squeeze
 from dro_grasp.grasps.object_energy import evaluate_nearest, object_energy
 from dro_grasp.grasps.quality import FARTHEST, LENGTH, MOTION, NEAR, GraspFeatures, grasp_features
 from dro_grasp.models.quality import QualityNetwork, shipped_quality
+from dro_grasp.models.small import save_small
 from dro_grasp.objects.library import load_object
 from dro_grasp.objects.shape import ObjectModel
 from tests.tiny_bundle import made_up_grasps
@@ -101,7 +102,7 @@ def test_links_are_a_set() -> None:
 
 def test_the_shipped_network_comes_back_as_it_was_saved(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     shipped = shipped_quality()
-    shipped.save(tmp_path / "quality.safetensors")
+    save_small(shipped, tmp_path / "quality.safetensors")
     monkeypatch.setattr("dro_grasp.models.quality.SHIPPED", tmp_path / "quality.safetensors")
     again = shipped_quality.__wrapped__()
     for name, value in shipped.state_dict().items():

@@ -17,8 +17,8 @@ from dro_grasp.geometry.rigid_motion import read_motion
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import object_of
 from dro_grasp.objects.library import load_object
-from dro_grasp.objects.scan import depth_points, load_scan, scanned_object, without_outliers
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.perception.scan import depth_points, load_scan, scanned_object, without_outliers
 from tests.weights import untrained_weights
 
 INTRINSICS = np.array([[300.0, 0, 79.5], [0, 310.0, 59.5], [0, 0, 1]])

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from dro_grasp.hands.hand import Hand
     from dro_grasp.hands.library import load_hand
     from dro_grasp.objects.library import load_object
-    from dro_grasp.objects.scan import depth_points, scanned_object
     from dro_grasp.objects.shape import ObjectModel
+    from dro_grasp.perception.scan import depth_points, scanned_object
     from dro_grasp.predictor import GraspPredictor
     from dro_grasp.simulation.trial import TrialResult, simulate
 
@@ -31,11 +31,11 @@ _EXPORTS = {
     "Hand": "hands.hand",
     "ObjectModel": "objects.shape",
     "TrialResult": "simulation.trial",
-    "depth_points": "objects.scan",
+    "depth_points": "perception.scan",
     "load_hand": "hands.library",
     "load_object": "objects.library",
     "read_collection": "datasets.collections",
-    "scanned_object": "objects.scan",
+    "scanned_object": "perception.scan",
     "simulate": "simulation.trial",
     "synthesize": "grasps.synthesis",
     "synthesize_dataset": "datasets.engine",

@@ -121,7 +121,7 @@ class Generate:
     ) -> Done:
         """One object, start to end."""
         from dro_grasp.objects.library import load_object
-        from dro_grasp.objects.scan import load_scan
+        from dro_grasp.perception.scan import load_scan
 
         begin = time.perf_counter()
         if camera is None:

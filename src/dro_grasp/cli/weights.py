@@ -49,10 +49,10 @@ class Verify:
     def run(self) -> int:
         """Check each file, then report on all; code 2 if one is not what it should be."""
         from dro_grasp.errors import WeightsError
-        from dro_grasp.models.checkpoints import verify_weights, weights_names
+        from dro_grasp.models.checkpoints import SMALL, verify_weights, weights_names
 
         rows = []
-        for name in self.names or weights_names():
+        for name in self.names or (*weights_names(), *SMALL):
             try:
                 rows.append({"name": name, "sha256": verify_weights(name), "error": None})
             except WeightsError as error:

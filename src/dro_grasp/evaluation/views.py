@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from dro_grasp.objects.camera import DepthCamera, visible_points
-from dro_grasp.objects.completion import completed
 from dro_grasp.objects.loading import cloud_object, estimate_normals
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.perception.camera import DepthCamera, visible_points
+from dro_grasp.perception.completion import completed
 
 View = Literal["whole", "cloud", "half", "depth"]
 """The mesh; all of the surface points, without the mesh; half of them; the points of a depth image."""
@@ -20,7 +20,7 @@ POINTS = 1024
 
 
 def seen(obj: ObjectModel, view: View, seed: int, camera: DepthCamera | None = None) -> ObjectModel:
-    """The object as it is seen: itself, or a bare cloud in its frame, to which the side that is not seen is added by symmetry.
+    """The object as it is seen: itself, or a bare cloud in its frame, to which the side that is not seen is added.
 
     Args:
         obj: An object with a mesh.
@@ -35,7 +35,8 @@ def seen(obj: ObjectModel, view: View, seed: int, camera: DepthCamera | None = N
     name = f"{obj.name}, {view} seen"
     if view == "cloud":
         return cloud_object(name, np.concatenate([obj.cloud, obj.cloud_normals], 1), origin=name)
-    return cloud_object(name, np.concatenate(completed(*seen_side(obj, view, seed, camera)), 1), origin=name)
+    both = completed(*seen_side(obj, view, seed, camera))
+    return cloud_object(name, np.concatenate([both.points, both.normals], 1), origin=name)
 
 
 def seen_side(

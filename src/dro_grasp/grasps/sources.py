@@ -77,7 +77,7 @@ def object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectMode
         ObjectError: It cannot be found; the message asks for --object.
     """
     from dro_grasp.objects.library import load_object
-    from dro_grasp.objects.scan import load_scan
+    from dro_grasp.perception.scan import load_scan
 
     if given is not None:
         return load_object(given, scale=scale)

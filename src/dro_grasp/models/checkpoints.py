@@ -15,16 +15,17 @@ from safetensors.torch import save_file
 from dro_grasp.errors import WeightsError
 from dro_grasp.files import replacing
 from dro_grasp.models.network import DistanceNetwork, NetworkConfig
+from dro_grasp.models.small import SHIPPED_FOLDER
 
 FORMAT_VERSION = 1
-SHIPPED_FOLDER = Path(__file__).parent.parent / "weights"
-"""Where shipped weights lie."""
 KEY = "dro_grasp_weights"
 """Metadata entry that marks a file as ours."""
 PICKLES = (b"PK", b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")
 """How zipped and bare pickles begin."""
 CHECKSUMS = "SHA256SUMS"
 """File beside the shipped weights with their checksums, as `sha256sum` writes it."""
+SMALL = ("completion/surface", "ranking/quality")
+"""Networks that ship beside those that predict grasps."""
 DEFAULT = "multi"
 """Weights that are used when none are named."""
 
@@ -105,17 +106,25 @@ def describe_weights(name: str | Path | None = None) -> dict[str, Any]:
 def verify_weights(name: str | Path | None = None) -> str:
     """SHA-256 of a weights file that loads and, if it is a shipped one, is as it was shipped.
 
+    Args:
+        name: As in `load_weights`, or one of `SMALL`.
+
     Raises:
-        WeightsError: As in `load_weights`; or shipped weights are not those that were shipped.
+        WeightsError: As in `load_weights`; or shipped weights are missing, or not those that were shipped.
     """
-    path = locate_weights(name)
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    if path.parent == SHIPPED_FOLDER:
+    path = SHIPPED_FOLDER / f"{name}.safetensors" if name in SMALL else locate_weights(name)
+    try:
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise WeightsError(f"{path} cannot be read ({error.strerror or error}); install the package again") from error
+    if path.is_relative_to(SHIPPED_FOLDER):
         lines = (SHIPPED_FOLDER / CHECKSUMS).read_text().splitlines()
-        expected = {file: known for known, file in (line.split() for line in lines)}.get(path.name, "none")
-        if digest != expected:
-            raise WeightsError(f"{path} has SHA-256 {digest}, shipped was {expected}; install the package again")
-    load_weights(path)
+        expected = {file: known for known, file in (line.split() for line in lines)}
+        shipped = expected.get(path.relative_to(SHIPPED_FOLDER).as_posix(), "none")
+        if digest != shipped:
+            raise WeightsError(f"{path} has SHA-256 {digest}, shipped was {shipped}; install the package again")
+    if name not in SMALL:
+        load_weights(path)
     return digest
 
 

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 
 import torch
 from jaxtyping import Float
-from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from dro_grasp.files import replacing
+from dro_grasp.models.small import SHIPPED_FOLDER, load_small
 
-SHIPPED = Path(__file__).parent.parent / "weights" / "ranking" / "quality.safetensors"
+SHIPPED = SHIPPED_FOLDER / "ranking" / "quality.safetensors"
 """The network that scores are made with."""
 LINK_FEATURES, GRASP_FEATURES = 16, 8
 """Numbers that describe a link and a grasp."""
@@ -51,20 +49,11 @@ class QualityNetwork(nn.Module):
         pooled = torch.cat([(each * nearness[..., None]).sum(1), each.amax(1), whole], -1)
         return self.grasp(pooled)
 
-    def save(self, path: Path) -> None:
-        """Write the weights in half precision.
-
-        Raises:
-            OutputError: The file cannot be written.
-        """
-        with replacing(path, "ranking weights") as temporary:
-            save_file({name: value.half().contiguous() for name, value in self.state_dict().items()}, temporary)
-
 
 @cache
 def shipped_quality() -> QualityNetwork:
     """The network that ships, loaded once."""
-    tensors = {name: value.float() for name, value in load_file(SHIPPED).items()}
+    tensors = load_small(SHIPPED)
     network = QualityNetwork(len(tensors["grasp.4.bias"]), len(tensors["link.0.bias"]))
     network.load_state_dict(tensors)
     return network.eval().requires_grad_(False)

@@ -1,1 +1,1 @@
-"""Objects: meshes, point clouds, and what a camera sees of them."""
+"""Objects: meshes and point clouds."""

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Num
 
 from dro_grasp.errors import ObjectError
-from dro_grasp.objects.completion import completed
 from dro_grasp.objects.loading import cloud_object, estimate_normals, read_points
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
+from dro_grasp.perception.completion import completed
 
 NEIGHBOURS = 12
 """Points that decide whether a point is an outlier."""
@@ -78,7 +78,7 @@ def scanned_object(
         T_frame_camera: The camera's pose in the wanted frame, in which up, `direction` and `table` mean something; the
             camera's own when None.
         denoise: Drop points that lie apart from all others.
-        complete: Add the side that the camera does not see, by symmetry; leave it out for a scan from all sides.
+        complete: Add the side that the camera does not see; leave it out for a scan from all sides.
 
     Raises:
         ObjectError: Too few points are left, or they are not in metres.
@@ -95,7 +95,7 @@ def scanned_object(
     normals = estimate_normals(kept.astype(np.float32), camera).astype(np.float64)
     if complete:
         up = None if T_frame_camera is None else T_frame_camera[2, :3].astype(np.float64)
-        kept, normals = completed(kept, normals, camera, up)
+        kept, normals, _ = completed(kept, normals, camera, up)
     if T_frame_camera is not None:
         R = T_frame_camera[:3, :3]
         kept, normals = kept @ R.T + T_frame_camera[:3, 3], normals @ R.T

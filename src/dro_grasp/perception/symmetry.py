@@ -1,4 +1,4 @@
-"""The side of an object that nobody saw, from a symmetry that agrees with the side that was seen.
+"""What the side that nobody saw may look like: symmetries that agree with the side that was seen.
 
 Source: symmetries judged by what the camera sees, Thrun and Wegbreit 2005, Bohg et al. 2011; kinds and costs are our own.
 """
@@ -27,8 +27,8 @@ KINK, SEEN_KINK = 0.5, 0.1
 """Weights of kinks at the rim: of a cut, and of an image, where normals are less sure."""
 LEANING, FLAT = 0.1, 0.999
 """Cost of symmetries that do not keep the vertical; cosine to the view from which a camera looks straight down."""
-THINNEST = 1e-4
-"""Width in the image below which nothing can be said of the other side [m]."""
+APART = 0.05
+"""Guesses closer to each other than this are one, in widths."""
 WORST = 0.5
 """Distances beyond this count no more, in widths."""
 TOLERANCE = 0.003
@@ -41,64 +41,36 @@ ROUND = 0.35
 """Cosine between the normal and the ray below which a surface at the rim is taken to turn away, not to end at an edge."""
 
 
-def completed(
-    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None = None,
-    up: Float[np.ndarray, "3"] | None = None,
-) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
-    """Points and normals of both sides of an object of which one was seen.
-
-    The other side is the seen one, inverted, turned by half or mirrored: the way that shows least where the camera saw nothing,
-    and that continues the seen side at its rim without gap or kink. What is seen face on is taken to be as thick as wide.
-    Of a line to the camera nothing is added.
-
-    Args:
-        points: Of the seen side [m].
-        normals: Outward unit normals there.
-        camera: Where it stands [m]. Without it the points are taken to be all that lies on one side of a plane, whose normal is
-            then the mean of theirs.
-        up: Unit vector along which the object stands, if it does: what stands is rather turned or mirrored upright.
-    """
-    middle = points.mean(0)
-    view = normals.mean(0) if camera is None else camera - middle
-    away = float(np.linalg.norm(view))
-    axes = _image_axes(view / max(away, 1e-9))
-    side = _SeenSide.of((points - middle) @ axes, normals @ axes, None if camera is None else away)
-    if side.width < THINNEST:
-        return points, normals
-    upright = None if up is None else up @ axes
-    linear, centre = min(side.symmetries(upright), key=lambda motion: side.cost(*motion) + _lean(motion[0], upright))
-    behind = (side.points - centre) @ linear.T + centre
-    return (np.concatenate([points, behind @ axes.T + middle]),
-            np.concatenate([normals, side.normals @ linear.T @ axes.T]))
-
-
-def _image_axes(view: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Columns: two directions in the image, and the one to the camera."""
-    helper = np.eye(3)[np.abs(view).argmin()]
-    across = np.cross(view, helper) / np.linalg.norm(np.cross(view, helper))
-    return np.stack([across, np.cross(view, across), view], 1)
-
-
 def _lean(linear: Float[np.ndarray, "3 3"], up: Float[np.ndarray, "3"] | None) -> float:
     """Cost of a motion that does not keep the vertical."""
     return 0.0 if up is None or np.allclose(linear @ up, up, atol=1e-6) else LEANING
 
 
-def _tree(points: Float[np.ndarray, "n d"]) -> KDTree:
-    """For nearest points; SciPy is loaded when needed."""
+def nearest_points(points: Float[np.ndarray, "n d"]) -> KDTree:
+    """A tree that finds the nearest of some points; SciPy is loaded when needed."""
     from scipy.spatial import KDTree
 
     return KDTree(points)
 
 
-def _projected(points: Float[np.ndarray, "n 3"], away: float | None) -> Float[np.ndarray, "n 2"]:
+def projected(points: Float[np.ndarray, "n 3"], away: float | None) -> Float[np.ndarray, "n 2"]:
     """Where points are in the image of a camera so far along z, in metres at the height 0."""
     return points[:, :2] if away is None else points[:, :2] / (1 - points[:, 2:] / away)
 
 
 @dataclass(frozen=True)
-class _SeenSide:
-    """What was seen, with z to the camera."""
+class Guess:
+    """A side that was seen together with what a symmetry adds, in the axes of the seen side."""
+
+    points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    cost: float
+    """How little it agrees with what was seen; 0 is best."""
+
+
+@dataclass(frozen=True)
+class SeenSide:
+    """What was seen, in axes with z to the camera."""
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
@@ -115,11 +87,13 @@ class _SeenSide:
     width: float
     end: float
     """Height below which nothing was seen [m]."""
+    top: float
+    """Height above which nothing was seen [m]."""
 
     @classmethod
-    def of(cls, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], away: float | None) -> _SeenSide:
+    def of(cls, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], away: float | None) -> SeenSide:
         """Find the rim, and how the surface goes on there."""
-        image, height = _projected(points, away), points[:, 2]
+        image, height = projected(points, away), points[:, 2]
         angles = np.linspace(0, np.pi, 16, endpoint=False)
         width = float(np.ptp(image @ np.stack([np.cos(angles), np.sin(angles)]), axis=0).min())
         end, top = np.quantile(height, (LAST, 1 - LAST))
@@ -129,7 +103,7 @@ class _SeenSide:
             rays, flat = np.array([[0.0, 0.0, 1.0]]), 0.0
         else:
             some = shuffled[:MOST]
-            near = _tree(image).query_ball_point(image[some], RIM * width)
+            near = nearest_points(image).query_ball_point(image[some], RIM * width)
             aside = np.array([np.linalg.norm(image[i].mean(0) - image[k]) for i, k in zip(near, some, strict=True)])
             rim = some[aside >= min(LOPSIDED * RIM * width, np.sort(aside)[-min(FEWEST, len(aside))])]
             rays, flat = np.array([0.0, 0.0, away]) - points[rim], max(0.0, width - float(top - end))
@@ -137,7 +111,31 @@ class _SeenSide:
         # A surface that turns away goes on as a circle; one that faces the camera ends at an edge.
         expected = facing * np.where(facing < ROUND, width, flat)
         smooth = KINK * (1 - facing) if away is None else SEEN_KINK * np.clip(1 - facing / ROUND, 0, 1)
-        return cls(points, normals, away, shuffled[:SAMPLE], rim, expected, smooth, width, float(end))
+        return cls(points, normals, away, shuffled[:SAMPLE], rim, expected, smooth, width, float(end), float(top))
+
+    def guesses(self, up: Float[np.ndarray, "3"] | None, count: int) -> list[Guess]:
+        """Both sides by the likeliest symmetries that differ, best first; the last is repeated where there are too few.
+
+        Args:
+            up: Unit vector along which the object stands, if it does: what stands is rather turned or mirrored upright.
+            count: How many.
+        """
+        motions = self.symmetries(up)
+        costs = np.array([self.cost(*motion) + _lean(motion[0], up) for motion in motions])
+        found: list[Guess] = []
+        sampled: list[KDTree] = []
+        for k in costs.argsort():
+            linear, centre = motions[k]
+            some = (self.points[self.sample] - centre) @ linear.T + centre
+            if any(tree.query(some)[0].mean() < APART * self.width for tree in sampled):
+                continue
+            sampled.append(nearest_points(some))
+            behind = (self.points - centre) @ linear.T + centre
+            found.append(Guess(np.concatenate([self.points, behind]),
+                               np.concatenate([self.normals, self.normals @ linear.T]), float(costs[k])))
+            if len(found) == count:
+                break
+        return found + found[-1:] * (count - len(found))
 
     def symmetries(self, up: Float[np.ndarray, "3"] | None) -> list[tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]]:
         """Linear parts and fixed points of the motions that are tried."""
@@ -168,7 +166,7 @@ class _SeenSide:
         wrong = self._shown((self.points[self.sample] - centre) @ linear.T + centre)
         # Every motion that is tried is its own inverse: what it takes to the rim is where it takes the rim.
         taken = (self.points[self.rim] - centre) @ linear.T + centre
-        gap, nearest = self._space.query(taken)
+        gap, nearest = self.space.query(taken)
         # Before the seen side instead of behind it, the object would be thinner than nothing.
         gap = gap * np.where(taken[:, 2] > self.points[nearest, 2], -1.0, 1.0)
         kink = 1 - (self.normals[nearest] @ linear.T * self.normals[self.rim]).sum(1)
@@ -177,17 +175,19 @@ class _SeenSide:
         return float(far / self.width + (kink * self.smooth).mean())
 
     @cached_property
-    def _space(self) -> KDTree:
-        return _tree(self.points)
+    def space(self) -> KDTree:
+        """For seen points that are nearest."""
+        return nearest_points(self.points)
 
     @cached_property
-    def _image(self) -> KDTree:
-        return _tree(_projected(self.points, self.away))
+    def image(self) -> KDTree:
+        """For seen points that are nearest in the image."""
+        return nearest_points(projected(self.points, self.away))
 
     def _shown(self, moved: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
         """How far points lie from where they would have been hidden [m]."""
         if self.away is None:
-            return np.where(moved[:, 2] > self.end, self._space.query(moved)[0], 0.0)
-        aside, nearest = self._image.query(_projected(moved, self.away))
+            return np.where(moved[:, 2] > self.end, self.space.query(moved)[0], 0.0)
+        aside, nearest = self.image.query(projected(moved, self.away))
         before = moved[:, 2] - self.points[nearest, 2]
         return np.hypot(np.maximum(0, aside - TOLERANCE), np.maximum(0, before - TOLERANCE))
