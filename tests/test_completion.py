@@ -127,6 +127,31 @@ def test_both_sides_are_about_as_dense() -> None:
         assert 0.35 < share < 0.65, f"{share} of the points were added to half a sphere of {shown.sum()}"
 
 
+def test_a_die_is_not_thinned_away() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, (3000, 3))
+    normals = np.eye(3)[np.abs(points).argmax(1)] * np.sign(points)
+    points = 0.004 * np.where(normals == 0, points, normals)
+    whole = completed(points[points[:, 2] > 0], normals[points[:, 2] > 0], None)
+    assert (~whole.added).sum() > 100
+    assert whole.added.sum() > 50
+    assert np.abs(np.abs(whole.points).max(1) - 0.004)[whole.added].mean() < 0.001
+
+
+def test_where_the_network_finds_no_surface_the_best_guess_stays() -> None:
+    points, normals, _ = box()
+    camera = np.array([0.36, 0.29, 0.38])
+    shown = facing(points, normals, camera)
+    network = SurfaceNetwork(GUESSES, 20)
+    with torch.no_grad():
+        # Everything is a metre away.
+        network.leave.bias[GUESSES] = 100.0
+    whole = completed(points[shown], normals[shown], camera, network=network)
+    added, _ = likeliest(points[shown], normals[shown], camera)
+    assert KDTree(added).query(whole.points[whole.added])[0].max() < 1e-9
+    assert whole.added.sum() > 0.3 * len(added)
+
+
 def test_an_untrained_network_believes_the_best_symmetry() -> None:
     points, normals, _ = box()
     camera = np.array([0.36, 0.29, 0.38])

@@ -23,14 +23,15 @@ SEEN = 2048
 """Seen points that guesses are made of."""
 THINNEST = 1e-4
 """Width in the image below which nothing can be said of the other side [m]."""
-SPACING, CELLS = 0.005, 30_000
-"""Spacing of the grid on which the surface is looked for [m], and the most cells of it; large objects get larger cells."""
+CELLS = 20_000
+"""About how many cells the grid has on which the surface is looked for: edges of 5 mm for a large can, 1 mm for a die."""
 MARGIN = 0.01
 """How far the grid reaches beyond all guesses [m]."""
 SPREAD, STEPS, CLOSE = 40_000, 4, 0.0005
 """Points that are moved to the surface, in so many steps, and how close they have to come [m]."""
-NEAR, FINE = 40, 0.002
-"""Of seen points one is kept in each cube whose edge is the object's width over this, but at least so long [m]."""
+NEAR, FINE, COARSE = 40, 0.002, 10
+"""Of seen points one is kept in each cube whose edge is the object's width over the first, but at least so long [m], unless that
+is more than the width over the last."""
 SMALL, LENGTH = 0.01, 0.05
 """Distances that the network sees as about 1/2, and lengths that it sees as 1 [m]."""
 
@@ -77,7 +78,7 @@ def completed(
         return CompletedCloud(points, normals, np.zeros(len(points), bool))
     guesses = side.guesses(None if up is None else up @ axes, GUESSES)
     surface, outward = zero_level(side, guesses, network or shipped_surface())
-    apart = max(FINE, side.width / NEAR)
+    apart = max(side.width / NEAR, min(FINE, side.width / COARSE))
     seen, seen_normals = _thinned(side.points, side.normals, apart)
     between = 2 * float(np.median(nearest_points(seen).query(seen, k=2)[0][:, 1]))
     near = side.space.query(surface)[0] < 1.5 * max(apart, between)
@@ -125,12 +126,14 @@ def surface_features(side: SeenSide, guesses: list[Guess], places: Float[np.ndar
 def zero_level(
     side: SeenSide, guesses: list[Guess], network: SurfaceNetwork
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
-    """Points all over the surface, in random order, and unit normals there, in the axes of the seen side."""
+    """Points all over the surface and unit normals there, in the axes of the seen side: those of the best guess where the network
+    finds no surface.
+    """
     from scipy.interpolate import RegularGridInterpolator
 
     everything = np.concatenate([g.points for g in guesses])
     low, high = everything.min(0) - MARGIN, everything.max(0) + MARGIN
-    spacing = max(SPACING, float((np.prod(high - low) / CELLS) ** (1 / 3)))
+    spacing = float((np.prod(high - low) / CELLS) ** (1 / 3))
     along = [np.arange(a, b + spacing, spacing) for a, b in zip(low, high, strict=True)]
     places = np.stack(np.meshgrid(*along, indexing="ij"), -1)
     distances = network(*surface_features(side, guesses, places.reshape(-1, 3))).double().numpy().reshape(places.shape[:3])
@@ -143,7 +146,7 @@ def zero_level(
     rng = np.random.default_rng(0)
     close = places[np.abs(distances) < 1.5 * spacing]
     if not len(close):
-        return np.zeros((0, 3)), np.zeros((0, 3))
+        return guesses[0].points, guesses[0].normals
     points = close[rng.integers(len(close), size=SPREAD)] + rng.uniform(-0.5, 0.5, (SPREAD, 3)) * spacing
     for _ in range(STEPS):
         here = values(points)
