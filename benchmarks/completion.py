@@ -3,9 +3,9 @@
     python benchmarks/completion.py [--views N] [--picture PNG] [--json]
 
 Two errors: how far added points are from the object's surface, and how far its surface that was not seen is from them. The
-mirror is where the seen side ends; the symmetry is the one that agrees best with what was seen, without the network. The picture
-shows depth images of the validate objects from the side: blue was seen, orange was added, grey is the object. Needs the
-development assets.
+mirror is where the seen side ends; the symmetry is the one that agrees best with what was seen, without the network. The
+picture shows depth images of the validate objects from the side: blue was seen, orange was added, grey is the object. Needs
+the development assets.
 """
 
 from __future__ import annotations

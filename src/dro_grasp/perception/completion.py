@@ -30,8 +30,8 @@ MARGIN = 0.01
 SPREAD, STEPS, CLOSE = 40_000, 4, 0.0005
 """Points that are moved to the surface, in so many steps, and how close they have to come [m]."""
 NEAR, FINE, COARSE = 40, 0.002, 10
-"""Of seen points one is kept in each cube whose edge is the object's width over the first, but at least so long [m], unless that
-is more than the width over the last."""
+"""Of seen points one is kept in each cube whose edge is the object's width over the first number, but at least so long [m],
+unless that is more than the width over the last."""
 SMALL, LENGTH = 0.01, 0.05
 """Distances that the network sees as about 1/2, and lengths that it sees as 1 [m]."""
 
@@ -126,8 +126,9 @@ def surface_features(side: SeenSide, guesses: list[Guess], places: Float[np.ndar
 def zero_level(
     side: SeenSide, guesses: list[Guess], network: SurfaceNetwork
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
-    """Points all over the surface and unit normals there, in the axes of the seen side: those of the best guess where the network
-    finds no surface.
+    """Points all over the surface and unit normals there, in the axes of the seen side.
+
+    Where the network finds no surface they are those of the best guess.
     """
     from scipy.interpolate import RegularGridInterpolator
 
