@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -30,12 +30,17 @@ from dro_grasp.objects.shape import ObjectModel, signed_distances
 from dro_grasp.perception.camera import DepthCamera
 from dro_grasp.perception.completion import GUESSES, THINNEST, looked_at, surface_features
 
+Kind = Literal["half", "depth"]
+KINDS: tuple[Kind, ...] = ("half", "depth")
+"""How objects are seen."""
 SHAPES, SIDES, PLACES = 5, 4, 1536
 """Shapes of each object, of which the first is its own; sides from which each is seen each way; places asked for in a view."""
 STRETCH = (0.7, 1.35)
 """Factors of a stretched object's extents."""
 BLUR, AROUND = 0.006, 0.02
 """Distance of places from surfaces, as a standard deviation, and how far the others reach beyond both surfaces [m]."""
+AWAY = 0.006
+"""Places that are this far from all seen points were not seen [m]."""
 DISTANCE, NOISE, FEWEST = (0.35, 0.7), (0.0, 0.0015), 40
 """Cameras' distances and noise [m], and fewest points that they see."""
 STANDING = 0.5
@@ -58,7 +63,7 @@ class Views(NamedTuple):
     truth: Tensor
     """(v n) [m]."""
     kind: Tensor
-    """(v): 0 half, 1 depth."""
+    """(v): index into KINDS."""
     unseen: Tensor
     """(v n): whether a place is away from all that was seen."""
 
@@ -71,10 +76,10 @@ def stretched(obj: ObjectModel, rng: np.random.Generator) -> ObjectModel:
     return mesh_object(obj.name, mesh, origin=obj.name)
 
 
-def asked(obj: ObjectModel, kind: str, rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
+def asked(obj: ObjectModel, kind: Kind, rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
     """One view: guessed distances, features, true distances, and what is away from all seen; None where too little is seen."""
     camera = DepthCamera(distance=rng.uniform(*DISTANCE), noise=rng.uniform(*NOISE))
-    points, normals, place = seen_side(obj, "half" if kind == "half" else "depth", int(rng.integers(1 << 30)), camera)
+    points, normals, place = seen_side(obj, kind, int(rng.integers(1 << 30)), camera)
     if len(points) < FEWEST:
         return None
     side, axes, middle = looked_at(points, normals, place)
@@ -91,7 +96,7 @@ def asked(obj: ObjectModel, kind: str, rng: np.random.Generator) -> tuple[Tensor
     assert obj.vertices is not None
     assert obj.faces is not None
     truth = signed_distances(obj.vertices, obj.faces, places @ axes.T + middle)
-    unseen = side.space.query(places)[0] > BLUR
+    unseen = side.space.query(places)[0] > AWAY
     return told.guessed, told.features, torch.from_numpy(truth).float(), torch.from_numpy(unseen)
 
 
@@ -104,7 +109,7 @@ def collect(label: str, seed: int) -> Views:
         except ObjectError as error:
             print(f"{label}: {error}")
             continue
-        for k, kind in enumerate(("half", "depth")):
+        for k, kind in enumerate(KINDS):
             views = [view for view in (asked(obj, kind, rng) for _ in range(SIDES)) if view is not None]
             found += views
             kinds += [k] * len(views)
@@ -145,7 +150,7 @@ def fit(views: Views, steps: int, seed: int) -> SurfaceNetwork:
 @torch.no_grad()
 def report(network: SurfaceNetwork, views: Views) -> None:
     """Errors where nothing was seen, beside those of the best symmetry."""
-    for k, kind in enumerate(("half", "depth")):
+    for k, kind in enumerate(KINDS):
         some = Views(*(column[views.kind == k] for column in views))
         predicted = torch.cat([network(g, f) for g, f in zip(some.guessed.split(16), some.features.split(16), strict=True)])
         for name, values in (("best symmetry", some.guessed[..., 0]), ("network", predicted)):

@@ -52,9 +52,9 @@ class SurfaceFeatures(NamedTuple):
     guessed: Float[Tensor, "n 5"]
     """Signed distances to the guesses [m]."""
     features: Float[Tensor, "n 20"]
-    """The same, squeezed; how little each guess agrees with what was seen; distance to the nearest seen point, height over its
-    tangent plane, distance from the seen image and height over its surface there; heights above the end and the top of what
-    was seen; place about the middle, along the view and across; the seen width; and whether there was a camera."""
+    """The same, squeezed. Squeezed likewise: distance to the nearest seen point, height over its tangent plane, distance from
+    the seen image, height over its surface there, heights above the end and the top of what was seen. Place along the view and
+    across it; how little each guess agrees with what was seen; the seen width; whether there was a camera."""
 
 
 def completed(
