@@ -23,15 +23,15 @@ from report import ROOT, emit
 from synthesis import HANDS
 
 from dro_grasp.cli.main import main as command
-from dro_grasp.datasets.bundle import Bundle, load_bundle
+from dro_grasp.datasets.bundle.training_file import Bundle, load_bundle
 from dro_grasp.datasets.splits import HELD_OUT_HANDS
-from dro_grasp.evaluation.benchmark import ALL, RAW, REFINED, BenchmarkConfig, benchmark
 from dro_grasp.evaluation.distance_error import distance_errors
-from dro_grasp.evaluation.views import View
+from dro_grasp.evaluation.success_rates import ALL, RAW, REFINED, BenchmarkConfig, benchmark
 from dro_grasp.hands.library import load_hand
 from dro_grasp.models.checkpoints import load_weights, save_weights
 from dro_grasp.models.network import DistanceNetwork, NetworkConfig
-from dro_grasp.objects.library import load_object, resolve_objects
+from dro_grasp.objects.catalogue import load_object, resolve_objects
+from dro_grasp.perception.partial_views import View
 from dro_grasp.predictor import GraspPredictor
 from dro_grasp.simulation.protocols import protocol
 from dro_grasp.training.config import (

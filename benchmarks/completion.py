@@ -21,11 +21,11 @@ from PIL import Image
 from report import emit
 from scipy.spatial import KDTree
 
-from dro_grasp.evaluation.views import seen_side
-from dro_grasp.geometry.rasterizer import Camera, Mesh, dots, render
-from dro_grasp.objects.library import load_object, resolve_objects
+from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.completion import completed, looked_at
+from dro_grasp.perception.partial_views import seen_side
+from dro_grasp.rendering.rasterizer import Camera, Mesh, dots, render
 from dro_grasp.viewer.pictures import contact_sheet
 
 GROUPS = ("assets:train", "assets:validate")

@@ -11,10 +11,10 @@ from pathlib import Path
 
 from report import ROOT
 
-from dro_grasp.datasets.collections import read_collection
-from dro_grasp.datasets.yields import Yield
+from dro_grasp.datasets.collections.collection import read_collection
+from dro_grasp.datasets.engine.yields import Yield
 from dro_grasp.evaluation.coverage import measure_coverage
-from dro_grasp.viewer.dataset_report import charts, grasps_drawn
+from dro_grasp.viewer.dataset_pages import charts, grasps_drawn
 
 PICTURED = "assets-shadowhand.parquet"
 """The hand of the pictures."""

@@ -16,7 +16,7 @@ from synthesis import HANDS
 
 from dro_grasp.evaluation.coverage import HALF_AXES, half_axis, half_axis_direction, palm_angles
 from dro_grasp.hands.library import load_hand
-from dro_grasp.objects.library import load_object, resolve_objects
+from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.predictor import GraspPredictor
 
 KEPT = 20.0

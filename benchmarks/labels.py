@@ -17,14 +17,14 @@ import torch
 from report import emit
 from synthesis import HANDS, training_objects
 
-from dro_grasp.datasets.production import EngineConfig, valid_grasps
+from dro_grasp.datasets.engine.production import EngineConfig, valid_grasps
+from dro_grasp.energy.contact_candidates import ContactConfig
 from dro_grasp.evaluation.metrics import diversity
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.fingers import ContactConfig
-from dro_grasp.grasps.initial import StartConfig
-from dro_grasp.grasps.synthesis import SynthesisConfig
 from dro_grasp.hands.library import load_hand
-from dro_grasp.objects.library import load_object
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.optimization.starts import StartConfig
+from dro_grasp.optimization.synthesis import SynthesisConfig
 from dro_grasp.simulation.protocols import changed
 from dro_grasp.simulation.trial import simulate
 

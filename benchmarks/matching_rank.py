@@ -20,9 +20,9 @@ from report import emit
 from synthesis import HANDS
 
 from dro_grasp.evaluation.correspondence import matching_rank, matching_rank_between, most_similar
-from dro_grasp.geometry.rasterizer import Camera, dots, render
 from dro_grasp.models.checkpoints import load_weights
 from dro_grasp.models.encoder import StaticGraphEncoder
+from dro_grasp.rendering.rasterizer import Camera, dots, render
 from dro_grasp.training.config import AugmentationConfig
 from dro_grasp.training.samples import SampleSource
 from dro_grasp.viewer.pictures import contact_sheet

@@ -15,16 +15,16 @@ import torch
 from report import emit
 from synthesis import HANDS
 
-from dro_grasp.evaluation.benchmark import KEPT, pair_seed
-from dro_grasp.evaluation.views import View, seen
-from dro_grasp.grasps.object_energy import object_energy
-from dro_grasp.grasps.ranking import score_grasps
-from dro_grasp.grasps.refinement import refine_grasps
+from dro_grasp.energy.object_energy import object_energy
+from dro_grasp.evaluation.success_rates import KEPT, pair_seed
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
-from dro_grasp.objects.library import load_object, resolve_objects
+from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.optimization.refinement import refine_grasps
+from dro_grasp.perception.partial_views import View, seen
 from dro_grasp.predictor import CLOUD_TEMPERATURE, GraspPredictor, PredictorConfig
+from dro_grasp.ranking.score import score_grasps
 from dro_grasp.simulation.trial import simulate
 
 PROTOCOLS = ("dro", "strict")

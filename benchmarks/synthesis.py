@@ -20,11 +20,11 @@ from pathlib import Path
 import torch
 from report import emit
 
-from dro_grasp.datasets.production import EngineConfig, valid_grasps
+from dro_grasp.datasets.engine.production import EngineConfig, valid_grasps
 from dro_grasp.grasps.duplicates import NEAR
-from dro_grasp.grasps.synthesis import SynthesisConfig
 from dro_grasp.hands.library import load_hand
-from dro_grasp.objects.library import load_object
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.optimization.synthesis import SynthesisConfig
 
 HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand")
 """The paper hands."""

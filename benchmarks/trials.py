@@ -20,9 +20,9 @@ from pathlib import Path
 
 from report import emit
 
-from dro_grasp.grasps.synthesis import SynthesisConfig, synthesize
 from dro_grasp.hands.library import load_hand
-from dro_grasp.objects.library import load_object
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.scene import cores
 from dro_grasp.simulation.trial import TrialResult, simulate

@@ -12,7 +12,7 @@ import time
 from statistics import median
 
 from benchmarks.report import emit
-from tests.browser import page_of
+from tests.helpers.browser import page_of
 
 TARGETS = (3.0, 15.0)
 """Of the page and of the grasps [s]."""

@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 
 import dro_grasp as dro
-from dro_grasp.grasps.formats import Frame, isaac_grasp, moveit_grasps
+from dro_grasp.export.formats import Frame, isaac_grasp, moveit_grasps
 
 hand, obj = dro.load_hand("barrett"), dro.load_object("can")
 grasps = dro.GraspPredictor().predict(hand, obj, num=8)

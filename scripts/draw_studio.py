@@ -11,7 +11,7 @@ import sys
 import time
 from pathlib import Path
 
-from tests.browser import page_of
+from tests.helpers.browser import page_of
 
 
 def main(path: Path) -> None:

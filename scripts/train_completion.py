@@ -21,14 +21,14 @@ from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from dro_grasp.errors import ObjectError
-from dro_grasp.evaluation.views import seen_side
-from dro_grasp.models.small import save_small
-from dro_grasp.models.surface import SHIPPED, SurfaceNetwork
-from dro_grasp.objects.library import load_object, resolve_objects
+from dro_grasp.models.completion_network import SHIPPED, SurfaceNetwork
+from dro_grasp.models.small_networks import save_small
+from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.loading import mesh_object
 from dro_grasp.objects.shape import ObjectModel, signed_distances
 from dro_grasp.perception.camera import DepthCamera
 from dro_grasp.perception.completion import GUESSES, THINNEST, looked_at, surface_features
+from dro_grasp.perception.partial_views import seen_side
 
 Kind = Literal["half", "depth"]
 KINDS: tuple[Kind, ...] = ("half", "depth")

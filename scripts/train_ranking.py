@@ -21,20 +21,20 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from dro_grasp.energy.object_energy import evaluate_nearest, object_energy
 from dro_grasp.evaluation.metrics import roc_area
-from dro_grasp.evaluation.views import View, seen
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.object_energy import evaluate_nearest, object_energy
-from dro_grasp.grasps.quality import grasp_features
-from dro_grasp.grasps.ranking import ScoreConfig
-from dro_grasp.grasps.refinement import refine_grasps
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
-from dro_grasp.models.quality import SHIPPED, QualityNetwork
-from dro_grasp.models.small import save_small
-from dro_grasp.objects.library import load_object, resolve_objects
+from dro_grasp.models.small_networks import save_small
+from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.optimization.refinement import refine_grasps
+from dro_grasp.perception.partial_views import View, seen
 from dro_grasp.predictor import GraspPredictor
+from dro_grasp.ranking.features import grasp_features
+from dro_grasp.ranking.score import ScoreConfig
+from dro_grasp.ranking.score_network import SHIPPED, QualityNetwork
 from dro_grasp.simulation.trial import simulate
 
 HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand", "assets/leaphand", "assets/allegro_right",

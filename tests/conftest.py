@@ -11,9 +11,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import jaxtyping
 import pytest
 
-import tests.typecheck  # noqa: F401  (must be imported before the hook is installed)
+import tests.helpers.typecheck  # noqa: F401  (must be imported before the hook is installed)
 
-jaxtyping.install_import_hook("dro_grasp", "tests.typecheck.check")
+jaxtyping.install_import_hook("dro_grasp", "tests.helpers.typecheck.check")
 
 
 @pytest.fixture(scope="session")
@@ -32,7 +32,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def bundle(home: Path):
-    from tests.tiny_bundle import tiny_bundle
+    from tests.helpers.tiny_bundle import tiny_bundle
 
     return tiny_bundle(home / "bundle.safetensors")
 
@@ -40,7 +40,7 @@ def bundle(home: Path):
 @pytest.fixture(scope="module")
 def results(home: Path, bundle) -> dict:
     """What uninterrupted runs of both stages of training return, by stage."""
-    from tests.training_stages import STAGES, run_stage
+    from tests.helpers.training_stages import STAGES, run_stage
 
     return {stage: run_stage(stage, bundle, home / stage) for stage in STAGES}
 

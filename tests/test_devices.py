@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from dro_grasp.devices import choose_device, on_device, require_device
+from dro_grasp.energy.grasp_energy import link_spheres
 from dro_grasp.errors import OptionError
-from dro_grasp.grasps.grasp_energy import link_spheres
-from tests.toy_hand import toy_hand
+from tests.helpers.toy_hand import toy_hand
 
 
 @pytest.mark.parametrize("there", [True, False])

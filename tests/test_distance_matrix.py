@@ -11,8 +11,8 @@ import torch
 from dro_grasp import distance_matrix
 from dro_grasp.geometry.point_clouds import partial_view
 from dro_grasp.hands.hand import Hand
-from tests.loaded_hands import loaded_hand
-from tests.toy_hand import toy_hand
+from tests.helpers.loaded_hands import loaded_hand
+from tests.helpers.toy_hand import toy_hand
 
 ASSET_HANDS = (
     "allegro_left", "allegro_right", "barrett_multidex", "barrett", "shadowhand", "leaphand", "inspire", "ability",

@@ -12,8 +12,8 @@ import pytest
 
 import dro_grasp as dro
 from dro_grasp.cli.main import parse
-from dro_grasp.geometry.rigid_motion import read_motion
-from tests.weights import untrained_weights
+from dro_grasp.frames import read_motion
+from tests.helpers.weights import untrained_weights
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -120,7 +120,7 @@ def test_frame_examples_are_frames(tmp_path: Path, document: str, key: str) -> N
 
 def test_public_names_of_the_readme_demo_exist() -> None:
     from dro_grasp.hands.library import hand_names
-    from dro_grasp.objects.library import object_names
+    from dro_grasp.objects.catalogue import object_names
 
     makefile = (ROOT / "Makefile").read_text()
     hand, obj = re.search(r"--hand (\w+)", makefile)[1], re.search(r"--object (\w+)", makefile)[1]

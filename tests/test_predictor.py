@@ -11,12 +11,12 @@ from torch import Tensor
 
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.ranking import score_grasps
-from dro_grasp.objects.library import load_object
+from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predictor import GraspPredictor, PredictorConfig, rotation_between
-from tests.toy_hand import toy_hand
-from tests.weights import untrained_weights
+from dro_grasp.ranking.score import score_grasps
+from tests.helpers.toy_hand import toy_hand
+from tests.helpers.weights import untrained_weights
 
 HAND = toy_hand()
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import dro_grasp as dro
-from tests.weights import untrained_weights
+from tests.helpers.weights import untrained_weights
 
 
 @pytest.mark.parametrize("name", dro.__all__)

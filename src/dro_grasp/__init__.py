@@ -9,20 +9,20 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dro_grasp.datasets.collections import read_collection
-    from dro_grasp.datasets.engine import synthesize_dataset
+    from dro_grasp.datasets.collections.collection import read_collection
+    from dro_grasp.datasets.engine.schedule import synthesize_dataset
     from dro_grasp.errors import DroGraspError
     from dro_grasp.grasps.batch import GraspBatch
-    from dro_grasp.grasps.synthesis import synthesize
     from dro_grasp.hands.hand import Hand
     from dro_grasp.hands.library import load_hand
-    from dro_grasp.objects.library import load_object
+    from dro_grasp.objects.catalogue import load_object
     from dro_grasp.objects.shape import ObjectModel
+    from dro_grasp.optimization.synthesis import synthesize
     from dro_grasp.perception.scan import depth_points, scanned_object
     from dro_grasp.predictor import GraspPredictor
     from dro_grasp.simulation.trial import TrialResult, simulate
 
-__version__ = "0.1.0"
+from dro_grasp._version import __version__
 
 _EXPORTS = {
     "DroGraspError": "errors",
@@ -33,12 +33,12 @@ _EXPORTS = {
     "TrialResult": "simulation.trial",
     "depth_points": "perception.scan",
     "load_hand": "hands.library",
-    "load_object": "objects.library",
-    "read_collection": "datasets.collections",
+    "load_object": "objects.catalogue",
+    "read_collection": "datasets.collections.collection",
     "scanned_object": "perception.scan",
     "simulate": "simulation.trial",
-    "synthesize": "grasps.synthesis",
-    "synthesize_dataset": "datasets.engine",
+    "synthesize": "optimization.synthesis",
+    "synthesize_dataset": "datasets.engine.schedule",
 }
 
 __all__ = [

@@ -20,12 +20,12 @@ from dro_grasp import distance_matrix
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
-from dro_grasp.grasps.ranking import score_grasps
-from dro_grasp.grasps.refinement import refine_grasps
 from dro_grasp.hands.hand import Hand
 from dro_grasp.models.checkpoints import load_weights
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.optimization.refinement import refine_grasps
+from dro_grasp.ranking.score import score_grasps
 
 PREDICTED = "predicted_points"
 """Column that carries the multilaterated points through selection and sorting; no file holds it."""

@@ -14,7 +14,7 @@ import tyro
 from dro_grasp.cli.output import optional, print_json, progress_bar, say
 
 if TYPE_CHECKING:
-    from dro_grasp.evaluation.benchmark import Row
+    from dro_grasp.evaluation.success_rates import Row
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,11 @@ class Benchmark:
 
     def run(self) -> int:
         """Load everything, measure, print."""
-        from dro_grasp.datasets.bundle import load_bundle
+        from dro_grasp.datasets.bundle.training_file import load_bundle
         from dro_grasp.errors import ObjectError, OptionError
-        from dro_grasp.evaluation.benchmark import BEST, TOP, BenchmarkConfig, benchmark
+        from dro_grasp.evaluation.success_rates import BEST, TOP, BenchmarkConfig, benchmark
         from dro_grasp.hands.library import load_hand
-        from dro_grasp.objects.library import load_object, resolve_objects
+        from dro_grasp.objects.catalogue import load_object, resolve_objects
         from dro_grasp.predictor import GraspPredictor, PredictorConfig, check_request
         from dro_grasp.simulation.protocols import protocol
 

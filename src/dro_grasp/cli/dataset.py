@@ -26,7 +26,7 @@ class Info:
 
     def run(self) -> int:
         """Count."""
-        from dro_grasp.datasets.collections import count_collection
+        from dro_grasp.datasets.collections.collection import count_collection
 
         counts = count_collection(self.folder)
         total = sum(sum(c.values()) for c in counts.values())
@@ -56,7 +56,7 @@ class Merge:
 
     def run(self) -> int:
         """Merge, then write all files."""
-        from dro_grasp.datasets.merging import file_name, merge
+        from dro_grasp.datasets.collections.merging import file_name, merge
         from dro_grasp.files import make_folder
 
         folder = make_folder(self.output)

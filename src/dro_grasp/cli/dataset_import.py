@@ -33,8 +33,8 @@ class Import:
 
     def run(self) -> int:
         """Read all files, find hands and objects, write."""
-        from dro_grasp.datasets.importing import import_grasps
-        from dro_grasp.datasets.merging import file_name
+        from dro_grasp.datasets.collections.importing import import_grasps
+        from dro_grasp.datasets.collections.merging import file_name
         from dro_grasp.errors import GraspFileError
         from dro_grasp.files import check_folder, make_folder
 

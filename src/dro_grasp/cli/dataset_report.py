@@ -27,10 +27,10 @@ class Report:
 
     def run(self) -> int:
         """Measure, print, write the page."""
-        from dro_grasp.datasets.collections import read_collection
+        from dro_grasp.datasets.collections.collection import read_collection
         from dro_grasp.evaluation.coverage import measure_coverage
         from dro_grasp.files import check_output
-        from dro_grasp.viewer.dataset_report import write_report
+        from dro_grasp.viewer.dataset_pages import write_report
 
         if self.output is not None:
             check_output(self.output)

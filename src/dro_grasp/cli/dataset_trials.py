@@ -35,8 +35,8 @@ class Check:
 
     def run(self) -> int:
         """Draw, try, compare."""
-        from dro_grasp.datasets.checking import check
-        from dro_grasp.datasets.collections import read_collection
+        from dro_grasp.datasets.collections.checking import check
+        from dro_grasp.datasets.collections.collection import read_collection
         from dro_grasp.evaluation.metrics import wilson_interval
         from dro_grasp.simulation.protocols import changed
 
@@ -81,9 +81,9 @@ class Filter:
 
     def run(self) -> int:
         """Try, keep, write one file a hand."""
-        from dro_grasp.datasets.checking import keep_passing
-        from dro_grasp.datasets.collections import read_collection
-        from dro_grasp.datasets.merging import file_name
+        from dro_grasp.datasets.collections.checking import keep_passing
+        from dro_grasp.datasets.collections.collection import read_collection
+        from dro_grasp.datasets.collections.merging import file_name
         from dro_grasp.files import make_folder
         from dro_grasp.grasps.batch import GraspBatch
         from dro_grasp.simulation.protocols import changed

@@ -11,8 +11,8 @@ import tyro
 from dro_grasp.cli.output import load_grasps, optional, print_json, say
 
 if TYPE_CHECKING:
+    from dro_grasp.export.formats import Frame
     from dro_grasp.grasps.batch import GraspBatch
-    from dro_grasp.grasps.formats import Frame
     from dro_grasp.hands.hand import Hand
 
 SUFFIXES = {"isaac_grasp": ".yaml", "moveit": ".yaml", "csv": ".csv", "dexgraspbench": ""}
@@ -47,8 +47,8 @@ class Export:
     def run(self) -> int:
         """Complete the grasps, then write a file for each object."""
         from dro_grasp.errors import GraspFileError
+        from dro_grasp.export.formats import Frame
         from dro_grasp.files import check_folder, check_output, make_folder
-        from dro_grasp.grasps.formats import Frame
         from dro_grasp.grasps.sources import hand_of
 
         frame = Frame() if self.frame is None else Frame.load(self.frame)
@@ -95,8 +95,8 @@ class Export:
         """The files of one object."""
         import numpy as np
 
+        from dro_grasp.export.formats import csv_table, dexgraspbench, isaac_grasp, moveit_grasps
         from dro_grasp.files import make_folder, replacing
-        from dro_grasp.grasps.formats import csv_table, dexgraspbench, isaac_grasp, moveit_grasps
         from dro_grasp.grasps.sources import object_source
 
         if self.format == "dexgraspbench":

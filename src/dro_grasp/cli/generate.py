@@ -16,7 +16,7 @@ from dro_grasp.grasps.sources import with_sources
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from dro_grasp.geometry.rigid_motion import NamedMotion
+    from dro_grasp.frames import NamedMotion
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.hands.hand import Hand
     from dro_grasp.objects.shape import ObjectModel
@@ -79,9 +79,9 @@ class Generate:
     def run(self) -> int:
         """Check everything that can be checked before the work, then do it."""
         from dro_grasp.errors import DroGraspError
-        from dro_grasp.geometry.rigid_motion import read_motion
+        from dro_grasp.frames import read_motion
         from dro_grasp.hands.library import load_hand
-        from dro_grasp.objects.library import resolve_objects
+        from dro_grasp.objects.catalogue import resolve_objects
         from dro_grasp.predictor import GraspPredictor, PredictorConfig, check_request
 
         check_request(self.num, self.direction, self.temperature, self.candidates)
@@ -120,7 +120,7 @@ class Generate:
         picture: Path | None, load: float,
     ) -> Done:
         """One object, start to end."""
-        from dro_grasp.objects.library import load_object
+        from dro_grasp.objects.catalogue import load_object
         from dro_grasp.perception.scan import load_scan
 
         begin = time.perf_counter()

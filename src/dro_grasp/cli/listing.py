@@ -40,7 +40,7 @@ class Objects:
 
     def run(self) -> int:
         """Print names and splits."""
-        from dro_grasp.objects.library import object_names
+        from dro_grasp.objects.catalogue import object_names
 
         names = object_names()
         if self.json:

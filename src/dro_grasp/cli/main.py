@@ -9,13 +9,13 @@ from typing import Annotated, Any
 
 import tyro
 
-from dro_grasp import __version__
+from dro_grasp._version import __version__
 from dro_grasp.cli.benchmark import Benchmark
 from dro_grasp.cli.dataset import Dataset
 from dro_grasp.cli.evaluate import Evaluate
 from dro_grasp.cli.export import Export
 from dro_grasp.cli.generate import Generate
-from dro_grasp.cli.hand import HandCommand
+from dro_grasp.cli.hand_check import HandCommand
 from dro_grasp.cli.listing import Hands, Objects
 from dro_grasp.cli.onboard import Onboard
 from dro_grasp.cli.synthesize import Synthesize

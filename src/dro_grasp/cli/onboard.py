@@ -41,7 +41,7 @@ class Onboard:
 
     def run(self) -> int:
         """All steps, then the report."""
-        from dro_grasp.objects.library import resolve_objects
+        from dro_grasp.objects.catalogue import resolve_objects
         from dro_grasp.onboarding.report import write_report
         from dro_grasp.onboarding.steps import WEIGHTS, OnboardingConfig, onboard
 

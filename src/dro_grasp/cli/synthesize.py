@@ -12,8 +12,8 @@ import tyro
 from dro_grasp.cli.output import optional, print_json, print_table, say_aside
 
 if TYPE_CHECKING:
-    from dro_grasp.datasets.pools import Pool
-    from dro_grasp.datasets.production import Job
+    from dro_grasp.datasets.engine.pools import Pool
+    from dro_grasp.datasets.engine.production import Job
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,9 @@ class Synthesize:
 
     def run(self) -> int:
         """Check numbers and names first, then fill the folder; code 2 if it holds no grasp because every pair failed."""
-        from dro_grasp.datasets.engine import EngineConfig, require_known, synthesize_dataset
-        from dro_grasp.grasps.synthesis import SynthesisConfig
-        from dro_grasp.objects.library import resolve_objects
+        from dro_grasp.datasets.engine.schedule import EngineConfig, require_known, synthesize_dataset
+        from dro_grasp.objects.catalogue import resolve_objects
+        from dro_grasp.optimization.synthesis import SynthesisConfig
 
         self._check_numbers()
         objects = resolve_objects(list(self.object))
@@ -93,6 +93,6 @@ class Synthesize:
             raise OptionError(f"--scale is {self.scale}; give a positive number, for example 0.001 for millimetres")
 
     def _ray_pool(self, job: Job) -> Pool:
-        from dro_grasp.datasets.ray_pool import RayPool
+        from dro_grasp.datasets.engine.ray_pool import RayPool
 
         return RayPool(job, self.workers, job.config.shard_limit, self.ray_address)

@@ -75,7 +75,7 @@ class Pretrain:
 
         import torch
 
-        from dro_grasp.datasets.bundle import load_bundle
+        from dro_grasp.datasets.bundle.training_file import load_bundle
         from dro_grasp.devices import choose_device
         from dro_grasp.evaluation.correspondence import matching_rank
         from dro_grasp.files import check_output
@@ -176,7 +176,7 @@ class Train:
         """Train and save."""
         import dataclasses
 
-        from dro_grasp.datasets.bundle import load_bundle
+        from dro_grasp.datasets.bundle.training_file import load_bundle
         from dro_grasp.devices import choose_device
         from dro_grasp.evaluation.distance_error import distance_errors
         from dro_grasp.files import check_output

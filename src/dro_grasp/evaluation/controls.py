@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.datasets.bundle import Bundle
+from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
 from dro_grasp.hands.hand import Hand

@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dro_grasp.datasets.collections import PairGrasps
-from dro_grasp.datasets.yields import Yield
+from dro_grasp.datasets.collections.collection import PairGrasps
+from dro_grasp.datasets.engine.yields import Yield
 from dro_grasp.evaluation.metrics import diversity
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import hand_of

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 
 from dro_grasp import distance_matrix
-from dro_grasp.datasets.bundle import Bundle
+from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.training.config import AugmentationConfig
 from dro_grasp.training.losses import divergence

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from dro_grasp.errors import GraspFileError, HandError, ObjectError
 
 if TYPE_CHECKING:
-    from dro_grasp.geometry.rigid_motion import NamedMotion
+    from dro_grasp.frames import NamedMotion
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.hands.hand import Hand
     from dro_grasp.objects.shape import ObjectModel
@@ -76,7 +76,7 @@ def object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectMode
     Raises:
         ObjectError: It cannot be found; the message asks for --object.
     """
-    from dro_grasp.objects.library import load_object
+    from dro_grasp.objects.catalogue import load_object
     from dro_grasp.perception.scan import load_scan
 
     if given is not None:

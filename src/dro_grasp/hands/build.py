@@ -10,12 +10,12 @@ import dataclasses
 import numpy as np
 import torch
 
+from dro_grasp.descriptions.loader import Description
 from dro_grasp.errors import HandError
 from dro_grasp.geometry.point_clouds import farthest_points
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.palm import CLOSINGS, Palm, find_palm
 from dro_grasp.hands.surface import LinkSurface, sample_links
-from dro_grasp.kinematics.loader import Description
 from dro_grasp.kinematics.tree import FIXED, KinematicTree
 
 TIP_OFFSET = 0.03

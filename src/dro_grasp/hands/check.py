@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from dro_grasp.geometry.rasterizer import Camera, Mesh, arrow, render
+from dro_grasp.descriptions.loader import Description
+from dro_grasp.descriptions.notes import Note
 from dro_grasp.geometry.triangles import enclosed_volume
 from dro_grasp.hands.build import build_hand
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand_description
-from dro_grasp.kinematics.loader import Description
-from dro_grasp.kinematics.notes import Note
+from dro_grasp.rendering.rasterizer import Camera, Mesh, arrow, render
 
 TILE, TEXT = (560, 520), 30
 """Size of one view, and height of a line of text [pixels]."""

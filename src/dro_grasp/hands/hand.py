@@ -15,7 +15,7 @@ from dro_grasp.geometry.point_clouds import farthest_points
 from dro_grasp.kinematics.tree import KinematicTree, cached_tensor
 
 if TYPE_CHECKING:
-    from dro_grasp.kinematics.loader import Description
+    from dro_grasp.descriptions.loader import Description
 
 MIN_FINGER_OFFSET = 0.005
 """Fingers whose middle is nearer than this to the palm's axis surround it [m]."""

@@ -7,10 +7,10 @@ import importlib
 import os
 from pathlib import Path
 
+from dro_grasp.descriptions.loader import Description, load_description
 from dro_grasp.errors import HandError
 from dro_grasp.hands.build import build_hand
 from dro_grasp.hands.hand import Hand
-from dro_grasp.kinematics.loader import Description, load_description
 
 BUILTIN_FOLDER = Path(__file__).parent / "builtin"
 """Where our own descriptions lie."""

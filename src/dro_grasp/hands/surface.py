@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dro_grasp.descriptions.loader import Description
 from dro_grasp.geometry.point_clouds import sample_surface
-from dro_grasp.kinematics.loader import Description
 from dro_grasp.kinematics.tree import KinematicTree
 
 POINTS_PER_LINK_SAMPLED = 512

@@ -15,7 +15,7 @@ from safetensors.torch import save_file
 from dro_grasp.errors import WeightsError
 from dro_grasp.files import replacing
 from dro_grasp.models.network import DistanceNetwork, NetworkConfig
-from dro_grasp.models.small import SHIPPED_FOLDER
+from dro_grasp.models.small_networks import SHIPPED_FOLDER
 
 FORMAT_VERSION = 1
 KEY = "dro_grasp_weights"

@@ -6,9 +6,9 @@ import html
 from pathlib import Path
 from typing import Any
 
-from dro_grasp.evaluation.benchmark import BEST, RAW, REFINED
+from dro_grasp.evaluation.success_rates import BEST, RAW, REFINED
 from dro_grasp.hands.library import load_hand
-from dro_grasp.objects.library import load_object
+from dro_grasp.objects.catalogue import load_object
 from dro_grasp.onboarding.steps import DATA, PICTURE, REPORT, WEIGHTS, Onboarded
 from dro_grasp.predictor import GraspPredictor
 from dro_grasp.simulation.trial import simulate

@@ -11,18 +11,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dro_grasp.datasets.bundle import load_bundle
-from dro_grasp.datasets.bundling import make_bundle
-from dro_grasp.datasets.collections import count_collection
-from dro_grasp.datasets.engine import require_known, synthesize_dataset
+from dro_grasp.datasets.bundle.bundling import make_bundle
+from dro_grasp.datasets.bundle.training_file import load_bundle
+from dro_grasp.datasets.collections.collection import count_collection
+from dro_grasp.datasets.engine.schedule import require_known, synthesize_dataset
 from dro_grasp.datasets.splits import split_of
 from dro_grasp.errors import BundleError, OptionError
-from dro_grasp.evaluation.benchmark import BEST, RAW, REFINED, BenchmarkConfig, benchmark
+from dro_grasp.evaluation.success_rates import BEST, RAW, REFINED, BenchmarkConfig, benchmark
 from dro_grasp.files import check_folder, make_folder, replacing
 from dro_grasp.hands.check import check_hand, picture
 from dro_grasp.hands.library import load_hand
 from dro_grasp.models.checkpoints import load_weights, locate_weights, save_weights
-from dro_grasp.objects.library import load_object, resolve_objects
+from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.predictor import GraspPredictor
 from dro_grasp.simulation.protocols import protocol
 from dro_grasp.training.config import ScheduleConfig, TrainConfig

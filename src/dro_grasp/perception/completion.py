@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from dro_grasp.models.surface import SurfaceNetwork, shipped_surface
+from dro_grasp.models.completion_network import SurfaceNetwork, shipped_surface
 from dro_grasp.objects.shape import cloud_distances
 from dro_grasp.perception.symmetry import Guess, SeenSide, nearest_points, projected
 

@@ -14,10 +14,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dro_grasp.descriptions.tree_reading import quaternion_matrix
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
 from dro_grasp.hands.hand import Hand
-from dro_grasp.kinematics.tree_reading import quaternion_matrix
 from dro_grasp.simulation.outcome import GIVE_UP
 from dro_grasp.simulation.protocols import Protocol
 from dro_grasp.simulation.scene import Scene, object_mass

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dro_grasp import distance_matrix
-from dro_grasp.datasets.bundle import Bundle
+from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.models.network import DistanceNetwork, NetworkConfig, NetworkOutput
 from dro_grasp.training.batch_statistics import recalibrate
 from dro_grasp.training.config import TrainConfig

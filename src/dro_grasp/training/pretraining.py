@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from dro_grasp.datasets.bundle import Bundle
+from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.errors import TrainingError
 from dro_grasp.models.encoder import StaticGraphEncoder
 from dro_grasp.models.latent import HandMotion, sample_posterior

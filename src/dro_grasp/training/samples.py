@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.datasets.bundle import Bundle
+from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.errors import BundleError
 from dro_grasp.geometry.point_clouds import nearer_half
 from dro_grasp.hands.hand import Hand

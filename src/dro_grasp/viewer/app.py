@@ -14,7 +14,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.viewer.scene import PREDICTED_COLOUR
+from dro_grasp.viewer.appearance import PREDICTED_COLOUR
 from dro_grasp.viewer.serving import HOST, ServedPage, serve
 from dro_grasp.viewer.stage import Stage
 

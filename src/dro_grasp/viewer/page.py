@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dro_grasp import __version__
+from dro_grasp._version import __version__
 from dro_grasp.files import replacing
 
 if TYPE_CHECKING:

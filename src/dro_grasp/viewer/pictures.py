@@ -13,11 +13,11 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from dro_grasp.errors import OutputError
-from dro_grasp.geometry.rasterizer import dots, render
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.viewer.scene import best_camera, hand_meshes, object_meshes, success_colour
+from dro_grasp.rendering.rasterizer import dots, render
+from dro_grasp.viewer.appearance import best_camera, hand_meshes, object_meshes, success_colour
 
 TILE = (320, 280)
 """Width and height of one grasp's picture [pixels]."""

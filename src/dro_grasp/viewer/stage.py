@@ -9,10 +9,10 @@ import viser.transforms
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.geometry.rasterizer import Colour
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.viewer.scene import (
+from dro_grasp.rendering.rasterizer import Colour
+from dro_grasp.viewer.appearance import (
     OBJECT_COLOUR,
     SOLVED_COLOUR,
     best_camera,

@@ -17,15 +17,15 @@ from torch import Tensor
 
 from dro_grasp.errors import DroGraspError
 from dro_grasp.evaluation.coverage import HALF_AXES, half_axis, half_axis_direction
+from dro_grasp.export.formats import Frame, csv_table, isaac_grasp, moveit_grasps
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.formats import Frame, csv_table, isaac_grasp, moveit_grasps
-from dro_grasp.grasps.ranking import score_grasps
-from dro_grasp.grasps.refinement import refine_grasps
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import hand_names, load_hand
-from dro_grasp.objects.library import load_object, object_names
+from dro_grasp.objects.catalogue import load_object, object_names
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.optimization.refinement import refine_grasps
 from dro_grasp.predictor import GraspPredictor, PredictorConfig
+from dro_grasp.ranking.score import score_grasps
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.trial import record, simulate
 from dro_grasp.viewer.app import POSTURES, Posture, describe, outcome, postures_of

@@ -1,0 +1,98 @@
+"""From grasp files to a training bundle: which grasps may enter, and their hands and objects found again."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence, Set
+from pathlib import Path
+
+import torch
+
+from dro_grasp.datasets.bundle.training_file import Bundle, ObjectCloud, write_bundle
+from dro_grasp.datasets.collections.collection import read_collection
+from dro_grasp.datasets.collections.merging import spread
+from dro_grasp.datasets.splits import SPLITS
+from dro_grasp.errors import BundleError
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.sources import hand_of, object_of, require_same
+from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.shape import ObjectModel
+
+
+def make_bundle(
+    inputs: Sequence[Path], output: Path, split: str = "train", hands: Sequence[str] = (), per_pair: int | None = None
+) -> tuple[Bundle, int]:
+    """Write the bundle of a split's grasps; returns it, and how many grasps of other splits were left out.
+
+    Args:
+        inputs: Folders that the engine filled, folders of grasp files, or grasp files.
+        output: The bundle.
+        split: One of SPLITS.
+        hands: Only these; all when none is named.
+        per_pair: Most grasps of a hand on an object; of more, those that spread best over palm directions are kept.
+
+    Raises:
+        BundleError: It cannot be made of these grasps.
+        GraspFileError: A file is damaged, or a hand or an object has changed since.
+        OutputError: It cannot be written.
+    """
+    allowed, kept, left_out = SPLITS[split], [], 0
+    seen: Counter[str] = Counter()
+    hands_seen: set[str] = set()
+    for pair in (pair for path in inputs for pair in read_collection(path)):
+        hands_seen |= {pair.hand, pair.grasps.hand}
+        if hands and pair.hand not in hands and pair.grasps.hand not in hands:
+            continue
+        grasps = pair.grasps[[i for i, name in enumerate(pair.grasps.split) if name in allowed]]
+        seen.update(pair.grasps.split)
+        left_out += len(pair.grasps) - len(grasps)
+        if len(grasps):
+            kept.append(grasps)
+    if not kept:
+        raise BundleError(_why_none(split, seen, hands, hands_seen))
+    found, clouds = sources(kept)
+    if per_pair is not None:
+        by_hash = {hand.sha256: hand for hand in found}
+        kept = [grasps[spread(by_hash[grasps.hand_sha256], grasps, per_pair)] for grasps in kept]
+    return write_bundle(output, found, clouds, kept, allowed), left_out
+
+
+def _why_none(split: str, seen: Counter[str], hands: Sequence[str], hands_seen: Set[str]) -> str:
+    """What was there instead of grasps of a split, and what to do."""
+    if not seen:
+        if hands and not hands_seen & set(hands):
+            return (f"no grasps of {', '.join(hands)} were given, but of {', '.join(sorted(hands_seen))}; name one of these "
+                    "with --hands, or leave it out")
+        return "no grasps that held in a trial were given; `dro-grasp synthesize` makes some, `dro-grasp evaluate` tries others"
+    counts = ", ".join(f"{number} of split '{name}'" for name, number in sorted(seen.items()))
+    fitting = sorted(name for name, allowed in SPLITS.items() if allowed & set(seen))
+    advice = f"choose --split {' or '.join(fitting)}" if fitting else "grasps on test objects are never bundled"
+    where = "hands and objects for training" if split == "train" else f"hands and objects of split '{split}'"
+    return f"no grasps of split '{split}' were given, but {counts}; {advice}, or make grasps of {where} (`dro-grasp objects`)"
+
+
+def sources(batches: list[GraspBatch]) -> tuple[list[Hand], dict[str, ObjectCloud]]:
+    """The hands and the object clouds of grasps, each once, checked to be those the grasps were made for.
+
+    Args:
+        batches: Each of one hand and one object.
+
+    Raises:
+        BundleError: Different files have one name.
+        GraspFileError: A hand or an object has changed since.
+    """
+    hands: dict[str, Hand] = {}
+    objects: dict[str, ObjectModel] = {}
+    for grasps in batches:
+        if grasps.hand_sha256 not in hands:
+            hands[grasps.hand_sha256] = hand_of(grasps, None)
+        if grasps.object_sha256[0] not in objects:
+            objects[grasps.object_sha256[0]] = object_of(grasps, None, 1.0)
+        require_same(grasps, hands[grasps.hand_sha256], objects[grasps.object_sha256[0]])
+    for kind, things in (("hand", hands), ("object", objects)):
+        names = [thing.name for thing in things.values()]
+        double = sorted({name for name in names if names.count(name) > 1})
+        if double:
+            raise BundleError(f"different files of a {kind} are called {', '.join(double)}; rename them and synthesise again")
+    clouds = {o.name: ObjectCloud(torch.from_numpy(o.cloud), torch.from_numpy(o.cloud_normals)) for o in objects.values()}
+    return list(hands.values()), clouds

@@ -1,0 +1,1 @@
+"""Collections of grasp files: merge, filter, check, import."""

@@ -1,0 +1,1 @@
+"""Production of grasp data: shards, made by pools of processes or machines."""

@@ -1,0 +1,122 @@
+"""A folder of grasp shards: one Parquet file for each (hand, object, round), there whole or not at all.
+
+The folder is the state of a data set's making: what is there is done, everything else is still to do.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import fcntl
+import os
+import re
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote, unquote
+
+from dro_grasp._version import __version__
+from dro_grasp.datasets.engine.yields import Yield
+from dro_grasp.errors import GraspFileError, OutputError
+from dro_grasp.files import replacing
+from dro_grasp.grasps.table import read_footer
+
+LOCK = ".lock"
+"""File in a data set's folder that a run holds while it fills it."""
+STALE = 3600.0
+"""Age after which a temporary file is taken as left behind by a killed process [s]."""
+
+
+@dataclass(frozen=True, order=True)
+class Shard:
+    """One unit of work and the file that holds its result."""
+
+    hand: str
+    """Name of the hand."""
+    object: str
+    """Name of the object."""
+    round: int
+    """Counts up from 0 for each pair."""
+
+    def path(self, folder: Path) -> Path:
+        """Where the shard's file lies in a data set's folder."""
+        return folder / quote(self.hand, safe="") / quote(self.object, safe="+") / f"{self.round:05d}.parquet"
+
+    def save(self, payload: bytes, folder: Path) -> None:
+        """Write the shard's file; it appears whole or not at all.
+
+        Raises:
+            OutputError: The folder cannot be written.
+        """
+        path = self.path(folder)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"cannot make {path.parent}: {error.strerror}; free some space or choose another "
+                              "folder") from error
+        with replacing(path) as temporary:
+            temporary.write_bytes(payload)
+
+
+def notes_of(result: Yield) -> dict[str, Any]:
+    """What a shard's header says of its making."""
+    return {"yield": result.to_dict(), "version": __version__}
+
+
+def find_shards(folder: Path | str) -> list[Shard]:
+    """All finished shards of a data set's folder, sorted.
+
+    Raises:
+        GraspFileError: There is no such folder.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise GraspFileError(f"no folder {folder}; give the folder that `dro-grasp synthesize` wrote")
+    shards = []
+    for path in folder.glob("*/*/*.parquet"):
+        if re.fullmatch(r"\d+", path.stem):
+            shards.append(Shard(unquote(path.parts[-3]), unquote(path.parts[-2]), int(path.stem)))
+    return sorted(shards)
+
+
+def read_yield(folder: Path, shard: Shard) -> Yield:
+    """What became of the candidates of a shard, from the file's footer; `valid` is the number of grasps it holds.
+
+    Raises:
+        GraspFileError: The file cannot be read, or is of another version.
+    """
+    rows, header = read_footer(shard.path(folder))
+    notes = header.get("notes") or {}
+    return dataclasses.replace(Yield.from_dict(notes.get("yield") or {}), valid=rows)
+
+
+@contextmanager
+def sole_run(folder: Path) -> Iterator[None]:
+    """Keep a second run out of a folder while the block lasts; the lock goes with the process.
+
+    Raises:
+        OutputError: Another run is filling the folder.
+    """
+    with (folder / LOCK).open("ab+", buffering=0) as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            lock.seek(0)
+            raise OutputError(f"another run is filling {folder} (process {lock.read().decode() or 'unknown'}); wait for it, or "
+                              "give another folder and join both with `dro-grasp dataset merge`") from error
+        except OSError:
+            pass  # a file system without locks
+        with suppress(OSError):  # a full disk is told by what needs the space
+            lock.truncate(0)
+            lock.write(str(os.getpid()).encode())
+        yield
+
+
+def remove_leftovers(folder: Path) -> int:
+    """Remove temporary files that killed processes left behind; returns how many."""
+    old = [p for p in folder.glob("*/*/.*.part") if time.time() - p.stat().st_mtime > STALE]
+    for path in old:
+        path.unlink(missing_ok=True)
+    return len(old)

@@ -1,0 +1,1 @@
+"""URDF and MJCF files in, descriptions of hands out, with repairs and notes."""

@@ -1,0 +1,115 @@
+"""Compile a hand, repairing what MuJoCo refuses in otherwise usable descriptions, without noise on the terminal."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from dro_grasp.descriptions.notes import Note
+from dro_grasp.errors import HandError
+
+LEAST_MASS, LEAST_INERTIA = 1e-4, 1e-8
+"""What moving links without mass get [kg, kg m^2]."""
+MOST_REPAIRS = 64
+"""Attempts before compiling is given up."""
+
+
+@contextmanager
+def mujoco_speaks_to(notes: list[Note], path: Path) -> Iterator[None]:
+    """Collect MuJoCo's warnings as notes; it would print them and write a log file into the working folder.
+
+    Raises:
+        HandError: MuJoCo refuses the description.
+    """
+    before: Callable[[str], None] | None = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda text: notes.append(Note("warning", path.name, text.strip())))
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except ValueError as error:
+        raise HandError(f"{path} cannot be read: {one_line(error)}") from error
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def one_line(error: Exception) -> str:
+    """A message of MuJoCo on one line."""
+    return "; ".join(line.strip() for line in str(error).strip().splitlines() if line.strip())
+
+
+def compile_hand(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> mujoco.MjModel:
+    """The compiled model; repairs change the specification, so that simulation gets them too.
+
+    Raises:
+        HandError: MuJoCo refuses the description for a reason that cannot be repaired, or places something nowhere.
+    """
+    with mujoco_speaks_to(notes, path):
+        model = _compile(spec, notes)
+    _check_finite(model, path)
+    return model
+
+
+def _compile(spec: mujoco.MjSpec, notes: list[Note]) -> mujoco.MjModel:
+    for _ in range(MOST_REPAIRS):
+        try:
+            return spec.copy().compile()
+        except ValueError as error:
+            if not _repair(spec, str(error), notes):
+                raise
+    return spec.copy().compile()
+
+
+def _check_finite(model: mujoco.MjModel, path: Path) -> None:
+    """MuJoCo reads NaN and infinity as numbers."""
+    bodies = np.concatenate([np.arange(model.nbody), model.geom_bodyid, model.jnt_bodyid])
+    places = np.concatenate([
+        np.concatenate([model.body_pos, model.body_quat], 1), np.concatenate([model.geom_pos, model.geom_quat], 1),
+        np.concatenate([model.jnt_pos, model.jnt_axis, model.jnt_range[:, :1]], 1),
+    ])
+    lost = bodies[~np.isfinite(places).all(1)]
+    if len(lost):
+        raise HandError(f"{path}: an origin or a limit of link '{model.body(int(lost[0])).name}' is not finite; expected "
+                        "numbers, not nan or inf")
+
+
+def _repair(spec: mujoco.MjSpec, message: str, notes: list[Note]) -> bool:
+    """Change what a message complains of; False when there is nothing to change."""
+    element = re.search(r"Element name '([^']*)'", message)
+    mesh = next((m for m in spec.meshes if element and m.name == element.group(1)), None)
+    if "volume is too small" in message and mesh is not None and mesh.inertia != mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL:
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+        notes.append(Note("warning", mesh.name, "is a mesh without volume"))
+        return True
+    if "at least 4 vertices" in message and mesh is not None:
+        shapes = [g for g in spec.geoms if g.meshname == mesh.name]
+        for link in dict.fromkeys(g.parent.name for g in shapes):
+            notes.append(Note("warning", link, f"has the mesh '{mesh.name}' of fewer than 4 vertices, which encloses nothing; "
+                              "it is left out"))
+        for geom in shapes:
+            spec.delete(geom)
+        spec.delete(mesh)
+        return True
+    if "convex hull" in message and mesh is not None:
+        touching = [g for g in spec.geoms if g.meshname == mesh.name and (g.contype or g.conaffinity)]
+        for geom in touching:
+            geom.contype = geom.conaffinity = 0
+        if touching:
+            notes.append(Note("warning", mesh.name, "is a flat mesh, which cannot collide; it is only drawn"))
+        return bool(touching)
+    compiler = spec.compiler
+    if "inertia of moving bodies" in message and compiler.boundmass < LEAST_MASS:
+        compiler.boundmass, compiler.boundinertia = LEAST_MASS, LEAST_INERTIA
+        notes.append(Note("warning", "mass", f"some moving links have none; taken as {LEAST_MASS:g} kg"))
+        return True
+    if "A + B >= C" in message and not compiler.balanceinertia:
+        compiler.balanceinertia = True
+        notes.append(Note("warning", "inertia", "some links have impossible inertias, which are balanced"))
+        return True
+    return False

@@ -1,0 +1,133 @@
+"""A hand description, URDF or MJCF, read once into a kinematic tree and link geometry.
+
+MuJoCo does the reading, so that kinematics and simulation agree on every link, limit and coupling.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from dro_grasp.descriptions.compiling import compile_hand, mujoco_speaks_to
+from dro_grasp.descriptions.couplings import Coupling
+from dro_grasp.descriptions.link_geometry import LinkGeometry, read_geometry
+from dro_grasp.descriptions.notes import Note
+from dro_grasp.descriptions.reduction import keep_hand_only
+from dro_grasp.descriptions.tree_reading import read_couplings, read_tree
+from dro_grasp.descriptions.urdf import prepare_urdf
+from dro_grasp.descriptions.urdf_meshes import as_obj
+from dro_grasp.descriptions.xml_files import included_files, parse_xml
+from dro_grasp.errors import HandError
+from dro_grasp.kinematics.tree import KinematicTree
+
+
+def load_description(path: Path | str) -> Description:
+    """Read a URDF or MJCF file.
+
+    Raises:
+        HandError: The file cannot be used; the message says why and what to do.
+    """
+    path = Path(path).expanduser()
+    root = parse_xml(path)
+    notes: list[Note] = []
+    if root.tag == "robot":
+        spec, files = _read_urdf(root, path, notes)
+    elif root.tag == "mujoco":
+        spec, files = _read_mjcf(root, path, notes)
+    else:
+        raise HandError(f"{path} starts with <{root.tag}>; expected a URDF (<robot>) or MJCF (<mujoco>) file")
+    notes.extend(keep_hand_only(spec, path))
+    model = compile_hand(spec, path, notes)
+    description = Description(path.resolve(), spec, model, _digest(path, files), tuple(notes))
+    _ = description.tree  # so that what is wrong is said now
+    return description
+
+
+@dataclass(frozen=True, eq=False)
+class Description:
+    """What a file says of a hand. Bodies of the compiled model are links, the first one the root at identity."""
+
+    path: Path
+    """The file."""
+    _spec: mujoco.MjSpec
+    model: mujoco.MjModel
+    """The hand alone, compiled."""
+    sha256: str
+    """Hash of the file and of the files it uses."""
+    notes: tuple[Note, ...]
+    """What loading found or repaired."""
+
+    @property
+    def name(self) -> str:
+        """The file's stem."""
+        return self.path.stem
+
+    def spec(self) -> mujoco.MjSpec:
+        """A fresh copy of the hand alone, without actuators, its couplings as joint equalities."""
+        return self._spec.copy()
+
+    @cached_property
+    def couplings(self) -> tuple[Coupling, ...]:
+        """Stated couplings between joints (URDF mimic, MJCF joint equalities and shared tendons)."""
+        return read_couplings(self.model)
+
+    @cached_property
+    def tree(self) -> KinematicTree:
+        """The kinematic tree, couplings resolved."""
+        return read_tree(self.model, self.couplings, self.path)
+
+    @cached_property
+    def link_of_body(self) -> dict[int, int]:
+        """Index of the link that carries each body's geometry."""
+        names = {name: i for i, name in enumerate(self.tree.link_names)}
+        return {b: names[self.model.body(b).name] for b in range(1, self.model.nbody)}
+
+    @cached_property
+    def geometry(self) -> tuple[LinkGeometry, ...]:
+        """All shapes of all links; a hand without any colliding shape collides with its visual ones."""
+        return read_geometry(self.model, self.link_of_body)
+
+    @cached_property
+    def masses(self) -> np.ndarray:
+        """Mass of each link (n_links) [kg]."""
+        masses = np.zeros(self.tree.n_links)
+        for body, link in self.link_of_body.items():
+            masses[link] = self.model.body_mass[body]
+        return masses
+
+
+def _read_urdf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.MjSpec, tuple[Path, ...]]:
+    prepared = prepare_urdf(root, path)
+    notes.extend(prepared.notes)
+    assets = {name: as_obj(file) for name, file in prepared.converted.items()}
+    with mujoco_speaks_to(notes, path):
+        return mujoco.MjSpec.from_string(prepared.xml, assets=assets), prepared.mesh_files
+
+
+def _read_mjcf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.MjSpec, tuple[Path, ...]]:
+    included = included_files(root, path)
+    if path.suffix.lower() != ".xml":
+        raise HandError(f"{path} is MJCF, which MuJoCo reads only from files that end in .xml; rename it")
+    with mujoco_speaks_to(notes, path):
+        spec = mujoco.MjSpec.from_file(str(path))
+    folder = path.parent / (spec.meshdir or "")
+    meshes = {folder / mesh.file for mesh in spec.meshes if mesh.file}
+    missing = sorted(str(mesh) for mesh in meshes if not mesh.is_file())
+    if missing:
+        raise HandError(f"{path}: {len(missing)} mesh files are missing (first: {missing[0]}); put them there or correct "
+                        "meshdir")
+    return spec, (*included, *meshes)
+
+
+def _digest(path: Path, files: tuple[Path, ...]) -> str:
+    digest = hashlib.sha256()
+    for file in (path, *sorted(set(files), key=os.fspath)):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()

@@ -1,0 +1,146 @@
+"""Reduce a MuJoCo specification to the hand alone: one body tree, its couplings as joint equalities, nothing else."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import mujoco
+
+from dro_grasp.descriptions.notes import Note
+from dro_grasp.errors import HandError
+
+CONTINUOUS_LIMIT = math.pi
+"""Limits given to hinges that state none [rad]."""
+SLIDE_LIMIT = 0.05
+"""Limits given to slides that state none [m]."""
+
+
+def keep_hand_only(spec: mujoco.MjSpec, path: Path) -> tuple[Note, ...]:
+    """Reduce a file, in place, to its largest articulated body tree, root at identity, nothing that acts or films.
+
+    Raises:
+        HandError: Nothing moves, or something moves as no tree of hinges and slides does.
+    """
+    notes: list[Note] = []
+    hand = _largest_tree(spec, path)
+    _name_everything(spec)
+    _couple_tendons(spec, notes)
+    for kind in (spec.actuators, spec.sensors, spec.keys, spec.excludes, spec.pairs, spec.tendons, spec.cameras,
+                 spec.lights, spec.tuples, spec.skins):
+        for item in list(kind):
+            spec.delete(item)
+    for geom in list(spec.worldbody.geoms):
+        spec.delete(geom)
+    for body in list(spec.worldbody.bodies):
+        if body.name != hand.name:
+            notes.append(Note("info", body.name, "is not part of the hand and is left out"))
+            spec.delete(body)
+    hand.pos, hand.quat, hand.mocap = [0, 0, 0], [1, 0, 0, 0], False
+    # A description in Euler angles or axes would win over the quaternion.
+    hand.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    for joint in list(hand.joints):
+        if joint.type == mujoco.mjtJoint.mjJNT_FREE:
+            spec.delete(joint)
+    _keep_joint_equalities(spec, notes)
+    _check_joints(spec, path, notes)
+    _let_visuals_collide(spec, notes)
+    return tuple(notes)
+
+
+def _largest_tree(spec: mujoco.MjSpec, path: Path) -> mujoco.MjsBody:
+    """The top-level body with most moving joints below it."""
+    roots = list(spec.worldbody.bodies)
+    if not roots:
+        raise HandError(f"{path} has no body; expected a hand with moving joints")
+    counts = [sum(j.type != mujoco.mjtJoint.mjJNT_FREE for j in _all_joints(r)) for r in roots]
+    if max(counts) == 0:
+        raise HandError(f"{path} has no moving joint; a hand needs at least one revolute or prismatic joint")
+    return roots[counts.index(max(counts))]
+
+
+def _all_joints(body: mujoco.MjsBody) -> list[mujoco.MjsJoint]:
+    return [*body.joints, *(j for child in body.bodies for j in _all_joints(child))]
+
+
+def _name_everything(spec: mujoco.MjSpec) -> None:
+    """MJCF may leave bodies and joints unnamed; links and joints are known by their names here."""
+    for kind, items in (("link", list(spec.bodies)[1:]), ("joint", list(spec.joints))):
+        taken = {item.name for item in items}
+        for number, item in enumerate(items):
+            if not item.name:
+                name = f"{kind}_{number}"
+                while name in taken:
+                    name += "_"
+                item.name = name
+                taken.add(name)
+
+
+def _couple_tendons(spec: mujoco.MjSpec, notes: list[Note]) -> None:
+    """One actuated fixed tendon over several joints: they move together, each by the same tendon length."""
+    driven = {a.target for a in spec.actuators if a.trntype == mujoco.mjtTrn.mjTRN_TENDON}
+    followers = {e.name1 for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT and e.active}
+    for tendon in spec.tendons:
+        wraps = [w for w in tendon.path if w.type == mujoco.mjtWrap.mjWRAP_JOINT]
+        if tendon.name not in driven or len(wraps) < 2:
+            continue
+        first = wraps[0]
+        for other in wraps[1:]:
+            if other.target.name in followers or abs(other.coef) < 1e-9:
+                continue
+            followers.add(other.target.name)
+            equality = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1=other.target.name, name2=first.target.name,
+                                         objtype=mujoco.mjtObj.mjOBJ_JOINT)
+            equality.data[:2] = [0.0, first.coef / other.coef]
+            notes.append(Note("info", other.target.name, f"shares tendon '{tendon.name}' with "
+                              f"'{first.target.name}' and moves with it"))
+
+
+def _keep_joint_equalities(spec: mujoco.MjSpec, notes: list[Note]) -> None:
+    """Only couplings that the kinematic tree can state, so that simulation and kinematics agree."""
+    joints = {joint.name for joint in spec.joints}
+    for equality in list(spec.equalities):
+        inside = equality.name1 in joints and (not equality.name2 or equality.name2 in joints)
+        if equality.type == mujoco.mjtEq.mjEQ_JOINT and equality.active and inside:
+            if any(abs(x) > 1e-9 for x in equality.data[2:5]):
+                equality.data[2:5] = 0.0
+                notes.append(Note("warning", equality.name1, f"follows '{equality.name2}' by a polynomial, of which only "
+                                  "the linear part is kept"))
+            continue
+        if equality.active and equality.type in {mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD} and _within(spec, equality):
+            notes.append(Note("warning", equality.name1, f"is tied to '{equality.name2}' in a closed loop, which a tree "
+                              "cannot state; the tie is left out and the joints on it move freely"))
+        spec.delete(equality)
+
+
+def _within(spec: mujoco.MjSpec, equality: mujoco.MjsEquality) -> bool:
+    """Whether both ends of a tie are bodies of the hand."""
+    bodies = {body.name for body in list(spec.bodies)[1:]}
+    return equality.objtype != mujoco.mjtObj.mjOBJ_BODY or {equality.name1, equality.name2} <= bodies
+
+
+def _check_joints(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
+    """Give unlimited joints limits; refuse ball joints and inner free joints."""
+    for joint in spec.joints:
+        if joint.type in {mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_FREE}:
+            kind = "ball" if joint.type == mujoco.mjtJoint.mjJNT_BALL else "free"
+            raise HandError(f"{path}: joint '{joint.name}' is a {kind} joint; expected hinges and slides (use three hinges)")
+        limited = joint.limited == mujoco.mjtLimited.mjLIMITED_TRUE or (
+            joint.limited == mujoco.mjtLimited.mjLIMITED_AUTO and joint.range[0] < joint.range[1])
+        if not limited:
+            slides = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
+            limit = SLIDE_LIMIT if slides else CONTINUOUS_LIMIT
+            # Angles are in the unit of the file, and compiled from there.
+            stated = math.degrees(limit) if spec.compiler.degree and not slides else limit
+            joint.range = [-stated, stated]
+            joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
+            notes.append(Note("warning", joint.name, f"states no limits; taken as +-{limit:.2f}"))
+
+
+def _let_visuals_collide(spec: mujoco.MjSpec, notes: list[Note]) -> None:
+    """A hand without any colliding shape collides with its visual ones."""
+    if any(g.contype or g.conaffinity for g in spec.geoms):
+        return
+    for geom in spec.geoms:
+        geom.contype = geom.conaffinity = 1
+    notes.append(Note("warning", "collision", "the description has no collision geometry; its visual shapes collide"))

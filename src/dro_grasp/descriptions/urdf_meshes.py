@@ -1,0 +1,107 @@
+"""The meshes a URDF names: where they are, and what stands in for those that are missing or in foreign formats."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+from dro_grasp.descriptions.notes import Note
+from dro_grasp.errors import HandError
+
+READABLE_MESHES = {".stl", ".obj", ".msh"}
+"""Mesh formats that MuJoCo reads itself; others go through trimesh."""
+
+
+def resolve_meshes(root: ET.Element, path: Path, notes: list[Note]) -> tuple[list[Path], dict[str, Path]]:
+    """Point every mesh to its file, in place; drop what cannot be found, if something is left.
+
+    Returns:
+        The mesh files in use, and stand-in names of those in formats that MuJoCo cannot read.
+
+    Raises:
+        HandError: No mesh can be found, and there is no other shape.
+    """
+    files: dict[str, Path] = {}
+    missing: list[str] = []
+    for link in root.iter("link"):
+        lost = [element for element in [*link.findall("visual"), *link.findall("collision")]
+                if not _resolve_mesh(element, path.parent, files)]
+        for element in lost:
+            name = element.find("geometry/mesh").get("filename", "")  # type: ignore[union-attr]
+            missing.append(name)
+            link.remove(element)
+            notes.append(Note("warning", link.get("name", ""), f"{element.tag} mesh '{name}' was not found and is left out"))
+        if any(element.tag == "collision" for element in lost) and link.find("collision") is None:
+            _collide_with_visuals(link, notes)
+    if missing and not files and not _has_geometry(root):
+        looked = ", ".join(str(p) for p in _candidates(missing[0], path.parent)[:4])
+        raise HandError(f"{path}: none of its {len(missing)} meshes can be found (first: '{missing[0]}'; looked for "
+                        f"{looked}); put the meshes beside the URDF or correct the file names")
+    converted = {name: file for name, file in files.items() if name != str(file)}
+    return list(files.values()), converted
+
+
+def _resolve_mesh(element: ET.Element, folder: Path, files: dict[str, Path]) -> bool:
+    """Point a shape's mesh to its file, or to a stand-in; False when there is no such file."""
+    mesh = element.find("geometry/mesh")
+    if mesh is None:
+        return True
+    name = mesh.get("filename", "")
+    file = find_mesh(name, folder)
+    if file is None:
+        return False
+    stand_in = str(file) if file.suffix.lower() in READABLE_MESHES else _stand_in(name)
+    mesh.set("filename", stand_in)
+    files[stand_in] = file
+    return True
+
+
+def as_obj(file: Path) -> bytes:
+    """A mesh in any format trimesh reads, as OBJ text.
+
+    Raises:
+        HandError: trimesh cannot read it either.
+    """
+    import trimesh
+
+    try:
+        mesh = trimesh.load_mesh(file)
+        return trimesh.exchange.obj.export_obj(mesh, include_normals=False, include_texture=False).encode()
+    except Exception as error:  # every mesh format fails in its own way
+        raise HandError(f"mesh {file} cannot be read ({type(error).__name__}: {error}); expected STL, OBJ, GLB, DAE or "
+                        "PLY, whole") from error
+
+
+def _stand_in(name: str) -> str:
+    return hashlib.sha256(name.encode()).hexdigest()[:16] + ".obj"
+
+
+def _collide_with_visuals(link: ET.Element, notes: list[Note]) -> None:
+    """A link whose collision meshes are all missing collides with its visual shapes."""
+    visuals = link.findall("visual")
+    for visual in visuals:
+        shape = copy.deepcopy(visual)
+        shape.tag = "collision"
+        link.append(shape)
+    if visuals:
+        notes.append(Note("warning", link.get("name", ""), "collides with its visual shapes instead"))
+
+
+def _has_geometry(root: ET.Element) -> bool:
+    return any(link.find(f"{kind}/geometry") is not None for link in root.iter("link") for kind in ("visual", "collision"))
+
+
+def _candidates(name: str, folder: Path) -> list[Path]:
+    """Where a mesh may lie, most likely first."""
+    rest = name.replace("\\", "/").split("://", 1)[-1]
+    roots = (folder, *list(folder.parents)[:4]) if "://" in name else (folder,)
+    return [root / tail for root in roots for tail in dict.fromkeys((rest, rest.split("/", 1)[-1]))]
+
+
+def find_mesh(name: str, folder: Path) -> Path | None:
+    """The file behind a mesh name: relative, absolute, `package://` or `file://`; None when there is none."""
+    if not name:
+        return None
+    return next((file.resolve() for file in _candidates(name, folder) if file.is_file()), None)

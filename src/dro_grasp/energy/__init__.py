@@ -1,0 +1,1 @@
+"""What makes a configuration of hand and object a grasp: the terms of the grasp energy."""

@@ -1,0 +1,263 @@
+"""The grasp energy of one hand on one object: the weighted terms and their gradient, batched over grasps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from dro_grasp.devices import on_device
+from dro_grasp.energy import terms as energies
+from dro_grasp.energy.contact_candidates import ContactCandidates, ContactConfig, contact_candidates, rigid_group
+from dro_grasp.energy.distance_field import DistanceField
+from dro_grasp.hands.hand import Hand
+
+TERMS = ("force_closure", "distance", "penetration", "self_penetration", "alignment", "joints")
+"""Names of the terms, the order of every table of them."""
+
+
+@dataclass(frozen=True)
+class EnergyConfig:
+    """Weights and geometry of the energy. Source: DexGraspNet, unless said otherwise."""
+
+    force_closure: float = 1.0
+    """Weight of the squared net wrench."""
+    distance: float = 100.0
+    """Weight of the contacts' distance to the surface [1/m]."""
+    penetration: float = 100.0
+    """Weight of the hand points' depth in the object [1/m]."""
+    self_penetration: float = 50.0
+    """Weight of the overlap of links [1/m] (DexGraspNet: 10; its spheres are finer)."""
+    alignment: float = 1.0
+    """Weight of the angle between hand and object normals (ours)."""
+    joints: float = 1.0
+    """Weight of joints closer to their closed end than `closing_room` [1/rad or 1/m]."""
+    closing_room: float = 0.1
+    """Share of a joint's range that is left for the squeeze (ours)."""
+    hand_points: int = 200
+    """Points of the hand at which penetration is measured."""
+    margin: float = 0.001
+    """Depth by which hand points are thought thicker than they are, for penetration [m] (ours)."""
+
+
+@dataclass(frozen=True)
+class LinkSpheres:
+    """Spheres that fill the links, and the pairs of them that must not overlap."""
+
+    centres: Float[Tensor, "s 3"]
+    """In their links' frames [m]."""
+    radii: Float[Tensor, " s"]
+    """[m]"""
+    links: Int[Tensor, " s"]
+    """The link of each sphere."""
+    pairs: Int[Tensor, "k 2"]
+    """Pairs to keep apart."""
+
+
+def link_spheres(hand: Hand) -> LinkSpheres:
+    """Spheres along the longest axis of each link, from its surface points.
+
+    Pairs on links that move together or are neighbours, and pairs that overlap in the open hand, may touch.
+    """
+    centres, radii, links = [], [], []
+    for link in hand.link_index.unique().tolist():
+        points = hand.link_points[hand.link_index == link]
+        if len(points) < 4:
+            continue
+        for centre, radius in _fill(points):
+            centres.append(centre)
+            radii.append(radius)
+            links.append(link)
+    centre, radius, link_of = torch.stack(centres), torch.stack(radii), torch.tensor(links)
+    pairs = torch.combinations(torch.arange(len(links)), 2)
+    near = _neighbours(hand)
+    pairs = pairs[~near[link_of[pairs[:, 0]], link_of[pairs[:, 1]]]]
+    poses = hand.tree.forward(hand.canonical_joints(0.9))[link_of]
+    placed = (poses[:, :3, :3] @ centre[..., None])[..., 0] + poses[:, :3, 3]
+    apart = (placed[pairs[:, 0]] - placed[pairs[:, 1]]).norm(dim=-1)
+    pairs = pairs[apart > radius[pairs[:, 0]] + radius[pairs[:, 1]]]
+    return LinkSpheres(centre, radius, link_of, pairs)
+
+
+def _fill(points: Float[Tensor, "n 3"]) -> list[tuple[Tensor, Tensor]]:
+    """Centres and radii of spheres along the longest axis of a set of surface points."""
+    middle = (points.amin(0) + points.amax(0)) / 2
+    axes = torch.linalg.svd(points - points.mean(0), full_matrices=False)[2]
+    local = (points - middle) @ axes.T
+    low, high = local.amin(0), local.amax(0)
+    half = (high - low) / 2
+    radius = half[1:].amin().clamp_min(0.002)
+    count = max(1, min(6, round(float(half[0] / radius))))
+    along = (high[0] + low[0]) / 2 + (half[0] - radius).clamp_min(0) * torch.linspace(-1, 1, count)
+    if count == 1:
+        along = ((high[0] + low[0]) / 2)[None]
+    across = (high + low) / 2
+    return [(middle + torch.stack([a, across[1], across[2]]) @ axes, radius) for a in along]
+
+
+def _neighbours(hand: Hand) -> Tensor:
+    """Pairs of links (n_links n_links) with at most one moving joint between them."""
+    tree = hand.tree
+    rigid = torch.stack([torch.tensor(rigid_group(tree, link)) for link in range(tree.n_links)])
+    rigid = rigid | rigid.T
+    rigid = (rigid.float() @ rigid.float()) > 0
+    step = torch.zeros_like(rigid)
+    for link, parent in enumerate(tree.parent):
+        if parent >= 0:
+            step[link, parent] = step[parent, link] = True
+    near = (rigid.float() @ step.float() @ rigid.float()) > 0
+    return near | rigid
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Energy and gradient of n grasps."""
+
+    terms: Float[Tensor, "n 6"]
+    """Weighted terms in the order of TERMS."""
+    by_pose: Float[Tensor, "n 6"]
+    """Derivative by the hand's translation [1/m] and rotation about its grasp centre [1/rad]."""
+    by_joint: Float[Tensor, "n n_dof"]
+    """Derivative by the joints."""
+
+    @property
+    def total(self) -> Float[Tensor, " n"]:
+        """Sum of the terms."""
+        return self.terms.sum(-1)
+
+
+@dataclass(frozen=True)
+class LinkPoints:
+    """Points fixed to links, laid out so that one matrix product places them all."""
+
+    layout: Float[Tensor, "rows p"]
+    """Homogeneous coordinates of each point in the four rows of its link [m]."""
+    members: Float[Tensor, "p n_links"]
+    """One-hot link of each point."""
+
+    @staticmethod
+    def of(local: Float[Tensor, "p 3"], links: Int[Tensor, " p"], n_links: int) -> LinkPoints:
+        """Lay out points given in their links' frames."""
+        members = torch.eye(n_links, dtype=local.dtype, device=local.device)[links]
+        homogeneous = torch.cat([local, torch.ones_like(local[:, :1])], -1)
+        layout = (members[:, :, None] * homogeneous[:, None, :]).flatten(1).T.contiguous()
+        return LinkPoints(layout, members)
+
+    def place(self, poses: Float[Tensor, "n n_links 4 4"]) -> Float[Tensor, "n p 3"]:
+        """The points in the world [m]."""
+        rows = poses[:, :, :3].transpose(1, 2).reshape(3 * len(poses), -1)
+        return (rows @ self.layout).unflatten(0, (-1, 3)).mT
+
+
+class GraspEnergy:
+    """The energy of a hand on an object, ready to be evaluated many times."""
+
+    def __init__(
+        self,
+        hand: Hand,
+        field: DistanceField,
+        centre: Float[Tensor, 3],
+        length: float,
+        config: EnergyConfig | None = None,
+        contacts: ContactConfig | None = None,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        """Prepare everything that does not change from step to step.
+
+        Args:
+            hand: The hand.
+            field: Signed distances of the object.
+            centre: The object's centre of mass [m].
+            length: Typical distance of its surface from there [m].
+            config: Weights.
+            contacts: Where the hand may touch.
+            device: Where the energy is evaluated; hand, field and centre are given on the CPU.
+        """
+        self.config, self.length = config or EnergyConfig(), length
+        self.candidates: ContactCandidates = on_device(contact_candidates(hand, contacts), device)
+        self.spheres = on_device(link_spheres(hand), device)
+        thin = hand.with_points(min(self.config.hand_points, hand.n_points)).to(device)
+        hand = hand.to(device)
+        self.hand, self.field, self.centre = hand, on_device(field, device), centre.to(device)
+        self.one_hot = torch.eye(hand.tree.n_links, dtype=hand.tree.origin.dtype, device=device)
+        self.body = LinkPoints.of(thin.link_points, thin.link_index, hand.tree.n_links)
+        self.contact_points = LinkPoints.of(self.candidates.points, self.candidates.links, hand.tree.n_links)
+        self.ball = LinkPoints.of(self.spheres.centres, self.spheres.links, hand.tree.n_links)
+        room = self.config.closing_room * (hand.tree.upper - hand.tree.lower) * ~hand.abduction
+        self.lower = torch.where(hand.opening > 0, hand.tree.lower + room, hand.tree.lower)
+        self.upper = torch.where(hand.opening > 0, hand.tree.upper, hand.tree.upper - room)
+
+    def __call__(
+        self,
+        T_object_wrist: Float[Tensor, "n 4 4"],
+        q: Float[Tensor, "n n_dof"],
+        contacts: Int[Tensor, "n c"],
+    ) -> Evaluation:
+        """Energy and gradient of n grasps.
+
+        Args:
+            T_object_wrist: Wrist poses [m].
+            q: Joints [rad or m].
+            contacts: Chosen contact candidates.
+        """
+        tree, config = self.hand.tree, self.config
+        poses = T_object_wrist[:, None] @ tree.forward(q)
+        contact_terms, wrenches = self._contacts(poses, contacts)
+        body = self.body.place(poses)
+        distance, gradient = self.field.distances(body)
+        inside = energies.penetration(distance - config.margin, gradient)
+        wrenches = wrenches + energies.link_wrenches(
+            body, config.penetration * inside.by_point, self.body.members
+        )
+        spheres = self.ball.place(poses)
+        own = energies.self_penetration(spheres, self.spheres.radii, self.spheres.pairs)
+        wrenches = wrenches + energies.link_wrenches(
+            spheres, config.self_penetration * own.by_point, self.ball.members
+        )
+        beyond, slope = energies.joint_margin(q, self.lower, self.upper)
+        by_pose, by_joint = energies.joint_gradient(tree, poses, wrenches, self.pivot(T_object_wrist))
+        closure, apart, alignment = contact_terms
+        terms = torch.stack([
+            config.force_closure * closure,
+            config.distance * apart,
+            config.penetration * inside.value.sum(-1),
+            config.self_penetration * own.value.sum(-1),
+            config.alignment * alignment,
+            config.joints * beyond.sum(-1),
+        ], -1)
+        movable = self.hand.movable.to(q.dtype)
+        return Evaluation(terms, by_pose, (by_joint + config.joints * slope) * movable)
+
+    def pivot(self, T_object_wrist: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 3"]:
+        """The hand's grasp centre, about which it is turned [m]."""
+        return self.hand.grasp_centres(T_object_wrist)
+
+    def _contacts(
+        self, poses: Float[Tensor, "n n_links 4 4"], contacts: Int[Tensor, "n c"]
+    ) -> tuple[tuple[Tensor, Tensor, Tensor], Float[Tensor, "n n_links 6"]]:
+        """The terms that depend on contacts, and their wrenches per link."""
+        config, candidates = self.config, self.candidates
+        links = candidates.links[contacts]
+        chosen = poses[torch.arange(len(poses), device=links.device)[:, None], links]
+        rotation = chosen[..., :3, :3]
+        points = (rotation @ candidates.points[contacts][..., None])[..., 0] + chosen[..., :3, 3]
+        outward = (rotation @ candidates.normals[contacts][..., None])[..., 0]
+        surface = self.field.normals(points)
+        normal, bend = surface.normal, surface.bend
+        closure = energies.force_closure(points - self.centre, normal, self.length)
+        apart = energies.contact_distance(surface.distance, surface.gradient)
+        align = energies.normal_alignment(outward, normal)
+        by_object_normal = config.force_closure * closure.by_normal + config.alignment * outward
+        by_point = (
+            config.force_closure * closure.by_point + config.distance * apart.by_point
+            + (by_object_normal[..., None, :] @ bend)[..., 0, :]
+        )
+        moment = torch.linalg.cross(points, by_point, dim=-1)
+        moment = moment + torch.linalg.cross(outward, config.alignment * align.by_normal, dim=-1)
+        members = self.one_hot[links]
+        wrenches = members.transpose(-1, -2) @ torch.cat([by_point, moment], -1)
+        return (closure.value.sum(-1), apart.value.sum(-1), align.value.sum(-1)), wrenches
+
+

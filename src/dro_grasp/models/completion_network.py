@@ -1,0 +1,70 @@
+"""A small network that says where an object's surface is: from distances to several guesses of it to one distance."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from dro_grasp.models.small_networks import SHIPPED_FOLDER, load_small
+
+SHIPPED = SHIPPED_FOLDER / "completion" / "surface.safetensors"
+"""The network that objects seen in part are completed with."""
+LENGTH = 0.01
+"""Size of a correction that the network makes with 1 [m]."""
+
+
+class SurfaceNetwork(nn.Module):
+    """Weighs guesses of a signed distance against each other, place by place, and corrects the mean.
+
+    Every place is judged on its own, so it learns how guesses go wrong, not how the objects look that it was trained on.
+    """
+
+    def __init__(self, guesses: int, features: int, width: int = 128, depth: int = 2) -> None:
+        """Make it; untrained, it believes the first guess.
+
+        Args:
+            guesses: Distances that it is told, best guess first.
+            features: Other numbers that describe a place.
+            width: Of the hidden layers.
+            depth: Residual blocks.
+        """
+        super().__init__()
+        self.guesses = guesses
+        self.enter = nn.Linear(features, width)
+        self.layers = nn.ModuleList(
+            nn.Sequential(nn.LayerNorm(width), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
+            for _ in range(depth))
+        self.leave = nn.Linear(width, guesses + 1)
+        nn.init.zeros_(self.leave.weight)
+        nn.init.zeros_(self.leave.bias)
+        with torch.no_grad():
+            self.leave.bias[0] = 1.0
+
+    def forward(
+        self, guessed: Float[Tensor, "*n guesses"], features: Float[Tensor, "*n features"]
+    ) -> Float[Tensor, "*n"]:
+        """Signed distances to the surface [m].
+
+        Args:
+            guessed: Signed distances to the guesses [m].
+            features: What else is known of each place.
+        """
+        x = self.enter(features)
+        for layer in self.layers:
+            x = x + layer(x)
+        weights, correction = self.leave(x).split([self.guesses, 1], -1)
+        return (weights.softmax(-1) * guessed).sum(-1) + LENGTH * correction[..., 0]
+
+
+@cache
+def shipped_surface() -> SurfaceNetwork:
+    """The network that ships, loaded once."""
+    tensors = load_small(SHIPPED)
+    width, features = tensors["enter.weight"].shape
+    depth = sum(name.endswith(".0.weight") for name in tensors)
+    network = SurfaceNetwork(len(tensors["leave.bias"]) - 1, features, width, depth)
+    network.load_state_dict(tensors)
+    return network.eval().requires_grad_(False)

@@ -1,0 +1,1 @@
+"""Descents of the grasp energy: synthesis from nothing, refinement of any grasps."""

@@ -1,0 +1,240 @@
+"""Grasps from nothing but geometry: annealed descent of the grasp energy from many starts at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import roma
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from dro_grasp._version import __version__
+from dro_grasp.energy.contact_candidates import ContactConfig
+from dro_grasp.energy.distance_field import DistanceField
+from dro_grasp.energy.grasp_energy import TERMS, EnergyConfig, Evaluation, GraspEnergy
+from dro_grasp.energy.object_energy import object_energy
+from dro_grasp.errors import ObjectError, OptionError
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.optimization.starts import StartConfig, starts
+
+PROVENANCE = f"dro-grasp {__version__}, synthesis 2"
+"""What synthesised grasps say of their making; counts up when the method changes."""
+
+
+@dataclass(frozen=True)
+class SynthesisConfig:
+    """The optimiser. Source of the scheme: DexGraspNet's annealed Langevin steps; the numbers are ours."""
+
+    steps: int = 120
+    """Steps. Longer descents lower the energy further and yield less an hour, since simulation settles the grasps."""
+    batch_size: int = 128
+    """Grasps optimised at once; the result of a seed depends on it."""
+    translation_step: float = 0.003
+    """First step of the wrist's translation [m]."""
+    rotation_step: float = 0.03
+    """First step of its rotation [rad]."""
+    joint_step: float = 0.04
+    """First step of each joint [rad; for sliding joints in their tree's unit]."""
+    last_step: float = 0.15
+    """Step length at the end, as a share of the first."""
+    smoothing: float = 0.9
+    """Memory of the mean squared gradient that scales the steps."""
+    switch: float = 0.3
+    """Probability that a step also moves one contact to another candidate."""
+    temperature: float = 1.0
+    """Energy increase accepted with probability 1/e at the start; falls to `last_temperature`."""
+    last_temperature: float = 0.02
+    """The same at the end."""
+    device: str = "cpu"
+    """Where energies are computed. Random numbers are drawn on the CPU, so that a seed means the same everywhere."""
+    energy: EnergyConfig = field(default_factory=EnergyConfig)
+    """Weights of the terms."""
+    starts: StartConfig = field(default_factory=StartConfig)
+    """Where it starts."""
+    contacts: ContactConfig = field(default_factory=ContactConfig)
+    """Where the hand may touch."""
+
+
+@dataclass(frozen=True)
+class State:
+    """n grasps in the middle of the optimisation."""
+
+    T: Float[Tensor, "n 4 4"]
+    """T_object_wrist [m]."""
+    q: Float[Tensor, "n n_dof"]
+    """Joints [rad or m]."""
+    contacts: Int[Tensor, "n c"]
+    """Chosen contact candidates."""
+    slots: Int[Tensor, "n c"]
+    """The slot that each contact draws its candidates from."""
+    result: Evaluation
+    """Energy and gradient there."""
+
+    def where(self, keep: Bool[Tensor, " n"], other: State) -> State:
+        """The other state's grasps where `keep` is true, these elsewhere."""
+        def choose(a: Tensor, b: Tensor) -> Tensor:
+            return torch.where(keep.reshape(-1, *[1] * (a.ndim - 1)), b, a)
+
+        a, b = self.result, other.result
+        result = Evaluation(
+            choose(a.terms, b.terms), choose(a.by_pose, b.by_pose), choose(a.by_joint, b.by_joint)
+        )
+        T, q, contacts = (choose(getattr(self, k), getattr(other, k)) for k in ("T", "q", "contacts"))
+        return State(T, q, contacts, self.slots, result)
+
+
+def field_of(obj: ObjectModel) -> DistanceField:
+    """The signed distances of an object.
+
+    Raises:
+        ObjectError: The object is a bare cloud.
+    """
+    if obj.is_cloud:
+        raise ObjectError(f"object '{obj.name}' is a bare point cloud; synthesis needs a mesh")
+    return DistanceField.of(obj.grid)
+
+
+def synthesize(
+    hand: Hand, obj: ObjectModel, num: int, seed: int = 0, config: SynthesisConfig | None = None
+) -> GraspBatch:
+    """Grasps of an object by a hand, lowest energy first, untested.
+
+    Args:
+        hand: Any hand.
+        obj: An object with a mesh.
+        num: How many grasps.
+        seed: The same seed gives the same grasps.
+        config: The optimiser.
+
+    Raises:
+        OptionError: `num` is not positive.
+        ObjectError: The object is a bare cloud.
+    """
+    if num < 1:
+        raise OptionError(f"num is {num}; ask for at least one grasp")
+    config = config or SynthesisConfig()
+    field = field_of(obj)
+    energy = object_energy(hand, obj, config.energy, config.contacts, config.device)
+    generator = torch.Generator().manual_seed(seed)
+    surface = torch.as_tensor(obj.cloud, dtype=torch.float32)
+    centre = energy.centre.cpu()
+    sizes = [min(config.batch_size, num - start) for start in range(0, num, config.batch_size)]
+    T, q, terms, depths = [], [], [], []
+    with torch.no_grad():
+        for size in sizes:
+            start = starts(hand, field, surface, centre, size, config.starts, generator)
+            end = optimise(energy, *start, config, generator)
+            T, q, terms = [*T, end.T.cpu()], [*q, end.q.cpu()], [*terms, end.result.terms.cpu()]
+            depths.append(depth(energy, end).cpu())
+    return _batch(hand, obj, torch.cat(T), torch.cat(q), torch.cat(terms), torch.cat(depths), seed)
+
+
+def _batch(
+    hand: Hand,
+    obj: ObjectModel,
+    T: Float[Tensor, "n 4 4"],
+    q: Float[Tensor, "n n_dof"],
+    terms: Float[Tensor, "n 6"],
+    depths: Float[Tensor, " n"],
+    seed: int,
+) -> GraspBatch:
+    """Grasps with rotations orthonormal to rounding, lowest energy first."""
+    T[:, :3, :3] = torch.as_tensor(roma.special_procrustes(T[:, :3, :3]))
+    columns = {"depth": depths} | {f"energy_{name}": terms[:, i] for i, name in enumerate(TERMS)}
+    batch = GraspBatch.create(hand, obj, T, q, score=-terms.sum(-1), seed=seed, provenance=PROVENANCE, extra=columns)
+    return batch.sorted_by_score()
+
+
+def depth(energy: GraspEnergy, state: State) -> Float[Tensor, " n"]:
+    """Deepest penetration of any of the hand's surface points in the object [m]."""
+    points = energy.hand.points(state.q, state.T)
+    return -energy.field.distances(points)[0].amin(-1).clamp_max(0)
+
+
+def optimise(
+    energy: GraspEnergy,
+    T: Float[Tensor, "n 4 4"],
+    q: Float[Tensor, "n n_dof"],
+    config: SynthesisConfig,
+    generator: torch.Generator,
+) -> State:
+    """Run n grasps from where they start to the end of the annealing.
+
+    Args:
+        energy: Of the hand on the object.
+        T: Wrist poses to start from [m], on the CPU.
+        q: Joints to start from [rad or m], on the CPU.
+        config: The optimiser.
+        generator: Source of randomness, on the CPU.
+    """
+    n, device = len(T), energy.centre.device
+    T, q = T.to(device), q.to(device)
+    slots = energy.candidates.assign(n, config.contacts.idle, generator).to(device)
+    contacts = energy.candidates.draw(n, generator).to(device).gather(1, slots)
+    state = State(T, q, contacts, slots, energy(T, q, contacts))
+    squares = _squares(state.result)
+    for step in range(config.steps):
+        left = 1 - step / config.steps
+        pace = config.last_step + (1 - config.last_step) * left
+        temperature = config.last_temperature * (config.temperature / config.last_temperature) ** left
+        proposal = propose(energy, state, squares, pace, config, generator)
+        rise = proposal.result.total - state.result.total
+        accepted = torch.rand(n, generator=generator).to(device) < torch.exp(-rise.clamp_min(0) / temperature)
+        state = state.where(accepted, proposal)
+        squares = config.smoothing * squares + (1 - config.smoothing) * _squares(state.result)
+    return state
+
+
+def propose(
+    energy: GraspEnergy,
+    state: State,
+    squares: Float[Tensor, "n k"],
+    pace: float,
+    config: SynthesisConfig,
+    generator: torch.Generator,
+) -> State:
+    """A step down the gradient, scaled per coordinate, with some contacts moved to other candidates."""
+    scale = 1 / squares.sqrt().clamp_min(1e-3)
+    move, turn = (-pace * state.result.by_pose * scale[:, :6]).split(3, -1)
+    bend = -pace * state.result.by_joint * scale[:, 6:]
+    T = moved(state.T, energy.pivot(state.T), config.translation_step * move, config.rotation_step * turn)
+    tree = energy.hand.tree
+    step = config.joint_step * tree.joint_unit
+    q = torch.minimum(torch.maximum(state.q + step * bend, tree.lower), tree.upper)
+    contacts = switched(energy, state, config.switch, generator)
+    return State(T, q, contacts, state.slots, energy(T, q, contacts))
+
+
+def moved(
+    T: Float[Tensor, "n 4 4"],
+    pivot: Float[Tensor, "n 3"],
+    move: Float[Tensor, "n 3"],
+    turn: Float[Tensor, "n 3"],
+) -> Float[Tensor, "n 4 4"]:
+    """Poses after a turn about the pivot [rad] and a translation [m]."""
+    rotation = roma.rotvec_to_rotmat(turn)
+    result = T.clone()
+    result[:, :3, :3] = rotation @ T[:, :3, :3]
+    result[:, :3, 3] = (rotation @ (T[:, :3, 3] - pivot)[..., None])[..., 0] + pivot + move
+    return result
+
+
+def switched(
+    energy: GraspEnergy, state: State, probability: float, generator: torch.Generator
+) -> Int[Tensor, "n c"]:
+    """Contacts with one of some grasps drawn anew from its slot."""
+    n, c = state.contacts.shape
+    slot = torch.randint(c, (n,), generator=generator)
+    chance = torch.rand(n, generator=generator) < probability
+    fresh = energy.candidates.draw(n, generator).to(state.slots.device).gather(1, state.slots)
+    change = (chance[:, None] & (torch.arange(c) == slot[:, None])).to(state.slots.device)
+    return torch.where(change, fresh, state.contacts)
+
+
+def _squares(result: Evaluation) -> Float[Tensor, "n k"]:
+    """Squared gradient of each coordinate; the three of a translation or rotation share theirs."""
+    move, turn = (part.square().sum(-1, keepdim=True).expand(-1, 3) for part in result.by_pose.split(3, -1))
+    return torch.cat([move, turn, result.by_joint.square()], -1)

@@ -1,0 +1,1 @@
+"""Scores that say which grasps will hold."""

@@ -1,0 +1,324 @@
+"""The command line: exit codes, messages, the JSON contract, and files. Weights are untrained throughout."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dro_grasp._version import __version__
+from dro_grasp.cli import main as cli
+from dro_grasp.cli.main import main
+from dro_grasp.grasps.batch import GraspBatch
+from tests.helpers.weights import untrained_weights
+
+COMMANDS = [
+    [], ["generate"], ["evaluate"], ["synthesize"], ["dataset"], ["dataset", "bundle"], ["dataset", "info"],
+    ["dataset", "import"],
+    ["pretrain"], ["train"], ["view"], ["picture"], ["hand"], ["hand", "check"], ["hands"], ["objects"],
+    ["weights"], ["weights", "list"], ["weights", "verify"], ["benchmark"],
+    ["export"], ["onboard"],
+]
+KEYS = {
+    "hand", "object", "num", "candidates", "seed", "weights", "protocol", "success", "success_rate", "seconds",
+    "output", "frame",
+}
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return str(untrained_weights(tmp_path_factory.mktemp("weights")))
+
+
+@pytest.fixture
+def generate(weights: str, capsys: pytest.CaptureFixture[str]):
+    def run(*arguments: str, num: int = 3, name: str = "sphere") -> dict:
+        base = ["generate", "--hand", "gripper3", "--object", name, "--weights", weights, "--num", str(num), "--json"]
+        assert main([*base, *arguments]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    return run
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda c: " ".join(c) or "top")
+def test_every_command_has_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([*command, "--help"])
+    out = capsys.readouterr().out
+    assert stop.value.code == 0
+    assert "usage: dro-grasp" in out
+    assert "{None}" not in out, "options that may be left out say what happens then"
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"dro-grasp {__version__}\n"
+
+
+def test_help_loads_nothing_heavy() -> None:
+    code = (
+        "import sys\nfrom dro_grasp.cli.main import main\n"
+        "try: main(['generate', '--help'])\nexcept SystemExit: pass\n"
+        "print(sorted({'torch', 'mujoco', 'trimesh', 'viser', 'matplotlib', 'pyarrow'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["--num", "0"], "num is 0"),
+        (["--num", "-1"], "num is -1"),
+        (["--num", "1000000000"], "at most"),
+        (["--table", "nan"], "table is nan"),
+        (["--output", "grasps.csv"], "grasps.parquet"),
+        (["--picture", "grasps.svg"], "grasps.png"),
+        (["--direction", "0", "0", "0"], "direction"),
+        (["--seed", "-1"], "seed is -1"),
+        (["--hand", "allegr"], "allegro"),
+        (["--hand", "nowhere.urdf"], "nowhere.urdf"),
+        (["--object", "mugg"], "mug"),
+        (["--object", "nowhere.obj"], "nowhere.obj"),
+        (["--scale", "0"], "scale"),
+        (["--weights", "nowhere.safetensors"], "nowhere.safetensors"),
+        (["--output", "nowhere/grasps.parquet"], "create it first"),
+        (["--picture", "nowhere/grasps.png"], "create it first"),
+    ],
+)
+def test_bad_input_is_one_message_and_status_2(
+    arguments: list[str], word: str, weights: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    base = {"--hand": ["gripper3"], "--object": ["sphere"], "--weights": [weights], "--num": ["2"]}
+    base[arguments[0]] = arguments[1:]
+    assert main(["generate", *[word for pair in base.items() for word in (pair[0], *pair[1])]]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith("error: ")
+    assert word in said.err
+    assert "Traceback" not in said.err
+
+
+def test_wrong_arguments_are_status_2(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["generate", "--hand", "gripper3", "--object", "sphere", "--numb", "3"])
+    assert stop.value.code == 2
+    assert "--num" in capsys.readouterr().err
+
+
+def test_our_fault_is_status_1(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    class Broken:
+        def run(self) -> int:
+            raise ZeroDivisionError("oops")
+
+    monkeypatch.setattr(cli, "parse", lambda arguments: Broken())
+    assert main(["hands"]) == 1
+    short = capsys.readouterr().err
+    assert "internal error: ZeroDivisionError: oops" in short
+    assert "--verbose" in short
+    assert "Traceback" not in short
+    assert main(["hands", "--verbose"]) == 1
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_outputs_are_checked_before_the_work(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    def working(*_: object) -> None:
+        raise AssertionError("the work began")
+
+    monkeypatch.setattr("dro_grasp.hands.library.load_hand", working)
+    assert main(["generate", "--hand", "gripper3", "--object", "sphere", "--output", "nowhere/a.parquet"]) == 2
+    assert "nowhere" in capsys.readouterr().err
+
+
+def test_generate_reports_and_saves_what_it_counts(generate, tmp_path: Path) -> None:
+    path = tmp_path / "grasps.parquet"
+    report = generate("--output", str(path))
+    assert report.keys() >= KEYS
+    assert set(report["seconds"]) == {"load", "network", "decode", "refine", "rank", "trial"}
+    assert (report["num"], report["candidates"], report["protocol"]) == (3, 12, "dro")
+    assert report["success_rate"] == pytest.approx(report["success"] / 3)
+    grasps = GraspBatch.load(path)
+    assert len(grasps) == 3
+    assert int(grasps.success.sum()) == report["success"]
+    assert (grasps.score[:-1] >= grasps.score[1:]).all()
+    assert "predicted_points" not in grasps.extra
+
+
+def test_same_seed_same_grasps(generate, tmp_path: Path) -> None:
+    files = [tmp_path / f"{i}.parquet" for i in range(3)]
+    for file, seed in zip(files, (5, 5, 6), strict=True):
+        generate("--output", str(file), "--seed", str(seed), "--protocol", "none")
+    first, again, other = (GraspBatch.load(f).joints for f in files)
+    assert (first == again).all()
+    assert not (first == other).all()
+
+
+def test_only_successful_filters_the_file_never_the_rate(generate, tmp_path: Path) -> None:
+    path = tmp_path / "grasps.parquet"
+    report = generate("--output", str(path), "--only-successful", num=6)
+    assert report["num"] == 6
+    assert report["success_rate"] == pytest.approx(report["success"] / 6)
+    assert len(GraspBatch.load(path)) == report["success"]
+
+
+def test_bare_cloud_is_not_tried(generate, tmp_path: Path) -> None:
+    directions = np.random.default_rng(0).normal(size=(3000, 3))
+    np.save(tmp_path / "cloud.npy", 0.03 * directions / np.linalg.norm(directions, axis=1, keepdims=True))
+    report = generate(name=str(tmp_path / "cloud.npy"))
+    assert (report["protocol"], report["success"], report["success_rate"]) == ("none", None, None)
+
+
+def test_folder_of_objects_gets_a_file_each(generate, tmp_path: Path) -> None:
+    import trimesh
+
+    objects, results = tmp_path / "objects", tmp_path / "results"
+    objects.mkdir(), results.mkdir()
+    trimesh.creation.icosphere(radius=0.03).export(objects / "a.stl")
+    trimesh.creation.icosphere(radius=0.03).export(objects / "a.ply")
+    report = generate("--output", str(results), "--protocol", "none", name=str(objects))
+    assert [r["num"] for r in report["results"]] == [3, 3]
+    assert sorted(f.name for f in results.iterdir()) == ["a_ply.parquet", "a_stl.parquet"]
+
+
+def test_a_bad_object_in_a_folder_costs_only_its_own_grasps(
+    weights: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import trimesh
+
+    objects, results = tmp_path / "objects", tmp_path / "results"
+    objects.mkdir(), results.mkdir()
+    trimesh.creation.icosphere(radius=0.03).export(objects / "a.stl")
+    trimesh.creation.icosphere(radius=30.0).export(objects / "huge.stl")
+    trimesh.creation.box((0.05, 0.05, 0.05)).export(objects / "z.stl")
+    base = ["generate", "--hand", "gripper3", "--object", str(objects), "--weights", weights, "--num", "2"]
+    assert main([*base, "--protocol", "none", "--output", str(results), "--json"]) == 2
+    said = capsys.readouterr()
+    report = json.loads(said.out)
+    assert [r["object"] for r in report["results"]] == ["a", "z"]
+    (failed,) = report["failed"]
+    assert failed["object"].endswith("huge.stl")
+    assert "too large" in failed["error"]
+    assert "huge.stl" in said.err
+    assert sorted(f.name for f in results.iterdir()) == ["a.parquet", "z.parquet"]
+
+
+def test_a_bad_camera_file_is_refused_once_for_all_objects(weights: str, tmp_path: Path, capsys) -> None:
+    for name in ("a.npy", "b.npy"):
+        np.save(tmp_path / name, np.zeros((3, 3)))
+    base = ["generate", "--hand", "gripper3", "--object", str(tmp_path), "--weights", weights]
+    assert main([*base, "--camera", str(tmp_path / "nowhere.json"), "--json"]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith("error: ")
+    assert said.err.count("nowhere.json must hold") == 1
+
+
+def test_folder_of_objects_needs_a_folder_for_results(weights: str, tmp_path: Path, capsys) -> None:
+    (tmp_path / "a.stl").write_text("")
+    (tmp_path / "b.stl").write_text("")
+    base = ["generate", "--hand", "gripper3", "--object", str(tmp_path), "--weights", weights]
+    assert main([*base, "--output", str(tmp_path / "nowhere")]) == 2
+    assert "no folder" in capsys.readouterr().err
+
+
+def test_table_keeps_hands_above_it(generate, tmp_path: Path) -> None:
+    from dro_grasp.hands.library import load_hand
+    from dro_grasp.predictor import above_table
+
+    path = tmp_path / "grasps.parquet"
+    report = generate("--table", "-0.15", "--protocol", "none", "--output", str(path))
+    assert report["candidates"] >= report["num"] == 3
+    assert above_table(load_hand("gripper3"), GraspBatch.load(path), -0.15).all()
+
+
+def test_impossible_table_says_so(weights: str, capsys: pytest.CaptureFixture[str]) -> None:
+    base = ["generate", "--hand", "gripper3", "--object", "sphere", "--weights", weights, "--num", "2"]
+    assert main([*base, "--table", "5"]) == 2
+    assert "leaves nothing of the object" in capsys.readouterr().err
+
+
+def test_evaluate_and_view_take_the_file_that_generate_wrote(generate, tmp_path: Path, capsys) -> None:
+    grasps, tried, picture = tmp_path / "a.parquet", tmp_path / "b.parquet", tmp_path / "a.png"
+    generate("--output", str(grasps), "--protocol", "none", num=2)
+    assert main(["evaluate", str(grasps), "--protocol", "strict", "--output", str(tried), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["num"] == 2
+    assert report["interval_95"][0] <= report["success_rate"] <= report["interval_95"][1]
+    assert set(GraspBatch.load(tried).protocol) == {"strict/1"}
+    assert main(["picture", str(tried), "--output", str(picture)]) == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_grasps_tried_on_another_object_are_told(generate, tmp_path: Path, capsys) -> None:
+    path = tmp_path / "grasps.parquet"
+    generate("--output", str(path), "--protocol", "none")
+    assert main(["evaluate", str(path)]) == 0
+    assert "made for another" not in capsys.readouterr().err
+    assert main(["evaluate", str(path), "--object", "can"]) == 0
+    assert "made for another 'sphere' than the one they are tried on, can" in capsys.readouterr().err
+
+
+def test_foreign_and_empty_grasp_files_are_status_2(generate, tmp_path: Path, capsys) -> None:
+    foreign, empty = tmp_path / "foreign.parquet", tmp_path / "empty.parquet"
+    foreign.write_bytes(b"PAR1 not really")
+    generate("--output", str(empty), "--protocol", "none", num=1)
+    GraspBatch.load(empty)[slice(0, 0)].save(empty)
+    for file in (foreign, empty, tmp_path / "missing.parquet"):
+        for command in ("evaluate", "view"):
+            assert main([command, str(file)]) == 2
+            assert file.name in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", [["hands"], ["objects"], ["weights", "list"]])
+def test_lists_in_both_forms(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*command, "--json"]) == 0
+    names = json.loads(capsys.readouterr().out)[command[0]]
+    assert main(command) == 0
+    table = capsys.readouterr().out
+    assert all((n if isinstance(n, str) else n["name"]) in table for n in names)
+
+
+def test_hand_check_in_both_forms(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["hand", "check", "gripper3", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["hand"]
+    assert main(["hand", "check", "gripper3", "--picture", str(tmp_path / "hand.png")]) == 0
+    assert "palm" in capsys.readouterr().out
+    assert main(["hand", "check", "nowhere.urdf"]) == 2
+
+
+def test_own_files_are_found_again(
+    weights: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import shutil
+
+    import trimesh
+
+    from dro_grasp.hands.library import BUILTIN_FOLDER
+
+    shutil.copy(BUILTIN_FOLDER / "gripper3.urdf", tmp_path / "mine.urdf")
+    trimesh.creation.box((40, 40, 60)).export(tmp_path / "box.stl")
+    (tmp_path / "below").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert main(["generate", "--hand", "mine.urdf", "--object", "box.stl", "--scale", "0.001", "--num", "2", "--weights",
+                 weights, "--output", "grasps.parquet", "--json"]) == 0
+    made = json.loads(capsys.readouterr().out)
+    monkeypatch.chdir(tmp_path / "below")
+    assert main(["evaluate", "../grasps.parquet", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["success"] == made["success"]
+    (tmp_path / "mine.urdf").unlink()
+    assert main(["picture", "../grasps.parquet", "--output", "a.png"]) == 2
+    assert "give its file with --hand" in capsys.readouterr().err
+
+
+def test_verify_prints_no_empty_table(weights: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "bad.safetensors").write_bytes(b"no weights")
+    assert main(["weights", "verify", str(tmp_path / "bad.safetensors")]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "bad.safetensors" in said.err
+    assert main(["weights", "verify", str(tmp_path / "bad.safetensors"), weights]) == 2
+    assert "sha256" in capsys.readouterr().out

@@ -1,0 +1,102 @@
+"""Trying stored grasps again: agreement, filtering, and refusal of what has changed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from dro_grasp.cli.main import main
+from dro_grasp.datasets.collections.checking import check, keep_passing
+from dro_grasp.datasets.collections.collection import read_collection
+from dro_grasp.errors import GraspFileError, OptionError
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.library import load_hand
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
+from dro_grasp.simulation.protocols import changed
+from dro_grasp.simulation.trial import simulate
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file of tried grasps of two objects, successes and failures."""
+    hand, batches = load_hand("barrett"), []
+    for name in ("can", "sphere"):
+        obj = load_object(name)
+        grasps = synthesize(hand, obj, 24, 0, SynthesisConfig(steps=80, batch_size=24))
+        batches.append(simulate(hand, obj, grasps, "dro").fill(grasps))
+    path = tmp_path_factory.mktemp("stored") / "barrett.parquet"
+    GraspBatch.concatenate(batches).save(path)
+    return path
+
+
+def test_the_same_trial_agrees_and_a_lie_is_found(stored, tmp_path):
+    pairs = list(read_collection(stored, only_successful=False))
+    found = check(pairs, 1000, changed("dro"))
+    grasps = GraspBatch.load(stored)
+    assert found.tried == found.agreed == 48
+    assert found.succeeded == int(grasps.success.sum())
+    assert found.hands == {"barrett": (48, found.succeeded)}
+    assert not found.reasons
+    failures = int((~grasps.success).sum())
+    assert failures > 0
+    grasps.replace(success=torch.ones(48, dtype=torch.bool)).save(tmp_path / "lie.parquet")
+    lie = check(read_collection(tmp_path / "lie.parquet"), 1000, changed("dro"))
+    assert lie.tried - lie.agreed == failures == lie.reasons.total()
+
+
+def test_a_sample_is_a_sample_and_repeats(stored):
+    pairs = list(read_collection(stored))
+    one, again, other = (check(pairs, 10, changed("dro"), seed) for seed in (1, 1, 2))
+    assert one.tried == other.tried == 10
+    assert one == again
+    with pytest.raises(OptionError, match="at least one"):
+        check(pairs, 0, changed("dro"))
+    with pytest.raises(GraspFileError, match="nothing to check"):
+        check([], 5, changed("dro"))
+
+
+def test_heavier_objects_and_slippery_hands_are_harder(stored):
+    pairs = list(read_collection(stored, only_successful=False))
+    base = check(pairs, 1000, changed("dro")).succeeded
+    assert check(pairs, 1000, changed("dro", friction=0.05)).succeeded < base
+    assert check(pairs, 1000, changed("dro", mass_factor=100)).succeeded < base
+    assert changed("strict", mass_factor=2).label == "strict+changed/1"
+    for wrong in ({"friction": 0.0}, {"mass_factor": -1.0}):
+        with pytest.raises(OptionError, match="between 0 and"):
+            changed("dro", **wrong)
+
+
+def test_filter_keeps_what_passes_with_its_new_numbers(stored):
+    pairs = list(read_collection(stored, only_successful=False))
+    kept = keep_passing(pairs, changed("strict"))
+    for pair, passed in kept:
+        again = simulate(load_hand("barrett"), load_object(pair.object), pair.grasps, "strict")
+        assert torch.equal(passed.joints, pair.grasps.joints[again.success])
+        assert set(passed.protocol or ()) <= {"strict/1"}
+    assert 0 < sum(len(passed) for _, passed in kept) < 48
+
+
+def test_commands(stored, tmp_path, capsys):
+    assert main(["dataset", "check", str(stored), "--sample", "12", "--protocol", "dro", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["tried"], told["agreed"], told["protocol"]) == (12, 12, "dro/1")
+    assert told["interval_95"][0] < 1.0
+    assert main(["dataset", "check", str(stored), "--sample", "5", "--protocol", "dro"]) == 0
+    assert "100.0%" in capsys.readouterr().out
+    assert main(["dataset", "filter", str(stored), "--output", str(tmp_path / "kept"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    kept = GraspBatch.load(tmp_path / "kept" / "barrett.parquet")
+    assert told["grasps"] == 48
+    assert told["kept"] == len(kept) == sum(pair["kept"] for pair in told["pairs"])
+    assert main(["dataset", "check", str(tmp_path / "none")]) == 2
+    assert "no grasps at" in capsys.readouterr().err
+
+
+def test_a_changed_hand_is_refused(stored, tmp_path):
+    GraspBatch.load(stored).replace(hand_sha256="0123456789abcdef").save(tmp_path / "old.parquet")
+    with pytest.raises(GraspFileError, match="another version of hand 'barrett'"):
+        check(read_collection(tmp_path / "old.parquet"), 5, changed("dro"))

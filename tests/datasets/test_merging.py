@@ -1,0 +1,135 @@
+"""Merging data sets: duplicates once, an even choice, compact files that mean the same, and the command."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from dro_grasp.cli.main import main
+from dro_grasp.datasets.collections.collection import read_collection
+from dro_grasp.datasets.collections.merging import ANGLE_STEP, POSITION_STEP, compact, file_name, merge, spread
+from dro_grasp.datasets.engine.shards import Shard, notes_of
+from dro_grasp.datasets.engine.yields import Yield
+from dro_grasp.errors import GraspFileError
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.library import load_hand
+from tests.helpers.tiny_bundle import made_up_grasps
+
+
+@pytest.fixture(scope="module")
+def hand() -> Hand:
+    return load_hand("gripper3")
+
+
+def tried(hand: Hand, obj: str, count: int, seed: int, failed: int = 0) -> GraspBatch:
+    """Made-up grasps, the first `failed` of which failed their trial."""
+    numbers = torch.rand(count, generator=torch.Generator().manual_seed(seed))
+    made = made_up_grasps(hand, obj, count, seed=seed, score=-numbers)
+    return made.replace(
+        success=torch.arange(count) >= failed, protocol=("strict/1",) * count, penetration=numbers / 300,
+        displacement=numbers / 100, rotation=numbers / 7,
+        extra={"energy_distance": numbers * 3, "reason": [""] * count, "contact_links": [["base"]] * count},
+    )
+
+
+@pytest.fixture
+def folders(hand: Hand, tmp_path: Path) -> tuple[Path, Path]:
+    """Two data sets with one shard in common."""
+    first, second = tmp_path / "first", tmp_path / "second"
+    both = tried(hand, "sphere", 12, seed=0, failed=2)
+    for folder, batches in ((first, [both, tried(hand, "can", 6, seed=1)]), (second, [both, tried(hand, "sphere", 8, seed=2)])):
+        for i, batch in enumerate(batches):
+            made = Yield(candidates=64, failures={"slipped": 2}, valid=len(batch), cpu_seconds=2.0)
+            Shard(hand.name, batch.object[0], i).save(batch.to_bytes(notes_of(made)), folder)
+    return first, second
+
+
+def test_what_two_sets_share_is_kept_once_and_failures_are_left_out(folders, hand):
+    (merged,) = merge(folders)
+    assert merged.hand == "gripper3"
+    counts = {name: merged.grasps.object.count(name) for name in ("sphere", "can")}
+    assert counts == {"sphere": 18, "can": 6}
+    assert merged.duplicates == 10
+    assert bool(merged.grasps.success.all())
+    assert merged.yields["sphere"].candidates == 3 * 64
+
+
+def test_merged_files_are_collections_with_their_yields(folders, tmp_path, capsys):
+    out = tmp_path / "merged"
+    assert main(["dataset", "merge", *map(str, folders), "--output", str(out), "--per-pair", "5", "--json"]) == 0
+    (told,) = json.loads(capsys.readouterr().out)["files"]
+    assert (told["hand"], told["grasps"], told["duplicates"], told["surplus"]) == ("gripper3", 10, 10, 14)
+    pairs = {p.object: p for p in read_collection(out)}
+    assert {name: len(p.grasps) for name, p in pairs.items()} == {"can": 5, "sphere": 5}
+    assert pairs["sphere"].made.failures == {"slipped": 6}
+    assert pairs["sphere"].made.valid == 12 + 12 + 8  # as the shards' files say, failures included
+    assert "reason" not in pairs["can"].grasps.extra
+    assert main(["dataset", "info", str(out), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"total": 10, "hands": {"gripper3": {"can": 5, "sphere": 5}}}
+
+
+def test_compact_numbers_mean_the_same_and_keep_the_limits(hand):
+    grasps = tried(hand, "sphere", 200, seed=3)
+    grasps = grasps.replace(joints=torch.where(torch.rand(200, hand.tree.n_dof) < 0.3, hand.tree.upper, grasps.joints))
+    small = compact(hand, grasps)
+    assert (small.joints - grasps.joints).abs().max() <= ANGLE_STEP
+    assert (small.joints >= hand.tree.lower).all()
+    assert (small.joints <= hand.tree.upper).all()
+    assert (small.T_object_wrist[:, :3, 3] - grasps.T_object_wrist[:, :3, 3]).abs().max() <= POSITION_STEP
+    turn = small.T_object_wrist[:, :3, :3].mT @ grasps.T_object_wrist[:, :3, :3]
+    assert (turn - torch.eye(3)).abs().max() < 2e-4
+    torch.testing.assert_close(small.score, grasps.score, rtol=2e-3, atol=0)
+    torch.testing.assert_close(small.extra["energy_distance"], grasps.extra["energy_distance"], rtol=2e-3, atol=0)
+    moved = (hand.points(small.joints, small.T_object_wrist) - hand.points(grasps.joints, grasps.T_object_wrist)).norm(dim=-1)
+    assert moved.max() < 1e-4  # [m]
+    assert len(small.to_bytes()) < 0.85 * len(grasps.to_bytes())
+
+
+def test_the_choice_covers_the_sphere_better_than_chance(hand):
+    grasps = made_up_grasps(hand, "sphere", 400)
+    chosen = spread(hand, grasps, 30)
+    assert len(chosen) == len(set(chosen.tolist())) == 30
+    assert 0 in chosen
+    assert chosen.tolist() == sorted(chosen.tolist())
+
+    def loneliest(rows: torch.Tensor) -> float:
+        """Largest angle of any palm direction to the nearest chosen one [rad]."""
+        d = hand.palm_directions(grasps.T_object_wrist)
+        return float((d @ d[rows].T).clamp(-1, 1).acos().amin(-1).max())
+
+    chance = np.median([loneliest(torch.randperm(400, generator=torch.Generator().manual_seed(i))[:30]) for i in range(9)])
+    assert loneliest(chosen) < 0.8 * chance
+    assert spread(hand, grasps, 400).tolist() == list(range(400))
+
+
+def test_versions_are_not_mixed(hand, tmp_path):
+    tried(hand, "sphere", 3, 0).save(tmp_path / "a.parquet")
+    tried(hand, "sphere", 3, 1).replace(object_sha256=("new",) * 3).save(tmp_path / "b.parquet")
+    with pytest.raises(GraspFileError, match="different versions of object 'sphere'"):
+        merge([tmp_path / "a.parquet", tmp_path / "b.parquet"])
+    tried(hand, "can", 3, 1).replace(hand_sha256="new").save(tmp_path / "c.parquet")
+    with pytest.raises(GraspFileError, match="different versions of hand 'gripper3'"):
+        merge([tmp_path / "a.parquet", tmp_path / "c.parquet"])
+
+
+def test_files_are_named_after_hands():
+    assert [file_name(n) for n in ("allegro", "assets/allegro_left")] == ["allegro.parquet", "assets-allegro_left.parquet"]
+
+
+def test_yields_add_up_and_name_the_obstacle():
+    a = Yield(candidates=10, ranked_out=2, deep=1, moved=1, failures={"slipped": 2, "lost": 1}, valid=3, cpu_seconds=6.0)
+    both = a + Yield(candidates=5, failures={"lost": 4}, valid=1, cpu_seconds=6.0)
+    assert both.failures == {"slipped": 2, "lost": 5}
+    assert both.tried == 11
+    assert both.per_cpu_hour == pytest.approx(1200)
+    assert both.main_obstacle() == "lost (38% of what was tried)"
+    assert Yield().main_obstacle() == "nothing was worth a trial"
+    assert Yield().per_cpu_hour == 0
+    assert Yield.from_dict(both.to_dict() | {"of another version": 1}) == both
+    assert math.isclose(sum(both.to_dict()["failures"].values()), 7)

@@ -1,0 +1,127 @@
+"""Metrics against SciPy and loops, and controls that know nothing of network or shape."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from scipy.stats import binomtest, mannwhitneyu
+
+from dro_grasp.datasets.bundle.training_file import Bundle
+from dro_grasp.evaluation.controls import mean_grasp, mean_grasps, palm_facing_starts
+from dro_grasp.evaluation.coverage import palm_angles
+from dro_grasp.evaluation.metrics import diversity, roc_area, wilson_interval
+from dro_grasp.models.network import DistanceNetwork
+from dro_grasp.objects.shape import ObjectModel
+from tests.helpers.tiny_bundle import SEMIAXES, ellipsoid, made_up_grasps, tiny_bundle
+from tests.helpers.toy_hand import toy_hand
+
+HAND = toy_hand()
+
+
+def bare(name: str, shift: float = 0.0) -> ObjectModel:
+    cloud = ellipsoid(SEMIAXES[name])
+    points = (cloud.points + shift).numpy()
+    return ObjectModel(name, points, cloud.normals.numpy(), points.mean(0), name)
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
+    return tiny_bundle(tmp_path_factory.mktemp("bundle") / "bundle.safetensors")
+
+
+@pytest.mark.parametrize(("success", "total"), [(0, 5), (5, 5), (1, 3), (37, 64), (199, 200), (0, 1)])
+def test_wilson_interval_equals_scipys(success: int, total: int) -> None:
+    expected = binomtest(success, total).proportion_ci(confidence_level=0.95, method="wilson")
+    assert wilson_interval(success, total) == pytest.approx((expected.low, expected.high), abs=1e-7)
+
+
+def test_without_trials_nothing_is_known() -> None:
+    assert wilson_interval(0, 0) == (0.0, 1.0)
+
+
+def test_diversity_equals_its_formula() -> None:
+    grasps = made_up_grasps(HAND, count=30)
+    # Roll, pitch, yaw: turns about the fixed x, y, z axes.
+    angles = Rotation.from_matrix(grasps.T_object_wrist[:, :3, :3].double().numpy()).as_euler("xyz")
+    coordinates = np.concatenate([grasps.T_object_wrist[:, :3, 3].numpy(), angles, grasps.joints.numpy()], 1)
+    deviations = [math.sqrt(sum((x - sum(c) / 30) ** 2 for x in c) / 29) for c in coordinates.T.tolist()]
+    found = diversity(grasps.T_object_wrist, grasps.joints)
+    assert found["all"] == pytest.approx(sum(deviations) / len(deviations), rel=1e-5)
+    assert found["wrist"] == pytest.approx(sum(deviations[:6]) / 6, rel=1e-5)
+    assert found["joints"] == pytest.approx(sum(deviations[6:]) / 6, rel=1e-5)
+    same = grasps[[0, 0, 0]]
+    assert diversity(same.T_object_wrist, same.joints)["all"] == pytest.approx(0, abs=1e-7)
+    assert diversity(grasps.T_object_wrist[:1], grasps.joints[:1])["all"] == 0
+
+
+def test_roc_area_is_mann_whitneys() -> None:
+    generator = torch.Generator().manual_seed(0)
+    score = torch.randint(10, (40,), generator=generator).float()
+    success = torch.rand(40, generator=generator) < 0.4
+    u = mannwhitneyu(score[success], score[~success]).statistic
+    assert roc_area(score, success) == pytest.approx(u / (success.sum() * (~success).sum()))
+    assert math.isnan(roc_area(score, torch.ones(40, dtype=torch.bool)))
+
+
+def test_mean_grasp_is_the_mean_in_the_wrist_frame(bundle: Bundle) -> None:
+    mean, grasps = mean_grasp(bundle, "toy"), bundle.grasps["toy"]
+    expected = np.zeros(3)
+    for T, index in zip(grasps.T_object_wrist.numpy(), grasps.object_index.tolist(), strict=True):
+        centre = bundle.objects[bundle.object_names[index]].points.numpy().mean(0)
+        expected += T[:3, :3].T @ (centre - T[:3, 3]) / len(grasps.joints)
+    np.testing.assert_allclose(mean.object_centre, expected, atol=1e-6)
+    np.testing.assert_allclose(mean.joints, grasps.joints.numpy().mean(0), rtol=1e-5)
+
+
+def test_mean_grasps_ignore_the_shape(bundle: Bundle) -> None:
+    mean = mean_grasp(bundle, "toy")
+    ball, egg = (mean_grasps(HAND, obj, mean, 12, 3) for obj in (bare("ball"), bare("egg", 0.5)))
+    assert torch.equal(ball.joints, egg.joints)
+    assert torch.equal(ball.joints, mean.joints.expand(12, -1))
+    assert torch.equal(ball.T_object_wrist[:, :3, :3], egg.T_object_wrist[:, :3, :3])
+    for grasps, obj in ((ball, bare("ball")), (egg, bare("egg", 0.5))):
+        T = torch.linalg.inv(grasps.T_object_wrist)
+        seen = T[:, :3, :3] @ torch.from_numpy(obj.cloud.mean(0)) + T[:, :3, 3]
+        torch.testing.assert_close(seen, mean.object_centre.expand(12, 3), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("name", list(SEMIAXES))
+def test_palm_facing_starts_face_the_object(name: str) -> None:
+    obj = bare(name, 0.2)
+    starts = palm_facing_starts(HAND, obj, 40, 0)
+    palm = starts.T_object_wrist @ HAND.T_wrist_palm(starts.joints)
+    for T in palm.numpy():
+        origin, direction = T[:3, :3] @ HAND.palm_centre.numpy() + T[:3, 3], T[:3, :3] @ HAND.palm_direction.numpy()
+        depth = (obj.cloud - origin) @ direction
+        assert -1e-5 <= depth.min() <= 0.0101, "the palm is at the surface, or up to a centimetre off [m]"
+        across = obj.cloud.mean(0) - origin
+        assert np.linalg.norm(across - (across @ direction) * direction) < 1e-5, "the palm's axis meets the centre"
+
+
+def test_controls_know_no_network(bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> None:
+    obj = bare("ball")
+    before = palm_facing_starts(HAND, obj, 8, 1)
+
+    def asked(*_: object) -> None:
+        raise AssertionError("the network was asked")
+
+    monkeypatch.setattr(DistanceNetwork, "__init__", asked)
+    again = palm_facing_starts(HAND, obj, 8, 1)
+    assert torch.equal(before.T_object_wrist, again.T_object_wrist)
+    assert not torch.equal(before.T_object_wrist, palm_facing_starts(HAND, obj, 8, 2).T_object_wrist)
+    mean_grasps(HAND, obj, mean_grasp(bundle, "toy"), 8, 1)
+
+
+def test_palm_angles_are_scipys() -> None:
+    grasps = made_up_grasps(HAND, count=15)
+    asked = np.array([1.0, 2.0, -2.0])
+    turned = Rotation.from_matrix(grasps.T_object_wrist[:, :3, :3].numpy()).apply(HAND.palm_direction_wrist.numpy())
+    np.testing.assert_allclose(palm_angles(HAND, grasps, (1.0, 2.0, -2.0)), np.arccos(turned @ asked / 3), atol=1e-5)
+    twice = dataclasses.replace(grasps[[0]], T_object_wrist=torch.eye(4)[None])
+    opposite = tuple((-HAND.palm_direction_wrist).tolist())
+    assert float(palm_angles(HAND, twice, opposite)) == pytest.approx(math.pi, abs=1e-5)

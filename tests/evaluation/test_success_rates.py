@@ -1,0 +1,197 @@
+"""The benchmark's table against trials done one by one."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from typing import Any
+
+import pytest
+import torch
+
+from dro_grasp.cli.main import main
+from dro_grasp.evaluation import success_rates as evaluated
+from dro_grasp.evaluation.success_rates import (
+    ALL,
+    BEST,
+    NETWORK,
+    RANKED,
+    RAW,
+    REFINED,
+    STAGES,
+    START,
+    SYNTHESISED,
+    TOP,
+    BenchmarkConfig,
+    Row,
+    benchmark,
+    pair_seed,
+)
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.library import load_hand
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.optimization.refinement import refine_grasps
+from dro_grasp.predictor import GraspPredictor
+from dro_grasp.ranking.score import score_grasps
+from dro_grasp.simulation.outcome import TrialResult
+from dro_grasp.simulation.protocols import protocol
+from dro_grasp.simulation.trial import simulate
+
+HANDS = ("gripper3", "barrett")
+OBJECTS = ("sphere", "can")
+CONFIG = BenchmarkConfig(num=8, protocols=(protocol("dro"), protocol("strict")))
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[Row]:
+    hands, objects = [load_hand(n) for n in HANDS], [load_object(n) for n in OBJECTS]
+    return benchmark(hands, objects, GraspPredictor(), CONFIG)
+
+
+def find(rows: list[Row], grasps: str, stage: str, hand: str) -> Row:
+    (row,) = (r for r in rows if (r.grasps, r.stage, r.hand) == (grasps, stage, hand))
+    return row
+
+
+def test_every_source_has_its_stages_for_every_hand_and_on_average(rows: list[Row]) -> None:
+    names = {(r.grasps, r.stage) for r in rows}
+    assert names == {*((NETWORK, stage) for stage in STAGES), (START, RAW), (SYNTHESISED, RAW)}
+    assert len(rows) == len(names) * 3
+    assert {r.num for r in rows if r.stage in {RAW, REFINED} and r.hand != ALL} == {16}
+    assert {r.num for r in rows if r.stage in {RANKED, BEST} and r.hand != ALL} == {4}
+    assert {(r.stage, r.num) for r in rows if r.stage in TOP and r.hand != ALL} == {
+        ("refined, top 5", 10), ("refined, top 1", 2)}
+
+
+def test_raw_and_ranked_rows_are_what_single_trials_say(rows: list[Row]) -> None:
+    hand, predictor = load_hand("barrett"), GraspPredictor()
+    for stage, best in ((RAW, RANKED), (REFINED, BEST)):
+        passed, passed_best, passed_first, held = [], [], [], []
+        for name in OBJECTS:
+            obj = load_object(name)
+            grasps = predictor.predict(hand, obj, num=8, seed=pair_seed(0, hand, obj), refine=False)
+            if stage == REFINED:
+                grasps = refine_grasps(hand, obj, grasps)
+            passed.append(simulate(hand, obj, grasps, "strict").success)
+            order = score_grasps(hand, obj, grasps).argsort(descending=True)[:2]
+            passed_best.append(simulate(hand, obj, grasps[order], "strict").success)
+            passed_first.append(simulate(hand, obj, grasps[order[:1]], "strict").success)
+            first = simulate(hand, obj, grasps, "dro")
+            held.append(first.displacement[first.success, -1])
+        assert find(rows, NETWORK, stage, "barrett").success["strict/1"][0] == float(torch.cat(passed).float().mean())
+        assert find(rows, NETWORK, best, "barrett").success["strict/1"][0] == float(torch.cat(passed_best).float().mean())
+        if stage == REFINED:
+            alone = find(rows, NETWORK, "refined, top 1", "barrett").success["strict/1"][0]
+            assert alone == float(torch.cat(passed_first).float().mean())
+        assert find(rows, NETWORK, stage, "barrett").displacement == pytest.approx(float(torch.cat(held).mean()))
+
+
+def test_pairs_share_no_random_numbers() -> None:
+    hands, objects = [load_hand(n) for n in HANDS], [load_object(n) for n in OBJECTS]
+    seeds = {pair_seed(7, hand, obj) for hand in hands for obj in objects}
+    assert len(seeds) == len(HANDS) * len(OBJECTS)
+    assert seeds == {pair_seed(6, hand, obj) + 1 for hand in hands for obj in objects}
+
+
+def test_each_look_is_from_another_side_with_grasps_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[ObjectModel] = []
+    honest = GraspPredictor.predict
+
+    def predict(self: GraspPredictor, hand: Hand, obj: ObjectModel, **options: Any) -> GraspBatch:
+        shown.append(obj)
+        return honest(self, hand, obj, **options)
+
+    monkeypatch.setattr(GraspPredictor, "predict", predict)
+    hand, obj = load_hand("gripper3"), load_object("can")
+    config = dataclasses.replace(CONFIG, num=4, stages=(RANKED,), controls=False, view="half")
+    three = benchmark([hand], [obj], GraspPredictor(), dataclasses.replace(config, looks=3))
+    seen_one_by_one = list(shown)
+    # The best quarter of each look, not of all of them together.
+    assert three[0].num == 3
+    assert len({o.sha256 for o in seen_one_by_one}) == 3
+    passed = []
+    for k in range(3):
+        (row,) = benchmark([hand], [obj], GraspPredictor(), dataclasses.replace(config, seed=k))
+        assert shown[-1].sha256 == seen_one_by_one[k].sha256
+        passed.append(row.success["strict/1"][0])
+    assert three[0].success["strict/1"][0] == pytest.approx(sum(passed) / 3)
+
+
+def test_the_average_is_over_hands(rows: list[Row]) -> None:
+    for stage in STAGES:
+        parts = [find(rows, NETWORK, stage, name) for name in HANDS]
+        whole = find(rows, NETWORK, stage, ALL)
+        mean, low, high = whole.success["dro/1"]
+        assert mean == pytest.approx(sum(p.success["dro/1"][0] for p in parts) / 2)
+        assert low <= mean <= high
+        assert whole.num == sum(p.num for p in parts)
+        assert whole.diversity == pytest.approx(sum(p.diversity for p in parts) / 2)
+        assert whole.seconds["network"] > 0
+
+
+def test_refined_grasps_cost_time_and_controls_say_what_they_are(rows: list[Row]) -> None:
+    assert "refine" not in find(rows, NETWORK, RAW, ALL).seconds
+    assert find(rows, NETWORK, REFINED, ALL).seconds["refine"] > 0
+    assert find(rows, SYNTHESISED, RAW, ALL).seconds["synthesis"] > 0
+    assert find(rows, START, RAW, ALL).success["strict/1"][0] < find(rows, NETWORK, REFINED, ALL).success["strict/1"][0]
+
+
+def test_grasps_that_all_fail_have_no_means(monkeypatch: pytest.MonkeyPatch) -> None:
+    def far(self: GraspPredictor, hand: object, obj: object, **options: object) -> GraspBatch:
+        made = honest(self, hand, obj, **options)
+        away = made.T_object_wrist.clone()
+        away[:, :3, 3] += 1.0
+        return made.replace(T_object_wrist=away)
+
+    honest = GraspPredictor.predict
+    monkeypatch.setattr(GraspPredictor, "predict", far)
+    config = dataclasses.replace(CONFIG, stages=(RAW,), controls=False)
+    (row,) = benchmark([load_hand("gripper3")], [load_object("can")], GraspPredictor(), config)
+    assert row.success["dro/1"][0] == 0
+    assert math.isnan(row.displacement)
+    assert row.diversity == 0
+
+
+@pytest.mark.parametrize("view", ["cloud", "half", "depth"])
+def test_a_view_hides_the_object_from_the_network_alone(view: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown, tried = [], []
+    honest_predict, honest_simulate = GraspPredictor.predict, simulate
+
+    def predict(self: GraspPredictor, hand: Hand, obj: ObjectModel, **options: object) -> GraspBatch:
+        shown.append(obj)
+        return honest_predict(self, hand, obj, **options)
+
+    def trial(hand: Hand, obj: ObjectModel, grasps: GraspBatch, *rest: object, **options: object) -> TrialResult:
+        tried.append(obj)
+        return honest_simulate(hand, obj, grasps, *rest, **options)
+
+    monkeypatch.setattr(GraspPredictor, "predict", predict)
+    monkeypatch.setattr(evaluated, "simulate", trial)
+    config = dataclasses.replace(CONFIG, num=2, stages=(REFINED,), controls=False, protocols=(protocol("dro"),), view=view)
+    objects = [load_object(n) for n in OBJECTS]
+    benchmark([load_hand("gripper3")], objects, GraspPredictor(), config)
+    assert [o.is_cloud for o in shown] == [True, True]
+    assert tried == objects
+    ball = torch.from_numpy(shown[0].cloud)
+    radius = float(ball.norm(dim=1).median())
+    # The hidden side of a sphere about the origin is made up from the seen one.
+    assert float(((ball.norm(dim=1) - radius).abs() / radius).quantile(0.9)) < 0.2
+    normals = torch.from_numpy(shown[0].cloud_normals)
+    assert float((normals * torch.nn.functional.normalize(ball, dim=1)).sum(1).quantile(0.1)) > 0.7
+
+
+def test_the_command_prints_rows_and_json(capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["benchmark", "--hands", "gripper3", "--objects", "can", "--num", "4", "--stages", "raw", "--protocols", "dro",
+               "--no-controls"]
+    assert main([*command, "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)["rows"]
+    assert row["stage"] == RAW
+    assert row["num"] == 4
+    assert main(command) == 0
+    line = next(x for x in capsys.readouterr().out.splitlines() if x.startswith("| network"))
+    assert f"| {100 * row['success']['dro/1'][0]:.1f} [" in line
+    assert main(["benchmark", "--hands", "gripper3", "--objects", "can", "--num", "0"]) == 2
+    assert "ask for at least one grasp" in capsys.readouterr().err

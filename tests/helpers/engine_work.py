@@ -1,0 +1,50 @@
+"""Stand-ins for the work of the data engine that worker processes can import, each failing in its own way."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+from dro_grasp.datasets.engine.production import Job, Made, Task
+from dro_grasp.datasets.engine.shards import notes_of
+from dro_grasp.datasets.engine.yields import Yield
+from dro_grasp.errors import HandError, ObjectError
+from tests.datasets.test_shards import grasps
+
+GRASPS = 5
+"""Grasps of a shard."""
+
+
+def easy(job: Job, task: Task) -> Made:
+    """Five grasps at once; the object `barren` gives none, the hand `broken` an error."""
+    if task.shard.hand == "broken":
+        raise HandError("no hand is called 'broken'")
+    if task.shard.object == "unsplit":
+        raise ObjectError("the mesh cannot be cut into convex parts (CoACD found none); repair or simplify it")
+    count = 0 if task.shard.object == "barren" else GRASPS
+    made = Yield(candidates=task.candidates, failures={"slipped": 20 - count}, valid=count)
+    return Made(task.shard, grasps(count, task.shard.hand, task.shard.object).to_bytes(notes_of(made)), made)
+
+
+def slow(job: Job, task: Task) -> Made:
+    """The same after a moment, in which something can be killed."""
+    time.sleep(0.2)
+    return easy(job, task)
+
+
+def dying(job: Job, task: Task) -> Made:
+    """The worker dies on `deadly`, always, and on `fragile`, the first time."""
+    mark = Path(job.protocol) / "died"
+    if task.shard.object == "deadly" or (task.shard.object == "fragile" and not mark.exists()):
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return easy(job, task)
+
+
+def endless(job: Job, task: Task) -> Made:
+    """`endless` never ends, like a mesh that is hard to cut."""
+    if task.shard.object == "endless":
+        time.sleep(3600)
+    return easy(job, task)

@@ -1,0 +1,197 @@
+"""Weights files: round trip, precision, damage, pickles, names, places that cannot be written."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from dro_grasp.cli.main import main
+from dro_grasp.errors import OutputError, WeightsError
+from dro_grasp.models import checkpoints
+from dro_grasp.models.checkpoints import (
+    CHECKSUMS,
+    KEY,
+    SHIPPED_FOLDER,
+    SMALL,
+    describe_weights,
+    load_weights,
+    locate_weights,
+    save_weights,
+    verify_weights,
+    weights_names,
+)
+from dro_grasp.models.network import DistanceNetwork, NetworkConfig
+from tests.helpers.tiny_bundle import TINY
+
+HALF_ROUNDING = 2.0**-11
+"""Largest relative rounding error of half precision."""
+
+
+@pytest.fixture
+def network() -> DistanceNetwork:
+    """Untrained, with statistics that half precision could not hold."""
+    torch.manual_seed(0)
+    made = DistanceNetwork(TINY)
+    made.hand_encoder.final.norm.running_var.fill_(1e-9)
+    made.hand_encoder.final.norm.running_mean.fill_(1.0001)
+    return made
+
+
+@pytest.fixture
+def path(tmp_path: Path, network: DistanceNetwork) -> Path:
+    save_weights(network, tmp_path / "mine.safetensors", {"stage": "test"})
+    return tmp_path / "mine.safetensors"
+
+
+def test_weights_come_back_in_half_precision(path: Path, network: DistanceNetwork) -> None:
+    read = load_weights(path)
+    assert (read.config, read.name, read.training) == (TINY, "mine", False)
+    given = network.state_dict()
+    assert list(read.state_dict()) == list(given)
+    for name, value in read.state_dict().items():
+        assert value.dtype == given[name].dtype, name
+        if "running" in name or "tracked" in name:
+            assert torch.equal(value, given[name]), name
+        else:
+            torch.testing.assert_close(value, given[name], rtol=HALF_ROUNDING, atol=6e-8)
+
+
+def test_a_second_round_trip_changes_nothing(path: Path, tmp_path: Path) -> None:
+    read = load_weights(path)
+    save_weights(read, tmp_path / "again.safetensors")
+    again = load_weights(tmp_path / "again.safetensors")
+    assert all(torch.equal(a, b) for a, b in zip(read.state_dict().values(), again.state_dict().values(), strict=True))
+
+
+def test_rounding_hardly_changes_the_prediction(path: Path, network: DistanceNetwork) -> None:
+    generator = torch.Generator().manual_seed(0)
+    hand, obj = (torch.randn(2, n, 3, generator=generator) * 0.1 for n in (TINY.n_hand, TINY.n_object))
+    network.hand_encoder.final.norm.reset_running_stats()
+    save_weights(network, path)
+    z = network.sample_latent(2, generator)
+    before, after = network.eval().predict(hand, obj, z), load_weights(path).predict(hand, obj, z)
+    torch.testing.assert_close(after, before, rtol=1e-2, atol=1e-4)
+
+
+def change(path: Path, how: str) -> None:
+    whole = path.read_bytes()
+    with safe_open(path, "pt") as file:
+        header = json.loads(file.metadata()[KEY])
+        tensors = {key: file.get_tensor(key) for key in file.keys()}
+    path.unlink()
+    if how == "cut short":
+        path.write_bytes(whole[:-100])
+    elif how == "empty":
+        path.write_bytes(b"")
+    elif how == "foreign":
+        save_file(tensors, path)
+    elif how == "strange header":
+        save_file(tensors, path, metadata={KEY: "[1]"})
+    elif how == "no configuration":
+        save_file(tensors, path, metadata={KEY: json.dumps({"format_version": 1})})
+    elif how == "another version":
+        save_file(tensors, path, metadata={KEY: json.dumps(header | {"format_version": 99})})
+    elif how == "other sizes":
+        header["config"]["width"] = 20
+        save_file(tensors, path, metadata={KEY: json.dumps(header)})
+    elif how == "impossible sizes":
+        header["config"]["latent_head"] = [1]
+        save_file(tensors, path, metadata={KEY: json.dumps(header)})
+    elif how == "unknown option":
+        save_file(tensors, path, metadata={KEY: json.dumps(header | {"config": header["config"] | {"magic": 1}})})
+    else:
+        torch.save(tensors, path, _use_new_zipfile_serialization=how == "zipped pickle")
+
+
+@pytest.mark.parametrize(
+    ("how", "word"),
+    [
+        ("cut short", "cut short"), ("empty", "cut short"), ("foreign", "not of dro-grasp"),
+        ("strange header", "not of dro-grasp"), ("no configuration", "does not fit"), ("other sizes", "does not fit"),
+        ("impossible sizes", "does not fit"), ("unknown option", "does not fit"),
+        ("another version", "version 99, expected 1"), ("zipped pickle", "can run code"), ("bare pickle", "can run code"),
+    ],
+)
+def test_a_damaged_or_foreign_file_is_refused(path: Path, how: str, word: str) -> None:
+    change(path, how)
+    with pytest.raises(WeightsError, match=word):
+        load_weights(path)
+
+
+def test_unknown_names_list_the_shipped_ones(tmp_path: Path) -> None:
+    for name in ("nothing", str(tmp_path), str(tmp_path / "no.safetensors")):
+        with pytest.raises(WeightsError, match=", ".join(weights_names())):
+            load_weights(name)
+
+
+def test_a_folder_that_cannot_be_written_is_told(
+    network: DistanceNetwork, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(OutputError, match="cannot write weights"):
+        save_weights(network, tmp_path / "none" / "mine.safetensors")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(OutputError, match="cannot write weights"):
+        save_weights(network, tmp_path / "folder")
+    monkeypatch.setattr(checkpoints, "save_file", full)
+    with pytest.raises(OutputError, match="No space left"):
+        save_weights(network, tmp_path / "mine.safetensors")
+    assert [p.name for p in tmp_path.iterdir()] == ["folder"]
+
+
+def test_description_counts_and_names(path: Path, network: DistanceNetwork) -> None:
+    about = describe_weights(path)
+    assert about["parameters"] == sum(v.numel() for v in network.state_dict().values())
+    assert (about["name"], about["bytes"], about["about"]) == ("mine", path.stat().st_size, {"stage": "test"})
+    assert NetworkConfig.from_dict(about["config"]) == TINY
+    assert path.stat().st_mode & 0o777 == 0o644
+
+
+def test_shipped_weights_load() -> None:
+    assert "multi" in weights_names()
+    assert locate_weights(None) == locate_weights("multi") == SHIPPED_FOLDER / "multi.safetensors"
+    assert load_weights().name == "multi"
+    assert all(bool(v.isfinite().all()) for v in load_weights("multi").state_dict().values())
+
+
+def test_shipped_weights_are_as_they_were_shipped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    lines = dict(reversed(line.split()) for line in (SHIPPED_FOLDER / CHECKSUMS).read_text().splitlines())
+    assert set(lines) == {f.relative_to(SHIPPED_FOLDER).as_posix() for f in SHIPPED_FOLDER.rglob("*.safetensors")}
+    assert set(lines) == {f"{name}.safetensors" for name in (*weights_names(), *SMALL)}
+    for name in weights_names():
+        assert verify_weights(name) == lines[f"{name}.safetensors"] == describe_weights(name)["sha256"]
+    for name in SMALL:
+        assert verify_weights(name) == lines[f"{name}.safetensors"]
+    folder = tmp_path / "weights"
+    shutil.copytree(SHIPPED_FOLDER, folder)
+    monkeypatch.setattr(checkpoints, "SHIPPED_FOLDER", folder)
+    save_weights(load_weights("multi"), folder / "multi.safetensors", {"about": "made anew"})
+    with pytest.raises(WeightsError, match="shipped was"):
+        verify_weights("multi")
+    harmed = bytearray((folder / "ranking" / "quality.safetensors").read_bytes())
+    harmed[-1] ^= 1
+    (folder / "ranking" / "quality.safetensors").write_bytes(harmed)
+    with pytest.raises(WeightsError, match="shipped was"):
+        verify_weights("ranking/quality")
+    (folder / "completion" / "surface.safetensors").unlink()
+    with pytest.raises(WeightsError, match="No such file"):
+        verify_weights("completion/surface")
+
+
+def test_verify_checks_files_of_the_user_as_well(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["weights", "verify", str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["weights"][0]["sha256"] == describe_weights(path)["sha256"]
+    path.write_bytes(path.read_bytes()[:-100])
+    assert main(["weights", "verify", str(path), "multi"]) == 2
+    said = capsys.readouterr()
+    assert "cut short" in said.err
+    assert "multi" in said.out
+    assert main(["weights", "verify"]) == 0

@@ -1,0 +1,111 @@
+"""A hand from its file to weights and a report, taken up where it stopped."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from dro_grasp.cli.main import main
+from dro_grasp.hands.library import BUILTIN_FOLDER
+from dro_grasp.models.checkpoints import describe_weights
+from dro_grasp.onboarding import steps
+from tests.helpers.weights import untrained_weights
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("onboarding")
+    shutil.copy(BUILTIN_FOLDER / "gripper3.urdf", folder / "mine.urdf")
+    untrained_weights(folder)
+    return folder
+
+
+def command(home: Path, *more: str, hand: str = "mine.urdf") -> list[str]:
+    return ["onboard", str(home / hand), "--output", str(home / "out"), "--objects", "sphere", "--held-out", "can",
+            "--num", "2", "--minutes", "0.1", "--workers", "1", "--weights", str(home / "untrained.safetensors"), *more]
+
+
+def test_a_file_becomes_weights_and_a_report(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(command(home, "--json")) == 0
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert set(told["seconds"]) == {"check", "before", "data", "training", "after"}
+    assert told["grasps"] > 0
+    assert describe_weights(told["weights"])["about"]["data"]["hands"] == {"mine": told["grasps"]}
+    page = (home / "out" / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 2, "the hand, and grasps of the one held-out object"
+    assert "http" not in page.replace("http-equiv", ""), "nothing is fetched"
+    assert f"{told['after']['refined']['dro/1']:.0%} after" in page
+    assert str(home / "out" / "weights.safetensors") in page
+
+
+def test_a_rerun_does_nothing_again(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def working(*_: object, **__: object) -> None:
+        raise AssertionError("done again")
+
+    before = (home / "out" / "weights.safetensors").read_bytes()
+    for name in ("synthesize_dataset", "train", "benchmark", "check_hand"):
+        monkeypatch.setattr(steps, name, working)
+    assert main(command(home)) == 0
+    said = capsys.readouterr()
+    assert said.err.count("done before") == 5
+    assert "report: " in said.out
+    assert (home / "out" / "weights.safetensors").read_bytes() == before
+
+
+def test_a_run_that_stopped_goes_on(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    state = json.loads((home / "out" / steps.STATE).read_text())
+    kept = {name: state["steps"][name] for name in ("check", "before", "data")}
+    (home / "out" / steps.STATE).write_text(json.dumps(state | {"steps": kept}))
+    monkeypatch.setattr(steps, "synthesize_dataset", None)
+    assert main(command(home)) == 0
+    assert capsys.readouterr().err.count("done before") == 3
+
+
+def test_the_folder_of_another_hand_is_refused(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copy(BUILTIN_FOLDER / "barrett.urdf", home / "other.urdf")
+    assert main(command(home, hand="other.urdf")) == 2
+    assert "belongs to hand 'mine'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("more", "word"), [(["--objects", "can"], "can would be trained on"), (["--minutes", "0"], "minutes is 0.0")])
+def test_what_makes_no_sense_is_refused(
+    home: Path, more: list[str], word: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*command(home), *more]) == 2
+    assert word in capsys.readouterr().err
+
+
+def test_a_hand_that_grasps_nothing_is_told(
+    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from dro_grasp.datasets.engine.schedule import DatasetReport
+
+    report = DatasetReport(0, 0, 1, 1.0, {("mine", "sphere"): "0 grasps: every candidate penetrates"})
+    monkeypatch.setattr(steps, "synthesize_dataset", lambda *_, **__: report)
+    monkeypatch.setattr(steps, "count_collection", lambda _: {})
+    assert main([*command(home), "--output", str(home / "empty")]) == 2
+    assert "every candidate penetrates" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "word"),
+    [("--minutes", "nan", "error: minutes is nan; give a positive number, for example --minutes 30\n"),
+     ("--minutes", "inf", "error: minutes is inf; "), ("--num", "0", "error: num is 0; give at least 1 (--num)\n"),
+     ("--workers", "0", "error: workers is 0; "), ("--held-out", "cann", "no object is called 'cann'"),
+     ("--held-out", "nowhere.stl", "nowhere.stl"), ("--objects", "spher", "no object is called 'spher'"),
+     ("--weights", "nowhere", "no weights at 'nowhere'"), ("hand", "nothand.urdf", "nothand.urdf"),
+     ("hand", "missing.urdf", "missing.urdf")],
+)
+def test_what_is_refused_leaves_no_folder(
+    home: Path, option: str, value: str, word: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (home / "nothand.urdf").write_text("<robot name='a'><link name='b'/></robot>")
+    more = ["--output", str(home / "new")]
+    line = command(home, *more, hand=value) if option == "hand" else command(home, *more, option, value)
+    assert main(line) == 2
+    assert word in capsys.readouterr().err
+    assert not (home / "new").exists()

@@ -1,0 +1,190 @@
+"""From rendered depth images back to the object: points, normals and frames against the mesh they were rendered from."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import igl
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from dro_grasp.cli.main import main
+from dro_grasp.errors import ObjectError, OptionError
+from dro_grasp.frames import read_motion
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.sources import object_of
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.perception.scan import depth_points, load_scan, scanned_object, without_outliers
+from tests.helpers.weights import untrained_weights
+
+INTRINSICS = np.array([[300.0, 0, 79.5], [0, 310.0, 59.5], [0, 0, 1]])
+SHAPE = (120, 160)
+
+
+@pytest.fixture(scope="module")
+def mug() -> ObjectModel:
+    return load_object("mug")
+
+
+@pytest.fixture(scope="module")
+def T_object_camera() -> np.ndarray:
+    """A camera half a metre off that looks at the mug askew."""
+    T = np.eye(4)
+    T[:3, :3] = (Rotation.from_euler("y", 25, degrees=True) * Rotation.from_euler("x", 200, degrees=True)).as_matrix()
+    T[:3, 3] = -0.5 * T[:3, 2]
+    return T
+
+
+@pytest.fixture(scope="module")
+def depth(mug: ObjectModel, T_object_camera: np.ndarray) -> np.ndarray:
+    """Depth along z of the first surface on each pixel's ray, by igl; zero where there is none."""
+    row, column = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    rays = np.stack([(column - 79.5) / 300, (row - 59.5) / 310, np.ones(SHAPE)], -1).reshape(-1, 3)
+    image = np.zeros(len(rays))
+    for i, ray in enumerate(rays @ T_object_camera[:3, :3].T):
+        hits = igl.ray_mesh_intersect(T_object_camera[:3, 3], ray, mug.vertices, mug.faces)
+        if hits:
+            image[i] = min(h[1] for h in hits)  # rays have z = 1, so the parameter is the depth
+    return image.reshape(SHAPE)
+
+
+def off_surface(mug: ObjectModel, points: np.ndarray) -> np.ndarray:
+    return np.abs(igl.signed_distance(points, mug.vertices, mug.faces)[0])
+
+
+def test_points_lie_on_the_mesh(mug: ObjectModel, depth: np.ndarray, T_object_camera: np.ndarray) -> None:
+    points = depth_points(depth, INTRINSICS)
+    assert len(points) == int((depth > 0).sum()) > 500
+    assert off_surface(mug, points @ T_object_camera[:3, :3].T + T_object_camera[:3, 3]).max() < 1e-5
+    mask = np.zeros(SHAPE, bool)
+    mask[:, 80:] = True
+    right = depth_points(depth, INTRINSICS, mask)
+    assert 0 < len(right) < len(points)
+    assert right[:, 0].min() > 0, "x points right"
+
+
+def test_a_scan_is_in_the_frame_asked_for_and_looks_at_the_camera(
+    mug: ObjectModel, depth: np.ndarray, T_object_camera: np.ndarray
+) -> None:
+    noise = np.random.default_rng(0)
+    points = depth_points(depth, INTRINSICS)
+    stray = np.array([[0.0, 0.0, 0.3], [0.1, 0.1, 0.6], [-0.1, 0.05, 0.45]])
+    dirty = np.concatenate([points + noise.normal(0, 5e-4, points.shape), stray, [[np.nan, 0, 0]]])
+    scan = scanned_object("mug seen", dirty, T_object_camera, complete=False)
+    assert scan.is_cloud
+    assert off_surface(mug, scan.cloud.astype(float)).max() < 0.004, "the stray points are gone"
+    towards = T_object_camera[:3, 3] - scan.cloud
+    assert ((scan.cloud_normals * towards).sum(1) > 0).all()
+    kept = scanned_object("mug seen", dirty[:-1], T_object_camera, denoise=False, complete=False)
+    assert off_surface(mug, kept.cloud.astype(float)).max() > 0.02
+    _, face, _, _ = igl.signed_distance(scan.cloud.astype(float), mug.vertices, mug.faces)
+    own = np.cross(*(mug.vertices[mug.faces[face, k]] - mug.vertices[mug.faces[face, 0]] for k in (1, 2)))
+    own /= np.linalg.norm(own, axis=1, keepdims=True)
+    assert np.median((own * scan.cloud_normals).sum(1)) > 0.95
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ("millimetres", "divide millimetres by 1000"), ("mask of another size", "shape"), ("empty mask", "within the mask"),
+        ("nothing", "no pixel"),
+    ],
+)
+def test_images_that_show_nothing_are_refused(depth: np.ndarray, change: str, word: str) -> None:
+    image, mask = depth.copy(), None
+    if change == "millimetres":
+        image *= 1000
+    elif change == "nothing":
+        image[:] = np.nan
+    else:
+        mask = np.zeros(SHAPE if change == "empty mask" else (5, 5), bool)
+    with pytest.raises(ObjectError, match=word):
+        depth_points(image, INTRINSICS, mask)
+
+
+def test_few_points_are_refused() -> None:
+    with pytest.raises(ObjectError, match="3 points after cleaning"):
+        scanned_object("crumbs", np.random.default_rng(0).normal(size=(3, 3)))
+
+
+def test_a_plane_loses_no_points_but_strays() -> None:
+    plane = np.stack([*np.meshgrid(np.linspace(0, 0.1, 20), np.linspace(0, 0.1, 20)), np.zeros((20, 20))], -1).reshape(-1, 3)
+    cleaned = without_outliers(np.concatenate([plane, [[0.05, 0.05, 0.08]]]))
+    assert cleaned[:, 2].max() == 0
+    assert len(cleaned) >= 396
+
+
+def test_grasps_of_a_cloud_are_in_the_frame_of_the_camera_file(
+    depth: np.ndarray, T_object_camera: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same cloud in two frames gives the same grasps in two frames, and the direction counts in the frame named."""
+    np.save(tmp_path / "scan.npy", depth_points(depth, INTRINSICS))
+    (tmp_path / "camera.json").write_text(json.dumps({"frame": "base", "T_frame_camera": T_object_camera.tolist()}))
+    base = ["generate", "--hand", "gripper3", "--object", str(tmp_path / "scan.npy"), "--num", "3", "--weights",
+            str(untrained_weights(tmp_path)), "--camera", str(tmp_path / "camera.json"), "--direction", "0", "0", "-1",
+            "--no-refine", "--json"]
+    assert main([*base, "--output", str(tmp_path / "g.parquet")]) == 0
+    from tests.helpers.loaded_hands import loaded_hand
+
+    palms = loaded_hand("gripper3").palm_directions(GraspBatch.load(tmp_path / "g.parquet").T_object_wrist)
+    assert float(palms[:, 2].max()) < -0.8
+    wrists = GraspBatch.load(tmp_path / "g.parquet").T_object_wrist[:, :3, 3]
+    assert float(wrists.norm(dim=1).max()) < 0.4, "about the object, not about the camera"
+    capsys.readouterr()
+    mesh = [a if not a.endswith("scan.npy") else "mug" for a in base]
+    assert main(mesh) == 2
+    assert "no camera has seen" in capsys.readouterr().err
+    assert torch.isfinite(palms).all()
+
+
+def test_a_file_remembers_the_frame_and_where_the_camera_stood(
+    depth: np.ndarray, T_object_camera: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Read again, the object stands where the grasps are; every export names their frame."""
+    points, file = depth_points(depth, INTRINSICS), tmp_path / "g.parquet"
+    np.save(tmp_path / "scan.npy", points)
+    (tmp_path / "camera.json").write_text(json.dumps({"frame": "base", "T_frame_camera": T_object_camera.tolist()}))
+    made = ["generate", "--hand", "gripper3", "--object", str(tmp_path / "scan.npy"), "--num", "2", "--weights",
+            str(untrained_weights(tmp_path)), "--camera", str(tmp_path / "camera.json"), "--output", str(file), "--json"]
+    assert main(made) == 0
+    assert json.loads(capsys.readouterr().out)["frame"] == "base"
+    grasps = GraspBatch.load(file)
+    again = object_of(grasps, None, 1.0)
+    assert again.sha256 == grasps.object_sha256[0] == load_scan(
+        tmp_path / "scan.npy", read_motion(tmp_path / "camera.json", "T_frame_camera").T.double().numpy()).sha256
+    seen = points @ T_object_camera[:3, :3].T + T_object_camera[:3, 3]
+    assert np.abs(again.cloud.mean(0) - seen.mean(0)).max() < 0.05
+    for form, ending in (("isaac_grasp", "yaml"), ("moveit", "moveit.yaml"), ("csv", "csv")):
+        target = tmp_path / f"out.{ending}"
+        assert main(["export", str(file), "--format", form, "--output", str(target)]) == 0
+        assert "in frame 'base'" in target.read_text().splitlines()[0]
+    assert "object_frame_link: base" in (tmp_path / "out.yaml").read_text()
+    assert "frame_id: base" in (tmp_path / "out.moveit.yaml").read_text()
+
+
+def test_what_depth_cameras_leave_behind_is_dropped(
+    mug: ObjectModel, depth: np.ndarray, T_object_camera: np.ndarray, tmp_path: Path
+) -> None:
+    """Pixels without depth as NaN, as organised clouds have them, and a stray far beyond the size of any object."""
+    points = depth_points(depth, INTRINSICS)
+    np.save(tmp_path / "raw.npy", np.concatenate([points, np.full((50, 3), np.nan), [[0.3, 0.2, 1.9]]]))
+    obj = load_scan(tmp_path / "raw.npy", T_object_camera)
+    assert float(np.ptp(obj.cloud, axis=0).max()) < 0.2
+    assert np.quantile(off_surface(mug, obj.cloud.astype(float)), 0.5) < 0.003
+
+
+@pytest.mark.parametrize(("content", "word"), [
+    ({"T_frame_camera": np.eye(4).tolist()}, "no entry 'frame'"),
+    ({"frame": "base"}, "no entry 'T_frame_camera'"),
+    ({"frame": "", "T_frame_camera": np.eye(4).tolist()}, "no name"),
+    ({"frame": 5, "T_frame_camera": np.eye(4).tolist()}, "no name"),
+    ({"frame": "base", "T_frame_camera": [[1, 0, 0, 400], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, "millimetres"),
+])
+def test_frames_that_mean_nothing_are_refused(content: dict[str, object], word: str, tmp_path: Path) -> None:
+    (tmp_path / "frame.json").write_text(json.dumps(content))
+    with pytest.raises(OptionError, match=word):
+        read_motion(tmp_path / "frame.json", "T_frame_camera")

@@ -1,0 +1,110 @@
+"""Features of grasps against plain geometry, and a network to which links are a set."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from dro_grasp.energy.object_energy import evaluate_nearest, object_energy
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.controller import pregrasp_and_squeeze
+from dro_grasp.models.small_networks import save_small
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.ranking.features import FARTHEST, LENGTH, MOTION, NEAR, GraspFeatures, grasp_features
+from dro_grasp.ranking.score_network import QualityNetwork, shipped_quality
+from tests.helpers.tiny_bundle import made_up_grasps
+from tests.helpers.toy_hand import toy_hand
+
+HAND = toy_hand()
+
+
+@pytest.fixture(scope="module")
+def ball() -> ObjectModel:
+    return load_object("sphere")
+
+
+@pytest.fixture(scope="module")
+def grasps(ball: ObjectModel) -> GraspBatch:
+    made = made_up_grasps(HAND, "sphere", count=6)
+    T = made.T_object_wrist.clone()
+    T[:, :3, 3] -= 0.01
+    return made.replace(T_object_wrist=T)
+
+
+def features(obj: ObjectModel, grasps: GraspBatch) -> GraspFeatures:
+    energy = object_energy(HAND, obj)
+    return grasp_features(energy, grasps, evaluate_nearest(energy, grasps.T_object_wrist, grasps.joints).terms)
+
+
+def test_links_are_described_at_their_point_nearest_to_a_ball(ball: ObjectModel, grasps: GraspBatch) -> None:
+    found = features(ball, grasps)
+    radius = float(np.linalg.norm(ball.vertices, axis=1).mean())
+    points = HAND.points(grasps.joints, grasps.T_object_wrist)
+    squeeze = pregrasp_and_squeeze(HAND, grasps.T_object_wrist, grasps.joints, torch.zeros(3))[1]
+    after = HAND.points(squeeze, grasps.T_object_wrist)
+    links, checked = HAND.link_index.unique().tolist(), 0
+    assert found.links.shape == (6, len(links), 16)
+    for i in range(len(grasps)):
+        axes = grasps.T_object_wrist[i, :3, :3] @ HAND.palm_axes_wrist
+        for slot, link in enumerate(links):
+            own = points[i, HAND.link_index == link]
+            distance = own.norm(dim=-1) - radius
+            gap = float(distance.min())
+            told = found.links[i, slot]
+            if gap < -0.02:  # near the ball's middle, where no direction is outward
+                continue
+            checked += 1
+            assert float(told[0]) * MOTION == pytest.approx(max(-FARTHEST, min(gap, FARTHEST)), abs=0.0015)
+            assert float(found.nearness[i, slot]) == pytest.approx(np.exp(-max(gap, 0) / NEAR), abs=0.2)
+            # Which of two points is nearest may differ by the grid's rounding; the one told lies that near as well.
+            place = axes @ told[9:12] * LENGTH
+            assert float(place.norm()) - radius == pytest.approx(gap, abs=0.002)
+            normal = axes @ told[6:9]
+            assert float(normal @ torch.nn.functional.normalize(place, dim=0)) > 0.97
+            which = int((own - place).norm(dim=-1).argmin())
+            closing = after[i, HAND.link_index == link][which] - own[which]
+            torch.testing.assert_close(axes @ told[12:15] * MOTION, closing, atol=1e-4, rtol=0)
+            assert float(told[3]) * MOTION == pytest.approx(-float(closing @ normal), abs=1e-4)
+            assert bool(told[4]) == (link == HAND.palm)
+    assert checked > 12
+
+
+def test_features_do_not_know_where_the_scene_is(ball: ObjectModel, grasps: GraspBatch) -> None:
+    # A turn that takes axes to axes, so that the grid turns as well.
+    R, shift = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), torch.tensor([0.1, -0.2, 0.3])
+    cloud = dataclasses.replace(ball, vertices=None, faces=None)
+    moved = dataclasses.replace(
+        cloud, cloud=(torch.from_numpy(ball.cloud) @ R.T + shift).numpy(),
+        cloud_normals=(torch.from_numpy(ball.cloud_normals) @ R.T).numpy(), centre_of_mass=shift.numpy().astype(float))
+    T = grasps.T_object_wrist.clone()
+    T[:, :3] = R @ T[:, :3]
+    T[:, :3, 3] += shift
+    here, there = features(cloud, grasps), features(moved, grasps.replace(T_object_wrist=T))
+    for ours, theirs in zip(here, there, strict=True):
+        assert ((ours - theirs).abs() < 2e-3).float().mean() > 0.97
+
+
+def test_links_are_a_set() -> None:
+    torch.manual_seed(0)
+    network = QualityNetwork(2)
+    links, nearness, whole = torch.randn(5, 7, 16), torch.rand(5, 7), torch.randn(5, 8)
+    order = torch.randperm(7)
+    whole_set = network(links, nearness, whole)
+    torch.testing.assert_close(network(links[:, order], nearness[:, order], whole), whole_set)
+    repeated = torch.cat([links, links[:, :1]], 1), torch.cat([nearness, torch.zeros(5, 1)], 1)
+    torch.testing.assert_close(network(*repeated, whole), whole_set)
+    assert not torch.allclose(network(links, nearness.flip(1), whole), whole_set)
+
+
+def test_the_shipped_network_comes_back_as_it_was_saved(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shipped = shipped_quality()
+    save_small(shipped, tmp_path / "quality.safetensors")
+    monkeypatch.setattr("dro_grasp.ranking.score_network.SHIPPED", tmp_path / "quality.safetensors")
+    again = shipped_quality.__wrapped__()
+    for name, value in shipped.state_dict().items():
+        assert torch.equal(value, again.state_dict()[name])
+    assert not any(p.requires_grad for p in again.parameters())

@@ -1,0 +1,190 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from dro_grasp.errors import HandError, ObjectError
+from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.library import ASSET_FILES, load_hand
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.simulation.contacts import measure_penetration
+from dro_grasp.simulation.protocols import protocol
+from dro_grasp.simulation.scene import Scene, build_scene
+from tests.helpers.claw import ball, claw, grasps_of, wrist_below
+
+GRIPPER = """<mujoco><worldbody><body name="base"><geom type="box" size="0.06 0.02 0.01" mass="0.3"/>
+<body name="left" pos="-0.05 0 0.04"><joint name="left" type="slide" axis="1 0 0" range="0 0.045"/>
+<geom type="box" size="0.006 0.012 0.03" mass="0.05"/></body>
+<body name="right" pos="0.05 0 0.04"><joint name="right" type="slide" axis="-1 0 0" range="0 0.045"/>
+<geom type="box" size="0.006 0.012 0.03" mass="0.05"/></body></body></worldbody></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def hand(tmp_path_factory: pytest.TempPathFactory) -> Hand:
+    return claw(tmp_path_factory.mktemp("hand"))
+
+
+@pytest.fixture(scope="module")
+def scene(hand: Hand) -> Scene:
+    return build_scene(hand, ball(), protocol("dro"))
+
+
+def test_contact_settings(scene):
+    model = scene.model
+    assert model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    assert model.opt.jacobian == mujoco.mjtJacobian.mjJAC_DENSE
+    assert (model.opt.timestep, model.opt.impratio, *model.opt.gravity) == (0.005, 10, 0, 0, 0)
+    touching = model.geom_bodyid == scene.object_body
+    assert (model.geom_condim[touching] == 4).all()
+    np.testing.assert_allclose(model.geom_friction[:, 0], 1.0)
+
+
+def test_friction_of_the_protocol_reaches_every_shape(hand):
+    model = build_scene(hand, ball(), replace(protocol("dro"), friction=3.0)).model
+    np.testing.assert_allclose(model.geom_friction[:, 0], 3.0)
+
+
+def test_servos_replace_what_the_description_says(scene):
+    model = scene.model
+    assert model.nu == 8
+    np.testing.assert_allclose(model.actuator_gainprm[:, 0], 3.0)
+    np.testing.assert_allclose(model.actuator_biasprm[:, 1:3], [[-3.0, -0.3]] * 8)
+    hand_dofs = model.dof_bodyid != scene.object_body
+    np.testing.assert_allclose(model.dof_damping[hand_dofs], 0)
+    np.testing.assert_allclose(model.dof_frictionloss[hand_dofs], 0)
+    np.testing.assert_allclose(model.dof_armature[hand_dofs], 1e-3)
+    assert not model.jnt_actfrclimited.any()
+
+
+def test_mass_and_inertia_are_those_of_the_solid_ball(scene):
+    mass = 500 * 4 / 3 * np.pi * 0.03**3
+    assert scene.model.body_mass[scene.object_body] == pytest.approx(mass, rel=1e-6)
+    np.testing.assert_allclose(scene.model.body_inertia[scene.object_body], 0.4 * mass * 0.03**2, rtol=1e-6)
+
+
+def test_links_and_object_stand_where_kinematics_puts_them(scene, hand):
+    q = hand.random_joints(3, torch.Generator().manual_seed(0))
+    T = wrist_below(0.2, 3)
+    T[1, :3, :3] = torch.tensor([[0.0, -1, 0], [0.6, 0, -0.8], [0.8, 0, 0.6]])
+    data = mujoco.MjData(scene.model)
+    for i, qpos in enumerate(scene.qpos(T, q)):
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(scene.model, data)
+        poses = hand.tree.forward(q[i])
+        for k, name in enumerate(hand.tree.link_names):
+            np.testing.assert_allclose(data.body(f"hand/{name}").xpos, poses[k, :3, 3], atol=1e-6)
+        expected = torch.linalg.inv(T[i])
+        np.testing.assert_allclose(data.body("object").xpos, expected[:3, 3], atol=1e-6)
+        np.testing.assert_allclose(data.body("object").xmat.reshape(3, 3), expected[:3, :3], atol=1e-6)
+
+
+def test_penetration_of_a_known_overlap(scene, hand):
+    """The ball's lowest point 4 mm below the palm's face (z = 10 mm)."""
+    grasps = grasps_of(hand, scene.obj, wrist_below(0.03 + 0.01 - 0.004), torch.zeros(1, 8))
+    assert measure_penetration(scene, grasps).object[0] == pytest.approx(0.004, abs=3e-4)
+    away = grasps_of(hand, scene.obj, wrist_below(0.08), hand.canonical_joints(1.0)[None])
+    assert measure_penetration(scene, away).object[0] == 0
+
+
+def test_fingers_that_cross_penetrate_the_hand_itself(scene, hand):
+    grasps = grasps_of(hand, scene.obj, wrist_below(0.5, 2), torch.tensor([[1.3, 1.0] * 4, [0.0, 0.0] * 4]))
+    own = measure_penetration(scene, grasps).own
+    assert own[0] > 0.005
+    assert own[1] == 0
+
+
+def test_sliding_joints_close(tmp_path):
+    """Gains of turning joints would move a sliding finger by millimetres a second."""
+    file = tmp_path / "gripper.xml"
+    file.write_text(GRIPPER)
+    gripper = load_hand(file)
+    model = build_scene(gripper, ball(0.01), protocol("dro")).model
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 0.02
+    mujoco.mj_step(model, data, nstep=200)
+    np.testing.assert_allclose(data.qpos[:2], 0.02, atol=1e-3)
+
+
+def test_a_cloud_has_no_scene(hand):
+    points = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
+    cloud = ObjectModel(name="scan", cloud=points, cloud_normals=points, centre_of_mass=np.zeros(3), sha256="scan")
+    with pytest.raises(ObjectError, match="'scan' is a bare point cloud; a trial needs a mesh"):
+        build_scene(hand, cloud, protocol("dro"))
+
+
+def test_a_hand_without_description_has_no_scene(hand):
+    with pytest.raises(HandError, match="carries no description"):
+        build_scene(replace(hand, description=None), ball(), protocol("dro"))
+
+
+def touched(scene: Scene, hand: Hand, q: torch.Tensor, place: torch.Tensor) -> set[str]:
+    """Links in contact with the object at a place in the wrist frame."""
+    T = torch.eye(4)[None].clone()
+    T[0, :3, 3] = -place
+    data = mujoco.MjData(scene.model)
+    data.qpos[:] = scene.qpos(T, q[None])[0]
+    mujoco.mj_fwdPosition(scene.model, data)
+    bodies = scene.model.geom_bodyid[data.contact.geom].reshape(-1, 2)
+    bodies = bodies[(bodies == scene.object_body).any(1)]
+    return {scene.model.body(b).name.removeprefix("hand/") for b in bodies.ravel() if b != scene.object_body}
+
+
+def deaf_links(hand: Hand) -> list[str]:
+    """Links that can touch and do not notice a ball on their surface."""
+    scene = build_scene(hand, ball(0.006), protocol("dro"))
+    q = hand.canonical_joints()
+    points = hand.points(q)
+    deaf = []
+    for link in hand.touching:
+        name, mine = hand.tree.link_names[link], points[hand.link_index == link]
+        if len(mine) and not any(name in touched(scene, hand, q, p) for p in mine[:: max(1, len(mine) // 8)]):
+            deaf.append(name)
+    return deaf
+
+
+def largest_shift(hand: Hand) -> float:
+    """How far links stand from where the kinematic tree has them [m], wrist joints that are held included."""
+    scene = build_scene(hand, ball(0.005), protocol("dro"))
+    q, data = hand.canonical_joints(), mujoco.MjData(scene.model)
+    data.qpos[:] = scene.qpos(wrist_below(1.0), q[None])[0]
+    mujoco.mj_kinematics(scene.model, data)
+    poses = {name: T[:3, 3].numpy() for name, T in zip(hand.tree.link_names, hand.tree.forward(q), strict=True)}
+    bodies = [scene.model.body(b) for b in range(scene.model.nbody)]
+    named = [(b.id, b.name.removeprefix("hand/")) for b in bodies if b.name.removeprefix("hand/") in poses]
+    assert len(named) > len(hand.tips)
+    return max(float(np.linalg.norm(data.xpos[i] - poses[name])) for i, name in named)
+
+
+def test_the_scene_stands_as_the_tree_says(hand):
+    assert largest_shift(hand) < 1e-5
+
+
+def test_every_link_of_the_claw_collides(hand):
+    assert len(hand.touching) == 9
+    assert deaf_links(hand) == []
+
+
+@pytest.mark.assets
+@pytest.mark.parametrize("name", sorted(ASSET_FILES))
+def test_every_link_collides_and_the_hand_closes(name: str, assets_folder: Path):
+    hand = load_hand(f"assets/{name}")
+    assert deaf_links(hand) == []
+    assert largest_shift(hand) < 1e-5
+    scene = build_scene(hand, ball(0.005), protocol("dro"))
+    data = mujoco.MjData(scene.model)
+    target = hand.canonical_joints(0.6)
+    data.qpos[:] = scene.qpos(wrist_below(1.0), hand.canonical_joints(0.9)[None])[0]
+    data.ctrl[:] = target.numpy()[scene.actuated]
+    mujoco.mj_step(scene.model, data, nstep=200)
+    assert not data.warning.number.any()
+    expected = scene.qpos(wrist_below(1.0), target[None])[0]
+    addresses, _ = scene.hand_qpos
+    # Neighbouring fingers may meet on the way; most joints arrive.
+    assert np.median(np.abs(data.qpos - expected)[addresses]) < 0.03
+    held = [n for n, m in zip(hand.tree.joint_names, hand.movable, strict=True) if not m]
+    assert not any(f"hand/{n}" == scene.model.actuator(i).name for n in held for i in range(scene.model.nu))

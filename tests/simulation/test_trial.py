@@ -1,0 +1,238 @@
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from dro_grasp.errors import ObjectError, OptionError
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.controller import ControllerConfig
+from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.simulation import trial as trials
+from dro_grasp.simulation.protocols import protocol
+from dro_grasp.simulation.trial import TrialResult, record, settle, simulate
+from tests.helpers.claw import ball, claw, grasps_of, power_grasp, wrist_below
+
+
+@pytest.fixture(scope="module")
+def hand(tmp_path_factory: pytest.TempPathFactory) -> Hand:
+    return claw(tmp_path_factory.mktemp("hand"))
+
+
+@pytest.fixture(scope="module")
+def obj() -> ObjectModel:
+    return ball()
+
+
+def same(a: TrialResult, b: TrialResult) -> None:
+    for name in ("success", "displacement", "rotation", "closing_shift", "contacts", "penetration"):
+        assert torch.equal(getattr(a, name).nan_to_num(-1.0), getattr(b, name).nan_to_num(-1.0)), name
+    assert a.reason == b.reason
+
+
+@pytest.mark.parametrize("name", ["dro", "strict", "dro_static", "dexgraspbench"])
+def test_power_grasp_holds_a_ball(hand, obj, name):
+    grasps = power_grasp(hand, obj, 3)
+    if name == "dro_static":
+        # Standing still holds only what it presses on already.
+        grasps = settle(hand, obj, grasps)
+        squeezed = grasps.joints + torch.tensor([0.0, 0.15] * 4)
+        grasps = grasps.replace(joints=squeezed)
+    result = simulate(hand, obj, grasps, name)
+    assert result.success.all()
+    assert result.reason == ("",) * 3
+    assert (result.displacement[:, -1] < 0.02).all()
+    assert (result.contacts >= 3).all()
+    assert result.protocol == f"{name}/1"
+
+
+def test_hand_30_cm_away_scores_nothing(hand, obj):
+    result = simulate(hand, obj, grasps_of(hand, obj, wrist_below(0.3, 2), torch.zeros(2, 8)), "dro")
+    assert not result.success.any()
+    assert result.reason == ("no contact after closing",) * 2
+    assert result.contacts.tolist() == [0, 0]
+
+
+def test_a_free_object_falls_by_half_a_t_squared(hand, obj):
+    """Under force F for t seconds an object of mass m moves F t^2 / 2m, here in the object's own frame."""
+    rules = replace(protocol("dro"), force=0.16)
+    T = wrist_below(0.6)
+    T[0, :3, :3] = torch.tensor([[0.0, -1, 0], [0.6, 0, -0.8], [0.8, 0, 0.6]])
+    result = simulate(hand, obj, grasps_of(hand, obj, T, torch.zeros(1, 8)), rules)
+    # Semi-implicit steps add a t dt / 2.
+    expected = 0.5 * 0.16 * 1.0 * (1 + rules.timestep)
+    assert result.displacement[0, 0] == pytest.approx(expected, rel=1e-3)
+    # It then coasts at a t while pushed along +y: a t^2 to the side of the 3/2 a t^2 forwards.
+    assert result.displacement[0, 1] == pytest.approx(0.16 * math.hypot(1.5, 0.5), rel=1e-2)
+    assert torch.equal(result.displacement[0, 2:], result.displacement[0, 1].expand(4))  # given up
+    poses, _ = record(hand, obj, grasps_of(hand, obj, T, torch.zeros(1, 8)), 0, rules, stride=200)
+    moved = T[0, :3, :3] @ (poses[2, :3, 3] - poses[1, :3, 3])
+    np.testing.assert_allclose(moved, [expected, 0, 0], atol=1e-5)
+
+
+def test_dexgraspbench_pushes_each_way_anew(hand, obj):
+    """Every force moves a free object by F t^2 / 2m from where it was, whatever the object's own mass."""
+    rules = replace(protocol("dexgraspbench"), force=0.02)
+    result = simulate(hand, obj, grasps_of(hand, obj, wrist_below(0.6), torch.zeros(1, 8)), rules)
+    expected = 0.5 * 0.02 * rules.force_time**2 * (1 + rules.timestep / rules.force_time)
+    torch.testing.assert_close(result.displacement[0], torch.full((6,), expected), rtol=1e-3, atol=0)
+    assert result.success.tolist() == [True]  # 4 cm are less than 5
+    lost = simulate(hand, obj, grasps_of(hand, obj, wrist_below(0.6), torch.zeros(1, 8)), "dexgraspbench")
+    assert lost.reason == ("no contact after closing",)
+
+
+def test_dexgraspbench_limits_rotation_and_the_worst_of_all_forces(hand, obj):
+    grasps = power_grasp(hand, obj, 2)
+    rules = protocol("dexgraspbench")
+    turned = simulate(hand, obj, grasps, rules).rotation.amax(1)
+    one_of_six = replace(rules, max_rotation=float(turned.max()) * 0.99)
+    again = simulate(hand, obj, grasps, one_of_six)
+    assert again.success.tolist() == (turned < one_of_six.max_rotation).tolist()
+    assert "turned by" in again.reason[int(turned.argmax())]
+
+
+def test_a_gradual_protocol_leads_the_hand_through_the_grasp(hand, obj):
+    grasps = grasps_of(hand, obj, wrist_below(0.6), torch.full((1, 8), 0.1)).replace(
+        pregrasp_joints=torch.zeros(1, 8), squeeze_joints=torch.full((1, 8), 0.2))
+    _, joints = record(hand, obj, grasps, 0, "dexgraspbench", stride=10)
+    assert joints[0] == pytest.approx(torch.zeros(8))
+    assert float(joints[10].mean()) == pytest.approx(0.1, abs=0.02)
+    assert float(joints[20].mean()) == pytest.approx(0.2, abs=0.03)
+    assert len(joints) == 1 + 20 + 6 * 50
+
+
+def test_one_finger_pushes_the_object_away(hand, obj):
+    joints = torch.tensor([[0.0, 0.0] + [-0.5, 0.0] * 3])
+    grasps = grasps_of(hand, obj, wrist_below(0.045), joints)
+    target = joints.clone()
+    target[0, :2] = torch.tensor([1.4, 0.0])
+    grasps = grasps.replace(pregrasp_joints=joints, squeeze_joints=target)
+    result = simulate(hand, obj, grasps, "strict")
+    assert result.reason == ("object pushed away while closing",)
+    assert result.displacement.isnan().all()
+    # The other fingers stop it: what `dro` asks for is met.
+    lenient = simulate(hand, obj, grasps, "dro")
+    assert lenient.closing_shift[0] > 0.02
+    assert lenient.success.all()
+
+
+def test_strict_refuses_what_penetrates(hand, obj):
+    deep = grasps_of(hand, obj, wrist_below(0.031), torch.tensor([[0.0, 0.6] * 4]))
+    assert simulate(hand, obj, deep, "strict").reason[0].startswith("hand penetrates object by ")
+    crossed = grasps_of(hand, obj, wrist_below(0.3), torch.tensor([[1.3, 1.0] * 4]))
+    assert simulate(hand, obj, crossed, "strict").reason[0].startswith("hand penetrates itself by ")
+
+
+def test_an_unstable_trial_fails(hand, obj, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    wild = replace(protocol("dro"), stiffness=1e9, damping=0.0, force_limit=1e15, armature=1e-9)
+    result = simulate(hand, obj, power_grasp(hand, obj, 2), wild)
+    assert not result.success.any()
+    assert result.reason == ("simulation unstable",) * 2
+    assert result.displacement.isnan().all()
+    assert list(tmp_path.iterdir()) == []
+    assert capfd.readouterr().err == ""
+
+
+def test_weak_fingers_lose_a_pulled_ball(hand, obj):
+    weak = replace(protocol("dro"), force_limit=0.005, force=20.0)
+    grasps = settle(hand, obj, power_grasp(hand, obj))
+    result = simulate(hand, obj, grasps.replace(pregrasp_joints=grasps.joints), weak)
+    assert result.contacts[0] > 0
+    assert result.reason == ("lost under force +x",)
+
+
+def test_result_depends_neither_on_workers_nor_on_company(hand, obj, monkeypatch):
+    grasps = power_grasp(hand, obj, 5)
+    first = simulate(hand, obj, grasps, "dro", workers=1)
+    same(first, simulate(hand, obj, grasps, "dro", workers=3))
+    same(first, simulate(hand, obj, grasps, "dro", workers=1))
+    monkeypatch.setattr(trials, "CHUNK", 2)
+    same(first, simulate(hand, obj, grasps, "dro", workers=2))
+
+
+def test_stated_joints_come_before_the_controller_s(hand, obj):
+    grasps = power_grasp(hand, obj)
+    held = grasps.replace(pregrasp_joints=grasps.joints, squeeze_joints=grasps.joints)
+    still = replace(protocol("dro"), controller=ControllerConfig(outer=0.0, inner=0.0))
+    same(simulate(hand, obj, held, "dro"), simulate(hand, obj, grasps, still))
+    unopened = replace(protocol("dro"), controller=ControllerConfig(outer=0.0))
+    same(simulate(hand, obj, held.replace(squeeze_joints=None), "dro"), simulate(hand, obj, grasps, unopened))
+
+
+def test_settled_labels_touch_without_penetrating(hand, obj):
+    loose = power_grasp(hand, obj, 2).replace(joints=torch.tensor([[0.0, 0.4] * 4, [0.05, 0.7] * 4]))
+    settled = settle(hand, obj, loose)
+    assert settled.squeeze_joints is None
+    assert (settled.joints >= hand.tree.lower).all()
+    distance = hand.points(settled.joints, settled.T_object_wrist).norm(dim=-1) - 0.03
+    # Contacts are soft: the squeeze presses fingers into so light a ball by millimetres.
+    assert (distance.amin(1).abs() < protocol("strict").max_penetration).all()
+    assert simulate(hand, obj, settled, "strict").success.all()
+
+
+def test_recorded_frames_follow_the_trial(hand, obj):
+    grasps = power_grasp(hand, obj, 2)
+    poses, joints = record(hand, obj, grasps, 1, stride=20)
+    assert poses.shape == (71, 4, 4)
+    assert joints.shape == (71, 8)
+    torch.testing.assert_close(poses[0], torch.linalg.inv(grasps.T_object_wrist[1]), atol=1e-6, rtol=0)
+    shift = (poses[10:, :3, 3] - poses[10, :3, 3]).norm(dim=-1)
+    assert shift[-1] == pytest.approx(float(simulate(hand, obj, grasps, "dro").displacement[1, -1]), abs=1e-6)
+
+
+def test_outcome_in_a_batch_and_its_file(hand, obj, tmp_path):
+    grasps = GraspBatch.concatenate([power_grasp(hand, obj), grasps_of(hand, obj, wrist_below(0.3), torch.zeros(1, 8))])
+    tried = simulate(hand, obj, grasps, "dro").fill(grasps)
+    tried.save(tmp_path / "tried.parquet")
+    loaded = GraspBatch.load(tmp_path / "tried.parquet")
+    assert loaded.success.tolist() == [True, False]
+    assert loaded.protocol == ("dro/1", "dro/1")
+    assert list(loaded.extra["reason"]) == ["", "no contact after closing"]
+    assert len(loaded.extra["contact_links"][0]) >= 3
+    assert set(loaded.extra["contact_links"][0]) <= set(hand.tree.link_names)
+    assert loaded.extra["contact_links"][1] == []
+
+
+def test_progress_and_empty_batches(hand, obj, monkeypatch):
+    monkeypatch.setattr(trials, "CHUNK", 2)
+    seen: list[tuple[int, int]] = []
+    simulate(hand, obj, power_grasp(hand, obj, 3), progress=lambda done, total: seen.append((done, total)))
+    assert seen == [(2, 3), (3, 3)]
+    nothing = power_grasp(hand, obj)[torch.zeros(1, dtype=torch.bool)]
+    assert len(simulate(hand, obj, nothing).success) == 0
+    assert len(settle(hand, obj, nothing)) == 0
+
+
+def test_grasps_of_another_hand_are_refused(hand, obj, tmp_path):
+    other = claw(tmp_path, fingers=3)
+    with pytest.raises(OptionError, match="Load the hand that the grasps name"):
+        simulate(other, obj, power_grasp(hand, obj))
+
+
+def test_a_cloud_cannot_be_tried(hand, obj):
+    cloud = replace(obj, vertices=None, faces=None, exact_parts=None, sha256="cloud")
+    with pytest.raises(ObjectError, match="bare point cloud"):
+        simulate(hand, cloud, power_grasp(hand, obj))
+
+
+@pytest.mark.assets
+@pytest.mark.parametrize("name", ["barrett_multidex", "allegro_left", "shadowhand"])
+def test_synthesised_grasps_of_the_paper_hands_hold(name: str, assets_folder: Path):
+    from dro_grasp.hands.library import load_hand
+    from dro_grasp.objects.catalogue import load_object
+    from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
+
+    hand, can = load_hand(f"assets/{name}"), load_object("can")
+    grasps = synthesize(hand, can, 48, config=SynthesisConfig(steps=100))[0:16]
+    result = simulate(hand, can, grasps, "dro")
+    assert result.success.float().mean() >= 0.5, Counter(result.reason)
+    T = grasps.T_object_wrist.clone()
+    T[:, :3, 3] += 0.3 * T[:, :3, 3] / T[:, :3, 3].norm(dim=-1, keepdim=True)
+    assert not simulate(hand, can, grasps.replace(T_object_wrist=T), "dro").success.any()

@@ -1,0 +1,277 @@
+"""Runs of training: resumption after a kill, refusals, full disks, several processes, the learning rate, TensorBoard."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import math
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+from torch import nn
+
+from dro_grasp.datasets.bundle.training_file import Bundle
+from dro_grasp.errors import OptionError, OutputError, TrainingError
+from dro_grasp.models.network import DistanceNetwork
+from dro_grasp.training import loop, pretraining
+from dro_grasp.training.config import ScheduleConfig
+from dro_grasp.training.processes import Processes
+from dro_grasp.training.runs import CHECKPOINT, LOG, Run, learning_rate_share
+from tests.helpers.tiny_bundle import TINY
+from tests.helpers.training_stages import SCHEDULE, SHARDED, STAGES, curve, quiet, run_stage
+
+ROOT = Path(__file__).parents[2]
+SHARED = """
+import sys
+from pathlib import Path
+from dro_grasp.datasets.bundle.training_file import load_bundle
+from tests.helpers.training_stages import SHARDED, run_stage
+bundle = load_bundle(Path(sys.argv[1]) / "bundle.safetensors")
+run_stage("pretrain", bundle, Path(sys.argv[1]) / "before", SHARDED)
+run_stage("train", bundle, Path(sys.argv[1]) / "shared", SHARDED)
+"""
+# Dies at step 6: after the log line and before its checkpoint, or with the checkpoint half written.
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+import torch
+from dro_grasp.datasets.bundle.training_file import load_bundle
+from tests.helpers.training_stages import run_stage
+stage, moment, folder = sys.argv[1], sys.argv[2], Path(sys.argv[3])
+whole_save = torch.save
+def die():
+    os.kill(os.getpid(), signal.SIGKILL)
+def report(run, means):
+    if run.step == 6:
+        if moment == "before":
+            die()
+        torch.save = half_save
+def half_save(state, file):
+    whole_save(state["step"], file)
+    die()
+run_stage(stage, load_bundle(folder / "bundle.safetensors"), folder / "killed", report=report)
+"""
+
+
+@pytest.mark.parametrize(("stage", "moment"), [("train", "before"), ("pretrain", "during")])
+def test_a_killed_run_goes_on_to_the_same_curve(
+    home: Path, bundle: Bundle, finished: dict[str, Path], results: dict[str, DistanceNetwork], tmp_path: Path, stage: str,
+    moment: str,
+) -> None:
+    (tmp_path / "bundle.safetensors").symlink_to(home / "bundle.safetensors")
+    dead = subprocess.run([sys.executable, "-c", KILLED, stage, moment, str(tmp_path)], capture_output=True, text=True)
+    assert dead.returncode == -signal.SIGKILL, dead.stderr
+    folder = tmp_path / "killed"
+    assert [line["step"] for line in curve(folder)] == [2, 4, 6]
+    assert torch.load(folder / CHECKPOINT, weights_only=True)["step"] == 4
+    with (folder / LOG).open("a") as file:
+        file.write('{"step": 7, "to')
+    resumed = run_stage(stage, bundle, folder)
+    expected = curve(finished[stage])
+    assert [line["step"] for line in expected] == [2, 4, 6, 8, 10]
+    assert curve(folder) == [pytest.approx(line, rel=1e-5, abs=1e-8) for line in expected]
+    assert {p.name for p in folder.iterdir()} == {CHECKPOINT, LOG}
+    for ours, theirs in zip(resumed.state_dict().values(), results[stage].state_dict().values(), strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
+
+
+def test_a_run_killed_before_its_first_checkpoint_begins_a_new_log(bundle: Bundle, tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / LOG).write_text('{"step": 2, "total": 7.0}\n{"st')
+    run_stage("pretrain", bundle, tmp_path / "run", dataclasses.replace(SCHEDULE, steps=4))
+    assert [line["step"] for line in curve(tmp_path / "run")] == [2, 4]
+    assert curve(tmp_path / "run")[0]["total"] != 7.0
+
+
+def test_a_loss_that_is_not_finite_stops_and_leaves_a_sound_checkpoint(
+    bundle: Bundle, finished: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls, honest = [], loop.placement_loss
+
+    def poisoned(*values: torch.Tensor) -> torch.Tensor:
+        calls.append(1)
+        return honest(*values) * (math.nan if len(calls) == 6 else 1)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "placement_loss", poisoned)
+        with pytest.raises(TrainingError, match=r"^placement is not finite at step 5"):
+            run_stage("train", bundle, tmp_path / "run")
+    state = torch.load(tmp_path / "run" / CHECKPOINT, weights_only=True)
+    assert state["step"] == 4
+    assert all(bool(v.isfinite().all()) for v in state["model"].values())
+    run_stage("train", bundle, tmp_path / "run")
+    assert curve(tmp_path / "run") == [pytest.approx(line, rel=1e-5, abs=1e-8) for line in curve(finished["train"])]
+
+
+def test_a_gradient_that_is_not_finite_stops(tmp_path: Path) -> None:
+    model = nn.Linear(1, 1)
+    run = Run(tmp_path / "run", model, SCHEDULE, torch.Generator())
+    before = copy.deepcopy(model.state_dict())
+    with pytest.raises(TrainingError, match=r"^gradient is not finite at step 0"):
+        run.train(lambda: {"total": (model.weight * 0).sqrt().sum()}, quiet)
+    assert all(torch.equal(before[k], v) for k, v in model.state_dict().items())
+
+
+def damage(path: Path, how: str) -> None:
+    whole = path.read_bytes()
+    if how == "truncated":
+        path.write_bytes(whole[: len(whole) // 2])
+    elif how == "empty":
+        path.write_bytes(b"")
+    elif how == "foreign":
+        torch.save([1, 2, 3], path)
+    else:
+        state = torch.load(path, weights_only=True)
+        torch.save({k: v for k, v in state.items() if k != "optimiser"}, path)
+
+
+@pytest.mark.parametrize("how", ["truncated", "empty", "foreign", "incomplete"])
+def test_a_damaged_checkpoint_is_refused(bundle: Bundle, finished: dict[str, Path], tmp_path: Path, how: str) -> None:
+    (tmp_path / "run").mkdir()
+    path = tmp_path / "run" / CHECKPOINT
+    path.write_bytes((finished["train"] / CHECKPOINT).read_bytes())
+    damage(path, how)
+    with pytest.raises(TrainingError, match=r"checkpoint\.pt does not fit this training"):
+        run_stage("train", bundle, tmp_path / "run")
+
+
+def test_a_checkpoint_of_another_training_is_refused(bundle: Bundle, finished: dict[str, Path]) -> None:
+    with pytest.raises(TrainingError, match="a run with steps 10, 12 was asked for"):
+        run_stage("train", bundle, finished["train"], dataclasses.replace(SCHEDULE, steps=12))
+    with pytest.raises(TrainingError, match="does not fit this training"):
+        run_stage("train", bundle, finished["train"], network=dataclasses.replace(TINY, width=20))
+    with pytest.raises(TrainingError, match="does not fit this training"):
+        run_stage("train", bundle, finished["pretrain"])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("steps", 0), ("steps", -5), ("minutes", 0.0), ("learning_rate", math.nan), ("log_every", 0), ("shards", 0)],
+)
+def test_an_impossible_schedule_is_refused(bundle: Bundle, tmp_path: Path, name: str, value: float) -> None:
+    with pytest.raises(OptionError, match=f"{name} is {value}"):
+        run_stage("train", bundle, tmp_path / "run", dataclasses.replace(SCHEDULE, **{name: value}))
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_that_cannot_be_made_is_refused_before_the_work(
+    bundle: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def working(*_: object) -> None:
+        raise AssertionError("the work began")
+
+    monkeypatch.setattr(loop, "step_losses", working)
+    monkeypatch.setattr(pretraining, "contrastive_step", working)
+    (tmp_path / "file").write_text("")
+    for stage in STAGES:
+        with pytest.raises(OutputError, match="create"):
+            run_stage(stage, bundle, tmp_path / "none" / "run")
+        with pytest.raises(OutputError, match="file"):
+            run_stage(stage, bundle, tmp_path / "file")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+@pytest.mark.parametrize("file", [LOG, f"{CHECKPOINT}.part"])
+def test_a_full_disk_is_told_and_leaves_the_old_checkpoint(tmp_path: Path, file: str) -> None:
+    model = nn.Linear(1, 1)
+    run = Run(tmp_path / "run", model, SCHEDULE, torch.Generator())
+    run.save()
+    before = (run.folder / CHECKPOINT).read_bytes()
+    (run.folder / file).symlink_to("/dev/full")
+    with pytest.raises(OutputError, match="cannot write into"):
+        run.train(lambda: {"total": model.weight.square().sum()}, quiet)
+    assert (run.folder / CHECKPOINT).read_bytes() == before
+
+
+def test_the_average_is_the_moving_average_of_the_weights(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    model, weights = nn.Linear(2, 1), []
+    run = Run(tmp_path / "run", model, SCHEDULE, torch.Generator())
+
+    def losses() -> dict[str, torch.Tensor]:
+        weights.append(model.weight.detach().clone())
+        return {"total": model(torch.ones(1, 2)).square().sum()}
+
+    run.train(losses, quiet)
+    expected = weights[1]
+    for value in [*weights[2:], model.weight.detach()]:
+        expected = 0.9 * expected + 0.1 * value
+    torch.testing.assert_close(run.average.module.weight.detach(), expected)
+    assert not torch.allclose(expected, model.weight)
+
+
+def test_a_time_limit_ends_the_schedule(bundle: Bundle, tmp_path: Path) -> None:
+    limited = dataclasses.replace(SCHEDULE, steps=10**6, minutes=1e-9)
+    run_stage("train", bundle, tmp_path / "run", limited)
+    assert [line["step"] for line in curve(tmp_path / "run")] == [1]
+    assert torch.load(tmp_path / "run" / CHECKPOINT, weights_only=True)["step"] == 1
+
+
+def test_learning_rate_warms_up_and_falls_to_zero() -> None:
+    schedule = ScheduleConfig(steps=1000, warmup_steps=10)
+    shares = [learning_rate_share(step, step / 1000, schedule) for step in range(1001)]
+    assert shares[0] == pytest.approx(0.1)
+    assert shares[500] == pytest.approx(0.5)
+    assert shares[1000] == pytest.approx(0, abs=1e-12)
+    assert shares[10:] == sorted(shares[10:], reverse=True)
+    assert learning_rate_share(20, 0.5, schedule) == pytest.approx(0.5), "time may be further on than steps"
+
+
+def test_two_processes_descend_the_curve_of_one(home: Path, bundle: Bundle, tmp_path: Path) -> None:
+    (tmp_path / "bundle.safetensors").symlink_to(home / "bundle.safetensors")
+    (tmp_path / "shared.py").write_text(SHARED)
+    subprocess.run(
+        [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", tmp_path / "shared.py",
+         str(tmp_path)],
+        check=True, capture_output=True, text=True, timeout=120,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"})
+    alone = run_stage("train", bundle, tmp_path / "alone", SHARDED)
+    assert [line["step"] for line in curve(tmp_path / "shared")] == [2, 4, 6, 8, 10]
+    assert curve(tmp_path / "shared") == [pytest.approx(line, rel=1e-4, abs=1e-7) for line in curve(tmp_path / "alone")]
+    shared = torch.load(tmp_path / "shared" / CHECKPOINT, weights_only=True)["model"]
+    whole = torch.load(tmp_path / "alone" / CHECKPOINT, weights_only=True)["model"]
+    for name in alone.state_dict():
+        if "running" not in name and "tracked" not in name:  # those of training are each process's own
+            torch.testing.assert_close(shared[name], whole[name], rtol=1e-4, atol=1e-5)
+    run_stage("pretrain", bundle, tmp_path / "alone before", SHARDED)
+    assert curve(tmp_path / "before") == [pytest.approx(x, rel=1e-4) for x in curve(tmp_path / "alone before")]
+    run_stage("train", bundle, tmp_path / "other", SCHEDULE)
+    assert curve(tmp_path / "other")[0] != pytest.approx(curve(tmp_path / "alone")[0], rel=1e-4), "two shards see more"
+
+
+def test_shards_that_cannot_be_shared_out_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match=r"3 shards .* 2 processes; give a multiple of 2"):
+        Run(tmp_path / "run", nn.Linear(1, 1), dataclasses.replace(SCHEDULE, shards=3), torch.Generator(), Processes(0, 2))
+
+
+def test_tensorboard_gets_the_log_where_it_is_installed(
+    bundle: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    schedule = dataclasses.replace(SCHEDULE, steps=4, tensorboard=True)
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    run_stage("pretrain", bundle, tmp_path / "without", schedule)
+    written: list[tuple[str, float, int]] = []
+
+    class SummaryWriter:
+        def __init__(self, folder: str) -> None:
+            assert Path(folder) == tmp_path / "with"
+
+        def add_scalar(self, name: str, value: float, step: int) -> None:
+            written.append((name, value, step))
+
+        def close(self) -> None:
+            written.append(("closed", 0.0, 0))
+
+    module = ModuleType("torch.utils.tensorboard")
+    module.__dict__["SummaryWriter"] = SummaryWriter
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", module)
+    run_stage("pretrain", bundle, tmp_path / "with", schedule)
+    log = curve(tmp_path / "with")
+    assert log == curve(tmp_path / "without")
+    assert written == [*(("total", line["total"], line["step"]) for line in log), ("closed", 0.0, 0)]

@@ -1,0 +1,190 @@
+"""The page that makes grasps: its parts called as the browser calls them, and (slow) a browser that uses it from end to end."""
+
+from __future__ import annotations
+
+import io
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import viser
+import yaml
+
+from dro_grasp.errors import OptionError
+from dro_grasp.evaluation.coverage import HALF_AXES, half_axis_direction
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.library import BUILTIN_FOLDER
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.viewer import studio as module
+from dro_grasp.viewer.studio import EXPORTS, Studio, chosen
+from dro_grasp.viewer.uploads import MOST_BYTES, store_upload
+from tests.helpers.browser import free_port, page_of
+from tests.helpers.weights import untrained_weights
+
+pytestmark = pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")
+
+
+@pytest.fixture(scope="module")
+def studio(tmp_path_factory: pytest.TempPathFactory):
+    made = Studio("gripper3", "sphere", str(untrained_weights(tmp_path_factory.mktemp("weights"))), port=free_port())
+    yield made
+    made.stop()
+
+
+@pytest.fixture(scope="module")
+def made(studio: Studio) -> module.Made:
+    studio.num.value = 6
+    studio._guarded(studio._generate)
+    assert studio.made is not None, studio.status.content
+    return studio.made
+
+
+def test_it_starts_empty_and_for_this_machine_alone(studio: Studio) -> None:
+    assert studio.server.get_host() == "127.0.0.1"
+    assert "Generate" in studio.status.content or "held" in studio.status.content
+
+
+def test_generating_shows_the_best_and_says_what_held(studio: Studio, made: module.Made) -> None:
+    assert len(made.refined) == len(made.raw) == 6
+    scores = made.refined.score.tolist()
+    assert scores == sorted(scores, reverse=True)
+    assert f"**{int(made.refined.success.sum())}** held" in studio.status.content
+    assert "Grasp 0" in studio.text.content
+    expected = made.refined.T_object_wrist[0] @ made.hand.tree.forward(made.refined.joints[0])
+    np.testing.assert_allclose(studio.stage.links[0].position, expected[0, :3, 3], atol=1e-5)
+    studio.stage_of.value = "network"
+    studio._show()
+    np.testing.assert_allclose(studio.stage.links[0].position, made.raw.T_object_wrist[0, :3, 3], atol=1e-5)
+    studio.stage_of.value = "refined"
+
+
+def test_filters_keep_what_they_say(studio: Studio, made: module.Made) -> None:
+    half = made.refined.replace(success=torch.arange(6) % 2 == 0)
+    assert chosen(made.hand, half, "succeeded", "any").tolist() == [True, False] * 3
+    assert chosen(made.hand, half, "failed", "any").tolist() == [False, True] * 3
+    palms = made.hand.palm_directions(half.T_object_wrist)
+    counts = 0
+    for axis in HALF_AXES:
+        keep = chosen(made.hand, half, "all", axis)
+        counts += int(keep.sum())
+        assert bool((palms[keep] @ torch.tensor(half_axis_direction(axis)) > 0.57).all())
+    assert counts == 6
+    studio.palm.value = next(a for a in HALF_AXES if not chosen(made.hand, made.refined, "all", a).any())
+    studio._filter()
+    assert studio.text.content == "No grasp is like that."
+    assert studio.play.disabled
+    studio.palm.value = "any"
+    studio._filter()
+
+
+def test_a_trial_plays_and_ends_where_it_began(studio: Studio, made: module.Made, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module.time, "sleep", lambda _: None)
+    seen = []
+    honest = studio.stage.show
+
+    def show(joints, T, T_object=None):
+        seen.append(T_object)
+        honest(joints, T, T_object)
+
+    monkeypatch.setattr(studio.stage, "show", show)
+    studio._guarded(studio._play)
+    moved = [T for T in seen if T is not None]
+    assert len(moved) > 50
+    assert float((moved[0] - torch.eye(4)).abs().max()) < 1e-4, "the object starts where it was"
+    assert seen[-1] is None
+
+
+@pytest.mark.parametrize("kind", EXPORTS)
+def test_what_is_taken_away_is_what_is_shown(studio: Studio, made: module.Made, kind: str) -> None:
+    name, content = studio.exported(kind)
+    assert name.startswith("gripper3_sphere")
+    if name.endswith(".parquet"):
+        assert torch.equal(GraspBatch.load(io.BytesIO(content)).joints, made.refined.joints)
+    elif name.endswith(".csv"):
+        assert len([x for x in content.decode().splitlines() if not x.startswith("#")]) == 7
+    else:
+        read = yaml.safe_load(content)
+        assert len(read["grasps"] if isinstance(read, dict) else read) == 6
+
+
+def test_uploads_are_picked_and_errors_are_shown(studio: Studio) -> None:
+    text = (BUILTIN_FOLDER / "gripper3.urdf").read_bytes()
+    studio._guarded(lambda: studio._take(viser.UploadedFile(name="../mine.urdf", content=text), studio.hand))
+    assert studio.hand.value.endswith("mine.urdf")
+    assert ".." not in studio.hand.value
+    studio._guarded(lambda: studio._take(viser.UploadedFile(name="bad.urdf", content=b"<robot"), studio.hand))
+    studio._guarded(studio._generate)
+    assert studio.status.content.startswith("**Error:**")
+    assert "bad.urdf" in studio.status.content
+    studio.hand.value = "gripper3"
+
+
+def test_one_thing_at_a_time(studio: Studio) -> None:
+    with studio._busy:
+        studio._guarded(lambda: pytest.fail("done beside other work"))
+    assert "Still at work" in studio.status.content
+
+
+def zipped(**files: bytes) -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return file.getvalue()
+
+
+def test_a_zip_file_is_unpacked_and_its_description_found(tmp_path: Path) -> None:
+    content = zipped(**{"hand/mine.urdf": b"<robot/>", "hand/meshes/a.stl": b"1", "other.xml": b"<x/>"})
+    assert store_upload("mine.zip", content, tmp_path) == tmp_path / "hand" / "mine.urdf"
+    assert (tmp_path / "hand" / "meshes" / "a.stl").read_bytes() == b"1"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "word"),
+    [
+        ("a.urdf", b"x" * (MOST_BYTES + 1), "at most 20"), ("..", b"", "no file name"), ("a.zip", b"no zip", "no ZIP file"),
+        ("a.zip", zipped(**{"../evil.urdf": b"x"}), "leads out"), ("a.zip", zipped(**{"/evil.urdf": b"x"}), "leads out"),
+        ("a.zip", zipped(**{"a.stl": b"x"}), "no URDF or MJCF"),
+        ("a.zip", zipped(**{f"{i}.urdf": b"" for i in range(1001)}), "1001 files"),
+    ],
+)
+def test_uploads_that_could_harm_are_refused(name: str, content: bytes, word: str, tmp_path: Path) -> None:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    with pytest.raises(OptionError, match=word):
+        store_upload(name, content, folder)
+    assert [p.name for p in tmp_path.iterdir()] == ["in"]
+
+
+@pytest.mark.slow
+def test_a_browser_goes_all_the_way(tmp_path: Path) -> None:
+    mesh, urdf = tmp_path / "block.stl", tmp_path / "mine.urdf"
+    urdf.write_bytes((BUILTIN_FOLDER / "gripper3.urdf").read_bytes())
+    import trimesh
+
+    box = load_object("sphere")
+    trimesh.Trimesh(box.vertices, box.faces).export(mesh)
+    with page_of(size=(1280, 860)) as page:
+        inputs = page.locator("input[type=file]")
+        inputs.nth(0).set_input_files(urdf)
+        page.get_by_text("mine.urdf is picked").wait_for(timeout=60_000)
+        inputs.nth(1).set_input_files(mesh)
+        page.get_by_text("block.stl is picked").wait_for(timeout=60_000)
+        page.get_by_role("button", name="Generate", exact=True).click(timeout=60_000)
+        page.get_by_text("held under").wait_for(timeout=180_000)
+        page.get_by_role("button", name="network", exact=True).click(timeout=60_000)
+        page.get_by_role("button", name="refined", exact=True).click(timeout=60_000)
+        page.get_by_role("button", name="Play the trial").click(timeout=60_000)
+        page.get_by_text("Played.").wait_for(timeout=180_000)
+        time.sleep(1)
+        with page.expect_download(timeout=60_000) as download:
+            page.get_by_role("button", name="Download what is shown").click()
+        saved = tmp_path / "taken.parquet"
+        download.value.save_as(saved)
+        time.sleep(3)
+        page.screenshot(path=tmp_path / "page.png")
+    assert len(GraspBatch.load(saved)) == 16
+    assert (tmp_path / "page.png").stat().st_size > 20_000
