@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dro_grasp.geometry.registration import register
+from dro_grasp.geometry.se3 import apply_to_cloud
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ def _settle(
     for _ in range(config.rounds):
         points = torch.where(second[..., None], candidates[:, 1], candidates[:, 0])
         T, _ = register(local, points, weight)
-        posed = local @ T[..., :3, :3].mT + T[..., None, :3, 3]
+        posed = apply_to_cloud(T, local)
         away = (candidates - posed[:, None]).square().sum(-1) + misfit
         second = away[:, 1] < away[:, 0]
     return second, (away.amin(1) * weight).sum(-1) / weight.sum(-1)

@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dro_grasp.geometry.se3 import compose
+
 
 def register(
     source: Float[Tensor, "*b n 3"],
@@ -44,10 +46,4 @@ def register(
     error = target - source @ rotation.mT - shift[..., None, :]
     # The root has an infinite slope at zero error: the floor is far below a micrometre.
     residual = ((error.square().sum(-1) * share).sum(-1) + 1e-16).sqrt()
-    return _pose(rotation, shift), residual
-
-
-def _pose(rotation: Float[Tensor, "*b 3 3"], shift: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
-    top = torch.cat([rotation, shift[..., None]], -1)
-    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
-    return torch.cat([top, bottom], -2)
+    return compose(rotation, shift), residual
