@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 
 import torch
@@ -175,17 +176,28 @@ class GraspEnergy:
             contacts: Where the hand may touch.
             device: Where the energy is evaluated; hand, field and centre are given on the CPU.
         """
-        self.config, self.length = config or EnergyConfig(), length
+        self.length = length
         self.candidates: ContactCandidates = on_device(contact_candidates(hand, contacts), device)
         self.spheres = on_device(link_spheres(hand), device)
-        thin = hand.with_points(min(self.config.hand_points, hand.n_points)).to(device)
-        hand = hand.to(device)
+        self.source, hand = hand, hand.to(device)
         self.hand, self.field, self.centre = hand, on_device(field, device), centre.to(device)
         self.one_hot = torch.eye(hand.tree.n_links, dtype=hand.tree.origin.dtype, device=device)
-        self.body = LinkPoints.of(thin.link_points, thin.link_index, hand.tree.n_links)
         self.contact_points = LinkPoints.of(self.candidates.points, self.candidates.links, hand.tree.n_links)
         self.ball = LinkPoints.of(self.spheres.centres, self.spheres.links, hand.tree.n_links)
-        room = self.config.closing_room * (hand.tree.upper - hand.tree.lower) * ~hand.abduction
+        self._weigh(config or EnergyConfig())
+
+    def weighted(self, config: EnergyConfig) -> GraspEnergy:
+        """This energy under other weights; contacts, link spheres and distance field are shared."""
+        other = copy(self)
+        other._weigh(config)
+        return other
+
+    def _weigh(self, config: EnergyConfig) -> None:
+        """Set the weights and what depends on them."""
+        hand = self.hand
+        thin = self.source.with_points(min(config.hand_points, hand.n_points)).to(hand.link_points.device)
+        self.config, self.body = config, LinkPoints.of(thin.link_points, thin.link_index, hand.tree.n_links)
+        room = config.closing_room * (hand.tree.upper - hand.tree.lower) * ~hand.abduction
         self.lower = torch.where(hand.opening > 0, hand.tree.lower + room, hand.tree.lower)
         self.upper = torch.where(hand.opening > 0, hand.tree.upper, hand.tree.upper - room)
 

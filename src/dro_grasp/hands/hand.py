@@ -197,9 +197,7 @@ class Hand:
             raise ValueError(f"hand '{self.name}' has {self.n_points} points, {count} were asked for")
         if count == self.n_points:
             return self
-        order = farthest_points(self.points(self.canonical_joints()), self.n_points)
-        rank = torch.empty_like(order)
-        rank[order] = torch.arange(self.n_points)
+        rank = self.spread_rank
         per_link = max(1, min(POINTS_PER_LINK, count // max(1, len(self.link_index.unique()))))
         first = torch.zeros(self.n_points, dtype=torch.bool)
         for link in self.link_index.unique().tolist():
@@ -211,6 +209,12 @@ class Hand:
             self, link_points=self.link_points[keep], link_normals=self.link_normals[keep],
             link_index=self.link_index[keep],
         )
+
+    @cached_tensor
+    def spread_rank(self) -> Int[Tensor, " n_hand"]:
+        """Place of each point in a farthest point sampling of the open hand: points of low rank are spread evenly."""
+        order = farthest_points(self.points(self.canonical_joints()), self.n_points)
+        return torch.empty_like(order).index_copy(0, order, torch.arange(self.n_points, device=order.device))
 
     def to_tensors(self) -> dict[str, Any]:
         """Tensors and plain values that `from_tensors` turns back into this hand, without its description."""
