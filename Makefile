@@ -1,10 +1,10 @@
-# make setup | demo | test | test-slow | lint | docs | rehearse | docs-pictures | data | clean
+# make setup | demo | test | test-slow | lint | wheels | docs | rehearse | docs-pictures | data | clean
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo test test-slow lint docs rehearse docs-pictures data clean
+.PHONY: setup demo test test-slow lint wheels docs rehearse docs-pictures data clean
 
 setup: $(STAMP)
 
@@ -30,6 +30,10 @@ lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/pyright
+	$(BIN)/pyright --pythonversion 3.13
+
+wheels: setup  # every runtime dependency has a wheel for the newer Pythons; needs the package index
+	$(BIN)/python scripts/check_wheels.py 3.12 3.13
 
 docs: setup  # the documents as a site in out/site; fails on unknown names and broken links
 	$(BIN)/zensical build --strict --clean

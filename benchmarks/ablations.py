@@ -142,12 +142,12 @@ def trained(name: str, ablation: Ablation, folder: Path, steps: int) -> tuple[Di
     return model, time.perf_counter() - begin
 
 
-def measured(name: str, ablation: Ablation, folder: Path, steps: int, num: int) -> dict[str, Any]:
-    """Train and try one row."""
+def measured(name: str, ablation: Ablation, folder: Path, steps: int, num: int, object_names: list[str]) -> dict[str, Any]:
+    """Train and evaluate one row."""
     model, seconds = trained(name, ablation, folder, steps)
     predictor = GraspPredictor()
     predictor.network, predictor.weights_name = model, name
-    objects = [load_object(o) for o in resolve_objects(["assets:validate"])]
+    objects = [load_object(o) for o in resolve_objects(object_names)]
     config = BenchmarkConfig(num, (RAW, REFINED), (protocol("dro"), protocol("strict")), controls=False, view=ablation.view)
     rows = benchmark([load_hand(h) for h in ablation.tried], objects, predictor, config)
     errors = []
@@ -186,20 +186,22 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS), help="rows to train")
     parser.add_argument("--steps", type=int, default=800, help="training steps of 16 samples")
     parser.add_argument("--num", type=int, default=10, help="grasps of each hand on each object")
+    parser.add_argument("--objects", nargs="+", default=["assets:validate"], help="objects of the trials, such as builtin:test")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(argv)
     torch.set_num_threads(1)
     options.output.mkdir(exist_ok=True)
     results = []
     for name in options.rows:
-        stored = options.output / f"{name.replace(' ', '_')}.json"
+        where = "" if options.objects == ["assets:validate"] else f" on {' '.join(options.objects)}"
+        stored = options.output / f"{f'{name}{where}'.replace(' ', '_')}.json"
         if not stored.exists():
-            result = measured(name, ROWS[name], options.output, options.steps, options.num)
+            result = measured(name, ROWS[name], options.output, options.steps, options.num, options.objects)
             stored.write_text(json.dumps(result))
         results.append(json.loads(stored.read_text()))
     columns = ["row", "hand", "n", "dro raw", "strict raw", "dro refined", "strict refined", "diversity", "posterior [mm]",
                "prior [mm]", "nats", "minutes"]
-    emit(f"{options.steps} steps of 16 samples, {options.num} grasps of each hand on each validate object",
+    emit(f"{options.steps} steps of 16 samples, {options.num} grasps of each hand on each of {' '.join(options.objects)}",
          [line for result in results for line in cells(result)], columns,
          {result["row"]: result for result in results}, options.json)
 

@@ -1,9 +1,8 @@
-"""Sixteen grasps of an object that the weights have never seen: predicted, polished, ranked, tried, drawn."""
+"""Sixteen grasps of an object that the weights have never seen: predict, refine, rank, evaluate and draw them."""
 
 from pathlib import Path
 
 import dro_grasp as dro
-from dro_grasp.viewer.pictures import draw_grasps
 
 hand = dro.load_hand("allegro")
 obj = dro.load_object("rubber_duck")
@@ -15,7 +14,6 @@ grasps = grasps.with_trial(dro.simulate(hand, obj, grasps, "strict"))
 out = Path("out")
 out.mkdir(exist_ok=True)
 grasps.save(out / "grasps.parquet")
-draw_grasps(hand, obj, grasps, out / "grasps.png")
+dro.draw_grasps(hand, obj, grasps, out / "grasps.png")
 
 print(f"{int(grasps.success.sum())} of {len(grasps)} hold under protocol 'strict'; see {out}/grasps.png")
-print("seconds:", {part: round(seconds, 2) for part, seconds in predictor.timings.items()})

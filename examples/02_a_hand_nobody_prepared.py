@@ -1,4 +1,4 @@
-"""A URDF written a moment ago: what is derived from it, and its first grasps, synthesised from geometry alone."""
+"""A URDF that was written a moment ago: check it, then synthesise its first grasps from geometry alone."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ BAR = "".join(
 
 
 def finger(name: str, x: float, y: float, axis: str) -> str:
-    """Two links; the outer joint follows the inner one."""
+    """URDF of two links; the outer joint follows the inner one."""
     limit = '<limit lower="0" upper="1.4" effort="5" velocity="2"/>'
     return (
         f'<link name="{name}_near">{BAR}</link><link name="{name}_far">{BAR}</link>'
@@ -28,12 +28,11 @@ out.mkdir(exist_ok=True)
 path = out / "my_hand.urdf"
 path.write_text(f'<robot name="my_hand">{PALM}{"".join(fingers)}</robot>')
 
+for line in dro.check_hand(path).lines():
+    print(line)
 hand = dro.load_hand(path)
-print(f"{hand.name}: {hand.tree.n_dof} independent joints {hand.tree.joint_names}, {len(hand.tips)} fingertips")
-print("palm direction in the wrist frame:", [round(x, 2) for x in hand.palm_direction_wrist.tolist()])
-
 obj = dro.load_object("can")
 grasps = dro.synthesize(hand, obj, num=64)[slice(0, 16)]
 result = dro.simulate(hand, obj, grasps, "strict")
-print(f"{int(result.success.sum())} of the best {len(grasps)} synthesised grasps hold; what became of the others:")
+print(f"{int(result.success.sum())} of the best {len(grasps)} synthesised grasps hold; the others failed for these reasons:")
 print({reason.split(",")[0] for reason in result.reason if reason})

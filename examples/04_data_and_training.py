@@ -1,23 +1,29 @@
-"""From nothing to weights of one's own: data for a hand, a bundle, pretraining, training. Minutes here, hours in earnest."""
+"""From nothing to weights of your own: synthesise, bundle, pretrain, train, predict. Minutes here, hours in earnest."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from dro_grasp.cli.main import main as dro_grasp
+import dro_grasp as dro
 
-COMMANDS = (
-    "synthesize --hand gripper3 --object can sphere --grasps 20 --output @data",
-    "dataset info @data",
-    "dataset bundle @data --output @bundle.safetensors",
-    "pretrain --bundle @bundle.safetensors --run-folder @pre --output @pretrained.safetensors --steps 3",
-    "train --bundle @bundle.safetensors --run-folder @main --pretrained @pretrained.safetensors --output @mine.safetensors "
-    "--steps 3",
-    "generate --hand gripper3 --object torus --weights @mine.safetensors --num 4",
-)
 
-# Worker processes read this file as well, and must not start all over.
+def main(folder: Path) -> None:
+    """Make data and weights in a folder, then grasp with them."""
+    dro.synthesize_dataset(["gripper3"], ["can", "sphere"], 20, folder / "data", workers=2)
+    for pair in dro.read_collection(folder / "data"):
+        print(f"{len(pair.grasps)} grasps of {pair.object} by {pair.hand} hold under protocol 'strict'")
+    bundle, _ = dro.make_bundle([folder / "data"], folder / "bundle.safetensors")
+
+    network, schedule = dro.NetworkConfig.slim(), dro.ScheduleConfig(steps=3)
+    encoder = dro.pretrain(bundle, network, dro.PretrainConfig(schedule), folder / "pretraining")
+    trained = dro.train(bundle, network, dro.TrainConfig(schedule), folder / "training", encoder)
+    dro.save_weights(trained, folder / "mine.safetensors")
+
+    predictor = dro.GraspPredictor(str(folder / "mine.safetensors"))
+    grasps = predictor.predict(dro.load_hand("gripper3"), dro.load_object("torus"), num=4)
+    print(f"{len(grasps)} grasps of a torus, with scores {[round(score, 2) for score in grasps.score.tolist()]}")
+
+
+# Worker processes import this file, and must not start all over.
 if __name__ == "__main__":
     with TemporaryDirectory() as name:
-        for command in COMMANDS:
-            print(f"$ dro-grasp {command}")
-            assert dro_grasp(command.replace("@", f"{Path(name)}/").split()) == 0
+        main(Path(name))

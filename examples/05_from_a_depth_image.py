@@ -1,24 +1,23 @@
-"""Grasps from above of what a depth camera sees, in the frame of the robot's base, above the table."""
+"""Grasps of an object in a depth image: from above, over a table, in the frame of the robot's base."""
 
 import numpy as np
 import torch
 
 import dro_grasp as dro
-from dro_grasp.perception.camera import DepthCamera, visible_points
 
-# A rendered view stands in for the camera. The duck's frame plays the robot's base; the camera looks at it from one metre
-# away, from the side and above, with z along its view, x to the right and y down, as drivers of depth cameras have it.
+# A rendered view stands in for the camera, and the duck's frame for the robot's base. The camera looks at the duck from one
+# metre away, from the side and above. Its z axis points forward, x right and y down, as in drivers of depth cameras.
 duck = dro.load_object("rubber_duck")
-direction, camera = torch.tensor([1.0, 0.3, 1.2]), DepthCamera(distance=1.0, noise=0.001)
+direction, camera = torch.tensor([1.0, 0.3, 1.2]), dro.DepthCamera(distance=1.0, noise=0.001)
 ahead = -direction.double().numpy() / float(direction.norm())
 right = np.cross(ahead, [0.0, 0.0, 1.0])
 right /= np.linalg.norm(right)
 T_base_camera = np.eye(4)
 T_base_camera[:3, :3] = np.stack([right, np.cross(ahead, right), ahead], 1)
 T_base_camera[:3, 3] = camera.place(duck, direction)
-in_base = visible_points(duck, direction, torch.Generator().manual_seed(0), camera).double().numpy()
+in_base = dro.visible_points(duck, direction, torch.Generator().manual_seed(0), camera).double().numpy()
 
-# With a real camera: points = dro.depth_points(depth, intrinsics, mask), and its pose from the calibration.
+# With a real camera: points = dro.depth_points(depth, intrinsics, mask), and T_base_camera from the calibration.
 points = (in_base - T_base_camera[:3, 3]) @ T_base_camera[:3, :3]
 obj = dro.scanned_object("seen", points, T_base_camera)
 

@@ -14,6 +14,16 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 
+def test_a_missing_wheel_fails_the_check_and_is_named(tmp_path: Path) -> None:
+    environment = os.environ | {"PIP_NO_INDEX": "1", "PIP_FIND_LINKS": str(tmp_path), "PIP_CONFIG_FILE": os.devnull}
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "scripts" / "check_wheels.py"), "3.13"], env=environment, capture_output=True, text=True,
+        timeout=120)
+    assert done.returncode == 1
+    assert "Python 3.13" in done.stderr
+    assert "torch" in done.stderr
+
+
 @pytest.mark.slow
 def test_the_wheel_holds_all_that_grasping_needs(tmp_path: Path) -> None:
     pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]

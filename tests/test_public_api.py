@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -11,11 +14,50 @@ import pytest
 import dro_grasp as dro
 from tests.helpers.weights import untrained_weights
 
+ROOT = Path(__file__).parents[1]
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+NAMES = sorted(set(dro.__all__) - {"__version__"})
 
-@pytest.mark.parametrize("name", dro.__all__)
-def test_every_public_name_exists_and_is_documented(name: str) -> None:
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_public_name_has_a_docstring_of_its_own(name: str) -> None:
     value = getattr(dro, name)
-    assert name == "__version__" or (value.__doc__ or "").strip()
+    # A dataclass without a docstring gets its signature, a subclass its parent's.
+    own = vars(value).get("__doc__") if inspect.isclass(value) else value.__doc__
+    assert own, name
+    assert not own.startswith(f"{name}("), name
+
+
+def test_the_names_for_type_checkers_are_those_of_the_lazy_table() -> None:
+    tree = ast.parse(inspect.getsource(dro))
+    (block,) = (node for node in tree.body if isinstance(node, ast.If))
+    stated = {alias.asname or alias.name: node.module for node in block.body if isinstance(node, ast.ImportFrom)
+              for alias in node.names}
+    assert stated == {name: f"dro_grasp.{module}" for name, module in dro._EXPORTS.items()}
+    assert dro.__all__ == sorted(set(dro.__all__), key=dro.__all__.index), "a name is stated twice"
+    assert set(stated) == set(NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_lazy_table_names_the_module_that_defines_it(name: str) -> None:
+    assert getattr(dro, name).__module__ == f"dro_grasp.{dro._EXPORTS[name]}"
+
+
+def test_the_python_page_documents_every_public_name_and_no_other() -> None:
+    documented = re.findall(r"^::: dro_grasp\.(\w+)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE)
+    assert sorted(documented) == NAMES
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.stem)
+def test_examples_import_the_package_alone(path: Path) -> None:
+    tree = ast.parse(path.read_text())
+    imported = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+    imported |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module}
+    assert {name for name in imported if name.partition(".")[0] == "dro_grasp"} == {"dro_grasp"}
+    used = {node.attr for node in ast.walk(tree)
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "dro"}
+    assert used
+    assert used <= set(dro.__all__)
 
 
 def test_unknown_names_are_attribute_errors() -> None:
@@ -23,8 +65,9 @@ def test_unknown_names_are_attribute_errors() -> None:
         _ = dro.nothing_such
 
 
-def test_importing_the_package_loads_nothing() -> None:
-    code = "import sys, dro_grasp; print(sorted({'torch', 'numpy', 'mujoco', 'trimesh'} & set(sys.modules)))"
+@pytest.mark.parametrize("module", ["dro_grasp", "dro_grasp.cli.main"])
+def test_neither_the_package_nor_the_command_loads_libraries_before_they_are_used(module: str) -> None:
+    code = f"import sys, {module}; print(sorted({{'torch', 'numpy', 'scipy', 'mujoco', 'trimesh'}} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

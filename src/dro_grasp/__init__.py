@@ -9,54 +9,150 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from dro_grasp.datasets.bundle.bundling import make_bundle
+    from dro_grasp.datasets.bundle.training_file import load_bundle
     from dro_grasp.datasets.collections.collection import read_collection
     from dro_grasp.datasets.engine.schedule import synthesize_dataset
     from dro_grasp.errors import DroGraspError
+    from dro_grasp.evaluation.controls import palm_facing_starts
+    from dro_grasp.evaluation.metrics import wilson_interval
+    from dro_grasp.export.formats import Frame, csv_table, dexgraspbench, isaac_grasp, moveit_grasps
     from dro_grasp.grasps.batch import GraspBatch
+    from dro_grasp.hands.check import HandReport, check_hand
     from dro_grasp.hands.hand import Hand
-    from dro_grasp.hands.library import load_hand
-    from dro_grasp.objects.catalogue import load_object
+    from dro_grasp.hands.library import hand_names, load_hand
+    from dro_grasp.models.checkpoints import load_weights, save_weights
+    from dro_grasp.models.network import NetworkConfig
+    from dro_grasp.objects.catalogue import load_object, object_names
     from dro_grasp.objects.shape import ObjectModel
-    from dro_grasp.optimization.synthesis import synthesize
+    from dro_grasp.optimization.refinement import RefineConfig, refine_grasps
+    from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
+    from dro_grasp.perception.camera import DepthCamera, visible_points
     from dro_grasp.perception.scan import depth_points, scanned_object
-    from dro_grasp.predictor import GraspPredictor
-    from dro_grasp.simulation.trial import TrialResult, simulate
+    from dro_grasp.predictor import GraspPredictor, PredictorConfig
+    from dro_grasp.ranking.score import score_grasps
+    from dro_grasp.simulation.outcome import TrialResult
+    from dro_grasp.simulation.protocols import Protocol
+    from dro_grasp.simulation.trial import simulate
+    from dro_grasp.training.config import (
+        AugmentationConfig,
+        LossConfig,
+        MotionConfig,
+        PretrainConfig,
+        ScheduleConfig,
+        TrainConfig,
+    )
+    from dro_grasp.training.loop import train
+    from dro_grasp.training.pretraining import pretrain, pretrain_motion
+    from dro_grasp.viewer.app import view_grasps
+    from dro_grasp.viewer.pictures import draw_grasps
 
 from dro_grasp._version import __version__
 
 _EXPORTS = {
+    "AugmentationConfig": "training.config",
+    "DepthCamera": "perception.camera",
     "DroGraspError": "errors",
+    "Frame": "export.formats",
     "GraspBatch": "grasps.batch",
     "GraspPredictor": "predictor",
     "Hand": "hands.hand",
+    "HandReport": "hands.check",
+    "LossConfig": "training.config",
+    "MotionConfig": "training.config",
+    "NetworkConfig": "models.network",
     "ObjectModel": "objects.shape",
-    "TrialResult": "simulation.trial",
+    "PredictorConfig": "predictor",
+    "PretrainConfig": "training.config",
+    "Protocol": "simulation.protocols",
+    "RefineConfig": "optimization.refinement",
+    "ScheduleConfig": "training.config",
+    "SynthesisConfig": "optimization.synthesis",
+    "TrainConfig": "training.config",
+    "TrialResult": "simulation.outcome",
+    "check_hand": "hands.check",
+    "csv_table": "export.formats",
     "depth_points": "perception.scan",
+    "dexgraspbench": "export.formats",
+    "draw_grasps": "viewer.pictures",
+    "hand_names": "hands.library",
+    "isaac_grasp": "export.formats",
+    "load_bundle": "datasets.bundle.training_file",
     "load_hand": "hands.library",
     "load_object": "objects.catalogue",
+    "load_weights": "models.checkpoints",
+    "make_bundle": "datasets.bundle.bundling",
+    "moveit_grasps": "export.formats",
+    "object_names": "objects.catalogue",
+    "palm_facing_starts": "evaluation.controls",
+    "pretrain": "training.pretraining",
+    "pretrain_motion": "training.pretraining",
     "read_collection": "datasets.collections.collection",
+    "refine_grasps": "optimization.refinement",
+    "save_weights": "models.checkpoints",
     "scanned_object": "perception.scan",
+    "score_grasps": "ranking.score",
     "simulate": "simulation.trial",
     "synthesize": "optimization.synthesis",
     "synthesize_dataset": "datasets.engine.schedule",
+    "train": "training.loop",
+    "view_grasps": "viewer.app",
+    "visible_points": "perception.camera",
+    "wilson_interval": "evaluation.metrics",
 }
+"""Module of each public name, below this package."""
 
 __all__ = [
+    "AugmentationConfig",
+    "DepthCamera",
     "DroGraspError",
+    "Frame",
     "GraspBatch",
     "GraspPredictor",
     "Hand",
+    "HandReport",
+    "LossConfig",
+    "MotionConfig",
+    "NetworkConfig",
     "ObjectModel",
+    "PredictorConfig",
+    "PretrainConfig",
+    "Protocol",
+    "RefineConfig",
+    "ScheduleConfig",
+    "SynthesisConfig",
+    "TrainConfig",
     "TrialResult",
     "__version__",
+    "check_hand",
+    "csv_table",
     "depth_points",
+    "dexgraspbench",
+    "draw_grasps",
+    "hand_names",
+    "isaac_grasp",
+    "load_bundle",
     "load_hand",
     "load_object",
+    "load_weights",
+    "make_bundle",
+    "moveit_grasps",
+    "object_names",
+    "palm_facing_starts",
+    "pretrain",
+    "pretrain_motion",
     "read_collection",
+    "refine_grasps",
+    "save_weights",
     "scanned_object",
+    "score_grasps",
     "simulate",
     "synthesize",
     "synthesize_dataset",
+    "train",
+    "view_grasps",
+    "visible_points",
+    "wilson_interval",
 ]
 
 
