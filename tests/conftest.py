@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 # Each worker of pytest-xdist has a core of its own; with more threads they wait for each other.
@@ -22,6 +23,22 @@ def assets_folder() -> Path:
     if not folder or not Path(folder).is_dir():
         pytest.skip("needs the development assets: set DRO_GRASP_ASSETS to their folder")
     return Path(folder)
+
+
+@pytest.fixture(params=["fake", pytest.param("cuda", marks=pytest.mark.gpu)])
+def device(request: pytest.FixtureRequest) -> Iterator[str]:
+    """A device that is not the CPU: the strict fake one, and with the marker `gpu` a real one."""
+    import torch
+
+    from tests.helpers.fake_device import fake_device
+
+    if request.param == "fake":
+        with fake_device() as name:
+            yield name
+    elif not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    else:
+        yield request.param
 
 
 @pytest.fixture(scope="module")

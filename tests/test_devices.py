@@ -1,26 +1,47 @@
-"""Devices: those that are asked for must be there, and records move whole."""
+"""Devices: those asked for must be there, records move whole, and every entry point computes on one what it does on the CPU."""
 
 from __future__ import annotations
+
+import dataclasses
+import functools
+from pathlib import Path
 
 import pytest
 import torch
 
+from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.devices import choose_device, on_device, require_device
 from dro_grasp.energy.grasp_energy import link_spheres
 from dro_grasp.errors import OptionError
+from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
+from dro_grasp.training import loop, pretraining
+from dro_grasp.training.batch_statistics import recalibrate
+from tests.helpers.claw import ball
 from tests.helpers.toy_hand import toy_hand
+from tests.helpers.training_stages import SCHEDULE, STAGES, curve, run_stage
+
+SHORT = dataclasses.replace(SCHEDULE, steps=2, log_every=1)
+NEARLY = {"atol": 1e-5, "rtol": 1e-4}
 
 
 @pytest.mark.parametrize("there", [True, False])
 def test_the_device_is_cuda_where_there_is_one(monkeypatch: pytest.MonkeyPatch, there: bool) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: there)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2 * there)
     assert choose_device("auto") == ("cuda" if there else "cpu")
     assert choose_device("cpu") == "cpu"
     if there:
         assert choose_device("cuda:1") == "cuda:1"
+        with pytest.raises(OptionError, match=r"device is 'cuda:2'.*finds 2 such"):
+            require_device("cuda:2")
     else:
-        with pytest.raises(OptionError, match=r"device is 'cuda:1'.*use --device cpu"):
+        with pytest.raises(OptionError, match=r"device is 'cuda:1'.*finds no such.*use --device cpu"):
             require_device("cuda:1")
+
+
+def test_a_device_without_meaning_is_refused() -> None:
+    with pytest.raises(OptionError, match=r"device is 'gpu'.*cpu, cuda, cuda:1 or mps"):
+        require_device("gpu")
 
 
 def test_records_move_with_what_is_in_them() -> None:
@@ -32,3 +53,28 @@ def test_records_move_with_what_is_in_them() -> None:
     assert hand.to("cpu") is hand
     spheres = on_device(link_spheres(hand), "meta")
     assert {spheres.centres.device.type, spheres.pairs.device.type} == {"meta"}
+
+
+def test_synthesis_on_a_device_gives_the_grasps_of_the_cpu(device: str) -> None:
+    config = SynthesisConfig(steps=4, batch_size=4)
+    here = synthesize(toy_hand(), ball(), 6, config=config)
+    there = synthesize(toy_hand(), ball(), 6, config=dataclasses.replace(config, device=device))
+    assert there.joints.device.type == "cpu"
+    torch.testing.assert_close(there.joints, here.joints, **NEARLY)
+    torch.testing.assert_close(there.T_object_wrist, here.T_object_wrist, **NEARLY)
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_training_on_a_device_gives_the_losses_of_the_cpu(
+    device: str, stage: str, bundle: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (loop, pretraining):
+        monkeypatch.setattr(module, "recalibrate", functools.partial(recalibrate, batches=1))
+    run_stage(stage, bundle, tmp_path / "here", SHORT)
+    model = run_stage(stage, bundle, tmp_path / "there", dataclasses.replace(SHORT, device=device))
+    assert {x.device.type for x in model.state_dict().values()} == {"cpu"}
+    losses = [[torch.tensor(list(line.values())) for line in curve(tmp_path / where)] for where in ("here", "there")]
+    for here, there in zip(*losses, strict=True):
+        assert there.isfinite().all()
+        if device != "cuda":  # it draws other samples
+            torch.testing.assert_close(there, here, **NEARLY)

@@ -1,4 +1,4 @@
-"""Where tensors live: devices that are asked for must be there, and records of tensors move as one."""
+"""Choosing a device for tensors, and moving records of tensors to it."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ Record = TypeVar("Record")
 
 
 def choose_device(name: str) -> str:
-    """The device of a name; `auto` is CUDA where there is one, and else the CPU.
+    """The named device; `auto` stands for CUDA if there is a GPU, and for the CPU otherwise.
 
     Raises:
-        OptionError: There is no such device here.
+        OptionError: This machine has no such device.
     """
     if name == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
@@ -24,19 +24,24 @@ def choose_device(name: str) -> str:
     return name
 
 
-def require_device(device: str) -> None:
-    """Refuse a device that this machine lacks.
+def require_device(name: str) -> None:
+    """Refuse a device that this machine does not have.
 
     Raises:
-        OptionError: There is no such device here.
+        OptionError: The name is no device, or this machine has no such device.
     """
-    if device.startswith("cuda") and not torch.cuda.is_available():
-        raise OptionError(f"device is '{device}', but torch {torch.__version__} finds no CUDA device; use --device cpu, which "
-                          "needs none, or install a build of torch with CUDA")
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise OptionError(f"device is '{name}'; give cpu, cuda, cuda:1 or mps") from None
+    count = {"cuda": torch.cuda.device_count, "mps": torch.mps.device_count}.get(device.type)
+    if count is not None and count() <= (device.index or 0):
+        raise OptionError(f"device is '{name}', but torch {torch.__version__} finds {count() or 'no'} such; use --device cpu, "
+                          f"which always works, or install a build of torch with {device.type.upper()}")
 
 
 def on_device(record: Record, device: torch.device | str) -> Record:
-    """A frozen dataclass with whatever it holds that can move, tensors and records with a `to`, on a device."""
+    """Copy a frozen dataclass to a device: its tensors, and its records that have a `to`."""
     values = {f.name: getattr(record, f.name) for f in dataclasses.fields(record)}  # type: ignore[arg-type]
     moved = {name: value.to(device) for name, value in values.items() if hasattr(value, "to")}
     return dataclasses.replace(record, **moved)  # type: ignore[type-var]
