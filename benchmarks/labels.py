@@ -59,7 +59,6 @@ def measure(hand_name: str, objects: list[str], config: EngineConfig) -> list[ob
         batches.append(grasps)
     joined = GraspBatch.concatenate(batches)
     spread = diversity(joined.T_object_wrist, joined.joints)
-    assert joined.penetration is not None
     depth = float(joined.penetration.median()) * 1e3
     slippery = changed("strict", friction=0.5)
     held = sum(int(simulate(hand, load_object(n), b, slippery).success.sum()) for n, b in zip(objects, batches, strict=True))

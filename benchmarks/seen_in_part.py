@@ -43,7 +43,6 @@ def tried(
     for name in PROTOCOLS:
         success = simulate(hand, obj, grasps, name).success.float()
         found |= {name: success, f"{name}, ranked": success[best]}
-    assert grasps.pregrasp_joints is not None
     points = hand.points(grasps.pregrasp_joints, grasps.T_object_wrist)
     inside = -object_energy(hand, obj).field.distances(points)[0].amin(1) > DEEP
     return found | {"begins inside": inside.float()}

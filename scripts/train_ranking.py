@@ -58,7 +58,7 @@ def shaken(hand: Hand, grasps: GraspBatch, generator: torch.Generator) -> GraspB
     T[:, :3, :3] = roma.rotvec_to_rotmat(turn) @ T[:, :3, :3]
     T[:, :3, 3] += hand.grasp_centres(grasps.T_object_wrist) - hand.grasp_centres(T) + move
     q = (grasps.joints + bend * hand.tree.joint_unit * hand.movable).clamp(hand.tree.lower, hand.tree.upper)
-    return grasps.replace(T_object_wrist=T, joints=q, pregrasp_joints=None, squeeze_joints=None, score=None)
+    return grasps.without("pregrasp_joints", "squeeze_joints", "score", "energy").replace(T_object_wrist=T, joints=q)
 
 
 @torch.no_grad()
@@ -88,7 +88,7 @@ def collect(
         groups = {
             "raw": raw[slice(0, num // 4)], "refined": polished,
             "shaken": shaken(hand, polished[slice(0, num // 2)], generator),
-            "opened": some.replace(joints=opened, pregrasp_joints=None, squeeze_joints=None, score=None),
+            "opened": some.without("pregrasp_joints", "squeeze_joints", "score", "energy").replace(joints=opened),
         }
         parts += [{"hand": name, "object": label, "kind": kind, "view": view, **tried(hand, obj, grasps, known)}
                   for kind, grasps in groups.items()]

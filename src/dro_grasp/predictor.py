@@ -263,10 +263,8 @@ def rotation_between(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tens
 def above_table(hand: Hand, grasps: GraspBatch, table: float) -> Tensor:
     """Mask (n) of the grasps whose hand stays above the plane z = table [m] in the grasp and in the pregrasp."""
     lowest = hand.points(grasps.joints, grasps.T_object_wrist)[..., 2].amin(-1)
-    if grasps.pregrasp_joints is not None:
-        before = hand.points(grasps.pregrasp_joints, grasps.T_object_wrist)[..., 2].amin(-1)
-        lowest = torch.minimum(lowest, before)
-    return lowest > table
+    before = hand.points(grasps.pregrasp_joints, grasps.T_object_wrist)[..., 2].amin(-1)
+    return torch.fmin(lowest, before) > table
 
 
 def check_request(

@@ -27,7 +27,7 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("can", "sphere"):
         obj = load_object(name)
         grasps = synthesize(hand, obj, 24, 0, SynthesisConfig(steps=80, batch_size=24))
-        batches.append(simulate(hand, obj, grasps, "dro").fill(grasps))
+        batches.append(grasps.with_trial(simulate(hand, obj, grasps, "dro")))
     path = tmp_path_factory.mktemp("stored") / "barrett.parquet"
     GraspBatch.concatenate(batches).save(path)
     return path

@@ -59,7 +59,7 @@ def test_the_official_data_set(made, tmp_path: Path, capsys: pytest.CaptureFixtu
         np.testing.assert_allclose(grasps.T_object_wrist[k, :3, :3], R, atol=1e-5)
         np.testing.assert_allclose(grasps.T_object_wrist[k, :3, 3], position[i], atol=1e-6)
     assert grasps.hand == hand.name
-    assert not grasps.tried.any()
+    assert not grasps.evaluated.any()
 
 
 @pytest.mark.parametrize("prefix", ["", "robot0:"])

@@ -72,8 +72,6 @@ def expected(grasps: GraspBatch, i: int, in_camera: bool) -> np.ndarray:
 
 
 def postures(grasps: GraspBatch) -> dict[str, torch.Tensor]:
-    assert grasps.pregrasp_joints is not None
-    assert grasps.squeeze_joints is not None
     return {"pregrasp": grasps.pregrasp_joints, "grasp": grasps.joints, "squeeze": grasps.squeeze_joints}
 
 
@@ -161,7 +159,7 @@ def test_several_objects_get_a_file_each(grasps: GraspBatch, tmp_path: Path, cap
 
 
 def test_missing_pregrasps_are_made(grasps: GraspBatch, tmp_path: Path) -> None:
-    grasps[[0]].replace(pregrasp_joints=None, squeeze_joints=None).save(tmp_path / "bare.parquet")
+    grasps[[0]].without("pregrasp_joints", "squeeze_joints").save(tmp_path / "bare.parquet")
     assert export(tmp_path / "bare.parquet", "--format", "isaac_grasp", "--output", tmp_path / "out.yaml") == 0
     (grasp,) = yaml.safe_load((tmp_path / "out.yaml").read_text())["grasps"].values()
     centre = torch.as_tensor(load_object("mug").centre_of_mass, dtype=torch.float32)
@@ -223,7 +221,7 @@ def test_old_and_new_npy_files_are_not_mixed(
 
 
 def test_a_failed_export_leaves_no_folder(grasps: GraspBatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    grasps.replace(pregrasp_joints=None).save(tmp_path / "all.parquet")
+    grasps.without("pregrasp_joints").save(tmp_path / "all.parquet")
     bad = ("--format", "dexgraspbench", "--hand", "nowhere.urdf", "--output", tmp_path / "out")
     assert export(tmp_path / "all.parquet", *bad) == 2
     assert "nowhere.urdf" in capsys.readouterr().err

@@ -32,19 +32,20 @@ def make(n: int, obj=BALL, seed: int = 0, **optional) -> GraspBatch:
     return GraspBatch.create(HAND, obj, T, joints, seed=seed, provenance="test 1", **optional)
 
 
-def tried(n: int, **optional) -> GraspBatch:
+def evaluated(n: int, **optional) -> GraspBatch:
     trial = SimpleNamespace(
         success=torch.arange(n) % 2 == 0, displacement=torch.rand(n, 6), rotation=torch.rand(n, 6),
         penetration=torch.rand(n), protocol="dro/1",
+        reason=tuple("" if i % 2 == 0 else "slipped by 30 mm" for i in range(n)), contact_links=(("tip",),) * n,
     )
     return make(n, **optional).with_trial(trial)
 
 
 def test_file_round_trip_keeps_every_field(tmp_path):
-    grasps = tried(5, score=torch.rand(5), pregrasp_joints=torch.rand(5, 2)).replace(
-        extra={"energy_contact": torch.rand(5), "contact_links": torch.arange(5), "wrench": torch.rand(5, 6),
-               "note": ["x"] * 5}
-    )
+    grasps = evaluated(5, score=torch.rand(5), pregrasp_joints=torch.rand(5, 2))
+    grasps = grasps.replace(
+        extra=grasps.extra | {"energy_contact": torch.rand(5), "order": torch.arange(5), "wrench": torch.rand(5, 6),
+               "note": ["x"] * 5})
     grasps.save(tmp_path / "g.parquet")
     back = GraspBatch.load(tmp_path / "g.parquet")
     torch.testing.assert_close(back.T_object_wrist, grasps.T_object_wrist, atol=1e-6, rtol=0)
@@ -54,20 +55,22 @@ def test_file_round_trip_keeps_every_field(tmp_path):
     for name in ("hand", "hand_sha256", "wrist_link", "joint_names", "object", "object_sha256", "split",
                  "provenance", "protocol"):
         assert getattr(back, name) == getattr(grasps, name), name
-    assert back.squeeze_joints is None
-    for name in ("energy_contact", "contact_links", "wrench"):
+    assert back.squeeze_joints.isnan().all()
+    for name in ("energy_contact", "order", "wrench"):
         assert torch.equal(back.extra[name], grasps.extra[name]), name
+    assert back.extra["reason"] == ["", *["slipped by 30 mm", ""] * 2]
+    assert back.extra["contact_links"] == [["tip"]] * 5
     assert back.extra["note"] == ["x"] * 5
 
 
-def test_untried_batch_has_null_outcome_in_the_file(tmp_path):
+def test_batch_without_trial_has_null_outcome_in_the_file(tmp_path):
     make(3).save(tmp_path / "g.parquet")
     table = pq.read_table(tmp_path / "g.parquet")
     assert all(table[name].null_count == 3 for name in ("success", "displacement", "protocol"))
     back = GraspBatch.load(tmp_path / "g.parquet")
-    assert back.success is None
-    assert back.protocol is None
-    assert not back.tried.any()
+    assert not back.success.any()
+    assert back.protocol == ("",) * 3
+    assert not back.evaluated.any()
 
 
 def test_file_layout_is_format_version_1(tmp_path):
@@ -96,7 +99,7 @@ MASK = torch.tensor([True, False, True, False, False])
 
 @pytest.mark.parametrize("index", [1, -1, slice(1, 4, 2), [3, 0], MASK])
 def test_selection_agrees_between_tensors_and_tuples(index):
-    grasps = tried(5).replace(extra={"row": torch.arange(5), "text": list("abcde")})
+    grasps = evaluated(5).replace(extra={"row": torch.arange(5), "text": list("abcde")})
     chosen = grasps[index]
     for place, row in enumerate(chosen.extra["row"].tolist()):
         assert torch.equal(chosen.joints[place], grasps.joints[row])
@@ -110,11 +113,11 @@ def test_iterating_ends_and_out_of_range_is_an_index_error():
         make(3)[3]
 
 
-def test_joining_tried_and_untried_survives_the_file(tmp_path):
-    joined = GraspBatch.concatenate([make(2, score=torch.rand(2)), tried(3, obj=CUBE, seed=7)])
+def test_joining_evaluated_and_unevaluated_survives_the_file(tmp_path):
+    joined = GraspBatch.concatenate([make(2, score=torch.rand(2)), evaluated(3, obj=CUBE, seed=7)])
     joined.save(tmp_path / "g.parquet")
     for batch in (joined, GraspBatch.load(tmp_path / "g.parquet")):
-        assert batch.tried.tolist() == [False] * 2 + [True] * 3
+        assert batch.evaluated.tolist() == [False] * 2 + [True] * 3
         assert batch.success[2:].tolist() == [True, False, True]
         assert batch.score[2:].isnan().all()
         assert batch.score[:2].isfinite().all()
@@ -207,7 +210,7 @@ def test_failed_write_leaves_the_old_file_and_no_rest(tmp_path, monkeypatch):
 
 def test_pandas_sees_the_columns():
     pytest.importorskip("pandas")
-    frame = tried(3).to_pandas()
+    frame = evaluated(3).to_pandas()
     assert len(frame) == 3
     assert set(frame["object"]) == {"ball"}
     assert frame["success"].tolist() == [True, False, True]
@@ -215,7 +218,7 @@ def test_pandas_sees_the_columns():
 
 def test_unequal_columns_are_refused():
     with pytest.raises(ValueError, match="other lengths"):
-        make(3).replace(extra={"energy": torch.zeros(2)})
+        make(3).replace(extra={"wrench": torch.zeros(2)})
 
 
 def test_another_hand_is_refused():

@@ -25,8 +25,8 @@ def test_columns_say_what_a_stranger_would_compute() -> None:
     again = decode(pa.table(columns), header, "memory")
     torch.testing.assert_close(again["T_object_wrist"], grasps.T_object_wrist, atol=1e-6, rtol=0)
     assert again["object"] == grasps.object
-    # No trial has tried them: neither a success nor a failure.
-    assert columns["success"].null_count == len(grasps) - int(grasps.tried.sum())
+    # They have no trial: neither a success nor a failure.
+    assert columns["success"].null_count == len(grasps) - int(grasps.evaluated.sum())
 
 
 def test_warnings_of_the_simulator_are_kept_quiet_and_heard_again_afterwards() -> None:

@@ -56,8 +56,8 @@ def test_no_energy_rises_and_most_fall(obj: ObjectModel, disturbed: GraspBatch) 
     before, after = total(disturbed), total(refined)
     assert bool((after <= before + 1e-3).all())
     assert (after < 0.8 * before).float().mean() > 0.8
-    assert refined.score is None
-    assert refined.squeeze_joints is not None
+    assert refined.score.isnan().all()
+    assert refined.squeeze_joints.isfinite().all()
     assert not torch.equal(refined.squeeze_joints, refined.joints)
 
 

@@ -105,9 +105,9 @@ def test_synthesis_repeats_for_a_seed_and_comes_sorted(ball):
     assert torch.equal(first.joints, again.joints)
     assert not torch.equal(first.joints, other.joints)
     assert len(first) == 40
-    assert (first.score.diff() <= 0).all()
+    assert (first.energy.diff() >= 0).all()
     terms = torch.stack([v for k, v in first.extra.items() if k.startswith("energy_")])
-    torch.testing.assert_close(-first.score, terms.sum(0))
+    torch.testing.assert_close(first.energy, terms.sum(0))
     rotation = first.T_object_wrist[:, :3, :3].double()
     torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).double().expand(40, 3, 3), atol=1e-5, rtol=0)
 

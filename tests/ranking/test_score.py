@@ -58,8 +58,8 @@ def test_scores_tell_what_holds_from_what_does_not():
     T = made.T_object_wrist.clone()
     T[:, :3, 3] -= 0.03 * hand.palm_directions(T)
     opened = hand.canonical_joints(1.0).expand_as(made.joints)
-    bare = {"pregrasp_joints": None, "squeeze_joints": None}
-    mixed = GraspBatch.concatenate([made, made.replace(T_object_wrist=T, **bare), made.replace(joints=opened, **bare)])
+    bare = made.without("pregrasp_joints", "squeeze_joints")
+    mixed = GraspBatch.concatenate([made, bare.replace(T_object_wrist=T), bare.replace(joints=opened)])
     held = simulate(hand, can, mixed, "strict").success
     assert 4 < int(held.sum()) < 30
     assert roc_area(score_grasps(hand, can, mixed), held) > 0.75

@@ -163,13 +163,13 @@ def test_stated_joints_come_before_the_controller_s(hand, obj):
     still = replace(protocol("dro"), controller=ControllerConfig(outer=0.0, inner=0.0))
     same(simulate(hand, obj, held, "dro"), simulate(hand, obj, grasps, still))
     unopened = replace(protocol("dro"), controller=ControllerConfig(outer=0.0))
-    same(simulate(hand, obj, held.replace(squeeze_joints=None), "dro"), simulate(hand, obj, grasps, unopened))
+    same(simulate(hand, obj, held.without("squeeze_joints"), "dro"), simulate(hand, obj, grasps, unopened))
 
 
 def test_settled_labels_touch_without_penetrating(hand, obj):
     loose = power_grasp(hand, obj, 2).replace(joints=torch.tensor([[0.0, 0.4] * 4, [0.05, 0.7] * 4]))
     settled = settle(hand, obj, loose)
-    assert settled.squeeze_joints is None
+    assert settled.squeeze_joints.isnan().all()
     assert (settled.joints >= hand.tree.lower).all()
     distance = hand.points(settled.joints, settled.T_object_wrist).norm(dim=-1) - 0.03
     # Contacts are soft: the squeeze presses fingers into so light a ball by millimetres.
@@ -189,7 +189,7 @@ def test_recorded_frames_follow_the_trial(hand, obj):
 
 def test_outcome_in_a_batch_and_its_file(hand, obj, tmp_path):
     grasps = GraspBatch.concatenate([power_grasp(hand, obj), grasps_of(hand, obj, wrist_below(0.3), torch.zeros(1, 8))])
-    tried = simulate(hand, obj, grasps, "dro").fill(grasps)
+    tried = grasps.with_trial(simulate(hand, obj, grasps, "dro"))
     tried.save(tmp_path / "tried.parquet")
     loaded = GraspBatch.load(tmp_path / "tried.parquet")
     assert loaded.success.tolist() == [True, False]

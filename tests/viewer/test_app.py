@@ -97,7 +97,7 @@ def test_text_says_what_is_known(grasps: GraspBatch) -> None:
     assert describe(grasps, 0).splitlines()[1].startswith("**success** under dro/1")
     assert "failed" in describe(grasps, 1)
     assert "displacement 4.00 mm" in describe(grasps, 0)
-    assert "not tried" in describe(grasps.replace(success=None, protocol=None), 0)
+    assert "not evaluated" in describe(grasps.without_trial(), 0)
 
 
 def test_nothing_to_show_and_foreign_hands_are_refused(grasps: GraspBatch) -> None:

@@ -46,6 +46,8 @@ class Export:
 
     def run(self) -> int:
         """Complete the grasps, then write a file for each object."""
+        import torch
+
         from dro_grasp.errors import GraspFileError
         from dro_grasp.export.formats import Frame
         from dro_grasp.files import check_folder, check_output, make_folder
@@ -54,17 +56,17 @@ class Export:
         frame = Frame() if self.frame is None else Frame.load(self.frame)
         grasps = load_grasps(self.file)
         if self.only_successful:
-            kept = grasps.tried if grasps.success is None else grasps.success & grasps.tried
-            if not bool(kept.any()):
+            if not bool(grasps.success.any()):
                 raise GraspFileError(f"no grasp in {self.file} has succeeded in a trial; `dro-grasp evaluate` tries them, or "
                                      "leave out --only-successful")
-            grasps = grasps[kept]
+            grasps = grasps[grasps.success]
         names = list(dict.fromkeys(grasps.object))
         folder = self.format == "dexgraspbench" or len(names) > 1
         target = check_folder(self.output) if folder else check_output(self.output)
         if self.format == "dexgraspbench":
             refuse_mixing(target)
-        hand = hand_of(grasps, self.hand) if self.format == "moveit" or grasps.pregrasp_joints is None else None
+        stated = bool(torch.stack([grasps.pregrasp_joints, grasps.squeeze_joints]).isfinite().all())
+        hand = hand_of(grasps, self.hand) if self.format == "moveit" or not stated else None
         parts = [self._complete(grasps[[i for i, o in enumerate(grasps.object) if o == name]], hand) for name in names]
         if folder:
             make_folder(target)
@@ -80,16 +82,15 @@ class Export:
 
     def _complete(self, grasps: GraspBatch, hand: Hand | None) -> GraspBatch:
         """The same with pregrasp and squeeze."""
-        if hand is None or (grasps.pregrasp_joints is not None and grasps.squeeze_joints is not None):
+        if hand is None:
             return grasps
         import torch
 
-        from dro_grasp.grasps.controller import pregrasp_and_squeeze
+        from dro_grasp.grasps.controller import completed
         from dro_grasp.grasps.sources import object_of
 
         centre = torch.as_tensor(object_of(grasps, self.object, 1.0).centre_of_mass, dtype=grasps.joints.dtype)
-        pregrasp, squeeze = pregrasp_and_squeeze(hand, grasps.T_object_wrist, grasps.joints, centre)
-        return grasps.replace(pregrasp_joints=pregrasp, squeeze_joints=squeeze)
+        return completed(hand, grasps, centre)
 
     def _write(self, path: Path, grasps: GraspBatch, hand: Hand | None, frame: Frame) -> list[Path]:
         """The files of one object."""

@@ -175,7 +175,7 @@ class Generate:
     def _show(self, report: dict[str, Any], grasps: GraspBatch, result: TrialResult | None) -> None:
         rows = []
         for i in range(min(len(grasps), ROWS_SHOWN)):
-            score = None if grasps.score is None else float(grasps.score[i])
+            score = float(grasps.score[i])
             tried = [None] * 4 if result is None else [
                 bool(result.success[i]), int(result.contacts[i]), float(result.penetration[i]) * 1e3, result.reason[i],
             ]

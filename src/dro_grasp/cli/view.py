@@ -97,9 +97,9 @@ class Picture:
         check_output(self.output)
         hand, obj, grasps = of_one_object(self.file, self.hand, self.object, self.scale)
         if self.only_successful:
-            if grasps.success is None or not bool((grasps.success & grasps.tried).any()):
+            if not bool(grasps.success.any()):
                 raise GraspFileError(f"no grasp in {self.file} has succeeded in a trial; leave out --only-successful")
-            grasps = grasps[grasps.success & grasps.tried]
+            grasps = grasps[grasps.success]
         shown = min(self.count, len(grasps))
         if (pixels := shown * self.size[0] * self.size[1]) > MOST_PIXELS:
             raise OptionError(f"{shown} pictures of {self.size[0]} x {self.size[1]} are {pixels / 1e6:.0f} million pixels; a "

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.controller import pregrasp_and_squeeze
+from dro_grasp.grasps.controller import completed
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 
@@ -80,9 +80,7 @@ def _poses(rotation: Float[Tensor, "n 3 3"], position: Float[Tensor, "n 3"]) -> 
 
 def _complete(hand: Hand, obj: ObjectModel, T: Tensor, joints: Tensor, seed: int, origin: str) -> GraspBatch:
     centre = torch.as_tensor(obj.centre_of_mass, dtype=joints.dtype)
-    pregrasp, squeeze = pregrasp_and_squeeze(hand, T, joints, centre)
-    return GraspBatch.create(hand, obj, T, joints, pregrasp_joints=pregrasp, squeeze_joints=squeeze, seed=seed,
-                             provenance=origin)
+    return completed(hand, GraspBatch.create(hand, obj, T, joints, seed=seed, provenance=origin), centre)
 
 
 def _random_rotations(num: int, generator: torch.Generator) -> Float[Tensor, "num 3 3"]:

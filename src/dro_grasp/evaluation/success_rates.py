@@ -194,7 +194,6 @@ def _stages(
             grasps = refine_grasps(hand, known, grasps)
             seconds = seconds | {"refine": (time.perf_counter() - begin) / len(grasps)}
         grasps = grasps.replace(score=score_grasps(hand, known, grasps))
-        assert grasps.score is not None
         results = tuple(simulate(hand, obj, grasps, rules, workers=config.workers) for rules in config.protocols)
         tried = Tried(grasps, results, seconds)
         if whole in wanted:
@@ -214,7 +213,7 @@ def _row(source: str, stage: str, tries: list[Tried], protocols: Sequence[Protoc
     held = GraspBatch.concatenate([t.grasps.replace(extra={}) for t in tries])[success[0]]
     first = [t.results[0] for t in tries]
     areas = {
-        rules.label: _mean([roc_area(t.grasps.score, t.results[i].success) for t in tries if t.grasps.score is not None])
+        rules.label: _mean([roc_area(t.grasps.score, t.results[i].success) for t in tries])
         for i, rules in enumerate(protocols)
     }
     parts = {name: _mean([t.seconds[name] for t in tries]) for name in tries[0].seconds}

@@ -118,12 +118,10 @@ def csv_table(grasps: GraspBatch, frame: Frame) -> str:
     names = [f"{posture}:{joint}" for posture in postures for joint in grasps.joint_names]
     writer.writerow(["object", "x", "y", "z", "qw", "qx", "qy", "qz", "score", "success", "protocol", *names])
     for i in range(len(grasps)):
-        tried = grasps.success is not None and bool(grasps.tried[i])
+        known = bool(grasps.evaluated[i])
         writer.writerow([
             grasps.object[i], *_plain(position[i]), *_plain(quaternion[i]),
-            "" if grasps.score is None else _plain(grasps.score[i : i + 1])[0],
-            "" if not tried or grasps.success is None else int(grasps.success[i]),
-            "" if not tried or grasps.protocol is None else grasps.protocol[i],
+            _known(grasps.score[i]), int(grasps.success[i]) if known else "", grasps.protocol[i],
             *(value for joints in postures.values() for value in _plain(joints[i])),
         ])
     return text.getvalue()
@@ -157,14 +155,14 @@ def _postures(grasps: GraspBatch) -> dict[str, Float[Tensor, "n n_dof"]]:
     Raises:
         OptionError: The grasps have none.
     """
-    if grasps.pregrasp_joints is None or grasps.squeeze_joints is None:
+    if not bool(torch.stack([grasps.pregrasp_joints, grasps.squeeze_joints]).isfinite().all()):
         raise OptionError("these grasps have no pregrasp and squeeze; `dro-grasp export` makes them")
     return {"pregrasp": grasps.pregrasp_joints, "grasp": grasps.joints, "squeeze": grasps.squeeze_joints}
 
 
 def _confidence(grasps: GraspBatch, i: int) -> float:
     """The logistic function of the score; one half where there is none."""
-    score = math.nan if grasps.score is None else float(grasps.score[i])
+    score = float(grasps.score[i])
     return round(1 / (1 + math.exp(-max(-30.0, min(30.0, score)))), 6) if math.isfinite(score) else 0.5
 
 
@@ -189,6 +187,11 @@ def _named(grasps: GraspBatch, joints: Tensor) -> dict[str, float]:
 def _plain(values: Tensor) -> list[float]:
     """Numbers that read well: a ten-millionth is finer than any robot."""
     return [round(float(v), 7) for v in values]
+
+
+def _known(value: Float[Tensor, ""]) -> float | str:
+    """A number, or nothing where it is unknown."""
+    return _plain(value[None])[0] if bool(value.isfinite()) else ""
 
 
 def _yaml(content: Any) -> str:

@@ -1,9 +1,9 @@
-"""GraspBatch: grasps of one hand, predicted or synthesised, tried or not, and their files."""
+"""GraspBatch: grasps of one hand, predicted or synthesised, evaluated or not."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from io import BytesIO
@@ -16,8 +16,10 @@ from torch import Tensor
 
 from dro_grasp.errors import GraspFileError
 from dro_grasp.files import check_output, replacing
-from dro_grasp.grasps.codec import FLOATS, LISTS, TEXTS, UNTRIED, decode, encode
+from dro_grasp.grasps import codec, summary
+from dro_grasp.grasps.columns import COLUMNS, MAY_BE_UNKNOWN, NOT_EVALUATED, UNKNOWN_PROTOCOL, joined, taken, unknown
 from dro_grasp.grasps.table import read_table, table_bytes
+from dro_grasp.grasps.trial_columns import FURTHER, MEASURED, Trial, columns_of
 
 __all__ = ["GraspBatch"]
 
@@ -36,12 +38,12 @@ class HandIdentity(Protocol):
     def tree(self) -> Any: ...
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class GraspBatch:
     """n grasps of one hand, of one or several objects.
 
-    Missing values are NaN within a column and None for a whole column. A grasp was tried when its protocol is
-    not the empty string; `success` means nothing for the others.
+    Every column exists for every grasp. What is unknown of a grasp is NaN in columns of floats and the empty string in
+    columns of text. `GraspBatch.create` and `load` fill in the columns that they are not given.
     """
 
     T_object_wrist: Float[Tensor, "n 4 4"]
@@ -63,39 +65,46 @@ class GraspBatch:
     seed: Int[Tensor, " n"]
     """Seed each grasp was made with."""
     split: tuple[str, ...]
-    """"train", "validate", "test", or empty, one per grasp."""
+    """"train", "few_shot", "validate", "test", or empty, one per grasp."""
     provenance: tuple[str, ...]
     """How each grasp was made, with model and version."""
-    pregrasp_joints: Float[Tensor, "n n_dof"] | None = None
-    """Opened joints from which the grasp is closed; the controller makes them where missing."""
-    squeeze_joints: Float[Tensor, "n n_dof"] | None = None
-    """Joint targets that press on the object; the controller makes them where missing."""
-    score: Float[Tensor, " n"] | None = None
-    """Higher is better."""
-    success: Bool[Tensor, " n"] | None = None
-    """Outcome of the trial."""
-    displacement: Float[Tensor, " n"] | None = None
+    pregrasp_joints: Float[Tensor, "n n_dof"]
+    """Opened joints from which the hand closes; a row of NaN is not stated, and `controller.completed` makes it."""
+    squeeze_joints: Float[Tensor, "n n_dof"]
+    """Joint targets that press on the object; likewise."""
+    score: Float[Tensor, " n"]
+    """Predicted log-odds that the grasp holds; higher is better."""
+    energy: Float[Tensor, " n"]
+    """Grasp energy; lower is better."""
+    success: Bool[Tensor, " n"]
+    """Whether the grasp held in its trial; False for grasps that were not evaluated."""
+    displacement: Float[Tensor, " n"]
     """Largest displacement of the object in the trial [m]."""
-    rotation: Float[Tensor, " n"] | None = None
+    rotation: Float[Tensor, " n"]
     """Largest rotation of the object in the trial [rad]."""
-    penetration: Float[Tensor, " n"] | None = None
+    penetration: Float[Tensor, " n"]
     """Deepest penetration in the grasp pose [m]."""
-    protocol: tuple[str, ...] | None = None
+    protocol: tuple[str, ...]
     """Protocol of each grasp's trial; the empty string where there was none."""
     extra: dict[str, Any] = field(default_factory=dict)
-    """Further columns by name: tensors (n) or (n k), or lists of n values."""
+    """Further columns by name: tensors (n) or (n k), or sequences of n values."""
 
     def __post_init__(self) -> None:
-        """Give tried grasps a protocol and refuse columns of unequal length."""
-        if self.success is not None and self.protocol is None:
-            object.__setattr__(self, "protocol", ("unknown",) * len(self))
-        names = (*TEXTS, *FLOATS, *LISTS, "T_object_wrist", "seed", "success", "protocol")
-        columns = {name: getattr(self, name) for name in names} | self.extra
-        wrong = {name: len(c) for name, c in columns.items() if c is not None and len(c) != len(self)}
+        """Refuse columns of unequal length and successes without a trial.
+
+        Raises:
+            ValueError: The columns do not fit together.
+        """
+        columns = {name: getattr(self, name) for name in COLUMNS} | self.extra
+        wrong = {name: len(column) for name, column in columns.items() if len(column) != len(self)}
         if wrong:
             raise ValueError(f"a batch of {len(self)} grasps has columns of other lengths: {wrong}")
         if self.joints.shape[1] != len(self.joint_names):
             raise ValueError(f"{self.joints.shape[1]} values for {len(self.joint_names)} joint names")
+        if taken_names := sorted(self.extra.keys() & set(COLUMNS)):
+            raise ValueError(f"further columns have the names of fields: {taken_names}; set the fields instead")
+        if bool((self.success & ~self.evaluated).any()):
+            raise ValueError("some grasps succeeded without a protocol; name the protocol of their trial")
 
     @staticmethod
     def create(
@@ -116,109 +125,117 @@ class GraspBatch:
         """
         n = len(joints)
         objects = list(obj) if isinstance(obj, Sequence) else [obj] * n
-        seed = optional.pop("seed", 0)
-        provenance = optional.pop("provenance", "")
-        fields = {
+        fields: dict[str, Any] = {name: unknown(name, joints) for name in COLUMNS[2:]}
+        fields |= {
             "hand": hand.name, "hand_sha256": hand.sha256, "wrist_link": hand.tree.link_names[0],
             "joint_names": tuple(hand.tree.joint_names), "object": tuple(o.name for o in objects),
             "object_sha256": tuple(o.sha256 for o in objects), "split": tuple(o.split or "" for o in objects),
-            "seed": seed if isinstance(seed, Tensor) else torch.full((n,), int(seed), dtype=torch.int64),
-            "provenance": (provenance,) * n if isinstance(provenance, str) else tuple(provenance),
         }
-        return GraspBatch(T_object_wrist=T_object_wrist, joints=joints, **(fields | optional))
+        if "success" in optional:
+            fields["protocol"] = (UNKNOWN_PROTOCOL,) * n
+        fields |= optional
+        if isinstance(fields["seed"], int):
+            fields["seed"] = torch.full((n,), fields["seed"], dtype=torch.int64)
+        if isinstance(fields["provenance"], str):
+            fields["provenance"] = (fields["provenance"],) * n
+        return GraspBatch(T_object_wrist=T_object_wrist, joints=joints, **fields)
 
     def __len__(self) -> int:
         return len(self.joints)
 
-    def __getitem__(self, index: int | slice | Sequence[int] | Tensor) -> GraspBatch:
+    def __iter__(self) -> Iterator[GraspBatch]:
+        return (self[i] for i in range(len(self)))
+
+    def __getitem__(
+        self, index: int | slice | Sequence[int] | Sequence[bool] | Int[Tensor, "*k"] | Bool[Tensor, " n"]
+    ) -> GraspBatch:
         """The grasps at an index, slice, list of indices, index tensor or mask; always a batch."""
         rows = torch.arange(len(self))
-        if isinstance(index, int):
-            if not -len(self) <= index < len(self):
-                raise IndexError(f"grasp {index} of a batch of {len(self)}")
-            chosen = rows[index].reshape(1)
-        else:
-            chosen = rows[index if isinstance(index, slice) else torch.as_tensor(index if len(index) else rows[:0]).cpu()]
-        return self._take(chosen)
+        if isinstance(index, int) and not -len(self) <= index < len(self):
+            raise IndexError(f"grasp {index} of a batch of {len(self)}")
+        if isinstance(index, slice):
+            return self._take(rows[index])
+        chosen = torch.as_tensor(index).cpu()
+        return self._take(rows[chosen if chosen.numel() else chosen.long()].reshape(-1))
 
     def _take(self, rows: Int[Tensor, " k"]) -> GraspBatch:
-        places = rows.tolist()
-
-        def take(value: Any) -> Any:
-            if value is None:
-                return None
-            return value[rows] if isinstance(value, Tensor) else type(value)(value[i] for i in places)
-
-        changes = {name: take(getattr(self, name)) for name in self._columns()}
-        return self.replace(**changes, extra={name: take(value) for name, value in self.extra.items()})
-
-    @staticmethod
-    def _columns() -> tuple[str, ...]:
-        return ("T_object_wrist", "joints", "seed", "success", "protocol", *FLOATS, *LISTS, *TEXTS)
+        fields = {name: taken(getattr(self, name), rows) for name in COLUMNS}
+        return self.replace(**fields, extra={name: taken(column, rows) for name, column in self.extra.items()})
 
     def replace(self, **changes: Any) -> GraspBatch:
         """The same batch with other values for some fields."""
         return dataclasses.replace(self, **changes)
 
+    def without(self, *names: str) -> GraspBatch:
+        """The same batch, in which some columns are unknown for every grasp; further columns are gone.
+
+        Raises:
+            ValueError: No such column, or one that is always known, or one of the trial's (see `without_trial`).
+        """
+        if wrong := [name for name in names if name not in {*MAY_BE_UNKNOWN, *self.extra}]:
+            raise ValueError(f"columns {wrong} cannot be left out; these can: {[*MAY_BE_UNKNOWN, *self.extra]}")
+        fields = {name: unknown(name, self.joints) for name in names if name in MAY_BE_UNKNOWN}
+        return self.replace(**fields, extra={name: c for name, c in self.extra.items() if name not in names})
+
     @cached_property
+    def evaluated(self) -> Bool[Tensor, " n"]:
+        """Which grasps have been through a trial."""
+        return torch.tensor([p != NOT_EVALUATED for p in self.protocol], dtype=torch.bool, device=self.success.device)
+
+    @property
     def tried(self) -> Bool[Tensor, " n"]:
-        """Which grasps a trial has tried."""
-        if self.protocol is None:
-            return torch.zeros(len(self), dtype=torch.bool)
-        return torch.tensor([p != UNTRIED for p in self.protocol], dtype=torch.bool)
+        """Former name of `evaluated`."""
+        return self.evaluated
 
     @staticmethod
     def concatenate(batches: Sequence[GraspBatch]) -> GraspBatch:
-        """One batch after the other; a column that some lack is missing (NaN) for their grasps.
+        """One batch after the other; further columns that some lack are unknown for their grasps.
 
         Raises:
             ValueError: No batch at all, or batches of different hands.
         """
         if not batches:
             raise ValueError("nothing to concatenate: give at least one batch")
-        first = batches[0]
+        first, lengths = batches[0], [len(b) for b in batches]
         for other in batches[1:]:
             if (other.hand_sha256, other.joint_names) != (first.hand_sha256, first.joint_names):
                 raise ValueError(f"grasps of hand '{other.hand}' cannot join those of '{first.hand}'")
-        columns = GraspBatch._columns()
-        changes = {name: _join([getattr(b, name) for b in batches], batches) for name in columns}
+        fields = {name: joined([getattr(b, name) for b in batches], lengths) for name in COLUMNS}
         names = dict.fromkeys(name for b in batches for name in b.extra)
-        extra = {name: _join([b.extra.get(name) for b in batches], batches) for name in names}
-        return first.replace(**changes, extra=extra)
+        return first.replace(**fields, extra={name: joined([b.extra.get(name) for b in batches], lengths) for name in names})
 
     def sorted_by_score(self) -> GraspBatch:
         """Best score first; equal scores keep their order, grasps without score come last."""
-        if self.score is None:
-            return self
-        return self._take((-self.score.nan_to_num(nan=-torch.inf)).argsort(stable=True))
+        return self._take((-self.score).nan_to_num(nan=torch.inf).argsort(stable=True))
+
+    def sorted_by_energy(self) -> GraspBatch:
+        """Lowest energy first; equal energies keep their order, grasps without energy come last."""
+        return self._take(self.energy.nan_to_num(nan=torch.inf).argsort(stable=True))
 
     def bare(self) -> GraspBatch:
-        """Poses, joints and objects alone, without outcomes and further columns."""
-        empty: dict[str, Any] = dict.fromkeys((*FLOATS, *LISTS, "success", "protocol"))
-        return self.replace(**empty, extra={})
+        """Poses, joints, objects and their making alone, without outcomes and further columns."""
+        return self.replace(extra={}).without(*MAY_BE_UNKNOWN).without_trial()
 
-    def with_trial(self, trial: Any) -> GraspBatch:
-        """The batch with a trial's outcome.
+    def with_trial(self, trial: Trial) -> GraspBatch:
+        """The batch with a trial's outcome; why grasps failed and what they touched are further columns.
 
         Args:
             trial: A TrialResult; its displacement and rotation are (n) or (n directions).
         """
-        def largest(values: Any) -> Tensor:
-            tensor = torch.as_tensor(values, dtype=torch.float32)
-            return tensor.amax(-1) if tensor.ndim == 2 else tensor
+        fields, further = columns_of(trial)
+        return self.replace(**fields, protocol=(trial.protocol,) * len(self), extra=self.extra | further)
 
-        return self.replace(
-            success=torch.as_tensor(trial.success), displacement=largest(trial.displacement),
-            rotation=largest(trial.rotation), penetration=largest(trial.penetration),
-            protocol=(trial.protocol,) * len(self),
-        )
+    def without_trial(self) -> GraspBatch:
+        """The batch as if no grasp had been evaluated."""
+        fields = {name: unknown(name, self.joints) for name in MEASURED}
+        return self.replace(**fields, extra={name: c for name, c in self.extra.items() if name not in FURTHER})
 
     def save(self, path: Path | str, notes: dict[str, Any] | None = None) -> None:
         """Write a grasp file (Parquet, format version 1); it appears whole or not at all.
 
         Args:
             path: The file; an existing one is replaced.
-            notes: Plain values about the making, kept in the file's header for `read_notes`.
+            notes: Plain values about the making, kept in the file's header.
 
         Raises:
             OutputError: The path cannot be written.
@@ -229,7 +246,7 @@ class GraspBatch:
 
     def to_bytes(self, notes: dict[str, Any] | None = None) -> bytes:
         """The grasp file that `save` writes."""
-        columns, header = encode(self)
+        columns, header = codec.encode(self)
         return table_bytes(columns, header if notes is None else header | {"notes": notes})
 
     @staticmethod
@@ -240,7 +257,15 @@ class GraspBatch:
             GraspFileError: No such file, or a truncated or foreign one, or one of another version.
         """
         table, header = read_table(path)
-        return GraspBatch(**decode(table, header, str(path)))
+        return GraspBatch(**codec.decode(table, header, str(path)))
+
+    def to_pandas(self) -> Any:
+        """The batch as a pandas DataFrame with the grasp file's columns.
+
+        Raises:
+            OptionError: pandas is not installed.
+        """
+        return codec.data_frame(self)
 
     def require_hand(self, hand: HandIdentity) -> None:
         """Refuse a hand whose joints are not those of these grasps.
@@ -254,29 +279,8 @@ class GraspBatch:
                 f"hand '{hand.name}' has {list(hand.tree.joint_names)}"
             )
 
-    def to_pandas(self) -> Any:
-        """The batch as a pandas DataFrame with the grasp file's columns (needs pandas)."""
-        import tempfile
+    def __repr__(self) -> str:
+        return f"GraspBatch({summary.sentence(self)})"
 
-        import pyarrow.parquet as pq
-
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "grasps.parquet"
-            self.save(path)
-            return pq.read_table(path).to_pandas()
-
-
-def _join(values: list[Any], batches: Sequence[GraspBatch]) -> Any:
-    """Concatenate one column, filling in for the batches that lack it."""
-    present = [v for v in values if v is not None]
-    if not present:
-        return None
-    if isinstance(present[0], Tensor):
-        fill = torch.nan if present[0].is_floating_point() else 0
-        shape = present[0].shape[1:]
-        return torch.cat([
-            present[0].new_full((len(b), *shape), fill) if v is None else v
-            for v, b in zip(values, batches, strict=True)
-        ])
-    filled = [[UNTRIED] * len(b) if v is None else list(v) for v, b in zip(values, batches, strict=True)]
-    return type(present[0])(x for part in filled for x in part)
+    def _repr_html_(self) -> str:
+        return summary.html_table(self)

@@ -2,31 +2,36 @@
 
 from __future__ import annotations
 
-from typing import Any
+import importlib.util
+import re
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pyarrow as pa
 import roma
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.errors import GraspFileError
+from dro_grasp.errors import GraspFileError, OptionError
+from dro_grasp.grasps.columns import COLUMNS, FLOATS, NOT_EVALUATED, POSTURES, TEXTS, UNKNOWN_PROTOCOL
 from dro_grasp.grasps.table import fixed_column, float_column, floats
+from dro_grasp.grasps.trial_columns import CONTACT_LINKS, FAILURE, REASON
 
-FLOATS = ("score", "displacement", "rotation", "penetration")
-"""Fields of one number a grasp that may be missing."""
-LISTS = ("pregrasp_joints", "squeeze_joints")
-"""Fields of one number a joint that may be missing."""
-TEXTS = ("object", "object_sha256", "split", "provenance")
-"""Fields of one string a grasp."""
+if TYPE_CHECKING:
+    from dro_grasp.grasps.batch import GraspBatch
+
 REQUIRED = ("object", "wrist_position", "wrist_quaternion_wxyz", "joints")
 """Columns without which a file holds no grasps."""
 HEADER = ("hand", "hand_sha256", "wrist_link", "joint_names")
 """Entries of the file's header."""
-UNTRIED = ""
-"""Protocol of a grasp that no trial has tried."""
+TEXT_TYPES = {REASON: pa.string(), FAILURE: pa.string(), CONTACT_LINKS: pa.list_(pa.string())}
+"""Types of the trial's further columns, which their values do not tell when all are unknown."""
+SYNTHESISED = re.compile(r"\bsynthesis \d+\b")
+"""Provenance of synthesised grasps; early files hold minus their energy as score."""
 
 
-def encode(batch: Any) -> tuple[dict[str, pa.Array], dict[str, Any]]:
+def encode(batch: GraspBatch) -> tuple[dict[str, pa.Array], dict[str, Any]]:
     """Columns and header of a GraspBatch's file."""
     xyzw = roma.rotmat_to_unitquat(batch.T_object_wrist[:, :3, :3].to(torch.float64))
     columns: dict[str, pa.Array] = {
@@ -35,28 +40,22 @@ def encode(batch: Any) -> tuple[dict[str, pa.Array], dict[str, Any]]:
         "wrist_quaternion_wxyz": fixed_column(roma.quat_xyzw_to_wxyz(xyzw)),
         "joints": float_column(batch.joints),
     }
-    nothing = torch.full((len(batch),), torch.nan)
-    for name in (*LISTS, *FLOATS):
-        value = getattr(batch, name)
-        wide = nothing[:, None].expand(-1, len(batch.joint_names)) if name in LISTS else nothing
-        columns[name] = float_column(wide if value is None else value)
-    success = torch.zeros(len(batch), dtype=torch.bool) if batch.success is None else batch.success
-    columns["success"] = pa.array(success.cpu().numpy(), mask=(~batch.tried).numpy())
-    protocol = [p or None for p in batch.protocol] if batch.protocol else [None] * len(batch)
-    columns["protocol"] = pa.array(protocol, pa.string())
+    columns |= {name: float_column(getattr(batch, name)) for name in (*POSTURES, *FLOATS)}
+    columns["success"] = pa.array(batch.success.cpu().numpy(), mask=(~batch.evaluated).cpu().numpy())
+    columns["protocol"] = pa.array([p or None for p in batch.protocol], pa.string())
     for name in TEXTS[1:]:
         columns[name] = pa.array(list(getattr(batch, name)), pa.string())
     columns["seed"] = pa.array(batch.seed.cpu().numpy())
-    columns |= {name: _extra_column(value) for name, value in batch.extra.items()}
+    columns |= {name: _further_column(name, value) for name, value in batch.extra.items()}
     header = {"hand": batch.hand, "hand_sha256": batch.hand_sha256, "wrist_link": batch.wrist_link,
               "joint_names": list(batch.joint_names)}
     return columns, header
 
 
-def _extra_column(value: Any) -> pa.Array:
+def _further_column(name: str, value: Any) -> pa.Array:
     if isinstance(value, Tensor):
         return float_column(value) if value.is_floating_point() else pa.array(value.cpu().numpy().tolist())
-    return pa.array(list(value))
+    return pa.array(list(value), TEXT_TYPES.get(name))
 
 
 def decode(table: pa.Table, header: dict[str, Any], path: str) -> dict[str, Any]:
@@ -74,41 +73,65 @@ def decode(table: pa.Table, header: dict[str, Any], path: str) -> dict[str, Any]
     def text(name: str) -> tuple[str, ...]:
         return tuple(v or "" for v in table[name].to_pylist()) if name in table.column_names else ("",) * n
 
-    def numbers(name: str, width: int | None) -> Tensor | None:
+    def numbers(name: str, width: int | None) -> Tensor:
         if name not in table.column_names or table[name].null_count == n:
-            return None
+            return torch.full((n,) if width is None else (n, width), torch.nan)
         return floats(table[name], width, f"{path}, column {name}")
 
-    position, quaternion, joints = (
-        floats(table[name], width, f"{path}, column {name}")
-        for name, width in (("wrist_position", 3), ("wrist_quaternion_wxyz", 4), ("joints", n_dof))
-    )
-    length = quaternion.norm(dim=-1, keepdim=True)
-    if not (position.isfinite().all() and joints.isfinite().all() and ((length - 1).abs() < 1e-2).all()):
+    joints = numbers("joints", n_dof)
+    T = _poses(numbers("wrist_position", 3), numbers("wrist_quaternion_wxyz", 4))
+    if not (T.isfinite().all() and joints.isfinite().all()):
         raise GraspFileError(f"{path} has grasps with missing or non-finite poses; write it without them")
-    T = torch.eye(4).repeat(n, 1, 1)
-    T[:, :3, :3] = roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(quaternion / length))
-    T[:, :3, 3] = position
     success = table["success"].to_pylist() if "success" in table.column_names else [None] * n
-    tried = any(s is not None for s in success)
     protocol = tuple(
-        (p or "unknown") if s is not None else UNTRIED for p, s in zip(text("protocol"), success, strict=True)
+        (p or UNKNOWN_PROTOCOL) if s is not None else NOT_EVALUATED for p, s in zip(text("protocol"), success, strict=True)
     )
-    known = {*FLOATS, *LISTS, *TEXTS, *REQUIRED, "seed", "success", "protocol"}
+    fields: dict[str, Any] = {name: text(name) for name in TEXTS} | {name: numbers(name, n_dof) for name in POSTURES}
+    fields |= {name: numbers(name, None) for name in FLOATS}
+    if "energy" not in table.column_names:
+        fields |= _energy_apart(fields["score"], fields["provenance"], table)
+    known = {*COLUMNS, *REQUIRED}
     seed = [s or 0 for s in table["seed"].to_pylist()] if "seed" in table.column_names else [0] * n
     return {
         "T_object_wrist": T, "joints": joints,
         "hand": header["hand"], "hand_sha256": header["hand_sha256"], "wrist_link": header["wrist_link"],
         "joint_names": tuple(header["joint_names"]), "seed": torch.tensor(seed, dtype=torch.int64),
-        **{name: text(name) for name in TEXTS},
-        **{name: numbers(name, n_dof) for name in LISTS}, **{name: numbers(name, None) for name in FLOATS},
-        "success": torch.tensor([bool(s) for s in success]) if tried else None,
-        "protocol": protocol if tried else None,
-        "extra": {name: _decode_extra(table[name]) for name in table.column_names if name not in known},
+        "success": torch.tensor([bool(s) for s in success], dtype=torch.bool), "protocol": protocol, **fields,
+        "extra": {name: _decode_further(table[name]) for name in table.column_names if name not in known},
     }
 
 
-def _decode_extra(column: pa.ChunkedArray) -> Any:
+def _poses(position: Float[Tensor, "n 3"], quaternion: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4 4"]:
+    """Wrist poses of positions [m] and unit quaternions (WXYZ); NaN where a quaternion has another length."""
+    length = quaternion.norm(dim=-1, keepdim=True)
+    unit = torch.where((length - 1).abs() < 1e-2, quaternion / length, torch.nan)
+    T = torch.eye(4).repeat(len(position), 1, 1)
+    T[:, :3, :3] = roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(unit))
+    T[:, :3, 3] = position
+    return T
+
+
+def _energy_apart(score: Float[Tensor, " n"], provenance: tuple[str, ...], table: pa.Table) -> dict[str, Tensor]:
+    """Energy and score of a file without a column of energies, whose synthesised grasps have minus the energy as score."""
+    terms = [name for name in table.column_names if name.startswith("energy_")]
+    has_terms = ~torch.from_numpy(np.array(table[terms[0]].is_null())) if terms else torch.zeros(len(score), dtype=torch.bool)
+    synthesised = has_terms & torch.tensor([SYNTHESISED.search(p) is not None for p in provenance], dtype=torch.bool)
+    nothing = torch.full_like(score, torch.nan)
+    return {"energy": torch.where(synthesised, -score, nothing), "score": torch.where(synthesised, nothing, score)}
+
+
+def data_frame(batch: GraspBatch) -> Any:
+    """A pandas DataFrame with the columns of the batch's file.
+
+    Raises:
+        OptionError: pandas is not installed.
+    """
+    if importlib.util.find_spec("pandas") is None:
+        raise OptionError("to_pandas needs pandas, which is not installed; install it with: pip install pandas")
+    return pa.table(encode(batch)[0]).to_pandas()
+
+
+def _decode_further(column: pa.ChunkedArray) -> Any:
     kind = column.type
     if pa.types.is_floating(kind):
         return floats(column, None, "extra")

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 
 
@@ -25,6 +26,31 @@ class ControllerConfig:
     # Differs from the paper's release (0.15), which leaves small objects without contact; the controls gain as well.
     dead_zone: float = 1e-3
     """Joints whose downstream points approach the object's centre by less stay [m/rad]."""
+
+
+def completed(
+    hand: Hand, grasps: GraspBatch, centre: Float[Tensor, "3"], config: ControllerConfig | None = None
+) -> GraspBatch:
+    """The same grasps, each with pregrasp and squeeze; rows that are stated stay.
+
+    Args:
+        hand: The grasps' hand.
+        grasps: Grasps of one object.
+        centre: The object's centre of mass, in the object's frame [m].
+        config: Amounts.
+    """
+    stated = torch.stack([grasps.pregrasp_joints, grasps.squeeze_joints]).isfinite().all(-1)
+    open_rows = (~stated).any(0)
+    if not bool(open_rows.any()):
+        return grasps
+    made = pregrasp_and_squeeze(
+        hand, grasps.T_object_wrist[open_rows], grasps.joints[open_rows], centre.to(grasps.joints), config)
+    postures = []
+    for given, known, new in zip((grasps.pregrasp_joints, grasps.squeeze_joints), stated, made, strict=True):
+        whole = given.clone()
+        whole[open_rows] = new
+        postures.append(torch.where(known[:, None], given, whole))
+    return grasps.replace(pregrasp_joints=postures[0], squeeze_joints=postures[1])
 
 
 def pregrasp_and_squeeze(

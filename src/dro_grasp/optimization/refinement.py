@@ -16,7 +16,7 @@ from torch import Tensor
 from dro_grasp.energy.grasp_energy import EnergyConfig, Evaluation, GraspEnergy
 from dro_grasp.energy.object_energy import nearest_contacts, object_energy
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.controller import pregrasp_and_squeeze
+from dro_grasp.grasps.controller import completed
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.synthesis import moved
@@ -76,8 +76,8 @@ def refine_grasps(
                 grasps.T_object_wrist.split(config.batch_size), grasps.joints.split(config.batch_size), strict=True)
         ]
     T, q = (torch.cat(part) for part in zip(*parts, strict=True))
-    pregrasp, squeeze = pregrasp_and_squeeze(hand, T, q, energy.centre)
-    return grasps.replace(T_object_wrist=T, joints=q, pregrasp_joints=pregrasp, squeeze_joints=squeeze, score=None)
+    moved_grasps = grasps.without("pregrasp_joints", "squeeze_joints", "score", "energy").replace(T_object_wrist=T, joints=q)
+    return completed(hand, moved_grasps, energy.centre)
 
 
 def _descend(

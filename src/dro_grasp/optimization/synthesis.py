@@ -144,8 +144,8 @@ def _batch(
     """Grasps with rotations orthonormal to rounding, lowest energy first."""
     T[:, :3, :3] = torch.as_tensor(roma.special_procrustes(T[:, :3, :3]))
     columns = {"depth": depths} | {f"energy_{name}": terms[:, i] for i, name in enumerate(TERMS)}
-    batch = GraspBatch.create(hand, obj, T, q, score=-terms.sum(-1), seed=seed, provenance=PROVENANCE, extra=columns)
-    return batch.sorted_by_score()
+    batch = GraspBatch.create(hand, obj, T, q, energy=terms.sum(-1), seed=seed, provenance=PROVENANCE, extra=columns)
+    return batch.sorted_by_energy()
 
 
 def depth(energy: GraspEnergy, state: State) -> Float[Tensor, " n"]:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dro_grasp.energy.grasp_energy import GraspEnergy
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.controller import pregrasp_and_squeeze
+from dro_grasp.grasps.controller import completed
 
 NEAR = 0.005
 """Distance from the surface at which a link counts for a third [m]."""
@@ -45,10 +45,8 @@ def grasp_features(energy: GraspEnergy, grasps: GraspBatch, terms: Float[Tensor,
         terms: Weighted terms of the energy.
     """
     hand = energy.hand
-    T, q = grasps.T_object_wrist, grasps.joints
-    pregrasp, squeeze = grasps.pregrasp_joints, grasps.squeeze_joints
-    if pregrasp is None or squeeze is None:
-        pregrasp, squeeze = pregrasp_and_squeeze(hand, T, q, energy.centre)
+    grasps = completed(hand, grasps, energy.centre)
+    T, q, pregrasp, squeeze = grasps.T_object_wrist, grasps.joints, grasps.pregrasp_joints, grasps.squeeze_joints
     points, normals = hand.points_and_normals(q, T)
     before, after = hand.points(pregrasp, T), hand.points(squeeze, T)
     distance, gradient = energy.field.distances(points)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from dro_grasp.descriptions.tree_reading import quaternion_matrix
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.controller import pregrasp_and_squeeze
+from dro_grasp.grasps.controller import completed
 from dro_grasp.hands.hand import Hand
 from dro_grasp.simulation.outcome import GIVE_UP
 from dro_grasp.simulation.protocols import Protocol
@@ -175,13 +175,8 @@ def joint_targets(
     rules: Protocol = scene.protocol
     if not rules.closing:
         return grasps.joints, grasps.joints
-    pregrasp, squeeze = grasps.pregrasp_joints, grasps.squeeze_joints
-    if pregrasp is None or squeeze is None:
-        centre = torch.as_tensor(scene.obj.centre_of_mass, dtype=grasps.joints.dtype)
-        outer, inner = pregrasp_and_squeeze(hand, grasps.T_object_wrist, grasps.joints, centre, rules.controller)
-        pregrasp = outer if pregrasp is None else pregrasp
-        squeeze = inner if squeeze is None else squeeze
-    return pregrasp, squeeze
+    grasps = completed(hand, grasps, torch.as_tensor(scene.obj.centre_of_mass), rules.controller)
+    return grasps.pregrasp_joints, grasps.squeeze_joints
 
 
 @contextmanager

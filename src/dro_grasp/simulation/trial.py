@@ -88,9 +88,8 @@ def settle(
         T_object_wrist = torch.linalg.inv(torch.where(stable[:, None, None], T, torch.eye(4, dtype=T.dtype)))
         joints.append(torch.where(held, reached, chunk.joints))
         poses.append(torch.where(stable[:, None, None], T_object_wrist.to(reached.dtype), chunk.T_object_wrist))
-    return grasps.replace(
-        T_object_wrist=torch.cat(poses), joints=torch.cat(joints), pregrasp_joints=None, squeeze_joints=None
-    )
+    unsettled = grasps.without("pregrasp_joints", "squeeze_joints")
+    return unsettled.replace(T_object_wrist=torch.cat(poses), joints=torch.cat(joints))
 
 
 def _holding_joints(hand: Hand, contact_links: Sequence[Sequence[str]]) -> Bool[Tensor, "n n_dof"]:

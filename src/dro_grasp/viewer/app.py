@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.controller import pregrasp_and_squeeze
+from dro_grasp.grasps.controller import completed
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.viewer.appearance import PREDICTED_COLOUR
@@ -112,22 +112,22 @@ def view_grasps(
 
 
 def outcome(grasps: GraspBatch, index: int) -> bool | None:
-    """Whether a grasp held, None where it was not tried."""
-    return bool(grasps.success[index]) if grasps.success is not None and bool(grasps.tried[index]) else None
+    """Whether a grasp held, None where it was not evaluated."""
+    return bool(grasps.success[index]) if bool(grasps.evaluated[index]) else None
 
 
 def describe(grasps: GraspBatch, index: int) -> str:
     """What is known of one grasp, as Markdown."""
     lines = [f"**Grasp {index}** of {len(grasps)}"]
-    tried = grasps.success is not None and bool(grasps.tried[index])
-    if tried and grasps.success is not None and grasps.protocol is not None:
+    if bool(grasps.evaluated[index]):
         lines.append(f"**{'success' if grasps.success[index] else 'failed'}** under {grasps.protocol[index]}")
     else:
-        lines.append("not tried")
-    values = {"score": (grasps.score, 1.0, ""), "displacement": (grasps.displacement, 1e3, " mm"),
-              "rotation": (grasps.rotation, 180 / np.pi, "°"), "penetration": (grasps.penetration, 1e3, " mm")}
+        lines.append("not evaluated")
+    values = {"score": (grasps.score, 1.0, ""), "energy": (grasps.energy, 1.0, ""),
+              "displacement": (grasps.displacement, 1e3, " mm"), "rotation": (grasps.rotation, 180 / np.pi, "°"),
+              "penetration": (grasps.penetration, 1e3, " mm")}
     for name, (column, factor, unit) in values.items():
-        if column is not None and bool(column[index].isfinite()):
+        if bool(column[index].isfinite()):
             lines.append(f"{name} {float(column[index]) * factor:.2f}{unit}")
     return "  \n".join(lines)
 
@@ -135,9 +135,7 @@ def describe(grasps: GraspBatch, index: int) -> str:
 def postures_of(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> dict[Posture, Float[Tensor, "n n_dof"]]:
     """Joints of every posture; the controller makes those that the grasps lack."""
     joints = grasps.joints.float()
-    before, after = grasps.pregrasp_joints, grasps.squeeze_joints
-    if before is None or after is None or not bool(before.isfinite().all() and after.isfinite().all()):
-        centre = torch.as_tensor(obj.centre_of_mass, dtype=torch.float32)
-        before, after = pregrasp_and_squeeze(hand, grasps.T_object_wrist.float(), joints, centre)
+    grasps = completed(hand, grasps, torch.as_tensor(obj.centre_of_mass, dtype=torch.float32))
     opened = hand.canonical_joints().expand_as(joints)
-    return {"open": opened, "pregrasp": before.float(), "grasp": joints, "squeeze": after.float()}
+    return {"open": opened, "pregrasp": grasps.pregrasp_joints.float(), "grasp": joints,
+            "squeeze": grasps.squeeze_joints.float()}

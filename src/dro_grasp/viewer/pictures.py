@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -109,20 +110,19 @@ def touching_points(
 def heading(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> str:
     """Title of a sheet."""
     text = f"{hand.name} on {obj.name}: {len(grasps)} grasps"
-    tried = grasps.tried
-    if grasps.success is None or not bool(tried.any()):
+    if not bool(grasps.evaluated.any()):
         return text
-    protocols = sorted({p for p in grasps.protocol or () if p})
-    return f"{text}, {int(grasps.success[tried].sum())} of {int(tried.sum())} succeeded ({', '.join(protocols)})"
+    protocols = sorted({p for p in grasps.protocol if p})
+    return f"{text}, {int(grasps.success.sum())} of {int(grasps.evaluated.sum())} succeeded ({', '.join(protocols)})"
 
 
 def caption(grasps: GraspBatch, index: int) -> tuple[str, bool | None]:
     """The line under a picture, and the outcome that colours it."""
-    tried = grasps.success is not None and bool(grasps.tried[index])
-    outcome = bool(grasps.success[index]) if tried and grasps.success is not None else None
-    words = {True: "success", False: "failed", None: "not tried"}[outcome]
-    score = "" if grasps.score is None else f"   score {float(grasps.score[index]):.2f}"
-    return f"{index}   {words}{score}", outcome
+    outcome = bool(grasps.success[index]) if bool(grasps.evaluated[index]) else None
+    words = {True: "success", False: "failed", None: "not evaluated"}[outcome]
+    values = {name: float(getattr(grasps, name)[index]) for name in ("score", "energy")}
+    numbers = "".join(f"   {name} {value:.2f}" for name, value in values.items() if math.isfinite(value))
+    return f"{index}   {words}{numbers}", outcome
 
 
 def contact_sheet(

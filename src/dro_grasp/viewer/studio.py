@@ -125,7 +125,6 @@ class Studio(ServedPage):
         raw = self.predictor.predict(loaded, target, num, direction=along, refine=False)
         refined = refine_grasps(loaded, target, raw)
         refined = refined.replace(score=score_grasps(loaded, target, refined))
-        assert refined.score is not None
         order = refined.score.argsort(descending=True)
         raw, refined = raw[order], refined[order]
         if not target.is_cloud:
@@ -212,7 +211,7 @@ class Studio(ServedPage):
         made = self.generate(
             self.hand.value, self.object.value, int(self.num.value), self.direction.value, float(self.temperature.value),
             self.protocol.value)
-        held = "" if made.refined.success is None else (
+        held = "" if not bool(made.refined.evaluated.any()) else (
             f", **{int(made.refined.success.sum())}** held under *{self.protocol.value}*")
         self._say(f"{len(made.refined)} grasps{held}; {time.perf_counter() - begin:.1f} s")
 
@@ -285,8 +284,7 @@ def chosen(hand: Hand, grasps: GraspBatch, success: str, palm: str) -> Bool[Tens
     """Grasps with an outcome (`all`, `succeeded`, `failed`) whose palm looks along a half-axis (or `any`)."""
     keep = torch.ones(len(grasps), dtype=torch.bool)
     if success != "all":
-        held = grasps.tried & (grasps.success if grasps.success is not None else False)
-        keep &= held if success == "succeeded" else grasps.tried & ~held
+        keep &= grasps.success if success == "succeeded" else grasps.evaluated & ~grasps.success
     if palm != ANY:
         keep &= half_axis(hand.palm_directions(grasps.T_object_wrist)) == HALF_AXES.index(palm)
     return keep

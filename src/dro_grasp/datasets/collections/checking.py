@@ -98,11 +98,10 @@ def keep_passing(
 
 def _with_pair(result: Agreement, grasps: GraspBatch, rules: Protocol, loaded: dict[str, Hand]) -> Agreement:
     _, passed, reasons = _try(grasps, rules, loaded)
-    stored = grasps.success if grasps.success is not None else torch.zeros(len(grasps), dtype=torch.bool)
-    failed = Counter(kind_of_failure(r) for r, was in zip(reasons, stored.tolist(), strict=True) if r and was)
+    failed = Counter(kind_of_failure(r) for r, was in zip(reasons, grasps.success.tolist(), strict=True) if r and was)
     tried, success = result.hands.get(grasps.hand, (0, 0))
     return replace(
-        result, tried=result.tried + len(grasps), agreed=result.agreed + int((passed == stored).sum()),
+        result, tried=result.tried + len(grasps), agreed=result.agreed + int((passed == grasps.success).sum()),
         succeeded=result.succeeded + int(passed.sum()), reasons=result.reasons + failed,
         hands=result.hands | {grasps.hand: (tried + len(grasps), success + int(passed.sum()))},
     )
@@ -117,4 +116,4 @@ def _try(
     hand, obj = loaded[grasps.hand_sha256], object_of(grasps, None, 1.0)
     require_same(grasps, hand, obj)
     trial = simulate(hand, obj, grasps, rules)
-    return trial.fill(grasps), trial.success, trial.reason
+    return grasps.with_trial(trial), trial.success, trial.reason

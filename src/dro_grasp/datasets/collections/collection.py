@@ -75,7 +75,7 @@ def count_collection(path: Path | str) -> dict[str, dict[str, int]]:
 
 def successful(grasps: GraspBatch) -> GraspBatch:
     """Those that passed their trial."""
-    return grasps[0:0] if grasps.success is None else grasps[grasps.success & grasps.tried]
+    return grasps[grasps.success]
 
 
 def rows_of(grasps: GraspBatch, obj: str) -> GraspBatch:

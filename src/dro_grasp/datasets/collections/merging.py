@@ -24,7 +24,7 @@ POSITION_STEP, ANGLE_STEP, UNIT_STEP = 2.0**-16, 2.0**-13, 2.0**-15
 """Grid on which merged files keep positions [m], joints [rad or m] and quaternions: 0.015 mm, 0.12 mrad, 0.03 mrad."""
 MANTISSA = 10
 """Bits of the mantissa that merged files keep of all other numbers: three digits."""
-PLAIN_COLUMNS = ("reason",)
+PLAIN_COLUMNS = ("reason", "failure")
 """Columns that say nothing of grasps that succeeded."""
 
 
@@ -128,8 +128,8 @@ def compact(hand: Hand, grasps: GraspBatch) -> GraspBatch:
         name: _short(value) if isinstance(value, Tensor) and value.is_floating_point() else value
         for name, value in grasps.extra.items() if name not in PLAIN_COLUMNS
     }
-    numbers = {name: getattr(grasps, name) for name in ("score", "displacement", "rotation", "penetration")}
-    short = {name: None if value is None else _short(value) for name, value in numbers.items()}
+    numbers = {name: getattr(grasps, name) for name in ("score", "energy", "displacement", "rotation", "penetration")}
+    short = {name: _short(value) for name, value in numbers.items()}
     return grasps.replace(T_object_wrist=T, joints=joints, extra=extra, **short)
 
 

@@ -158,7 +158,7 @@ def valid_grasps(
         made = dataclasses.replace(made, moved=int((shift >= config.farthest).sum()))
         grasps = closed[shift < config.farthest]
     trial = simulate(hand, obj, grasps, protocol, workers=1)
-    tried = trial.fill(grasps)
+    tried = grasps.with_trial(trial)
     loose = trial.success & (trial.contacts < config.least_contacts)
     passed = tried[trial.success & ~loose]
     new = distinct(hand, passed, earlier=earlier)

@@ -1,0 +1,67 @@
+"""The columns of a grasp batch: which there are, what "unknown" is in each, how rows are taken and joined."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+FLOATS = ("score", "energy", "displacement", "rotation", "penetration")
+"""Columns of one number per grasp; NaN is unknown."""
+POSTURES = ("pregrasp_joints", "squeeze_joints")
+"""Columns of one number per joint; a row of NaN is not stated."""
+TEXTS = ("object", "object_sha256", "split", "provenance")
+"""Columns of one string per grasp; the empty string is unknown."""
+COLUMNS = ("T_object_wrist", "joints", "seed", "success", "protocol", *FLOATS, *POSTURES, *TEXTS)
+"""Fields of a batch with one entry per grasp."""
+MAY_BE_UNKNOWN = ("score", "energy", *POSTURES)
+"""Columns that say nothing about a grasp until somebody fills them; those of its trial are the others."""
+NOT_EVALUATED = ""
+"""Protocol of a grasp without a trial."""
+UNKNOWN_PROTOCOL = "unknown"
+"""Protocol of a grasp whose outcome is known without its protocol."""
+
+
+def unknown(name: str, joints: Float[Tensor, "n n_dof"]) -> Any:
+    """A column that says nothing about any grasp.
+
+    Args:
+        name: One of COLUMNS, except pose and joints, which are always known.
+        joints: The batch's joints, for size and device.
+    """
+    n = len(joints)
+    if name in FLOATS:
+        return torch.full((n,), torch.nan, device=joints.device)
+    if name in POSTURES:
+        return torch.full_like(joints, torch.nan)
+    if name in {"seed", "success"}:
+        return torch.zeros(n, dtype=torch.int64 if name == "seed" else torch.bool, device=joints.device)
+    return ("",) * n
+
+
+def taken(column: Any, rows: Int[Tensor, " k"]) -> Any:
+    """Some rows of a column."""
+    return column[rows] if isinstance(column, Tensor) else type(column)(column[i] for i in rows.tolist())
+
+
+def joined(parts: Sequence[Any], lengths: Sequence[int]) -> Any:
+    """One column after the other; a part that is None stands for as many unknown entries as its length says.
+
+    Unknown is NaN in floats and None in everything else, which then becomes a list.
+    """
+    present = [part for part in parts if part is not None]
+    same = all(isinstance(p, Tensor) and p.shape[1:] == present[0].shape[1:] for p in present)
+    if same and (len(present) == len(parts) or present[0].is_floating_point()):
+        shape = present[0].shape[1:]
+        return torch.cat([
+            present[0].new_full((n, *shape), torch.nan) if part is None else part
+            for part, n in zip(parts, lengths, strict=True)
+        ])
+    rows = [
+        [None] * n if part is None else part.tolist() if isinstance(part, Tensor) else list(part)
+        for part, n in zip(parts, lengths, strict=True)
+    ]
+    return (tuple if isinstance(present[0], tuple) else list)(row for part in rows for row in part)

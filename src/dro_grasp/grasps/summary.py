@@ -1,0 +1,58 @@
+"""A grasp batch in words: one sentence, or an HTML table for notebooks."""
+
+from __future__ import annotations
+
+import html
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from dro_grasp.grasps.columns import NOT_EVALUATED
+from dro_grasp.grasps.trial_columns import REASON
+
+if TYPE_CHECKING:
+    from dro_grasp.grasps.batch import GraspBatch
+
+ROWS = 10
+"""Most grasps in the HTML table (ours)."""
+NAMES = 3
+"""Most objects that are named (ours)."""
+
+
+def sentence(grasps: GraspBatch) -> str:
+    """Number of grasps, hand, objects, outcome and range of score or energy."""
+    parts = [f"{len(grasps)} grasps", f"hand '{grasps.hand}'", _objects(grasps)]
+    for protocol, count in Counter(p for p in grasps.protocol if p != NOT_EVALUATED).items():
+        held = sum(s for s, p in zip(grasps.success.tolist(), grasps.protocol, strict=True) if p == protocol)
+        parts.append(f"{held} of {count} hold under {protocol}")
+    if not grasps.evaluated.all():
+        parts.append("not evaluated" if not grasps.evaluated.any() else f"{int((~grasps.evaluated).sum())} not evaluated")
+    for name in ("score", "energy"):
+        known = getattr(grasps, name)
+        known = known[known.isfinite()]
+        if len(known):
+            parts.append(f"{name} {float(known.min()):.2f} to {float(known.max()):.2f}")
+    return ", ".join(part for part in parts if part)
+
+
+def _objects(grasps: GraspBatch) -> str:
+    names = list(dict.fromkeys(grasps.object))
+    if not names:
+        return ""
+    named = ", ".join(f"'{name}'" for name in names[:NAMES])
+    more = f" and {len(names) - NAMES} more" if len(names) > NAMES else ""
+    return f"object{'s' if len(names) > 1 else ''} {named}{more}"
+
+
+def html_table(grasps: GraspBatch) -> str:
+    """The sentence above a table of the first grasps."""
+    reasons = grasps.extra.get(REASON) or [None] * len(grasps)
+    lines = []
+    for i in range(min(len(grasps), ROWS)):
+        outcome = ("success" if grasps.success[i] else "failure") if grasps.evaluated[i] else ""
+        numbers = [float(column[i]) for column in (grasps.score, grasps.energy)]
+        cells = [i, grasps.object[i], *("" if x != x else f"{x:.2f}" for x in numbers), outcome, reasons[i] or ""]
+        lines.append("".join(f"<td>{html.escape(str(cell))}</td>" for cell in cells))
+    heads = "".join(f"<th>{head}</th>" for head in ("grasp", "object", "score", "energy", "trial", "reason"))
+    body = "".join(f"<tr>{line}</tr>" for line in lines)
+    more = f"<p>and {len(grasps) - ROWS} more</p>" if len(grasps) > ROWS else ""
+    return f"<p>{html.escape(sentence(grasps))}</p><table><tr>{heads}</tr>{body}</table>{more}"
