@@ -35,7 +35,7 @@ def grasps() -> GraspBatch:
     pregrasp, squeeze = pregrasp_and_squeeze(hand, T, joints, torch.zeros(3))
     return GraspBatch.create(
         hand, [mug, mug, can, mug, can], T, joints, pregrasp_joints=pregrasp, squeeze_joints=squeeze,
-        score=torch.tensor([2.0, 0.0, -1.0, -3.0, 40.0]), success=torch.tensor([True, False, True, True, True]),
+        score=torch.tensor([2.0, 0.0, -1.0, -3.0, 40.0]), success=torch.tensor([True, False, True, True, False]),
         protocol=("strict/1", "strict/1", "strict/1", "strict/1", ""))
 
 
