@@ -19,12 +19,12 @@ from pathlib import Path
 import torch
 from report import emit
 
+from dro_grasp.devices import cores
 from dro_grasp.hands.library import load_hand
 from dro_grasp.models.checkpoints import save_weights
 from dro_grasp.models.network import DistanceNetwork, NetworkConfig
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predictor import GraspPredictor
-from dro_grasp.simulation.scene import cores
 
 HANDS = ("barrett", "allegro", "shadowhand")
 """Built-in versions of the paper's hands."""

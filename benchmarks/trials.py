@@ -20,11 +20,11 @@ from pathlib import Path
 
 from report import emit
 
+from dro_grasp.devices import cores
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
 from dro_grasp.simulation.protocols import PROTOCOLS
-from dro_grasp.simulation.scene import cores
 from dro_grasp.simulation.trial import TrialResult, simulate
 
 HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand")
@@ -71,7 +71,7 @@ def row(hand: str, runs: list[Run]) -> list[object]:
     """A line of the table."""
     trials = sum(len(r.result.success) for r in runs)
     slowest = max(runs, key=lambda r: r.seconds)
-    failures = Counter(x.split(" by ")[0] for r in runs for x in r.result.reason if x)
+    failures = Counter(x.value for r in runs for x in r.result.failure if x)
     return [
         hand, trials, rate(runs), sum(r.cpu_seconds for r in runs) / trials * 1e3, slowest.object, rate([slowest]),
         100 * sum(int(r.result.success.sum()) for r in runs) / trials,

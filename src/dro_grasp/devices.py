@@ -1,8 +1,9 @@
-"""Choosing a device for tensors, and moving records of tensors to it."""
+"""Devices and cores of this machine, and moving records of tensors to a device."""
 
 from __future__ import annotations
 
 import dataclasses
+import os
 from typing import TypeVar
 
 import torch
@@ -38,6 +39,11 @@ def require_device(name: str) -> None:
     if count is not None and count() <= (device.index or 0):
         raise OptionError(f"device is '{name}', but torch {torch.__version__} finds {count() or 'no'} such; use --device cpu, "
                           f"which always works, or install a build of torch with {device.type.upper()}")
+
+
+def cores() -> int:
+    """Cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def on_device(record: Record, device: torch.device | str) -> Record:

@@ -14,6 +14,7 @@ import torch
 from dro_grasp.errors import GraspFileError, OutputError
 from dro_grasp.files import check_output
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.simulation.outcome import Failure
 
 HAND = SimpleNamespace(
     name="toy", sha256="a" * 64, tree=SimpleNamespace(link_names=("base", "tip"), joint_names=("j0", "j1"))
@@ -37,6 +38,7 @@ def evaluated(n: int, **optional) -> GraspBatch:
         success=torch.arange(n) % 2 == 0, displacement=torch.rand(n, 6), rotation=torch.rand(n, 6),
         penetration=torch.rand(n), protocol="dro/1",
         reason=tuple("" if i % 2 == 0 else "slipped by 30 mm" for i in range(n)), contact_links=(("tip",),) * n,
+        failure=tuple(None if i % 2 == 0 else Failure.SLIPPED for i in range(n)),
     )
     return make(n, **optional).with_trial(trial)
 
@@ -59,6 +61,7 @@ def test_file_round_trip_keeps_every_field(tmp_path):
     for name in ("energy_contact", "order", "wrench"):
         assert torch.equal(back.extra[name], grasps.extra[name]), name
     assert back.extra["reason"] == ["", *["slipped by 30 mm", ""] * 2]
+    assert back.extra["failure"] == [None, *["SLIPPED", None] * 2]
     assert back.extra["contact_links"] == [["tip"]] * 5
     assert back.extra["note"] == ["x"] * 5
 

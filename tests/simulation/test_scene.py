@@ -14,7 +14,7 @@ from dro_grasp.hands.library import ASSET_FILES, load_hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.contacts import measure_penetration
 from dro_grasp.simulation.protocols import protocol
-from dro_grasp.simulation.scene import Scene, build_scene
+from dro_grasp.simulation.scene import CACHED_SCENES, Scene, build_scene, cached_scene
 from tests.helpers.claw import ball, claw, grasps_of, wrist_below
 
 GRIPPER = """<mujoco><worldbody><body name="base"><geom type="box" size="0.06 0.02 0.01" mass="0.3"/>
@@ -108,6 +108,16 @@ def test_sliding_joints_close(tmp_path):
     data.ctrl[:] = 0.02
     mujoco.mj_step(model, data, nstep=200)
     np.testing.assert_allclose(data.qpos[:2], 0.02, atol=1e-3)
+
+
+def test_a_scene_is_built_once_for_a_pair_and_a_protocol(hand):
+    first = cached_scene(hand, ball(), protocol("dro"))
+    assert cached_scene(replace(hand), ball(), replace(protocol("dro"))) is first
+    assert cached_scene(hand, ball(), protocol("strict")) is not first
+    assert cached_scene(hand, ball(0.02), protocol("dro")).obj.volume < first.obj.volume
+    for i in range(CACHED_SCENES):
+        cached_scene(hand, ball(), replace(protocol("dro"), friction=0.5 + i / 100))
+    assert cached_scene(hand, ball(), protocol("dro")) is not first  # the oldest has gone
 
 
 def test_a_cloud_has_no_scene(hand):

@@ -15,6 +15,7 @@ from dro_grasp.grasps.controller import ControllerConfig
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation import trial as trials
+from dro_grasp.simulation.outcome import Failure
 from dro_grasp.simulation.protocols import protocol
 from dro_grasp.simulation.trial import TrialResult, record, settle, simulate
 from tests.helpers.claw import ball, claw, grasps_of, power_grasp, wrist_below
@@ -33,7 +34,7 @@ def obj() -> ObjectModel:
 def same(a: TrialResult, b: TrialResult) -> None:
     for name in ("success", "displacement", "rotation", "closing_shift", "contacts", "penetration"):
         assert torch.equal(getattr(a, name).nan_to_num(-1.0), getattr(b, name).nan_to_num(-1.0)), name
-    assert a.reason == b.reason
+    assert (a.failure, a.reason) == (b.failure, b.reason)
 
 
 @pytest.mark.parametrize("name", ["dro", "strict", "dro_static", "dexgraspbench"])
@@ -46,6 +47,7 @@ def test_power_grasp_holds_a_ball(hand, obj, name):
         grasps = grasps.replace(joints=squeezed)
     result = simulate(hand, obj, grasps, name)
     assert result.success.all()
+    assert result.failure == (None,) * 3
     assert result.reason == ("",) * 3
     assert (result.displacement[:, -1] < 0.02).all()
     assert (result.contacts >= 3).all()
@@ -55,6 +57,7 @@ def test_power_grasp_holds_a_ball(hand, obj, name):
 def test_hand_30_cm_away_scores_nothing(hand, obj):
     result = simulate(hand, obj, grasps_of(hand, obj, wrist_below(0.3, 2), torch.zeros(2, 8)), "dro")
     assert not result.success.any()
+    assert result.failure == (Failure.NO_CONTACT,) * 2
     assert result.reason == ("no contact after closing",) * 2
     assert result.contacts.tolist() == [0, 0]
 
@@ -94,7 +97,9 @@ def test_dexgraspbench_limits_rotation_and_the_worst_of_all_forces(hand, obj):
     one_of_six = replace(rules, max_rotation=float(turned.max()) * 0.99)
     again = simulate(hand, obj, grasps, one_of_six)
     assert again.success.tolist() == (turned < one_of_six.max_rotation).tolist()
-    assert "turned by" in again.reason[int(turned.argmax())]
+    most = int(turned.argmax())
+    assert again.failure[most] is Failure.TURNED
+    assert again.reason[most] == f"turned by {math.degrees(turned[most]):.0f} degrees"
 
 
 def test_a_gradual_protocol_leads_the_hand_through_the_grasp(hand, obj):
@@ -104,7 +109,6 @@ def test_a_gradual_protocol_leads_the_hand_through_the_grasp(hand, obj):
     assert joints[0] == pytest.approx(torch.zeros(8))
     assert float(joints[10].mean()) == pytest.approx(0.1, abs=0.02)
     assert float(joints[20].mean()) == pytest.approx(0.2, abs=0.03)
-    assert len(joints) == 1 + 20 + 6 * 50
 
 
 def test_one_finger_pushes_the_object_away(hand, obj):
@@ -114,6 +118,7 @@ def test_one_finger_pushes_the_object_away(hand, obj):
     target[0, :2] = torch.tensor([1.4, 0.0])
     grasps = grasps.replace(pregrasp_joints=joints, squeeze_joints=target)
     result = simulate(hand, obj, grasps, "strict")
+    assert result.failure == (Failure.PUSHED_AWAY,)
     assert result.reason == ("object pushed away while closing",)
     assert result.displacement.isnan().all()
     # The other fingers stop it: what `dro` asks for is met.
@@ -124,9 +129,11 @@ def test_one_finger_pushes_the_object_away(hand, obj):
 
 def test_strict_refuses_what_penetrates(hand, obj):
     deep = grasps_of(hand, obj, wrist_below(0.031), torch.tensor([[0.0, 0.6] * 4]))
-    assert simulate(hand, obj, deep, "strict").reason[0].startswith("hand penetrates object by ")
     crossed = grasps_of(hand, obj, wrist_below(0.3), torch.tensor([[1.3, 1.0] * 4]))
-    assert simulate(hand, obj, crossed, "strict").reason[0].startswith("hand penetrates itself by ")
+    result = simulate(hand, obj, GraspBatch.concatenate([deep, crossed]), "strict")
+    assert result.failure == (Failure.PENETRATION, Failure.SELF_PENETRATION)
+    assert result.reason[0] == f"hand penetrates object by {result.penetration[0] * 1e3:.0f} mm"
+    assert result.reason[1] == f"hand penetrates itself by {result.self_penetration[1] * 1e3:.0f} mm"
 
 
 def test_an_unstable_trial_fails(hand, obj, tmp_path, monkeypatch, capfd):
@@ -134,6 +141,7 @@ def test_an_unstable_trial_fails(hand, obj, tmp_path, monkeypatch, capfd):
     wild = replace(protocol("dro"), stiffness=1e9, damping=0.0, force_limit=1e15, armature=1e-9)
     result = simulate(hand, obj, power_grasp(hand, obj, 2), wild)
     assert not result.success.any()
+    assert result.failure == (Failure.UNSTABLE,) * 2
     assert result.reason == ("simulation unstable",) * 2
     assert result.displacement.isnan().all()
     assert list(tmp_path.iterdir()) == []
@@ -145,7 +153,12 @@ def test_weak_fingers_lose_a_pulled_ball(hand, obj):
     grasps = settle(hand, obj, power_grasp(hand, obj))
     result = simulate(hand, obj, grasps.replace(pregrasp_joints=grasps.joints), weak)
     assert result.contacts[0] > 0
+    assert result.failure == (Failure.LOST,)
     assert result.reason == ("lost under force +x",)
+    slipping = replace(protocol("dro"), max_displacement=1e-9)
+    slipped = simulate(hand, obj, grasps, slipping)
+    assert slipped.failure == (Failure.SLIPPED,)
+    assert slipped.reason == (f"slipped by {slipped.displacement[0, -1] * 1e3:.0f} mm",)
 
 
 def test_result_depends_neither_on_workers_nor_on_company(hand, obj, monkeypatch):
@@ -166,6 +179,17 @@ def test_stated_joints_come_before_the_controller_s(hand, obj):
     same(simulate(hand, obj, held.without("squeeze_joints"), "dro"), simulate(hand, obj, grasps, unopened))
 
 
+@pytest.mark.parametrize("name", ["dro", "dexgraspbench"])
+def test_the_controller_fills_single_rows(hand, obj, name):
+    """A file without pregrasps joined with one that states them gives the verdicts of each alone."""
+    bare = power_grasp(hand, obj, 2)
+    stated = bare.replace(pregrasp_joints=bare.joints - 0.02, squeeze_joints=bare.joints + 0.1)
+    joined = simulate(hand, obj, GraspBatch.concatenate([bare, stated]), name)
+    same(joined.rows(torch.arange(2)), simulate(hand, obj, bare, name))
+    same(joined.rows(torch.arange(2, 4)), simulate(hand, obj, stated, name))
+    assert joined.success.all()
+
+
 def test_settled_labels_touch_without_penetrating(hand, obj):
     loose = power_grasp(hand, obj, 2).replace(joints=torch.tensor([[0.0, 0.4] * 4, [0.05, 0.7] * 4]))
     settled = settle(hand, obj, loose)
@@ -177,14 +201,29 @@ def test_settled_labels_touch_without_penetrating(hand, obj):
     assert simulate(hand, obj, settled, "strict").success.all()
 
 
-def test_recorded_frames_follow_the_trial(hand, obj):
+@pytest.mark.parametrize("stride", [20, 200, 37])
+@pytest.mark.parametrize("name", ["dro", "dexgraspbench"])
+def test_the_recorded_run_is_the_judged_one(hand, obj, name, stride):
+    """Same motion to the last bit, however often a frame is taken, also where frames do not divide the phases."""
     grasps = power_grasp(hand, obj, 2)
-    poses, joints = record(hand, obj, grasps, 1, stride=20)
-    assert poses.shape == (71, 4, 4)
-    assert joints.shape == (71, 8)
+    judged, rules = simulate(hand, obj, grasps, name), protocol(name)
+    poses, joints = record(hand, obj, grasps, 1, name, stride=stride)
+    phases = [10] * 20 if rules.gradual else [200]
+    frames = 1 + sum(math.ceil(steps / stride) for steps in phases)
+    each = math.ceil(round(rules.force_time / rules.timestep) / stride)
+    assert joints.shape == (frames + 6 * each, 8)
     torch.testing.assert_close(poses[0], torch.linalg.inv(grasps.T_object_wrist[1]), atol=1e-6, rtol=0)
-    shift = (poses[10:, :3, 3] - poses[10, :3, 3]).norm(dim=-1)
-    assert shift[-1] == pytest.approx(float(simulate(hand, obj, grasps, "dro").displacement[1, -1]), abs=1e-6)
+    origin = poses[0 if rules.reset else frames - 1, :3, 3]
+    ends = (poses[frames - 1 + each :: each, :3, 3] - origin).norm(dim=-1)
+    torch.testing.assert_close(ends, judged.displacement[1], atol=1e-7, rtol=0)  # frames are float32
+    assert len(ends) == 6
+
+
+def test_a_record_ends_where_the_trial_ends(hand, obj):
+    away = grasps_of(hand, obj, wrist_below(0.6), torch.zeros(1, 8))
+    assert len(record(hand, obj, away, 0, "dexgraspbench", stride=500)[0]) == 1 + 20 + 1  # lost under the first force
+    deep = grasps_of(hand, obj, wrist_below(0.031), torch.tensor([[0.0, 0.6] * 4]))
+    assert len(record(hand, obj, deep, 0, "strict", stride=200)[0]) == 2  # no forces
 
 
 def test_outcome_in_a_batch_and_its_file(hand, obj, tmp_path):
@@ -195,6 +234,7 @@ def test_outcome_in_a_batch_and_its_file(hand, obj, tmp_path):
     assert loaded.success.tolist() == [True, False]
     assert loaded.protocol == ("dro/1", "dro/1")
     assert list(loaded.extra["reason"]) == ["", "no contact after closing"]
+    assert list(loaded.extra["failure"]) == [None, "NO_CONTACT"]
     assert len(loaded.extra["contact_links"][0]) >= 3
     assert set(loaded.extra["contact_links"][0]) <= set(hand.tree.link_names)
     assert loaded.extra["contact_links"][1] == []
@@ -216,7 +256,7 @@ def test_grasps_of_another_hand_are_refused(hand, obj, tmp_path):
         simulate(other, obj, power_grasp(hand, obj))
 
 
-def test_a_cloud_cannot_be_tried(hand, obj):
+def test_a_cloud_cannot_be_simulated(hand, obj):
     cloud = replace(obj, vertices=None, faces=None, exact_parts=None, sha256="cloud")
     with pytest.raises(ObjectError, match="bare point cloud"):
         simulate(hand, cloud, power_grasp(hand, obj))

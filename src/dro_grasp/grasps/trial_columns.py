@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from enum import Enum
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor
 REASON = "reason"
 """Further column: why a grasp failed, in words; empty for a success."""
 FAILURE = "failure"
-"""Further column: the kind of failure; None for a success."""
+"""Further column: name of the kind of failure (`Failure`); None for a success."""
 CONTACT_LINKS = "contact_links"
 """Further column: names of the links that touch the object after closing."""
 FURTHER = (REASON, FAILURE, CONTACT_LINKS)
@@ -56,6 +57,11 @@ class Trial(Protocol):
         ...
 
     @property
+    def failure(self) -> Sequence[Enum | None]:
+        """Kind of each failure; None for a success."""
+        ...
+
+    @property
     def contact_links(self) -> Sequence[Sequence[str]]:
         """Links that touch the object after closing."""
         ...
@@ -68,8 +74,7 @@ def columns_of(trial: Trial) -> tuple[dict[str, Any], dict[str, Any]]:
         "rotation": _largest(trial.rotation), "penetration": _largest(trial.penetration),
     }
     further: dict[str, Any] = {REASON: list(trial.reason), CONTACT_LINKS: [list(links) for links in trial.contact_links]}
-    if hasattr(trial, FAILURE):
-        further[FAILURE] = [getattr(failure, "value", failure) for failure in trial.failure]
+    further[FAILURE] = [failure.name if failure else None for failure in trial.failure]
     return fields, further
 
 

@@ -1,4 +1,4 @@
-"""What touches what in a configuration: penetration of labelled grasps, links in contact after closing."""
+"""Contacts of a configuration: penetration of labelled grasps, links that touch the object."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from jaxtyping import Float, Int
 
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.simulation.scene import PREFIX, Scene
@@ -14,12 +15,12 @@ from dro_grasp.simulation.scene import PREFIX, Scene
 
 @dataclass(frozen=True)
 class Penetration:
-    """Of n grasps."""
+    """Penetration in n grasps."""
 
-    object: np.ndarray
-    """Deepest contact of hand and object (n) [m]; zero without contact."""
-    own: np.ndarray
-    """Summed depth over pairs of hand links (n) [m], the deepest contact of each pair."""
+    object: Float[np.ndarray, " n"]
+    """Deepest contact of hand and object [m]; zero without contact."""
+    own: Float[np.ndarray, " n"]
+    """Summed over pairs of hand links, the deepest contact of each pair [m]."""
 
 
 def measure_penetration(scene: Scene, grasps: GraspBatch) -> Penetration:
@@ -36,8 +37,8 @@ def measure_penetration(scene: Scene, grasps: GraspBatch) -> Penetration:
     return Penetration(depth, own)
 
 
-def touching_links(scene: Scene, qpos: np.ndarray) -> tuple[tuple[str, ...], ...]:
-    """Names of the hand's links that touch the object in each configuration (n nq), sorted."""
+def find_contact_links(scene: Scene, qpos: Float[np.ndarray, "n nq"]) -> tuple[tuple[str, ...], ...]:
+    """Names of the links that touch the object in each configuration, sorted."""
     names = [scene.model.body(i).name.removeprefix(PREFIX) for i in range(scene.model.nbody)]
     found = []
     for bodies, _ in _contacts(scene, qpos):
@@ -46,8 +47,10 @@ def touching_links(scene: Scene, qpos: np.ndarray) -> tuple[tuple[str, ...], ...
     return tuple(found)
 
 
-def _contacts(scene: Scene, qpos: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Bodies (k 2) and distances (k) [m] of the contacts of each configuration."""
+def _contacts(
+    scene: Scene, qpos: Float[np.ndarray, "n nq"]
+) -> Iterator[tuple[Int[np.ndarray, "k 2"], Float[np.ndarray, " k"]]]:
+    """The two bodies and the distance [m] of each contact, one configuration after the other."""
     data = mujoco.MjData(scene.model)
     for q in qpos:
         data.qpos[:] = np.nan_to_num(q)

@@ -1,47 +1,62 @@
-"""What became of tried grasps: numbers, verdicts, and the reason of each failure."""
+"""Outcome of trials: measurements, verdicts, and why a grasp fails."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from enum import Enum
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.simulation.contacts import Penetration
 from dro_grasp.simulation.protocols import Protocol
 
 DIRECTIONS = ("+x", "+y", "+z", "-x", "-y", "-z")
 """Order of the forces, in the object's frame."""
 GIVE_UP = 0.1
-"""An object this far from where the hand had it will not come back [m]."""
+"""An object that moves this far counts as lost [m]. Ours."""
+
+
+class Failure(Enum):
+    """Why a grasp fails its trial; the value is the reason in words, without numbers."""
+
+    PENETRATION = "hand penetrates object"
+    SELF_PENETRATION = "hand penetrates itself"
+    UNSTABLE = "simulation unstable"
+    PUSHED_AWAY = "object pushed away while closing"
+    NO_CONTACT = "no contact after closing"
+    LOST = "lost"
+    TURNED = "turned"
+    SLIPPED = "slipped"
 
 
 @dataclass(frozen=True)
 class TrialResult:
-    """What became of n grasps. Numbers that a trial never came to measure are NaN."""
+    """Outcome of the trials of n grasps. A quantity that a trial did not measure is NaN."""
 
     success: Bool[Tensor, " n"]
     displacement: Float[Tensor, "n 6"]
-    """Of the object's centre of mass after each force, from where it was after closing [m]; a lost object keeps
-    its last value."""
+    """Displacement of the object's centre of mass after each force, relative to its place after closing [m]; a lost
+    object keeps its last value."""
     rotation: Float[Tensor, "n 6"]
-    """Of the object after each force, from how it was after closing [rad]; likewise."""
+    """Rotation of the object after each force, relative to its orientation after closing [rad]; likewise."""
     closing_shift: Float[Tensor, " n"]
-    """Displacement of the object while the hand closed [m]."""
+    """Displacement of the object while the hand closes [m]."""
     closing_rotation: Float[Tensor, " n"]
-    """Rotation of the object while the hand closed [rad]."""
+    """Rotation of the object while the hand closes [rad]."""
     contact_links: tuple[tuple[str, ...], ...]
-    """Names of the hand's links that touch the object after closing."""
+    """Names of the links that touch the object after closing."""
     penetration: Float[Tensor, " n"]
-    """Deepest penetration of hand and object in the grasp as labelled [m]."""
+    """Deepest penetration of hand and object in the labelled grasp [m]."""
     self_penetration: Float[Tensor, " n"]
-    """Summed penetration of hand links in the grasp as labelled [m]."""
+    """Summed penetration of hand links in the labelled grasp [m]."""
+    failure: tuple[Failure | None, ...]
+    """Why each grasp fails; None for a success."""
     reason: tuple[str, ...]
-    """Why a grasp failed; empty for a success."""
+    """The same in words, with the number or the direction; empty for a success."""
     protocol: str
     """Name and version."""
 
@@ -55,91 +70,82 @@ class TrialResult:
         """Share of successes; NaN without grasps."""
         return float(self.success.float().mean())
 
-    def fill(self, grasps: GraspBatch) -> GraspBatch:
-        """The tried grasps with their outcome, and the columns `reason` and `contact_links`."""
-        columns = {"reason": list(self.reason), "contact_links": [list(links) for links in self.contact_links]}
-        return grasps.with_trial(self).replace(extra=grasps.extra | columns)
-
     def rows(self, index: Int[Tensor, " k"]) -> TrialResult:
         """The outcome of some of the grasps."""
         kept = index.tolist()
         return replace(
-            self, **{name: getattr(self, name)[index] for name in NUMBERS}, reason=tuple(self.reason[i] for i in kept),
-            contact_links=tuple(self.contact_links[i] for i in kept))
+            self, **{name: getattr(self, name)[index] for name in NUMBERS},
+            **{name: tuple(getattr(self, name)[i] for i in kept) for name in TEXTS})
 
     @staticmethod
     def join(results: Sequence[TrialResult], label: str) -> TrialResult:
         """One result after the other, all of the same protocol."""
-        def column(name: str) -> Tensor:
-            return torch.cat([getattr(r, name) for r in results])
-
         if not results:
             none = np.zeros(0)
-            empty = Measured(Penetration(none, none), none, none, (), none > 0, np.zeros((0, 6)), np.zeros((0, 6)))
-            return empty.result((), label)
+            empty = Measurements(Penetration(none, none), none, none, (), none > 0, np.zeros((0, 6)), np.zeros((0, 6)))
+            return empty.result([], label)
         return TrialResult(
-            **{name: column(name) for name in NUMBERS}, reason=tuple(x for r in results for x in r.reason),
-            contact_links=tuple(x for r in results for x in r.contact_links), protocol=label,
-        )
+            **{name: torch.cat([getattr(r, name) for r in results]) for name in NUMBERS},
+            **{name: tuple(x for r in results for x in getattr(r, name)) for name in TEXTS}, protocol=label)
 
 
-NUMBERS = tuple(n for n in TrialResult.__dataclass_fields__ if n not in {"reason", "contact_links", "protocol"})
+TEXTS = ("contact_links", "failure", "reason")
+"""Fields of a TrialResult with one entry a grasp that are no tensors."""
+NUMBERS = tuple(n for n in TrialResult.__dataclass_fields__ if n not in {*TEXTS, "protocol"})
 """Fields of a TrialResult that are tensors."""
 
 
-def kind_of_failure(reason: str) -> str:
-    """A failure's reason without its numbers and directions, for counting."""
-    return reason.split(" by ")[0].split(" under ")[0]
-
-
 @dataclass(frozen=True)
-class Measured:
+class Measurements:
     """Raw measurements of n trials; fields as in TrialResult."""
 
     penetration: Penetration
-    shift: np.ndarray
-    turn: np.ndarray
+    shift: Float[np.ndarray, " n"]
+    turn: Float[np.ndarray, " n"]
     contacts: tuple[tuple[str, ...], ...]
-    stable: np.ndarray
-    displacement: np.ndarray
-    rotation: np.ndarray
+    stable: Bool[np.ndarray, " n"]
+    displacement: Float[np.ndarray, "n 6"]
+    rotation: Float[np.ndarray, "n 6"]
 
     def judged(self, rules: Protocol) -> TrialResult:
         """Success, or the first reason against it, of every trial."""
-        return self.result(tuple(self._reason(i, rules) for i in range(len(self.shift))), rules.label)
+        return self.result([self._verdict(i, rules) for i in range(len(self.shift))], rules.label)
 
-    def result(self, reasons: tuple[str, ...], label: str) -> TrialResult:
-        """These measurements with their verdicts; those of unstable trials mean nothing and are left out."""
-        def tensor(values: np.ndarray, measured: np.ndarray | None = None) -> Tensor:
-            kept = values if measured is None else np.where(measured, values.T, np.nan).T
+    def result(self, verdicts: Sequence[tuple[Failure | None, str]], label: str) -> TrialResult:
+        """These measurements with their verdicts; numbers of unstable trials mean nothing and become NaN."""
+        def tensor(values: Float[np.ndarray, "n *k"], measured: bool = False) -> Float[Tensor, "n *k"]:
+            kept = np.where(self.stable, values.T, np.nan).T if measured else values
             return torch.from_numpy(np.asarray(kept, np.float32))
 
         return TrialResult(
-            success=torch.tensor([not r for r in reasons], dtype=torch.bool),
-            displacement=tensor(self.displacement, self.stable), rotation=tensor(self.rotation, self.stable),
-            closing_shift=tensor(self.shift, self.stable), closing_rotation=tensor(self.turn, self.stable),
-            contact_links=self.contacts, penetration=tensor(self.penetration.object),
-            self_penetration=tensor(self.penetration.own), reason=reasons, protocol=label,
+            success=torch.tensor([failure is None for failure, _ in verdicts], dtype=torch.bool),
+            displacement=tensor(self.displacement, True), rotation=tensor(self.rotation, True),
+            closing_shift=tensor(self.shift, True), closing_rotation=tensor(self.turn, True), contact_links=self.contacts,
+            penetration=tensor(self.penetration.object), self_penetration=tensor(self.penetration.own),
+            failure=tuple(failure for failure, _ in verdicts),
+            reason=tuple(failure.value + detail if failure else "" for failure, detail in verdicts), protocol=label,
         )
 
-    def _reason(self, i: int, rules: Protocol) -> str:
-        lost = np.flatnonzero(self.displacement[i] >= GIVE_UP)
+    def _verdict(self, i: int, rules: Protocol) -> tuple[Failure | None, str]:
+        """Why trial i fails, None if it does not, and the number or the direction in words."""
         if self.penetration.object[i] > rules.max_penetration:
-            return f"hand penetrates object by {self.penetration.object[i] * 1e3:.0f} mm"
+            return Failure.PENETRATION, f" by {self.penetration.object[i] * 1e3:.0f} mm"
         if self.penetration.own[i] > rules.max_self_penetration:
-            return f"hand penetrates itself by {self.penetration.own[i] * 1e3:.0f} mm"
+            return Failure.SELF_PENETRATION, f" by {self.penetration.own[i] * 1e3:.0f} mm"
         if not self.stable[i]:
-            return "simulation unstable"
+            return Failure.UNSTABLE, ""
         if self.shift[i] > min(rules.max_closing_shift, GIVE_UP) or self.turn[i] > rules.max_closing_rotation:
-            return "object pushed away while closing"
+            return Failure.PUSHED_AWAY, ""
+        # With a reset every force counts, otherwise the last one alone.
         counted = slice(None) if rules.reset else slice(-1, None)
         moved, turned = self.displacement[i, counted].max(), self.rotation[i, counted].max()
         if moved < rules.max_displacement and turned < rules.max_rotation:
-            return ""
+            return None, ""
         if not self.contacts[i]:
-            return "no contact after closing"
+            return Failure.NO_CONTACT, ""
+        lost = np.flatnonzero(self.displacement[i] >= GIVE_UP)
         if len(lost):
-            return f"lost under force {DIRECTIONS[lost[0]]}"
+            return Failure.LOST, f" under force {DIRECTIONS[lost[0]]}"
         if moved < rules.max_displacement:
-            return f"turned by {np.degrees(turned):.0f} degrees"
-        return f"slipped by {moved * 1e3:.0f} mm"
+            return Failure.TURNED, f" by {np.degrees(turned):.0f} degrees"
+        return Failure.SLIPPED, f" by {moved * 1e3:.0f} mm"

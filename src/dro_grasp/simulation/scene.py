@@ -1,20 +1,19 @@
 """One MuJoCo model for a hand and an object; it serves all grasps of the pair.
 
-The hand's root is fixed at the origin, and a grasp's inverse wrist pose is written into the object's free joint.
+The hand's root is fixed at the origin; the object's free joint takes the inverse of a grasp's wrist pose.
 """
 
 from __future__ import annotations
 
-import os
 import warnings
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 
 import mujoco
 import numpy as np
 import roma
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from dro_grasp.errors import HandError, ObjectError
@@ -23,15 +22,17 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.protocols import Protocol
 
 HULL_VERTICES = 64
-"""Most vertices of a colliding hull; more only cost time."""
+"""Most vertices of a colliding hull; more only cost time. Ours."""
 SOLVER_ITERATIONS = 20
-"""Most iterations of the contact solver; two are the rule, and a hundred give the same verdicts."""
+"""Most iterations of the contact solver. Ours: trials usually need two, and a hundred give the same verdicts."""
 EQUALITY_TIME = 0.01
-"""Time constant of joint couplings [s], the stiffest that a 5 ms step allows."""
+"""Time constant of joint couplings [s]: the smallest that MuJoCo allows at a time step of 5 ms."""
 FAR_AWAY = (0.0, 0.0, 5.0)
-"""Where the object waits while the hand is looked at alone [m]."""
+"""Place of the object until a grasp is written [m]. Ours."""
 PREFIX = "hand/"
-"""Stands before every name of the hand in a scene."""
+"""Prefix of the hand's names in a scene."""
+CACHED_SCENES = 8
+"""Scenes that `cached_scene` keeps. Ours: a viewer or a benchmark returns to a few pairs and protocols."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +40,8 @@ class Scene:
     """A compiled hand and object, and where to write a grasp."""
 
     model: mujoco.MjModel
+    """The whole scene: the hand's bodies, joints and geoms with PREFIX before their names, the servos, and the body
+    and free joint `object`."""
     hand: Hand
     obj: ObjectModel
     protocol: Protocol
@@ -50,25 +53,25 @@ class Scene:
 
     @cached_property
     def object_qpos(self) -> slice:
-        """Where the object's position and quaternion WXYZ stand in qpos."""
+        """Place of the object's position and quaternion WXYZ in qpos."""
         start = int(self.model.jnt_qposadr[self.model.joint("object").id])
         return slice(start, start + 7)
 
     @cached_property
-    def hand_qpos(self) -> tuple[np.ndarray, np.ndarray]:
-        """Addresses in qpos, and indices into the tree's moving joints, of the joints that are simulated."""
+    def hand_qpos(self) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+        """Addresses in qpos, and indices into the tree's moving joints, of the simulated joints."""
         return _joint_addresses(self.model, self.hand)
 
     @cached_property
-    def actuated(self) -> np.ndarray:
+    def actuated(self) -> Int[np.ndarray, " n_servos"]:
         """Index into the independent joints of each actuator."""
         names = [self.model.actuator(i).name.removeprefix(PREFIX) for i in range(self.model.nu)]
         return np.array([self.hand.tree.joint_names.index(n) for n in names])
 
     def qpos(
         self, T_object_wrist: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"]
-    ) -> np.ndarray:
-        """Configurations (n nq) of the hand at these joints and the object at its pose in the wrist frame."""
+    ) -> Float[np.ndarray, "n nq"]:
+        """Configurations of the hand at these joints and the object at its pose in the wrist frame."""
         n = len(joints)
         q = np.tile(self.model.qpos0, (n, 1))
         addresses, moving = self.hand_qpos
@@ -79,6 +82,32 @@ class Scene:
         quaternion = roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(rotation))
         q[:, self.object_qpos] = torch.cat([T_wrist_object[:, :3, 3], quaternion], -1).numpy()
         return q
+
+
+@dataclass(frozen=True)
+class SceneKey:
+    """The pair and protocol of a scene; equal keys, by hashes and protocol, have the same scene."""
+
+    hand_sha256: str
+    object_sha256: str
+    protocol: Protocol
+    hand: Hand = field(compare=False)
+    obj: ObjectModel = field(compare=False)
+
+
+def cached_scene(hand: Hand, obj: ObjectModel, protocol: Protocol) -> Scene:
+    """The scene of a pair; the process keeps the last few, least recently used first to go.
+
+    Raises:
+        ObjectError: The object is a bare point cloud.
+        HandError: The hand came without its description.
+    """
+    return _build_once(SceneKey(hand.sha256, obj.sha256, protocol, hand, obj))
+
+
+@lru_cache(maxsize=CACHED_SCENES)
+def _build_once(key: SceneKey) -> Scene:
+    return build_scene(key.hand, key.obj, key.protocol)
 
 
 def build_scene(hand: Hand, obj: ObjectModel, protocol: Protocol) -> Scene:
@@ -163,12 +192,12 @@ def _add_servos(scene: mujoco.MjSpec, hand: Hand, protocol: Protocol) -> None:
 
 
 def _lever(joint: mujoco.MjsJoint, protocol: Protocol) -> float:
-    """What turns Nm/rad into N/m for sliding joints."""
+    """Lever arm that turns Nm/rad into N/m for sliding joints [m]; 1 for turning joints."""
     return protocol.lever if joint.type == mujoco.mjtJoint.mjJNT_SLIDE else 1.0
 
 
 def _hold_joints(spec: mujoco.MjSpec, hand: Hand) -> None:
-    """Joints above the palm do not move: where the model has them already they are removed, elsewhere they are tied."""
+    """Hold the joints above the palm: remove those that already have their value, tie the others to theirs."""
     assert hand.description is not None
     model = hand.description.model
     values = hand.tree.coupling @ hand.rest + hand.tree.offset
@@ -206,14 +235,14 @@ def _add_object(scene: mujoco.MjSpec, obj: ObjectModel, protocol: Protocol) -> N
 
 
 def object_mass(obj: ObjectModel, protocol: Protocol) -> float:
-    """What an object weighs in a protocol [kg]."""
+    """Mass of an object under a protocol [kg]."""
     return protocol.mass_factor * (obj.mass if protocol.mass is None else protocol.mass)
 
 
 def _exclude_resting_contacts(scene: mujoco.MjSpec, hand: Hand) -> None:
-    """Links that touch in the open hand, and each link and what it hangs on, do not collide.
+    """Exclude contacts of links that touch in the open hand, and of each link with its parent.
 
-    MuJoCo's own parent-child filter does not apply where the parent is static.
+    MuJoCo's own parent-child filter ignores static parents.
     """
     model = scene.compile()
     data = mujoco.MjData(model)
@@ -234,7 +263,7 @@ def _exclude_resting_contacts(scene: mujoco.MjSpec, hand: Hand) -> None:
         scene.add_exclude(bodyname1=first, bodyname2=second)
 
 
-def _joint_addresses(model: mujoco.MjModel, hand: Hand) -> tuple[np.ndarray, np.ndarray]:
+def _joint_addresses(model: mujoco.MjModel, hand: Hand) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
     names = {model.joint(j).name: int(model.jnt_qposadr[j]) for j in range(model.njnt)}
     pairs = [(names[PREFIX + n], i) for i, n in enumerate(hand.tree.moving_names) if PREFIX + n in names]
     return np.array([a for a, _ in pairs], int), np.array([i for _, i in pairs], int)
@@ -247,8 +276,3 @@ def _pair(model: mujoco.MjModel, a: int, b: int) -> tuple[str, str]:
 def _named(model: mujoco.MjModel, a: int, b: int) -> tuple[str, str]:
     first, second = sorted((model.body(a).name, model.body(b).name))
     return first, second
-
-
-def cores() -> int:
-    """Cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

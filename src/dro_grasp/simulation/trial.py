@@ -1,33 +1,34 @@
-"""Run a protocol over grasps: close the hand, push the object six ways, see whether it stays.
+"""Run trials of grasps: close the hand, push the object along six directions, see whether it stays.
 
 Source: paper, evaluation metric details.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from dro_grasp.devices import cores
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.controller import completed
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.simulation.contacts import measure_penetration, touching_links
-from dro_grasp.simulation.outcome import DIRECTIONS, GIVE_UP, Measured, TrialResult
+from dro_grasp.simulation.contacts import find_contact_links, measure_penetration
+from dro_grasp.simulation.outcome import DIRECTIONS, GIVE_UP, Failure, Measurements, TrialResult
 from dro_grasp.simulation.protocols import Protocol
 from dro_grasp.simulation.protocols import protocol as find_protocol
-from dro_grasp.simulation.rollout import FORCES, Rollout, quiet
-from dro_grasp.simulation.scene import Scene, build_scene, cores
+from dro_grasp.simulation.rollout import Rollout
+from dro_grasp.simulation.scene import Scene, cached_scene
 
-__all__ = ["DIRECTIONS", "TrialResult", "record", "settle", "simulate"]
+__all__ = ["DIRECTIONS", "Failure", "TrialResult", "record", "settle", "simulate"]
 
 CHUNK = 64
-"""Grasps simulated together."""
+"""Grasps simulated together. Ours: bounds memory; the result does not depend on it."""
 
 
 def simulate(
@@ -39,15 +40,15 @@ def simulate(
     workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> TrialResult:
-    """Try grasps of one object in MuJoCo.
+    """Evaluate grasps of one object in MuJoCo.
 
     Args:
         hand: The hand of the grasps.
         obj: Their object; it needs a mesh.
-        grasps: Poses, and pregrasp and squeeze joints where they are not to be made by the controller.
+        grasps: The controller makes each pregrasp and squeeze that a grasp does not state.
         protocol: `dro`, `strict`, `dro_static`, `dexgraspbench`, or a Protocol of your own.
         workers: Threads; all cores by default. The result does not depend on it.
-        progress: Called with (grasps tried, grasps in all).
+        progress: Called with (grasps evaluated, grasps in all).
 
     Raises:
         ObjectError: The object is a bare point cloud.
@@ -55,41 +56,105 @@ def simulate(
         OptionError: The grasps are of another hand, or the protocol does not exist.
     """
     scene = _scene(hand, obj, grasps, protocol)
-    results = []
-    for start in range(0, len(grasps), CHUNK):
-        results.append(_try(scene, hand, grasps[slice(start, start + CHUNK)], workers or cores()))
+    results, done = [], 0
+    for part, rollout in _rollouts(scene, hand, grasps, workers):
+        results.append(_run(rollout, part))
+        done += len(part)
         if progress is not None:
-            progress(min(start + CHUNK, len(grasps)), len(grasps))
+            progress(done, len(grasps))
     return TrialResult.join(results, scene.protocol.label)
 
 
 def settle(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = "dro", *, workers: int | None = None
 ) -> GraspBatch:
-    """The same grasps relabelled with where hand and object are after closing.
+    """The same grasps, relabelled with the poses of hand and object after closing.
 
-    Joints below which a link touches the object take the values reached, held back by the contact, so that a label
-    touches the surface instead of guessing; all others keep theirs, which the closing only drives towards a fist. A
+    A joint above a link that touches the object takes the value it reached, held back by the contact, so that the
+    label touches the surface. The other joints keep their values: closing would only drive them towards a fist. A
     grasp whose simulation is unstable keeps its label.
 
     Raises:
         ObjectError: The object is a bare point cloud.
+        HandError: The hand came without its description.
         OptionError: The grasps are of another hand, or the protocol does not exist.
     """
     scene = _scene(hand, obj, grasps, protocol)
     joints, poses = [grasps.joints[:0]], [grasps.T_object_wrist[:0]]
-    for start in range(0, len(grasps), CHUNK):
-        chunk = grasps[slice(start, start + CHUNK)]
-        rollout = Rollout(scene, hand, chunk, workers or cores())
+    for part, rollout in _rollouts(scene, hand, grasps, workers):
         stable = torch.from_numpy(rollout.close().stable)
         q, T = (torch.from_numpy(x) for x in rollout.poses())
-        reached = q.to(grasps.joints.dtype).clamp(hand.tree.lower, hand.tree.upper)
-        held = stable[:, None] & _holding_joints(hand, touching_links(scene, rollout.qpos))
+        reached = q.to(part.joints.dtype).clamp(hand.tree.lower, hand.tree.upper)
+        held = stable[:, None] & _holding_joints(hand, find_contact_links(scene, rollout.qpos))
         T_object_wrist = torch.linalg.inv(torch.where(stable[:, None, None], T, torch.eye(4, dtype=T.dtype)))
-        joints.append(torch.where(held, reached, chunk.joints))
-        poses.append(torch.where(stable[:, None, None], T_object_wrist.to(reached.dtype), chunk.T_object_wrist))
+        joints.append(torch.where(held, reached, part.joints))
+        poses.append(torch.where(stable[:, None, None], T_object_wrist.to(reached.dtype), part.T_object_wrist))
     unsettled = grasps.without("pregrasp_joints", "squeeze_joints")
     return unsettled.replace(T_object_wrist=torch.cat(poses), joints=torch.cat(joints))
+
+
+def record(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, index: int, protocol: str | Protocol = "dro", *, stride: int = 10
+) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames n_dof"]]:
+    """Frames of one grasp's trial, as `simulate` runs it: it ends where the trial ends.
+
+    Args:
+        hand: The hand of the grasps.
+        obj: Their object; it needs a mesh.
+        grasps: As in `simulate`.
+        index: Which grasp.
+        protocol: As in `simulate`.
+        stride: Time steps between two frames; the end of closing and of each force gets a frame in any case.
+
+    Returns:
+        Object poses in the wrist frame [m], and joints [rad or m].
+
+    Raises:
+        ObjectError: The object is a bare point cloud.
+        HandError: The hand came without its description.
+        OptionError: The grasps are of another hand, or the protocol does not exist.
+    """
+    scene = _scene(hand, obj, grasps, protocol)
+    (grasp, rollout), = _rollouts(scene, hand, grasps[index], workers=1, stride=stride)
+    _run(rollout, grasp)
+    joints, poses = (
+        torch.from_numpy(np.concatenate(part).astype(np.float32)) for part in zip(*rollout.frames, strict=True))
+    return poses, joints
+
+
+def _scene(hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol) -> Scene:
+    """The scene in which the grasps are simulated."""
+    rules = find_protocol(protocol)
+    if tuple(grasps.joint_names) != tuple(hand.tree.joint_names):
+        raise OptionError(f"these grasps are of hand '{grasps.hand}' with {len(grasps.joint_names)} joints; hand "
+                          f"'{hand.name}' has {hand.tree.n_dof}. Load the hand that the grasps name")
+    return cached_scene(hand, obj, rules)
+
+
+def _rollouts(
+    scene: Scene, hand: Hand, grasps: GraspBatch, workers: int | None, stride: int | None = None
+) -> Iterator[tuple[GraspBatch, Rollout]]:
+    """The grasps in parts that are simulated together, with pregrasp and squeeze; each part's rollout at its start."""
+    centre = torch.as_tensor(scene.obj.centre_of_mass)
+    for start in range(0, len(grasps), CHUNK):
+        part = grasps[slice(start, start + CHUNK)]
+        if scene.protocol.closing:
+            part = completed(hand, part, centre, scene.protocol.controller)
+        yield part, Rollout(scene, part, workers or cores(), stride)
+
+
+def _run(rollout: Rollout, grasps: GraspBatch) -> TrialResult:
+    """Take a rollout through the whole protocol."""
+    scene, rules = rollout.scene, rollout.scene.protocol
+    penetration = measure_penetration(scene, grasps)
+    closed = rollout.close()
+    contacts = find_contact_links(scene, rollout.qpos)
+    shift, turn = closed.shift(rollout.start), closed.turn(rollout.start)
+    # A trial that has failed already needs no forces.
+    failed = ((shift > min(rules.max_closing_shift, GIVE_UP)) | (turn > rules.max_closing_rotation)
+              | (penetration.object > rules.max_penetration) | (penetration.own > rules.max_self_penetration))
+    displacement, rotation, stable = rollout.push(closed, ~failed)
+    return Measurements(penetration, shift, turn, contacts, stable, displacement, rotation).judged(rules)
 
 
 def _holding_joints(hand: Hand, contact_links: Sequence[Sequence[str]]) -> Bool[Tensor, "n n_dof"]:
@@ -100,66 +165,3 @@ def _holding_joints(hand: Hand, contact_links: Sequence[Sequence[str]]) -> Bool[
         row[[names[link] for link in links if link in names]] = 1
     moves = hand.tree.descends.float() @ (hand.tree.link_coupling != 0).float()
     return touching @ moves > 0
-
-
-def record(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, index: int, protocol: str | Protocol = "dro", *, stride: int = 10
-) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames n_dof"]]:
-    """One grasp's trial as frames: object poses in the wrist frame [m], and joints [rad or m], every `stride` steps.
-
-    Raises:
-        ObjectError: The object is a bare point cloud.
-        OptionError: The grasps are of another hand, or the protocol does not exist.
-    """
-    scene = _scene(hand, obj, grasps, protocol)
-    rollout, only = Rollout(scene, hand, grasps[index], workers=1), np.arange(1)
-    rules, frames = scene.protocol, [rollout.poses()]
-
-    def advance(steps: int) -> None:
-        for _ in range(math.ceil(steps / stride)):
-            with quiet():
-                rollout.batch.step(nstep=min(stride, steps))
-            frames.append(rollout.poses())
-
-    for steps in rollout.closing():
-        advance(steps)
-    closed = rollout.state() if rules.reset else {}
-    for axis in FORCES:
-        rollout.restore(closed, only)
-        rollout.set_force(axis, only)
-        advance(rollout.steps(rules.force_time))
-    joints, poses = (torch.from_numpy(np.concatenate(part).astype(np.float32)) for part in zip(*frames, strict=True))
-    return poses, joints
-
-
-def _try(scene: Scene, hand: Hand, grasps: GraspBatch, workers: int) -> TrialResult:
-    """Some grasps through the whole protocol."""
-    rules = scene.protocol
-    penetration = measure_penetration(scene, grasps)
-    rollout = Rollout(scene, hand, grasps, workers)
-    closed = rollout.close()
-    contacts = touching_links(scene, rollout.qpos)
-    shift, turn = closed.shift(rollout.start), closed.turn(rollout.start)
-    # What the protocol fails whatever the forces do needs no forces.
-    failed = ((shift > min(rules.max_closing_shift, GIVE_UP)) | (turn > rules.max_closing_rotation)
-              | (penetration.object > rules.max_penetration) | (penetration.own > rules.max_self_penetration))
-    displacement, rotation, stable = rollout.push(closed, ~failed)
-    return Measured(penetration, shift, turn, contacts, stable, displacement, rotation).judged(rules)
-
-
-_SCENES: dict[tuple[str, str, Protocol], Scene] = {}
-_MOST_SCENES = 8
-
-
-def _scene(hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol) -> Scene:
-    """The scene of a pair, kept while the same few pairs are tried again and again."""
-    rules = find_protocol(protocol)
-    if tuple(grasps.joint_names) != tuple(hand.tree.joint_names):
-        raise OptionError(f"these grasps are of hand '{grasps.hand}' with {len(grasps.joint_names)} joints; hand "
-                          f"'{hand.name}' has {hand.tree.n_dof}. Load the hand that the grasps name")
-    key = (hand.sha256, obj.sha256, rules)
-    if key not in _SCENES:
-        while len(_SCENES) >= _MOST_SCENES:
-            _SCENES.pop(next(iter(_SCENES)))
-        _SCENES[key] = build_scene(hand, obj, rules)
-    return _SCENES[key]

@@ -1,4 +1,4 @@
-"""Try stored grasps again: does a data set hold what it says, and what of anybody's grasps passes a protocol?"""
+"""Evaluate stored grasps again: do their verdicts hold, and which grasps pass another protocol?"""
 
 from __future__ import annotations
 
@@ -7,15 +7,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Bool
-from torch import Tensor
 
 from dro_grasp.datasets.collections.collection import PairGrasps
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import hand_of, object_of, require_same
 from dro_grasp.hands.hand import Hand
-from dro_grasp.simulation.outcome import kind_of_failure
+from dro_grasp.simulation.outcome import TrialResult
 from dro_grasp.simulation.protocols import Protocol
 from dro_grasp.simulation.trial import simulate
 
@@ -24,32 +22,44 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Agreement:
-    """Stored verdicts against those of another trial, for some grasps."""
+    """Stored verdicts against those of new trials, for some grasps."""
 
     protocol: str
-    """Of the new trial."""
+    """Protocol of the new trials."""
     tried: int = 0
+    """Number of new trials."""
     agreed: int = 0
-    """Same verdict as stored."""
+    """Trials with the stored verdict."""
     succeeded: int = 0
-    """Passed the new trial."""
+    """Grasps that pass the new trial."""
     reasons: Counter[str] = field(default_factory=Counter)
-    """Why stored successes failed now."""
+    """Why stored successes fail now, counted."""
     hands: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """By hand: tried, and passed the new trial."""
+    """Trials and successes by hand."""
+
+    def extended(self, grasps: GraspBatch, trial: TrialResult) -> Agreement:
+        """With the new trials of more grasps."""
+        failed = Counter(f.value for f, held in zip(trial.failure, grasps.success.tolist(), strict=True) if f and held)
+        success = int(trial.success.sum())
+        of_hand = self.hands.get(grasps.hand, (0, 0))
+        return replace(
+            self, tried=self.tried + len(grasps), agreed=self.agreed + int((trial.success == grasps.success).sum()),
+            succeeded=self.succeeded + success, reasons=self.reasons + failed,
+            hands=self.hands | {grasps.hand: (of_hand[0] + len(grasps), of_hand[1] + success)},
+        )
 
 
 def check(
     pairs: Iterable[PairGrasps], sample: int, rules: Protocol, seed: int = 0, progress: Progress | None = None
 ) -> Agreement:
-    """Try a random sample of stored grasps again and compare verdicts.
+    """Evaluate a random sample of stored grasps again and compare verdicts.
 
     Args:
         pairs: The data set, failures included if they are to be checked as well.
-        sample: How many grasps, drawn evenly from all; all of them if there are fewer.
+        sample: Number of grasps, drawn evenly; all of them if there are fewer.
         rules: The protocol.
-        seed: Of the draw.
-        progress: Called with (grasps tried, grasps to try).
+        seed: Seed of the draw.
+        progress: Called with (grasps evaluated, grasps in all).
 
     Raises:
         OptionError: `sample` is not positive.
@@ -57,63 +67,45 @@ def check(
     """
     if sample < 1:
         raise OptionError(f"sample is {sample}; check at least one grasp")
-    parts = [pair for pair in pairs if len(pair.grasps)]
-    sizes = [len(pair.grasps) for pair in parts]
+    parts = [pair.grasps for pair in pairs if len(pair.grasps)]
+    sizes = [len(grasps) for grasps in parts]
     if not parts:
         raise GraspFileError("the data set holds no grasp; there is nothing to check")
     order = torch.randperm(sum(sizes), generator=torch.Generator().manual_seed(seed))
     chosen = torch.zeros(sum(sizes), dtype=torch.bool)
     chosen[order[:sample]] = True
-    result, wanted = Agreement(rules.label), int(chosen.sum())
-    loaded: dict[str, Hand] = {}
-    for pair, mask in zip(parts, chosen.split(sizes), strict=True):
+    result, hands = Agreement(rules.label), {}
+    for grasps, mask in zip(parts, chosen.split(sizes), strict=True):
         if mask.any():
-            result = _with_pair(result, pair.grasps[mask], rules, loaded)
+            result = result.extended(grasps[mask], _evaluate(grasps[mask], rules, hands))
             if progress is not None:
-                progress(result.tried, wanted)
+                progress(result.tried, int(chosen.sum()))
     return result
 
 
 def keep_passing(
     pairs: Iterable[PairGrasps], rules: Protocol, progress: Progress | None = None
 ) -> list[tuple[PairGrasps, GraspBatch]]:
-    """Try all grasps and keep what passes, with the new trial's numbers: pairs, and what is left of each.
+    """Evaluate all grasps and keep those that pass, with their new results: each pair and the grasps left of it.
 
     Raises:
         GraspFileError: A hand or an object is not the one the grasps were made for.
     """
-    loaded: dict[str, Hand] = {}
-    parts = list(pairs)
-    total, done, kept = sum(len(p.grasps) for p in parts), 0, []
+    parts = [pair for pair in pairs if len(pair.grasps)]
+    total, done, kept, hands = sum(len(pair.grasps) for pair in parts), 0, [], {}
     for pair in parts:
-        if not len(pair.grasps):
-            continue
-        tried, passed, _ = _try(pair.grasps, rules, loaded)
-        kept.append((pair, tried[passed]))
-        done += len(tried)
+        trial = _evaluate(pair.grasps, rules, hands)
+        kept.append((pair, pair.grasps.with_trial(trial)[trial.success]))
+        done += len(pair.grasps)
         if progress is not None:
             progress(done, total)
     return kept
 
 
-def _with_pair(result: Agreement, grasps: GraspBatch, rules: Protocol, loaded: dict[str, Hand]) -> Agreement:
-    _, passed, reasons = _try(grasps, rules, loaded)
-    failed = Counter(kind_of_failure(r) for r, was in zip(reasons, grasps.success.tolist(), strict=True) if r and was)
-    tried, success = result.hands.get(grasps.hand, (0, 0))
-    return replace(
-        result, tried=result.tried + len(grasps), agreed=result.agreed + int((passed == grasps.success).sum()),
-        succeeded=result.succeeded + int(passed.sum()), reasons=result.reasons + failed,
-        hands=result.hands | {grasps.hand: (tried + len(grasps), success + int(passed.sum()))},
-    )
-
-
-def _try(
-    grasps: GraspBatch, rules: Protocol, loaded: dict[str, Hand]
-) -> tuple[GraspBatch, Bool[Tensor, " n"], tuple[str, ...]]:
-    """The grasps with their new results, which of them passed, and why the others did not."""
-    if grasps.hand_sha256 not in loaded:
-        loaded[grasps.hand_sha256] = hand_of(grasps, None)
-    hand, obj = loaded[grasps.hand_sha256], object_of(grasps, None, 1.0)
+def _evaluate(grasps: GraspBatch, rules: Protocol, hands: dict[str, Hand]) -> TrialResult:
+    """New trials of one pair's grasps; `hands` keeps the hands loaded so far, by hash."""
+    if grasps.hand_sha256 not in hands:
+        hands[grasps.hand_sha256] = hand_of(grasps, None)
+    hand, obj = hands[grasps.hand_sha256], object_of(grasps, None, 1.0)
     require_same(grasps, hand, obj)
-    trial = simulate(hand, obj, grasps, rules)
-    return grasps.with_trial(trial), trial.success, trial.reason
+    return simulate(hand, obj, grasps, rules)

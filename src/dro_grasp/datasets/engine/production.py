@@ -21,7 +21,6 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
-from dro_grasp.simulation.outcome import kind_of_failure
 from dro_grasp.simulation.trial import settle, simulate
 
 LOOSE = "held by too few links"
@@ -162,7 +161,7 @@ def valid_grasps(
     loose = trial.success & (trial.contacts < config.least_contacts)
     passed = tried[trial.success & ~loose]
     new = distinct(hand, passed, earlier=earlier)
-    failures = Counter(kind_of_failure(reason) for reason in trial.reason if reason)
+    failures = Counter(failure.value for failure in trial.failure if failure)
     if loose.any():
         failures[LOOSE] += int(loose.sum())
     made = dataclasses.replace(

@@ -1,0 +1,23 @@
+"""Geometry of the object's motion, against SciPy."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from dro_grasp.simulation.rollout import ObjectState, _matrices
+
+ROTATIONS = Rotation.random(200, random_state=0)
+
+
+def test_matrices_of_quaternions():
+    np.testing.assert_allclose(_matrices(ROTATIONS.as_quat(scalar_first=True)), ROTATIONS.as_matrix(), atol=1e-15)
+
+
+def test_shift_and_turn_between_two_states():
+    generator = np.random.default_rng(0)
+    first, second = generator.normal(size=(2, 100, 3))
+    a, b = (ObjectState(p, r.as_matrix(), np.ones(100, bool)) for p, r in ((first, ROTATIONS[:100]), (second, ROTATIONS[100:])))
+    np.testing.assert_allclose(a.turn(b), (ROTATIONS[:100].inv() * ROTATIONS[100:]).magnitude(), atol=1e-12)
+    np.testing.assert_allclose(a.shift(b), np.linalg.norm(first - second, axis=1))
+    np.testing.assert_allclose(a.turn(a), 0, atol=1e-15)
