@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Any
 
 import numpy as np
 import torch
@@ -84,9 +85,9 @@ class TrialResult:
             none = np.zeros(0)
             empty = Measurements(Penetration(none, none), none, none, (), none > 0, np.zeros((0, 6)), np.zeros((0, 6)))
             return empty.result([], label)
-        return TrialResult(
-            **{name: torch.cat([getattr(r, name) for r in results]) for name in NUMBERS},
-            **{name: tuple(x for r in results for x in getattr(r, name)) for name in TEXTS}, protocol=label)
+        columns: dict[str, Any] = {name: torch.cat([getattr(r, name) for r in results]) for name in NUMBERS}
+        columns |= {name: tuple(x for r in results for x in getattr(r, name)) for name in TEXTS}
+        return TrialResult(**columns, protocol=label)
 
 
 TEXTS = ("contact_links", "failure", "reason")
