@@ -14,7 +14,7 @@ import argparse
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cvxpy as cp
@@ -24,10 +24,11 @@ import torch
 from report import emit
 
 from dro_grasp import distance_matrix
+from dro_grasp.geometry.se3 import compose
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.kinematics import joint_solver
-from dro_grasp.kinematics.joint_solver import JointSolution, JointSolverConfig, solve_joints
+from dro_grasp.kinematics.joint_solver import JointSolution, JointSolverConfig, Targets, solve_joints
 
 ASSET_HANDS = (
     "barrett_multidex", "allegro_left", "shadowhand", "barrett", "leaphand", "inspire", "ability", "dclaw", "orca",
@@ -45,9 +46,7 @@ class Task:
     """Targets of one hand and where both solvers start."""
 
     hand: Hand
-    positions: torch.Tensor
-    links: torch.Tensor
-    local: torch.Tensor
+    targets: Targets
     T_start: torch.Tensor
     q_start: torch.Tensor
 
@@ -56,26 +55,23 @@ def random_poses(hand: Hand, n: int, seed: int) -> distance_matrix.LinkPoses:
     """Exact link poses of random grasps: what a perfect D(R,O) decodes to."""
     torch.manual_seed(seed)
     q = hand.random_joints(n, torch.Generator().manual_seed(seed))
-    T = torch.eye(4).repeat(n, 1, 1)
-    T[:, :3, :3], T[:, :3, 3] = roma.random_rotmat(n), 0.1 * torch.randn(n, 3)
+    T = compose(roma.random_rotmat(n), 0.1 * torch.randn(n, 3))
     poses = T[:, None] @ hand.tree.forward(q)
     return distance_matrix.LinkPoses(poses, torch.zeros(poses.shape[:2]), hand.registrable, hand.points(q, T))
 
 
 def canonical_task(hand: Hand, poses: distance_matrix.LinkPoses, noise: float) -> Task:
     """The canonical joints, with the palm where it was registered."""
-    positions, links, local = distance_matrix.targets(hand, poses)
-    n = len(positions)
-    q = hand.canonical_joints().expand(n, -1)
+    targets = distance_matrix.targets(hand, poses)
+    noisy = replace(targets, positions=targets.positions + noise * torch.randn_like(targets.positions))
+    q = hand.canonical_joints().expand(len(noisy.positions), -1)
     T = poses.T_world_link[:, hand.palm] @ torch.linalg.inv(hand.T_wrist_palm(q))
-    return Task(hand, positions + noise * torch.randn_like(positions), links, local, T, q)
+    return Task(hand, noisy, T, q)
 
 
 def ours(task: Task) -> JointSolution:
     """The whole batch at once."""
-    return solve_joints(
-        task.hand.tree, task.positions, task.links, task.local, task.T_start, task.q_start, movable=task.hand.movable
-    )
+    return solve_joints(task.hand.tree, task.targets, task.T_start, task.q_start, task.hand.movable)
 
 
 class ConvexStep:
@@ -106,10 +102,8 @@ def theirs(task: Task, row: int, convex: ConvexStep) -> tuple[float, float, int]
     q, T = task.q_start[row : row + 1].double(), task.T_start[row : row + 1].double()
     low = torch.where(task.hand.movable, tree.lower, q)
     high = torch.where(task.hand.movable, tree.upper, q)
-    targets = task.positions[row : row + 1].double()
-    problem = joint_solver._problem(
-        tree, task.links, task.local.double(), targets, torch.ones_like(targets[..., 0]), low, high
-    )
+    targets = replace(task.targets, positions=task.targets.positions[row : row + 1])
+    problem = joint_solver._problem(tree, targets, low, high)
     state, seconds, stalled = joint_solver._state(problem, T, q, config), 0.0, 0
     steps = 0
     while steps < config.max_iterations and stalled < 2:
@@ -163,7 +157,7 @@ def compare(hand: Hand, grasps: int, seed: int) -> Comparison:
     task = canonical_task(hand, random_poses(hand, BATCH, seed), NOISE)
     per_grasp = median_seconds(lambda: ours(task)) / BATCH
     solution = ours(task)
-    convex = ConvexStep(len(task.links), 6 + hand.tree.n_dof)
+    convex = ConvexStep(len(task.targets.links), 6 + hand.tree.n_dof)
     theirs(task, 0, convex)
     results = [[theirs(task, row, convex) for _ in range(RUNS)] for row in range(grasps)]
     return Comparison(

@@ -14,54 +14,58 @@ from torch import Tensor
 from dro_grasp.geometry.mirrored_sides import SideConfig, choose_sides
 from dro_grasp.geometry.multilateration import MultilaterationConfig, distance_misfit, multilaterate_both
 from dro_grasp.geometry.registration import register
+from dro_grasp.geometry.se3 import apply, apply_to_cloud
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinematics.joint_reading import read_joints
-from dro_grasp.kinematics.joint_solver import JointSolution, JointSolverConfig, solve_joints
+from dro_grasp.kinematics.joint_solver import JointSolution, JointSolverConfig, Targets, solve_joints
 
 
 @dataclass(frozen=True)
 class DecodeConfig:
-    """Numbers of the decoding."""
+    """Settings of the decoding."""
 
     multilateration: MultilaterationConfig = field(default_factory=MultilaterationConfig)
-    """Closed form and refinement."""
+    """Closed form and its refinement."""
     sides: SideConfig = field(default_factory=SideConfig)
-    """How mirrored candidates are told apart on flat clouds."""
+    """Choice between mirrored candidates on flat clouds."""
 
 
 @dataclass(frozen=True)
 class LinkPoses:
-    """What D(R,O) says about a hand."""
+    """Pose of a hand's links, decoded from D(R,O)."""
 
     T_world_link: Float[Tensor, "*b n_links 4 4"]
     """Pose of each link in the frame of the object points; the identity where not valid."""
     residual: Float[Tensor, "*b n_links"]
     """Root mean square distance of a link's points from its posed surface [m]; 0 where not valid."""
     valid: Bool[Tensor, " n_links"]
-    """Links with enough points to have a pose."""
+    """Links with enough points for a pose."""
     points: Float[Tensor, "*b n_hand 3"]
     """The multilaterated hand cloud [m]."""
 
     def to(self, device: torch.device | str) -> LinkPoses:
-        """The same on another device."""
+        """The same poses on another device."""
         return LinkPoses(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
 
 
 @dataclass(frozen=True)
 class _Segments:
-    """The points of each registrable link, padded to the same number."""
+    """The points of each registrable link, padded to one length."""
 
     links: Int[Tensor, " l"]
     index: Int[Tensor, "l p"]
+    """Rows of the hand cloud; 0 where padded."""
     weight: Float[Tensor, "l p"]
+    """1, or 0 where padded."""
     local: Float[Tensor, "l p 3"]
+    """The points in their link's frame [m]."""
 
 
 def build(
     hand_points: Float[Tensor, "*b n 3"], object_points: Float[Tensor, "*b m 3"]
 ) -> Float[Tensor, "*b n m"]:
     """D(R,O) of a posed hand and an object [m]."""
-    # The matrix-product form of cdist loses half of the digits.
+    # The matrix-product form of cdist loses half of the significant digits.
     return torch.cdist(hand_points, object_points, compute_mode="donot_use_mm_for_euclid_dist")
 
 
@@ -73,13 +77,19 @@ def decode(
 ) -> LinkPoses:
     """Multilaterate each row and register each link; differentiable.
 
-    Flat object clouds leave two mirrored candidates per point: each link takes those with which it fits without
-    reflection, and in doubt the palm's side.
+    A flat object cloud leaves two mirrored candidates per point. Each link takes the candidates that it fits without a
+    reflection; in doubt it takes the palm's side.
+
+    Args:
+        hand: The hand of the rows.
+        distances: D(R,O), predicted or exact [m].
+        object_points: The object points of the columns [m].
+        config: See DecodeConfig.
     """
     config = config or DecodeConfig()
     batch, (n, m) = distances.shape[:-2], distances.shape[-2:]
     distances, object_points = distances.reshape(-1, n, m), object_points.reshape(-1, m, 3)
-    segments = _segments(hand, distances)
+    segments = _segments(hand, distances.device, distances.dtype)
     both, flat = multilaterate_both(distances, object_points, config.multilateration)
     points = both[:, 0]
     if bool(flat.any()):
@@ -97,22 +107,22 @@ def decode(
     )
 
 
-def _segments(hand: Hand, like: Tensor) -> _Segments:
-    """Rows of the hand's points per registrable link; padding has weight zero."""
+def _segments(hand: Hand, device: torch.device, dtype: torch.dtype) -> _Segments:
+    """The hand's points grouped by link."""
     links = hand.registrable.nonzero()[:, 0]
     rows = [(hand.link_index == link).nonzero()[:, 0] for link in links]
     index = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)
     lengths = torch.tensor([len(row) for row in rows])
-    weight = (torch.arange(index.shape[1]) < lengths[:, None]).to(device=like.device, dtype=like.dtype)
-    local = hand.link_points[index].to(like)
-    return _Segments(links.to(like.device), index.to(like.device), weight, local)
+    weight = (torch.arange(index.shape[1]) < lengths[:, None]).to(device, dtype)
+    local = hand.link_points[index].to(device, dtype)
+    return _Segments(links.to(device), index.to(device), weight, local)
 
 
 def _sides(
     hand: Hand, segments: _Segments, both: Float[Tensor, "b 2 n 3"], distances: Float[Tensor, "b n m"],
     object_points: Float[Tensor, "b m 3"], config: DecodeConfig,
 ) -> Bool[Tensor, "b n"]:
-    """For each hand point over a flat object, whether its second candidate is the right one."""
+    """Whether each hand point takes its second candidate, for grasps of flat objects."""
     misfit = torch.stack([distance_misfit(both[:, side], distances, object_points) for side in (0, 1)], 1)
     palm = int((segments.links == hand.palm).float().argmax())
     chosen = choose_sides(
@@ -124,12 +134,10 @@ def _sides(
     return second
 
 
-def targets(hand: Hand, poses: LinkPoses) -> tuple[Float[Tensor, "*b t 3"], Int[Tensor, " t"], Float[Tensor, "t 3"]]:
-    """What the joint solver aims at: origins of the registered links, and the extra point beyond each fingertip.
+def targets(hand: Hand, poses: LinkPoses) -> Targets:
+    """Targets of the joint solver: origins of the registered links, and the extra point beyond each fingertip.
 
-    Returns:
-        World positions [m], the link of each target, and its position in the link's frame [m]. A fingertip without a
-        pose of its own gives no extra target.
+    A fingertip without a pose of its own gives no extra target.
     """
     device = poses.points.device
     links = poses.valid.nonzero()[:, 0]
@@ -138,8 +146,7 @@ def targets(hand: Hand, poses: LinkPoses) -> tuple[Float[Tensor, "*b t 3"], Int[
     beyond = hand.tip_offsets.to(device)[kept]
     local = torch.cat([beyond.new_zeros(len(links), 3), beyond])
     index = torch.cat([links, tips[kept]])
-    T = poses.T_world_link[..., index, :, :]
-    return (T[..., :3, :3] @ local[..., None])[..., 0] + T[..., :3, 3], index, local
+    return Targets(apply(poses.T_world_link[..., index, :, :], local), index, local)
 
 
 @torch.no_grad()
@@ -151,43 +158,37 @@ def solve(
 ) -> JointSolution:
     """Wrist pose and joints whose links come closest to decoded link poses.
 
-    The wrist starts from the registered pose of the palm. The joints start from `q_start` or from what the relative
-    poses of neighbouring links say, whichever is closer to the targets.
+    The wrist starts at the registered pose of the palm. The joints start at `q_start` or at the values that the relative
+    poses of neighbouring links imply, whichever is closer to the targets.
 
     Args:
         hand: The hand that was decoded.
         link_poses: From `decode`.
-        q_start: The open hand that the network saw; the canonical one by default [rad or m].
+        q_start: Joints of the open hand that the network was given; the canonical ones by default [rad or m].
         config: See JointSolverConfig.
     """
     link_poses = link_poses.to(hand.tree.origin.device)
-    positions, links, local = targets(hand, link_poses)
-    batch = positions.shape[:-2]
-    given = hand.canonical_joints() if q_start is None else q_start.to(positions.device)
-    given = torch.where(hand.movable, given, hand.rest).expand(*batch, -1)
+    wanted = targets(hand, link_poses)
+    given = hand.canonical_joints() if q_start is None else q_start.to(wanted.positions.device)
+    given = torch.where(hand.movable, given, hand.rest).expand(*wanted.positions.shape[:-2], -1)
     read = read_joints(hand.tree, link_poses.T_world_link, link_poses.valid, given)
     read = torch.where(hand.movable, read, given)
-    starts = []
-    for q in (given, read):
-        T, error = _place_wrist(hand, link_poses, q, positions, links, local)
-        starts.append((T, q, error))
-    better = starts[1][2] < starts[0][2]
-    T = torch.where(better[..., None, None], starts[1][0], starts[0][0])
-    q = torch.where(better[..., None], starts[1][1], starts[0][1])
-    return solve_joints(hand.tree, positions, links, local, T, q, movable=hand.movable, config=config)
+    T_given, error_given = _place_wrist(hand, link_poses, given, wanted)
+    T_read, error_read = _place_wrist(hand, link_poses, read, wanted)
+    better = error_read < error_given
+    T = torch.where(better[..., None, None], T_read, T_given)
+    q = torch.where(better[..., None], read, given)
+    return solve_joints(hand.tree, wanted, T, q, hand.movable, config)
 
 
 def _place_wrist(
-    hand: Hand, link_poses: LinkPoses, q: Float[Tensor, "*b n_dof"], positions: Float[Tensor, "*b t 3"],
-    links: Int[Tensor, " t"], local: Float[Tensor, "t 3"],
+    hand: Hand, link_poses: LinkPoses, q: Float[Tensor, "*b n_dof"], wanted: Targets
 ) -> tuple[Float[Tensor, "*b 4 4"], Float[Tensor, "*b"]]:
-    """Wrist pose that puts the palm where it was registered, and the mean distance from the targets there."""
+    """Wrist pose that puts the palm where it was registered, and the mean distance from the targets there [m]."""
     T_wrist_link = hand.tree.forward(q)
-    chosen = T_wrist_link[..., links, :, :]
-    points = (chosen[..., :3, :3] @ local[..., None])[..., 0] + chosen[..., :3, 3]
+    points = apply(T_wrist_link[..., wanted.links, :, :], wanted.local)
     if bool(link_poses.valid[hand.palm]):
         T = link_poses.T_world_link[..., hand.palm, :, :] @ torch.linalg.inv(T_wrist_link[..., hand.palm, :, :])
     else:
-        T, _ = register(points, positions)
-    error = points @ T[..., :3, :3].mT + T[..., None, :3, 3] - positions
-    return T, error.norm(dim=-1).mean(-1)
+        T, _ = register(points, wanted.positions)
+    return T, (apply_to_cloud(T, points) - wanted.positions).norm(dim=-1).mean(-1)

@@ -1,1 +1,1 @@
-"""Kinematic trees: loading, forward kinematics, the joint solver."""
+"""Kinematic trees: forward kinematics, Jacobians and the joint solver, on tensors alone."""

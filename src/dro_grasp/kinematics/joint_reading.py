@@ -1,7 +1,7 @@
-"""Joint values read off link poses: the start of the joint solver.
+"""Joint values from link poses: the initial guess of the joint solver.
 
-Where the poses of two links with joints between them are known, each joint's value is the one that turns (or slides)
-the lower link best into its known pose. Source: none, the paper starts from the given open hand.
+Where the poses of two links are known, each joint between them takes the value that brings the lower link closest to
+its known pose. Source: ours; the paper starts from the given open hand.
 """
 
 from __future__ import annotations
@@ -12,12 +12,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dro_grasp.geometry.se3 import invert, rotate
 from dro_grasp.kinematics.tree import FIXED, REVOLUTE, KinematicTree
 
 ROUNDS = 8
-"""Sweeps over chains in which several joints lie between two known links."""
+"""Sweeps of coordinate descent where several joints lie between two known links (ours)."""
 RIDGE = 1e-6
-"""Pull of joints that no pose determines towards their given values."""
+"""Pull towards the given values, for joints that no pose determines [1] (ours)."""
 
 
 @torch.no_grad()
@@ -31,9 +32,9 @@ def read_joints(
 
     Args:
         tree: The kinematic tree.
-        T_world_link: Link poses, noisy ones too.
+        T_world_link: Link poses; noise is allowed.
         valid: Links whose pose is known.
-        q: Values of joints that no pair of known links encloses, and where the sweeps start [rad or m].
+        q: Where the sweeps start; joints that no pair of known links encloses keep these values [rad or m].
     """
     segments = _segments(tree, valid)
     if not segments:
@@ -49,8 +50,8 @@ def read_joints(
     return q
 
 
-def _segments(tree: KinematicTree, valid: Tensor) -> list[tuple[int, int, list[int]]]:
-    """Known link, next known link below it, and the moving links from one to the other, topmost first."""
+def _segments(tree: KinematicTree, valid: Bool[Tensor, " n_links"]) -> list[tuple[int, int, list[int]]]:
+    """Triples: a known link, the next known link below it, and the moving links between them, topmost first."""
     found = []
     for bottom in valid.nonzero()[:, 0].tolist():
         chain, link = [], bottom
@@ -67,13 +68,14 @@ def _update(
     tree: KinematicTree, target: Float[Tensor, "*b n_links 4 4"], q: Float[Tensor, "*b n_dof"],
     known: Bool[Tensor, " n_joints"], top: Int[Tensor, " s"], bottom: Int[Tensor, " s"], moving: Int[Tensor, " s"],
 ) -> Float[Tensor, "*b n_dof"]:
-    """Set one joint of each segment to its best value, the others standing."""
+    """Set one joint of each segment to its best value and keep the others."""
     poses = tree.forward(q)
     parent = torch.tensor(tree.parent, device=q.device)[moving]
-    before = _inverse(poses[..., top, :, :]) @ poses[..., parent, :, :] @ tree.origin[moving]
-    after = _inverse(poses[..., moving, :, :]) @ poses[..., bottom, :, :]
-    wanted = _inverse(target[..., top, :, :]) @ target[..., bottom, :, :]
-    motion = _inverse(before) @ wanted @ _inverse(after)
+    # T_top_bottom = before @ joint motion @ after: solve for the motion that gives the wanted relative pose.
+    before = invert(poses[..., top, :, :]) @ poses[..., parent, :, :] @ tree.origin[moving]
+    after = invert(poses[..., moving, :, :]) @ poses[..., bottom, :, :]
+    wanted = invert(target[..., top, :, :]) @ target[..., bottom, :, :]
+    motion = invert(before) @ wanted @ invert(after)
     x = q @ tree.coupling.T + tree.offset
     joint = torch.tensor(tree.link_joint, device=q.device)[moving]
     x[..., joint] = _joint_value(tree, motion, moving, x[..., joint])
@@ -83,7 +85,11 @@ def _update(
 def _joint_value(
     tree: KinematicTree, motion: Float[Tensor, "*b s 4 4"], moving: Int[Tensor, " s"], near: Float[Tensor, "*b s"]
 ) -> Float[Tensor, "*b s"]:
-    """Angle about, or shift along, each joint's axis that comes closest to a motion."""
+    """Angle about, or shift along, each joint's axis a that comes closest to a motion (R, t).
+
+    The rotation about a closest to R in the Frobenius norm maximises trace(R(x)^T R), which is
+    sin(x) (a . v) + cos(x) (trace R - a^T R a) + a^T R a, with v the axial vector of R - R^T.
+    """
     axis = tree.axis[moving]
     rotation = motion[..., :3, :3]
     turned = torch.stack([
@@ -92,9 +98,9 @@ def _joint_value(
         rotation[..., 1, 0] - rotation[..., 0, 1],
     ], -1)
     trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1)
-    along = (axis * (rotation @ axis[..., None])[..., 0]).sum(-1)
+    along = (axis * rotate(rotation, axis)).sum(-1)
     angle = torch.atan2((axis * turned).sum(-1), trace - along)
-    # Of the angles that are whole turns apart, the one nearest to the middle of the joint's present neighbourhood.
+    # Angles are equal up to whole turns: take the one nearest to the present value.
     angle = angle + 2 * math.pi * torch.round((near - angle) / (2 * math.pi))
     revolute = torch.tensor(tree.kind, device=axis.device)[moving] == REVOLUTE
     return torch.where(revolute, angle, (axis * motion[..., :3, 3]).sum(-1))
@@ -104,16 +110,9 @@ def _independent(
     tree: KinematicTree, x: Float[Tensor, "*b n_joints"], q: Float[Tensor, "*b n_dof"],
     known: Bool[Tensor, " n_joints"],
 ) -> Float[Tensor, "*b n_dof"]:
-    """Independent joints whose coupled values fit all joints best (exactly, where nothing is coupled)."""
+    """Independent joints that fit all known joints best; the fit is exact without couplings."""
     rows = tree.coupling[known]
     matrix = rows.T @ rows + RIDGE * torch.eye(tree.n_dof, dtype=q.dtype, device=q.device)
     right = (x - tree.offset)[..., known] @ rows + RIDGE * q
     fitted = torch.linalg.solve(matrix, right[..., None])[..., 0]
     return torch.minimum(torch.maximum(fitted, tree.lower), tree.upper)
-
-
-def _inverse(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
-    inverse = T.clone()
-    inverse[..., :3, :3] = T[..., :3, :3].mT
-    inverse[..., :3, 3] = -(T[..., :3, :3].mT @ T[..., :3, 3:])[..., 0]
-    return inverse

@@ -3,8 +3,12 @@
 Each iteration linearises the kinematics and takes the best step of `joint_step`; a step that does not lower the
 objective is undone and damped. The wrist moves by local se(3) increments, so nothing is singular.
 
-Tensors come and go in single precision; in between everything is double. The matrices are tiny, so it costs no time,
-and rounding, which depends on the batch size, then decides neither which limits are active nor when a grasp stops.
+Layout: residuals are coordinate-major. With t targets, a row of k = 3 t numbers holds x of all targets, then all y,
+then all z. The norm of each target is then a sum of three contiguous chunks, and the Jacobian, stored transposed
+(p unknowns x k), is built by whole-row products. The p unknowns are wrist shift (3), wrist rotation (3) and joints.
+
+Tensors come and go in single precision; everything between is double. The matrices are tiny, so it costs no time, and
+rounding, which depends on the batch size, then decides neither which limits are active nor when a grasp stops.
 Source: paper section III-D, joint configurations.
 """
 
@@ -18,13 +22,26 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
+from dro_grasp.geometry.se3 import apply, compose
 from dro_grasp.kinematics.joint_step import StepConfig, best_step, point_norms, smoothed_norms
 from dro_grasp.kinematics.tree import KinematicTree
 
 
 @dataclass(frozen=True)
+class Targets:
+    """World positions for points that are fixed to links."""
+
+    positions: Float[Tensor, "*b t 3"]
+    """Where each point should be [m]."""
+    links: Int[Tensor, " t"]
+    """The link that each point is fixed to."""
+    local: Float[Tensor, "t 3"]
+    """Each point in the frame of its link [m]."""
+
+
+@dataclass(frozen=True)
 class JointSolverConfig:
-    """Stopping, step limits and damping."""
+    """Stopping, step limits and damping. Values are ours unless a source is given."""
 
     max_iterations: int = 32
     """Linearisations per grasp."""
@@ -33,12 +50,18 @@ class JointSolverConfig:
     tolerance: float = 2e-5
     """A grasp is done when no coordinate changes by more than this [rad or m]."""
     objective_tolerance: float = 5e-4
-    """A grasp is also done when a step lowers the objective, but by a smaller share than this, or when two steps in a
-    row fail to lower it."""
+    """A grasp is also done when a step lowers the objective by less than this share, or when two steps in a row fail
+    to lower it."""
     damping: float = 1e-2
-    """First damping, relative to the normal equations' mean weight times a square centimetre."""
+    """Initial damping, in units of the mean IRLS weight times `damping_length` squared."""
     damping_range: tuple[float, float] = (1e-6, 1e8)
-    """Smallest and largest damping, likewise."""
+    """Smallest and largest damping, in the same unit."""
+    damping_length: float = 0.01
+    """Lever arm that gives the damping its scale [m]: it makes 1 rad of a joint comparable to so many metres."""
+    damping_decrease: float = 8.0
+    """Divides the damping after a step that lowers the objective (Levenberg-Marquardt)."""
+    damping_increase: float = 16.0
+    """Multiplies the damping after a step that does not; larger than the decrease, so that failures do not alternate."""
     sharpness: float = 0.8
     """Once steps are small: share of Newton's curvature in place of IRLS's; see joint_step."""
     sharpen_below: float = 0.1
@@ -49,57 +72,59 @@ class JointSolverConfig:
 
 @dataclass(frozen=True)
 class JointSolution:
-    """Where the solver ended, per grasp."""
+    """Result of the solver, per grasp."""
 
     T_world_wrist: Float[Tensor, "*b 4 4"]
     """Pose of the root link."""
     joints: Float[Tensor, "*b n_dof"]
     """Independent joints, inside their limits [rad or m]."""
     residual: Float[Tensor, "*b"]
-    """Weighted mean distance of the points from their targets [m]."""
+    """Mean distance of the points from their targets [m]."""
     converged: Bool[Tensor, "*b"]
-    """Steps or gains had become smaller than their tolerances."""
+    """Whether steps or gains fell below their tolerances."""
     iterations: Int[Tensor, "*b"]
     """Linearisations taken."""
 
 
 @dataclass(frozen=True)
 class _Problem:
-    """What stays the same over the iterations; tensors lead with the grasps."""
+    """What stays the same over the iterations; a pair is a moving link and an independent joint (dof) that drives it."""
 
     tree: KinematicTree
     links: Int[Tensor, " t"]
-    points: Float[Tensor, "t 3"]
+    local: Float[Tensor, "t 3"]
     drive: Float[Tensor, "pairs k"]
-    """Change of a link's own joint per unit of a dof, where the joint lies above the target's link, else zero."""
+    """Change of a pair's joint per unit of its dof where that joint moves the target, else zero; coordinate-major."""
     pair_link: Int[Tensor, " pairs"]
     pair_dof: Float[Tensor, "n_dof pairs"] | None
-    """Sums pairs into dofs; None where they are the same."""
-    targets: Float[Tensor, "b t 3"]
-    weights: Float[Tensor, "b t"]
+    """Sums pairs into dofs; None if pair i is dof i."""
+    positions: Float[Tensor, "b t 3"]
     lower: Float[Tensor, "b n_dof"]
     upper: Float[Tensor, "b n_dof"]
 
-    def rows(self, index: Tensor) -> _Problem:
+    def rows(self, index: Bool[Tensor, " b"]) -> _Problem:
         """The problem of some of the grasps."""
-        return replace(self, **{k: getattr(self, k)[index] for k in ("targets", "weights", "lower", "upper")})
+        return replace(self, **{k: getattr(self, k)[index] for k in ("positions", "lower", "upper")})
 
 
 @dataclass(frozen=True)
 class _State:
-    """A working point of each grasp, with the kinematics linearised there."""
+    """The iterate of each grasp, with the kinematics linearised there."""
 
     T: Float[Tensor, "b 4 4"]
     q: Float[Tensor, "b n_dof"]
     residual: Float[Tensor, "b k"]
+    """Points minus targets in the wrist frame, coordinate-major [m]."""
     jacobian: Float[Tensor, "b p k"]
+    """Transposed derivative of the residual."""
     cost: Float[Tensor, " b"]
+    """Sum of smoothed norms [m]."""
     damping: Float[Tensor, " b"]
     sharpness: Float[Tensor, " b"]
     stalled: Int[Tensor, " b"]
-    """Since the last real gain: 2 for each step that gained little, 1 for each that was undone."""
+    """Sum over the steps since the last real gain: 2 for a step that gained little, 1 for a step that was undone."""
 
-    def rows(self, index: Tensor) -> _State:
+    def rows(self, index: Bool[Tensor, " b"]) -> _State:
         """Some of the grasps."""
         return _State(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
@@ -111,7 +136,7 @@ class _State:
 
 @dataclass(frozen=True)
 class _Result:
-    """Filled row by row as grasps finish."""
+    """Results, filled in as grasps finish."""
 
     T: Float[Tensor, "b 4 4"]
     q: Float[Tensor, "b n_dof"]
@@ -121,7 +146,7 @@ class _Result:
 
     @staticmethod
     def empty(state: _State) -> _Result:
-        """Room for the results of these grasps, as if no step were taken."""
+        """Results that equal the state, with no iteration."""
         none = torch.zeros_like(state.stalled)
         return _Result(state.T.clone(), state.q.clone(), state.residual.clone(), none.bool(), none)
 
@@ -134,66 +159,51 @@ class _Result:
 @torch.no_grad()
 def solve_joints(
     tree: KinematicTree,
-    targets: Float[Tensor, "*b t 3"],
-    target_links: Int[Tensor, " t"],
-    target_points: Float[Tensor, "t 3"],
+    targets: Targets,
     T_world_wrist: Float[Tensor, "*b 4 4"],
     q: Float[Tensor, "*b n_dof"],
-    lower: Float[Tensor, " n_dof"] | None = None,
-    upper: Float[Tensor, " n_dof"] | None = None,
-    weights: Float[Tensor, "*b t"] | None = None,
     movable: Bool[Tensor, " n_dof"] | None = None,
     config: JointSolverConfig | None = None,
 ) -> JointSolution:
     """Wrist pose and joints that bring points on links closest to target positions.
 
-    Minimises the weighted sum of un-squared distances within the joint limits. Every grasp stops by itself, and what
-    comes out for it does not depend on the others in the batch.
+    Minimises the sum of un-squared distances within the joint limits. Each grasp stops on its own criterion, and its
+    result does not depend on the other grasps in the batch.
 
     Args:
         tree: The hand's kinematic tree; its couplings hold exactly.
-        targets: Wanted world positions [m].
-        target_links: The link that each point is fixed to.
-        target_points: The points in their links' frames [m].
-        T_world_wrist: Where the root link starts.
-        q: Where the independent joints start; clamped to the limits.
-        lower: Limits other than the tree's [rad or m].
-        upper: Likewise.
-        weights: Weight of each target; 1 by default, 0 leaves one out.
-        movable: False for joints that stay where they start.
+        targets: Points on links and their wanted positions.
+        T_world_wrist: Initial pose of the root link.
+        q: Initial independent joints; clamped to the limits [rad or m].
+        movable: False for joints that keep their initial value, inside the limits or not; all move by default.
         config: See JointSolverConfig.
 
     Raises:
         OptionError: There is no target.
     """
     config = config or JointSolverConfig()
-    if len(target_links) == 0:
+    if len(targets.links) == 0:
         raise OptionError("the joint solver got no target; give at least one point on a link with its position")
-    batch, t, dtype = q.shape[:-1], len(target_links), q.dtype
-    weights = torch.ones_like(targets[..., 0]) if weights is None else weights
+    batch, dtype = q.shape[:-1], q.dtype
     q = q.reshape(-1, tree.n_dof).double()
     movable = torch.ones_like(tree.lower, dtype=torch.bool) if movable is None else movable
-    low = torch.where(movable, (tree.lower if lower is None else lower).double(), q)
-    high = torch.where(movable, (tree.upper if upper is None else upper).double(), q)
-    problem = _problem(
-        tree.double, target_links, target_points.double(), targets.reshape(-1, t, 3).double(),
-        weights.reshape(-1, t).double(), low, high,
-    )
+    low, high = (torch.where(movable, limit.double(), q) for limit in (tree.lower, tree.upper))
+    problem = _problem(tree.double, targets, low, high)
     T = T_world_wrist.reshape(-1, 4, 4).double()
-    start = _state(problem, T, torch.minimum(torch.maximum(q, low), high), config)
-    final = _iterate(problem, start, config)
-    total = problem.weights.sum(-1).clamp(min=1e-12)
-    residual = (point_norms(final.residual) * problem.weights).sum(-1) / total
+    final = _iterate(problem, _state(problem, T, torch.minimum(torch.maximum(q, low), high), config), config)
     # Rounding to single precision may step over a limit by half a unit: clamp once more.
     joints = torch.minimum(torch.maximum(final.q.to(dtype), low.to(dtype)), high.to(dtype))
+    # Repeated products leave rounding errors in the rotation: make it orthonormal again.
+    T = compose(roma.special_gramschmidt(final.T[:, :3, :2]), final.T[:, :3, 3])
     return JointSolution(
-        _orthonormal(final.T).to(dtype).reshape(*batch, 4, 4), joints.reshape(*batch, tree.n_dof),
-        residual.to(dtype).reshape(batch), final.converged.reshape(batch), final.iterations.reshape(batch),
+        T.to(dtype).reshape(*batch, 4, 4), joints.reshape(*batch, tree.n_dof),
+        point_norms(final.residual).mean(-1).to(dtype).reshape(batch), final.converged.reshape(batch),
+        final.iterations.reshape(batch),
     )
 
 
 def _iterate(problem: _Problem, state: _State, config: JointSolverConfig) -> _Result:
-    """Iterate until every grasp is done; the rows of finished grasps leave the computation."""
+    """Iterate until every grasp is done; finished grasps leave the batch."""
     result = _Result.empty(state)
     rows = torch.arange(len(state.q), device=state.q.device)
     for iteration in range(1, config.max_iterations + 1):
@@ -210,57 +220,58 @@ def _iterate(problem: _Problem, state: _State, config: JointSolverConfig) -> _Re
 
 
 def _advance(problem: _Problem, state: _State, config: JointSolverConfig) -> tuple[_State, Float[Tensor, " b"]]:
-    """One step per grasp, kept where it lowers the objective; and the largest change it makes or would make."""
+    """One step per grasp, undone if it raises the objective; and its largest change of a coordinate [rad or m]."""
     limit = config.step_limit
     wrist = torch.full_like(state.T[:, :3, :2].flatten(1), limit)
     low = torch.cat([-wrist, (problem.lower - state.q).clamp(-limit, limit)], -1)
     high = torch.cat([wrist, (problem.upper - state.q).clamp(-limit, limit)], -1)
-    scale = (problem.weights / smoothed_norms(state.residual, config.step.norm_floor)).mean(-1) * 1e-4
-    step = best_step(
-        state.jacobian, state.residual, problem.weights, low, high, state.damping * scale, state.sharpness, config.step
-    )
+    weight = smoothed_norms(state.residual, config.step.norm_floor).reciprocal().mean(-1)
+    damping = state.damping * (weight * config.damping_length**2)
+    step = best_step(state.jacobian, state.residual, low, high, damping, state.sharpness, config.step)
     T, q = _move(state, step)
     q = torch.minimum(torch.maximum(q, problem.lower), problem.upper)
-    tried = _state(problem, T, q, config)
-    better = tried.cost <= state.cost
+    proposed = _state(problem, T, q, config)
+    better = proposed.cost <= state.cost
     change = step.abs().amax(-1)
-    damping = torch.where(better, state.damping / 8, state.damping * 16).clamp(*config.damping_range)
+    lighter, heavier = state.damping / config.damping_decrease, state.damping * config.damping_increase
+    damping = torch.where(better, lighter, heavier).clamp(*config.damping_range)
     sharpness = torch.where(better & (change < config.sharpen_below), config.sharpness, 0.0).to(damping)
-    little = tried.cost > state.cost * (1 - config.objective_tolerance)
+    little = proposed.cost > state.cost * (1 - config.objective_tolerance)
     stalled = torch.where(little, state.stalled + 1 + better.long(), 0)
-    return replace(tried.where(better, state), damping=damping, sharpness=sharpness, stalled=stalled), change
+    return replace(proposed.where(better, state), damping=damping, sharpness=sharpness, stalled=stalled), change
 
 
 def _move(state: _State, step: Float[Tensor, "b p"]) -> tuple[Float[Tensor, "b 4 4"], Float[Tensor, "b n_dof"]]:
-    local = torch.zeros_like(state.T)
-    local[:, :3, :3] = roma.rotvec_to_rotmat(step[:, 3:6])
-    local[:, :3, 3] = step[:, :3]
-    local[:, 3, 3] = 1
+    """Apply a step: the wrist moves in its own frame."""
+    local = compose(roma.rotvec_to_rotmat(step[:, 3:6]), step[:, :3])
     return state.T @ local, state.q + step[:, 6:]
 
 
 def _problem(
-    tree: KinematicTree, links: Tensor, points: Tensor, targets: Tensor, weights: Tensor, lower: Tensor, upper: Tensor
+    tree: KinematicTree, targets: Targets, lower: Float[Tensor, "b n_dof"], upper: Float[Tensor, "b n_dof"]
 ) -> _Problem:
+    """The problem in double precision, with the batch axes of the targets flattened."""
+    positions = targets.positions.reshape(-1, *targets.positions.shape[-2:]).double()
     coupling = tree.link_coupling
     pair_link, dof = coupling.nonzero(as_tuple=True)
-    drive = (tree.descends[links][:, pair_link].to(coupling.dtype) * coupling[pair_link, dof]).T.repeat(1, 3)
+    drive = (tree.descends[targets.links][:, pair_link].to(coupling.dtype) * coupling[pair_link, dof]).T.repeat(1, 3)
     gather = torch.zeros(tree.n_dof, len(dof), dtype=coupling.dtype, device=coupling.device)
     gather[dof, torch.arange(len(dof), device=dof.device)] = 1
     same = gather.shape[0] == gather.shape[1] and bool((gather.diagonal() == 1).all())
-    return _Problem(tree, links, points, drive, pair_link, None if same else gather, targets, weights, lower, upper)
+    return _Problem(
+        tree, targets.links, targets.local.double(), drive, pair_link, None if same else gather, positions, lower, upper
+    )
 
 
 def _state(
     problem: _Problem, T: Float[Tensor, "b 4 4"], q: Float[Tensor, "b n_dof"], config: JointSolverConfig
 ) -> _State:
-    """Kinematics, residuals and their derivative, all in the wrist frame, where wrist increments are simplest."""
+    """Kinematics, residuals and their derivative, all in the wrist frame, where the wrist Jacobian is simplest."""
     poses = problem.tree.forward(q)
-    chosen = poses[:, problem.links]
-    points = (chosen[..., :3, :3] @ problem.points[..., None])[..., 0] + chosen[..., :3, 3]
-    wanted = (problem.targets - T[:, None, :3, 3]) @ T[:, :3, :3]
+    points = apply(poses[:, problem.links], problem.local)
+    wanted = (problem.positions - T[:, None, :3, 3]) @ T[:, :3, :3]
     residual = (points - wanted).mT.flatten(1)
-    cost = (smoothed_norms(residual, config.step.norm_floor) * problem.weights).sum(-1)
+    cost = smoothed_norms(residual, config.step.norm_floor).sum(-1)
     damping = torch.full_like(cost, config.damping)
     none = torch.zeros_like(cost)
     return _State(T, q, residual, _jacobian(problem, poses, points), cost, damping, none, none.long())
@@ -269,13 +280,14 @@ def _state(
 def _jacobian(
     problem: _Problem, poses: Float[Tensor, "b n_links 4 4"], points: Float[Tensor, "b t 3"]
 ) -> Float[Tensor, "b p k"]:
-    """Transposed derivative of the points by wrist shift, wrist rotation and joints.
+    """Transposed derivative of the points with respect to wrist shift, wrist rotation and joints.
 
-    A twist (v, w) moves a point p by v + w x p: that is one 6 x 3 block per point, which serves the wrist and, after
-    multiplication by the joints' axes, the joints.
+    A twist (v, w) moves a point p by v + w x p. `twist` holds this map, six rows over all coordinates; it is the wrist's
+    part of the Jacobian, and a joint's row is its own twist times these six rows.
     """
     zero, one = torch.zeros_like(points[..., 0]), torch.ones_like(points[..., 0])
     x, y, z = points.unbind(-1)
+    # Entry 3 i + c: coordinate c of a point's velocity per unit of twist coordinate i.
     rows = [one, zero, zero, zero, one, zero, zero, zero, one, zero, -z, y, z, zero, -x, -y, x, zero]
     twist = torch.stack(rows, 1).unflatten(1, (6, 3)).flatten(2)
     linear, angular = problem.tree.motion_axes(poses)
@@ -284,10 +296,3 @@ def _jacobian(
     if problem.pair_dof is not None:
         joints = problem.pair_dof @ joints
     return torch.cat([twist, joints], 1)
-
-
-def _orthonormal(T: Float[Tensor, "b 4 4"]) -> Float[Tensor, "b 4 4"]:
-    """Remove the rounding that repeated products leave in a rotation."""
-    clean = T.clone()
-    clean[:, :3, :3] = roma.special_gramschmidt(T[:, :3, :2])
-    return clean

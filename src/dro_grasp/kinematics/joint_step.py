@@ -1,12 +1,15 @@
 """One step of the joint solver: a convex problem per grasp, solved for a whole batch at once.
 
-Minimise over d the weighted sum of un-squared norms |residual_i + J_i d|, with d inside a box. The norms are handled
-by iteratively reweighted least squares (IRLS), the box by an active set, each pass by one batched Cholesky
-factorisation. Source: paper section III-D, joint configurations.
+Minimise over d the sum of un-squared norms |r_i + J_i d|, with d inside a box. Iteratively reweighted least squares
+(IRLS) handles the norms, an active set handles the box, and each pass is one batched Cholesky factorisation.
+Source: paper section III-D, joint configurations.
 
-A norm |r| has the curvature (I - u u^T) / |r|, u = r / |r|. IRLS takes I / |r| instead: it never overshoots, and
-creeps near an optimum that misses its targets. `sharpness` s in [0, 1] takes (I - s u u^T) / |r|: 0 is IRLS, 1 is
-Newton's method.
+A norm |r| has the curvature (I - u u^T) / |r| with u = r / |r|. IRLS takes I / |r| instead: it never overshoots, but it
+converges slowly near an optimum that misses its targets. `sharpness` s in [0, 1] takes (I - s u u^T) / |r|: 0 is IRLS,
+1 is Newton's method.
+
+Layout: see joint_solver. Rows of k = 3 t numbers are coordinate-major (x of all t targets, then y, then z), and the
+Jacobian is transposed (p unknowns x k).
 """
 
 from __future__ import annotations
@@ -14,20 +17,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
 @dataclass(frozen=True)
 class StepConfig:
-    """How precisely one step is solved."""
+    """How precisely one step is solved. Values are ours."""
 
     reweightings: int = 1
     """IRLS passes."""
     active_set_passes: int = 3
-    """Corrections of the active set after each reweighting; a pass that changes nothing ends them."""
+    """Most solves with a corrected active set per reweighting; they end when the set no longer changes."""
     norm_floor: float = 3e-4
-    """Norms below this count as squared ones [m]: keeps the weights finite, changes the optimum by less."""
+    """Below this, norms are replaced by parabolas [m]: the weights stay finite and the optimum moves by less than this."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,7 @@ class _Quadratic:
     lower: Float[Tensor, "b p"]
     upper: Float[Tensor, "b p"]
 
-    def rows(self, index: Tensor) -> _Quadratic:
+    def rows(self, index: Int[Tensor, " r"]) -> _Quadratic:
         """Some of the problems."""
         return _Quadratic(self.matrix[index], self.gradient[index], self.lower[index], self.upper[index])
 
@@ -47,7 +50,6 @@ class _Quadratic:
 def best_step(
     jacobian: Float[Tensor, "b p k"],
     residual: Float[Tensor, "b k"],
-    weights: Float[Tensor, "b t"],
     lower: Float[Tensor, "b p"],
     upper: Float[Tensor, "b p"],
     damping: Float[Tensor, " b"],
@@ -57,11 +59,10 @@ def best_step(
     """The step that brings all points closest to their targets, to first order.
 
     Args:
-        jacobian: Transposed derivative of the k = 3 t coordinates (x of all targets, then y, then z) by p unknowns.
-        residual: Coordinates minus targets, likewise [m].
-        weights: Weight of each of the t targets.
-        lower: Smallest allowed step, at most 0.
-        upper: Largest allowed step, at least 0.
+        jacobian: Transposed derivative of the k coordinates with respect to p unknowns.
+        residual: Coordinates minus targets [m].
+        lower: Smallest allowed step, at most 0 [rad or m].
+        upper: Largest allowed step, at least 0 [rad or m].
         damping: Multiple of the identity that is added to the normal equations [1/m].
         sharpness: Between IRLS (0, the default) and Newton's method (1).
         config: See StepConfig.
@@ -71,7 +72,8 @@ def best_step(
     held: tuple[Bool[Tensor, "b p"], Bool[Tensor, "b p"]] | None = None
     for i in range(config.reweightings):
         left = residual + (step[:, None] @ jacobian)[:, 0] if i else residual
-        matrix, gradient = _model(jacobian, left, weights, sharpness, config)
+        matrix, gradient = _model(jacobian, left, sharpness, config)
+        # The model is expanded about `step`: its slope at d = 0 is gradient - H step.
         constant = gradient - (matrix @ step[..., None])[..., 0] if i else gradient
         matrix.diagonal(dim1=-2, dim2=-1).add_(damping[:, None])
         quadratic = _Quadratic(matrix, constant, lower, upper)
@@ -80,17 +82,21 @@ def best_step(
 
 
 def _model(
-    jacobian: Float[Tensor, "b p k"], left: Float[Tensor, "b k"], weights: Float[Tensor, "b t"],
-    sharpness: Float[Tensor, " b"] | None, config: StepConfig,
+    jacobian: Float[Tensor, "b p k"], left: Float[Tensor, "b k"], sharpness: Float[Tensor, " b"] | None,
+    config: StepConfig,
 ) -> tuple[Float[Tensor, "b p p"], Float[Tensor, "b p"]]:
-    """Curvature and slope of the sum of norms where these residuals are left."""
+    """Curvature H and slope g of the sum of norms at the residuals `left`.
+
+    With weights w_i = 1 / |r_i|, IRLS has H = sum w_i J_i^T J_i. The correction -s w_i (J_i^T u_i)(J_i^T u_i)^T is of rank
+    one per target, so it joins the same matrix product as one more column per target.
+    """
     norms = point_norms(left)
     floored = norms.clamp(min=config.norm_floor)
-    scale = weights / floored
+    scale = floored.reciprocal()
     weighted, plain = jacobian * scale.repeat(1, 3)[:, None], jacobian
     gradient = (weighted @ left[..., None])[..., 0]
     if sharpness is not None:
-        # Below the floor the function is a parabola, whose curvature IRLS has exactly.
+        # Below the floor the function is a parabola, and IRLS has its exact curvature.
         share = torch.where(norms > config.norm_floor, sharpness[:, None] * scale, 0.0)
         directions = left / floored.repeat(1, 3)
         x, y, z = (jacobian * directions[:, None]).chunk(3, -1)
@@ -100,27 +106,39 @@ def _model(
 
 
 def point_norms(residual: Float[Tensor, "*b k"]) -> Float[Tensor, "*b t"]:
-    """Length of each point's residual [m]; the coordinates are x of all points, then y, then z."""
+    """Length of each target's residual [m]."""
     x, y, z = residual.square().chunk(3, -1)
     return (x + y + z).sqrt()
 
 
 def smoothed_norms(residual: Float[Tensor, "*b k"], floor: float) -> Float[Tensor, "*b t"]:
-    """Norms of the points' residuals as IRLS with a floor minimises them [m]."""
+    """Norms that IRLS with a floor minimises [m]: a parabola below the floor, joined with equal value and slope."""
     norms = point_norms(residual)
     return torch.where(norms > floor, norms, (norms.square() + floor**2) / (2 * floor))
 
 
 def _minimum_in_box(
-    quadratic: _Quadratic, held: tuple[Tensor, Tensor] | None, passes: int
+    quadratic: _Quadratic, held: tuple[Bool[Tensor, "b p"], Bool[Tensor, "b p"]] | None, passes: int
 ) -> tuple[Float[Tensor, "b p"], tuple[Bool[Tensor, "b p"], Bool[Tensor, "b p"]]]:
-    """Primal-dual active set: variables are held at a bound while the slope pushes them outwards.
+    """Minimum of the quadratic in its box, by a primal-dual active set.
 
-    Passes after the first one see only the rows whose active set has changed.
+    Each unknown is free, held at its lower bound or held at its upper bound. A pass minimises over the free unknowns. Then
+    a free unknown beyond a bound is held there, and a held unknown is released if the slope pulls it back inside. Most
+    sets settle in two or three passes; passes after the first one see only the rows whose set has changed.
+
+    Args:
+        quadratic: The problem.
+        held: Unknowns held at their lower and upper bounds by the previous reweighting.
+        passes: Most passes.
+
+    Returns:
+        The minimum, clamped to the box, and the unknowns held at either bound.
     """
     lower, upper, gradient = quadratic.lower, quadratic.upper, quadratic.gradient
+    # Joints that cannot move have equal bounds: they stay at the lower one whatever the slope.
     frozen = lower >= upper
     if held is None:
+        # First guess: a bound already reached, with the steepest descent pointing out of the box.
         held = (lower >= 0) & (gradient > 0), (upper <= 0) & (gradient < 0)
     at_lower, at_upper = held[0] | frozen, held[1] & ~frozen
     step, at_lower, at_upper, changed = _pass(quadratic, at_lower, at_upper)
@@ -136,7 +154,7 @@ def _minimum_in_box(
 def _pass(
     quadratic: _Quadratic, at_lower: Bool[Tensor, "b p"], at_upper: Bool[Tensor, "b p"]
 ) -> tuple[Float[Tensor, "b p"], Bool[Tensor, "b p"], Bool[Tensor, "b p"], Bool[Tensor, " b"]]:
-    """The minimum for an active set, the active set that it suggests, and the rows in which that differs."""
+    """The minimum for an active set, the next active set, and the rows in which the two differ."""
     step = _solve_free(quadratic, at_lower, at_upper)
     slope = (quadratic.matrix @ step[..., None])[..., 0] + quadratic.gradient
     frozen = quadratic.lower >= quadratic.upper
@@ -150,7 +168,10 @@ def _pass(
 def _solve_free(
     quadratic: _Quadratic, at_lower: Bool[Tensor, "b p"], at_upper: Bool[Tensor, "b p"]
 ) -> Float[Tensor, "b p"]:
-    """Minimum over the free variables, the others standing at their bounds."""
+    """Minimum over the free unknowns, with the others at their bounds.
+
+    Rows and columns of held unknowns become those of the identity, so that all problems of the batch keep one size.
+    """
     fixed = at_lower | at_upper
     value = torch.where(at_lower, quadratic.lower, torch.where(at_upper, quadratic.upper, 0.0))
     free = (~fixed).to(value.dtype)

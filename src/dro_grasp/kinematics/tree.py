@@ -1,7 +1,7 @@
 """A hand's kinematic tree: batched forward kinematics and Jacobians.
 
-Mimic joints and stated couplings are resolved once, when the tree is made: everything here takes `q`, the values of
-the *independent* joints, and maps them to all joints by one affine map. Source: paper section III-D and any textbook.
+Mimic joints and stated couplings are resolved once, when the tree is built: all functions take `q`, the values of the
+*independent* joints, and one affine map gives all joints. Source: paper section III-D and any textbook.
 """
 
 from __future__ import annotations
@@ -14,13 +14,20 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
+from dro_grasp.geometry.se3 import apply, rotate
+
+FIXED = 0
+"""Kind of a link that does not move against its parent (ours)."""
+REVOLUTE = 1
+"""Kind of a link that turns about its joint's axis (ours)."""
+PRISMATIC = 2
+"""Kind of a link that slides along its joint's axis (ours)."""
 SLIDING_UNIT = 0.03
-"""Travel of a sliding joint that moves a hand about as much as 1 rad of a turning one [m]."""
+"""Travel of a prismatic joint that moves a hand about as much as 1 rad of a revolute one [m] (ours)."""
 
 
 class cached_tensor(cached_property):  # type: ignore[type-arg]  # reads like the decorator it extends
-    """A cached property whose tensors can be used in training even if inference asked for them first."""
+    """A cached property whose tensors still work in training after inference has computed them."""
 
     def __get__(self, instance: Any, owner: type | None = None) -> Any:
         with torch.inference_mode(False):
@@ -106,7 +113,7 @@ class KinematicTree:
 
     @cached_tensor
     def _level_order(self) -> Int[Tensor, " n_links"]:
-        """Where each link stands when the levels are joined."""
+        """Position of each link in the concatenated levels."""
         joined = torch.cat([self._roots, *[links for links, _ in self._levels]])
         return joined.argsort()
 
@@ -119,10 +126,11 @@ class KinematicTree:
         return torch.tensor(self.kind, device=self.origin.device) == REVOLUTE
 
     @cached_tensor
-    def _motion_basis(self) -> Float[Tensor, "4 n_links 4 4"]:
-        """Four constant matrices per link: the factors of 1, sin x, 1 - cos x and x in its own joint's motion.
+    def _local_basis(self) -> Float[Tensor, "4 n_links 4 4"]:
+        """Four constant matrices B_k per link: T_parent_link = B_0 + sin(x) B_1 + (1 - cos(x)) B_2 + x B_3.
 
-        Rodrigues' formula about an axis through the anchor, and a slide, are linear in these.
+        For an axis a through the anchor c, Rodrigues' formula is R = I + sin(x) K + (1 - cos(x)) K^2, K = [a]_x, and the
+        motion is p -> R (p - c) + c: K c and K^2 c move into the translation. A slide is x a.
         """
         turns = self._revolute[:, None]
         slides = torch.tensor(self.kind, device=self.axis.device)[:, None] == PRISMATIC
@@ -130,14 +138,9 @@ class KinematicTree:
         basis = self.origin.new_zeros(4, self.n_links, 4, 4)
         basis[0] = torch.eye(4)
         basis[1, :, :3, :3], basis[2, :, :3, :3] = k, k @ k
-        basis[1:3, :, :3, 3] = -(basis[1:3, :, :3, :3] @ self.anchor[..., None])[..., 0]
+        basis[1:3, :, :3, 3] = -rotate(basis[1:3, :, :3, :3], self.anchor)
         basis[3, :, :3, 3] = self.axis * slides
-        return basis
-
-    @cached_tensor
-    def _local_basis(self) -> Float[Tensor, "4 n_links 4 4"]:
-        """The same for T_parent_link."""
-        return self.origin @ self._motion_basis
+        return self.origin @ basis
 
     @cached_tensor
     def link_coupling(self) -> Float[Tensor, "n_links n_dof"]:
@@ -152,7 +155,7 @@ class KinematicTree:
     def link_offset(self) -> Float[Tensor, " n_links"]:
         """Value of each link's own joint at q = 0."""
         joint = torch.tensor(self.link_joint, device=self.offset.device)
-        # The zero at the end is where the -1 of fixed links points.
+        # Fixed links have joint -1, which indexes the appended zero.
         return torch.cat([self.offset, self.offset.new_zeros(1)])[joint]
 
     @cached_tensor
@@ -165,23 +168,16 @@ class KinematicTree:
             table[link, link] = True
         return table
 
-    def joint_motion(self, q: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_links 4 4"]:
-        """Motion of each link caused by its own joint, in the link's frame at joint value zero."""
-        return self._combine(self._motion_basis, q)
-
-    def _combine(
-        self, basis: Float[Tensor, "4 n_links 4 4"], q: Float[Tensor, "*batch n_dof"]
-    ) -> Float[Tensor, "*batch n_links 4 4"]:
-        x = (q @ self.link_coupling.T + self.link_offset)[..., None, None]
-        return basis[0] + torch.sin(x) * basis[1] + (1 - torch.cos(x)) * basis[2] + x * basis[3]
-
     def forward(self, q: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_links 4 4"]:
         """Pose of every link in the root link's frame, T_root_link.
 
         Args:
             q: Values of the independent joints [rad or m].
         """
-        local = self._combine(self._local_basis, q)
+        x = (q @ self.link_coupling.T + self.link_offset)[..., None, None]
+        basis = self._local_basis
+        local = basis[0] + torch.sin(x) * basis[1] + (1 - torch.cos(x)) * basis[2] + x * basis[3]
+        # One batched product per depth of the tree, not one per link.
         levels = [local[..., self._roots, :, :]]
         for links, parents in self._levels:
             levels.append(levels[-1][..., parents, :, :] @ local[..., links, :, :])
@@ -190,13 +186,12 @@ class KinematicTree:
     def motion_axes(
         self, T_world_link: Float[Tensor, "*batch n_links 4 4"]
     ) -> tuple[Float[Tensor, "*batch n_links 3"], Float[Tensor, "*batch n_links 3"]]:
-        """Velocity (linear at the world origin, angular) of everything below each link per unit of its own joint.
+        """Twist (linear velocity at the world origin, angular velocity) of each link per unit of its own joint.
 
-        A point p below link j moves by linear[j] + angular[j] x p per unit of joint j.
+        A point p on link j or below it moves by linear[j] + angular[j] x p per unit of joint j.
         """
-        rotation = T_world_link[..., :3, :3]
-        axis = (rotation @ self.axis[..., None])[..., 0]
-        anchor = (rotation @ self.anchor[..., None])[..., 0] + T_world_link[..., :3, 3]
+        axis = rotate(T_world_link[..., :3, :3], self.axis)
+        anchor = apply(T_world_link, self.anchor)
         revolute = self._revolute[:, None]
         angular = torch.where(revolute, axis, torch.zeros_like(axis))
         linear = torch.where(revolute, _cross(anchor, axis), axis)
@@ -208,10 +203,10 @@ class KinematicTree:
         points: Float[Tensor, "*batch n_points 3"],
         links: Int[Tensor, " n_points"],
     ) -> Float[Tensor, "*batch n_points 3 n_dof"]:
-        """Derivative of world points, each fixed to a link, by the independent joints.
+        """Derivative of world points, each fixed to a link, with respect to the independent joints.
 
         Args:
-            T_world_link: Poses of all links, as `forward` gives them (in any world frame).
+            T_world_link: Poses of all links, from `forward`, in any world frame.
             points: Positions in that world frame [m].
             links: The link that each point is fixed to.
         """
@@ -231,6 +226,6 @@ def _skew(v: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
 
 
 def _cross(a: Float[Tensor, "*batch 3"], b: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """torch.linalg.cross takes several times as long on small tensors."""
+    """Cross product; several times as fast as torch.linalg.cross on small tensors."""
     (ax, ay, az), (bx, by, bz) = a.unbind(-1), b.unbind(-1)
     return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1)
