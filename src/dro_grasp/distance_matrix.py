@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.geometry.mirrored_sides import SideConfig, choose_sides
-from dro_grasp.geometry.multilateration import MultilaterationConfig, distance_misfit, multilaterate_both
+from dro_grasp.geometry.multilateration import MultilaterationConfig, distance_misfit, multilaterate
 from dro_grasp.geometry.registration import register
 from dro_grasp.geometry.se3 import apply, apply_to_cloud
 from dro_grasp.hands.hand import Hand
@@ -90,7 +90,7 @@ def decode(
     batch, (n, m) = distances.shape[:-2], distances.shape[-2:]
     distances, object_points = distances.reshape(-1, n, m), object_points.reshape(-1, m, 3)
     segments = _segments(hand, distances.device, distances.dtype)
-    both, flat = multilaterate_both(distances, object_points, config.multilateration)
+    both, flat = multilaterate(distances, object_points, config.multilateration)
     points = both[:, 0]
     if bool(flat.any()):
         second = _sides(hand, segments, both[flat].detach(), distances[flat].detach(), object_points[flat], config)

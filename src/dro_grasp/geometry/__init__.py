@@ -1,1 +1,1 @@
-"""Geometry on tensors: knows no robot, reads no file."""
+"""Geometry on tensors: knows no robot and reads no file."""

@@ -1,7 +1,7 @@
-"""Which side of a flat object each point of a rigid body lies on.
+"""Choose the side of a flat object on which each point of a rigid body lies.
 
-Distances to a flat cloud leave every point two positions, mirrored in its plane. The body's own shape tells them
-apart: a body cannot be mirrored.
+Distances to a flat cloud leave two positions for each point, mirrored in its plane. The body's known shape resolves the
+ambiguity, because a rigid motion cannot mirror it.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from dro_grasp.geometry.se3 import apply_to_cloud
 
 @dataclass(frozen=True)
 class SideConfig:
-    """Numbers of the choice."""
+    """Settings of the choice. Values are ours."""
 
     rounds: int = 4
-    """How often each point picks its nearer candidate and the body is registered again."""
+    """Rounds in which each point picks its nearer candidate and the body is registered again."""
     reference_margin: float = 0.8
-    """Factor on the error of what lies mostly on the reference body's side: it wins when both sides fit alike."""
+    """Factor on the error of a solution on the reference body's side, so that it wins if both sides fit alike."""
     ridge: float = 1e-6
-    """Regularises the fit of the heights, in units of the body's size."""
+    """Regularises the fit of the heights [1]; lengths are in units of the body's size there."""
 
 
 @torch.no_grad()
@@ -37,18 +37,18 @@ def choose_sides(
     reference: int,
     config: SideConfig | None = None,
 ) -> Bool[Tensor, "b l p"]:
-    """For each point, whether its second candidate is the right one.
+    """Whether each point takes its second candidate.
 
-    Each body is registered from four starts: all points on one side, all on the other, and cut by the plane in the
-    two ways that its heights allow. From each start, points pick their nearer candidates and the body is registered
-    again; the smallest error wins.
+    Each body is registered from four starts: all points on one side, all on the other, and the two ways in which the
+    plane may cut it. From each start, points pick their nearer candidates and the body is registered again; the smallest
+    error wins.
 
     Args:
         local: Points of l bodies in their own frames [m], padded.
         weight: 0 for padding.
         candidates: The two positions of each point [m].
         misfit: Mean squared error of the distances at each candidate [m^2].
-        reference: The body whose side others take when both sides fit them alike.
+        reference: The body whose side the others take if both sides fit alike.
         config: See SideConfig.
     """
     config = config or SideConfig()
@@ -67,10 +67,11 @@ def choose_sides(
 def _cut(
     local: Float[Tensor, "l p 3"], weight: Float[Tensor, "l p"], height: Float[Tensor, "b l p"], config: SideConfig
 ) -> Bool[Tensor, "b l p"]:
-    """Where the plane cuts each body, up to exchanging the sides.
+    """Side of the plane for each point of each body, up to exchanging the sides.
 
-    A point's height over the plane is linear in its own coordinates, h = a . (x, 1). The distances give |h|, so that
-    the ten products of a are a linear least-squares fit to h^2, and a is their leading eigenvector.
+    A point's height over the plane is linear in its own coordinates, h = a . (x, 1), and the distances give |h|. So
+    h^2 = (x, 1)^T (a a^T) (x, 1) is linear in the ten entries of the symmetric matrix a a^T: a least-squares fit gives
+    them, and a is the leading eigenvector.
     """
     count = weight.sum(-1)[:, None, None]
     centred = local - (local * weight[..., None]).sum(1, keepdim=True) / count
@@ -92,7 +93,7 @@ def _settle(
     local: Float[Tensor, "l p 3"], weight: Float[Tensor, "l p"], candidates: Float[Tensor, "b 2 l p 3"],
     misfit: Float[Tensor, "b 2 l p"], second: Bool[Tensor, "b l p"], config: SideConfig,
 ) -> tuple[Bool[Tensor, "b l p"], Float[Tensor, "b l"]]:
-    """Alternate between picking and registering; the picks, and the mean squared error of each body [m^2]."""
+    """Alternate between picking and registering; returns the picks and each body's mean squared error [m^2]."""
     local = local.expand(len(candidates), -1, -1, -1)
     weight = weight.expand(len(candidates), -1, -1)
     away = misfit

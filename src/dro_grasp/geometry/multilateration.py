@@ -6,7 +6,6 @@ Source: paper section III-D, robotic grasp pose point cloud generation.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,32 +14,32 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class MultilaterationConfig:
-    """Numbers of the closed form and of the refinement."""
+    """Settings of the closed form and of the refinement. Values are ours."""
 
     ridge: float = 1e-8
-    """Added to the anchors' covariance [m^2], so that flat clouds stay solvable."""
+    """Added to the anchors' covariance, so that flat clouds stay solvable [m^2]."""
     thin: float = 5e-3
-    """Clouds whose thinnest direction has a smaller standard deviation are refined [m]."""
+    """A cloud is thin, and is refined, if the standard deviation along its thinnest axis is below this [m]."""
     steps: int = 4
     """Gauss-Newton steps of the refinement."""
     damping: float = 1e-4
-    """Added to the Gauss-Newton matrix, as a share of the number of anchors."""
+    """Added to the Gauss-Newton matrix, per anchor [1]."""
     max_step: float = 0.05
     """Longest Gauss-Newton step [m]."""
     approach_anchors: int = 128
-    """All steps but the last two read about so many anchors, evenly from the list: they only have to come near."""
+    """All steps but the last two use about so many anchors, evenly from the list: they only approach the minimum."""
     chunk: int = 4
-    """Clouds that are refined at a time: more do not fit into the processor's cache."""
+    """Clouds that are refined at once: more do not fit into the processor's cache."""
 
 
 @dataclass(frozen=True)
 class _Cloud:
-    """Anchors about their mean, with the axes of their spread."""
+    """Anchors about their mean, with their principal axes."""
 
     centre: Float[Tensor, "*b 1 3"]
     points: Float[Tensor, "*b m 3"]
     axes: Float[Tensor, "*b 3 3"]
-    """Columns: principal axes, the thinnest first."""
+    """Principal axes as columns, the thinnest first."""
     variance: Float[Tensor, "*b 3"]
     """Variance along each axis [m^2], ascending."""
 
@@ -48,13 +47,13 @@ class _Cloud:
 def multilaterate(
     distances: Float[Tensor, "*b n m"],
     anchors: Float[Tensor, "*b m 3"],
-    refine: bool | Literal["auto"] = "auto",
     config: MultilaterationConfig | None = None,
-) -> Float[Tensor, "*b n 3"]:
-    """Points whose distances to the anchors are closest to the given ones.
+) -> tuple[Float[Tensor, "*b 2 n 3"], Bool[Tensor, "*b"]]:
+    """Points whose distances to the anchors are closest to the given ones: both candidates where the anchors are flat.
 
     The closed form is the minimiser of the linear least-squares problem that is left when the anchors' mean is
-    subtracted from the squared distances. `refine` starts there and minimises the sum of (|p - anchor| - distance)^2.
+    subtracted from the squared distances. If the anchors are thin, a point and its mirror image fit alike: both are
+    refined to minima of the sum of (|p - anchor| - distance)^2.
 
     Differs from the paper: its argmin of squared distances to the fourth power is replaced by the linear problem,
     which has one minimum, and on thin clouds by unsquared distances, which weigh noise evenly.
@@ -62,38 +61,22 @@ def multilaterate(
     Args:
         distances: Distance of each point to each anchor [m].
         anchors: Known positions [m].
-        refine: "auto" refines thin clouds only.
         config: See MultilaterationConfig.
-    """
-    config = config or MultilaterationConfig()
-    cloud = _spread(anchors)
-    start = _closed_form(distances, cloud, config)
-    chosen = _thin(cloud, config) if refine == "auto" else torch.full_like(cloud.variance[..., 0], refine).bool()
-    if bool(chosen.any()):
-        start = _refine_where(chosen, start, distances, cloud, config)
-    return start + cloud.centre
-
-
-def multilaterate_both(
-    distances: Float[Tensor, "*b n m"],
-    anchors: Float[Tensor, "*b m 3"],
-    config: MultilaterationConfig | None = None,
-) -> tuple[Float[Tensor, "*b 2 n 3"], Bool[Tensor, "*b"]]:
-    """Both candidates where the anchors are so flat that a point and its mirror image fit alike.
 
     Returns:
-        The candidates on the two sides of the anchors' plane [m], equal where the cloud is not thin; and the mask
-        of thin clouds.
+        The candidates on the two sides of the anchors' plane [m], equal where the cloud is not thin; and the mask of
+        thin clouds.
     """
     config = config or MultilaterationConfig()
     cloud = _spread(anchors)
-    flat = _thin(cloud, config)
+    flat = cloud.variance[..., 0] < config.thin**2
     plain = _closed_form(distances, cloud, config)
     both = torch.stack([plain, plain], -3)
     if bool(flat.any()):
-        height = _height(plain, distances, cloud)[..., None] * cloud.axes[..., None, :, 0]
+        normal = cloud.axes[..., None, :, 0]
+        height = _height(plain, distances, cloud)[..., None] * normal
         # The closed form carries a large error along the thin axis; the height comes from the distances alone.
-        level = plain - (plain * cloud.axes[..., None, :, 0]).sum(-1, keepdim=True) * cloud.axes[..., None, :, 0]
+        level = plain - (plain * normal).sum(-1, keepdim=True) * normal
         sides = [_refine_where(flat, level + sign * height, distances, cloud, config) for sign in (1.0, -1.0)]
         both = torch.where(flat[..., None, None, None], torch.stack(sides, -3), both)
     return both + cloud.centre[..., None, :, :], flat
@@ -116,19 +99,19 @@ def _spread(anchors: Float[Tensor, "*b m 3"]) -> _Cloud:
     return _Cloud(centre, points, axes, variance.clamp(min=0))
 
 
-def _thin(cloud: _Cloud, config: MultilaterationConfig) -> Bool[Tensor, "*b"]:
-    return cloud.variance[..., 0] < config.thin**2
-
-
 def _closed_form(
     distances: Float[Tensor, "*b n m"], cloud: _Cloud, config: MultilaterationConfig
 ) -> Float[Tensor, "*b n 3"]:
-    """Linear least squares, about the anchors' mean: one 3x3 inverse per cloud, one product for all rows."""
+    """Linear least squares about the anchors' mean: one 3x3 inverse per cloud, one product for all rows.
+
+    With anchors q of zero mean, |p|^2 - 2 q.p = d^2 - |q|^2. Its mean over the anchors removes |p|^2 and leaves
+    2 q.p = (|q|^2 - d^2) - mean, whose normal matrix is the anchors' covariance.
+    """
     q = cloud.points
     count = q.shape[-2]
     inverse = cloud.axes @ ((1 / (cloud.variance + config.ridge))[..., None] * cloud.axes.mT)
     weights = q @ inverse / (2 * count)
-    # Subtracting the rows' means changes nothing in exact arithmetic (the weights sum to zero) and saves digits.
+    # Subtracting the mean of each row changes nothing in exact arithmetic (the weights sum to zero) and saves digits.
     squared = q.square().sum(-1)[..., None, :] - distances.square()
     return (squared - squared.mean(-1, keepdim=True)) @ weights
 
@@ -136,7 +119,7 @@ def _closed_form(
 def _height(
     start: Float[Tensor, "*b n 3"], distances: Float[Tensor, "*b n m"], cloud: _Cloud
 ) -> Float[Tensor, "*b n"]:
-    """Distance of each point from the anchors' plane, from what its in-plane position leaves of the distances [m]."""
+    """Distance of each point from the anchors' plane, by Pythagoras from its distances and its place in the plane [m]."""
     normal = cloud.axes[..., :, 0]
     level = start - (start * normal[..., None, :]).sum(-1, keepdim=True) * normal[..., None, :]
     in_plane = level.square().sum(-1) + cloud.points.square().sum(-1).mean(-1)[..., None]
@@ -160,10 +143,10 @@ def _refine(
     start: Float[Tensor, "*b n 3"], distances: Float[Tensor, "*b n m"], anchors: Float[Tensor, "*b m 3"],
     config: MultilaterationConfig,
 ) -> Float[Tensor, "*b n 3"]:
-    """Gauss-Newton steps; autograd goes through the last one alone.
+    """Gauss-Newton steps; autograd sees the last one alone.
 
-    At the minimum, the derivative of one Gauss-Newton step by the distances is the derivative of the minimum itself
-    (up to second-order terms), so the steps before need no graph.
+    At the minimum, the derivative of one Gauss-Newton step with respect to the distances is the derivative of the minimum
+    itself (up to second-order terms), so earlier steps need no graph.
     """
     stride = max(1, anchors.shape[-2] // config.approach_anchors)
     with torch.no_grad():
@@ -204,9 +187,9 @@ def _outer_products(
 
 
 def _distances(points: Float[Tensor, "*b n 3"], anchors: Float[Tensor, "*b m 3"]) -> Float[Tensor, "*b n m"]:
-    """Distances by one matrix product; the points must be given about the anchors' mean.
+    """Distances by one matrix product, for points about the anchors' mean.
 
-    About the mean, cancellation costs under a micrometre beyond 5 mm of distance, and the time is a tenth of cdist's.
+    Cancellation then costs less than a micrometre beyond 5 mm of distance, and the time is a tenth of cdist's.
     """
     inner = points @ anchors.mT
     squared = points.square().sum(-1)[..., None] + anchors.square().sum(-1)[..., None, :] - 2 * inner

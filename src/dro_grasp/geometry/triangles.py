@@ -1,4 +1,4 @@
-"""What follows from a surface's triangles alone."""
+"""Measures of closed triangle meshes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 
 def enclosed_volume(triangles: Float[np.ndarray, "n 3 3"]) -> float:
-    """Signed volume inside a closed surface, by the divergence theorem [m^3]; negative where it is turned inside out.
+    """Signed volume inside a closed surface, by the divergence theorem [m^3]; negative if the faces are turned inward.
 
     Args:
         triangles: Corners [m], counter-clockwise from outside.
