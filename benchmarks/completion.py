@@ -59,7 +59,7 @@ def errors(
 ) -> tuple[float, float]:
     """How far added points are from the surface, and the surface away from all seen points from seen and added ones [mm]."""
     unseen = obj.cloud[KDTree(seen).query(obj.cloud)[0] > AWAY]
-    wrong = obj.grid.query(torch.from_numpy(added).float())[0].abs() if len(added) else torch.zeros(1)
+    wrong = obj.distance_field.distances(torch.from_numpy(added).float())[0].abs() if len(added) else torch.zeros(1)
     missing = KDTree(np.concatenate([seen, added])).query(unseen)[0] if len(unseen) else np.zeros(1)
     return 1e3 * float(wrong.mean()), 1e3 * float(missing.mean())
 

@@ -52,7 +52,7 @@ def measure(hand_name: str, objects: list[str], config: EngineConfig) -> list[ob
     hand, batches, seconds = load_hand(hand_name), [], 0.0
     for name in objects:
         obj = load_object(name)
-        _ = obj.grid, obj.parts
+        _ = obj.distance_field, obj.parts
         start = time.process_time()
         grasps, _ = valid_grasps(hand, obj, 5, "strict", config)
         seconds += time.process_time() - start

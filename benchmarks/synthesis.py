@@ -53,7 +53,7 @@ def measure(hand_name: str, objects: list[str], seed: int, device: str) -> tuple
     for name in objects:
         begin = time.process_time()
         obj = load_object(name)
-        _ = obj.grid, obj.parts
+        _ = obj.distance_field, obj.parts
         start = time.process_time()
         preparation += start - begin
         grasps, _ = valid_grasps(hand, obj, seed, "strict", config)

@@ -25,7 +25,8 @@ from dro_grasp.models.completion_network import SHIPPED, SurfaceNetwork
 from dro_grasp.models.small_networks import save_small
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.loading import mesh_object
-from dro_grasp.objects.shape import ObjectModel, signed_distances
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.objects.surface_distances import signed_distances
 from dro_grasp.perception.camera import DepthCamera
 from dro_grasp.perception.completion import GUESSES, THINNEST, looked_at, surface_features
 from dro_grasp.perception.partial_views import seen_side

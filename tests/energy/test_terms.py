@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from dro_grasp.energy import terms as energies
-from dro_grasp.energy.distance_field import DistanceField
-from dro_grasp.geometry.signed_distance import SignedDistanceGrid
+from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.kinematics.tree import PRISMATIC, REVOLUTE, KinematicTree
 from dro_grasp.optimization.synthesis import moved
 from tests.helpers.energy_samples import precise, rounded_box
@@ -23,10 +22,10 @@ STEP = 1e-6
 RADIUS = 0.03
 
 
-def sphere_grid(half: float = 0.08, spacing: float = 0.004) -> SignedDistanceGrid:
+def sphere_field(half: float = 0.08, spacing: float = 0.004) -> DistanceField:
     axis = torch.arange(-half, half + 1e-9, spacing, dtype=torch.float64)
     points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
-    return SignedDistanceGrid.from_values(points.norm(dim=-1) - RADIUS, torch.full((3,), -half), spacing)
+    return DistanceField.from_values(points.norm(dim=-1) - RADIUS, torch.full((3,), -half), spacing)
 
 
 def random(*shape: int, seed: int = 0, scale: float = 1.0) -> Tensor:
@@ -159,7 +158,7 @@ def test_forces_on_points_and_normals_become_the_gradient_by_pose_and_joints(wit
 
 
 def test_field_reads_distance_normal_and_curvature_of_a_sphere():
-    field = DistanceField.from_grid(sphere_grid(), torch.float64)
+    field = sphere_field()
     points = unit(random(200, 3)) * (RADIUS + 0.01 * torch.linspace(0, 1, 200).double()[:, None])
     distance, _, normal, bend = field.normals(points)
     torch.testing.assert_close(distance, points.norm(dim=-1) - RADIUS, atol=2e-4, rtol=0)  # [m]
@@ -194,6 +193,6 @@ def test_field_within_a_voxel_is_consistent(beyond_the_grid):
 
 
 def test_field_grows_beyond_the_grid():
-    field = DistanceField.from_grid(sphere_grid(), torch.float64)
+    field = sphere_field()
     points = unit(random(50, 3)) * 0.3
     assert field.distances(points)[0].min() > 0.15  # [m]

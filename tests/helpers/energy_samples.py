@@ -16,9 +16,8 @@ import roma
 import torch
 from torch import Tensor
 
-from dro_grasp.energy.distance_field import DistanceField
 from dro_grasp.energy.grasp_energy import GraspEnergy
-from dro_grasp.geometry.signed_distance import SignedDistanceGrid
+from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinematics.tree import KinematicTree
 
@@ -50,8 +49,7 @@ def rounded_box() -> DistanceField:
     points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
     beyond = points.abs() - (torch.tensor(HALF, dtype=torch.float64) - ROUND)
     values = beyond.clamp_min(0).norm(dim=-1) + beyond.amax(-1).clamp_max(0) - ROUND
-    grid = SignedDistanceGrid.from_values(values, torch.full((3,), -0.08), SPACING)
-    return DistanceField.from_grid(grid, torch.float64)
+    return DistanceField.from_values(values, torch.full((3,), -0.08), SPACING)
 
 
 def precise(hand: Hand) -> Hand:

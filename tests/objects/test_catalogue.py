@@ -12,7 +12,8 @@ from dro_grasp.errors import ObjectError
 from dro_grasp.objects.builtin import BUILTIN, make_builtin
 from dro_grasp.objects.catalogue import load_object, object_names, resolve_objects
 from dro_grasp.objects.primitives import box, frustum, hollow, ring, superquadric
-from dro_grasp.objects.shape import ObjectModel, signed_distances
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.objects.surface_distances import signed_distances
 
 NAMES = list(BUILTIN)
 

@@ -8,7 +8,7 @@ import torch
 import trimesh
 
 from dro_grasp.errors import ObjectError
-from dro_grasp.objects import shape
+from dro_grasp.objects import shape, surface_distances
 from dro_grasp.objects.cache import cache_folder, cached_arrays, content_hash
 from dro_grasp.objects.loading import cloud_object, mesh_object
 
@@ -57,7 +57,7 @@ def test_cloud_lies_on_the_surface_with_outward_normals():
 def test_grid_gives_the_distance_to_a_sphere():
     obj = ball()
     points = 0.12 * (torch.rand(2000, 3, generator=seeded()) - 0.5)
-    value, gradient = obj.grid.query(points)
+    value, gradient = obj.distance_field.distances(points)
     radius = points.norm(dim=-1)
     assert (value - (radius - 0.03)).abs().max() < 5e-4
     clear = radius > 0.012  # at the centre the gradient has no direction
@@ -67,7 +67,7 @@ def test_grid_gives_the_distance_to_a_sphere():
 def test_grid_of_a_bare_cloud_gives_the_distance_to_a_sphere(cache: Path):
     obj = cloud_object("cloud", np.concatenate([ball().cloud, ball().cloud_normals], 1).astype(np.float64), origin="cloud")
     points = 0.12 * (torch.rand(2000, 3, generator=seeded()) - 0.5)
-    value, gradient = obj.grid.query(points)
+    value, gradient = obj.distance_field.distances(points)
     radius = points.norm(dim=-1)
     clear = radius > 0.012
     assert (value - (radius - 0.03)).abs()[clear].max() < 1e-3
@@ -80,7 +80,7 @@ def test_a_cloud_is_a_surface_of_discs():
     x, y = np.meshgrid(np.linspace(-0.02, 0.02, 9), np.linspace(-0.02, 0.02, 9))
     sheet = np.stack([x.ravel(), y.ravel(), np.full(81, height)], 1)
     points = np.array([[0, 0, 0.03], [0.0025, 0.0025, 0.0], [0.001, 0, height], [0.06, 0, height]])
-    found = shape.cloud_distances(sheet, np.tile([0.0, 0, 1], (81, 1)), points)
+    found = surface_distances.cloud_distances(sheet, np.tile([0.0, 0, 1], (81, 1)), points)
     np.testing.assert_allclose(found[:3], [0.02, -0.01, 0], atol=1e-12)
     assert 0.03 < found[3] < 0.035, "beyond the rim, to the rim's disc"
 
@@ -95,32 +95,32 @@ def test_signed_distances_survive_a_hole_flipped_faces_and_overlap():
     points = np.random.default_rng(0).normal(size=(1000, 3))
     points *= (np.linspace(0.001, 0.06, 1000) / np.linalg.norm(points, axis=1))[:, None]
     radius = np.linalg.norm(points, axis=1)
-    distance = shape.signed_distances(vertices, faces, points)
+    distance = surface_distances.signed_distances(vertices, faces, points)
     clear = np.abs(radius - 0.03) > 0.002
     assert (np.sign(distance) == np.sign(radius - 0.03))[clear].mean() > 0.995
 
 
 def test_grid_of_a_large_object_stays_small(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(shape, "LARGEST_GRID", 20_000)
+    monkeypatch.setattr(surface_distances, "LARGEST_GRID", 20_000)
     box = trimesh.creation.box((0.3, 0.3, 0.3))
-    baked = shape.bake_grid(box.vertices, lambda points: points[:, 0])
+    baked = surface_distances.bake_grid(box.vertices, lambda points: points[:, 0])
     assert baked["values"].size < 25_000
-    assert baked["spacing"] > shape.GRID_SPACING
+    assert baked["spacing"] > surface_distances.GRID_SPACING
 
 
 def test_grid_is_read_from_the_cache_and_damage_is_mended(cache: Path, monkeypatch: pytest.MonkeyPatch):
-    first = ball(0.01, 1).grid
+    first = ball(0.01, 1).distance_field
     (file,) = cache.iterdir()
     assert file.name.startswith(f"grid-{ball(0.01, 1).sha256[:24]}")
     with monkeypatch.context() as patch:
         patch.setattr(shape, "bake_grid", lambda *_: pytest.fail("was in the cache"))
-        second = ball(0.01, 1).grid
-    torch.testing.assert_close(first.values, second.values)
+        second = ball(0.01, 1).distance_field
+    torch.testing.assert_close(first.slopes, second.slopes)
     whole = file.read_bytes()
     for damaged in (b"", whole[: len(whole) // 2], b"something else", whole[:200] + b"\0" * 50 + whole[250:]):
         file.write_bytes(damaged)
-        third = ball(0.01, 1).grid
-        torch.testing.assert_close(first.values, third.values)
+        third = ball(0.01, 1).distance_field
+        torch.testing.assert_close(first.slopes, third.slopes)
         assert len(file.read_bytes()) == len(whole)
     assert [f.name for f in cache.iterdir()] == [file.name]
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from dro_grasp.devices import on_device
 from dro_grasp.energy import terms as energies
 from dro_grasp.energy.contact_candidates import ContactCandidates, ContactConfig, contact_candidates, rigid_group
-from dro_grasp.energy.distance_field import DistanceField
+from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.hands.hand import Hand
 
 TERMS = ("force_closure", "distance", "penetration", "self_penetration", "alignment", "joints")

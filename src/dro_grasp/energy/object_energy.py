@@ -9,7 +9,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dro_grasp.energy.contact_candidates import ContactConfig
-from dro_grasp.energy.distance_field import DistanceField
 from dro_grasp.energy.grasp_energy import EnergyConfig, Evaluation, GraspEnergy
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
@@ -34,7 +33,7 @@ def object_energy(
     surface = torch.as_tensor(obj.cloud, dtype=torch.float32)
     centre = torch.as_tensor(obj.centre_of_mass, dtype=torch.float32)
     length = float((surface - centre).norm(dim=-1).mean())
-    return GraspEnergy(hand, DistanceField.of(obj.grid), centre, length, config, contacts, device)
+    return GraspEnergy(hand, obj.distance_field, centre, length, config, contacts, device)
 
 
 def evaluate_nearest(

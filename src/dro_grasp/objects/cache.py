@@ -1,4 +1,4 @@
-"""Derived geometry kept on disk under the hash of what it was derived from."""
+"""Derived geometry on disk, under the hash of its source."""
 
 from __future__ import annotations
 
@@ -10,24 +10,28 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Num
 
 from dro_grasp.errors import OutputError
 from dro_grasp.files import replacing
 
 DAMAGED = (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile)
-"""What numpy raises on a file that is missing, cut short, or no archive of arrays."""
+"""Exceptions of NumPy for a file that is missing, truncated or no archive of arrays."""
+
+Arrays = dict[str, Num[np.ndarray, "..."]]
+"""Arrays by name, as in an NPZ file."""
 
 
 def cache_folder() -> Path:
-    """Where derived geometry is kept: `DRO_GRASP_CACHE`, or the user's cache folder."""
+    """The folder of derived geometry: `DRO_GRASP_CACHE`, or the user's cache folder."""
     root = os.environ.get("DRO_GRASP_CACHE")
     return Path(root) if root else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "dro-grasp"
 
 
-def cached_arrays(key: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Arrays from the cache, or made and stored there.
+def cached_arrays(key: str, make: Callable[[], Arrays]) -> Arrays:
+    """Load arrays from the cache, or make and store them.
 
-    A damaged file is made anew. A folder that cannot be written costs time, and is no error.
+    A damaged file is replaced. A folder that cannot be written is no error; it only costs time.
     """
     path = cache_folder() / f"{key}.npz"
     try:
@@ -40,16 +44,16 @@ def cached_arrays(key: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[s
     return made
 
 
-def content_hash(*arrays: np.ndarray) -> str:
-    """Hash of geometry: equal arrays of one type have equal hashes on every machine."""
+def content_hash(*arrays: Num[np.ndarray, "..."]) -> str:
+    """SHA-256 of arrays; the hashes of equal arrays of one type agree on every machine."""
     digest = hashlib.sha256()
     for array in arrays:
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
 
 
-def _store(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Write under a temporary name and rename, so that no reader meets half a file."""
+def _store(path: Path, arrays: Arrays) -> None:
+    """Write under a temporary name and rename, so that no reader sees half a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez(file, **arrays)  # type: ignore[arg-type]

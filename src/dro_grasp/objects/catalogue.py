@@ -15,8 +15,9 @@ import numpy as np
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.objects.builtin import BUILTIN, make_builtin
+from dro_grasp.objects.convex_parts import Part
 from dro_grasp.objects.loading import load_file, mesh_object, read_geometry
-from dro_grasp.objects.shape import ObjectModel, Part
+from dro_grasp.objects.shape import ObjectModel
 
 if TYPE_CHECKING:
     import trimesh

@@ -1,47 +1,56 @@
-"""Convex parts of a mesh, because a simulator collides convex hulls only."""
+"""Convex parts of a mesh: a simulator collides convex hulls only."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from dro_grasp.errors import ObjectError
-from dro_grasp.objects.cache import cached_arrays
+from dro_grasp.objects.cache import Arrays, cached_arrays
 from dro_grasp.objects.repair import OPEN_FILL
-from dro_grasp.objects.shape import Part, signed_distances
+from dro_grasp.objects.surface_distances import signed_distances
 
 if TYPE_CHECKING:
     import trimesh
 
 THRESHOLD = 0.08
-"""CoACD's concavity threshold."""
+"""CoACD's concavity threshold [1] (ours)."""
 MAX_PARTS = 24
-"""Most parts of one object."""
+"""Most parts of one object (ours)."""
 MAX_VERTICES = 64
-"""Most vertices of one part: collision cost grows with them."""
-SEARCH, RESOLUTION = 60, 1000
-"""CoACD's search iterations per cut, and points by which it measures concavity."""
+"""Most vertices of one part (ours): collision cost grows with them."""
+SEARCH = 60
+"""CoACD's search iterations per cut (ours)."""
+RESOLUTION = 1000
+"""Points with which CoACD measures concavity (ours)."""
 CONVEX = 0.97
-"""Share of its hull that a mesh fills to count as convex."""
-CLOSING, CLOSED_FACES = 64, 6000
-"""Cells along the longest side for closing a mesh with holes, and most faces of the closed one."""
+"""Share of its hull that a mesh must fill to count as convex (ours)."""
+CLOSING = 64
+"""Cells along the longest side of the grid that closes a mesh with holes (ours)."""
+CLOSED_FACES = 6000
+"""Most faces of a closed mesh (ours)."""
+
+Part = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
+"""Vertices [m] and faces of a convex part."""
 
 
-def decompose(vertices: np.ndarray, faces: np.ndarray, key: str) -> tuple[Part, ...]:
+def decompose(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"], key: str) -> tuple[Part, ...]:
     """Convex parts by CoACD, cached under the content hash `key`; a convex mesh is its own part."""
     settings = f"{THRESHOLD * 1000:.0f}-{MAX_PARTS}-{MAX_VERTICES}"
     stored = cached_arrays(f"parts-{key[:24]}-{settings}", lambda: _pack(_run(vertices, faces)))
     return _unpack(stored)
 
 
-def _run(vertices: np.ndarray, faces: np.ndarray) -> list[Part]:
+def _run(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> list[Part]:
+    """Close the mesh if necessary, and cut it unless it is convex."""
     import trimesh
 
     hull = trimesh.convex.convex_hull(vertices)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     if not mesh.is_volume:
-        # CoACD closes such a mesh itself, and then takes ten times as long over what it has made.
+        # CoACD would close such a mesh itself, but the result takes it ten times as long to cut.
         mesh = closed_surface(vertices, faces)
         if mesh is None or mesh.volume < OPEN_FILL * hull.volume:
             mesh = hull
@@ -62,8 +71,8 @@ def _run(vertices: np.ndarray, faces: np.ndarray) -> list[Part]:
     return [(np.asarray(v), np.asarray(f)) for v, f in parts]
 
 
-def closed_surface(vertices: np.ndarray, faces: np.ndarray) -> trimesh.Trimesh | None:
-    """A watertight mesh around what the winding number calls inside; None where that is nothing."""
+def closed_surface(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> trimesh.Trimesh | None:
+    """A watertight mesh around the points that are inside by their winding number; None if there are none."""
     import igl
     import trimesh
 
@@ -71,7 +80,7 @@ def closed_surface(vertices: np.ndarray, faces: np.ndarray) -> trimesh.Trimesh |
     spacing = float((high - low).max()) / CLOSING
     counts = np.ceil((high - low) / spacing).astype(int) + 5
     axes = [low[i] + spacing * (np.arange(counts[i]) - 2) for i in range(3)]
-    # libigl wants the first axis to run fastest.
+    # In libigl's grids the first axis is the fastest.
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).transpose(2, 1, 0, 3).reshape(-1, 3)
     distance = signed_distances(vertices, faces, points)
     if distance.min() >= 0:
@@ -85,14 +94,16 @@ def closed_surface(vertices: np.ndarray, faces: np.ndarray) -> trimesh.Trimesh |
     return surface
 
 
-def _pack(parts: list[Part]) -> dict[str, np.ndarray]:
+def _pack(parts: list[Part]) -> Arrays:
+    """Parts as three arrays: all vertices, all faces, and the counts of each part."""
     return {
         "vertices": np.concatenate([v for v, _ in parts]), "faces": np.concatenate([f for _, f in parts]),
         "counts": np.array([(len(v), len(f)) for v, f in parts]),
     }
 
 
-def _unpack(stored: dict[str, np.ndarray]) -> tuple[Part, ...]:
+def _unpack(stored: Arrays) -> tuple[Part, ...]:
+    """The inverse of `_pack`."""
     ends = np.cumsum(stored["counts"], axis=0)[:-1]
     vertices = np.split(stored["vertices"], ends[:, 0])
     faces = np.split(stored["faces"], ends[:, 1])

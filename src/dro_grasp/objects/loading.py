@@ -11,8 +11,9 @@ import numpy as np
 from dro_grasp.errors import ObjectError
 from dro_grasp.objects.cache import content_hash
 from dro_grasp.objects.cloud_files import CLOUD_SUFFIXES, read_cloud
+from dro_grasp.objects.convex_parts import Part
 from dro_grasp.objects.repair import mass_properties, repair
-from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel, Part
+from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
 
 if TYPE_CHECKING:
     import trimesh

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.energy.distance_field import DistanceField
+from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.hands.hand import Hand
 
 

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from dro_grasp._version import __version__
 from dro_grasp.energy.contact_candidates import ContactConfig
-from dro_grasp.energy.distance_field import DistanceField
 from dro_grasp.energy.grasp_energy import TERMS, EnergyConfig, Evaluation, GraspEnergy
 from dro_grasp.energy.object_energy import object_energy
 from dro_grasp.errors import ObjectError, OptionError
+from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
@@ -94,7 +94,7 @@ def field_of(obj: ObjectModel) -> DistanceField:
     """
     if obj.is_cloud:
         raise ObjectError(f"object '{obj.name}' is a bare point cloud; synthesis needs a mesh")
-    return DistanceField.of(obj.grid)
+    return obj.distance_field
 
 
 def synthesize(

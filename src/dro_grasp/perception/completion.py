@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dro_grasp.models.completion_network import SurfaceNetwork, shipped_surface
-from dro_grasp.objects.shape import cloud_distances
+from dro_grasp.objects.surface_distances import cloud_distances
 from dro_grasp.perception.symmetry import Guess, SeenSide, nearest_points, projected
 
 GUESSES = 5

@@ -104,7 +104,7 @@ def touching_points(
 ) -> Float[np.ndarray, "k 3"]:
     """Points of the posed hand at the object's surface [m]."""
     points = hand.points(joints, T_object_wrist)
-    return points[obj.grid.query(points)[0].abs() < TOUCH].double().numpy()
+    return points[obj.distance_field.distances(points)[0].abs() < TOUCH].double().numpy()
 
 
 def heading(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> str:

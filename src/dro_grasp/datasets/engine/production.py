@@ -111,7 +111,7 @@ def make_shard(job: Job, task: Task) -> Made:
     """Synthesise and try one shard. Files go to and from it as bytes, so that it runs where the folder is not."""
     started = time.process_time()
     hand, obj = _hand(task.shard.hand), _object(task.shard.object, job.scale)
-    _ = obj.grid, obj.parts
+    _ = obj.distance_field, obj.parts
     prepared = time.process_time()
     earlier = [GraspBatch.load(io.BytesIO(payload)) for payload in task.earlier]
     grasps, result = valid_grasps(

@@ -1,0 +1,70 @@
+"""Signed distances of points to meshes and to bare clouds, and grids of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from dro_grasp.objects.cache import Arrays
+
+GRID_SPACING = 0.003
+"""Spacing of a grid of signed distances [m] (ours)."""
+GRID_PADDING = 0.04
+"""Distance that the grid extends beyond the object [m] (ours)."""
+LARGEST_GRID = 8_000_000
+"""Most grid points; a larger object gets a wider spacing (ours)."""
+DISC_NEIGHBOURS = 7
+"""Points of a bare cloud within the disc around each point, itself included (ours)."""
+
+
+def bake_grid(
+    surface: Float[np.ndarray, "n 3"], distance: Callable[[Float[np.ndarray, "_ 3"]], Float[np.ndarray, " _"]]
+) -> Arrays:
+    """Signed distances on a grid around a surface: `values` (nx ny nz), `origin` (3) and `spacing` [m].
+
+    Args:
+        surface: Points that the grid encloses [m].
+        distance: Gives the signed distances of points [m].
+    """
+    low, high = surface.min(0) - GRID_PADDING, surface.max(0) + GRID_PADDING
+    spacing = max(GRID_SPACING, float((np.prod(high - low) / LARGEST_GRID) ** (1 / 3)))
+    counts = np.ceil((high - low) / spacing).astype(int) + 1
+    axes = [low[i] + spacing * np.arange(counts[i]) for i in range(3)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    return {"values": distance(points).reshape(counts).astype(np.float32), "origin": low, "spacing": np.array(spacing)}
+
+
+def cloud_distances(
+    cloud: Float[np.ndarray, "m 3"], normals: Float[np.ndarray, "m 3"], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, " n"]:
+    """Distance of each point to the disc around the nearest point of a cloud [m], negative behind the disc.
+
+    Discs are perpendicular to the normals and extend to the neighbours: they close the surface and leave its rims open.
+    """
+    from scipy.spatial import KDTree
+
+    tree = KDTree(cloud)
+    some = cloud[:: max(1, len(cloud) // 256)]
+    reach = float(np.median(tree.query(some, k=min(DISC_NEIGHBOURS, len(cloud)))[0][:, -1]))
+    index = tree.query(points)[1]
+    apart = points - cloud[index]
+    height = (apart * normals[index]).sum(1)
+    beyond = np.maximum(0, np.linalg.norm(apart - height[:, None] * normals[index], axis=1) - reach)
+    return np.where(height < 0, -1.0, 1.0) * np.hypot(height, beyond)
+
+
+def signed_distances(
+    vertices: Float[np.ndarray, "n_vertices 3"], faces: Int[np.ndarray, "n_faces 3"], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, " n"]:
+    """Distance of each point to a mesh [m], negative inside.
+
+    Magnitude and sign are computed separately: winding numbers cope with holes, flipped faces and overlapping shells.
+    """
+    import igl
+
+    corners, triangles = np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64)
+    squared = igl.point_mesh_squared_distance(points, corners, triangles)[0]
+    winding = igl.fast_winding_number(corners, triangles, points)
+    return np.where(np.abs(winding) > 0.5, -1.0, 1.0) * np.sqrt(squared)
