@@ -25,7 +25,7 @@ COLUMNS = ("hand", "grasps", "train", "few_shot", "validate", "objects", "fewest
 def row(path: Path) -> list[str]:
     """One file's counts."""
     (hand,) = measure_coverage(read_collection(path))
-    made: Yield = hand.made
+    made: Yield = hand.yields
     counts = [p.grasps for p in hand.pairs]
     splits = Counter(hand.grasps.split)
     cells = [hand.grasps.hand, len(hand.grasps), splits["train"], splits["few_shot"], splits["validate"], len(counts),

@@ -14,7 +14,8 @@ import torch
 from report import emit
 from synthesis import HANDS
 
-from dro_grasp.evaluation.coverage import HALF_AXES, half_axis, half_axis_direction, palm_angles
+from dro_grasp.evaluation.coverage import palm_angles
+from dro_grasp.geometry.half_axes import HALF_AXES, half_axis, half_axis_direction
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.predictor import GraspPredictor

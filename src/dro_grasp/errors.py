@@ -1,14 +1,14 @@
-"""Every error that a user's input can cause.
+"""All errors that a user's input can cause.
 
-Messages say what was given, what was expected, and what to do. The command line prints them without a
-traceback and exits with status 2.
+A message says what was given, what was expected and what to do. The command line prints it without a traceback and exits
+with status 2.
 """
 
 from __future__ import annotations
 
 
 class DroGraspError(Exception):
-    """Root of all errors that dro-grasp raises on purpose."""
+    """Base of all errors that dro-grasp raises on purpose."""
 
 
 class HandError(DroGraspError):
@@ -16,7 +16,7 @@ class HandError(DroGraspError):
 
 
 class ObjectError(DroGraspError):
-    """An object's mesh or point cloud cannot be used."""
+    """A mesh or point cloud of an object cannot be used."""
 
 
 class GraspFileError(DroGraspError):
@@ -28,11 +28,11 @@ class WeightsError(DroGraspError):
 
 
 class BundleError(DroGraspError):
-    """A training bundle is truncated, foreign, or lacks what training needs."""
+    """A training bundle is truncated, foreign, or incomplete for training."""
 
 
 class OptionError(DroGraspError):
-    """An option or argument has a value outside its range."""
+    """An option or argument has an invalid value."""
 
 
 class OutputError(DroGraspError):
@@ -40,4 +40,4 @@ class OutputError(DroGraspError):
 
 
 class TrainingError(DroGraspError):
-    """Training cannot go on, for example after a non-finite loss."""
+    """Training cannot continue, for example after a non-finite loss."""

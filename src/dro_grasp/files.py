@@ -1,4 +1,4 @@
-"""Writing files: refused before the work where it cannot succeed, and whole or not at all."""
+"""Writing files: paths are checked before the work, and a file is written whole or not at all."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dro_grasp.errors import OutputError
 
 
 def check_output(path: Path | str) -> Path:
-    """Refuse a path that cannot be written, before any work is done for it.
+    """Refuse a path that cannot be written, before any work is done.
 
     Raises:
         OutputError: The parent folder is missing or read-only, or the path is a folder or a read-only file.
@@ -31,46 +31,46 @@ def check_output(path: Path | str) -> Path:
 
 
 def check_folder(path: Path | str) -> Path:
-    """Refuse a folder that cannot be made or written into, without making it.
+    """Refuse a folder that cannot be created or written to, without creating it.
 
     Raises:
-        OutputError: Its parent is missing, it is a file, or there is no permission.
+        OutputError: Its parent is missing, it is a file, or permission is missing.
     """
     path = Path(path)
     if path.exists() and not path.is_dir():
         raise OutputError(f"cannot write into {path}: it is a file; give a folder")
     parent = path.absolute().parent
     if not parent.is_dir():
-        raise OutputError(f"cannot make {path}: no folder {parent}; create it first")
+        raise OutputError(f"cannot create {path}: no folder {parent}; create it first")
     if not os.access(path if path.exists() else parent, os.W_OK):
         raise OutputError(f"cannot write into {path if path.exists() else parent}: no permission; choose another folder")
     return path
 
 
 def make_folder(path: Path | str) -> Path:
-    """A folder to write into, made when only itself is missing.
+    """Create a folder to write to, unless it exists; its parent must exist.
 
     Raises:
-        OutputError: Its parent is missing, it is a file, or there is no permission.
+        OutputError: Its parent is missing, it is a file, or permission is missing.
     """
     path = check_folder(path)
     try:
         path.mkdir(exist_ok=True)
     except OSError as error:
-        raise OutputError(f"cannot make {path}: {error.strerror}; choose another folder") from error
+        raise OutputError(f"cannot create {path}: {error.strerror}; choose another folder") from error
     return path
 
 
 @contextmanager
 def replacing(path: Path, what: str = "") -> Iterator[Path]:
-    """A temporary path beside `path`, which takes its place when the block has written it; a failure leaves nothing.
+    """A temporary path that replaces `path` when the block ends; a failure leaves `path` as it was.
 
     Args:
-        path: The file; an existing one is replaced.
-        what: What is written, for the error.
+        path: File to write or replace.
+        what: Name of the content, for the error.
 
     Raises:
-        OutputError: It cannot be written.
+        OutputError: The file cannot be written.
     """
     temporary: Path | None = None
     try:

@@ -31,15 +31,15 @@ from dro_grasp.viewer.appearance import (
 )
 from dro_grasp.viewer.pictures import (
     CAPTION,
+    CONTACT_DISTANCE,
     HEADER,
     TILE,
-    TOUCH,
     PictureStyle,
     caption,
+    contact_points,
     draw_grasp,
     draw_grasps,
     heading,
-    touching_points,
 )
 
 
@@ -157,16 +157,16 @@ def test_a_transparent_object_is_between_none_and_a_solid_one(hand, obj, grasps)
     assert (np.abs(solid - none).max(-1) > 20).mean() > 0.02, "the object fills a part of the picture"
 
 
-def test_touching_points_lie_on_the_ball(hand, obj, grasps) -> None:
-    near = touching_points(hand, obj, grasps.joints[0], grasps.T_object_wrist[0])
+def test_contact_points_lie_on_the_ball(hand, obj, grasps) -> None:
+    near = contact_points(hand, obj, grasps.joints[0], grasps.T_object_wrist[0])
     points = hand.points(grasps.joints[0], grasps.T_object_wrist[0]).numpy()
     radius = np.linalg.norm(obj.vertices, axis=1).mean()
-    expected = np.abs(np.linalg.norm(points, axis=1) - radius) < TOUCH
+    expected = np.abs(np.linalg.norm(points, axis=1) - radius) < CONTACT_DISTANCE
     assert abs(len(near) - expected.sum()) <= 0.4 * expected.sum() + 3
-    assert (np.abs(np.linalg.norm(near, axis=1) - radius) < TOUCH + 0.001).all()
+    assert (np.abs(np.linalg.norm(near, axis=1) - radius) < CONTACT_DISTANCE + 0.001).all()
     marked = draw_grasp(hand, obj, grasps, 0, PictureStyle(contacts=True, size=(64, 48)))
     assert marked.shape == (48, 64, 3)
-    bare = touching_points(
+    bare = contact_points(
         hand, dataclasses.replace(obj, vertices=None, faces=None), grasps.joints[0], grasps.T_object_wrist[0])
     assert abs(len(bare) - expected.sum()) <= 0.4 * expected.sum() + 3, "of a cloud as well"
 

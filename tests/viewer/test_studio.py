@@ -14,13 +14,13 @@ import viser
 import yaml
 
 from dro_grasp.errors import OptionError
-from dro_grasp.evaluation.coverage import HALF_AXES, half_axis_direction
+from dro_grasp.geometry.half_axes import HALF_AXES, half_axis_direction
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import BUILTIN_FOLDER
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.viewer import studio as module
 from dro_grasp.viewer.studio import EXPORTS, Studio, chosen
-from dro_grasp.viewer.uploads import MOST_BYTES, store_upload
+from dro_grasp.viewer.uploads import MAX_BYTES, store_upload
 from tests.helpers.browser import free_port, page_of
 from tests.helpers.weights import untrained_weights
 
@@ -145,8 +145,9 @@ def test_a_zip_file_is_unpacked_and_its_description_found(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("name", "content", "word"),
     [
-        ("a.urdf", b"x" * (MOST_BYTES + 1), "at most 20"), ("..", b"", "no file name"), ("a.zip", b"no zip", "no ZIP file"),
-        ("a.zip", zipped(**{"../evil.urdf": b"x"}), "leads out"), ("a.zip", zipped(**{"/evil.urdf": b"x"}), "leads out"),
+        ("a.urdf", b"x" * (MAX_BYTES + 1), "limit is 20"), ("..", b"", "not a file name"),
+        ("a.zip", b"no zip", "not a ZIP file"), ("a.zip", zipped(**{"../evil.urdf": b"x"}), "outside the archive"),
+        ("a.zip", zipped(**{"/evil.urdf": b"x"}), "outside the archive"),
         ("a.zip", zipped(**{"a.stl": b"x"}), "no URDF or MJCF"),
         ("a.zip", zipped(**{f"{i}.urdf": b"" for i in range(1001)}), "1001 files"),
     ],

@@ -41,7 +41,7 @@ class Report:
         if self.json:
             print_json({"hands": [h.to_dict() for h in hands], "output": None if self.output is None else str(self.output)})
             return 0
-        rows = [[h.grasps.hand, len(h.grasps), len(h.pairs), h.made.per_cpu_hour, *h.diversity.values()] for h in hands]
+        rows = [[h.grasps.hand, len(h.grasps), len(h.pairs), h.yields.per_cpu_hour, *h.diversity.values()] for h in hands]
         print_table("data set", ["hand", "grasps", "objects", "per CPU-hour", "diversity", "of wrist", "of joints"], rows,
                     note="" if self.output is None else f"page: {self.output}")
         for h in hands:

@@ -1,4 +1,4 @@
-"""How a data set's grasps spread: over palm directions, wrist rolls, grasp sizes and joints."""
+"""Coverage of a data set: palm directions, wrist rolls, grasp sizes and joints of its grasps."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.datasets.collections.collection import PairGrasps
 from dro_grasp.datasets.engine.yields import Yield
 from dro_grasp.evaluation.metrics import diversity
+from dro_grasp.geometry import se3
+from dro_grasp.geometry.half_axes import HALF_AXES, half_axis
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import hand_of
 from dro_grasp.hands.hand import Hand
 
-HALF_AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
-"""Order of the counts of palm directions: each counts for the half-axis it is nearest to."""
 ROLL_BINS = 8
-"""Sectors of 45 degrees in which wrist rolls are counted."""
+"""Sectors of 45 degrees that wrist rolls are counted in."""
 
 
 @dataclass(frozen=True)
@@ -31,21 +31,21 @@ class PairCoverage:
     object: str
     grasps: int
     """In the data set."""
-    made: Yield
-    """What became of the candidates in the making, of which the data set may hold a choice."""
+    yields: Yield
+    """What became of the candidates in synthesis; the data set may hold only some of the valid grasps."""
     half_axes: tuple[int, ...]
-    """Grasps whose palm looks along each of HALF_AXES."""
+    """Grasps by the half-axis nearest to their palm direction, in the order of HALF_AXES."""
     rolls: int
-    """Sectors of the wrist's roll that have a grasp, of ROLL_BINS."""
+    """How many of the ROLL_BINS sectors of wrist roll have a grasp."""
     size: tuple[float, float]
     """Smallest and largest grasp size [m]; NaN without grasps."""
-    fingers: tuple[int, int]
-    """Fewest and most links in contact after closing; zero where not recorded."""
+    contact_links: tuple[int, int]
+    """Fewest and most links in contact after closing; zero if not recorded."""
 
     @property
     def reason(self) -> str:
-        """Why there is no grasp, empty where there is one."""
-        return "" if self.grasps else self.made.main_obstacle()
+        """Why there is no grasp; empty if there is one."""
+        return "" if self.grasps else self.yields.main_obstacle()
 
 
 @dataclass(frozen=True)
@@ -56,20 +56,20 @@ class HandCoverage:
     grasps: GraspBatch
     pairs: tuple[PairCoverage, ...]
     diversity: dict[str, float]
-    """The paper's measure, pooled over objects: all, wrist, joints."""
+    """Diversity over all objects together: all, wrist, joints."""
 
     @property
-    def made(self) -> Yield:
+    def yields(self) -> Yield:
         """What became of all candidates."""
-        return sum((pair.made for pair in self.pairs), Yield())
+        return sum((pair.yields for pair in self.pairs), Yield())
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
         return {
             "hand": self.grasps.hand, "grasps": len(self.grasps), "diversity": self.diversity,
-            "yield": self.made.to_dict(), "per_cpu_hour": self.made.per_cpu_hour,
+            "yield": self.yields.to_dict(), "per_cpu_hour": self.yields.per_cpu_hour,
             "objects": [
-                {"object": p.object, "grasps": p.grasps, "yield": p.made.to_dict(), "per_cpu_hour": p.made.per_cpu_hour,
+                {"object": p.object, "grasps": p.grasps, "yield": p.yields.to_dict(), "per_cpu_hour": p.yields.per_cpu_hour,
                  "half_axes": dict(zip(HALF_AXES, p.half_axes, strict=True)), "rolls": p.rolls, "size": list(p.size),
                  "reason": p.reason}
                 for p in self.pairs
@@ -101,45 +101,32 @@ def _of_pair(hand: Hand, pair: PairGrasps) -> PairCoverage:
     counts = torch.bincount(half_axis(hand.palm_directions(grasps.T_object_wrist)), minlength=6)
     sector = (wrist_rolls(hand, grasps) / (2 * math.pi) * ROLL_BINS).long() % ROLL_BINS
     sizes = grasp_sizes(hand, grasps)
-    held = [len(links) for links in grasps.extra.get("contact_links", ()) if isinstance(links, list)]
+    touched = [len(links) for links in grasps.extra.get("contact_links", ()) if isinstance(links, list)]
     return PairCoverage(
         grasps.object[0] if len(grasps) else pair.object, len(grasps), pair.made, tuple(counts.tolist()), len(sector.unique()),
         (float(sizes.min()), float(sizes.max())) if len(grasps) else (math.nan, math.nan),
-        (min(held, default=0), max(held, default=0)),
+        (min(touched, default=0), max(touched, default=0)),
     )
 
 
-def half_axis(directions: Float[Tensor, "n 3"]) -> Int[Tensor, " n"]:
-    """Index into HALF_AXES of the half-axis that each direction is nearest to."""
-    axis = directions.abs().argmax(-1)
-    return 2 * axis + (directions.gather(1, axis[:, None])[:, 0] < 0)
-
-
-def half_axis_direction(name: str) -> tuple[float, float, float]:
-    """The unit vector that one of HALF_AXES names."""
-    sign = 1.0 if name[0] == "+" else -1.0
-    x, y, z = (sign if letter == name[1] else 0.0 for letter in "xyz")
-    return x, y, z
-
-
 def palm_angles(hand: Hand, grasps: GraspBatch, direction: tuple[float, float, float]) -> Float[Tensor, " n"]:
-    """Angle between the palm direction of each grasp and the one asked for, of any length [rad]."""
-    obtained, asked = hand.palm_directions(grasps.T_object_wrist), torch.tensor(direction)
-    sine = torch.linalg.cross(obtained, asked.expand_as(obtained), dim=-1).norm(dim=-1)
-    return torch.atan2(sine, obtained @ asked)
+    """Angle between the palm direction of each grasp and a requested direction of any length [rad]."""
+    actual, requested = hand.palm_directions(grasps.T_object_wrist), torch.tensor(direction)
+    sine = torch.linalg.cross(actual, requested.expand_as(actual), dim=-1).norm(dim=-1)
+    return torch.atan2(sine, actual @ requested)
 
 
 def wrist_rolls(hand: Hand, grasps: GraspBatch) -> Float[Tensor, " n"]:
-    """Turn of each wrist about its palm direction, from 0 to 2 pi [rad].
+    """Roll of each wrist about its palm direction, from 0 to 2 pi [rad].
 
-    Counted from the shortest rotation that brings the palm from where it looks in the wrist frame to where it looks now.
+    Zero roll is the smallest rotation from the palm direction in the wrist frame to the palm direction of the grasp.
     """
     start, now = hand.palm_direction_wrist, hand.palm_directions(grasps.T_object_wrist)
     side = torch.linalg.cross(start, start.new_tensor([1.0, 0, 0] if abs(start[0]) < 0.9 else [0, 1.0, 0]), dim=0)
     side = side / side.norm()
     axis = torch.linalg.cross(start.expand_as(now), now, dim=-1)
     cosine = (start * now).sum(-1, keepdim=True)
-    # Rodrigues with sine and cosine in the axis; opposite directions have no shortest way, and any will do.
+    # Rodrigues' formula; the axis holds the sine. Opposite directions have no smallest rotation, and any of them will do.
     cross = torch.linalg.cross(axis, side.expand_as(axis), dim=-1)
     carried = cosine * side + cross + axis * (axis * side).sum(-1, keepdim=True) / (1 + cosine).clamp_min(1e-6)
     actual = grasps.T_object_wrist[:, :3, :3] @ side
@@ -152,6 +139,5 @@ def grasp_sizes(hand: Hand, grasps: GraspBatch) -> Float[Tensor, " n"]:
     if not len(grasps):
         return torch.zeros(0)
     tips = torch.tensor(hand.tips)
-    poses = hand.tree.forward(grasps.joints)[:, tips]
-    points = (poses[..., :3, :3] @ hand.tip_offsets[..., None])[..., 0] + poses[..., :3, 3]
+    points = se3.apply(hand.tree.forward(grasps.joints)[:, tips], hand.tip_offsets)
     return torch.cdist(points, points).amax((-1, -2))

@@ -1,7 +1,7 @@
-"""How far predicted distances are off, with z from the true grasp (posterior) and with z as it is drawn (prior).
+"""Errors of predicted distances, with z from the true grasp (posterior) and with z drawn as at inference (prior).
 
-Equal errors mean that z says nothing; a posterior error that is much the smaller one, that z says much. Needs a bundle alone,
-no mesh and no simulator.
+If both errors are equal, z carries no information; the smaller the posterior error is beside the prior error, the more z
+carries. Only a bundle is needed, neither meshes nor a simulator.
 """
 
 from __future__ import annotations
@@ -18,33 +18,33 @@ from dro_grasp.training.losses import divergence
 from dro_grasp.training.samples import SampleSource
 
 SAMPLES = 400
-"""Placed hands, of each hand."""
+"""Placements of each hand."""
 AT_ONCE = 50
-"""Of these go through the network together."""
+"""Placements that pass through the network together."""
 
 
 @dataclass(frozen=True)
 class DistanceError:
-    """One hand's."""
+    """Distance error of one hand."""
 
     hand: str
     posterior: float
     """Mean absolute error of D(R,O) with z from the true grasp [m]."""
     prior: float
-    """The same with z as it is drawn at inference [m]."""
+    """The same with z drawn as at inference [m]."""
     divergence: float
-    """Of the posterior from the standard normal or the learned Gaussian [nat]."""
+    """KL divergence of the posterior from the prior, a standard normal or a learned Gaussian [nat]."""
 
 
 @torch.no_grad()
 def distance_errors(network: DistanceNetwork, bundle: Bundle, samples: int = SAMPLES, seed: int = 0) -> list[DistanceError]:
-    """Errors of each hand of a bundle, of which the open hand is placed as far off the true grasp as in training.
+    """Distance error of each hand of a bundle, with the open hand placed as close to the true grasp as in training.
 
     Args:
         network: Trained weights, in evaluation mode, on the CPU.
-        bundle: Grasps to compare with; of the validate split for numbers that mean something.
-        samples: Placed hands, of each hand.
-        seed: Of the samples.
+        bundle: Grasps to compare with; take the validate split, since training has seen the others.
+        samples: Placements of each hand.
+        seed: Seed of the samples.
     """
     source = SampleSource(bundle, network.config, AugmentationConfig())
     generator = torch.Generator().manual_seed(seed)

@@ -1,4 +1,4 @@
-"""Numbers that say how good grasps are, with their uncertainty."""
+"""Measures of grasps, with their uncertainty."""
 
 from __future__ import annotations
 
@@ -9,33 +9,25 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-CONFIDENCE = 1.959964
-"""Standard deviations of a two-sided 95 % interval."""
-
 
 def wilson_interval(success: int, total: int) -> tuple[float, float]:
-    """95 % confidence interval of a success rate. Source: Wilson 1927.
+    """Wilson's 95 % confidence interval of a success rate; [0, 1] without trials."""
+    # scipy.stats takes half a second to import, which only those who ask for intervals should pay.
+    from scipy.stats import binomtest
 
-    Args:
-        success: Successes.
-        total: Trials; with none, the interval is everything.
-    """
     if total == 0:
         return 0.0, 1.0
-    rate, z2 = success / total, CONFIDENCE**2
-    centre = (rate + z2 / (2 * total)) / (1 + z2 / total)
-    half = CONFIDENCE / (1 + z2 / total) * math.sqrt(rate * (1 - rate) / total + z2 / (4 * total**2))
-    # Rounding may leave the rate itself outside.
-    return max(0.0, min(rate, centre - half)), min(1.0, max(rate, centre + half))
+    interval = binomtest(success, total).proportion_ci(confidence_level=0.95, method="wilson")
+    return float(interval.low), float(interval.high)
 
 
 def diversity(
     T_object_wrist: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"]
 ) -> dict[str, float]:
-    """The paper's diversity: standard deviation of each wrist coordinate and joint over grasps, then the mean.
+    """The paper's diversity: the standard deviation of each wrist coordinate and joint over grasps, averaged.
 
-    The wrist counts as x, y, z [m] and roll, pitch, yaw [rad], which mixes units, as the paper does; the parts are
-    given apart too. Source: paper section IV-A.
+    The wrist coordinates are x, y, z [m] and roll, pitch, yaw [rad]. The mean mixes units, as in the paper, so wrist and
+    joints are also given separately. Source: paper section IV-A.
     """
     if len(joints) < 2:
         return {"all": 0.0, "wrist": 0.0, "joints": 0.0}
@@ -46,10 +38,14 @@ def diversity(
 
 
 def roc_area(score: Float[Tensor, " n"], success: Bool[Tensor, " n"]) -> float:
-    """Probability that a success has a higher score than a failure; ties count half, NaN when one kind is missing."""
-    good, bad = score[success], score[~success]
-    if not len(good) or not len(bad):
+    """Probability that a success scores higher than a failure; ties count half, NaN if all grasps have one outcome.
+
+    This is the Mann-Whitney U statistic, from rank sums, as a share of all pairs.
+    """
+    from scipy.stats import rankdata
+
+    good, bad = int(success.sum()), int((~success).sum())
+    if not good or not bad:
         return math.nan
-    above = (good[:, None] > bad).double().mean()
-    equal = (good[:, None] == bad).double().mean()
-    return float(above + 0.5 * equal)
+    ranks = rankdata(score.cpu().numpy())[success.cpu().numpy()]
+    return float((ranks.mean() - (good + 1) / 2) / bad)

@@ -1,8 +1,8 @@
-"""The browser viewer: a hand on an object, one grasp at a time. Served to this machine only."""
+"""The browser viewer: the grasps of one hand on one object, one at a time."""
 
 from __future__ import annotations
 
-from typing import Literal, cast
+from typing import Literal, cast, get_args
 
 import numpy as np
 import torch
@@ -18,8 +18,10 @@ from dro_grasp.viewer.appearance import PREDICTED_COLOUR
 from dro_grasp.viewer.serving import HOST, ServedPage, serve
 from dro_grasp.viewer.stage import Stage
 
-POSTURES = ("open", "pregrasp", "grasp", "squeeze")
 Posture = Literal["open", "pregrasp", "grasp", "squeeze"]
+"""Stages of closing the hand that the viewer shows."""
+POSTURES: tuple[Posture, ...] = get_args(Posture)
+"""All postures, from open to closed."""
 
 
 class GraspViewer(ServedPage):
@@ -42,19 +44,19 @@ class GraspViewer(ServedPage):
         """Start serving.
 
         Args:
-            hand: The hand of the grasps.
-            obj: Their object.
-            grasps: At least one grasp, tried or not.
-            predicted_points: The hand's points as the network placed them, before links and joints were solved [m].
-            port: The next free one is taken.
-            host: Only this machine by default; 0.0.0.0 lets the network in.
+            hand: Hand of the grasps.
+            obj: Object of the grasps.
+            grasps: At least one grasp, with or without a trial.
+            predicted_points: Hand points multilaterated from D(R,O), before the solver [m].
+            port: Port to serve on; if it is taken, the next free one.
+            host: Address to serve at; 0.0.0.0 serves the whole network.
 
         Raises:
-            OptionError: There is no grasp, no such port or host.
-            GraspFileError: The grasps are of another hand.
+            OptionError: There is no grasp, or the port or host is invalid.
+            GraspFileError: The grasps belong to another hand.
         """
         if len(grasps) == 0:
-            raise OptionError("there is no grasp to look at; generate at least one, or leave out --only-successful")
+            raise OptionError("there is no grasp to view; generate at least one, or leave out --only-successful")
         grasps.require_hand(hand)
         self.hand, self.obj, self.grasps, self.predicted_points = hand, obj, grasps, predicted_points
         self.index = 0
@@ -90,7 +92,7 @@ class GraspViewer(ServedPage):
         shapes = gui.add_checkbox("Hand shapes", True)
         solved = gui.add_checkbox("Solved hand points", False, hint="The hand's surface points in this posture.")
         missing = self._predicted is None
-        hint = "Only right after generating: files do not hold them." if missing else "As multilaterated from D(R,O)."
+        hint = "Files do not store them." if missing else "Multilaterated from D(R,O)."
         predicted = gui.add_checkbox("Predicted points", False, disabled=missing, hint=hint)
         slider.on_update(lambda _: self.show(int(slider.value)))
         postures.on_click(lambda _: self.show(self.index, cast(Posture, postures.value)))
@@ -112,12 +114,12 @@ def view_grasps(
 
 
 def outcome(grasps: GraspBatch, index: int) -> bool | None:
-    """Whether a grasp held, None where it was not evaluated."""
+    """Whether a grasp passed its trial; None if it was not evaluated."""
     return bool(grasps.success[index]) if bool(grasps.evaluated[index]) else None
 
 
 def describe(grasps: GraspBatch, index: int) -> str:
-    """What is known of one grasp, as Markdown."""
+    """Summary of one grasp, in Markdown."""
     lines = [f"**Grasp {index}** of {len(grasps)}"]
     if bool(grasps.evaluated[index]):
         lines.append(f"**{'success' if grasps.success[index] else 'failed'}** under {grasps.protocol[index]}")
@@ -133,7 +135,7 @@ def describe(grasps: GraspBatch, index: int) -> str:
 
 
 def postures_of(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> dict[Posture, Float[Tensor, "n n_dof"]]:
-    """Joints of every posture; the controller makes those that the grasps lack."""
+    """Joints of every posture; the controller completes those that the grasps lack."""
     joints = grasps.joints.float()
     grasps = completed(hand, grasps, torch.as_tensor(obj.centre_of_mass, dtype=torch.float32))
     opened = hand.canonical_joints().expand_as(joints)

@@ -1,4 +1,4 @@
-"""What there is to see of a grasp: posed link shapes, the object, colours, and where to look from."""
+"""Appearance of a grasp: posed link shapes, the object, colours and camera."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from dro_grasp.hands.hand import Hand
@@ -15,19 +15,28 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.rendering.rasterizer import Camera, Colour, Mesh, dots
 
 OBJECT_COLOUR: Colour = (0.95, 0.62, 0.28)
+"""Orange of the object."""
 PALM_COLOUR: Colour = (0.58, 0.62, 0.69)
+"""Grey of links that belong to no finger."""
 PREDICTED_COLOUR: Colour = (0.85, 0.20, 0.55)
+"""Pink of hand points predicted by the network."""
 SOLVED_COLOUR: Colour = (0.15, 0.45, 0.85)
+"""Blue of hand points after the joint solver."""
 SUCCESS_COLOUR: Colour = (0.16, 0.60, 0.30)
+"""Green of grasps that passed their trial."""
 FAILURE_COLOUR: Colour = (0.80, 0.22, 0.20)
-UNTRIED_COLOUR: Colour = (0.50, 0.50, 0.50)
+"""Red of grasps that failed their trial."""
+UNEVALUATED_COLOUR: Colour = (0.50, 0.50, 0.50)
+"""Grey of grasps that were not evaluated."""
 
 CELLS = 28
 """Cells along each side of the coarse picture that rates a viewpoint."""
 VIEWPOINTS = 48
-"""Viewpoints that are rated."""
-LOWEST_VIEW, HIGHEST_VIEW = -0.5, 0.85
-"""Cameras stay between these heights on the unit sphere: neither straight from below nor from above."""
+"""Half the number of viewpoints spread over the sphere."""
+LOWEST_VIEW = -0.5
+"""Smallest height of a camera on the unit sphere, so that none looks straight up."""
+HIGHEST_VIEW = 0.85
+"""Largest height of a camera on the unit sphere, so that none looks straight down."""
 
 
 def finger_of_link(hand: Hand) -> list[int]:
@@ -53,12 +62,12 @@ def link_colours(hand: Hand) -> list[Colour]:
 
 
 def success_colour(success: bool | None) -> Colour:
-    """Green, red, or grey for a grasp that was not tried."""
-    return UNTRIED_COLOUR if success is None else SUCCESS_COLOUR if success else FAILURE_COLOUR
+    """Green for success, red for failure, grey if not evaluated."""
+    return UNEVALUATED_COLOUR if success is None else SUCCESS_COLOUR if success else FAILURE_COLOUR
 
 
-def link_shapes(hand: Hand) -> list[tuple[int, np.ndarray, np.ndarray]]:
-    """Link, vertices (n 3) in its frame [m] and faces (m 3) of every visible shape of a hand."""
+def link_shapes(hand: Hand) -> list[tuple[int, Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]]:
+    """Link, vertices in the link's frame [m] and faces of every visual shape of a hand."""
     if hand.description is None:
         return []
     return [(g.link, g.vertices, g.faces) for g in hand.description.geometry if g.visual]
@@ -68,13 +77,13 @@ def hand_meshes(
     hand: Hand, joints: Float[Tensor, " n_dof"], T_object_wrist: Float[Tensor, "4 4"] | None = None,
     *, above_palm: bool = True,
 ) -> list[Mesh]:
-    """The posed hand in the object's frame; its surface points where there is no description.
+    """The posed hand in the object's frame; without a description, its surface points.
 
     Args:
         hand: The hand.
         joints: Independent joints [rad or m].
-        T_object_wrist: Wrist pose; none draws the hand in its own root frame.
-        above_palm: Whether links above the palm (a forearm, a stand) are drawn.
+        T_object_wrist: Wrist pose; by default the hand is drawn in its wrist frame.
+        above_palm: Whether to draw links above the palm (a forearm, a stand).
     """
     T = torch.eye(4) if T_object_wrist is None else T_object_wrist
     shapes = link_shapes(hand)
@@ -89,7 +98,7 @@ def hand_meshes(
 
 
 def object_meshes(obj: ObjectModel) -> list[Mesh]:
-    """The object, or the points of a bare cloud."""
+    """The object's mesh, or the points of a bare cloud."""
     if obj.vertices is None or obj.faces is None:
         radius = 0.01 * float(np.linalg.norm(obj.extents))
         return [dots(obj.cloud[:: max(1, len(obj.cloud) // 3000)], OBJECT_COLOUR, radius)]
@@ -100,7 +109,7 @@ def best_camera(
     hand: Hand, joints: Float[Tensor, " n_dof"], T_object_wrist: Float[Tensor, "4 4"], obj: ObjectModel,
     aspect: float = 4 / 3,
 ) -> Camera:
-    """The viewpoint, out of many around a grasp, from which most of the object and of the fingers can be told apart."""
+    """The camera, out of many around a grasp, that shows most of the object and of the fingers."""
     of_hand = hand.points(joints, T_object_wrist).double().numpy()
     finger = np.asarray(finger_of_link(hand))[hand.link_index.numpy()] >= 0
     of_object = obj.cloud[:: max(1, len(obj.cloud) // 1024)].astype(float)
@@ -112,7 +121,7 @@ def best_camera(
 
 @lru_cache(maxsize=1)
 def _directions() -> tuple[tuple[float, float, float], ...]:
-    """Evenly spread viewpoints (Fibonacci sphere), none straight from below or above."""
+    """Evenly spread viewpoints (Fibonacci sphere), without those from straight below or above."""
     i = np.arange(2 * VIEWPOINTS) + 0.5
     z = 1 - i / VIEWPOINTS
     angle = np.pi * (1 + 5**0.5) * i
@@ -121,8 +130,16 @@ def _directions() -> tuple[tuple[float, float, float], ...]:
     return tuple(row for row in rows if LOWEST_VIEW < row[2] < HIGHEST_VIEW)
 
 
-def _clarity(points: np.ndarray, owner: np.ndarray, direction: tuple[float, float, float]) -> float:
-    """Cells of a coarse picture that show the object (2) and the fingers (1); the scarcer of the two counts more."""
+def _clarity(
+    points: Float[np.ndarray, "n 3"], owner: Int[np.ndarray, " n"], direction: tuple[float, float, float]
+) -> float:
+    """Number of cells of a coarse picture that show the object or the fingers; the scarcer of the two counts more.
+
+    Args:
+        points: Points of hand and object [m].
+        owner: 1 for points of fingers, 2 for points of the object, 0 for all others.
+        direction: From the points towards the camera.
+    """
     right, up, backward = Camera(direction, (0.0, 0.0, 0.0)).axes()
     size = float(np.linalg.norm(np.ptp(points, axis=0))) + 1e-9
     x, y = (((points @ axis) - (points @ axis).min()) / size * CELLS for axis in (right, up))

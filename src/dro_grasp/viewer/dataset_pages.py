@@ -1,4 +1,4 @@
-"""A data set as one self-contained web page: yields, failures, coverage, spread, energies, and pictures of grasps."""
+"""Report of a data set as one self-contained web page: yields, failures, coverage, diversity, energies, pictures."""
 
 from __future__ import annotations
 
@@ -11,27 +11,31 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from dro_grasp.evaluation.coverage import HALF_AXES, ROLL_BINS, HandCoverage, PairCoverage, grasp_sizes, wrist_rolls
+from dro_grasp.evaluation.coverage import ROLL_BINS, HandCoverage, PairCoverage, grasp_sizes, wrist_rolls
 from dro_grasp.files import check_output
+from dro_grasp.geometry.half_axes import HALF_AXES
 from dro_grasp.grasps.sources import object_of
-from dro_grasp.viewer.page import Shade, image, png_bytes, table, write_page
+from dro_grasp.viewer.page import ShadedCount, image, png_bytes, table, write_page
 from dro_grasp.viewer.pictures import caption, contact_sheet, draw_grasp
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-SHOWN = 8
-"""Grasps drawn for each hand, on different objects."""
-COLOUR, SECOND = "#2a788e", "#d1713b"
+MAX_PICTURES = 8
+"""Grasps drawn for each hand, each on another object."""
+COLOUR = "#2a788e"
+"""Blue of the data in charts."""
+ACCENT = "#d1713b"
+"""Orange of medians and labels in charts."""
 
 
 def write_report(hands: Sequence[HandCoverage], path: Path, progress: Callable[[int, int], None] | None = None) -> None:
     """Write the page.
 
     Args:
-        hands: What to report.
+        hands: Coverage of each hand.
         path: HTML file.
-        progress: Called with (hands done, hands in all).
+        progress: Called with (hands done, all hands).
 
     Raises:
         OutputError: The file cannot be written.
@@ -48,15 +52,15 @@ def write_report(hands: Sequence[HandCoverage], path: Path, progress: Callable[[
 
 def _overview(hands: Sequence[HandCoverage]) -> str:
     rows = [
-        [h.grasps.hand, len(h.grasps), len(h.pairs), sum(not p.grasps for p in h.pairs), h.made.candidates, h.made.tried,
-         _percent(h.made.valid, h.made.tried), round(h.made.per_cpu_hour), *(f"{h.diversity[k]:.3f}" for k in h.diversity)]
-        for h in hands
+        [h.grasps.hand, len(h.grasps), len(h.pairs), sum(not p.grasps for p in h.pairs), y.candidates, y.tried,
+         _percent(y.valid, y.tried), round(y.per_cpu_hour), *(f"{value:.3f}" for value in h.diversity.values())]
+        for h, y in ((h, h.yields) for h in hands)
     ]
-    head = ["hand", "grasps", "objects", "without a grasp", "candidates", "tried", "of these valid", "per CPU-hour",
-            "diversity", "of the wrist", "of the joints"]
+    head = ["hand", "grasps", "objects", "without a grasp", "candidates", "trials", "valid", "per CPU-hour",
+            "diversity", "of wrist", "of joints"]
     return table(head, rows) + (
-        "<p class=note>Diversity: standard deviation over all grasps of each of x, y, z, roll, pitch, yaw and joints, then "
-        "the mean. Yields are those of the making; the data set may hold a choice of what was made.</p>")
+        "<p class=note>Diversity: mean over x, y, z, roll, pitch, yaw and all joints of the standard deviation over "
+        "grasps. Yields are those of synthesis; the data set may hold only some of the valid grasps.</p>")
 
 
 def _section(hand: HandCoverage) -> str:
@@ -68,7 +72,7 @@ def _section(hand: HandCoverage) -> str:
 
 
 def charts(hand: HandCoverage) -> bytes:
-    """Palm directions, rolls, sizes, energies and joints of a hand with grasps, as one PNG."""
+    """Palm directions, rolls, sizes, energies and joints of a hand's grasps, as one PNG."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 6.2), layout="constrained")
@@ -90,8 +94,8 @@ def _directions(axes: Axes, hand: HandCoverage) -> None:
     axes.scatter(torch.atan2(d[:, 1], d[:, 0]), d[:, 2].clamp(-1, 1).asin(), s=4, alpha=0.4, color=COLOUR, linewidths=0)
     for label, (x, y) in {"+x": (0, 0), "+y": (math.pi / 2, 0), "-y": (-math.pi / 2, 0), "+z": (0, math.pi / 2.05),
                           "-z": (0, -math.pi / 2.05), "-x": (math.pi * 0.97, 0)}.items():
-        box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": SECOND, "linewidth": 0.8}
-        axes.annotate(label, (x, y), color=SECOND, weight="bold", fontsize=8, ha="center", va="center", bbox=box, zorder=5)
+        box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": ACCENT, "linewidth": 0.8}
+        axes.annotate(label, (x, y), color=ACCENT, weight="bold", fontsize=8, ha="center", va="center", bbox=box, zorder=5)
     axes.set(title="palm directions in the object's frame", xticklabels=[], yticklabels=[])
     axes.grid(alpha=0.3)
 
@@ -103,27 +107,27 @@ def _energies(axes: Axes, hand: HandCoverage) -> None:
         return
     names = list(terms)
     axes.boxplot([terms[n].tolist() for n in names], orientation="horizontal", showfliers=False, tick_labels=names,
-                 medianprops={"color": SECOND})
+                 medianprops={"color": ACCENT})
     axes.set(title="energy terms, weighted")
 
 
 def _joints(axes: Axes, hand: HandCoverage) -> None:
     tree, q = hand.hand.tree, hand.grasps.joints
-    low, high = (x.tolist() for x in (tree.lower, tree.upper))
+    low, high = tree.lower.tolist(), tree.upper.tolist()
     places = range(tree.n_dof)
     axes.vlines(places, low, high, color="#ccd", linewidth=7, label="limits")
     quantiles = torch.quantile(q, torch.tensor([0.1, 0.5, 0.9]), dim=0)
     axes.vlines(places, quantiles[0].tolist(), quantiles[2].tolist(), color=COLOUR, linewidth=4, label="10 to 90 %")
-    axes.plot(places, quantiles[1].tolist(), "o", color=SECOND, markersize=4, label="median")
+    axes.plot(places, quantiles[1].tolist(), "o", color=ACCENT, markersize=4, label="median")
     axes.set_xticks(list(places), [n[:14] for n in tree.joint_names], rotation=60, ha="right", fontsize=7)
-    axes.set(title=f"joints; standard deviation {hand.diversity['joints']:.2f} on average", ylabel="[rad or m]")
+    axes.set(title=f"joints; mean standard deviation {hand.diversity['joints']:.2f}", ylabel="[rad or m]")
     axes.legend(fontsize=7, loc="lower right")
 
 
 def grasps_drawn(hand: HandCoverage) -> bytes:
-    """Grasps on some of the objects, spread over the alphabet, as one PNG."""
+    """One grasp on each of some objects, evenly chosen from the alphabet, as one PNG."""
     names = [p.object for p in hand.pairs if p.grasps]
-    chosen = [names[i * len(names) // min(SHOWN, len(names))] for i in range(min(SHOWN, len(names)))]
+    chosen = [names[i * len(names) // min(MAX_PICTURES, len(names))] for i in range(min(MAX_PICTURES, len(names)))]
     tiles, captions = [], []
     for name in chosen:
         row = hand.grasps.object.index(name)
@@ -136,29 +140,30 @@ def grasps_drawn(hand: HandCoverage) -> bytes:
 
 
 def _failures(hand: HandCoverage) -> str:
-    made = hand.made
-    if not made.candidates:
+    yields = hand.yields
+    if not yields.candidates:
         return ""
-    rows = [["candidates", made.candidates, "100 %"], ["energy too high to try", made.ranked_out, None],
-            ["too deep in the object to try", made.deep, None], ["closing moved the object too far", made.moved, None],
-            *[[reason, n, None] for reason, n in sorted(made.failures.items(), key=lambda item: -item[1])],
-            ["near-duplicates", made.duplicates, None], ["valid", made.valid, None]]
-    return table(["what became of candidates", "number", "share"], [
-        [name, n, share or _percent(n, made.candidates)] for name, n, share in rows
+    rows = [["candidates", yields.candidates, "100 %"], ["not evaluated: energy too high", yields.ranked_out, None],
+            ["not evaluated: penetration too deep", yields.deep, None],
+            ["not evaluated: closing moved the object too far", yields.moved, None],
+            *[[reason, n, None] for reason, n in sorted(yields.failures.items(), key=lambda item: -item[1])],
+            ["near-duplicates", yields.duplicates, None], ["valid", yields.valid, None]]
+    return table(["outcome of candidates", "number", "share"], [
+        [name, n, share or _percent(n, yields.candidates)] for name, n, share in rows
     ])
 
 
 def _pair_table(hand: HandCoverage) -> str:
     head = ["object", "grasps", "candidates", "per CPU-hour", *HALF_AXES, f"rolls of {ROLL_BINS}", "size [cm]",
-            "links in contact", "why none"]
+            "contact links", "why no grasp"]
     return table(head, [_pair_row(pair) for pair in hand.pairs])
 
 
 def _pair_row(pair: PairCoverage) -> list[object]:
     size = "" if math.isnan(pair.size[0]) else f"{100 * pair.size[0]:.0f}-{100 * pair.size[1]:.0f}"
-    links = f"{pair.fingers[0]}-{pair.fingers[1]}" if pair.fingers[1] else ""
-    cells = [Shade(n, max(pair.half_axes)) for n in pair.half_axes]
-    return [pair.object, pair.grasps, pair.made.candidates or None, round(pair.made.per_cpu_hour) or None, *cells,
+    links = f"{pair.contact_links[0]}-{pair.contact_links[1]}" if pair.contact_links[1] else ""
+    cells = [ShadedCount(n, max(pair.half_axes)) for n in pair.half_axes]
+    return [pair.object, pair.grasps, pair.yields.candidates or None, round(pair.yields.per_cpu_hour) or None, *cells,
             pair.rolls, size, links, pair.reason]
 
 

@@ -1,4 +1,4 @@
-"""Self-contained web pages: tables, pictures inside the file, one style."""
+"""Self-contained web pages: tables, embedded pictures, one style."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ table { border-collapse: collapse; font-size: 13px; margin: 1em 0 } td, th { pad
 td:first-child, th:first-child, td:last-child.words { text-align: left } tr:nth-child(even) { background: #f6f7f8 }
 td.cell { min-width: 2.2em } img { max-width: 100% } p.note { color: #666 }
 """
+"""CSS of every page."""
 
 
 def write_page(path: Path, title: str, body: str) -> None:
@@ -29,7 +30,7 @@ def write_page(path: Path, title: str, body: str) -> None:
 
     Args:
         path: HTML file.
-        title: Of the window.
+        title: Title of the window.
         body: HTML.
 
     Raises:
@@ -40,21 +41,21 @@ def write_page(path: Path, title: str, body: str) -> None:
                              f"{body}<p class=note>dro-grasp {__version__}</p>")
 
 
-class Shade:
-    """A count that is shaded by its share of the largest."""
+class ShadedCount:
+    """A count whose cell is shaded by its share of the largest count."""
 
     def __init__(self, count: int, largest: int) -> None:
         self.count, self.share = count, count / max(1, largest)
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """A table; strings of several words are set to the left, missing values stay empty."""
+    """A table; text of several words is left-aligned, and None is an empty cell."""
     body = "".join(f"<tr>{''.join(_cell(value) for value in row)}</tr>" for row in rows)
     return f"<table><tr>{''.join(f'<th>{html.escape(h)}</th>' for h in head)}</tr>{body}</table>"
 
 
 def _cell(value: object) -> str:
-    if isinstance(value, Shade):
+    if isinstance(value, ShadedCount):
         colour = f"rgba(42,120,142,{0.65 * value.share:.2f})" if value.count else "#f3d9cc"
         return f'<td class=cell style="background:{colour}">{value.count}</td>'
     if isinstance(value, str) and " " in value:
@@ -64,7 +65,7 @@ def _cell(value: object) -> str:
 
 
 def image(png: bytes, description: str) -> str:
-    """A picture, inside the page."""
+    """A picture embedded in the page."""
     return f'<p><img alt="{html.escape(description)}" src="data:image/png;base64,{base64.b64encode(png).decode()}"></p>'
 
 

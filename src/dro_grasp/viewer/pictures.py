@@ -1,4 +1,4 @@
-"""Pictures of grasps without a browser, OpenGL or any system package."""
+"""Pictures of grasps, drawn without a browser, OpenGL or system packages."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
@@ -17,20 +17,29 @@ from dro_grasp.errors import OutputError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.rendering.rasterizer import dots, render
+from dro_grasp.rendering.rasterizer import Colour, dots, render
 from dro_grasp.viewer.appearance import best_camera, hand_meshes, object_meshes, success_colour
 
 TILE = (320, 280)
-"""Width and height of one grasp's picture [pixels]."""
-MOST = 16
-"""Grasps on one sheet, unless told otherwise."""
+"""Width and height of the picture of one grasp [pixels]."""
+MAX_PICTURES = 16
+"""Default limit of grasps on one sheet."""
 COLUMNS = 4
-TOUCH = 0.002
-"""Hand points nearer than this to the surface touch it [m]."""
-TOUCH_COLOUR, TOUCH_RADIUS = (0.86, 0.10, 0.16), 0.0022
-CAPTION, HEADER = 26, 44
-"""Heights of the line under each picture and of the title [pixels]."""
-INK, FAINT = (40, 44, 52), (120, 126, 136)
+"""Default number of pictures side by side."""
+CONTACT_DISTANCE = 0.002
+"""Hand points closer than this to the object's surface count as contacts [m]."""
+CONTACT_COLOUR: Colour = (0.86, 0.10, 0.16)
+"""Red of contact marks."""
+CONTACT_RADIUS = 0.0022
+"""Radius of a contact mark [m]."""
+CAPTION = 26
+"""Height of the caption under each picture [pixels]."""
+HEADER = 44
+"""Height of the title of a sheet [pixels]."""
+INK = (40, 44, 52)
+"""Colour of text (red, green, blue, to 255)."""
+FAINT = (120, 126, 136)
+"""Colour of captions of grasps that were not evaluated (red, green, blue, to 255)."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +49,9 @@ class PictureStyle:
     size: tuple[int, int] = TILE
     """Width and height [pixels]."""
     opacity: float = 1.0
-    """Of the object; below 1 the hand shows through it."""
+    """Opacity of the object; below 1 the hand shows through it."""
     contacts: bool = False
-    """Mark where the hand touches the object, through whatever stands before."""
+    """Mark contacts in red, even where something hides them."""
 
 
 def draw_grasps(
@@ -50,23 +59,23 @@ def draw_grasps(
     obj: ObjectModel,
     grasps: GraspBatch,
     path: Path | str,
-    count: int = MOST,
+    count: int = MAX_PICTURES,
     columns: int = COLUMNS,
     style: PictureStyle | None = None,
 ) -> None:
     """Write a PNG with pictures of the first `count` grasps, captioned with score and trial outcome.
 
     Args:
-        hand: The hand of the grasps; links above its palm are not drawn.
-        obj: Their object.
-        grasps: At least one grasp; the first ones are drawn.
+        hand: Hand of the grasps; links above its palm are not drawn.
+        obj: Object of the grasps.
+        grasps: At least one grasp.
         path: PNG to write.
-        count: Most grasps drawn.
+        count: Limit of grasps drawn, from the first on.
         columns: Pictures side by side.
-        style: Size, transparency and contact points.
+        style: Size, opacity and contact marks.
 
     Raises:
-        OutputError: The file cannot be written, or there is no grasp to draw.
+        OutputError: The file cannot be written, or there is no grasp.
     """
     if len(grasps) == 0:
         raise OutputError(f"no grasp to draw into {path}; ask for at least one")
@@ -81,30 +90,30 @@ def draw_grasps(
 
 def draw_grasp(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, index: int, style: PictureStyle | None = None
-) -> np.ndarray:
-    """The picture (height width 3) of one grasp, from the viewpoint that hides least."""
+) -> UInt8[np.ndarray, "height width 3"]:
+    """The picture of one grasp, from the viewpoint that shows most of object and fingers."""
     style = style or PictureStyle()
     joints, T = grasps.joints[index].float(), grasps.T_object_wrist[index].float()
     with torch.no_grad():
         fingers = hand_meshes(hand, joints, T, above_palm=False)
         camera = best_camera(hand, joints, T, obj, aspect=style.size[0] / style.size[1])
-        touching = touching_points(hand, obj, joints, T) if style.contacts else np.zeros((0, 3))
+        contacts = contact_points(hand, obj, joints, T) if style.contacts else np.zeros((0, 3))
     whole = render([*object_meshes(obj), *fingers], camera, *style.size)
     if style.opacity < 1:
         behind = render(fingers, camera, *style.size)
         whole = (style.opacity * whole + (1 - style.opacity) * behind + 0.5).astype(np.uint8)
-    if len(touching):
-        marks = render([dots(touching, TOUCH_COLOUR, TOUCH_RADIUS)], camera, *style.size)
+    if len(contacts):
+        marks = render([dots(contacts, CONTACT_COLOUR, CONTACT_RADIUS)], camera, *style.size)
         whole = np.where((marks < 250).any(-1, keepdims=True), marks, whole)
     return whole
 
 
-def touching_points(
+def contact_points(
     hand: Hand, obj: ObjectModel, joints: Float[Tensor, " n_dof"], T_object_wrist: Float[Tensor, "4 4"]
 ) -> Float[np.ndarray, "k 3"]:
-    """Points of the posed hand at the object's surface [m]."""
+    """Points of the posed hand in contact with the object [m]."""
     points = hand.points(joints, T_object_wrist)
-    return points[obj.distance_field.distances(points)[0].abs() < TOUCH].double().numpy()
+    return points[obj.distance_field.distances(points)[0].abs() < CONTACT_DISTANCE].double().numpy()
 
 
 def heading(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> str:
@@ -117,7 +126,7 @@ def heading(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> str:
 
 
 def caption(grasps: GraspBatch, index: int) -> tuple[str, bool | None]:
-    """The line under a picture, and the outcome that colours it."""
+    """The caption of a picture, and the trial outcome that gives its colour."""
     outcome = bool(grasps.success[index]) if bool(grasps.evaluated[index]) else None
     words = {True: "success", False: "failed", None: "not evaluated"}[outcome]
     values = {name: float(getattr(grasps, name)[index]) for name in ("score", "energy")}
@@ -126,9 +135,10 @@ def caption(grasps: GraspBatch, index: int) -> tuple[str, bool | None]:
 
 
 def contact_sheet(
-    tiles: list[np.ndarray], captions: Sequence[tuple[str, bool | None]], title: str, columns: int = COLUMNS
+    tiles: list[UInt8[np.ndarray, "height width 3"]], captions: Sequence[tuple[str, bool | None]], title: str,
+    columns: int = COLUMNS,
 ) -> Image.Image:
-    """Pictures in a grid, each with a caption, under a title."""
+    """A grid of captioned pictures under a title."""
     height, width = tiles[0].shape[:2]
     columns = min(columns, len(tiles))
     rows = -(-len(tiles) // columns)

@@ -1,4 +1,4 @@
-"""A page with a server of its own."""
+"""Web pages with their own server."""
 
 from __future__ import annotations
 
@@ -11,38 +11,39 @@ import viser
 from dro_grasp.errors import OptionError
 
 HOST = "127.0.0.1"
-"""Nobody else on the network can connect."""
+"""Default address: only this machine can connect."""
 PORTS = range(1, 65536)
+"""Valid TCP ports."""
 
 
 class ServedPage:
-    """What viewer and studio share: a running server; `stop()` ends it."""
+    """A page that is being served; `stop()` ends it."""
 
     def __init__(self, port: int, host: str) -> None:
         """Start serving.
 
         Args:
-            port: The next free one is taken.
-            host: Only this machine, or 0.0.0.0 to let the network in.
+            port: Port to serve on; if it is taken, the next free one.
+            host: Address to serve at; 0.0.0.0 serves the whole network.
 
         Raises:
-            OptionError: There is no such port, or no address of this machine is called so.
+            OptionError: The port is invalid, or the host is no address of this machine.
         """
         if port not in PORTS:
             raise OptionError(f"port is {port}; give a number from {PORTS[0]} to {PORTS[-1]}, for example --port 8080")
         try:
-            # viser would look for a free port for ever.
+            # viser would search for a free port forever.
             socket.create_server((host, 0)).close()
         except OSError as error:
-            raise OptionError(f"this machine cannot serve at '{host}' ({error}); give --host {HOST} for this machine alone, or "
-                              "0.0.0.0 for the network") from error
-        # The server prints a banner on stdout, where commands promise a table or one JSON object.
+            raise OptionError(f"this machine cannot serve at '{host}' ({error}); give --host {HOST} for this machine only, or "
+                              "0.0.0.0 for the whole network") from error
+        # viser prints a banner to stdout, which is reserved for tables and JSON.
         with contextlib.redirect_stdout(sys.stderr):
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
 
     @property
     def url(self) -> str:
-        """Where to point the browser."""
+        """Address of the page for a browser."""
         return f"http://{self.server.get_host()}:{self.server.get_port()}"
 
     def stop(self) -> None:
@@ -51,8 +52,8 @@ class ServedPage:
 
 
 def serve(page: ServedPage) -> None:
-    """Say where the page is, and serve it until Ctrl-C."""
-    print(f"viewer: {page.url} (Ctrl-C ends it)", file=sys.stderr, flush=True)
+    """Print the address of the page, and serve it until Ctrl-C."""
+    print(f"viewer: {page.url} (Ctrl-C stops it)", file=sys.stderr, flush=True)
     try:
         page.server.sleep_forever()
     except KeyboardInterrupt:

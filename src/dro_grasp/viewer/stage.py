@@ -1,4 +1,4 @@
-"""A hand and an object in the browser: their meshes, put where they belong."""
+"""The 3D scene in the browser: one hand, one object, their poses."""
 
 from __future__ import annotations
 
@@ -23,31 +23,31 @@ from dro_grasp.viewer.appearance import (
 )
 
 POINT_SIZE = 0.0022
-"""[m]"""
+"""Size of a drawn point [m]."""
 CAMERA_DISTANCE = 1.15
-"""How much farther than a picture's camera the viewer starts."""
-BELOW = 0.12
-"""Height of the object above the grid [m]."""
+"""Initial camera distance, as a multiple of that of a picture."""
+GRID_DEPTH = 0.12
+"""Distance from the object's lowest point down to the grid [m]."""
 
 
 class Stage:
-    """One hand and one object of a server; `set_pair` replaces them."""
+    """One hand and one object on a server; `set_pair` replaces them."""
 
     def __init__(self, server: viser.ViserServer) -> None:
-        """An empty one."""
+        """Start with an empty scene."""
         self.server = server
         self.hand: Hand | None = None
         server.scene.set_up_direction("+z")
         self._root = 0
 
     def set_pair(self, hand: Hand, obj: ObjectModel, joints: Float[Tensor, " n_dof"], T: Float[Tensor, "4 4"]) -> None:
-        """Show another hand and object, and look at them from where most is seen.
+        """Replace hand and object, and move the camera to the best viewpoint.
 
         Args:
-            hand: With its description, for shapes.
-            obj: Mesh or cloud.
-            joints: First posture [rad or m].
-            T: First wrist pose in the object's frame [m].
+            hand: Hand with its description, which holds the shapes.
+            obj: Object with a mesh or a cloud.
+            joints: Initial joints [rad or m].
+            T: Initial wrist pose in the object's frame [m].
         """
         scene, name = self.server.scene, f"/pair{self._root}"
         if self.hand is not None:
@@ -64,7 +64,7 @@ class Stage:
         for k, (link, vertices, faces) in enumerate(link_shapes(hand)):
             scene.add_mesh_simple(f"{name}/hand/{link}/{k}", vertices, faces, color=rgb(colours[link]), side="double")
         self.solved = self.cloud("solved", np.zeros((1, 3)), SOLVED_COLOUR)
-        position = (*obj.cloud.mean(0)[:2].tolist(), float(obj.cloud.min(0)[2]) - BELOW)
+        position = (*obj.cloud.mean(0)[:2].tolist(), float(obj.cloud.min(0)[2]) - GRID_DEPTH)
         self._grid = scene.add_grid(f"{name}/grid", width=0.4, height=0.4, cell_size=0.05, section_size=0.1, position=position)
         camera = best_camera(hand, joints, T, obj)
         start, target = np.asarray(camera.position), np.asarray(camera.target)
@@ -75,8 +75,8 @@ class Stage:
             client.camera.position, client.camera.look_at, client.camera.fov = position, camera.target, camera.field_of_view
         self.show(joints, T)
 
-    def cloud(self, name: str, points: np.ndarray, colour: Colour) -> viser.PointCloudHandle:
-        """Points that are hidden at first."""
+    def cloud(self, name: str, points: Float[np.ndarray, "n 3"], colour: Colour) -> viser.PointCloudHandle:
+        """Add points, hidden at first."""
         return self.server.scene.add_point_cloud(
             f"/pair{self._root}/{name}", points.astype(np.float32), colors=rgb(colour), point_size=POINT_SIZE,
             point_shape="circle", precision="float32", visible=False,
@@ -85,7 +85,7 @@ class Stage:
     def show(
         self, joints: Float[Tensor, " n_dof"], T: Float[Tensor, "4 4"], T_object: Float[Tensor, "4 4"] | None = None
     ) -> None:
-        """Put the hand into a pose, and the object where it was moved to."""
+        """Pose the hand, and the object if it has moved."""
         assert self.hand is not None
         with torch.no_grad():
             poses = (T @ self.hand.tree.forward(joints)).double().numpy()
@@ -98,7 +98,7 @@ class Stage:
             self.solved.points = points.astype(np.float32)
 
     def colour_grid(self, success: bool | None) -> None:
-        """Say by the grid's colour whether the grasp held."""
+        """Show the trial outcome by the colour of the grid."""
         self._grid.cell_color = self._grid.section_color = rgb(success_colour(success))
 
     def show_shapes(self, visible: bool) -> None:
@@ -109,6 +109,6 @@ class Stage:
 
 
 def rgb(colour: Colour) -> tuple[int, int, int]:
-    """Whole numbers to 255."""
+    """Red, green and blue as whole numbers to 255."""
     red, green, blue = (round(255 * c) for c in colour)
     return red, green, blue

@@ -16,8 +16,8 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from dro_grasp.errors import DroGraspError
-from dro_grasp.evaluation.coverage import HALF_AXES, half_axis, half_axis_direction
 from dro_grasp.export.formats import Frame, csv_table, isaac_grasp, moveit_grasps
+from dro_grasp.geometry.half_axes import HALF_AXES, half_axis, half_axis_direction
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import hand_names, load_hand

@@ -1,4 +1,4 @@
-"""Files that came through the browser: kept small, unpacked with care, and found again."""
+"""Files uploaded through the browser: limited in size and unpacked safely."""
 
 from __future__ import annotations
 
@@ -8,30 +8,32 @@ from pathlib import Path, PurePosixPath
 
 from dro_grasp.errors import OptionError
 
-MOST_BYTES = 20_000_000
+MAX_BYTES = 20_000_000
 """Largest upload [bytes]."""
-MOST_UNPACKED, MOST_FILES = 100_000_000, 1_000
-"""Largest content of a ZIP file [bytes], and most files in it."""
+MAX_UNPACKED = 100_000_000
+"""Largest unpacked content of a ZIP file [bytes]."""
+MAX_FILES = 1_000
+"""Most files in a ZIP file."""
 DESCRIPTIONS = (".urdf", ".xml", ".mjcf")
-"""Endings of hand descriptions."""
+"""Suffixes of hand descriptions."""
 
 
 def store_upload(name: str, content: bytes, folder: Path) -> Path:
-    """Write an upload into a folder; of a ZIP file, the hand description in it is returned.
+    """Write an upload into a folder, and return its path or, for a ZIP file, that of the hand description in it.
 
     Args:
-        name: What the browser calls it; only its last part counts.
-        content: Its bytes.
+        name: File name from the browser; folders in it are ignored.
+        content: Bytes of the file.
         folder: An empty folder.
 
     Raises:
-        OptionError: It is too large, its name is none, or a ZIP file holds no description, or paths that lead out of it.
+        OptionError: The file is too large, its name is invalid, or a ZIP file holds no description or paths outside itself.
     """
     plain = PurePosixPath(name.replace("\\", "/")).name
     if not plain or plain in {".", ".."}:
-        raise OptionError(f"'{name}' is no file name")
-    if len(content) > MOST_BYTES:
-        raise OptionError(f"{plain} has {len(content) / 1e6:.0f} MB, at most {MOST_BYTES / 1e6:.0f} are taken; use the command "
+        raise OptionError(f"'{name}' is not a file name")
+    if len(content) > MAX_BYTES:
+        raise OptionError(f"{plain} has {len(content) / 1e6:.0f} MB, the limit is {MAX_BYTES / 1e6:.0f} MB; use the command "
                           "line for larger files")
     if not plain.lower().endswith(".zip"):
         path = folder / plain
@@ -50,22 +52,22 @@ def _unpack(name: str, content: bytes, folder: Path) -> None:
         archive = zipfile.ZipFile(io.BytesIO(content))
         entries = archive.infolist()
     except zipfile.BadZipFile as error:
-        raise OptionError(f"{name} is no ZIP file, or was cut short; pack it again") from error
+        raise OptionError(f"{name} is not a ZIP file or is truncated; pack it again") from error
     size = sum(entry.file_size for entry in entries)
-    if size > MOST_UNPACKED or len(entries) > MOST_FILES:
-        raise OptionError(f"{name} unpacks to {len(entries)} files of {size / 1e6:.0f} MB, at most {MOST_FILES} of "
-                          f"{MOST_UNPACKED / 1e6:.0f} MB are taken")
-    left = MOST_UNPACKED
+    if size > MAX_UNPACKED or len(entries) > MAX_FILES:
+        raise OptionError(f"{name} unpacks to {len(entries)} files of {size / 1e6:.0f} MB, the limits are {MAX_FILES} "
+                          f"files and {MAX_UNPACKED / 1e6:.0f} MB")
+    left = MAX_UNPACKED
     for entry in entries:
         target = folder / entry.filename
         if entry.filename.startswith("/") or ".." in PurePosixPath(entry.filename.replace("\\", "/")).parts:
-            raise OptionError(f"{name} holds '{entry.filename}', which leads out of it; pack it again")
+            raise OptionError(f"{name} holds '{entry.filename}', which lies outside the archive; pack it again")
         if entry.is_dir():
             continue
         target.parent.mkdir(parents=True, exist_ok=True)
-        with archive.open(entry) as source:  # sizes in a ZIP file's list may lie
+        with archive.open(entry) as source:  # the sizes listed in a ZIP file may be false
             data = source.read(left + 1)
         left -= len(data)
         if left < 0:
-            raise OptionError(f"{name} unpacks to more than it says")
+            raise OptionError(f"{name} unpacks to more data than it declares; pack it again")
         target.write_bytes(data)
