@@ -19,7 +19,8 @@ ROOT = Path(__file__).parent.parent
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
-FILE = re.compile(r"`((?:benchmarks|docs|scripts|tests|geometry|kinematics|models|src)/[\w/.-]+\.\w+)`")
+FOLDERS = ["benchmarks", "docs", "scripts", "tests", "src", *(p.name for p in (ROOT / "src" / "dro_grasp").iterdir() if p.is_dir())]
+FILE = re.compile(rf"`((?:{'|'.join(FOLDERS)})/[\w/.-]+\.\w+)`")
 MAKE_TARGET = re.compile(r"^([\w-]+):", re.MULTILINE)
 
 
