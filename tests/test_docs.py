@@ -19,7 +19,9 @@ ROOT = Path(__file__).parent.parent
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
-FOLDERS = ["benchmarks", "docs", "scripts", "tests", "src", *(p.name for p in (ROOT / "src" / "dro_grasp").iterdir() if p.is_dir())]
+# The development assets have folders hands/ and objects/ as well.
+ROOMS = {path.name for path in (ROOT / "src" / "dro_grasp").iterdir() if path.is_dir()} - {"hands", "objects"}
+FOLDERS = ["benchmarks", "docs", "scripts", "tests", "src", *ROOMS]
 FILE = re.compile(rf"`((?:{'|'.join(FOLDERS)})/[\w/.-]+\.\w+)`")
 MAKE_TARGET = re.compile(r"^([\w-]+):", re.MULTILINE)
 
