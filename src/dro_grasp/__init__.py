@@ -16,7 +16,11 @@ if TYPE_CHECKING:
     from dro_grasp.errors import DroGraspError
     from dro_grasp.evaluation.controls import palm_facing_starts
     from dro_grasp.evaluation.metrics import wilson_interval
-    from dro_grasp.export.formats import Frame, csv_table, dexgraspbench, isaac_grasp, moveit_grasps
+    from dro_grasp.export.csv_table import csv_table
+    from dro_grasp.export.dexgraspbench import dexgraspbench
+    from dro_grasp.export.frame import Frame
+    from dro_grasp.export.isaac_grasp import isaac_grasp
+    from dro_grasp.export.moveit import moveit_grasps
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.hands.check import HandReport, check_hand
     from dro_grasp.hands.hand import Hand
@@ -53,7 +57,7 @@ _EXPORTS = {
     "AugmentationConfig": "training.config",
     "DepthCamera": "perception.camera",
     "DroGraspError": "errors",
-    "Frame": "export.formats",
+    "Frame": "export.frame",
     "GraspBatch": "grasps.batch",
     "GraspPredictor": "predictor",
     "Hand": "hands.hand",
@@ -71,18 +75,18 @@ _EXPORTS = {
     "TrainConfig": "training.config",
     "TrialResult": "simulation.outcome",
     "check_hand": "hands.check",
-    "csv_table": "export.formats",
+    "csv_table": "export.csv_table",
     "depth_points": "perception.scan",
-    "dexgraspbench": "export.formats",
+    "dexgraspbench": "export.dexgraspbench",
     "draw_grasps": "viewer.pictures",
     "hand_names": "hands.library",
-    "isaac_grasp": "export.formats",
+    "isaac_grasp": "export.isaac_grasp",
     "load_bundle": "datasets.bundle.training_file",
     "load_hand": "hands.library",
     "load_object": "objects.catalogue",
     "load_weights": "models.checkpoints",
     "make_bundle": "datasets.bundle.bundling",
-    "moveit_grasps": "export.formats",
+    "moveit_grasps": "export.moveit",
     "object_names": "objects.catalogue",
     "palm_facing_starts": "evaluation.controls",
     "pretrain": "training.pretraining",

@@ -13,7 +13,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from dro_grasp.cli.main import main
-from dro_grasp.export.formats import Frame
+from dro_grasp.export.frame import Frame
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
 from dro_grasp.objects.catalogue import load_object
@@ -120,6 +120,25 @@ def test_moveit(grasps: GraspBatch, one: Path, camera: Path, tmp_path: Path, in_
         assert approach["desired_distance"] > approach["min_distance"] > 0
 
 
+def test_only_a_score_makes_a_confidence(grasps: GraspBatch, tmp_path: Path) -> None:
+    """Synthesised grasps have an energy: no format calls them hopeless, or certain, for it."""
+    energies = torch.tensor([300.0, 0.1])
+    synthesised = grasps[[0, 1]].without("score").replace(energy=energies)
+    GraspBatch.concatenate([synthesised, grasps[[3]]]).save(tmp_path / "mug.parquet")
+    for format in ("isaac_grasp", "moveit", "csv"):
+        assert export(tmp_path / "mug.parquet", "--format", format, "--output", tmp_path / format) == 0
+    isaac = (tmp_path / "isaac_grasp").read_text()
+    known = 1 / (1 + np.exp(3.0))
+    confidences = [grasp["confidence"] for grasp in yaml.safe_load(isaac)["grasps"].values()]
+    assert confidences == [0.5, 0.5, pytest.approx(known, abs=1e-5)]
+    assert "# 2 of 3 grasps have no score: their confidence 0.5 stands for unknown" in isaac
+    qualities = [message.get("grasp_quality") for message in yaml.safe_load((tmp_path / "moveit").read_text())]
+    assert qualities == [None, None, pytest.approx(known, abs=1e-5)]
+    rows = list(csv.DictReader(x for x in (tmp_path / "csv").read_text().splitlines() if not x.startswith("#")))
+    assert [row["score"] for row in rows] == ["", "", "-3.0"]
+    assert [float(row["energy"] or "nan") for row in rows] == pytest.approx([300.0, 0.1, np.nan], abs=1e-6, nan_ok=True)
+
+
 def test_csv_holds_every_posture(grasps: GraspBatch, one: Path, tmp_path: Path) -> None:
     assert export(one, "--format", "csv", "--output", tmp_path / "out.csv") == 0
     lines = [x for x in (tmp_path / "out.csv").read_text().splitlines() if not x.startswith("#")]
@@ -153,7 +172,7 @@ def test_several_objects_get_a_file_each(grasps: GraspBatch, tmp_path: Path, cap
     grasps.save(tmp_path / "all.parquet")
     assert export(tmp_path / "all.parquet", "--format", "csv", "--output", tmp_path / "out", "--only-successful", "--json") == 0
     told = json.loads(capsys.readouterr().out)
-    assert told["num"] == 3, "one has failed, one was not tried"
+    assert told["num"] == 3, "one has failed, one was not evaluated"
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["can.csv", "mug.csv"]
     assert told["files"] == [str(tmp_path / "out" / name) for name in ("mug.csv", "can.csv")]
 

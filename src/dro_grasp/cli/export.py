@@ -4,20 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from dro_grasp.cli.output import load_grasps, optional, print_json, say
+from dro_grasp.export.formats import FORMATS, ExportJob
 
 if TYPE_CHECKING:
-    from dro_grasp.export.formats import Frame
+    from dro_grasp.export.frame import Frame
     from dro_grasp.grasps.batch import GraspBatch
-    from dro_grasp.hands.hand import Hand
-
-SUFFIXES = {"isaac_grasp": ".yaml", "moveit": ".yaml", "csv": ".csv", "dexgraspbench": ""}
-"""Ending of one object's file; DexGraspBench has a file a grasp, in a folder."""
-
 
 @dataclass(frozen=True)
 class Export:
@@ -28,9 +24,9 @@ class Export:
 
     file: tyro.conf.Positional[Path]
     """Grasp file."""
-    format: Literal["isaac_grasp", "moveit", "dexgraspbench", "csv"]
-    """isaac_grasp: YAML 1.0 for Isaac Sim and Isaac ROS. moveit: moveit_msgs/Grasp as YAML. dexgraspbench: one npy a grasp, in
-    a folder. csv: one line a grasp."""
+    format: Annotated[str, tyro.conf.arg(
+        constructor=tyro.extras.literal_type_from_choices(FORMATS),
+        help=" ".join(f"{name}: {form.explanation}." for name, form in FORMATS.items()))]
     output: Path
     """File to write; a folder, made when it is missing, for dexgraspbench and for grasps of several objects."""
     frame: Annotated[Path | None, optional("JSON", "the object's frame")] = None
@@ -46,89 +42,78 @@ class Export:
 
     def run(self) -> int:
         """Complete the grasps, then write a file for each object."""
-        import torch
-
-        from dro_grasp.errors import GraspFileError
-        from dro_grasp.export.formats import Frame
+        from dro_grasp.export.frame import Frame
         from dro_grasp.files import check_folder, check_output, make_folder
-        from dro_grasp.grasps.sources import hand_of
 
         frame = Frame() if self.frame is None else Frame.load(self.frame)
-        grasps = load_grasps(self.file)
-        if self.only_successful:
-            if not bool(grasps.success.any()):
-                raise GraspFileError(f"no grasp in {self.file} has succeeded in a trial; `dro-grasp evaluate` tries them, or "
-                                     "leave out --only-successful")
-            grasps = grasps[grasps.success]
+        grasps, form = self._load(), FORMATS[self.format]
         names = list(dict.fromkeys(grasps.object))
-        folder = self.format == "dexgraspbench" or len(names) > 1
+        folder = form.file_per_grasp or len(names) > 1
         target = check_folder(self.output) if folder else check_output(self.output)
-        if self.format == "dexgraspbench":
-            refuse_mixing(target)
-        stated = bool(torch.stack([grasps.pregrasp_joints, grasps.squeeze_joints]).isfinite().all())
-        hand = hand_of(grasps, self.hand) if self.format == "moveit" or not stated else None
-        parts = [self._complete(grasps[[i for i, o in enumerate(grasps.object) if o == name]], hand) for name in names]
+        if form.file_per_grasp:
+            refuse_mixing(target, form.suffix)
+        jobs = [self._job(grasps[[i for i, o in enumerate(grasps.object) if o == name]], frame) for name in names]
         if folder:
             make_folder(target)
-        written = []
-        for name, part in zip(names, parts, strict=True):
-            path = target / f"{name.replace('/', '-')}{SUFFIXES[self.format]}" if len(names) > 1 else target
-            written += self._write(path, part, hand, frame)
+        written: list[Path] = []
+        for name, job in zip(names, jobs, strict=True):
+            label = name.replace("/", "-") + ("" if form.file_per_grasp else form.suffix)
+            written += write(form.content(job), target / label if len(names) > 1 else target, form.suffix)
         if self.json:
             print_json({"format": self.format, "frame": frame.name, "num": len(grasps), "files": [str(p) for p in written]})
         else:
             say(f"{len(grasps)} grasps in {len(written)} file{'s' if len(written) > 1 else ''}: {target}")
         return 0
 
-    def _complete(self, grasps: GraspBatch, hand: Hand | None) -> GraspBatch:
-        """The same with pregrasp and squeeze."""
-        if hand is None:
+    def _load(self) -> GraspBatch:
+        """The grasps that are asked for."""
+        from dro_grasp.errors import GraspFileError
+
+        grasps = load_grasps(self.file)
+        if not self.only_successful:
             return grasps
+        if not bool(grasps.success.any()):
+            raise GraspFileError(f"no grasp in {self.file} has succeeded in a trial; run trials with `dro-grasp evaluate`, or "
+                                 "leave out --only-successful")
+        return grasps[grasps.success]
+
+    def _job(self, grasps: GraspBatch, frame: Frame) -> ExportJob:
+        """One object's grasps, each with pregrasp and squeeze; hand and object are loaded where they are needed."""
         import torch
 
         from dro_grasp.grasps.controller import completed
-        from dro_grasp.grasps.sources import object_of
+        from dro_grasp.grasps.sources import hand_of, object_of, object_source
 
-        centre = torch.as_tensor(object_of(grasps, self.object, 1.0).centre_of_mass, dtype=grasps.joints.dtype)
-        return completed(hand, grasps, centre)
-
-    def _write(self, path: Path, grasps: GraspBatch, hand: Hand | None, frame: Frame) -> list[Path]:
-        """The files of one object."""
-        import numpy as np
-
-        from dro_grasp.export.formats import csv_table, dexgraspbench, isaac_grasp, moveit_grasps
-        from dro_grasp.files import make_folder, replacing
-        from dro_grasp.grasps.sources import object_source
-
-        if self.format == "dexgraspbench":
-            folder, files = make_folder(path), []
-            source, scale = object_source(grasps)
-            for i, content in enumerate(dexgraspbench(grasps, frame, source, scale)):
-                with replacing(folder / f"{i}.npy") as temporary, temporary.open("wb") as file:
-                    np.save(file, np.array(content, dtype=object), allow_pickle=True)
-                files.append(folder / f"{i}.npy")
-            return files
-        if self.format == "isaac_grasp":
-            text = isaac_grasp(grasps, frame)
-        elif self.format == "csv":
-            text = csv_table(grasps, frame)
-        else:
-            assert hand is not None
-            text = moveit_grasps(grasps, hand, frame)
-        with replacing(path) as temporary:
-            temporary.write_text(text)
-        return [path]
+        stated = bool(torch.stack([grasps.pregrasp_joints, grasps.squeeze_joints]).isfinite().all())
+        hand = hand_of(grasps, self.hand) if FORMATS[self.format].needs_hand or not stated else None
+        if hand is not None and not stated:
+            centre = torch.as_tensor(object_of(grasps, self.object, 1.0).centre_of_mass, dtype=grasps.joints.dtype)
+            grasps = completed(hand, grasps, centre)
+        return ExportJob(grasps, frame, hand, *object_source(grasps))
 
 
-def refuse_mixing(folder: Path) -> None:
-    """Refuse a folder that holds npy files, itself or one level down: a reader could not tell old grasps from new.
+def write(content: bytes | list[bytes], path: Path, suffix: str) -> list[Path]:
+    """The files of one object: one at the path, or one per grasp in the folder of that name."""
+    from dro_grasp.files import make_folder, replacing
+
+    files = {path: content} if isinstance(content, bytes) else {
+        make_folder(path) / f"{i}{suffix}": entry for i, entry in enumerate(content)}
+    for place, entry in files.items():
+        with replacing(place) as temporary:
+            temporary.write_bytes(entry)
+    return list(files)
+
+
+def refuse_mixing(folder: Path, suffix: str) -> None:
+    """Refuse a folder that holds files of a format, itself or one level down: a reader could not tell old grasps from new.
 
     Raises:
         OutputError: It holds some.
     """
     from dro_grasp.errors import OutputError
 
-    old = next((path for pattern in ("*.npy", "*/*.npy") for path in folder.glob(pattern)), None)
+    old = next((path for pattern in (f"*{suffix}", f"*/*{suffix}") for path in folder.glob(pattern)), None)
     if old is not None:
-        raise OutputError(f"cannot write grasps into {folder}: it holds npy files already ({old.relative_to(folder)}), and old "
-                          "and new grasps would be mixed; choose an empty folder or a new one")
+        raise OutputError(f"cannot write grasps into {folder}: it holds {suffix[1:]} files already "
+                          f"({old.relative_to(folder)}), and old and new grasps would be mixed; choose an empty folder or a "
+                          "new one")

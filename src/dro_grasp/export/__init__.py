@@ -1,1 +1,1 @@
-"""Grasps in the formats of other programs."""
+"""Grasps in the formats of other programs, each of which states its frames and units."""

@@ -16,7 +16,8 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from dro_grasp.errors import DroGraspError
-from dro_grasp.export.formats import Frame, csv_table, isaac_grasp, moveit_grasps
+from dro_grasp.export.formats import FORMATS, ExportJob
+from dro_grasp.export.frame import Frame
 from dro_grasp.geometry.half_axes import HALF_AXES, half_axis, half_axis_direction
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
@@ -36,9 +37,10 @@ from dro_grasp.viewer.uploads import store_upload
 FRAME_TIME = 0.04
 """Time between two pictures of a trial [s]."""
 ANY = "any"
-EXPORTS = {
-    "grasp file (Parquet)": ".parquet", "isaac_grasp (YAML)": ".yaml", "MoveIt (YAML)": ".moveit.yaml", "table (CSV)": ".csv"}
-"""What can be taken away, with the ending of its file."""
+GRASP_FILE = "grasp file (Parquet)"
+"""Choice of the grasp file itself among the formats that can be downloaded."""
+EXPORTS = (GRASP_FILE, *(form.title for form in FORMATS.values() if not form.file_per_grasp))
+"""What can be downloaded."""
 MOST = 64
 """Most grasps made at once."""
 
@@ -168,7 +170,7 @@ class Studio(ServedPage):
             self.play = gui.add_button("Play the trial", disabled=True)
             self.text = gui.add_markdown("")
         with gui.add_folder("Take away"):
-            self.format = gui.add_dropdown("Format", tuple(EXPORTS), initial_value=next(iter(EXPORTS)))
+            self.format = gui.add_dropdown("Format", EXPORTS, initial_value=GRASP_FILE)
             self.download = gui.add_button("Download what is shown", disabled=True)
         self.stage_of.value = "refined"
         self.posture.value = "grasp"
@@ -272,12 +274,13 @@ class Studio(ServedPage):
         """Name and content of a file with the grasps that are shown, in one of EXPORTS."""
         assert self.made is not None
         grasps = self._batch()[self.shown]
-        name = f"{Path(self.made.hand.name).name}_{Path(self.made.obj.name).name}{EXPORTS[kind]}"
-        if EXPORTS[kind] == ".parquet":
-            return name, grasps.to_bytes()
-        text = (isaac_grasp(grasps, Frame()) if EXPORTS[kind] == ".yaml" else
-                csv_table(grasps, Frame()) if EXPORTS[kind] == ".csv" else moveit_grasps(grasps, self.made.hand, Frame()))
-        return name, text.encode()
+        stem = f"{Path(self.made.hand.name).name}_{Path(self.made.obj.name).name}"
+        if kind == GRASP_FILE:
+            return f"{stem}.parquet", grasps.to_bytes()
+        name, form = next((name, form) for name, form in FORMATS.items() if form.title == kind)
+        content = form.content(ExportJob(grasps, Frame(), self.made.hand))
+        assert isinstance(content, bytes)
+        return f"{stem}_{name}{form.suffix}", content
 
 
 def chosen(hand: Hand, grasps: GraspBatch, success: str, palm: str) -> Bool[Tensor, " n"]:

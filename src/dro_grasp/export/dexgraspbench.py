@@ -1,0 +1,47 @@
+"""Grasps as DexGraspBench reads them. Source: readme of DexGraspBench."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+import roma
+import torch
+
+from dro_grasp.export.contents import postures
+from dro_grasp.export.formats import ExportJob
+from dro_grasp.export.frame import Frame
+from dro_grasp.grasps.batch import GraspBatch
+
+
+def dexgraspbench(grasps: GraspBatch, frame: Frame, object_path: str, scale: float) -> list[dict[str, Any]]:
+    """One dictionary per grasp, as DexGraspBench reads it from a npy file.
+
+    Postures are wrist pose (x y z, qw qx qy qz) and joints in one row; `obj_pose` is the object's pose in their frame, WXYZ
+    as well.
+    """
+    position, quaternion = frame.place(grasps)
+    joints = postures(grasps)
+    turn = roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(frame.T_frame_object[:3, :3].double()))
+    pose = torch.cat([frame.T_frame_object[:3, 3].double(), turn])
+    found = []
+    for i in range(len(grasps)):
+        wrist = torch.cat([position[i], quaternion[i]])
+        qpos = {f"{name}_qpos": torch.cat([wrist, values[i].double()]).numpy() for name, values in joints.items()}
+        found.append({
+            **qpos, "obj_scale": scale, "obj_pose": pose.numpy(), "obj_path": object_path, "hand": grasps.hand,
+            "wrist_link": grasps.wrist_link, "joint_names": list(grasps.joint_names), "frame": frame.name_for(grasps),
+            "units": "m, rad",
+        })
+    return found
+
+
+def content(job: ExportJob) -> list[bytes]:
+    """One object's files, one per grasp."""
+    files = []
+    for entry in dexgraspbench(job.grasps, job.frame, job.object_path, job.object_scale):
+        file = io.BytesIO()
+        np.save(file, np.array(entry, dtype=object), allow_pickle=True)
+        files.append(file.getvalue())
+    return files
