@@ -11,8 +11,8 @@ from dro_grasp.export.frame import Frame
 from dro_grasp.grasps.batch import GraspBatch
 
 NO_CONFIDENCE = 0.5
-"""Confidence of a grasp without a score: neither good nor bad (ours). The documented format lists the entry for every grasp, and
-readers may rely on it."""
+"""Confidence of a grasp without a score: neither good nor bad (ours). The documented format lists the entry for every grasp,
+and readers may rely on it."""
 
 
 def isaac_grasp(grasps: GraspBatch, frame: Frame) -> str:
