@@ -1,10 +1,10 @@
-"""What each part of training buys: the slim network, trained anew for every row on equally many samples, then tried.
+"""Ablations of training: the slim network, trained anew for every row on equally many samples, then evaluated.
 
-    python benchmarks/ablations.py --output FOLDER [--rows ROW ...] [--steps N] [--num N] [--json]
+    python benchmarks/ablations.py --output FOLDER [--rows ROW ...] [--steps N] [--num N] [--objects NAME ...] [--json]
 
-Rows are trained one after the other and remembered in the folder: run it again, with more rows or after an interruption, and
-only what is missing is done; two runs with different rows may share a folder. Every row's hands get the same number of grasps a
-pair; the benchmark tries them on the validate objects. Needs the development assets.
+Rows are trained in turn and stored in the folder. A rerun, with more rows or after an interruption, does only the missing
+ones; two runs with different rows may share a folder. Every pair of a hand and an object gets the same number of grasps.
+`--objects builtin:test` evaluates on objects by which no configuration was chosen. Needs the development assets.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Ablation:
     hands: tuple[str, ...] = HANDS
     """Hands trained on."""
     tried: tuple[str, ...] = HANDS
-    """Hands that the weights are tried with."""
+    """Hands that the weights are evaluated with."""
     pretrained: bool = True
     network: dict[str, Any] = field(default_factory=dict)
     """Settings that differ from the slim network's."""
@@ -69,9 +69,9 @@ class Ablation:
     fine_tuned: bool = False
     """The shipped weights are trained further, instead of new ones."""
     grasps: int | None = None
-    """Only so many grasps of the hand, of all objects; all by default."""
+    """Grasps of the hand, over all objects, that are trained on; all by default."""
     share: float = 1.0
-    """Of the steps of the other rows."""
+    """Share of the steps of the other rows."""
     view: View = "whole"
 
 
@@ -119,7 +119,7 @@ def bundle_of(ablation: Ablation, folder: Path) -> Bundle:
 
 
 def trained(name: str, ablation: Ablation, folder: Path, steps: int) -> tuple[DistanceNetwork, float]:
-    """The row's network and the seconds that its training took; its run folder lets it go on after an interruption."""
+    """The row's network and the seconds that its training took; its run folder lets it resume after an interruption."""
     begin = time.perf_counter()
     if ablation.grasps == 0:
         return load_weights(), 0.0
@@ -180,7 +180,7 @@ def cells(result: dict[str, Any]) -> list[list[object]]:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Train, try and print."""
+    """Train, evaluate and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, required=True, help="folder for weights and results")
     parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS), help="rows to train")

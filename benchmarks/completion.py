@@ -1,11 +1,11 @@
-"""How well the side that is added to what was seen of an object matches it, beside what a mirror and a symmetry would add.
+"""Accuracy of the completed side of an object, beside completion by a mirror and by the best symmetry.
 
     python benchmarks/completion.py [--views N] [--picture PNG] [--json]
 
-Two errors: how far added points are from the object's surface, and how far its surface that was not seen is from them. The
-mirror is where the seen side ends; the symmetry is the one that agrees best with what was seen, without the network. The
-picture shows depth images of the validate objects from the side: blue was seen, orange was added, grey is the object. Needs
-the development assets.
+Two errors: the distance of added points from the object's surface, and of the unseen surface from the added points. The
+mirror stands where the seen side ends; the symmetry is the one that agrees best with the seen side, without the network. The
+picture shows depth images of the validate objects from the side: seen points in blue, added points in orange, the object in
+grey. Needs the development assets.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def draw(path: Path) -> None:
         obj = load_object(name)
         tiles.append(tile(obj))
         captions.append((obj.name.rpartition("+")[2], None))
-    sheet = contact_sheet(tiles, captions, "what a camera on the left saw (blue), and what is added (orange)", COLUMNS)
+    sheet = contact_sheet(tiles, captions, "points seen by a camera on the left (blue), and added points (orange)", COLUMNS)
     Image.Image.save(sheet, path)
 
 
@@ -124,7 +124,7 @@ def main() -> None:
             rows.append([view, group, count, *cells, 1e3 * seconds / count])
     columns = ["view", "objects", "views", *(f"{kind}, {what} [mm]" for kind in ("mirror", "symmetry", "network")
                                              for what in ("added off", "missing")), "time [ms]"]
-    emit("how far the added side is off the surface, and the unseen surface off it", rows, columns,
+    emit("distance of added points from the surface, and of the unseen surface from them", rows, columns,
          {f"{row[0]} {row[1]}": dict(zip(columns[2:], row[2:], strict=True)) for row in rows}, options.json)
 
 

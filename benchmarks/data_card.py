@@ -18,7 +18,7 @@ from dro_grasp.viewer.dataset_pages import charts, grasps_drawn
 
 PICTURED = "assets-shadowhand.parquet"
 """The hand of the pictures."""
-COLUMNS = ("hand", "grasps", "train", "few_shot", "validate", "objects", "fewest", "without", "of tried valid [%]",
+COLUMNS = ("hand", "grasps", "train", "few_shot", "validate", "objects", "fewest", "without", "valid of evaluated [%]",
            "per CPU-hour", "diversity", "wrist", "joints", "all six half-axes [%]", "kB")
 
 

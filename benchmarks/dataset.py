@@ -1,7 +1,7 @@
-"""What a data set is worth: speed and completeness of its making, diversity, and whether its grasps hold again.
+"""Quality of a data set: speed and completeness of its production, diversity, and whether its grasps hold again.
 
-Yields come from the notes of the data set's own files, for the pairs of the paper hands; grasps are then tried again in
-this fresh process: as they were, on a more slippery and a rougher object, on a lighter and a heavier one.
+Yields come from the notes in the data set's files, for the pairs of the paper hands. Grasps are then evaluated again in
+this new process: unchanged, with lower and higher friction, and with a lighter and a heavier object.
 
     python benchmarks/dataset.py FOLDER [--sample 500] [--goal 150] [--json]
 """
@@ -70,7 +70,7 @@ def main() -> None:
         emit("Making", table, ["hand", "grasps", "valid per CPU-hour", "preparation share", f"pairs with {options.goal}",
                                "diversity", "of the wrist", "of the joints"], {}, False)
         print()
-    emit(f"{options.sample} random grasps of {len({p.hand for p in pairs})} hands tried again", tried,
+    emit(f"{options.sample} random grasps of {len({p.hand for p in pairs})} hands evaluated again", tried,
          ["trial", "grasps", "success [%]", "95 %"],
          {"valid_per_cpu_hour": speeds, "diversity": {str(r[0]): r[5] for r in rows},
           "pairs": {str(r[0]): r[4] for r in rows}, "success_again": {str(r[0]): r[2] for r in tried}}, options.json)

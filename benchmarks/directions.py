@@ -1,9 +1,9 @@
-"""How well grasps keep the palm direction that was asked for, and how directions spread when none is.
+"""Deviation of grasps from the requested palm direction, and the spread of directions without a request.
 
     python benchmarks/directions.py [--weights NAME|PATH] [--num N] [--json]
 
-Each of the six half-axes is asked for on each validate object; angles are those of the refined grasps. Without a direction,
-each grasp counts for the half-axis that it is nearest to; even is 16.7 %. Needs the development assets.
+Each of the six half-axes is requested on each validate object; angles are those of the refined grasps. Without a direction,
+each grasp counts for its nearest half-axis; uniform is 16.7 %. Needs the development assets.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""How far predicted distances are off, with z from the true grasp (posterior) and with z as it is drawn (prior).
+"""Error of predicted distances, with z from the true grasp (posterior) and with z sampled at inference (prior).
 
-Measured on the grasps that ship for the validate objects, which no weights were trained on.
+Measured on the shipped grasps of the validate objects, which no weights were trained on. The prior error is mostly not an
+error: a sampled z means another valid grasp than the stored one.
 
     python benchmarks/distance_error.py [--weights NAME|PATH] [--json]
 

@@ -1,8 +1,8 @@
-"""How long one grasp takes, and one of sixteen, from loaded hand and object to joints, pregrasp and score.
+"""Time of one grasp, and of one of sixteen, from loaded hand and object to joints, pregrasp and score.
 
-The paper-size network has random weights, so its distances are no distances of a grasp and the joint solver needs more
-steps than it would: its times are an upper bound. `multi` are the shipped weights. Each figure is the median over hands
-and repetitions; loading of hands, objects and weights is not counted, one prediction before the clock starts is.
+The paper-size network has random weights. Its distances fit no grasp, so the joint solver needs more steps and its times are
+an upper bound. `multi` are the shipped weights. Each number is the median over hands and repetitions, after one prediction
+that is not counted. Loading of hands, objects and weights is not counted either.
 
     python benchmarks/inference.py [--json] [--full] [--threads N] [--seed 0]
 """

@@ -1,11 +1,11 @@
-"""The joint solver against CVXPY + Clarabel, and how often it reaches clean targets.
+"""The joint solver against CVXPY + Clarabel, and its convergence on exact targets.
 
 Speed and objective: targets of random grasps with 5 mm of noise on every coordinate, both solvers from the canonical
 joints and the registered palm, on one thread. CVXPY solves each linearised problem with step limit 0.5 to its optimum,
-as in the paper; the problem is built once with parameters, its compilation is not counted, nor is any kinematics on
-its side. Both stop at the same objective tolerance. Times are processor times of one thread.
+as in the paper. The problem is built once with parameters; its compilation and
+kinematics are not counted. Both stop at the same objective tolerance. Times are processor times of one thread.
 
-Convergence: clean targets, joints uniform within the limits, wrist uniform on SO(3), canonical initial guess.
+Convergence: exact targets, joints uniform within the limits, wrist uniform on SO(3), canonical initial guess.
 """
 
 from __future__ import annotations

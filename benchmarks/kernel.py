@@ -1,8 +1,8 @@
-"""The symmetric kernel, factorised and chunked, against the form in which the paper and its release compute it.
+"""The symmetric kernel, factorised and chunked, against the form of the paper and its release.
 
 Naive form: features of both points concatenated for every pair, in both orders, a block of 4x4 at a time, through the
 whole perceptron. Both forms get the same inputs (512 x 512 points, features of the paper's width with a latent), the same
-weights, threads and matrix-product precision. Peak memory is what a fresh process of each form adds to its resident set.
+weights, threads and matrix-product precision. Peak memory is the growth of the resident set in a new process of each form.
 
     python benchmarks/kernel.py [--json] [--full] [--threads 1] [--seed 0]
 """

@@ -1,8 +1,8 @@
-"""What labels and starts cost and buy: yield, spread and cleanness of grasps, with and without each choice of the engine.
+"""Cost and benefit of labels and starts: yield, diversity and penetration of grasps, with and without each choice.
 
-Settled labels are taken after the hand has closed on the object in simulation; wide starts have joints anywhere within
-their limits; idle fingers are left out of the contacts at random; the engine descends for 120 steps and tries 70 %.
-How grasps that pass `strict` hold with half the friction says whether a choice makes them weaker.
+Settled labels are read after the hand has closed on the object in simulation. Wide starts have joints anywhere within
+their limits. Random idle fingers have no contacts. The engine descends for 120 steps and evaluates the better 70 %. Success
+with half the friction, of grasps that pass `strict`, shows whether a choice makes them weaker.
 
     python benchmarks/labels.py [--candidates 128] [--json]
 """
@@ -39,7 +39,7 @@ def choices(candidates: int) -> dict[str, EngineConfig]:
     return {
         "the engine's": EngineConfig(candidates=candidates),
         "labels as synthesised": EngineConfig(candidates=candidates, settle=False),
-        "400 steps, best third tried": EngineConfig(
+        "400 steps, best third evaluated": EngineConfig(
             candidates=candidates, tried_share=0.34, synthesis=SynthesisConfig(steps=400)),
         "every finger holds": EngineConfig(candidates=candidates, synthesis=SynthesisConfig(contacts=all_hold)),
         "narrow starts, every finger holds": EngineConfig(

@@ -1,10 +1,10 @@
-"""How well the hand encoder knows a point again: in another pose of its hand, and on other hands.
+"""How well the hand encoder recognises a point: in another pose of its hand, and on other hands.
 
     python benchmarks/matching_rank.py [--weights NAME|PATH] [--picture PNG] [--json]
 
-Within a hand the counterpart is the point itself; across hands it is the nearest one after both open hands are laid on each
-other. Ranks are means over points and grasps on validate objects; chance is half of the number of points. The picture gives
-each point of every hand, grasping, the colour of the most similar point of the first hand, open. Needs the development assets.
+Within a hand the counterpart is the point itself; across hands it is the nearest one after the palms of both open hands
+are aligned. Ranks are means over points and grasps on validate objects; chance is half of the number of points. The picture
+paints each point of every grasping hand like the most similar point of the first, open hand. Needs the development assets.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What every benchmark prints: one table for people, or one JSON object for programs."""
+"""Output of every benchmark: one table for people, or one JSON object for programs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def machine() -> dict[str, str | int]:
-    """Processor, cores, threads, library versions and commit: without them a time means nothing."""
+    """Processor, cores, threads, library versions and commit: a time means nothing without them."""
     return {
         "cpu": _cpu_model(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
@@ -39,7 +39,7 @@ def emit(
     """Print the result: exactly one JSON object on standard output, or a table headed by the machine.
 
     Args:
-        title: What was measured, with the sample it was measured on.
+        title: The measurement and its sample.
         rows: Cells of the table; floats are shown with three significant digits.
         columns: Headings, with units in [brackets].
         json_object: The keys that the project's targets name; the machine is added.

@@ -1,9 +1,9 @@
-"""Where success is lost on objects that are seen in part: in the prediction, or in polishing and ranking on a guessed surface.
+"""Where success is lost on objects seen in part: in prediction, or in refinement and ranking on a completed surface.
 
     python benchmarks/seen_in_part.py [--views cloud half depth] [--num N] [--json]
 
-Grasps of the paper's hands on the validate objects are predicted from the view or from the mesh, polished and ranked on the
-view's cloud or on the mesh, and tried on the mesh, always at the temperature of bare clouds. Needs the development assets.
+Grasps of the paper's hands on the validate objects are predicted from the view or from the mesh, refined and ranked on the
+view's cloud or on the mesh, and evaluated on the mesh, always at the temperature of bare clouds. Needs the development assets.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def main() -> None:
     for key, parts in found.items():
         rates = {name: 100 * float(torch.cat([p[name] for p in parts]).mean()) for name in parts[0]}
         rows.append([*key, sum(len(p["dro"]) for p in parts), *rates.values()])
-    columns = ["view", "predicted from", "polished and ranked on", "n", *next(iter(found.values()))[0]]
+    columns = ["view", "predicted from", "refined and ranked on", "n", *next(iter(found.values()))[0]]
     emit(f"objects seen in part, {options.num} grasps of each hand on each object; per cent", rows, columns,
          {" / ".join(row[:3]): dict(zip(columns[3:], row[3:], strict=True)) for row in rows}, options.json)
 

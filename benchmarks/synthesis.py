@@ -1,8 +1,8 @@
-"""How many strict-valid grasps an hour of one CPU core yields, by synthesis, settling and trial together.
+"""Strict-valid grasps per CPU-hour, by synthesis, settling and trial together.
 
-The work is the data engine's own: every shard is synthesised, closed, tried with protocol `strict`, and its
-near-duplicates are counted once. CPU time is that of the process, models compiled on the way included; loading a hand
-and an object is counted apart, with grid and convex parts from the cache.
+The work is the data engine's own: every shard is synthesised, closed, evaluated under protocol `strict`, and its
+near-duplicates are counted once. CPU time is that of the process, including model compilation; loading a hand
+and an object is counted separately, with grid and convex parts from the cache.
 
     python benchmarks/synthesis.py [--json] [--full] [--seed 0] [--device cuda]
 """

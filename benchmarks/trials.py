@@ -1,8 +1,8 @@
-"""How many grasps a second protocol `dro` tries, by wall clock on all cores, and what hinders them.
+"""Trials per second under protocol `dro`, by wall clock on all cores, and the slowest objects.
 
-The grasps are synthesised ones, so that most trials run to their end: a trial that fails early is cheaper. Counted is
-what `simulate` does, penetration of the labelled pose and building of the scene included (`--full` tries 64 grasps a
-pair, otherwise 16); loading of hands and objects is not.
+The grasps are synthesised, so most trials run to their end; a trial that fails early is cheaper. The time is that of
+`simulate`, including penetration and scene building (64 grasps per pair with `--full`, otherwise 16), but not the loading of
+hands and objects.
 
     python benchmarks/trials.py [--json] [--full] [--seed 0] [--protocol dro] [--workers N]
 """

@@ -1,8 +1,8 @@
-"""How varied predicted grasps are beside the stored grasps of the same objects, wrist and joints apart.
+"""Diversity of predicted grasps beside that of the stored grasps of the same objects, of wrist and joints apart.
 
     python benchmarks/variety.py [--weights NAME|PATH] [--num N] [--temperature T] [--json]
 
-The paper's measure, over all grasps and not over successes alone. Needs the development assets.
+The paper's measure, over successes and failures. Needs the development assets.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def main() -> None:
             spread = diversity(grasps.T_object_wrist, grasps.joints)
             rows.append([hand.name, kind, len(grasps), spread["wrist"], spread["joints"], spread["all"]])
     columns = ["hand", "grasps", "n", "wrist", "joints", "diversity"]
-    emit(f"variety of '{predictor.weights_name}' at temperature {options.temperature:g}", rows, columns,
+    emit(f"diversity of '{predictor.weights_name}' at temperature {options.temperature:g}", rows, columns,
          {f"{row[0]}, {row[1]}": dict(zip(columns[2:], row[2:], strict=True)) for row in rows}, options.json)
 
 

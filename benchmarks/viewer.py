@@ -1,8 +1,8 @@
-"""How long people wait for the viewer, in headless Chromium: for its first page, and for sixteen grasps with their trials.
+"""Waiting times of the viewer in headless Chromium: for its first page, and for sixteen grasps with their trials.
 
     python -m benchmarks.viewer [--runs N] [--json]
 
-Needs Chromium. The object is known to the cache, as after the first time.
+Needs Chromium. The object is in the cache, as after its first use.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=3, help="servers that are started")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
-    found = dict(zip(("first page", "16 grasps, tried under strict"), waits(options.runs), strict=True))
+    found = dict(zip(("first page", "16 grasps, evaluated under strict"), waits(options.runs), strict=True))
     rows = [[what, median(seconds), max(seconds), target]
             for (what, seconds), target in zip(found.items(), TARGETS, strict=True)]
     emit(f"the viewer, {options.runs} servers", rows, ["wait for", "median [s]", "longest [s]", "target [s]"],

@@ -1,4 +1,4 @@
-"""What a second worker is worth: the same shards made by one process and by two, starting and loading included.
+"""Speed-up by a second worker: the same shards made by one process and by two, including start and loading.
 
 python benchmarks/workers.py [--json]
 """
