@@ -111,10 +111,9 @@ class SampleSource:
         """
         hand, grasps = self.hands[name], self.grasps[name]
         chosen = torch.randint(len(grasps.joints), (count,), generator=generator, device=generator.device)
-        lower, upper = hand.tree.lower, hand.tree.upper
-        share = torch.rand(count, len(lower), generator=generator, device=generator.device)
+        drawn = hand.random_joints(count, generator)
         known = torch.rand(count, 1, generator=generator, device=generator.device) < 0.5
-        q = torch.where(known, grasps.joints[chosen], lower + share * (upper - lower))
+        q = torch.where(known, grasps.joints[chosen], drawn)
         wrist = torch.eye(4, device=generator.device).repeat(count, 1, 1)
         moved = torch.linalg.inv(self._placements(hand, wrist, generator))
         turn = random_rotations(count, generator) if self.network.frame == "object" else self.network.axes(hand).mT
