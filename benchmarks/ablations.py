@@ -28,8 +28,10 @@ from dro_grasp.datasets.splits import HELD_OUT_HANDS
 from dro_grasp.evaluation.distance_error import distance_errors
 from dro_grasp.evaluation.success_rates import ALL, RAW, REFINED, BenchmarkConfig, benchmark
 from dro_grasp.hands.library import load_hand
-from dro_grasp.models.checkpoints import load_weights, save_weights
-from dro_grasp.models.network import DistanceNetwork, NetworkConfig
+from dro_grasp.models.checkpoints import load_weights, locate_weights, save_weights
+from dro_grasp.models.network import DistanceNetwork
+from dro_grasp.models.presets import NetworkConfig
+from dro_grasp.models.small_networks import history_of
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.perception.partial_views import View
 from dro_grasp.predictor import GraspPredictor
@@ -124,8 +126,9 @@ def trained(name: str, ablation: Ablation, folder: Path, steps: int) -> tuple[Di
     if ablation.grasps == 0:
         return load_weights(), 0.0
     bundle, place = bundle_of(ablation, folder), folder / name.replace(" ", "_")
-    network = dataclasses.replace(NetworkConfig.slim(), **ablation.network)
+    network = dataclasses.replace(NetworkConfig.preset("slim"), **ablation.network)
     initial = load_weights() if ablation.fine_tuned else None
+    history = [] if initial is None else history_of(locate_weights())
     first = None
     if ablation.pretrained and initial is None:
         first = pretrain(bundle, network, PretrainConfig(ScheduleConfig(steps=PRETRAINING_STEPS)), folder / f"{place.name}_pre")
@@ -138,7 +141,8 @@ def trained(name: str, ablation: Ablation, folder: Path, steps: int) -> tuple[Di
         AugmentationConfig(partial=ablation.partial))
     network = network if initial is None else initial.config
     model = train(bundle, network, config, place, first, name=name, initial=initial)
-    save_weights(model, folder / f"{place.name}.safetensors", {})
+    about = {"stage": "ablation", "row": name, "steps": config.schedule.steps, "data": bundle.summary()}
+    save_weights(model, folder / f"{place.name}.safetensors", about, history)
     return model, time.perf_counter() - begin
 
 

@@ -22,7 +22,8 @@ from report import emit
 from dro_grasp.devices import cores
 from dro_grasp.hands.library import load_hand
 from dro_grasp.models.checkpoints import save_weights
-from dro_grasp.models.network import DistanceNetwork, NetworkConfig
+from dro_grasp.models.network import DistanceNetwork
+from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predictor import GraspPredictor
 
@@ -37,7 +38,7 @@ def paper_size(folder: Path, seed: int) -> Path:
     """Weights of the paper's size, untrained."""
     torch.manual_seed(seed)
     path = folder / "paper_size.safetensors"
-    save_weights(DistanceNetwork(NetworkConfig.paper()), path)
+    save_weights(DistanceNetwork(NetworkConfig.preset("paper")), path)
     return path
 
 

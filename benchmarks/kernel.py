@@ -24,8 +24,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from dro_grasp.models.distance_head import DistanceHead
-from dro_grasp.models.network import NetworkConfig
 from dro_grasp.models.precision import fast_products
+from dro_grasp.models.presets import NetworkConfig
 
 BLOCKS = 4
 """Blocks along each side of the matrix in the naive form. Source: appendix, matrix block computation."""
@@ -64,7 +64,7 @@ FORMS: dict[str, Form] = {"naive, 4x4 blocks": naive, "factorised": factorised}
 def case(seed: int) -> tuple[DistanceHead, Tensor, Tensor]:
     """A kernel of the paper's size and features of one grasp."""
     torch.manual_seed(seed)
-    config = NetworkConfig.paper()
+    config = NetworkConfig.preset("paper")
     width = config.width + config.latent
     head = DistanceHead(width, config.kernel_hidden, config.initial_distance)
     return head, torch.randn(1, config.n_hand, width), torch.randn(1, config.n_object, width)

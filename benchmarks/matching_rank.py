@@ -35,13 +35,13 @@ def draw(encoder: StaticGraphEncoder, source: SampleSource, path: Path) -> None:
     """The colour-matching picture: the first hand open and grasping, then the others grasping."""
     first = source.hands[source.names[0]]
     axes = source.network.axes
-    reference = first.points(first.canonical_joints()) @ axes(first)
+    reference = first.points(first.canonical_joints()) @ axes(first.palm_axes_wrist)
     span = reference.amax(0) - reference.amin(0)
     colours = ((reference - reference.amin(0)) / span.clamp_min(1e-6)).mul(0.85).add(0.1)
     tiles, captions = [tile(reference, colours)], [(f"{first.name}, open", None)]
     for name in source.names:
         hand, grasps = source.hands[name], source.grasps[name]
-        points = hand.points(grasps.joints[0]) @ axes(hand)
+        points = hand.points(grasps.joints[0]) @ axes(hand.palm_axes_wrist)
         tiles.append(tile(points, colours[most_similar(encoder, points, reference)]))
         captions.append((f"{name}, grasping", None))
     sheet = contact_sheet(tiles, captions, "each point in the colour of the most similar point of the first hand", len(tiles))

@@ -13,7 +13,6 @@ from pathlib import Path
 import torch
 
 ROOT = Path(__file__).resolve().parent.parent
-"""Folder of the repository."""
 
 
 def machine() -> dict[str, str | int]:

@@ -13,7 +13,7 @@ def main(folder: Path) -> None:
         print(f"{len(pair.grasps)} grasps of {pair.object} by {pair.hand} hold under protocol 'strict'")
     bundle, _ = dro.make_bundle([folder / "data"], folder / "bundle.safetensors")
 
-    network, schedule = dro.NetworkConfig.slim(), dro.ScheduleConfig(steps=3)
+    network, schedule = dro.NetworkConfig.preset("slim"), dro.ScheduleConfig(steps=3)
     encoder = dro.pretrain(bundle, network, dro.PretrainConfig(schedule), folder / "pretraining")
     trained = dro.train(bundle, network, dro.TrainConfig(schedule), folder / "training", encoder)
     dro.save_weights(trained, folder / "mine.safetensors")

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from dro_grasp.hands.hand import Hand
     from dro_grasp.hands.library import hand_names, load_hand
     from dro_grasp.models.checkpoints import load_weights, save_weights
-    from dro_grasp.models.network import NetworkConfig
+    from dro_grasp.models.presets import NetworkConfig
     from dro_grasp.objects.catalogue import load_object, object_names
     from dro_grasp.objects.shape import ObjectModel
     from dro_grasp.optimization.refinement import RefineConfig, refine_grasps
@@ -64,7 +64,7 @@ _EXPORTS = {
     "HandReport": "hands.check",
     "LossConfig": "training.config",
     "MotionConfig": "training.config",
-    "NetworkConfig": "models.network",
+    "NetworkConfig": "models.presets",
     "ObjectModel": "objects.shape",
     "PredictorConfig": "predictor",
     "PretrainConfig": "training.config",

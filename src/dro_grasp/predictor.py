@@ -172,14 +172,14 @@ class GraspPredictor:
             joints = small.random_open_joints(num, generator)
             temperature = self.config.temperature
             if temperature is None and obj.is_cloud:
-                temperature = min(CLOUD_TEMPERATURE, network.config.latent_temperature)
-            latent = network.sample_latent(num, generator, temperature)
+                temperature = CLOUD_TEMPERATURE
+            latent = network.sample_latent(num, generator, 1.0 if temperature is None else temperature)
         poses, solved, predicted = [], [], []
         for start in range(0, num, self.config.batch_size):
             part = slice(start, min(start + self.config.batch_size, num))
             with _timed(self.timings, "network"):
                 placed = small.points(joints[part], T_object_wrist[part])
-                rotation = T_object_wrist[part, :3, :3] @ network.config.axes(small)
+                rotation = T_object_wrist[part, :3, :3] @ network.config.axes(small.palm_axes_wrist)
                 distances = self._distances(placed, points, rotation, latent[part])
             with _timed(self.timings, "decode"):
                 anchors = points.expand(len(placed), -1, -1)
@@ -208,7 +208,7 @@ class GraspPredictor:
     ) -> Float[Tensor, "num 4 4"]:
         """Wrist poses near which grasps are asked for, in the object's frame."""
         per_grasp = self.config.rotations_per_grasp if direction is None else self.config.rolls_per_grasp
-        axes = self.network.config.axes(hand)
+        axes = self.network.config.axes(hand.palm_axes_wrist)
         candidates = self._rotations(hand, num * per_grasp, direction, generator) @ axes
         opened = hand.points(hand.canonical_joints()) @ axes
         rotation, position = self.network.sample_placements(opened, points, candidates, num, generator)

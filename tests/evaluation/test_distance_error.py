@@ -13,14 +13,17 @@ from dro_grasp.cli.main import main
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.evaluation.distance_error import distance_errors
 from dro_grasp.models.checkpoints import load_weights
-from dro_grasp.models.network import DistanceNetwork, NetworkConfig, NetworkOutput
+from dro_grasp.models.network import DistanceNetwork, NetworkOutput
+from dro_grasp.models.presets import PRESETS
 from tests.helpers.tiny_bundle import TINY
 
 
 class Off(DistanceNetwork):
     """Predicts true distances, a few millimetres off; its posterior is two standard deviations off the prior."""
 
-    def forward(self, hand: Tensor, obj: Tensor, grasp: Tensor, columns: int | None = None) -> NetworkOutput:
+    def forward(
+        self, hand: Tensor, obj: Tensor, grasp: Tensor, generator: torch.Generator, columns: int | None = None
+    ) -> NetworkOutput:
         self.true = torch.cdist(grasp, obj, compute_mode="donot_use_mm_for_euclid_dist")
         zero = torch.zeros(len(obj), TINY.latent)
         mean = zero.clone()
@@ -44,7 +47,7 @@ def test_training_reports_them_of_grasps_it_has_not_seen(
     bundle: Bundle, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = str(home / "bundle.safetensors")
-    monkeypatch.setattr(NetworkConfig, "slim", staticmethod(lambda: TINY))
+    monkeypatch.setitem(PRESETS, "slim", TINY)
     command = ["train", "--bundle", path, "--run-folder", str(tmp_path / "run"), "--output", str(tmp_path / "w.safetensors"),
                "--steps", "2", "--validation", path]
     assert main([*command, "--json"]) == 0

@@ -12,13 +12,13 @@ import torch
 from dro_grasp.datasets.bundle.training_file import Bundle, ObjectCloud, write_bundle
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
-from dro_grasp.models.network import NetworkConfig
+from dro_grasp.models.presets import NetworkConfig
 from tests.helpers.toy_hand import toy_hand
 
 TINY = NetworkConfig(
     n_hand=48, n_object=32, width=16, encoder_widths=(8, 16), neighbours=6, attention_hidden=16, latent=4,
-    latent_widths=(8, 16), latent_head=(16, 16), latent_neighbours=6, kernel_hidden=(16, 8), frame="wrist", placed=True,
-    residual=True, placement_width=16,
+    latent_widths=(8, 16), latent_head=(16, 16), latent_neighbours=6, kernel_hidden=(16, 8), frame="wrist",
+    placement_width=16,
 )
 SEMIAXES = {"ball": (0.03, 0.03, 0.03), "egg": (0.02, 0.025, 0.04)}
 

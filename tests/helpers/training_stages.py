@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 from dro_grasp.datasets.bundle.training_file import Bundle
-from dro_grasp.models.network import DistanceNetwork, NetworkConfig
+from dro_grasp.models.network import DistanceNetwork
+from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.training.config import PretrainConfig, ScheduleConfig, TrainConfig
 from dro_grasp.training.loop import train
 from dro_grasp.training.pretraining import pretrain
-from dro_grasp.training.runs import LOG, Run
+from dro_grasp.training.reports import Report, RunProgress
+from dro_grasp.training.run_folder import LOG
 from tests.helpers.tiny_bundle import TINY
 
 SCHEDULE = ScheduleConfig(
@@ -22,13 +23,13 @@ SHARDED = dataclasses.replace(SCHEDULE, shards=2)
 STAGES = ["train", "pretrain"]
 
 
-def quiet(run: Run, means: dict[str, float]) -> None:
+def quiet(run: RunProgress, means: dict[str, float]) -> None:
     """A report that nobody reads."""
 
 
 def run_stage(
     stage: str, bundle: Bundle, folder: Path, schedule: ScheduleConfig = SCHEDULE,
-    report: Callable[[Run, dict[str, float]], None] = quiet, network: NetworkConfig = TINY,
+    report: Report = quiet, network: NetworkConfig = TINY,
 ) -> DistanceNetwork:
     if stage == "pretrain":
         return pretrain(bundle, network, PretrainConfig(schedule, hands_per_step=1), folder, report)

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import torch
-
 
 def untrained_weights(folder: Path) -> Path:
     from dro_grasp.models.checkpoints import save_weights
-    from dro_grasp.models.network import DistanceNetwork, NetworkConfig
+    from dro_grasp.models.network import untrained_network
+    from dro_grasp.models.presets import NetworkConfig
 
     path = folder / "untrained.safetensors"
-    torch.manual_seed(0)
     config = NetworkConfig(
         n_hand=96, n_object=64, width=32, encoder_widths=(16, 32), neighbours=8, attention_hidden=32, latent=8,
         latent_widths=(16, 32), latent_head=(32, 32), latent_neighbours=8, kernel_hidden=(32, 16), frame="wrist",
-        placed=True, residual=True, placement_width=32,
+        placement_width=32,
     )
-    save_weights(DistanceNetwork(config), path)
+    save_weights(untrained_network(config, seed=0), path)
     return path

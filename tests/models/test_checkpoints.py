@@ -26,7 +26,9 @@ from dro_grasp.models.checkpoints import (
     verify_weights,
     weights_names,
 )
-from dro_grasp.models.network import DistanceNetwork, NetworkConfig
+from dro_grasp.models.network import DistanceNetwork
+from dro_grasp.models.presets import NetworkConfig
+from dro_grasp.models.small_networks import history_of, save_small
 from tests.helpers.tiny_bundle import TINY
 
 HALF_ROUNDING = 2.0**-11
@@ -79,6 +81,13 @@ def test_rounding_hardly_changes_the_prediction(path: Path, network: DistanceNet
     torch.testing.assert_close(after, before, rtol=1e-2, atol=1e-4)
 
 
+CHANGED = {
+    "unknown setting": {"magic": 1}, "hand not placed": {"placed": False}, "kernel alone": {"residual": False},
+    "colder z": {"latent_temperature": 0.5}, "contradiction": {"frame": "object", "latent_form": "motion"},
+}
+"""Settings that a file may not have."""
+
+
 def change(path: Path, how: str) -> None:
     whole = path.read_bytes()
     with safe_open(path, "pt") as file:
@@ -103,8 +112,8 @@ def change(path: Path, how: str) -> None:
     elif how == "impossible sizes":
         header["config"]["latent_head"] = [1]
         save_file(tensors, path, metadata={KEY: json.dumps(header)})
-    elif how == "unknown option":
-        save_file(tensors, path, metadata={KEY: json.dumps(header | {"config": header["config"] | {"magic": 1}})})
+    elif how in CHANGED:
+        save_file(tensors, path, metadata={KEY: json.dumps(header | {"config": header["config"] | CHANGED[how]})})
     else:
         torch.save(tensors, path, _use_new_zipfile_serialization=how == "zipped pickle")
 
@@ -114,7 +123,9 @@ def change(path: Path, how: str) -> None:
     [
         ("cut short", "cut short"), ("empty", "cut short"), ("foreign", "not of dro-grasp"),
         ("strange header", "not of dro-grasp"), ("no configuration", "does not fit"), ("other sizes", "does not fit"),
-        ("impossible sizes", "does not fit"), ("unknown option", "does not fit"),
+        ("impossible sizes", "does not fit"), ("unknown setting", "unknown settings magic"),
+        ("hand not placed", "placed is no longer a choice"), ("kernel alone", "residual is no longer a choice"),
+        ("colder z", "latent_temperature is no longer a choice"), ("contradiction", "knows no placement"),
         ("another version", "version 99, expected 1"), ("zipped pickle", "can run code"), ("bare pickle", "can run code"),
     ],
 )
@@ -151,8 +162,21 @@ def test_description_counts_and_names(path: Path, network: DistanceNetwork) -> N
     about = describe_weights(path)
     assert about["parameters"] == sum(v.numel() for v in network.state_dict().values())
     assert (about["name"], about["bytes"], about["about"]) == ("mine", path.stat().st_size, {"stage": "test"})
+    assert about["history"] == []
     assert NetworkConfig.from_dict(about["config"]) == TINY
     assert path.stat().st_mode & 0o777 == 0o644
+
+
+def test_weights_remember_every_training_before(path: Path, network: DistanceNetwork, tmp_path: Path) -> None:
+    later = tmp_path / "later.safetensors"
+    save_weights(network, later, {"stage": "second"}, history_of(path))
+    assert describe_weights(later)["about"] == {"stage": "second"}
+    assert describe_weights(later)["history"] == [{"stage": "test"}]
+    save_small(torch.nn.Linear(2, 1), tmp_path / "small.safetensors", {"stage": "third"}, history_of(later))
+    stages = [entry["stage"] for entry in history_of(tmp_path / "small.safetensors")]
+    assert stages == ["test", "second", "third"]
+    assert [entry["initial"] for entry in history_of(locate_weights("multi"))] == ["multi"]
+    assert history_of(SHIPPED_FOLDER / "ranking" / "quality.safetensors") == [], "made before weights remembered"
 
 
 def test_shipped_weights_load() -> None:

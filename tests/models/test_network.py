@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 from torch import Tensor, nn
@@ -12,8 +14,9 @@ from dro_grasp.models import precision
 from dro_grasp.models.attention import Attention
 from dro_grasp.models.encoder import SLOPE, EdgeLayer, StaticGraphEncoder, nearest_neighbours
 from dro_grasp.models.latent import FlowPrior
-from dro_grasp.models.network import DistanceNetwork, NetworkConfig
+from dro_grasp.models.network import DistanceNetwork, untrained_network
 from dro_grasp.models.precision import fast_products
+from dro_grasp.models.presets import NetworkConfig
 
 SMALL = NetworkConfig(
     n_hand=40, n_object=32, width=24, encoder_widths=(8, 16), neighbours=6, attention_hidden=32, latent=8,
@@ -106,24 +109,12 @@ def test_attention_equals_pytorch() -> None:
     torch.testing.assert_close(ours(x, memory), theirs(x, memory, memory)[0], rtol=1e-5, atol=1e-6)
 
 
-def test_paper_network_has_fourteen_million_parameters() -> None:
-    config = NetworkConfig.paper()
-    network = DistanceNetwork(config)
-    paper_parts = [p for name, p in network.named_parameters() if not name.startswith("placement")]
-    assert 13.5e6 < sum(p.numel() for p in paper_parts) < 15e6
-    assert (config.width, config.n_hand, config.n_object, config.latent, config.kernel_hidden) == (
-        512, 512, 512, 64, (300, 100)
-    )
-    assert (config.frame, config.placed, config.residual) == ("object", False, False)
-
-
 @pytest.mark.parametrize("frame", ["object", "wrist"])
 def test_training_pass_has_gradients_everywhere(frame: str) -> None:
     torch.manual_seed(0)
-    values = {**SMALL.__dict__, "frame": frame, "placed": frame == "wrist", "residual": frame == "wrist"}
-    network = DistanceNetwork(NetworkConfig.from_dict(values))
+    network = DistanceNetwork(dataclasses.replace(SMALL, frame=frame))
     hand, obj, grasp = torch.randn(4, 40, 3) * 0.1, torch.randn(4, 32, 3) * 0.1, torch.randn(4, 40, 3) * 0.1
-    out = network(hand, obj, grasp, columns=10)
+    out = network(hand, obj, grasp, torch.Generator(), columns=10)
     assert out.distances.shape == (4, 40, 10)
     (out.distances.sum() + out.mean.sum() + out.log_variance.sum()).backward()
     silent = [n for n, p in network.named_parameters() if p.grad is None and not n.startswith("placement")]
@@ -136,7 +127,7 @@ def test_zero_centred_hand_forgets_its_place_unless_placed() -> None:
     moved = hand + torch.tensor([0.2, 0.0, 0.0])
     paper = DistanceNetwork(SMALL).eval()
     torch.testing.assert_close(paper.predict(hand, obj, z), paper.predict(moved, obj, z), rtol=1e-4, atol=1e-5)
-    placed = DistanceNetwork(NetworkConfig.from_dict({**SMALL.__dict__, "placed": True})).eval()
+    placed = DistanceNetwork(dataclasses.replace(SMALL, frame="wrist")).eval()
     assert (placed.predict(hand, obj, z) - placed.predict(moved, obj, z)).abs().max() > 1e-3
 
 
@@ -147,28 +138,28 @@ def test_latents_change_the_prediction_and_temperature_scales_them() -> None:
     z = network.sample_latent(2, torch.Generator().manual_seed(1))
     a, b = network.predict(hand.expand(2, -1, -1), obj.expand(2, -1, -1), z)
     assert (a - b).abs().max() > 1e-4
-    cold = DistanceNetwork(NetworkConfig.from_dict({**SMALL.__dict__, "latent_temperature": 0.5}))
-    torch.testing.assert_close(cold.sample_latent(2, torch.Generator().manual_seed(1)), z * 0.5)
+    torch.testing.assert_close(network.sample_latent(2, torch.Generator().manual_seed(1), 0.5), z * 0.5)
 
 
 def test_a_learned_prior_changes_nothing_before_training_and_much_after() -> None:
     torch.manual_seed(0)
     paper = DistanceNetwork(SMALL).eval()
-    ours = DistanceNetwork(NetworkConfig.from_dict({**SMALL.__dict__, "prior": "learned"})).eval()
+    ours = DistanceNetwork(dataclasses.replace(SMALL, prior="learned")).eval()
     assert not ours.load_state_dict(paper.state_dict(), strict=False).unexpected_keys
     hand, obj, noise = torch.randn(3, 40, 3) * 0.1, torch.randn(3, 32, 3) * 0.1, torch.randn(3, 8)
     torch.testing.assert_close(ours.predict(hand, obj, noise), paper.predict(hand, obj, noise))
-    assert not ours(hand, obj, hand).prior_mean.any()
+    assert not ours(hand, obj, hand, torch.Generator()).prior_mean.any()
     with torch.no_grad():
         ours.prior.last.weight.normal_(0, 0.3)
     assert (ours.predict(hand, obj, noise * 0) - paper.predict(hand, obj, noise * 0)).abs().max() > 1e-4
-    assert ours(hand, obj, hand).prior_mean.abs().min() > 0
+    assert ours(hand, obj, hand, torch.Generator()).prior_mean.abs().min() > 0
 
 
 def test_a_flow_learns_a_distribution_of_two_modes_that_depends_on_the_condition() -> None:
     torch.manual_seed(0)
     flow, width = FlowPrior(latent=2, width=32), 32
     optimiser = torch.optim.Adam(flow.parameters(), lr=3e-3)
+    generator = torch.Generator().manual_seed(0)
     apart = torch.tensor([[1.5, 0.0], [0.0, 1.5]])  # of the modes from their middle, for each of two conditions
 
     def condition(kind: Tensor) -> Tensor:
@@ -179,7 +170,7 @@ def test_a_flow_learns_a_distribution_of_two_modes_that_depends_on_the_condition
         side = torch.randint(2, (128, 1)) * 2.0 - 1
         z = side * apart[kind] + 0.2 * torch.randn(128, 2)
         optimiser.zero_grad()
-        flow.loss(z, condition(kind)).mean().backward()
+        flow.loss(z, condition(kind), generator).mean().backward()
         optimiser.step()
     for kind in range(2):
         with torch.no_grad():
@@ -192,14 +183,13 @@ def test_a_flow_learns_a_distribution_of_two_modes_that_depends_on_the_condition
 
 
 def test_a_motion_needs_to_be_told_where_the_hand_is() -> None:
-    with pytest.raises(OptionError, match="set placed and residual"):
-        DistanceNetwork(NetworkConfig.from_dict({**SMALL.__dict__, "latent_form": "motion"}))
+    with pytest.raises(OptionError, match="choose frame 'palm'"):
+        dataclasses.replace(SMALL, latent_form="motion")
 
 
 def test_a_latent_that_moves_the_hand_moves_its_points_apart() -> None:
     torch.manual_seed(0)
-    forms = {"latent_form": "motion", "prior": "flow", "placed": True, "residual": True}
-    network = DistanceNetwork(NetworkConfig.from_dict({**SMALL.__dict__, **forms})).eval()
+    network = DistanceNetwork(dataclasses.replace(SMALL, latent_form="motion", prior="flow", frame="wrist")).eval()
     hand, obj, grasp = torch.randn(3, 40, 3) * 0.1, torch.randn(3, 32, 3) * 0.1, torch.randn(3, 40, 3) * 0.1
     features = network.hand_encoder(hand - hand.mean(1, keepdim=True))
     z = torch.randn(2, 3, 8)
@@ -210,7 +200,23 @@ def test_a_latent_that_moves_the_hand_moves_its_points_apart() -> None:
     assert (mean - other).norm(dim=-1).min() > 1e-2  # the code sees where the hand goes
     turned, _ = network.motion.encode(features[:, torch.arange(39, -1, -1)], hand.flip(1), grasp.flip(1))
     torch.testing.assert_close(turned, mean, rtol=1e-4, atol=1e-5)  # and not the order of its points
-    assert network(hand, obj, grasp).flow_error.min() > 0
+    assert network(hand, obj, grasp, torch.Generator()).flow_error.min() > 0
+
+
+@pytest.mark.parametrize("changes", [{}, {"latent_form": "motion", "prior": "flow", "frame": "wrist"}], ids=["paper", "ours"])
+def test_all_randomness_comes_from_the_generator(changes: dict) -> None:
+    hand, obj, grasp = torch.randn(3, 2, 40, 3, generator=torch.Generator().manual_seed(0)) * 0.1
+    network = untrained_network(dataclasses.replace(SMALL, **changes), seed=3).eval()
+    state = torch.get_rng_state()
+    again = untrained_network(network.config, seed=3).eval()
+    first = network(hand, obj, grasp, torch.Generator().manual_seed(1))
+    assert torch.equal(torch.get_rng_state(), state), "the global generator is left alone"
+    torch.manual_seed(99)
+    second = again(hand, obj, grasp, torch.Generator().manual_seed(1))
+    for name, value in vars(first).items():
+        assert torch.equal(value, getattr(second, name)), name
+    other = network(hand, obj, grasp, torch.Generator().manual_seed(2))
+    assert not torch.equal(first.distances, other.distances)
 
 
 def test_prediction_does_not_depend_on_the_batch() -> None:
@@ -224,7 +230,7 @@ def test_prediction_does_not_depend_on_the_batch() -> None:
 
 
 def test_wrist_frame_turns_with_the_wrist() -> None:
-    network = DistanceNetwork(NetworkConfig.from_dict({**SMALL.__dict__, "frame": "wrist"}))
+    network = DistanceNetwork(dataclasses.replace(SMALL, frame="wrist"))
     rotation = torch.linalg.qr(torch.randn(1, 3, 3, generator=torch.Generator().manual_seed(0)))[0]
     rotation = rotation * torch.linalg.det(rotation)
     points, centre = torch.rand(1, 6, 3), torch.rand(1, 3)
@@ -259,15 +265,13 @@ def test_inaccurate_processors_keep_full_precision(monkeypatch: pytest.MonkeyPat
 @pytest.mark.parametrize("form", ["kernel", "motion"])
 def test_mixed_precision_stays_near_single_precision(form: str) -> None:
     torch.manual_seed(0)
-    forms = {"latent_form": form, "placed": True, "residual": True}
-    network = DistanceNetwork(NetworkConfig.from_dict({**SMALL.__dict__, **forms})).train()
+    network = DistanceNetwork(dataclasses.replace(SMALL, latent_form=form, frame="wrist")).train()
     hand, obj, grasp = torch.randn(4, 40, 3) * 0.05, torch.randn(4, 32, 3) * 0.05, torch.randn(4, 40, 3) * 0.05
     found = {}
     for mixed in (False, True):
         network.mixed = mixed
         network.zero_grad()
-        torch.manual_seed(1)
-        distances = network(hand, obj, grasp).distances
+        distances = network(hand, obj, grasp, torch.Generator().manual_seed(1)).distances
         assert distances.dtype == torch.float32
         (distances - torch.cdist(grasp, obj)).abs().mean().backward()
         weights = [p for n, p in network.named_parameters() if n.startswith("object_transformer") and p.grad is not None]

@@ -39,7 +39,7 @@ from dro_grasp.training.loop import train
 from dro_grasp.training.pretraining import pretrain
 from tests.helpers.tiny_bundle import TINY
 
-folder, schedule = Path(sys.argv[1]), ScheduleConfig(steps=2, tensorboard=True)
+folder, schedule = Path(sys.argv[1]), ScheduleConfig(steps=2)
 bundle = load_bundle(folder / "bundle.safetensors")
 encoder = pretrain(bundle, TINY, PretrainConfig(schedule, hands_per_step=1), folder / "pre")
 model = train(bundle, TINY, TrainConfig(schedule, hands_per_step=1, columns=24), folder / "main", encoder)

@@ -23,6 +23,7 @@ from dro_grasp.viewer import pictures
 from dro_grasp.viewer.appearance import (
     OBJECT_COLOUR,
     best_camera,
+    finger_of_link,
     hand_meshes,
     link_colours,
     object_meshes,
@@ -130,7 +131,7 @@ def test_links_above_the_palm_can_be_left_out(hand, grasps) -> None:
 
 
 def test_fingers_are_counted_from_the_palm_on(hand) -> None:
-    fingers = hand.finger_of_link.tolist()
+    fingers = finger_of_link(hand)
     assert fingers[hand.palm] == -1
     assert sorted({fingers[tip] for tip in hand.tips}) == [0, 1, 2]
 

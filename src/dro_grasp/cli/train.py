@@ -11,31 +11,49 @@ import tyro
 from dro_grasp.cli.output import optional, print_json, print_table
 
 if TYPE_CHECKING:
-    from dro_grasp.models.network import NetworkConfig
+    from dro_grasp.models.network import DistanceNetwork
+    from dro_grasp.models.presets import NetworkConfig
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
+Preset = Annotated[
+    Literal["slim", "paper", "multi"] | None,
+    tyro.conf.arg(aliases=["--size"], metavar="{slim,paper,multi}", help_behavior_hint="(default: slim)"),
+]
+Latent = Annotated[int | None, optional("N", "the preset's")]
+LatentForm = Annotated[Literal["kernel", "motion"] | None, optional("{kernel,motion}", "the preset's")]
 
 
-def network_config(size: str, latent: int | None, **changes: Any) -> NetworkConfig:
-    """The network configuration of a size, with another number of latents if one is given, and other changes.
+def network_config(preset: str | None, initial: DistanceNetwork | None = None, **options: Any) -> NetworkConfig:
+    """The configuration of a preset, or of initial weights, with the options that are given.
+
+    Args:
+        preset: Name of a preset, if one is asked for.
+        initial: Weights that training begins with; they decide the configuration.
+        options: Other values of single settings; None where none is asked for.
 
     Raises:
-        OptionError: The number is not positive.
+        OptionError: A value is out of range, or the initial weights have another configuration than is asked for.
     """
     import dataclasses
 
     from dro_grasp.errors import OptionError
-    from dro_grasp.models.network import NetworkConfig
+    from dro_grasp.models.presets import NetworkConfig
 
-    network = NetworkConfig.slim() if size == "slim" else NetworkConfig.paper()
-    if latent is not None and latent < 1:
-        raise OptionError(f"latent is {latent}; z needs at least one number")
-    return dataclasses.replace(network, latent=network.latent if latent is None else latent, **changes)
+    asked = {name: value for name, value in options.items() if value is not None}
+    if asked.get("latent", 1) < 1:
+        raise OptionError(f"latent is {asked['latent']}; z needs at least one number")
+    network = NetworkConfig.preset(preset or "slim") if initial is None or preset is not None else initial.config
+    network = dataclasses.replace(network, **asked)
+    if initial is not None and (other := network.differences(initial.config)):
+        told = ", ".join(f"{name} {mine} instead of {theirs}" for name, (mine, theirs) in other.items())
+        raise OptionError(f"the initial weights '{initial.name}' have another configuration than is asked for: {told}; leave "
+                          "out --preset and the options of the latent, which the weights decide")
+    return network
 
 
 @dataclass(frozen=True)
 class Pretrain:
-    """Pretrain the hand encoder so that a point keeps its features whatever the joints.
+    """Pretrain the hand encoder so that a point's features do not depend on the joints.
 
     Example: dro-grasp pretrain --bundle bundle.safetensors --run-folder runs/pre --output pretrained.safetensors
     """
@@ -43,25 +61,25 @@ class Pretrain:
     bundle: Path
     """Bundle from `dro-grasp dataset bundle`."""
     run_folder: Path
-    """Folder for log and checkpoints; a run in it is taken up. Its parent must exist."""
+    """Folder for log and checkpoints; a run in it is resumed. Its parent must exist."""
     output: Path
     """Weights file to write."""
-    size: Literal["slim", "paper"] = "slim"
-    """Network size."""
-    latent: Annotated[int | None, optional("N", "the size's")] = None
+    preset: Preset = None
+    """Network: slim (narrow, the paper's latent), paper, or multi (that of the shipped weights)."""
+    latent: Latent = None
     """Numbers in z."""
-    latent_form: Literal["kernel", "motion"] = "kernel"
-    """With `motion`, z also learns to say how hands move, after the encoder and in a folder of its own in the run folder."""
+    latent_form: LatentForm = None
+    """With `motion`, z also learns how hands move, after the encoder and in its own folder in the run folder."""
     steps: int = 3000
     """Optimiser steps."""
     motion_steps: int = 5000
-    """Those of the motion."""
+    """Optimiser steps of the motion."""
     minutes: Annotated[float | None, optional("MINUTES", "no limit")] = None
-    """Time limit of each; the learning rate follows whichever of steps and time is further on."""
+    """Time limit of each stage; the learning rate follows steps or time, whichever is further on."""
     shards: int = 1
-    """Independent parts of a step's batch, of 16 samples each; processes that torchrun starts share them out."""
+    """Independent parts of a step's batch, of 16 samples each; the processes of torchrun share them."""
     tensorboard: Flag = False
-    """Also write the log for TensorBoard."""
+    """Also write the log for TensorBoard, which must be installed."""
     device: Annotated[str, optional("DEVICE", "cuda where there is one, else cpu")] = "auto"
     """Where to compute: cpu, cuda, or cuda:1."""
     seed: int = 0
@@ -83,17 +101,19 @@ class Pretrain:
         from dro_grasp.training.config import AugmentationConfig, MotionConfig, PretrainConfig, ScheduleConfig
         from dro_grasp.training.pretraining import pretrain, pretrain_motion
         from dro_grasp.training.processes import is_first
+        from dro_grasp.training.runs import check_schedule
         from dro_grasp.training.samples import SampleSource
 
         check_output(self.output)
-        bundle = load_bundle(self.bundle)
-        network = network_config(self.size, self.latent, latent_form=self.latent_form)
+        network = network_config(self.preset, latent=self.latent, latent_form=self.latent_form)
         schedule = ScheduleConfig(
             steps=self.steps, minutes=self.minutes, shards=self.shards, tensorboard=self.tensorboard,
             device=choose_device(self.device), seed=self.seed,
         )
+        check_schedule(schedule)
+        bundle = load_bundle(self.bundle)
         model = pretrain(bundle, network, PretrainConfig(schedule=schedule), self.run_folder)
-        if self.latent_form == "motion":
+        if network.latent_form == "motion":
             motion = MotionConfig(dataclasses.replace(schedule, steps=self.motion_steps))
             model = pretrain_motion(model, bundle, motion, self.run_folder / "motion")
         if not is_first():
@@ -113,7 +133,7 @@ class Pretrain:
 
 @dataclass(frozen=True)
 class Train:
-    """Train the D(R,O) network on a bundle; a stopped run goes on where it was.
+    """Train the D(R,O) network on a bundle; a stopped run resumes from its last checkpoint.
 
     Example: dro-grasp train --bundle bundle.safetensors --run-folder runs/main --pretrained pretrained.safetensors
     --output my_weights.safetensors
@@ -122,51 +142,52 @@ class Train:
     bundle: Path
     """Bundle from `dro-grasp dataset bundle`."""
     run_folder: Path
-    """Folder for log and checkpoints; a run in it is taken up. Its parent must exist."""
+    """Folder for log and checkpoints; a run in it is resumed. Its parent must exist."""
     output: Path
     """Weights file to write."""
     pretrained: Annotated[str | None, optional("PATH", "none")] = None
-    """Weights from `dro-grasp pretrain`; without them the hand encoder is trained along."""
+    """Weights from `dro-grasp pretrain`; without them, and without --initial, the hand encoder is trained along."""
     initial: Annotated[str | None, optional("NAME|PATH", "none")] = None
-    """Weights to go on from: fine-tunes them on the bundle. The hand encoder stays as it is in them."""
-    size: Literal["slim", "paper"] = "slim"
-    """Network size."""
+    """Weights to fine-tune on the bundle. They decide the network; their hand encoder stays as it is."""
+    preset: Preset = None
+    """Network: slim (narrow, the paper's latent), paper, or multi (that of the shipped weights)."""
     steps: int = 10_000
     """Optimiser steps."""
     minutes: Annotated[float | None, optional("MINUTES", "no limit")] = None
-    """Time limit; the learning rate follows whichever of steps and time is further on."""
+    """Time limit; the learning rate follows steps or time, whichever is further on."""
     shards: int = 1
-    """Independent parts of a step's batch, of 16 samples each; processes that torchrun starts share them out."""
+    """Independent parts of a step's batch, of 16 samples each; the processes of torchrun share them."""
     tensorboard: Flag = False
-    """Also write the log for TensorBoard."""
+    """Also write the log for TensorBoard, which must be installed."""
     learning_rate: float = 1e-3
     """Peak of the learning rate."""
-    prior: Literal["standard", "learned", "flow"] = "standard"
-    """What z is drawn from: N(0, I), the paper's form, or a Gaussian or a flow learned from hand and object."""
-    latent: Annotated[int | None, optional("N", "the size's")] = None
+    prior: Annotated[
+        Literal["standard", "learned", "flow"] | None, optional("{standard,learned,flow}", "the preset's")] = None
+    """Distribution of z: standard (N(0, I), the paper's form), or a Gaussian or a flow learned from hand and object."""
+    latent: Latent = None
     """Numbers in z."""
-    latent_form: Literal["kernel", "motion"] = "kernel"
-    """What z does: it enters the kernel alone, the paper's form, or also moves the placed open hand."""
+    latent_form: LatentForm = None
+    """kernel: z enters the kernel alone, the paper's form; motion: z also moves the placed open hand."""
     divergence: float = 0.01
-    """Weight of the KL term."""
+    """KL weight; a lower value lets z carry more information."""
     divergence_warmup: float = 0.0
-    """Share of the schedule over which that weight grows from zero."""
+    """Share of the schedule over which the KL weight grows from zero."""
     free_bits: float = 0.0
     """KL of each latent dimension that costs nothing [nat]."""
     samples_per_hand: int = 4
-    """Grasps of each of the four hands in a part of a step's batch."""
+    """Grasps of each of the four hands in a shard."""
     columns: int = 48
-    """Object points to which distances are predicted in a step; a GPU affords 128."""
+    """Object points to which a step predicts distances; a GPU affords 128."""
     mixed: Flag = False
-    """Multiply in bfloat16 where that is safe; for GPUs."""
+    """Multiply in bfloat16 in encoders and transformers; for GPUs."""
     partial: float = 0.0
     """Share of samples with half of the object cut away."""
     device: Annotated[str, optional("DEVICE", "cuda where there is one, else cpu")] = "auto"
     """Where to compute: cpu, cuda, or cuda:1."""
     validation: Annotated[Path | None, optional("PATH", "no errors")] = None
-    """Bundle of grasps that are not trained on, of which the weights' distance errors are reported in the end."""
+    """Bundle of grasps that are not trained on; the weights' distance errors on them are reported in the end."""
     validation_samples: int = 400
-    """Of these, for each hand."""
+    """Validation grasps of each hand."""
     seed: int = 0
     """Seed of everything."""
     json: Flag = False
@@ -180,15 +201,18 @@ class Train:
         from dro_grasp.devices import choose_device
         from dro_grasp.evaluation.distance_error import distance_errors
         from dro_grasp.files import check_output
-        from dro_grasp.models.checkpoints import load_weights, save_weights
+        from dro_grasp.models.checkpoints import load_weights, locate_weights, save_weights
+        from dro_grasp.models.small_networks import history_of
         from dro_grasp.training.config import AugmentationConfig, LossConfig, ScheduleConfig, TrainConfig
         from dro_grasp.training.loop import train
         from dro_grasp.training.processes import is_first
+        from dro_grasp.training.runs import check_schedule
 
         check_output(self.output)
-        bundle = load_bundle(self.bundle)
-        validation = None if self.validation is None else load_bundle(self.validation)
+        given = [name for name in (self.initial, self.pretrained) if name is not None]
         pretrained, initial = (None if name is None else load_weights(name) for name in (self.pretrained, self.initial))
+        network = network_config(
+            self.preset, initial, latent=self.latent, prior=self.prior, latent_form=self.latent_form)
         config = TrainConfig(
             schedule=ScheduleConfig(
                 steps=self.steps, minutes=self.minutes, shards=self.shards, tensorboard=self.tensorboard,
@@ -199,14 +223,16 @@ class Train:
                 divergence=self.divergence, divergence_warmup=self.divergence_warmup, free_bits=self.free_bits),
             augmentation=AugmentationConfig(partial=self.partial),
         )
-        network = network_config(self.size, self.latent, prior=self.prior, latent_form=self.latent_form)
+        check_schedule(config.schedule)
+        bundle = load_bundle(self.bundle)
+        validation = None if self.validation is None else load_bundle(self.validation)
         model = train(bundle, network, config, self.run_folder, pretrained, name=self.output.stem, initial=initial)
         if not is_first():
             return 0
         about = how_long(self.run_folder) | {
             "stage": "training", "pretrained": self.pretrained is not None, "initial": self.initial, "data": bundle.summary(),
         }
-        save_weights(model, self.output, about)
+        save_weights(model, self.output, about, [entry for name in given for entry in history_of(locate_weights(name))])
         errors = [] if validation is None else distance_errors(load_weights(self.output), validation, self.validation_samples)
         report = {"output": str(self.output), "steps": about["steps"], "log": str(self.run_folder / "log.jsonl")}
         if self.json:
@@ -220,8 +246,8 @@ class Train:
 
 
 def how_long(run_folder: Path) -> dict[str, int]:
-    """Steps and seconds that a run took, whichever of its limits ended it."""
-    from dro_grasp.training.runs import last_logged
+    """Steps and seconds that a run took."""
+    from dro_grasp.training.run_folder import last_logged
 
     last = last_logged(run_folder)
     return {"steps": int(last["step"]), "seconds": round(last["seconds"])}

@@ -74,9 +74,9 @@ def _features(
     """Unit features of hand a in stored grasps, and of hand b opened."""
     grasps = source.grasps[a]
     chosen = torch.randint(len(grasps.joints), (samples,), generator=generator, device=generator.device)
-    closed = source.hands[a].points(grasps.joints[chosen]) @ source.network.axes(source.hands[a])
+    closed = source.hands[a].points(grasps.joints[chosen]) @ source.network.axes(source.hands[a].palm_axes_wrist)
     opened = source.hands[b].points(source.hands[b].random_open_joints(samples, generator))
-    opened = opened @ source.network.axes(source.hands[b])
+    opened = opened @ source.network.axes(source.hands[b].palm_axes_wrist)
     first, second = (functional.normalize(encoder(c - c.mean(1, keepdim=True)), dim=-1) for c in (closed, opened))
     return first, second
 

@@ -47,21 +47,19 @@ def distance_errors(network: DistanceNetwork, bundle: Bundle, samples: int = SAM
         seed: Seed of the samples.
     """
     source = SampleSource(bundle, network.config, AugmentationConfig())
-    generator = torch.Generator().manual_seed(seed)
+    generator, posterior = (torch.Generator().manual_seed(seed) for _ in range(2))
     found = []
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        for name in source.names:
-            parts, left = [], samples
-            while left > 0:
-                count = min(left, AT_ONCE)
-                drawn = source.draw(name, count, generator)
-                true = distance_matrix.build(drawn.grasp, drawn.obj)
-                output = network(drawn.placed, drawn.obj, drawn.grasp)
-                prior = network.predict(drawn.placed, drawn.obj, network.sample_latent(count, generator))
-                nats = divergence(output.mean, output.log_variance, output.prior_mean, output.prior_log_variance).sum(-1)
-                errors = [(d - true).abs().mean((1, 2)) for d in (output.distances, prior)]
-                parts.append(torch.stack([*errors, nats]))
-                left -= count
-            found.append(DistanceError(name, *torch.cat(parts, 1).mean(1).tolist()))
+    for name in source.names:
+        parts, left = [], samples
+        while left > 0:
+            count = min(left, AT_ONCE)
+            drawn = source.draw(name, count, generator)
+            true = distance_matrix.build(drawn.grasp, drawn.obj)
+            output = network(drawn.placed, drawn.obj, drawn.grasp, posterior)
+            prior = network.predict(drawn.placed, drawn.obj, network.sample_latent(count, generator))
+            nats = divergence(output.mean, output.log_variance, output.prior_mean, output.prior_log_variance).sum(-1)
+            errors = [(d - true).abs().mean((1, 2)) for d in (output.distances, prior)]
+            parts.append(torch.stack([*errors, nats]))
+            left -= count
+        found.append(DistanceError(name, *torch.cat(parts, 1).mean(1).tolist()))
     return found

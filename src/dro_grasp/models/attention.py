@@ -27,7 +27,7 @@ class Attention(nn.Module):
         if query.is_cuda or not torch.is_grad_enabled():
             mixed = functional.scaled_dot_product_attention(query, key, value)
         else:
-            # The fused kernel is quicker forwards, but several times slower backwards on a CPU at these sizes.
+            # On a CPU at these sizes the fused kernel is faster forwards, but several times slower backwards.
             scores = query @ key.mT / query.shape[-1] ** 0.5
             mixed = scores.softmax(-1) @ value
         return self.output(mixed.transpose(1, 2).flatten(2))
@@ -55,7 +55,7 @@ class CrossTransformer(nn.Module):
         self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(7))
 
     def forward(self, x: Float[Tensor, "b n c"], memory: Float[Tensor, "b m c"]) -> Float[Tensor, "b n c"]:
-        """Features of x that know of the memory; the caller adds the residual of the paper."""
+        """Features of x that know the memory; the caller adds the paper's residual."""
         memory = self.norms[0](memory + self.memory_attention(memory, memory))
         memory = self.norms[2](self.norms[1](memory + self.memory_forward(memory)))
         x = self.norms[3](x + self.self_attention(x, x))

@@ -5,38 +5,41 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
+from jaxtyping import Num
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
+from torch import Tensor
 
-from dro_grasp.errors import WeightsError
+from dro_grasp.errors import OptionError, WeightsError
 from dro_grasp.files import replacing
-from dro_grasp.models.network import DistanceNetwork, NetworkConfig
-from dro_grasp.models.small_networks import SHIPPED_FOLDER
+from dro_grasp.models.network import DistanceNetwork
+from dro_grasp.models.presets import NetworkConfig
+from dro_grasp.models.small_networks import FORMAT_VERSION, KEY, SHIPPED_FOLDER, header
 
-FORMAT_VERSION = 1
-KEY = "dro_grasp_weights"
-"""Metadata entry that marks a file as ours."""
 PICKLES = (b"PK", b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")
-"""How zipped and bare pickles begin."""
+"""First two bytes of zipped and of bare pickles."""
 CHECKSUMS = "SHA256SUMS"
 """File beside the shipped weights with their checksums, as `sha256sum` writes it."""
 SMALL = ("completion/surface", "ranking/quality")
 """Networks that ship beside those that predict grasps."""
 DEFAULT = "multi"
-"""Weights that are used when none are named."""
+"""Name of the default weights."""
 
 
-def save_weights(network: DistanceNetwork, path: Path | str, about: dict[str, Any] | None = None) -> None:
+def save_weights(
+    network: DistanceNetwork, path: Path | str, about: dict[str, Any] | None = None, history: Sequence[dict[str, Any]] = ()
+) -> None:
     """Write weights in half precision; counters and statistics of BatchNorm stay in single precision.
 
     Args:
         network: The network; its configuration goes along.
         path: The file to write.
-        about: What the weights were trained on, for people.
+        about: How the weights were made, and on what data.
+        history: The same of the weights that training began with, oldest first (`small_networks.history_of`).
 
     Raises:
         OutputError: The file cannot be written.
@@ -46,9 +49,8 @@ def save_weights(network: DistanceNetwork, path: Path | str, about: dict[str, An
         name: value.half().contiguous() if value.is_floating_point() and "running" not in name else value.contiguous()
         for name, value in network.state_dict().items()
     }
-    header = {"format_version": FORMAT_VERSION, "config": dataclasses.asdict(network.config), "about": about or {}}
     with replacing(path, "weights") as temporary:
-        save_file(tensors, temporary, metadata={KEY: json.dumps(header)})
+        save_file(tensors, temporary, metadata=header(about, history, config=dataclasses.asdict(network.config)))
 
 
 def load_weights(name: str | Path | None = None) -> DistanceNetwork:
@@ -61,11 +63,11 @@ def load_weights(name: str | Path | None = None) -> DistanceNetwork:
         WeightsError: No such weights, or the file is truncated, foreign, a pickle, or of another version.
     """
     path = locate_weights(name)
-    header, tensors = _read(path)
+    entry, tensors = _read(path)
     try:
-        network = DistanceNetwork(NetworkConfig.from_dict(header["config"]), name=path.stem)
+        network = DistanceNetwork(NetworkConfig.from_dict(entry["config"]), name=path.stem)
         network.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in tensors.items()})
-    except (RuntimeError, TypeError, KeyError) as error:
+    except (RuntimeError, TypeError, ValueError, KeyError, OptionError) as error:
         raise WeightsError(f"{path} does not fit this version of the network ({str(error).splitlines()[0]}); use weights "
                            "made with this version") from error
     return network.eval()
@@ -94,23 +96,24 @@ def weights_names() -> list[str]:
 
 
 def describe_weights(name: str | Path | None = None) -> dict[str, Any]:
-    """What a weights file says of itself, its size and its SHA-256."""
+    """Configuration, training and earlier trainings of a weights file, its size and its SHA-256."""
     path = locate_weights(name)
-    header, tensors = _read(path)
+    entry, tensors = _read(path)
     return {
         "name": path.stem, "parameters": sum(t.numel() for t in tensors.values()), "bytes": path.stat().st_size,
-        "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "config": header["config"], "about": header["about"],
+        "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "config": entry["config"], "about": entry["about"],
+        "history": entry.get("history", []),
     }
 
 
 def verify_weights(name: str | Path | None = None) -> str:
-    """SHA-256 of a weights file that loads and, if it is a shipped one, is as it was shipped.
+    """SHA-256 of a weights file that loads and, if it ships, is unchanged.
 
     Args:
         name: As in `load_weights`, or one of `SMALL`.
 
     Raises:
-        WeightsError: As in `load_weights`; or shipped weights are missing, or not those that were shipped.
+        WeightsError: As in `load_weights`; or shipped weights are missing or changed.
     """
     path = SHIPPED_FOLDER / f"{name}.safetensors" if name in SMALL else locate_weights(name)
     try:
@@ -128,23 +131,23 @@ def verify_weights(name: str | Path | None = None) -> str:
     return digest
 
 
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, Num[Tensor, "..."]]]:
     try:
         with safe_open(path, "pt") as file:
             text = (file.metadata() or {}).get(KEY)
             tensors = {key: file.get_tensor(key) for key in file.keys()}
-        header = None if text is None else json.loads(text)
+        entry = None if text is None else json.loads(text)
     except (SafetensorError, json.JSONDecodeError, OSError) as error:
         if _starts_like_a_pickle(path):
             raise WeightsError(f"{path} is a pickled PyTorch file, which can run code and is refused; expected safetensors "
                                "written by `dro-grasp train`") from error
-        raise WeightsError(f"{path} is no weights file, or was cut short ({error}); copy or train it again") from error
-    if not isinstance(header, dict):
+        raise WeightsError(f"{path} is not a weights file, or was cut short ({error}); copy or train it again") from error
+    if not isinstance(entry, dict):
         raise WeightsError(f"{path} is a safetensors file, but not of dro-grasp; give a file that `dro-grasp train` wrote")
-    if header.get("format_version") != FORMAT_VERSION:
-        raise WeightsError(f"{path} has weights version {header.get('format_version')}, expected {FORMAT_VERSION}; use "
+    if entry.get("format_version") != FORMAT_VERSION:
+        raise WeightsError(f"{path} has weights version {entry.get('format_version')}, expected {FORMAT_VERSION}; use "
                            "weights made with this version")
-    return header, tensors
+    return entry, tensors
 
 
 def _starts_like_a_pickle(path: Path) -> bool:

@@ -1,4 +1,4 @@
-"""A small network that says where an object's surface is: from distances to several guesses of it to one distance."""
+"""A small network that locates an object's surface: it merges distances to several guesses of the surface into one."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from torch import Tensor, nn
 from dro_grasp.models.small_networks import SHIPPED_FOLDER, load_small
 
 SHIPPED = SHIPPED_FOLDER / "completion" / "surface.safetensors"
-"""The network that objects seen in part are completed with."""
+"""The shipped network, which completes objects seen in part."""
 LENGTH = 0.01
-"""Size of a correction that the network makes with 1 [m]."""
+"""Unit of the network's corrections [m]. Source: ours."""
 
 
 class SurfaceNetwork(nn.Module):
-    """Weighs guesses of a signed distance against each other, place by place, and corrects the mean.
+    """Weighs guesses of a signed distance against each other, point by point, and corrects their mean.
 
-    Every place is judged on its own, so it learns how guesses go wrong, not how the objects look that it was trained on.
+    It judges every point by itself, so it learns how guesses fail, not the shapes of its training objects.
     """
 
     def __init__(self, guesses: int, features: int, width: int = 128, depth: int = 2) -> None:
-        """Make it; untrained, it believes the first guess.
+        """Untrained, it returns nearly the first guess.
 
         Args:
-            guesses: Distances that it is told, best guess first.
-            features: Other numbers that describe a place.
+            guesses: Number of guessed distances, best guess first.
+            features: Number of other features of a point.
             width: Of the hidden layers.
             depth: Residual blocks.
         """
@@ -50,7 +50,7 @@ class SurfaceNetwork(nn.Module):
 
         Args:
             guessed: Signed distances to the guesses [m].
-            features: What else is known of each place.
+            features: Other features of each point.
         """
         x = self.enter(features)
         for layer in self.layers:

@@ -1,4 +1,4 @@
-"""The latent variable of the CVAE: its encoder, sampling, and divergence from the prior. Source: paper section III-C."""
+"""The latent variable z of the CVAE: its encoders, its priors, and how it is drawn. Source: paper section III-C."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from torch.nn import functional
 from dro_grasp.models.encoder import SLOPE, EdgeLayer, PointLayer, nearest_neighbours
 
 MAX_LOG_VARIANCE = 8.0
-"""Log-variances are kept within plus and minus this."""
+"""Log-variances of z are clamped to plus and minus this. Source: ours."""
 CERTAIN = -4.0
-"""Log-variance that the code of a motion starts with."""
+"""Log-variance of the posterior of an untrained motion code. Source: ours."""
 
 
 class LatentEncoder(nn.Module):
@@ -42,10 +42,10 @@ class LatentEncoder(nn.Module):
 
 
 class Condition(nn.Module):
-    """What a prior of z has to know: the object as it lies before the placed open hand, and which hand it is."""
+    """Input of a learned prior of z: the object relative to the placed open hand, and the hand's features."""
 
     SCALE = 0.1
-    """Size of a cloud that networks see as 1 [m]."""
+    """Unit of length inside the network, about the size of a cloud [m]. Source: ours."""
 
     def __init__(self, features: int, width: int) -> None:
         super().__init__()
@@ -59,7 +59,7 @@ class Condition(nn.Module):
         self, hand_features: Float[Tensor, "b n c"], obj_features: Float[Tensor, "b m c"], hand: Float[Tensor, "b n 3"],
         obj: Float[Tensor, "b m 3"],
     ) -> Float[Tensor, "b width"]:
-        """One vector out of the encoders' features and both clouds [m], in one frame."""
+        """One vector from the encoders' features and both clouds [m], which share a frame."""
         x = self.points(torch.cat([obj_features, (obj - hand.mean(1, keepdim=True)) / self.SCALE], -1))
         return self.join(torch.cat([x.amax(1), x.mean(1), hand_features.amax(1), hand_features.mean(1)], -1))
 
@@ -91,14 +91,14 @@ class GaussianPrior(nn.Module):
 class FlowPrior(nn.Module):
     """p(z | hand, object) of any shape: a flow that carries N(0, I) to the posteriors' z along straight lines.
 
-    Differs from the paper, whose prior is N(0, I): what the true grasps' z look like, for this hand and object together,
-    is learned beside them instead of being forced on them. Source: flow matching, Lipman et al. 2023, Liu et al. 2023.
+    Differs from the paper, whose prior is N(0, I): the flow learns how z of true grasps is distributed for this hand and
+    object, instead of forcing a distribution on z. Source: flow matching, Lipman et al. 2023, Liu et al. 2023.
     """
 
     STEPS = 10
-    """Steps of the integration from noise to z."""
+    """Midpoint steps of the integration from noise to z. Source: ours."""
     DRAWS = 8
-    """Times and noises that each z is trained with at once; they are cheap beside the encoders."""
+    """Pairs of time and noise for each z in a training step; they are cheap beside the encoders. Source: ours."""
 
     def __init__(self, latent: int, width: int) -> None:
         super().__init__()
@@ -111,17 +111,20 @@ class FlowPrior(nn.Module):
     def velocity(
         self, z: Float[Tensor, "b latent"], time: Float[Tensor, "b 1"], condition: Float[Tensor, "b width"]
     ) -> Float[Tensor, "b latent"]:
-        """Where a point of the path goes; time runs from 0, noise, to 1, z."""
+        """Velocity of points on the path; time runs from 0 (noise) to 1 (z)."""
         angle = 0.5 * torch.pi * time
         x = self.enter(torch.cat([z, angle.sin(), angle.cos()], -1)) + condition
         for layer in self.layers:
             x = x + layer(x)
         return self.leave(x)
 
-    def loss(self, z: Float[Tensor, "b latent"], condition: Float[Tensor, "b width"]) -> Float[Tensor, " b"]:
+    def loss(
+        self, z: Float[Tensor, "b latent"], condition: Float[Tensor, "b width"], generator: torch.Generator
+    ) -> Float[Tensor, " b"]:
         """Squared error of the velocity, mean over dimensions; its gradient reaches the condition, not z."""
         goal = z.detach().repeat_interleave(self.DRAWS, 0)
-        noise, time = torch.randn_like(goal), torch.rand_like(goal[:, :1])
+        noise = torch.randn(goal.shape, generator=generator, device=goal.device)
+        time = torch.rand(len(goal), 1, generator=generator, device=goal.device)
         on_the_way = torch.lerp(noise, goal, time)
         error = self.velocity(on_the_way, time, condition.repeat_interleave(self.DRAWS, 0)) - (goal - noise)
         return error.square().mean(-1).unflatten(0, (-1, self.DRAWS)).mean(-1)
@@ -137,15 +140,15 @@ class FlowPrior(nn.Module):
 
 
 class HandMotion(nn.Module):
-    """z as a code of how the open hand moves into the grasp: read off both poses, and turned back into shifts of points.
+    """z as a code of how the open hand moves into the grasp: encoded from both poses, decoded into shifts of points.
 
-    Knows the hand only, so it learns from any joint angles, before there are grasps; what motion suits an object is for
-    the prior to say. Differs from the paper, where z reaches the kernel alone, as one bias for all pairs: too little to tell
-    one finger to open and another to close.
+    It knows the hand alone, so it learns from any joint values, without grasps; the prior learns which motion suits an
+    object. Differs from the paper, where z enters the kernel alone, as one bias for all pairs: too little to tell one
+    finger to open and another to close.
     """
 
     SCALE = 0.05
-    """Size of a shift that networks see as 1 [m]."""
+    """Unit of length inside the network, about the size of a shift [m]. Source: ours."""
 
     def __init__(self, features: int, latent: int, width: int) -> None:
         super().__init__()
@@ -158,7 +161,7 @@ class HandMotion(nn.Module):
         last = self.code[-1]
         assert isinstance(last, nn.Linear)
         with torch.no_grad():
-            # Noise as large as what is coded would hide what z is good for.
+            # At unit variance the noise would drown the code before it is of any use.
             last.bias[latent:] = CERTAIN
 
     def encode(
@@ -180,7 +183,7 @@ class HandMotion(nn.Module):
 
 
 class Modulated(nn.Module):
-    """Layers on points whose values a second input scales and shifts: what moves how far is a product, not a sum.
+    """Layers on points whose values a second input scales and shifts: which point moves how far is a product, not a sum.
 
     Source: feature-wise linear modulation, Perez et al. 2018.
     """
@@ -199,12 +202,13 @@ class Modulated(nn.Module):
 
 
 def with_latent(features: Float[Tensor, "b n c"], z: Float[Tensor, "b latent"]) -> Float[Tensor, "b n d"]:
-    """Features of points that know z."""
+    """Features of points, with z appended to each."""
     return torch.cat([features, z[:, None].expand(-1, features.shape[1], -1)], -1)
 
 
 def sample_posterior(
-    mean: Float[Tensor, "b latent"], log_variance: Float[Tensor, "b latent"]
+    mean: Float[Tensor, "b latent"], log_variance: Float[Tensor, "b latent"], generator: torch.Generator
 ) -> Float[Tensor, "b latent"]:
     """A draw of z that lets gradients through."""
-    return mean + torch.randn_like(mean) * (0.5 * log_variance).exp()
+    noise = torch.randn(mean.shape, generator=generator, device=mean.device)
+    return mean + noise * (0.5 * log_variance).exp()

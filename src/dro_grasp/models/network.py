@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from dro_grasp.errors import OptionError
-from dro_grasp.hands.hand import Hand
 from dro_grasp.models.attention import CrossTransformer
 from dro_grasp.models.distance_head import DistanceHead
 from dro_grasp.models.encoder import StaticGraphEncoder
@@ -25,89 +23,17 @@ from dro_grasp.models.latent import (
 )
 from dro_grasp.models.placement import PlacementPrior
 from dro_grasp.models.precision import fast_products
+from dro_grasp.models.presets import NetworkConfig
 
-
-@dataclass(frozen=True)
-class NetworkConfig:
-    """Sizes and forms. The defaults are the paper's."""
-
-    n_hand: int = 512
-    """Points of the hand's cloud."""
-    n_object: int = 512
-    """Points of the object's cloud."""
-    width: int = 512
-    """Feature dimension D."""
-    encoder_widths: tuple[int, ...] = (64, 64, 128, 256, 512)
-    """Outputs of the edge layers."""
-    neighbours: int = 32
-    """K of the encoders' graphs."""
-    heads: int = 4
-    """Attention heads."""
-    attention_hidden: int = 1024
-    """Hidden width of the transformers' feed-forward layers."""
-    latent: int = 64
-    """Dimension of z."""
-    latent_widths: tuple[int, ...] = (64, 64, 128, 256)
-    """Edge layers of the latent encoder."""
-    latent_head: tuple[int, int] = (512, 256)
-    """Fully connected layers of the latent encoder."""
-    latent_neighbours: int = 20
-    """K of the latent encoder's graph."""
-    prior: Literal["standard", "learned", "flow"] = "standard"
-    """What z is drawn from at inference: N(0, I) (the paper's form), a Gaussian learned from hand and object, or any
-    distribution that a flow learns from them."""
-    latent_form: Literal["kernel", "motion"] = "kernel"
-    """What z does: it enters the kernel alone (the paper's form), or also moves the placed open hand, which needs
-    `placed` and `residual`."""
-    kernel_hidden: tuple[int, int] = (300, 100)
-    """Hidden layers of the kernel."""
-    initial_distance: float = 0.1
-    """Distance that an untrained kernel predicts [m]; softplus alone starts at 0.69."""
-    frame: Literal["object", "wrist", "palm"] = "object"
-    """Axes of both clouds: the object's (the paper's form), the given wrist's, which each description chooses as it likes, or
-    those of the palm there, which mean the same for every hand."""
-    placed: bool = False
-    """Tell the network where the open hand is; the paper discards it by zero-centring."""
-    residual: bool = False
-    """Add the kernel to the distances of the placed open hand; needs `placed`."""
-    placement_width: int = 128
-    """Width of the placement prior."""
-    placement_components: int = 8
-    """Components of its mixture."""
-    latent_temperature: float = 1.0
-    """Scales z drawn at inference; 1 is the paper's form."""
-    placement_temperature: float = 0.7
-    """Scales the spread of placements drawn at inference."""
-
-    def axes(self, hand: Hand) -> Float[Tensor, "3 3"]:
-        """Axes that the network works in, as columns in the wrist frame; those of the wrist where it works in the object's."""
-        return hand.palm_axes_wrist if self.frame == "palm" else torch.eye(3, device=hand.link_points.device)
-
-    @staticmethod
-    def paper() -> NetworkConfig:
-        """The paper's network, about 14 M parameters."""
-        return NetworkConfig()
-
-    @staticmethod
-    def slim() -> NetworkConfig:
-        """A small one that trains on a CPU: the same code, narrower, in the palm's axes, with placement."""
-        return NetworkConfig(
-            n_hand=160, n_object=128, width=128, encoder_widths=(32, 32, 64, 128), neighbours=16,
-            attention_hidden=256, latent=64, latent_widths=(32, 32, 64), latent_head=(128, 128), latent_neighbours=12,
-            kernel_hidden=(128, 64), frame="palm", placed=True, residual=True,
-            placement_temperature=0.3,
-        )
-
-    @staticmethod
-    def from_dict(values: dict[str, Any]) -> NetworkConfig:
-        """From plain values, as stored in a weights file; lists become tuples."""
-        plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-        return NetworkConfig(**plain)
+EXACT = "donot_use_mm_for_euclid_dist"
+"""Mode of `torch.cdist` for the placed hand's distances: the matrix-product form loses half of the digits."""
+PLACE_SCALE = 10.0
+"""Factor of the placed hand's coordinates, a tenth of a metre large, at the network's input [1/m]. Source: ours."""
 
 
 @dataclass(frozen=True)
 class NetworkOutput:
-    """What training needs of one forward pass."""
+    """Result of one forward pass in training."""
 
     distances: Float[Tensor, "b n columns"]
     """D(R,O) [m]."""
@@ -122,7 +48,7 @@ class NetworkOutput:
     flow_error: Float[Tensor, " b"]
     """Squared velocity error of the flow to z; zero without a flow."""
     moved: Float[Tensor, "b n 3"]
-    """The placed hand, moved as z says where z says so [m]."""
+    """The placed hand, moved by z if z moves it [m]."""
     hand_feature: Float[Tensor, "b width"]
     """Mean feature of the open hand, for the placement prior."""
 
@@ -140,9 +66,6 @@ class DistanceNetwork(nn.Module):
         self.object_encoder = StaticGraphEncoder(c.encoder_widths, c.width, c.neighbours)
         self.hand_transformer = CrossTransformer(c.width, c.heads, c.attention_hidden)
         self.object_transformer = CrossTransformer(c.width, c.heads, c.attention_hidden)
-        if c.latent_form == "motion" and not (c.placed and c.residual):
-            raise OptionError("latent_form 'motion' moves the placed open hand, of which this network is not told; use the "
-                              "size slim, or set placed and residual")
         latent_width = c.latent_head[0]
         self.motion = HandMotion(c.width, c.latent, latent_width) if c.latent_form == "motion" else None
         self.latent_encoder = None if self.motion is not None else LatentEncoder(
@@ -166,21 +89,23 @@ class DistanceNetwork(nn.Module):
     def relate(
         self, hand_features: Float[Tensor, "b n width"], obj_features: Float[Tensor, "b m width"], hand: Float[Tensor, "b n 3"]
     ) -> tuple[Float[Tensor, "b n width"], Float[Tensor, "b m width"]]:
-        """Features that know of the other cloud, and of where the hand [m] is if the configuration says so."""
+        """Features that know the other cloud, and the place of the hand [m] if the configuration says so."""
         if self.place is not None:
-            hand_features = hand_features + self.place(hand * 10)
+            hand_features = hand_features + self.place(hand * PLACE_SCALE)
         with self._products(hand):
             related = self.hand_transformer(hand_features, obj_features), self.object_transformer(obj_features, hand_features)
         return related[0].float() + hand_features, related[1].float() + obj_features
 
-    def _products(self, like: Tensor) -> torch.autocast:
-        return torch.autocast(like.device.type, torch.bfloat16, enabled=self.mixed)
+    def _products(self, like: Float[Tensor, "..."]) -> AbstractContextManager[object]:
+        """bfloat16 products if they are asked for; not every kind of device knows them."""
+        return torch.autocast(like.device.type, torch.bfloat16) if self.mixed else nullcontext()
 
     def forward(
         self,
         hand: Float[Tensor, "b n 3"],
         obj: Float[Tensor, "b m 3"],
         grasp: Float[Tensor, "b n 3"],
+        generator: torch.Generator,
         columns: int | None = None,
     ) -> NetworkOutput:
         """One training pass: z comes from the true grasp.
@@ -189,12 +114,13 @@ class DistanceNetwork(nn.Module):
             hand: The open hand [m], in the frame of the configuration.
             obj: The object in the same frame [m].
             grasp: The hand in the grasp pose, in the same frame [m].
+            generator: Source of the draws of z, on the clouds' device.
             columns: Compute distances to this many leading object points only; the order must be random.
         """
         phi_hand, phi_object = self.encode(hand, obj)
         if self.motion is not None:
             mean, log_variance = self.motion.encode(phi_hand, hand, grasp)
-            z = sample_posterior(mean, log_variance)
+            z = sample_posterior(mean, log_variance, generator)
             moved = self.motion(phi_hand, hand, z)
             psi_hand, psi_object = self.relate(phi_hand, phi_object, moved)
         else:
@@ -204,13 +130,13 @@ class DistanceNetwork(nn.Module):
                 mean, log_variance = self.latent_encoder(
                     torch.cat([grasp, obj], 1), torch.cat([psi_hand, psi_object], 1))
             mean, log_variance = mean.float(), log_variance.float()
-            z, moved = sample_posterior(mean, log_variance), hand
+            z, moved = sample_posterior(mean, log_variance, generator), hand
         distances = self._distances(psi_hand, psi_object[:, :columns], z, moved, obj[:, :columns])
         prior_mean, prior_log_variance, flow_error = torch.zeros_like(z), torch.zeros_like(z), z.new_zeros(len(z))
         if self.condition is not None:
             condition = self.condition(phi_hand, phi_object, hand, obj)
             if isinstance(self.prior, FlowPrior):
-                flow_error = self.prior.loss(z, condition)
+                flow_error = self.prior.loss(z, condition, generator)
             elif self.prior is not None:
                 prior_mean, prior_log_variance = self.prior.moments(condition)
         return NetworkOutput(
@@ -219,7 +145,7 @@ class DistanceNetwork(nn.Module):
     def predict(
         self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], noise: Float[Tensor, "b latent"]
     ) -> Float[Tensor, "b n m"]:
-        """D(R,O) [m] for draws of `sample_latent`, which the prior turns into z; see `forward` for the clouds."""
+        """D(R,O) [m] for draws of `sample_latent`, which the prior turns into z; `forward` explains the clouds."""
         with fast_products():
             phi_hand, phi_object = self.encode(hand, obj)
             z = noise
@@ -230,32 +156,37 @@ class DistanceNetwork(nn.Module):
             return self._distances(psi_hand, psi_object, z, moved, obj)
 
     def _distances(
-        self, psi_hand: Tensor, psi_object: Tensor, z: Tensor, hand: Tensor, obj: Tensor
+        self, psi_hand: Float[Tensor, "b n width"], psi_object: Float[Tensor, "b m width"], z: Float[Tensor, "b latent"],
+        hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"],
     ) -> Float[Tensor, "b n m"]:
-        # The matrix-product form of cdist loses half of the digits.
-        exact = "donot_use_mm_for_euclid_dist"
-        base = torch.cdist(hand, obj, compute_mode=exact) if self.config.residual else None
+        base = torch.cdist(hand, obj, compute_mode=EXACT) if self.config.placed else None
         return self.head(with_latent(psi_hand, z), with_latent(psi_object, z), base)
 
     def to_frame(
         self, points: Float[Tensor, "b n 3"], centre: Float[Tensor, "b 3"], rotation: Float[Tensor, "b 3 3"]
     ) -> Float[Tensor, "b n 3"]:
-        """Points of the object's frame in the frame the network works in: about the object's centre.
+        """Points of the object's frame in the network's frame, about the object's centre.
 
         Args:
             points: In the object's frame [m].
             centre: Mean of the object's cloud [m].
-            rotation: Of the given hand's axes (`NetworkConfig.axes`) in the object's frame.
+            rotation: The given hand's axes (`NetworkConfig.axes`) in the object's frame.
         """
         centred = points - centre[:, None]
-        return centred if self.config.frame == "object" else centred @ rotation
+        return centred @ rotation if self.config.placed else centred
 
     def sample_latent(
-        self, num: int, generator: torch.Generator, temperature: float | None = None
+        self, num: int, generator: torch.Generator, temperature: float = 1.0
     ) -> Float[Tensor, "num latent"]:
-        """Draws that `predict` turns into z; in the paper's form they are z. Without a temperature, the configuration's."""
-        scale = self.config.latent_temperature if temperature is None else temperature
-        return torch.randn(num, self.config.latent, generator=generator) * scale
+        """Draws that `predict` turns into z, on the network's device; without a learned prior they are z.
+
+        Args:
+            num: How many.
+            generator: Source of randomness.
+            temperature: Standard deviation of the draws: 1 as in training, 0 for the likeliest z.
+        """
+        noise = torch.randn(num, self.config.latent, generator=generator, device=generator.device) * temperature
+        return noise.to(self.head.first.weight.device)
 
     def sample_placements(
         self,
@@ -278,3 +209,10 @@ class DistanceNetwork(nn.Module):
         return self.placement.sample(
             obj - obj.mean(0), feature, rotations, num, generator, self.config.placement_temperature
         )
+
+
+def untrained_network(config: NetworkConfig, seed: int, name: str = "untrained") -> DistanceNetwork:
+    """A network whose weights follow from the seed; PyTorch's global generator is left as it was."""
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(seed)
+        return DistanceNetwork(config, name)

@@ -1,7 +1,7 @@
-"""Where to put the open hand before asking for a grasp: a learned prior over wrist placements.
+"""A learned prior over placements: the poses of the open hand that the network is given.
 
-Differs from the paper, which zero-centres the hand cloud and leaves the placement to the latent: the open hand is
-given near where it will grasp. The prior says which wrist rotations suit an object and where the grasp centre goes.
+Differs from the paper, which zero-centres the hand cloud and leaves the placement to the latent: here the open hand
+starts near the grasp. The prior scores wrist rotations for an object and predicts the position of the grasp centre.
 """
 
 from __future__ import annotations
@@ -14,7 +14,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 MIN_SCALE = 0.003
-"""Smallest standard deviation of a mixture component [m]."""
+"""Smallest standard deviation of a mixture component [m]. Source: ours."""
+LENGTH = 0.1
+"""Unit of length inside the network, about the size of an object [m]. Source: ours."""
+SCALE = 0.03
+"""Unit of the components' standard deviations inside the network [m]. Source: ours."""
+COLDEST = 1e-3
+"""Lower temperatures choose components as this one does: the heaviest. Source: ours."""
 
 
 class PlacementPrior(nn.Module):
@@ -38,12 +44,11 @@ class PlacementPrior(nn.Module):
             obj: Object points in wrist axes about the object's centre [m].
             hand: Mean feature of the open hand's points.
         """
-        # Points are a tenth of a metre large; networks prefer numbers near one.
-        x = torch.cat([self.points(obj * 10).amax(1), self.hand(hand)], -1)
+        x = torch.cat([self.points(obj * (1 / LENGTH)).amax(1), self.hand(hand)], -1)
         out = self.head(x)
         logits, mean, scale = out[:, :-1].split([self.components, 3 * self.components, 3 * self.components], -1)
-        mean = mean.unflatten(-1, (self.components, 3)) * 0.1
-        scale = functional.softplus(scale).unflatten(-1, (self.components, 3)) * 0.03 + MIN_SCALE
+        mean = mean.unflatten(-1, (self.components, 3)) * LENGTH
+        scale = functional.softplus(scale).unflatten(-1, (self.components, 3)) * SCALE + MIN_SCALE
         return logits, mean, scale, out[:, -1]
 
     def log_density(
@@ -78,10 +83,16 @@ class PlacementPrior(nn.Module):
         """
         turned = obj @ rotations
         logits, mean, scale, score = self(turned, hand.expand(len(rotations), -1))
-        noise = -torch.log(-torch.log(torch.rand(len(rotations), generator=generator).clamp(1e-9, 1 - 1e-7)))
-        chosen = (score + noise).topk(num).indices
-        uniform = torch.rand(num, self.components, generator=generator).clamp(1e-9, 1 - 1e-7)
-        component = (logits[chosen] / max(temperature, 1e-3) - torch.log(-torch.log(uniform))).argmax(-1)
-        row = torch.arange(num)
-        spread = torch.randn(num, 3, generator=generator) * temperature
+        # The largest of (log-probability + Gumbel noise) is a draw from the distribution; the n largest, n without repetition.
+        chosen = (score + gumbel(score.shape, generator).to(score)).topk(num).indices
+        noise = gumbel(torch.Size([num, self.components]), generator).to(score)
+        component = (logits[chosen] / max(temperature, COLDEST) + noise).argmax(-1)
+        row = torch.arange(num, device=score.device)
+        spread = torch.randn(num, 3, generator=generator, device=generator.device).to(score) * temperature
         return rotations[chosen], mean[chosen][row, component] + scale[chosen][row, component] * spread
+
+
+def gumbel(shape: torch.Size, generator: torch.Generator) -> Float[Tensor, "..."]:
+    """Standard Gumbel noise, on the generator's device."""
+    uniform = torch.rand(shape, generator=generator, device=generator.device).clamp(1e-9, 1 - 1e-7)
+    return -torch.log(-torch.log(uniform))

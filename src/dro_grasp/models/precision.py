@@ -9,8 +9,9 @@ from functools import cache
 import torch
 
 LARGEST_DEVIATION = 1e-5
-"""Relative deviation of a test product beyond which the quick path is not taken."""
+"""Largest relative deviation of a test product with which the quick path is taken. Source: ours; single precision has 4e-7."""
 PROBE_SIZE = 256
+"""Rows and columns of the test product's matrices. Source: ours."""
 
 
 @contextmanager

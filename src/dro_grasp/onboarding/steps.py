@@ -22,6 +22,7 @@ from dro_grasp.files import check_folder, make_folder, replacing
 from dro_grasp.hands.check import check_hand, picture
 from dro_grasp.hands.library import load_hand
 from dro_grasp.models.checkpoints import load_weights, locate_weights, save_weights
+from dro_grasp.models.small_networks import history_of
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.predictor import GraspPredictor
 from dro_grasp.simulation.protocols import protocol
@@ -190,6 +191,6 @@ class _Way:
         model = train(bundle, initial.config, config, self.folder / "run", name=self.folder.name, initial=initial,
                       report=lambda run, means: self.say(f"step {run.step}: distance {1e3 * means['distance']:.1f} mm"))
         about = {"stage": "fine-tuning", "initial": initial.name, "data": bundle.summary(), "minutes": self.config.minutes}
-        save_weights(model, self.folder / WEIGHTS, about)
+        save_weights(model, self.folder / WEIGHTS, about, history_of(locate_weights(self.config.weights)))
         said = f"{initial.name} fine-tuned on {bundle.n_grasps} grasps"
         return {"grasps": bundle.n_grasps, "initial": initial.name, "said": said}

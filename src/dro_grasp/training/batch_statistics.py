@@ -1,4 +1,4 @@
-"""Statistics of BatchNorm that belong to the averaged weights."""
+"""Statistics of BatchNorm for the averaged weights."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from torch import nn
 
 @torch.no_grad()
 def recalibrate(model: nn.Module, forward: Callable[[], object], batches: int = 64) -> None:
-    """Measure the statistics of BatchNorm anew for the averaged weights.
+    """Measure the statistics of BatchNorm for the averaged weights.
 
     The averages kept during training belong to other weights: with them the distance error in evaluation mode is
-    twice that in training mode. Statistics of layers in evaluation mode, as in a frozen encoder, stay.
+    twice that in training mode. Layers in evaluation mode, as in a frozen encoder, keep their statistics.
 
     Args:
         model: A model in training mode, with the averaged weights.
-        forward: Sends the next batch of training data through it.
-        batches: How many batches the statistics are the mean of.
+        forward: Passes the next batch of training data through it.
+        batches: Number of batches that the statistics average over.
     """
     layers = [layer for layer in model.modules() if isinstance(layer, nn.BatchNorm1d) and layer.training]
     momenta = [layer.momentum for layer in layers]

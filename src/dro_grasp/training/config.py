@@ -1,4 +1,4 @@
-"""Typed settings of pretraining and training; every number that matters, with its source."""
+"""Typed settings of pretraining and training, with their sources."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class AugmentationConfig:
-    """How a sample differs from the stored grasp."""
+    """How a training sample differs from the stored grasp."""
 
     object_noise: float = 0.002
     """Standard deviation of the noise on object points [m]. Source: appendix, object point cloud sampling."""
     placement_rotation: float = math.radians(4)
-    """Largest rotation of the open hand's placement away from the grasp's [rad]."""
+    """Largest rotation between the open hand's placement and the grasp's wrist pose [rad]. Source: ours."""
     placement_shift: float = 0.004
-    """Standard deviation of its shift along each axis [m]."""
+    """Standard deviation of the shift between them, along each axis [m]. Source: ours."""
     partial: float = 0.0
-    """Share of samples that see half of the object, as in the appendix."""
+    """Share of samples in which half of the object is seen. Source: appendix."""
 
 
 @dataclass(frozen=True)
@@ -33,15 +33,15 @@ class LossConfig:
     divergence_form: Literal["batch_mean", "official"] = "batch_mean"
     """Sum over latents and mean over the batch, or the release's sum over all and sqrt(1 + x^2) - 1."""
     divergence_warmup: float = 0.0
-    """Share of the schedule over which the divergence's weight grows from zero, so that z is used before it costs."""
+    """Share of the schedule over which the divergence's weight grows from zero."""
     free_bits: float = 0.0
     """Divergence of each latent dimension that costs nothing [nat]."""
     motion: float = 1.0
-    """Weight of the mean distance between the hand as z moves it and the true grasp, where z moves it."""
+    """Weight of the mean distance between the hand as z moves it and the true grasp; for latent_form `motion`."""
     flow: float = 0.01
-    """Weight of the flow to z, where the network has one."""
+    """Weight of the flow's loss; for prior `flow`."""
     placement: float = 0.01
-    """Weight of the placement prior's own loss; it shares no parameter with the rest."""
+    """Weight of the placement prior's loss; it shares no parameter with the rest."""
 
 
 @dataclass(frozen=True)
@@ -49,31 +49,31 @@ class ScheduleConfig:
     """Optimiser and bookkeeping of both loops."""
 
     steps: int = 10_000
-    """Optimiser steps in all."""
+    """Optimiser steps."""
     minutes: float | None = None
-    """Time limit [min]; learning rate and end follow whichever of steps and time is further on."""
+    """Time limit [min]; the learning rate follows steps or time, whichever is further on."""
     learning_rate: float = 1e-3
-    """Peak of Adam's rate. Differs from the paper (1e-4): better at equal time on a CPU."""
+    """Peak of Adam's learning rate. Differs from the paper (1e-4): better at equal time on a CPU."""
     warmup_steps: int = 200
     """Steps of linear warm-up; a cosine to zero follows."""
     gradient_norm: float = 1.0
     """Gradients are clipped to this norm."""
     average_decay: float = 0.998
-    """Decay of the moving average of the weights, which is what is saved."""
+    """Decay of the moving average of the weights, which is saved."""
     checkpoint_seconds: float = 60.0
-    """A checkpoint is written this often [s]."""
+    """Time between checkpoints [s]."""
     shards: int = 1
-    """Independent parts of a step's batch, each as large as the configuration says; processes share them out."""
+    """Independent parts of a step's batch, each as large as the configuration says; processes share them."""
     log_every: int = 20
     """Steps between lines of the log."""
     tensorboard: bool = False
-    """Also write the log for TensorBoard, where that is installed."""
+    """Also write the log for TensorBoard, which must be installed."""
     mixed: bool = False
-    """Multiply in bfloat16 in encoders and transformers: twice as fast where the hardware has it."""
+    """Multiply in bfloat16 in encoders and transformers: twice as fast on hardware that supports it."""
     device: str = "cpu"
-    """Where everything is computed, samples included: `cpu`, `cuda`, `cuda:1`. Another kind draws other samples."""
+    """Device of network and samples: `cpu`, `cuda`, `cuda:1`. Another kind of device draws other samples."""
     seed: int = 0
-    """Seed of initial weights and of all samples."""
+    """Seed of initial weights and samples."""
 
 
 @dataclass(frozen=True)
@@ -86,11 +86,11 @@ class TrainConfig:
     hands_per_step: int = 4
     """Different hands in one step."""
     samples_per_hand: int = 4
-    """Grasps of each of them."""
+    """Grasps of each of these hands."""
     columns: int = 48
-    """Object points to which distances are predicted in a step; inference uses all."""
+    """Object points to which a step predicts distances; inference uses all."""
     freeze_hand_encoder: bool = True
-    """Keep the pretrained hand encoder as it is. Source: paper section III-C."""
+    """Keep a pretrained or given hand encoder as it is. Source: paper section III-C."""
 
 
 @dataclass(frozen=True)
@@ -110,11 +110,11 @@ class PretrainConfig:
 
 @dataclass(frozen=True)
 class MotionConfig:
-    """Pretraining of the z that says how hands move."""
+    """Pretraining of the z that encodes how hands move."""
 
     schedule: ScheduleConfig = ScheduleConfig(steps=5_000)
     augmentation: AugmentationConfig = AugmentationConfig()
     hands_per_step: int = 4
     samples_per_hand: int = 16
     divergence: float = 1e-5
-    """Weight of the divergence of z from N(0, I) [m/nat]; main training, which weighs it more, takes away what objects tell."""
+    """Weight of the divergence of z from N(0, I) [m/nat]; main training weighs it more."""

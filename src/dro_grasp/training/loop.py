@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from torch import Tensor
+from jaxtyping import Float
+from torch import Tensor, nn
 
 from dro_grasp import distance_matrix
 from dro_grasp.datasets.bundle.training_file import Bundle
-from dro_grasp.models.network import DistanceNetwork, NetworkConfig, NetworkOutput
+from dro_grasp.errors import WeightsError
+from dro_grasp.geometry.se3 import apply
+from dro_grasp.models.network import DistanceNetwork, NetworkOutput, untrained_network
+from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.training.batch_statistics import recalibrate
 from dro_grasp.training.config import TrainConfig
 from dro_grasp.training.losses import (
@@ -21,10 +24,12 @@ from dro_grasp.training.losses import (
     placement_loss,
     pose_loss,
 )
-from dro_grasp.training.processes import join
-from dro_grasp.training.reports import console_report
-from dro_grasp.training.runs import Run
+from dro_grasp.training.reports import Report, console_report
+from dro_grasp.training.runs import Losses, TrainingRun, begin
 from dro_grasp.training.samples import HandSamples, SampleSource
+
+NAMED = 4
+"""Tensors that an error names one by one."""
 
 
 def train(
@@ -33,7 +38,7 @@ def train(
     config: TrainConfig,
     folder: Path,
     pretrained: DistanceNetwork | None = None,
-    report: Callable[[Run, dict[str, float]], None] | None = None,
+    report: Report | None = None,
     name: str = "trained",
     initial: DistanceNetwork | None = None,
 ) -> DistanceNetwork:
@@ -43,33 +48,33 @@ def train(
         bundle: Hands, objects and grasps.
         network: Sizes and forms.
         config: Losses, augmentation and schedule.
-        folder: Run folder; a checkpoint in it is taken up, to the same curve.
-        pretrained: Where the hand encoder comes from; without it, and without `initial`, the encoder is trained along.
-        report: Called now and then; the console by default.
-        name: How the weights are called.
-        initial: Weights to go on from, as in fine-tuning; what the network has of another shape starts afresh.
+        folder: Run folder; a checkpoint in it is resumed and reproduces the curve.
+        pretrained: Source of the hand encoder, and of the motion where z moves the hand. Without it, and without
+            `initial`, the hand encoder is trained along.
+        report: Called every few steps; the console by default.
+        name: Name of the weights.
+        initial: Weights to begin with, as in fine-tuning; `network` must be their configuration.
 
     Returns:
         The moving average of the weights, on the CPU, in evaluation mode.
 
     Raises:
+        OptionError: The schedule cannot be carried out here.
         TrainingError: A loss is not finite.
+        WeightsError: `initial` or `pretrained` does not fit the network.
     """
-    processes, device = join(config.schedule.device)
-    torch.manual_seed(config.schedule.seed)
-    generator = torch.Generator(device)
-    model = DistanceNetwork(network, name=name).to(device)
-    frozen = (pretrained is not None or initial is not None) and config.freeze_hand_encoder
+    processes, device = begin(config.schedule)
+    model = untrained_network(network, config.schedule.seed, name)
     if initial is not None:
-        take_over(model, initial)
+        take_weights(model, initial, initial.name)
     if pretrained is not None:
-        model.hand_encoder.load_state_dict(pretrained.hand_encoder.state_dict())
-        if model.motion is not None and pretrained.motion is not None:
-            model.motion.load_state_dict(pretrained.motion.state_dict())
-    model.hand_encoder.requires_grad_(not frozen)
+        take_pretrained(model, pretrained)
+    frozen = (pretrained is not None or initial is not None) and config.freeze_hand_encoder
+    model.to(device).hand_encoder.requires_grad_(not frozen)
     model.mixed = config.schedule.mixed
+    generator = torch.Generator(device)
     source = SampleSource(bundle, network, config.augmentation, device)
-    run = Run(folder, model, config.schedule, generator, processes)
+    run = TrainingRun(folder, model, config.schedule, generator, processes)
     model.train()
     if frozen:
         # train() would put the frozen encoder's BatchNorm back into training mode.
@@ -79,35 +84,65 @@ def train(
         names = source.draw_hands(config.hands_per_step, generator)
         return [source.draw(hand, config.samples_per_hand, generator) for hand in names]
 
-    run.train(lambda: step_losses(model, draw(), config, run.progress), report or console_report("training"))
+    run.train(lambda: step_losses(model, draw(), config, generator, run.progress), report or console_report("training"))
     model.load_state_dict(run.average.module.state_dict())
     run.seed_shard()
-    recalibrate(model, lambda: model(*_clouds(draw()), columns=1))
+    recalibrate(model, lambda: model(*_clouds(draw()), generator, columns=1))
     model.mixed = False
     return model.cpu().eval()
 
 
-def take_over(model: DistanceNetwork, other: DistanceNetwork) -> list[str]:
-    """Copy the tensors that both networks have in the same shape; returns the names of the others, which stay."""
-    theirs, ours = other.state_dict(), model.state_dict()
-    same = {name: value for name, value in theirs.items() if name in ours and value.shape == ours[name].shape}
-    model.load_state_dict(same, strict=False)
-    return sorted(set(ours) - set(same))
+def take_weights(model: nn.Module, given: nn.Module, name: str) -> None:
+    """Copy all weights of another network of the same form.
+
+    Args:
+        model: Receives the weights.
+        given: Has them.
+        name: How they are called, for the error.
+
+    Raises:
+        WeightsError: The two differ in a tensor's name or shape.
+    """
+    ours, theirs = model.state_dict(), given.state_dict()
+    wrong = [f"{key} is missing" for key in ours if key not in theirs]
+    wrong += [f"{key} has no place" for key in theirs if key not in ours]
+    wrong += [f"{key} has shape {tuple(theirs[key].shape)}, not {tuple(value.shape)}" for key, value in ours.items()
+              if key in theirs and theirs[key].shape != value.shape]
+    if wrong:
+        more = f", and {len(wrong) - NAMED} more" if len(wrong) > NAMED else ""
+        raise WeightsError(f"weights '{name}' do not fit this network: {', '.join(wrong[:NAMED])}{more}; train with the "
+                           "configuration of these weights")
+    model.load_state_dict(theirs)
+
+
+def take_pretrained(model: DistanceNetwork, pretrained: DistanceNetwork) -> None:
+    """Copy the hand encoder, and the motion where z moves the hand.
+
+    Raises:
+        WeightsError: They do not fit, or there is a pretrained motion and z does not move the hand.
+    """
+    take_weights(model.hand_encoder, pretrained.hand_encoder, pretrained.name)
+    if pretrained.motion is not None and model.motion is None:
+        raise WeightsError(f"weights '{pretrained.name}' hold a pretrained motion, but z does not move the hand in this "
+                           "network; train with latent_form 'motion' (--latent-form motion)")
+    if pretrained.motion is not None and model.motion is not None:
+        take_weights(model.motion, pretrained.motion, pretrained.name)
 
 
 def step_losses(
-    model: DistanceNetwork, groups: list[HandSamples], config: TrainConfig, progress: float = 1.0
-) -> dict[str, Tensor]:
+    model: DistanceNetwork, groups: list[HandSamples], config: TrainConfig, generator: torch.Generator, progress: float = 1.0
+) -> Losses:
     """All losses of one batch, by name, with their weighted sum as `total`, and the plain divergence as `nats`.
 
     Args:
         model: The network, in training mode.
         groups: Samples of one or several hands.
         config: Weights.
-        progress: How much of the schedule is behind, from 0 to 1.
+        generator: Source of the draws of z.
+        progress: Share of the schedule that is done.
     """
     placed, obj, grasp = _clouds(groups)
-    output = model(placed, obj, grasp, columns=config.columns)
+    output = model(placed, obj, grasp, generator, columns=config.columns)
     anchors = obj[:, : config.columns]
     parts = {"distance": distance_loss(output.distances, distance_matrix.build(grasp, anchors))}
     poses, penetrations = [], []
@@ -134,20 +169,21 @@ def step_losses(
     return {"total": total, **parts, "nats": nats.sum(-1).mean()}
 
 
-def _clouds(groups: list[HandSamples]) -> tuple[Tensor, Tensor, Tensor]:
-    """The network's inputs: open hands, objects, grasps."""
+def _clouds(
+    groups: list[HandSamples],
+) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b m 3"], Float[Tensor, "b n 3"]]:
+    """The network's inputs: open hands, objects, grasps [m]."""
     placed, obj, grasp = (torch.cat([getattr(g, n) for g in groups]) for n in ("placed", "obj", "grasp"))
     return placed, obj, grasp
 
 
-def _posed_points(group: HandSamples, decoded: distance_matrix.LinkPoses) -> Tensor:
-    """Hand points under the decoded link poses (b k 3), of the links that have one."""
+def _posed_points(group: HandSamples, decoded: distance_matrix.LinkPoses) -> Float[Tensor, "b k 3"]:
+    """Hand points under the decoded link poses [m], of the links that have one."""
     kept = decoded.valid[group.hand.link_index]
-    T = decoded.T_world_link[:, group.hand.link_index[kept]]
-    return (T[..., :3, :3] @ group.hand.link_points[kept][..., None])[..., 0] + T[..., :3, 3]
+    return apply(decoded.T_world_link[:, group.hand.link_index[kept]], group.hand.link_points[kept])
 
 
-def _placement(model: DistanceNetwork, groups: list[HandSamples], output: NetworkOutput) -> Tensor:
+def _placement(model: DistanceNetwork, groups: list[HandSamples], output: NetworkOutput) -> Float[Tensor, ""]:
     feature = output.hand_feature.detach()
     obj, other, position = (
         torch.cat([getattr(g, n) for g in groups]) for n in ("obj_hand", "obj_random", "position")

@@ -44,7 +44,7 @@ def _norm(x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
 def penetration_loss(
     hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], normals: Float[Tensor, "b m 3"]
 ) -> Float[Tensor, " b"]:
-    """Mean depth of hand points inside the object [m], by the nearest object point and its outward normal.
+    """Mean penetration of hand points into the object [m], by the nearest object point and its outward normal.
 
     Differs from the paper: a mean instead of a sum, so that the weight does not depend on the number of points.
     Source: paper section III-E.
@@ -70,7 +70,7 @@ def divergence(
 def divergence_loss(
     divergence: Float[Tensor, "b d"], form: Literal["batch_mean", "official"], free_bits: float = 0.0
 ) -> Float[Tensor, ""]:
-    """One number out of the divergences of a batch.
+    """Loss of the divergences of a batch.
 
     Args:
         divergence: Per grasp and latent dimension [nat].

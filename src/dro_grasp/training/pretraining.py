@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.errors import TrainingError
+from dro_grasp.geometry.se3 import random_rotations
 from dro_grasp.models.encoder import StaticGraphEncoder
 from dro_grasp.models.latent import HandMotion, sample_posterior
-from dro_grasp.models.network import DistanceNetwork, NetworkConfig
+from dro_grasp.models.network import DistanceNetwork, untrained_network
+from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.training.batch_statistics import recalibrate
 from dro_grasp.training.config import AugmentationConfig, MotionConfig, PretrainConfig
 from dro_grasp.training.losses import contrastive_loss, divergence
-from dro_grasp.training.processes import join
-from dro_grasp.training.reports import console_report
-from dro_grasp.training.runs import Run
-from dro_grasp.training.samples import SampleSource, random_rotations, random_turns
+from dro_grasp.training.reports import Report, console_report
+from dro_grasp.training.runs import Losses, TrainingRun, begin
+from dro_grasp.training.samples import SampleSource, random_turns
 
 
 def pretrain(
@@ -26,33 +28,33 @@ def pretrain(
     network: NetworkConfig,
     config: PretrainConfig,
     folder: Path,
-    report: Callable[[Run, dict[str, float]], None] | None = None,
+    report: Report | None = None,
 ) -> DistanceNetwork:
     """Pretrain the hand encoder on the bundle's grasps.
 
     Args:
         bundle: Hands and grasps.
-        network: Sizes.
+        network: Sizes and forms.
         config: Loss and schedule.
-        folder: Run folder; a checkpoint in it is taken up.
-        report: Called now and then; the console by default.
+        folder: Run folder; a checkpoint in it is resumed.
+        report: Called every few steps; the console by default.
 
     Returns:
-        A network whose hand encoder is trained and whose other parts are fresh, in evaluation mode.
+        A network with a trained hand encoder and otherwise untrained, on the CPU, in evaluation mode.
 
     Raises:
+        OptionError: The schedule cannot be carried out here.
         TrainingError: A loss is not finite.
     """
-    processes, device = join(config.schedule.device)
-    torch.manual_seed(config.schedule.seed)
-    whole = DistanceNetwork(network, name="pretrained").to(device)
+    processes, device = begin(config.schedule)
+    whole = untrained_network(network, config.schedule.seed, "pretrained").to(device)
     generator = torch.Generator(device)
     source = SampleSource(bundle, network, AugmentationConfig(), device)
     encoder = whole.hand_encoder
-    run = Run(folder, encoder, config.schedule, generator, processes)
+    run = TrainingRun(folder, encoder, config.schedule, generator, processes)
     encoder.train()
 
-    def losses() -> dict[str, torch.Tensor]:
+    def losses() -> Losses:
         return {"total": contrastive_step(encoder, source, config, generator)}
 
     run.train(losses, report or console_report("pretraining"))
@@ -67,33 +69,34 @@ def pretrain_motion(
     bundle: Bundle,
     config: MotionConfig,
     folder: Path,
-    report: Callable[[Run, dict[str, float]], None] | None = None,
+    report: Report | None = None,
 ) -> DistanceNetwork:
-    """Teach z to say how hands move, before any object is seen; the hand encoder stays as it is.
+    """Train z to encode how hands move, without objects; the hand encoder stays as it is.
 
     Args:
         model: A network whose z moves the hand, with a pretrained hand encoder.
         bundle: Hands and grasps.
         config: Loss and schedule.
-        folder: Run folder; a checkpoint in it is taken up.
-        report: Called now and then; the console by default.
+        folder: Run folder; a checkpoint in it is resumed.
+        report: Called every few steps; the console by default.
 
     Returns:
         The same network, on the CPU, in evaluation mode.
 
     Raises:
+        OptionError: The schedule cannot be carried out here.
         TrainingError: A loss is not finite, or z does not move the hand in this network.
     """
     if model.motion is None:
-        raise TrainingError(f"latent_form is '{model.config.latent_form}'; only with 'motion' is there a motion to pretrain")
-    processes, device = join(config.schedule.device)
+        raise TrainingError(f"latent_form is '{model.config.latent_form}', which has no motion to pretrain; choose 'motion'")
+    processes, device = begin(config.schedule)
     motion, encoder = model.motion.to(device), model.hand_encoder.to(device).eval()
     generator = torch.Generator(device)
     source = SampleSource(bundle, model.config, config.augmentation, device)
-    run = Run(folder, motion, config.schedule, generator, processes)
+    run = TrainingRun(folder, motion, config.schedule, generator, processes)
     motion.train()
 
-    def losses() -> dict[str, torch.Tensor]:
+    def losses() -> Losses:
         return motion_losses(motion, encoder, source, config, generator)
 
     run.train(losses, report or console_report("motion"))
@@ -103,22 +106,22 @@ def pretrain_motion(
 
 def motion_losses(
     motion: HandMotion, encoder: StaticGraphEncoder, source: SampleSource, config: MotionConfig, generator: torch.Generator
-) -> dict[str, torch.Tensor]:
-    """Mean distance of moved points from where they should be [m], and the divergence [nat]."""
+) -> Losses:
+    """Mean distance between moved points and their targets [m], and the divergence [nat]."""
     names = source.draw_hands(config.hands_per_step, generator)
     drawn = [source.draw_motions(name, config.samples_per_hand, generator) for name in names]
     hand, goal = (torch.cat(clouds) for clouds in zip(*drawn, strict=True))
     with torch.no_grad():
         features = encoder(hand - hand.mean(1, keepdim=True))
     mean, log_variance = motion.encode(features, hand, goal)
-    distance = (motion(features, hand, sample_posterior(mean, log_variance)) - goal).norm(dim=-1).mean()
+    distance = (motion(features, hand, sample_posterior(mean, log_variance, generator)) - goal).norm(dim=-1).mean()
     nats = divergence(mean, log_variance).sum(-1).mean()
     return {"total": distance + config.divergence * nats, "distance": distance, "nats": nats}
 
 
 def contrastive_step(
     encoder: StaticGraphEncoder, source: SampleSource, config: PretrainConfig, generator: torch.Generator
-) -> torch.Tensor:
+) -> Float[Tensor, ""]:
     """Loss of one batch: grasps (cloud A) against the open hand (cloud B) with a similar wrist rotation."""
     grasp_clouds, open_clouds = [], []
     for name in source.draw_hands(config.hands_per_step, generator):
@@ -127,7 +130,7 @@ def contrastive_step(
         if source.network.frame == "object":
             wrist = random_rotations(len(chosen), generator)
         else:
-            wrist = source.network.axes(hand).mT.expand(len(chosen), 3, 3)
+            wrist = source.network.axes(hand.palm_axes_wrist).mT.expand(len(chosen), 3, 3)
         turn = wrist @ random_turns(len(chosen), config.rotation, generator)
         grasp_clouds.append(hand.points(grasps.joints[chosen]) @ turn.mT)
         open_clouds.append(hand.points(hand.random_open_joints(len(chosen), generator)) @ wrist.mT)

@@ -1,4 +1,4 @@
-"""Training in several processes, as torchrun starts them: who is who, and sums over all of them."""
+"""Training in several processes, as torchrun starts them: ranks, and sums over all of them."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, distributed
 
 from dro_grasp.errors import OptionError
@@ -16,19 +17,19 @@ from dro_grasp.errors import OptionError
 
 @dataclass(frozen=True)
 class Processes:
-    """This process among those that train together; alone by default."""
+    """This process among those that train together; a process alone by default."""
 
     rank: int = 0
-    """Which one this is; the first one writes files and speaks."""
+    """Number of this process."""
     count: int = 1
-    """How many there are."""
+    """Number of processes."""
 
     @property
     def first(self) -> bool:
-        """Whether this is the one that writes files and speaks."""
+        """Whether this is the process that writes files and reports."""
         return self.rank == 0
 
-    def add_up(self, tensors: Iterable[Tensor]) -> None:
+    def add_up(self, tensors: Iterable[Float[Tensor, "..."]]) -> None:
         """Replace every tensor by its sum over all processes, in one message."""
         tensors = list(tensors)
         if self.count == 1 or not tensors:
@@ -39,7 +40,7 @@ class Processes:
             tensor.copy_(part.view_as(tensor))
 
     def from_first(self, value: Any) -> Any:
-        """What the first process holds, in all of them; it alone may have read it from a disk."""
+        """The first process's value, in all processes; the others may lack its disk."""
         if self.count == 1:
             return value
         box = [value]
@@ -48,14 +49,19 @@ class Processes:
 
 
 def is_first() -> bool:
-    """Whether this process writes files and speaks, by what torchrun tells it; true without torchrun."""
+    """Whether this process writes files and reports, according to torchrun; true without torchrun."""
     return os.environ.get("RANK", "0") == "0"
 
 
-def join(device: str) -> tuple[Processes, str]:
-    """Join the processes that torchrun started, and take a device of one's own; alone where it started none.
+def process_count() -> int:
+    """Number of processes that torchrun started; one without torchrun."""
+    return int(os.environ.get("WORLD_SIZE", "1"))
 
-    They stay together until they end: a stage that follows another finds them as they are.
+
+def join(device: str) -> tuple[Processes, str]:
+    """Join the processes that torchrun started, if any, and take a device of one's own.
+
+    Processes stay joined until they end, so a second stage of training finds them joined.
 
     Args:
         device: `cpu`, or `cuda` for the GPU with this process's number on its machine.
@@ -63,7 +69,7 @@ def join(device: str) -> tuple[Processes, str]:
     Raises:
         OptionError: torchrun started more processes on this machine than it has GPUs.
     """
-    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+    if process_count() == 1:
         return Processes(), device
     if device == "cuda":
         number, there = int(os.environ.get("LOCAL_RANK", "0")), torch.cuda.device_count()

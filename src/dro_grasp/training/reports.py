@@ -1,50 +1,76 @@
-"""How a training run tells people where it stands."""
+"""How a training run reports its progress: on the console, and to TensorBoard."""
 
 from __future__ import annotations
 
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from dro_grasp.training.runs import Run
+from dro_grasp.errors import OptionError
 
 SECONDS_BETWEEN_LINES = 10.0
-"""The console gets a line this often [s]."""
+"""Least time between two lines on the console [s]. Source: ours."""
 
 
-def console_report(title: str) -> Callable[[Run, dict[str, float]], None]:
-    """Prints a line of losses and the time left to stderr, now and then and at the end."""
-    said, begin, first = 0.0, time.monotonic(), -1.0
+@dataclass(frozen=True)
+class RunProgress:
+    """How far a run is."""
 
-    def report(run: Run, means: dict[str, float]) -> None:
-        nonlocal said, first
-        now, progress = time.monotonic(), run.progress
-        first = progress if first < 0 else first
-        if now - said < SECONDS_BETWEEN_LINES and progress < 1:
+    step: int
+    """Steps done."""
+    steps: int
+    """Steps of the schedule."""
+    share: float
+    """Share of the schedule that is done: 0 at the start, 1 at the end."""
+
+
+Report = Callable[[RunProgress, dict[str, float]], None]
+"""Called with a run's progress and the mean losses since the last call."""
+
+
+def console_report(title: str) -> Report:
+    """Prints losses and the time left to stderr, every few seconds and at the end."""
+    printed, begin, first = 0.0, time.monotonic(), -1.0
+
+    def report(run: RunProgress, means: dict[str, float]) -> None:
+        nonlocal printed, first
+        now = time.monotonic()
+        first = run.share if first < 0 else first
+        if now - printed < SECONDS_BETWEEN_LINES and run.share < 1:
             return
-        said = now
-        left = f"{(now - begin) / (progress - first) * (1 - progress) / 60:.0f} min left" if progress > first else ""
+        printed = now
+        left = f"{(now - begin) / (run.share - first) * (1 - run.share) / 60:.0f} min left" if run.share > first else ""
         text = "  ".join(f"{name} {value:.4f}" for name, value in means.items())
-        print(f"{title} {run.step}/{run.schedule.steps}  {text}  {left}", file=sys.stderr, flush=True)
+        print(f"{title} {run.step}/{run.steps}  {text}  {left}", file=sys.stderr, flush=True)
 
     return report
 
 
-def tensorboard_reports(folder: Path) -> list[Callable[[Run, dict[str, float]], None]]:
-    """One that writes losses for TensorBoard; none where it is not installed."""
+def require_tensorboard() -> None:
+    """Refuse to log for TensorBoard where it is not installed.
+
+    Raises:
+        OptionError: It is not installed.
+    """
     try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        return []
+        from torch.utils.tensorboard import SummaryWriter  # noqa: F401
+    except ImportError as error:
+        raise OptionError("--tensorboard needs TensorBoard, which is not installed; install it with pip install "
+                          "'dro-grasp[tensorboard]', or leave the option out: log.jsonl holds the same numbers") from error
+
+
+def tensorboard_report(folder: Path) -> Report:
+    """Writes losses for TensorBoard, which must be installed."""
+    from torch.utils.tensorboard import SummaryWriter
+
     writer = SummaryWriter(str(folder))
 
-    def report(run: Run, means: dict[str, float]) -> None:
+    def report(run: RunProgress, means: dict[str, float]) -> None:
         for name, value in means.items():
             writer.add_scalar(name, value, run.step)
-        if run.progress >= 1:
+        if run.share >= 1:
             writer.close()
 
-    return [report]
+    return report

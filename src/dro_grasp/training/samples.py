@@ -1,4 +1,4 @@
-"""Training samples, made in batches from a bundle: no files, no loader processes, nothing but tensors."""
+"""Training samples, drawn in batches from a bundle: tensors alone, without files and loader processes."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ from dataclasses import dataclass
 
 import roma
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.errors import BundleError
 from dro_grasp.geometry.point_clouds import nearer_half
+from dro_grasp.geometry.se3 import compose, invert, random_rotations, rotate
 from dro_grasp.hands.hand import Hand
-from dro_grasp.models.network import NetworkConfig
+from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.training.config import AugmentationConfig
 
 
@@ -42,7 +43,7 @@ class HandSamples:
 
 
 class SampleSource:
-    """Draws samples of the bundle's hands; all randomness comes from one generator."""
+    """Draws samples of the bundle's hands; all randomness comes from the generator of each call."""
 
     def __init__(
         self,
@@ -51,13 +52,13 @@ class SampleSource:
         augmentation: AugmentationConfig,
         device: torch.device | str = "cpu",
     ) -> None:
-        """Put everything on the device where samples are made.
+        """Put hands, grasps and objects on the device on which samples are drawn.
 
         Args:
             bundle: Hands, objects and grasps.
             network: Numbers of points, and the frame.
             augmentation: How a sample differs from the stored grasp.
-            device: Generators that samples are drawn with must be of the same device.
+            device: Device of the samples, and of the generators that draw them.
 
         Raises:
             BundleError: The bundle holds no grasps.
@@ -84,46 +85,47 @@ class SampleSource:
         points, normals = self._objects(grasps.object_index[chosen], generator)
         centre = points.mean(1)
         T_placed = self._placements(hand, T, generator)
-        own = self.network.axes(hand)
+        own = self.network.axes(hand.palm_axes_wrist)
         world = torch.eye(3, device=T.device).expand(count, 3, 3)
         axes = world if self.network.frame == "object" else T_placed[:, :3, :3] @ own
-        T_frame_object = _frame(axes, centre)
+        T_frame_object = invert(compose(axes, centre))
         opened = hand.random_open_joints(count, generator)
         T_frame_wrist = T_frame_object @ T
         about_centre = points - centre[:, None]
-        centre_of_grasp = (T[:, :3, :3] @ hand.grasp_centre_wrist) + T[:, :3, 3]
         return HandSamples(
             hand=hand, placed=hand.points(opened, T_frame_object @ T_placed), grasp=hand.points(q, T_frame_wrist),
             obj=about_centre @ axes, normals=normals @ axes,
             T_frame_link=T_frame_wrist[:, None] @ hand.tree.forward(q),
             obj_hand=about_centre @ (T[:, :3, :3] @ own),
             obj_random=about_centre @ random_rotations(count, generator),
-            position=((centre_of_grasp - centre)[:, None] @ (T[:, :3, :3] @ own))[:, 0],
+            position=((hand.grasp_centres(T) - centre)[:, None] @ (T[:, :3, :3] @ own))[:, 0],
         )
 
     def draw_motions(
         self, name: str, count: int, generator: torch.Generator
     ) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b n 3"]]:
-        """Placed open hands, and the same hands with other joint angles and a wrist as far off as placements are [m].
+        """Placed open hands, and the same hands with other joint values and a wrist pose as far off as placements are [m].
 
-        Half of the joint angles are those of grasps, the others uniform within the limits. Axes are those that the network
-        works in, random ones where these are the object's.
+        Half of the joint values are those of grasps, the others are uniform within the limits. Axes are the network's; they
+        are random where these are the object's.
         """
         hand, grasps = self.hands[name], self.grasps[name]
         chosen = torch.randint(len(grasps.joints), (count,), generator=generator, device=generator.device)
-        drawn = hand.random_joints(count, generator)
         known = torch.rand(count, 1, generator=generator, device=generator.device) < 0.5
-        q = torch.where(known, grasps.joints[chosen], drawn)
-        wrist = torch.eye(4, device=generator.device).repeat(count, 1, 1)
-        moved = torch.linalg.inv(self._placements(hand, wrist, generator))
-        turn = random_rotations(count, generator) if self.network.frame == "object" else self.network.axes(hand).mT
-        for T in (wrist, moved):
-            T[:, :3] = turn @ T[:, :3]
+        q = torch.where(known, grasps.joints[chosen], hand.random_joints(count, generator))
+        if self.network.frame == "object":
+            turn = random_rotations(count, generator)
+        else:
+            turn = self.network.axes(hand.palm_axes_wrist).mT.expand(count, 3, 3)
+        wrist = compose(turn, turn.new_zeros(3))
+        near = self._placements(hand, torch.eye(4, device=generator.device).repeat(count, 1, 1), generator)
         opened = hand.random_open_joints(count, generator)
-        return hand.points(opened, wrist), hand.points(q, moved)
+        return hand.points(opened, wrist), hand.points(q, wrist @ invert(near))
 
-    def _objects(self, index: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Random object points with noise, and their normals (b m 3)."""
+    def _objects(
+        self, index: Int[Tensor, " b"], generator: torch.Generator
+    ) -> tuple[Float[Tensor, "b m 3"], Float[Tensor, "b m 3"]]:
+        """Random object points with noise [m], and their normals."""
         m, device = self.network.n_object, generator.device
         twice = torch.randint(self.points.shape[1], (len(index), 2 * m), generator=generator, device=device)
         direction = torch.randn(len(index), 3, generator=generator, device=device)
@@ -139,18 +141,8 @@ class SampleSource:
         turn = random_turns(len(T), self.augmentation.placement_rotation, generator)
         centre = hand.grasp_centre_wrist
         shift = torch.randn(len(T), 3, generator=generator, device=generator.device) * self.augmentation.placement_shift
-        placed = T.clone()
-        placed[:, :3, :3] = T[:, :3, :3] @ turn
-        placed[:, :3, 3] += (T[:, :3, :3] @ (centre - turn @ centre)[..., None])[..., 0] + shift
-        return placed
-
-
-def _frame(axes: Float[Tensor, "b 3 3"], centre: Float[Tensor, "b 3"]) -> Float[Tensor, "b 4 4"]:
-    """T_frame_object of a frame with these axes at this place."""
-    T = torch.eye(4, device=axes.device).repeat(len(axes), 1, 1)
-    T[:, :3, :3] = axes.mT
-    T[:, :3, 3] = -(axes.mT @ centre[..., None])[..., 0]
-    return T
+        moved = rotate(T[:, :3, :3], centre - rotate(turn, centre)) + shift
+        return compose(T[:, :3, :3] @ turn, T[:, :3, 3] + moved)
 
 
 def random_turns(count: int, largest: float, generator: torch.Generator) -> Float[Tensor, "count 3 3"]:
@@ -158,9 +150,3 @@ def random_turns(count: int, largest: float, generator: torch.Generator) -> Floa
     axis = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, device=generator.device), dim=-1)
     angle = torch.rand(count, 1, generator=generator, device=generator.device) * largest
     return roma.rotvec_to_rotmat(axis * angle)
-
-
-def random_rotations(count: int, generator: torch.Generator) -> Float[Tensor, "count 3 3"]:
-    """Rotations uniform on SO(3)."""
-    quaternion = torch.randn(count, 4, generator=generator, device=generator.device)
-    return roma.unitquat_to_rotmat(torch.nn.functional.normalize(quaternion, dim=-1))

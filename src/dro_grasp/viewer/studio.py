@@ -150,7 +150,7 @@ class Studio(ServedPage):
             self.direction = gui.add_dropdown(
                 "Palm direction", (ANY, *HALF_AXES), initial_value=ANY, hint="-z grasps from above.")
             self.temperature = gui.add_slider(
-                "Variety", 0.0, 1.0, 0.05, min(1.0, self.predictor.network.config.latent_temperature),
+                "Variety", 0.0, 1.0, 0.05, 1.0,
                 hint="0: the likeliest grasp of each placement.")
             self.protocol = gui.add_dropdown("Trial", tuple(PROTOCOLS), initial_value="strict")
             self.button = gui.add_button("Generate", color="green")

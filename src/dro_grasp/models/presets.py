@@ -1,0 +1,124 @@
+"""The network's configuration, and the named configurations that training offers."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dro_grasp.errors import OptionError
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Sizes and forms. The defaults are the paper's."""
+
+    n_hand: int = 512
+    """Points of the hand's cloud."""
+    n_object: int = 512
+    """Points of the object's cloud."""
+    width: int = 512
+    """Feature dimension D."""
+    encoder_widths: tuple[int, ...] = (64, 64, 128, 256, 512)
+    """Outputs of the edge layers."""
+    neighbours: int = 32
+    """K of the encoders' graphs."""
+    heads: int = 4
+    """Attention heads."""
+    attention_hidden: int = 1024
+    """Hidden width of the transformers' feed-forward layers."""
+    latent: int = 64
+    """Dimension of z."""
+    latent_widths: tuple[int, ...] = (64, 64, 128, 256)
+    """Edge layers of the latent encoder."""
+    latent_head: tuple[int, int] = (512, 256)
+    """Fully connected layers of the latent encoder."""
+    latent_neighbours: int = 20
+    """K of the latent encoder's graph."""
+    frame: Literal["object", "wrist", "palm"] = "object"
+    """Axes of both clouds. With `object`, the paper's form, the hand is zero-centred and its placement discarded. With `wrist`
+    or `palm` the network knows the placement, and adds the kernel to the distances of the placed open hand. The wrist's axes
+    are those that each description chooses; the palm's mean the same for every hand."""
+    latent_form: Literal["kernel", "motion"] = "kernel"
+    """z enters the kernel alone (the paper's form), or also moves the placed open hand."""
+    prior: Literal["standard", "learned", "flow"] = "standard"
+    """Distribution of z at inference: N(0, I) (the paper's form), or a Gaussian or a flow learned from hand and object."""
+    kernel_hidden: tuple[int, int] = (300, 100)
+    """Hidden layers of the kernel."""
+    initial_distance: float = 0.1
+    """Distance that an untrained kernel predicts [m]; softplus alone starts at 0.69."""
+    placement_width: int = 128
+    """Width of the placement prior."""
+    placement_components: int = 8
+    """Components of its mixture."""
+    placement_temperature: float = 0.7
+    """Scale of the spread of placements drawn at inference."""
+
+    def __post_init__(self) -> None:
+        """Refuse forms that contradict each other."""
+        if self.latent_form == "motion" and not self.placed:
+            raise OptionError("latent_form 'motion' moves the placed open hand, but in frame 'object' the network knows no "
+                              "placement; choose frame 'palm', as the presets slim and multi do")
+
+    @property
+    def placed(self) -> bool:
+        """Whether the network knows where the open hand is; the paper's discards it."""
+        return self.frame != "object"
+
+    def axes(self, palm_axes: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+        """The hand's axes in which the network works, as columns in the wrist frame.
+
+        Args:
+            palm_axes: The hand's `palm_axes_wrist`.
+        """
+        return palm_axes if self.frame == "palm" else torch.eye(3, device=palm_axes.device)
+
+    def differences(self, other: NetworkConfig) -> dict[str, tuple[Any, Any]]:
+        """Settings in which two configurations differ: (own, other) by name."""
+        pairs = {f.name: (getattr(self, f.name), getattr(other, f.name)) for f in dataclasses.fields(self)}
+        return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
+
+    @staticmethod
+    def preset(name: str) -> NetworkConfig:
+        """A named configuration: `paper` (about 14 M parameters), `slim`, or `multi`, that of the shipped weights (1.5 M).
+
+        Raises:
+            OptionError: No configuration has the name.
+        """
+        if name not in PRESETS:
+            raise OptionError(f"no network is called '{name}'; choose {', '.join(PRESETS)}")
+        return PRESETS[name]
+
+    @staticmethod
+    def from_dict(values: dict[str, Any]) -> NetworkConfig:
+        """From plain values, as a weights file stores them; lists become tuples.
+
+        Raises:
+            ValueError: A setting is unknown, or one that is no longer a choice has another value than it has now.
+        """
+        plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+        placed = plain.get("frame", "object") != "object"
+        for name, fixed in {"placed": placed, "residual": placed, "latent_temperature": 1.0}.items():
+            if plain.pop(name, fixed) != fixed:
+                raise ValueError(f"{name} is no longer a choice; it is {fixed} now, and {values[name]} in the file")
+        if unknown := sorted(plain.keys() - {f.name for f in dataclasses.fields(NetworkConfig)}):
+            raise ValueError(f"unknown settings {', '.join(unknown)}")
+        return NetworkConfig(**plain)
+
+
+SLIM = NetworkConfig(
+    n_hand=160, n_object=128, width=128, encoder_widths=(32, 32, 64, 128), neighbours=16, attention_hidden=256,
+    latent_widths=(32, 32, 64), latent_head=(128, 128), latent_neighbours=12, kernel_hidden=(128, 64), frame="palm",
+    placement_temperature=0.3,
+)
+"""A network narrow enough to train on a CPU, with the paper's latent; it knows the placement. Source: ours."""
+PRESETS = {
+    "paper": NetworkConfig(),
+    "slim": SLIM,
+    "multi": dataclasses.replace(SLIM, latent=32, latent_form="motion", prior="flow"),
+}
+"""Configurations by name (`NetworkConfig.preset`)."""

@@ -1,0 +1,115 @@
+"""The folder of a training run: its log, and the checkpoint from which it resumes."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any
+
+import torch
+
+from dro_grasp.errors import OutputError, TrainingError
+
+CHECKPOINT = "checkpoint.pt"
+"""File with everything that a run needs to resume."""
+LOG = "log.jsonl"
+"""File with one JSON object a line: step, seconds, learning rate and mean losses."""
+ENTRIES = ("step", "seconds", "model", "average", "optimiser", "plan")
+"""Entries of a checkpoint."""
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Log and checkpoint of one run; where several processes train, the first alone uses it."""
+
+    path: Path
+
+    def write_checkpoint(self, state: dict[str, Any]) -> None:
+        """Replace the checkpoint, whole or not at all.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        path, temporary = self.path / CHECKPOINT, self.path / f"{CHECKPOINT}.part"
+        try:
+            with writing_into(self.path):
+                torch.save(state, temporary)
+                os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+    def read_checkpoint(self, plan: dict[str, Any]) -> dict[str, Any] | None:
+        """The checkpoint; None where there is none.
+
+        Args:
+            plan: What determines a run's curve, beside model and data: the checkpoint must have the same.
+
+        Raises:
+            TrainingError: The checkpoint is damaged, or of a run with another plan.
+        """
+        path = self.path / CHECKPOINT
+        if not path.is_file():
+            return None
+        try:
+            state = torch.load(path, weights_only=True, map_location="cpu")
+            _ = [state[key] for key in ENTRIES]
+        except (RuntimeError, LookupError, TypeError, ValueError, EOFError, OSError, UnpicklingError) as error:
+            raise self.misfit(error) from error
+        for name, asked in plan.items():
+            if state["plan"].get(name) != asked:
+                raise TrainingError(f"{path} belongs to a run with {name} {state['plan'].get(name)}, {asked} was asked for; "
+                                    "use the same to resume, or another folder")
+        return state
+
+    def misfit(self, error: Exception) -> TrainingError:
+        """The error of a checkpoint that cannot be used."""
+        reason = str(error).partition("\n")[0] or "it is empty"
+        return TrainingError(f"{self.path / CHECKPOINT} does not fit this training ({reason}); use another folder, or the "
+                             "configuration it was made with")
+
+    def append_to_log(self, line: dict[str, float]) -> None:
+        """Write one line of the log.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        with writing_into(self.path), (self.path / LOG).open("a") as file:
+            file.write(json.dumps(line) + "\n")
+
+    def cut_log(self, step: int) -> None:
+        """Drop the lines after a step, among them one that was cut short."""
+        log = self.path / LOG
+        if not log.is_file():
+            return
+        kept = []
+        for line in log.read_text().splitlines():
+            try:
+                if json.loads(line)["step"] <= step:
+                    kept.append(line)
+            except json.JSONDecodeError:
+                break
+        log.write_text("".join(line + "\n" for line in kept))
+
+
+def last_logged(folder: Path) -> dict[str, float]:
+    """The last line of a run's log: steps, seconds and losses at its end."""
+    return json.loads((folder / LOG).read_text().splitlines()[-1])
+
+
+@contextmanager
+def writing_into(folder: Path) -> Iterator[None]:
+    """Explain a full disk or a missing permission; PyTorch's writer raises RuntimeError for both.
+
+    Raises:
+        OutputError: The block could not write.
+    """
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        raise OutputError(f"cannot write into {folder}: {error}; free some space, or make it writable, and start again: the "
+                          "run resumes from its last checkpoint") from error
