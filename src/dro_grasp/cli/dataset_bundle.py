@@ -1,4 +1,4 @@
-"""`dro-grasp dataset bundle`: all that training needs in one file."""
+"""`dro-grasp dataset bundle`: one file for training."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ class BundleCommand:
     """
 
     inputs: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders that `dro-grasp synthesize` filled, folders of grasp files, or grasp files."""
+    """Output folders of `dro-grasp synthesize`, folders of grasp files, or grasp files."""
     output: Path
-    """The bundle to write."""
+    """Bundle to write (.safetensors)."""
     split: Literal["train", "few_shot", "validate"] = "train"
-    """What goes in: grasps that may be trained on, those of held-out hands for fine-tuning studies, or those on objects that
-    no weights are trained on, to measure weights with."""
+    """Grasps to include. train: for training. few_shot: of held-out hands, for fine-tuning. validate: on objects that no
+    weights are trained on, for measuring."""
     hands: tuple[str, ...] = ()
-    """Only these hands; all when none is named."""
+    """Hands to include; by default all."""
     per_pair: Annotated[int | None, optional("N", "all")] = None
-    """Most grasps of a hand on an object; of more, those that spread best over palm directions are kept."""
-    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Limit of grasps of a hand on an object; those that cover palm directions best are kept."""
+    json: Flag = False
     """Print one JSON object instead of a table."""
 
     def run(self) -> int:
-        """Take the grasps of the split, find their hands and objects, write."""
+        """Select the grasps of the split, find their hands and objects, write the bundle."""
         from dro_grasp.datasets.bundle.bundling import make_bundle
         from dro_grasp.files import check_output
 
         check_output(self.output)
         bundle, left_out = make_bundle(self.inputs, self.output, self.split, self.hands, self.per_pair)
         if left_out:
-            say_aside(f"{left_out} grasps that are not of split '{self.split}' are left out")
+            say_aside(f"{left_out} grasps outside split '{self.split}' are left out")
         report = {"output": str(self.output), "bytes": self.output.stat().st_size, **bundle.summary()}
         if self.json:
             print_json(report)

@@ -1,4 +1,4 @@
-"""`dro-grasp dataset import`: other projects' grasps as grasp files."""
+"""`dro-grasp dataset import`: grasps of other projects as grasp files."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from dro_grasp.cli.output import optional, print_json, print_table, say_aside
 
 @dataclass(frozen=True)
 class Import:
-    """Turn grasps of other data sets into grasp files, to try them, filter them and train on them.
+    """Convert grasps of other data sets into grasp files, to evaluate, filter and train on.
 
     Example: dro-grasp dataset import cmap_dataset.pt --format cmap --hands barrett=assets/barrett_multidex --output imported
     """
 
     inputs: tyro.conf.Positional[tuple[Path, ...]]
-    """`cmap_dataset.pt` of the official release, or npy files of DexGraspNet or DexGraspBench."""
+    """`cmap_dataset.pt` of the official D(R,O) release, or npy files of DexGraspNet or DexGraspBench."""
     format: Literal["cmap", "dexgraspnet", "dexgraspbench"]
-    """Whose files they are."""
+    """Format of the files."""
     output: Path
-    """Folder for one grasp file a hand; made when only itself is missing."""
+    """Folder for one grasp file per hand; created if missing, inside an existing folder."""
     hands: tuple[str, ...] = ()
-    """Names or paths of the hands, as NAME_IN_FILE=NAME_HERE where they differ; for files that name no hand, just one."""
-    object: Annotated[str | None, optional("NAME|PATH", "the one that the file names")] = None
-    """Object of all grasps, for files that name it otherwise or not at all."""
-    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Names or paths of the hands; NAME_IN_FILE=NAME renames one. Files that name no hand need exactly one."""
+    object: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
+    """Object of all grasps, if the file names another or none."""
+    json: Flag = False
     """Print one JSON object instead of a table."""
 
     def run(self) -> int:
-        """Read all files, find hands and objects, write."""
+        """Read all files, find hands and objects, write grasp files."""
         from dro_grasp.datasets.collections.importing import import_grasps
         from dro_grasp.datasets.collections.merging import file_name
         from dro_grasp.errors import GraspFileError
@@ -59,5 +59,5 @@ class Import:
             print_json({"files": [dict(zip(keys, row, strict=True)) for row in rows], "missing": missing})
         else:
             print_table("imported", ["hand", "objects", "grasps", "file"], rows,
-                        note="`dro-grasp dataset filter` keeps those that hold")
+                        note="`dro-grasp dataset filter` keeps those that pass a trial")
         return 0 if rows else 2

@@ -1,4 +1,4 @@
-"""`dro-grasp dataset report`: a data set as one web page."""
+"""`dro-grasp dataset report`: statistics of a data set."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from dro_grasp.cli.output import optional, print_json, print_table, progress_bar
 
 @dataclass(frozen=True)
 class Report:
-    """Say how a data set was made and how its grasps spread: yields, failures, palm directions, rolls, sizes, joints.
+    """Report yields, failures and diversity of a data set: palm directions, wrist rolls, grasp sizes, joints.
 
     Example: dro-grasp dataset report data --output report.html
     """
 
     inputs: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders that `dro-grasp synthesize` filled, folders of grasp files, or grasp files."""
+    """Output folders of `dro-grasp synthesize`, folders of grasp files, or grasp files."""
     output: Annotated[Path | None, optional("PATH", "no page")] = None
-    """Self-contained HTML page with pictures."""
-    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Self-contained HTML page with charts and pictures."""
+    json: Flag = False
     """Print one JSON object instead of a table."""
 
     def run(self) -> int:

@@ -10,7 +10,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from dro_grasp.cli.output import load_grasps, optional, print_json, print_table, progress_bar, say_aside
+from dro_grasp.cli.grasp_files import load_grasps
+from dro_grasp.cli.output import optional, print_json, print_table, progress_bar, say_aside
 from dro_grasp.grasps.sources import hand_of, object_of
 
 

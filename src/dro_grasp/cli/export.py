@@ -1,4 +1,4 @@
-"""`dro-grasp export`: grasps for other programs and for robots."""
+"""`dro-grasp export`: grasps for other software and for robots."""
 
 from __future__ import annotations
 
@@ -8,16 +8,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from dro_grasp.cli.output import load_grasps, optional, print_json, say
+from dro_grasp.cli.grasp_files import load_grasps
+from dro_grasp.cli.output import Flag, optional, print_json, say
 from dro_grasp.export.formats import FORMATS, ExportJob
 
 if TYPE_CHECKING:
     from dro_grasp.export.frame import Frame
     from dro_grasp.grasps.batch import GraspBatch
 
+
 @dataclass(frozen=True)
 class Export:
-    """Write the grasps of a file in another program's format.
+    """Export grasps in the format of other software.
 
     Example: dro-grasp export grasps.parquet --format isaac_grasp --output grasps.yaml
     """
@@ -28,16 +30,16 @@ class Export:
         constructor=tyro.extras.literal_type_from_choices(FORMATS),
         help=" ".join(f"{name}: {form.explanation}." for name, form in FORMATS.items()))]
     output: Path
-    """File to write; a folder, made when it is missing, for dexgraspbench and for grasps of several objects."""
+    """File to write. For dexgraspbench and for several objects: a folder, created if missing."""
     frame: Annotated[Path | None, optional("JSON", "the object's frame")] = None
-    """File with {"frame": "camera", "T_frame_object": 4x4}: poses are given in that frame."""
-    only_successful: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Leave out grasps that failed their trial or had none."""
+    """File with {"frame": "camera", "T_frame_object": 4x4}, the frame for the exported poses."""
+    only_successful: Flag = False
+    """Export only grasps that passed their trial."""
     hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
-    """Hand to use instead of the one that the file names or remembers."""
+    """Hand to use instead of the one named in the file."""
     object: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
-    """Object to use, likewise, where pregrasps are missing."""
-    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Object to use instead, if pregrasps are missing."""
+    json: Flag = False
     """Print one JSON object."""
 
     def run(self) -> int:
@@ -66,14 +68,14 @@ class Export:
         return 0
 
     def _load(self) -> GraspBatch:
-        """The grasps that are asked for."""
+        """The requested grasps."""
         from dro_grasp.errors import GraspFileError
 
         grasps = load_grasps(self.file)
         if not self.only_successful:
             return grasps
         if not bool(grasps.success.any()):
-            raise GraspFileError(f"no grasp in {self.file} has succeeded in a trial; run trials with `dro-grasp evaluate`, or "
+            raise GraspFileError(f"no grasp in {self.file} has passed a trial; run trials with `dro-grasp evaluate`, or "
                                  "leave out --only-successful")
         return grasps[grasps.success]
 
@@ -93,7 +95,7 @@ class Export:
 
 
 def write(content: bytes | list[bytes], path: Path, suffix: str) -> list[Path]:
-    """The files of one object: one at the path, or one per grasp in the folder of that name."""
+    """Write one file at the path, or one per grasp in a folder of that name; returns their paths."""
     from dro_grasp.files import make_folder, replacing
 
     files = {path: content} if isinstance(content, bytes) else {

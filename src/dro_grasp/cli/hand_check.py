@@ -1,4 +1,4 @@
-"""`dro-grasp hand`: work with hand descriptions."""
+"""`dro-grasp hand`: commands for hand descriptions."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from dro_grasp.cli.output import optional, print_json, say
 
 @dataclass(frozen=True)
 class Check:
-    """Say what was derived from a hand description and what is wrong with it, and draw it.
+    """Check a hand description: report what is derived from it and what is wrong with it, and draw it.
 
     Example: dro-grasp hand check my_hand.urdf --picture my_hand.png
     """
 
     hand: tyro.conf.Positional[str]
-    """A hand's name or the path of its URDF or MJCF file."""
+    """Name of a hand, or path of a URDF or MJCF file."""
     picture: Annotated[Path | None, optional("PNG", "none")] = None
-    """PNG of the hand open and closed, with palm direction and contact links."""
-    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """PNG file with the hand open and closed, its palm direction and its contact links."""
+    json: Flag = False
     """Print one JSON object instead of text."""
 
     def run(self) -> int:
@@ -48,7 +48,7 @@ class Check:
 
 @dataclass(frozen=True)
 class HandCommand:
-    """Work with hand descriptions."""
+    """Check and list hands."""
 
     command: Annotated[Check, tyro.conf.subcommand("check")] | Annotated[Hands, tyro.conf.subcommand("list")]
 

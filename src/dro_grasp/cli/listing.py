@@ -1,25 +1,21 @@
-"""`dro-grasp hands` and `objects`: what there is."""
+"""`dro-grasp hands` and `objects`: names of hands and objects."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import tyro
-
-from dro_grasp.cli.output import print_json, print_table
-
-Flag = tyro.conf.FlagCreatePairsOff[bool]
+from dro_grasp.cli.output import Flag, print_json, print_table
 
 
 @dataclass(frozen=True)
 class Hands:
-    """List the hands that have names. Any URDF or MJCF file works as well."""
+    """List hands by name. Any URDF or MJCF file works as well."""
 
     json: Flag = False
     """Print one JSON object."""
 
     def run(self) -> int:
-        """Print names and where they come from."""
+        """Print names and their sources."""
         from dro_grasp.hands.library import hand_names
 
         names = hand_names()
@@ -27,13 +23,13 @@ class Hands:
             print_json({"hands": names})
         else:
             print_table("hands", ["name", "from"], [[n, o] for n, o in names.items()],
-                        note="or the path of a URDF or MJCF file, or a robot_descriptions name")
+                        note="also: the path of a URDF or MJCF file, or a robot_descriptions name")
         return 0
 
 
 @dataclass(frozen=True)
 class Objects:
-    """List the objects that have names. Any mesh or point cloud file works as well."""
+    """List objects by name. Any mesh or point cloud file works as well."""
 
     json: Flag = False
     """Print one JSON object."""
@@ -47,5 +43,5 @@ class Objects:
             print_json({"objects": names})
         else:
             print_table("objects", ["name", "split"], [[n, s] for n, s in names.items()],
-                        note="or the path of a mesh or point cloud")
+                        note="also: the path of a mesh or point cloud")
         return 0

@@ -1,4 +1,4 @@
-"""The `dro-grasp` command: parses, runs one command, and turns errors into messages and exit codes."""
+"""The `dro-grasp` command: it parses and runs one command, and turns errors into messages and exit codes."""
 
 from __future__ import annotations
 
@@ -18,14 +18,21 @@ from dro_grasp.cli.generate import Generate
 from dro_grasp.cli.hand_check import HandCommand
 from dro_grasp.cli.listing import Hands, Objects
 from dro_grasp.cli.onboard import Onboard
+from dro_grasp.cli.picture import Picture
 from dro_grasp.cli.synthesize import Synthesize
 from dro_grasp.cli.train import Pretrain, Train
-from dro_grasp.cli.view import Picture, View
+from dro_grasp.cli.view import View
 from dro_grasp.cli.weights import Weights
 from dro_grasp.errors import DroGraspError
 
-DONE, OUR_FAULT, BAD_INPUT = 0, 1, 2
-"""Exit codes."""
+DONE = 0
+"""Exit code of a command that succeeded."""
+INTERNAL_ERROR = 1
+"""Exit code after a fault of dro-grasp."""
+BAD_INPUT = 2
+"""Exit code after invalid input."""
+INTERRUPTED = 130
+"""Exit code after Ctrl-C: 128 plus the number of SIGINT, as shells have it."""
 
 named = tyro.conf.subcommand
 Command = (
@@ -49,23 +56,23 @@ Command = (
 
 
 def parse(arguments: Sequence[str]) -> Any:
-    """The command that the arguments ask for, not yet run.
+    """Parse the arguments into a command.
 
     Raises:
-        SystemExit: With code 2 after a message about wrong arguments, with 0 after `--help`.
+        SystemExit: With code 2 after a message about invalid arguments, with code 0 after `--help`.
     """
     return tyro.cli(
         Command,  # type: ignore[arg-type]
         prog="dro-grasp",
         description="Any robot hand description in, simulation-checked dexterous grasps out. "
-        "--version prints the version; --verbose, anywhere, shows tracebacks.",
+        "--version prints the version; --verbose, at any place, shows tracebacks.",
         args=list(arguments),
         config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
     )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns its exit code: 0 done, 2 bad input, 1 our fault."""
+    """Run one command, and return its exit code: 0 for success, 2 for invalid input, 1 for an internal error."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments in (["--version"], ["-V"]):
         print(f"dro-grasp {__version__}")
@@ -82,11 +89,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return BAD_INPUT
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
-        return 130
+        return INTERRUPTED
     except Exception as error:
         if verbose:
             traceback.print_exc()
         else:
-            print(f"internal error: {type(error).__name__}: {error}\nThis is a fault of dro-grasp, not of your input. "
+            print(f"internal error: {type(error).__name__}: {error}\nThis is a bug in dro-grasp, not in your input. "
                   "Run again with --verbose and report the traceback.", file=sys.stderr)
-        return OUR_FAULT
+        return INTERNAL_ERROR

@@ -1,4 +1,4 @@
-"""`dro-grasp onboard`: a new hand in one command."""
+"""`dro-grasp onboard`: everything for a new hand in one command."""
 
 from __future__ import annotations
 
@@ -13,34 +13,34 @@ from dro_grasp.cli.output import optional, print_json, say, say_aside
 
 @dataclass(frozen=True)
 class Onboard:
-    """Check a hand, make grasps for it, fine-tune weights on them, and report what they hold, before and after.
+    """Check a new hand, synthesize grasps, fine-tune weights on them, and report success rates before and after.
 
     Example: dro-grasp onboard my_hand.urdf --output my_hand --minutes 30
     """
 
     hand: tyro.conf.Positional[str]
-    """The path of its URDF or MJCF file, or a name."""
+    """Path of a URDF or MJCF file, or name of a hand."""
     output: Path
-    """Folder for data, weights and report; a rerun goes on in it."""
+    """Folder for data, weights and report. A rerun resumes there."""
     objects: tuple[str, ...] = ("builtin:train",)
-    """Objects that grasps are made of: names, meshes, folders, or groups."""
+    """Objects to synthesize grasps of: names, meshes, folders or groups."""
     held_out: tuple[str, ...] = ("builtin:test",)
-    """Objects that the weights are tried on, and never trained on."""
+    """Objects to evaluate the weights on, never used in training."""
     minutes: float = 30.0
-    """Time for data, training and trials together."""
+    """Total time for data, training and trials [min]."""
     num: int = 20
-    """Grasps of each held-out object that are tried."""
+    """Grasps to evaluate on each held-out object."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Weights to fine-tune."""
     workers: int = 2
-    """Processes that make grasps."""
+    """Processes that synthesize grasps."""
     seed: int = 0
-    """Of everything."""
-    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Seed of data, training and trials."""
+    json: Flag = False
     """Print one JSON object at the end."""
 
     def run(self) -> int:
-        """All steps, then the report."""
+        """Run all steps, then write the report."""
         from dro_grasp.objects.catalogue import resolve_objects
         from dro_grasp.onboarding.report import write_report
         from dro_grasp.onboarding.steps import WEIGHTS, OnboardingConfig, onboard

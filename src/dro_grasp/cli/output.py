@@ -1,4 +1,4 @@
-"""How commands talk: tables and messages for people, one JSON object for programs, progress on stderr."""
+"""Output of the commands: tables and messages for people, one JSON object for programs, progress on stderr."""
 
 from __future__ import annotations
 
@@ -6,38 +6,36 @@ import json
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-if TYPE_CHECKING:
-    from dro_grasp.grasps.batch import GraspBatch
+Flag = tyro.conf.FlagCreatePairsOff[bool]
+"""A switch that is off by default and has no --no- form."""
 
 stdout = Console(highlight=False, markup=False)
 stderr = Console(stderr=True, highlight=False, markup=False)
 
 
 def say(text: str) -> None:
-    """One line on stdout, never broken: paths stay whole."""
+    """Print one line to stdout without wrapping, so that paths stay whole."""
     stdout.print(text, soft_wrap=True)
 
 
 def say_aside(text: str) -> None:
-    """One line on stderr, never broken."""
+    """Print one line to stderr without wrapping."""
     stderr.print(text, soft_wrap=True)
 
 
 def optional(metavar: str, default: str) -> Any:
-    """How an option that may be left out is listed in --help, with what happens then."""
+    """Help settings of an option without a default value: its metavar, and a description of the default."""
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})")
 
 
 def print_json(values: dict[str, Any]) -> None:
-    """One JSON object on stdout; numbers that are not finite become null."""
+    """Print one JSON object to stdout; numbers that are not finite become null."""
     print(json.dumps(_plain(values)))
 
 
@@ -52,7 +50,7 @@ def _plain(value: Any) -> Any:
 
 
 def print_table(title: str, columns: list[str], rows: list[list[Any]], note: str = "") -> None:
-    """A table for people."""
+    """Print a table for people."""
     table = Table(title=title, title_justify="left")
     for column in columns:
         table.add_column(column, justify="left" if column in {"name", "hand", "object", "reason", "from"} else "right")
@@ -75,26 +73,13 @@ def _cell(value: Any) -> str:
 
 @contextmanager
 def progress_bar(title: str, quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
-    """A bar on stderr that is fed with (done, wanted); nothing when quiet."""
+    """A progress bar on stderr; the block calls its value with (done, total), or gets None if quiet."""
     if quiet:
         yield None
         return
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with Progress(*columns, console=stderr, transient=True) as bar:
         task = bar.add_task(title, total=None)
-        yield lambda done, wanted: bar.update(task, completed=done, total=wanted)
-
-
-def load_grasps(path: Path) -> GraspBatch:
-    """A grasp file with at least one grasp in it.
-
-    Raises:
-        GraspFileError: No such file, a foreign one, or an empty one.
-    """
-    from dro_grasp.errors import GraspFileError
-    from dro_grasp.grasps.batch import GraspBatch
-
-    grasps = GraspBatch.load(path)
-    if len(grasps) == 0:
-        raise GraspFileError(f"{path} holds no grasp; generate again, perhaps without --only-successful")
-    return grasps
+        yield lambda done, total: bar.update(task, completed=done, total=total)

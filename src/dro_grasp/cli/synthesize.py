@@ -1,4 +1,4 @@
-"""`dro-grasp synthesize`: grasp data for any hand."""
+"""`dro-grasp synthesize`: a grasp data set for any hand."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
-
-import tyro
 
 from dro_grasp.cli.output import optional, print_json, print_table, say_aside
 
@@ -18,40 +16,40 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Synthesize:
-    """Make grasps from geometry alone and keep those that pass a trial; a rerun goes on where it stopped.
+    """Synthesize grasps from geometry alone, and keep those that pass a trial. A rerun resumes.
 
     Example: dro-grasp synthesize --hand my_hand.urdf --object bottle can --grasps 50 --output data
     """
 
     hand: tuple[str, ...]
-    """Hands: names or paths."""
+    """Names or paths of hands."""
     object: tuple[str, ...]
-    """Objects: names, meshes, folders of meshes, or groups such as builtin:train and assets:validate."""
+    """Names, meshes, folders of meshes, or groups such as builtin:train and assets:validate."""
     output: Path
-    """Folder for the grasp files; its parent must exist."""
+    """Folder for the grasp files; created if missing, inside an existing folder."""
     grasps: int = 150
-    """Valid grasps of each hand and object; a rerun with more adds the rest."""
+    """Valid grasps of each hand on each object. A rerun with a larger number adds the difference."""
     minutes: Annotated[float | None, optional("MINUTES", "no limit")] = None
-    """Begin no more work after this time; a rerun goes on."""
+    """Start no new work after this time [min]. A rerun resumes."""
     workers: int = 2
-    """Processes of one thread each; on a running Ray cluster, all of its CPUs are used instead."""
+    """Processes of one thread each. A running Ray cluster uses all its CPUs instead."""
     engine: Literal["local", "ray"] = "local"
-    """Where the work is done: processes of this machine, or a Ray cluster."""
-    ray_address: Annotated[str | None, optional("HOST:PORT", "RAY_ADDRESS, or a new one here")] = None
-    """Head of the Ray cluster; `auto` for the one that runs on this machine."""
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Where energies are computed; trials always run on the CPU."""
+    """Processes on this machine, or a Ray cluster."""
+    ray_address: Annotated[str | None, optional("HOST:PORT", "RAY_ADDRESS, or a new local cluster")] = None
+    """Head of the Ray cluster, or `auto` for the cluster running on this machine."""
+    device: str = "cpu"
+    """Device for the energies: cpu, cuda or cuda:1. Trials always run on the CPU."""
     scale: float = 1.0
-    """Multiplies the coordinates of the objects: 0.001 for millimetres."""
+    """Factor for the coordinates of the objects: 0.001 for millimetres."""
     seed: int = 0
     """The same seed gives the same grasps."""
     protocol: Literal["strict", "dro"] = "strict"
-    """Trial that grasps must pass."""
-    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Protocol of the trial that grasps must pass."""
+    json: Flag = False
     """Print one JSON object instead of a table."""
 
     def run(self) -> int:
-        """Check numbers and names first, then fill the folder; code 2 if it holds no grasp because every pair failed."""
+        """Check numbers and names, then fill the folder; the exit code is 2 if every pair fails and there is no grasp."""
         from dro_grasp.datasets.engine.schedule import EngineConfig, require_known, synthesize_dataset
         from dro_grasp.objects.catalogue import resolve_objects
         from dro_grasp.optimization.synthesis import SynthesisConfig
@@ -77,11 +75,11 @@ class Synthesize:
         for failure in failures:
             say_aside(f"{failure['hand']} on {failure['object']}: {failure['reason']}")
         if code:
-            say_aside("error: no grasp was made, for the reasons above")
+            say_aside("error: no grasp was found, for the reasons above")
         return code
 
     def _check_numbers(self) -> None:
-        """Refuse numbers that nothing can be made with, by the names of their options."""
+        """Refuse invalid numbers by the names of their options."""
         from dro_grasp.errors import OptionError
 
         for option, value in (("--grasps", self.grasps), ("--workers", self.workers)):

@@ -1,4 +1,4 @@
-"""`dro-grasp weights`: what ships, what it was trained on, and whether it is unharmed."""
+"""`dro-grasp weights`: the shipped weights, their training data and their checksums."""
 
 from __future__ import annotations
 
@@ -8,20 +8,18 @@ from typing import Annotated, Any
 
 import tyro
 
-from dro_grasp.cli.output import print_json, print_table
-
-Flag = tyro.conf.FlagCreatePairsOff[bool]
+from dro_grasp.cli.output import Flag, print_json, print_table
 
 
 @dataclass(frozen=True)
 class List:
-    """List the shipped weights: size, checksum, and what they were trained on."""
+    """List the shipped weights with size, training data and checksum."""
 
     json: Flag = False
     """Print one JSON object."""
 
     def run(self) -> int:
-        """Print what each file says of itself."""
+        """Print the metadata of each file."""
         from dro_grasp.models.checkpoints import DEFAULT, describe_weights, weights_names
 
         found = [describe_weights(name) for name in weights_names()]
@@ -30,24 +28,24 @@ class List:
         else:
             rows = [[w["name"], w["parameters"], w["bytes"] / 1e6, trained_on(w["about"]), w["sha256"][:16]] for w in found]
             print_table("weights", ["name", "parameters", "MB", "trained on", "sha256"], rows,
-                        note=f"'{DEFAULT}' is used when none are named; `dro-grasp weights verify` checks the files")
+                        note=f"default: '{DEFAULT}'; `dro-grasp weights verify` checks the files")
         return 0
 
 
 @dataclass(frozen=True)
 class Verify:
-    """Compare weights with the checksums that ship beside them, and load them.
+    """Verify the checksums of weights, and load them.
 
     Example: dro-grasp weights verify
     """
 
     names: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Names of shipped weights, or paths of weights files, whose checksum is printed; all shipped ones when none is given."""
+    """Names of shipped weights, or paths of weights files; by default all shipped weights. The checksums are printed."""
     json: Flag = False
     """Print one JSON object."""
 
     def run(self) -> int:
-        """Check each file, then report on all; code 2 if one is not what it should be."""
+        """Check all files, then report; the exit code is 2 if one is damaged."""
         from dro_grasp.errors import WeightsError
         from dro_grasp.models.checkpoints import SMALL, verify_weights, weights_names
 
@@ -57,15 +55,15 @@ class Verify:
                 rows.append({"name": name, "sha256": verify_weights(name), "error": None})
             except WeightsError as error:
                 rows.append({"name": name, "sha256": None, "error": str(error)})
-        harmed = [row for row in rows if row["error"]]
+        damaged = [row for row in rows if row["error"]]
         if self.json:
-            print_json({"ok": not harmed, "weights": rows})
+            print_json({"ok": not damaged, "weights": rows})
         else:
-            if sound := [[row["name"], row["sha256"]] for row in rows if not row["error"]]:
-                print_table("weights", ["name", "sha256"], sound)
-            for row in harmed:
+            if intact := [[row["name"], row["sha256"]] for row in rows if not row["error"]]:
+                print_table("weights", ["name", "sha256"], intact)
+            for row in damaged:
                 print(f"error: {row['error']}", file=sys.stderr)
-        return 2 if harmed else 0
+        return 2 if damaged else 0
 
 
 @dataclass(frozen=True)
@@ -80,7 +78,7 @@ class Weights:
 
 
 def trained_on(about: dict[str, Any]) -> str:
-    """One line out of what a file says of its training."""
+    """Training data in one line."""
     data = about.get("data", {})
     if not data:
         return "-"
