@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from dro_grasp.cli.output import optional, print_json, print_table, progress_bar, say_aside
+from dro_grasp.cli.output import Flag, optional, print_json, print_table, progress_bar, say_aside
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from dro_grasp.cli.listing import Hands
-from dro_grasp.cli.output import optional, print_json, say
+from dro_grasp.cli.output import Flag, optional, print_json, say
 
 
 @dataclass(frozen=True)

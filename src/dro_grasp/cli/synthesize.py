@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from dro_grasp.cli.output import optional, print_json, print_table, say_aside
+from dro_grasp.cli.output import Flag, optional, print_json, print_table, say_aside
 
 if TYPE_CHECKING:
     from dro_grasp.datasets.engine.pools import Pool
