@@ -212,7 +212,7 @@ def test_dataset_bundle_packs_what_is_for_training(dataset: Path, capsys: pytest
     output = dataset / "bundle.safetensors"
     assert main(["dataset", "bundle", str(dataset / "data"), "--output", str(output), "--json"]) == 0
     said = capsys.readouterr()
-    assert "16 grasps that are not of split 'train' are left out" in said.err
+    assert "16 grasps outside split 'train' are left out" in said.err
     report = json.loads(said.out)
     assert report == {"output": str(output), "bytes": output.stat().st_size, "hands": {"gripper3": 8, "mine": 8},
                       "objects": 1, "grasps": 16}
