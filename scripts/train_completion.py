@@ -1,11 +1,12 @@
-"""Train the network that completes objects seen in part, on views of training objects whose whole surface is known.
+"""Train the network that completes objects seen in part, on views of training objects with known surfaces.
 
     python scripts/train_completion.py --folder FOLDER [--part K N] [--steps N] [--collect-only]
 
-Each object is seen as it is and stretched, by half and by a depth camera, from many sides; its true signed distance is asked
-for near its surface, near what symmetries guess, and around both. Views of one object are remembered in the folder, so that
-the script can be stopped and started again, and other processes can take other objects. Errors on objects left out are
-reported; the network that is written to the package has seen them all. Needs the development assets.
+Each object is viewed in its own and in stretched shapes, as half of a cloud and by a depth camera, from many sides. The
+network learns its true signed distance near its surface, near the surfaces that symmetries guess, and around both. The
+folder keeps the views of each object, so a stopped script resumes, and other processes can take other objects. The script
+reports errors on objects left out of a first fit; the network written to the package is fitted to all. Needs the
+development assets.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import torch
 import trimesh
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
@@ -33,40 +35,58 @@ from dro_grasp.perception.partial_views import seen_side
 
 Kind = Literal["half", "depth"]
 KINDS: tuple[Kind, ...] = ("half", "depth")
-"""How objects are seen."""
-SHAPES, SIDES, PLACES = 5, 4, 1536
-"""Shapes of each object, of which the first is its own; sides from which each is seen each way; places asked for in a view."""
+"""Kinds of view."""
+SHAPES = 5
+"""Shapes of each object; the first is its own, the others are stretched."""
+SIDES = 4
+"""Views of each shape of each kind."""
+PLACES = 1536
+"""Points with a true distance in a view."""
 STRETCH = (0.7, 1.35)
-"""Factors of a stretched object's extents."""
-BLUR, AROUND = 0.006, 0.02
-"""Distance of places from surfaces, as a standard deviation, and how far the others reach beyond both surfaces [m]."""
+"""Range of the factors of a stretched object's extents."""
+BLUR = 0.006
+"""Standard deviation of points about surfaces [m]."""
+AROUND = 0.02
+"""Margin of the other points beyond both surfaces [m]."""
 AWAY = 0.006
-"""Places that are this far from all seen points were not seen [m]."""
-DISTANCE, NOISE, FEWEST = (0.35, 0.7), (0.0, 0.0015), 40
-"""Cameras' distances and noise [m], and fewest points that they see."""
+"""Points at least this far from all seen points are unseen [m]."""
+DISTANCE = (0.35, 0.7)
+"""Range of the cameras' distances [m]."""
+NOISE = (0.0, 0.0015)
+"""Range of the cameras' noise [m]."""
+FEWEST = 40
+"""Fewest seen points of a view that is used."""
 STANDING = 0.5
-"""Share of depth images in which the vertical is known."""
+"""Share of depth images with a known up direction."""
 FARTHEST = 0.03
-"""Distances beyond this are all alike [m]."""
-VIEWS, SOME, RATE, DECAY, AVERAGE = 32, 384, 1e-3, 1e-4, 0.998
-"""Views in a batch, places of each; learning rate, weight decay, decay of the averaged weights."""
+"""Distances are clamped to plus and minus this [m]."""
+VIEWS = 32
+"""Views in a batch."""
+SOME = 384
+"""Points of each of them."""
+RATE = 1e-3
+"""Peak learning rate."""
+DECAY = 1e-4
+"""Weight decay."""
+AVERAGE = 0.998
+"""Decay of the moving average of the weights."""
 EVERY = 6
-"""One in so many objects is left out of the first fit."""
+"""One in this many objects is left out of the first fit."""
 
 
 class Views(NamedTuple):
-    """Places in v views."""
+    """Points in v views."""
 
-    guessed: Tensor
-    """(v n 5) [m]."""
-    features: Tensor
-    """(v n 20)."""
-    truth: Tensor
-    """(v n) [m]."""
-    kind: Tensor
-    """(v): index into KINDS."""
-    unseen: Tensor
-    """(v n): whether a place is away from all that was seen."""
+    guessed: Float[Tensor, "v n guesses"]
+    """Signed distances to the guessed surfaces [m]."""
+    features: Float[Tensor, "v n features"]
+    """Other features of the points."""
+    truth: Float[Tensor, "v n"]
+    """True signed distances [m]."""
+    kind: Int[Tensor, " v"]
+    """Index into KINDS."""
+    unseen: Bool[Tensor, "v n"]
+    """Whether a point is away from all seen points."""
 
 
 def stretched(obj: ObjectModel, rng: np.random.Generator) -> ObjectModel:
@@ -77,8 +97,10 @@ def stretched(obj: ObjectModel, rng: np.random.Generator) -> ObjectModel:
     return mesh_object(obj.name, mesh, origin=obj.name)
 
 
-def asked(obj: ObjectModel, kind: Kind, rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
-    """One view: guessed distances, features, true distances, and what is away from all seen; None where too little is seen."""
+def view_of(
+    obj: ObjectModel, kind: Kind, rng: np.random.Generator
+) -> tuple[Float[Tensor, "n guesses"], Float[Tensor, "n features"], Float[Tensor, " n"], Bool[Tensor, " n"]] | None:
+    """One view: guessed distances, features, true distances, and which points are unseen; None if too little is seen."""
     camera = DepthCamera(distance=rng.uniform(*DISTANCE), noise=rng.uniform(*NOISE))
     points, normals, place = seen_side(obj, kind, int(rng.integers(1 << 30)), camera)
     if len(points) < FEWEST:
@@ -111,7 +133,7 @@ def collect(label: str, seed: int) -> Views:
             print(f"{label}: {error}")
             continue
         for k, kind in enumerate(KINDS):
-            views = [view for view in (asked(obj, kind, rng) for _ in range(SIDES)) if view is not None]
+            views = [view for view in (view_of(obj, kind, rng) for _ in range(SIDES)) if view is not None]
             found += views
             kinds += [k] * len(views)
     guessed, features, truth, unseen = (torch.stack(column) for column in zip(*found, strict=True))
@@ -123,20 +145,22 @@ def joined(parts: list[Views]) -> Views:
     return Views(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
-def error(predicted: Tensor, truth: Tensor) -> Tensor:
-    """How far distances are off; it does not matter how far away a place is that is far away [m]."""
+def error(predicted: Float[Tensor, "*n"], truth: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Errors of clamped distances [m]."""
     return (predicted.clamp(-FARTHEST, FARTHEST) - truth.clamp(-FARTHEST, FARTHEST)).abs()
 
 
 def fit(views: Views, steps: int, seed: int) -> SurfaceNetwork:
-    """The averaged weights after so many steps."""
-    torch.manual_seed(seed)
+    """The averaged weights after the given number of steps."""
+    torch.manual_seed(seed)  # of the initial weights
+    generator = torch.Generator().manual_seed(seed)
     network = SurfaceNetwork(GUESSES, views.features.shape[-1])
     average = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(AVERAGE))
     optimiser = torch.optim.AdamW(network.parameters(), RATE, weight_decay=DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=steps, pct_start=0.05)
     for _ in range(steps):
-        view, place = torch.randint(len(views.truth), (VIEWS, 1)), torch.randint(views.truth.shape[1], (VIEWS, SOME))
+        view = torch.randint(len(views.truth), (VIEWS, 1), generator=generator)
+        place = torch.randint(views.truth.shape[1], (VIEWS, SOME), generator=generator)
         loss = error(network(views.guessed[view, place], views.features[view, place]), views.truth[view, place]).mean()
         optimiser.zero_grad()
         (1e3 * loss).backward()
@@ -150,24 +174,24 @@ def fit(views: Views, steps: int, seed: int) -> SurfaceNetwork:
 
 @torch.no_grad()
 def report(network: SurfaceNetwork, views: Views) -> None:
-    """Errors where nothing was seen, beside those of the best symmetry."""
+    """Errors at unseen points, beside those of the best symmetry."""
     for k, kind in enumerate(KINDS):
         some = Views(*(column[views.kind == k] for column in views))
         predicted = torch.cat([network(g, f) for g, f in zip(some.guessed.split(16), some.features.split(16), strict=True)])
         for name, values in (("best symmetry", some.guessed[..., 0]), ("network", predicted)):
             near = some.unseen & (some.truth.abs() < 0.01)
             inside = ((values < 0) == (some.truth < 0))[some.unseen].float().mean()
-            print(f"{kind}, unseen, {name}: {1e3 * error(values, some.truth)[near].mean():.2f} mm off near the surface, "
-                  f"{100 * inside:.1f} % on the right side of it")
+            print(f"{kind}, unseen, {name}: error {1e3 * error(values, some.truth)[near].mean():.2f} mm near the "
+                  f"surface, {100 * inside:.1f} % on the right side of it")
 
 
 def main() -> None:
     """Collect, fit without some objects and report, fit with all and save."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--folder", type=Path, required=True, help="where views are remembered")
+    parser.add_argument("--folder", type=Path, required=True, help="folder for the views")
     parser.add_argument("--part", type=int, nargs=2, default=(0, 1), metavar=("K", "N"), help="collect the k-th of n parts")
-    parser.add_argument("--steps", type=int, default=2500, help="of each of the two fits")
-    parser.add_argument("--seed", type=int, default=0, help="of everything")
+    parser.add_argument("--steps", type=int, default=2500, help="steps of each of the two fits")
+    parser.add_argument("--seed", type=int, default=0, help="seed of everything")
     parser.add_argument("--collect-only", action="store_true", help="do not fit")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -184,7 +208,9 @@ def main() -> None:
     left_out = [part for k, part in enumerate(parts) if k % EVERY == 0]
     report(fit(joined([p for k, p in enumerate(parts) if k % EVERY]), options.steps, options.seed), joined(left_out))
     SHIPPED.parent.mkdir(exist_ok=True)
-    save_small(fit(joined(parts), options.steps, options.seed), SHIPPED)
+    about = {"stage": "completion", "script": Path(__file__).name, "steps": options.steps, "seed": options.seed,
+             "data": {"objects": len(parts), "views": sum(len(part.kind) for part in parts)}}
+    save_small(fit(joined(parts), options.steps, options.seed), SHIPPED, about)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
-# Pretrain, train, measure and pack weights on a machine that has Python with torch, numpy, pyarrow and safetensors, and
-# nothing else: no simulator, no network, no installation. Run it again after an interruption: it goes on.
+# Pretrain, train, measure and pack weights on a machine that has only Python with torch, numpy, pyarrow and safetensors:
+# no simulator, no network, no installation. Run it again after an interruption: it resumes.
 #
 #   BUNDLE      training bundle (dro-grasp dataset bundle ... --split train)
-#   VALIDATION  bundle of the validate split, of which distance errors are reported
+#   VALIDATION  bundle of the validate split, on which distance errors are reported
 #   OUT         existing folder for the results: weights in pieces of 15 MB, checksum, logs
 #   RUNS        folder for checkpoints, which stay on the machine                 (runs)
-#   WHEELS      folder of wheels to install first, as docs/training.md names them (none)
-#   PROCESSES   training processes, one a GPU                                     (1)
+#   WHEELS      folder of wheels to install first, listed in docs/training.md    (none)
+#   PROCESSES   training processes, one for each GPU                              (1)
 #   PRETRAIN    options of `pretrain`                                             (--minutes 3)
 #   TRAIN       options of `train`                                                (--minutes 6)
 #   NAME        name of the weights                                               (multi)

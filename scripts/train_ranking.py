@@ -1,10 +1,10 @@
-"""Train the network that ranks grasps, on the outcome of trials of grasps that the weights predict for training objects.
+"""Train the network that ranks grasps on the outcomes of trials of predicted grasps on training objects.
 
     python scripts/train_ranking.py --folder FOLDER [--num N] [--objects N] [--collect-only]
 
-Grasps are drawn at several temperatures and tried as they are, polished, and shaken; a part of them is judged as seen in a
-depth image or as half of a cloud. Trials of one hand are remembered in the folder, so that the script can be stopped and
-started again. The network that is best on objects left out is written to the package. Needs the development assets.
+Grasps are drawn at several temperatures and evaluated raw, refined, shaken and opened; some features come from a depth
+image or half of a cloud. The folder keeps the trials of each hand, so a stopped script resumes. The network with the
+lowest loss on objects left out is written to the package. Needs the development assets.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import random
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, get_args
@@ -26,6 +27,7 @@ from dro_grasp.evaluation.metrics import roc_area
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
+from dro_grasp.models.checkpoints import DEFAULT
 from dro_grasp.models.small_networks import save_small
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
@@ -39,18 +41,29 @@ from dro_grasp.simulation.trial import simulate
 
 HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand", "assets/leaphand", "assets/allegro_right",
          "allegro", "barrett", "gripper3", "leaphand", "shadowhand")
+"""Training hands."""
 TRIALS = ("strict", "dexgraspbench")
-"""Trials whose outcome is predicted; the score is the mean of their log-odds."""
+"""Protocols whose outcome the network predicts; the score is the mean of their log-odds."""
 TEMPERATURES = (0.2, 0.5, 0.8, 1.0)
+"""Temperatures of z, one drawn for each object."""
 SHAKE = (0.01, 0.15, 0.2)
 """Standard deviations of a shaken grasp's shift [m], turn [rad] and joints [rad], times a number up to 2."""
 LEFT_OUT = 6
-"""Training objects that the network is chosen by."""
-STEPS, BATCH, RATE, DECAY = 4000, 256, 2e-3, 0.05
+"""Training objects left out of the fit, which select its best step."""
+STEPS = 4000
+"""Steps of the fit."""
+BATCH = 256
+"""Grasps in a step."""
+RATE = 2e-3
+"""Peak learning rate."""
+DECAY = 0.05
+"""Weight decay."""
+NOISE = 0.05
+"""Standard deviation of the noise on link features."""
 
 
 def shaken(hand: Hand, grasps: GraspBatch, generator: torch.Generator) -> GraspBatch:
-    """Grasps moved a little in every way; what goes wrong is worth knowing as well."""
+    """Grasps with wrist and joints perturbed: the network must know failures too."""
     T, n = grasps.T_object_wrist.clone(), len(grasps)
     strength = 2 * torch.rand(n, 1, generator=generator)
     move, turn, bend = (
@@ -62,8 +75,8 @@ def shaken(hand: Hand, grasps: GraspBatch, generator: torch.Generator) -> GraspB
 
 
 @torch.no_grad()
-def tried(hand: Hand, obj: ObjectModel, grasps: GraspBatch, known: ObjectModel) -> dict[str, Tensor]:
-    """Features of grasps, as far as the object is known, and their outcomes."""
+def evaluated(hand: Hand, obj: ObjectModel, grasps: GraspBatch, known: ObjectModel) -> dict[str, Tensor]:
+    """Features of grasps from the known part of the object, and outcomes of their trials on the whole object."""
     energy = object_energy(hand, known, ScoreConfig().energy)
     features = grasp_features(energy, grasps, evaluate_nearest(energy, grasps.T_object_wrist, grasps.joints).terms)
     outcomes = torch.stack([simulate(hand, obj, grasps, rules).success for rules in TRIALS], 1)
@@ -82,27 +95,27 @@ def collect(
         view = rng.choice(views)
         known = seen(obj, view, rng.randrange(10**6))
         raw = predictor.predict(hand, known, num, seed=rng.randrange(10**6), refine=False)
-        polished = refine_grasps(hand, known, raw)
-        some = polished[slice(0, num // 8)]
+        refined = refine_grasps(hand, known, raw)
+        some = refined[slice(0, num // 8)]
         opened = hand.canonical_joints(1.0).expand_as(some.joints)
         groups = {
-            "raw": raw[slice(0, num // 4)], "refined": polished,
-            "shaken": shaken(hand, polished[slice(0, num // 2)], generator),
+            "raw": raw[slice(0, num // 4)], "refined": refined,
+            "shaken": shaken(hand, refined[slice(0, num // 2)], generator),
             "opened": some.without("pregrasp_joints", "squeeze_joints", "score", "energy").replace(joints=opened),
         }
-        parts += [{"hand": name, "object": label, "kind": kind, "view": view, **tried(hand, obj, grasps, known)}
+        parts += [{"hand": name, "object": label, "kind": kind, "view": view, **evaluated(hand, obj, grasps, known)}
                   for kind, grasps in groups.items()]
     return parts
 
 
 def joined(parts: list[dict[str, Any]]) -> dict[str, Tensor]:
-    """All grasps in one table; links that a hand does not have count for nothing."""
+    """All grasps in one table; hands with fewer links are padded, and the padding has no effect."""
     most = max(part["links"].shape[1] for part in parts)
     columns = {}
     for key in ("links", "nearness", "whole", "outcomes"):
         rows = [part[key] for part in parts]
         if key == "links":
-            # The maximum over links must not see the missing ones: they repeat the first.
+            # The network takes a maximum over links: padding repeats the first link.
             rows = [torch.cat([r, r[:, :1].expand(-1, most - r.shape[1], -1)], 1) for r in rows]
         if key == "nearness":
             rows = [functional.pad(r, (0, most - r.shape[1])) for r in rows]
@@ -111,7 +124,7 @@ def joined(parts: list[dict[str, Any]]) -> dict[str, Tensor]:
 
 
 def areas(network: QualityNetwork, parts: list[dict[str, Any]]) -> list[float]:
-    """Mean area under the ROC curve within groups, per kind of trial."""
+    """Mean area under the ROC curve within groups, for each protocol."""
     with torch.no_grad():
         found = [[roc_area(network(p["links"], p["nearness"], p["whole"])[:, k], p["outcomes"][:, k] > 0.5) for p in parts]
                  for k in range(len(TRIALS))]
@@ -119,8 +132,9 @@ def areas(network: QualityNetwork, parts: list[dict[str, Any]]) -> list[float]:
 
 
 def fit(parts: list[dict[str, Any]], left_out: set[str], seed: int) -> tuple[QualityNetwork, list[float], float]:
-    """The network at its best on objects left out, with its areas and its loss there."""
-    torch.manual_seed(seed)
+    """The network at its best step on objects left out, with its ROC areas and its loss there."""
+    torch.manual_seed(seed)  # of the initial weights
+    generator = torch.Generator().manual_seed(seed)
     train = joined([p for p in parts if p["object"] not in left_out])
     others = [p for p in parts if p["object"] in left_out]
     check = joined(others)
@@ -129,9 +143,9 @@ def fit(parts: list[dict[str, Any]], left_out: set[str], seed: int) -> tuple[Qua
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=STEPS)
     best, best_state = float("inf"), network.state_dict()
     for step in range(1, STEPS + 1):
-        rows = torch.randint(len(train["whole"]), (BATCH,))
+        rows = torch.randint(len(train["whole"]), (BATCH,), generator=generator)
         links, nearness, whole, outcomes = (train[k][rows] for k in ("links", "nearness", "whole", "outcomes"))
-        links = links + 0.05 * torch.randn_like(links)
+        links = links + NOISE * torch.randn(links.shape, generator=generator)
         loss = functional.binary_cross_entropy_with_logits(network(links, nearness, whole), outcomes)
         optimiser.zero_grad()
         loss.backward()
@@ -150,14 +164,14 @@ def fit(parts: list[dict[str, Any]], left_out: set[str], seed: int) -> tuple[Qua
 def main() -> None:
     """Collect, fit, save."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--folder", type=Path, required=True, help="where trials are remembered")
-    parser.add_argument("--weights", default=None, help="weights whose grasps are tried; the shipped ones by default")
+    parser.add_argument("--folder", type=Path, required=True, help="folder for the trials")
+    parser.add_argument("--weights", default=None, help="weights that predict the grasps; the shipped ones by default")
     parser.add_argument("--hands", nargs="+", default=list(HANDS), help="hands to collect trials of")
     parser.add_argument("--objects", type=int, default=16, help="training objects of each hand")
     parser.add_argument("--num", type=int, default=16, help="predicted grasps of each")
     parser.add_argument("--views", nargs="+", choices=get_args(View), default=["whole", "whole", "half", "depth"],
-                        help="what is seen of the objects, each as often as it is named")
-    parser.add_argument("--seed", type=int, default=0, help="of everything")
+                        help="views of the objects; naming one twice doubles its share")
+    parser.add_argument("--seed", type=int, default=0, help="seed of everything")
     parser.add_argument("--collect-only", action="store_true", help="do not fit")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -177,8 +191,14 @@ def main() -> None:
     network, found, loss = fit(parts, left_out, options.seed)
     print(f"{sum(len(p['whole']) for p in parts)} grasps; objects left out: loss {loss:.3f}, ROC area of refined grasps "
           + ", ".join(f"{rules} {area:.3f}" for rules, area in zip(TRIALS, found, strict=True)))
+    about = {
+        "stage": "ranking", "script": Path(__file__).name, "weights": options.weights or DEFAULT, "steps": STEPS,
+        "trials": TRIALS, "seed": options.seed, "left_out": sorted(left_out), "loss": loss, "areas": found,
+        "data": {"hands": dict(Counter(p["hand"] for p in parts for _ in p["whole"])), "objects": len(names),
+                 "grasps": sum(len(p["whole"]) for p in parts)},
+    }
     SHIPPED.parent.mkdir(exist_ok=True)
-    save_small(network, SHIPPED)
+    save_small(network, SHIPPED, about)
 
 
 if __name__ == "__main__":
