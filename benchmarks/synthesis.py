@@ -21,7 +21,7 @@ import torch
 from report import emit
 
 from dro_grasp.datasets.engine.production import EngineConfig, valid_grasps
-from dro_grasp.grasps.duplicates import NEAR
+from dro_grasp.grasps.duplicates import DUPLICATE_DISTANCE
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import SynthesisConfig
@@ -87,7 +87,7 @@ def main() -> None:
     table += [[f"{name}, published, {where}", "", "", "", "", speed, "", ""] for name, speed, where in PUBLISHED]
     emit(
         f"Synthesis: {CANDIDATES} candidates for each of {len(objects)} of the paper's {len(names)} training objects "
-        f"(seed {options.seed}); grasps closer than {NEAR * 1e3:.0f} mm count once",
+        f"(seed {options.seed}); grasps closer than {DUPLICATE_DISTANCE * 1e3:.0f} mm count once",
         table, ["hand", "valid", "CPU time [s]", "preparation [s]", "valid per CPU-hour", "a second", "worst object", "there"],
         {"strict_valid_per_cpu_hour": average, "per_hand": per_hand}, options.json,
     )

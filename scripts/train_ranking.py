@@ -28,7 +28,6 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.models.checkpoints import DEFAULT
-from dro_grasp.models.small_networks import save_small
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.refinement import refine_grasps
@@ -36,7 +35,7 @@ from dro_grasp.perception.partial_views import View, seen
 from dro_grasp.predictor import GraspPredictor
 from dro_grasp.ranking.features import grasp_features
 from dro_grasp.ranking.score import ScoreConfig
-from dro_grasp.ranking.score_network import SHIPPED, QualityNetwork
+from dro_grasp.ranking.score_network import SHIPPED, ScoreNetwork, save_score_network
 from dro_grasp.simulation.trial import simulate
 
 HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand", "assets/leaphand", "assets/allegro_right",
@@ -123,7 +122,7 @@ def joined(parts: list[dict[str, Any]]) -> dict[str, Tensor]:
     return columns
 
 
-def areas(network: QualityNetwork, parts: list[dict[str, Any]]) -> list[float]:
+def areas(network: ScoreNetwork, parts: list[dict[str, Any]]) -> list[float]:
     """Mean area under the ROC curve within groups, for each protocol."""
     with torch.no_grad():
         found = [[roc_area(network(p["links"], p["nearness"], p["whole"])[:, k], p["outcomes"][:, k] > 0.5) for p in parts]
@@ -131,14 +130,14 @@ def areas(network: QualityNetwork, parts: list[dict[str, Any]]) -> list[float]:
     return [sum(x for x in a if x == x) / max(1, sum(x == x for x in a)) for a in found]
 
 
-def fit(parts: list[dict[str, Any]], left_out: set[str], seed: int) -> tuple[QualityNetwork, list[float], float]:
+def fit(parts: list[dict[str, Any]], left_out: set[str], seed: int) -> tuple[ScoreNetwork, list[float], float]:
     """The network at its best step on objects left out, with its ROC areas and its loss there."""
     torch.manual_seed(seed)  # of the initial weights
     generator = torch.Generator().manual_seed(seed)
     train = joined([p for p in parts if p["object"] not in left_out])
     others = [p for p in parts if p["object"] in left_out]
     check = joined(others)
-    network = QualityNetwork(len(TRIALS))
+    network = ScoreNetwork(len(TRIALS))
     optimiser = torch.optim.AdamW(network.parameters(), RATE, weight_decay=DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=STEPS)
     best, best_state = float("inf"), network.state_dict()
@@ -198,7 +197,7 @@ def main() -> None:
                  "grasps": sum(len(p["whole"]) for p in parts)},
     }
     SHIPPED.parent.mkdir(exist_ok=True)
-    save_small(network, SHIPPED, about)
+    save_score_network(network, SHIPPED, about)
 
 
 if __name__ == "__main__":

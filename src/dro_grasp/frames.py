@@ -1,4 +1,4 @@
-"""Rigid motions in files."""
+"""Poses of frames in JSON files."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from torch import Tensor
 from dro_grasp.errors import OptionError
 
 LONGEST = 100.0
-"""Translations beyond this are in another unit [m]."""
+"""A longer translation must be in another unit [m] (ours)."""
 
 
 class NamedMotion(NamedTuple):
-    """Where something stands in a frame."""
+    """A pose in a named frame."""
 
     frame: str
     T: Float[Tensor, "4 4"]
-    """Takes its coordinates to those of the frame [m]."""
+    """Takes coordinates to those of the frame [m]."""
 
 
 def read_motion(path: Path, key: str) -> NamedMotion:
@@ -29,7 +29,7 @@ def read_motion(path: Path, key: str) -> NamedMotion:
 
     Args:
         path: The file.
-        key: What the matrix is called, as `T_frame_object`.
+        key: Name of the matrix, such as `T_frame_object`.
 
     Raises:
         OptionError: No such file, no such content, or no rigid motion.
@@ -43,12 +43,12 @@ def read_motion(path: Path, key: str) -> NamedMotion:
     except (OSError, ValueError, TypeError) as error:
         raise OptionError(f"{wanted}; it does not ({error})") from error
     if not isinstance(name, str) or not name:
-        raise OptionError(f"{wanted}; its frame is {name!r}, which is no name")
+        raise OptionError(f"{wanted}; its frame is {name!r}, which is not a name")
     if T.shape != (4, 4) or not bool(T.isfinite().all()) or T[3].tolist() != [0, 0, 0, 1]:
         raise OptionError(f"{wanted}; its matrix has shape {tuple(T.shape)} or a last row other than 0 0 0 1")
     R = T[:3, :3]
     if float((R @ R.T - torch.eye(3)).abs().max()) > 1e-3 or float(torch.linalg.det(R)) < 0:
-        raise OptionError(f"{wanted}; the upper left 3x3 of its matrix is no rotation (scaled, or mirrored)")
+        raise OptionError(f"{wanted}; the upper left 3x3 of its matrix is not a rotation (scaled, or mirrored)")
     if float(T[:3, 3].norm()) > LONGEST:
         raise OptionError(f"{wanted}; its translation is {float(T[:3, 3].norm()):g} m long; divide millimetres by 1000")
     return NamedMotion(name, T.float())

@@ -21,7 +21,7 @@ from dro_grasp.datasets.engine.yields import Yield
 from dro_grasp.errors import OptionError, OutputError
 from dro_grasp.grasps import table
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.duplicates import NEAR
+from dro_grasp.grasps.duplicates import DUPLICATE_DISTANCE
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import SynthesisConfig
@@ -227,7 +227,7 @@ def test_real_shards_hold_valid_grasps_repeat_and_add_up(tmp_path):
     assert made.cpu_seconds > 0
     points = load_hand("barrett").with_points(64).points(found.joints, found.T_object_wrist)
     apart = (points[:, None] - points).norm(dim=-1).mean(-1) + torch.eye(len(found))
-    assert apart.min() >= NEAR  # also across shards
+    assert apart.min() >= DUPLICATE_DISTANCE  # also across shards
     hand, can = production._hand("barrett"), production._object("can", 1.0)
     again, _ = valid_grasps(hand, can, shard_seed(0, Shard("barrett", "can", 0)), "strict", TINY)
     assert torch.equal(again.joints, GraspBatch.load(Shard("barrett", "can", 0).path(tmp_path)).joints)

@@ -13,7 +13,7 @@ from dro_grasp.datasets.collections.collection import YIELDS, read_collection
 from dro_grasp.datasets.collections.merging import file_name
 from dro_grasp.datasets.splits import FEW_SHOT, HELD_OUT_HANDS
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.duplicates import NEAR
+from dro_grasp.grasps.duplicates import DUPLICATE_DISTANCE
 from dro_grasp.grasps.table import read_footer
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import object_names
@@ -90,7 +90,7 @@ def test_joints_keep_their_limits_and_no_grasp_is_there_twice(grasps):
         part = grasps[[i for i, o in enumerate(grasps.object) if o == name]]
         points = thin.points(part.joints, part.T_object_wrist).flatten(1)
         apart = torch.stack([(points[:, None, k::3] - points[None, :, k::3]) for k in range(3)], -1).norm(dim=-1).mean(-1)
-        assert float((apart + torch.eye(len(part))).min()) > NEAR - 1e-4
+        assert float((apart + torch.eye(len(part))).min()) > DUPLICATE_DISTANCE - 1e-4
 
 
 @pytest.mark.assets

@@ -191,8 +191,8 @@ def test_missing_pregrasps_are_made(grasps: GraspBatch, tmp_path: Path) -> None:
     [
         ("not json", "it does not"), ("{}", "no entry 'frame'"),
         ('{"frame": "a", "T_frame_object": [[1, 0], [0, 1]]}', "shape"),
-        ('{"frame": "a", "T_frame_object": [[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]}', "no rotation"),
-        ('{"frame": "a", "T_frame_object": [[-1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}', "no rotation"),
+        ('{"frame": "a", "T_frame_object": [[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]}', "not a rotation"),
+        ('{"frame": "a", "T_frame_object": [[-1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}', "not a rotation"),
         ('{"frame": "a", "T_frame_object": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[1,0,0,1]]}', "last row"),
         (None, "it does not"),
     ],

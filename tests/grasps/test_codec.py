@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import mujoco
 import numpy as np
 import pyarrow as pa
 import torch
 from scipy.spatial.transform import Rotation
 
 from dro_grasp.grasps.codec import decode, encode
-from dro_grasp.simulation.rollout import quiet
 from tests.helpers.tiny_bundle import made_up_grasps
 from tests.helpers.toy_hand import toy_hand
 
@@ -27,23 +25,3 @@ def test_columns_say_what_a_stranger_would_compute() -> None:
     assert again["object"] == grasps.object
     # They have no trial: neither a success nor a failure.
     assert columns["success"].null_count == len(grasps) - int(grasps.evaluated.sum())
-
-
-def test_warnings_of_the_simulator_are_kept_quiet_and_heard_again_afterwards() -> None:
-    heard: list[str] = []
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(heard.append)
-    try:
-        model = mujoco.MjModel.from_xml_string(
-            "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>")
-        data = mujoco.MjData(model)
-        with quiet():
-            data.qvel[0] = np.nan
-            mujoco.mj_step(model, data)
-        assert not heard
-        mujoco.mj_resetData(model, data)
-        data.qvel[0] = np.nan
-        mujoco.mj_step(model, data)
-        assert heard
-    finally:
-        mujoco.set_mju_user_warning(before)

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from dro_grasp.energy.object_energy import evaluate_nearest, object_energy
+from dro_grasp.errors import WeightsError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
 from dro_grasp.models.small_networks import save_small
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.ranking.features import FARTHEST, LENGTH, MOTION, NEAR, GraspFeatures, grasp_features
-from dro_grasp.ranking.score_network import QualityNetwork, shipped_quality
+from dro_grasp.ranking.features import FARTHEST, LENGTH, LINK_FEATURES, MOTION, NEAR, Feature, GraspFeatures, grasp_features
+from dro_grasp.ranking.score_network import ScoreNetwork, load_score_network, save_score_network, shipped_score_network
 from tests.helpers.tiny_bundle import made_up_grasps
 from tests.helpers.toy_hand import toy_hand
 
@@ -90,7 +92,7 @@ def test_features_do_not_know_where_the_scene_is(ball: ObjectModel, grasps: Gras
 
 def test_links_are_a_set() -> None:
     torch.manual_seed(0)
-    network = QualityNetwork(2)
+    network = ScoreNetwork(2)
     links, nearness, whole = torch.randn(5, 7, 16), torch.rand(5, 7), torch.randn(5, 8)
     order = torch.randperm(7)
     whole_set = network(links, nearness, whole)
@@ -100,11 +102,22 @@ def test_links_are_a_set() -> None:
     assert not torch.allclose(network(links, nearness.flip(1), whole), whole_set)
 
 
-def test_the_shipped_network_comes_back_as_it_was_saved(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    shipped = shipped_quality()
-    save_small(shipped, tmp_path / "quality.safetensors")
-    monkeypatch.setattr("dro_grasp.ranking.score_network.SHIPPED", tmp_path / "quality.safetensors")
-    again = shipped_quality.__wrapped__()
+def test_a_network_comes_back_as_it_was_saved(tmp_path: Path) -> None:
+    shipped = shipped_score_network()
+    save_score_network(shipped, tmp_path / "again.safetensors")
+    again = load_score_network(tmp_path / "again.safetensors")
     for name, value in shipped.state_dict().items():
         assert torch.equal(value, again.state_dict()[name])
     assert not any(p.requires_grad for p in again.parameters())
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_a_network_of_other_features_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, named: bool) -> None:
+    """A feature more than the weights know: both lists are named, and files without a list are those of the first features."""
+    if named:
+        save_score_network(ScoreNetwork(2), tmp_path / "old.safetensors")
+    else:
+        save_small(ScoreNetwork(2), tmp_path / "old.safetensors")
+    monkeypatch.setitem(LINK_FEATURES, "spin", Feature(1, lambda s: s.gap))
+    with pytest.raises(WeightsError, match=r"old.safetensors.*'within reach', 'energy terms'.*'within reach', 'spin'"):
+        load_score_network(tmp_path / "old.safetensors")

@@ -21,3 +21,23 @@ def test_shift_and_turn_between_two_states():
     np.testing.assert_allclose(a.turn(b), (ROTATIONS[:100].inv() * ROTATIONS[100:]).magnitude(), atol=1e-12)
     np.testing.assert_allclose(a.shift(b), np.linalg.norm(first - second, axis=1))
     np.testing.assert_allclose(a.turn(a), 0, atol=1e-15)
+
+
+def test_warnings_of_the_simulator_are_kept_quiet_and_heard_again_afterwards() -> None:
+    heard: list[str] = []
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(heard.append)
+    try:
+        model = mujoco.MjModel.from_xml_string(
+            "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>")
+        data = mujoco.MjData(model)
+        with quiet():
+            data.qvel[0] = np.nan
+            mujoco.mj_step(model, data)
+        assert not heard
+        mujoco.mj_resetData(model, data)
+        data.qvel[0] = np.nan
+        mujoco.mj_step(model, data)
+        assert heard
+    finally:
+        mujoco.set_mju_user_warning(before)

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.errors import GraspFileError, OptionError
+from dro_grasp.geometry import se3
 from dro_grasp.grasps.columns import COLUMNS, FLOATS, NOT_EVALUATED, POSTURES, TEXTS, UNKNOWN_PROTOCOL
 from dro_grasp.grasps.table import fixed_column, float_column, floats
 from dro_grasp.grasps.trial_columns import CONTACT_LINKS, FAILURE, REASON
@@ -28,7 +29,7 @@ HEADER = ("hand", "hand_sha256", "wrist_link", "joint_names")
 TEXT_TYPES = {REASON: pa.string(), FAILURE: pa.string(), CONTACT_LINKS: pa.list_(pa.string())}
 """Types of the trial's further columns, which their values do not tell when all are unknown."""
 SYNTHESISED = re.compile(r"\bsynthesis \d+\b")
-"""Provenance of synthesised grasps; early files hold minus their energy as score."""
+"""Provenance of synthesised grasps, whose `score` is minus the energy in files without a column `energy`."""
 
 
 def encode(batch: GraspBatch) -> tuple[dict[str, pa.Array], dict[str, Any]]:
@@ -73,7 +74,7 @@ def decode(table: pa.Table, header: dict[str, Any], path: str) -> dict[str, Any]
     def text(name: str) -> tuple[str, ...]:
         return tuple(v or "" for v in table[name].to_pylist()) if name in table.column_names else ("",) * n
 
-    def numbers(name: str, width: int | None) -> Tensor:
+    def numbers(name: str, width: int | None) -> Float[Tensor, "n *width"]:
         if name not in table.column_names or table[name].null_count == n:
             return torch.full((n,) if width is None else (n, width), torch.nan)
         return floats(table[name], width, f"{path}, column {name}")
@@ -105,14 +106,11 @@ def _poses(position: Float[Tensor, "n 3"], quaternion: Float[Tensor, "n 4"]) -> 
     """Wrist poses of positions [m] and unit quaternions (WXYZ); NaN where a quaternion has another length."""
     length = quaternion.norm(dim=-1, keepdim=True)
     unit = torch.where((length - 1).abs() < 1e-2, quaternion / length, torch.nan)
-    T = torch.eye(4).repeat(len(position), 1, 1)
-    T[:, :3, :3] = roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(unit))
-    T[:, :3, 3] = position
-    return T
+    return se3.compose(roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(unit)), position)
 
 
-def _energy_apart(score: Float[Tensor, " n"], provenance: tuple[str, ...], table: pa.Table) -> dict[str, Tensor]:
-    """Energy and score of a file without a column of energies, whose synthesised grasps have minus the energy as score."""
+def _energy_apart(score: Float[Tensor, " n"], provenance: tuple[str, ...], table: pa.Table) -> dict[str, Float[Tensor, " n"]]:
+    """Energy and score in a file without a column `energy`: the score of its synthesised grasps is minus the energy."""
     terms = [name for name in table.column_names if name.startswith("energy_")]
     has_terms = ~torch.from_numpy(np.array(table[terms[0]].is_null())) if terms else torch.zeros(len(score), dtype=torch.bool)
     synthesised = has_terms & torch.tensor([SYNTHESISED.search(p) is not None for p in provenance], dtype=torch.bool)

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dro_grasp.geometry import se3
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 
@@ -25,7 +26,7 @@ class ControllerConfig:
     """Share of the remaining range by which the squeeze closes."""
     # Differs from the paper's release (0.15), which leaves small objects without contact; the controls gain as well.
     dead_zone: float = 1e-3
-    """Joints whose downstream points approach the object's centre by less stay [m/rad]."""
+    """Joints whose downstream points approach the object's centre more slowly stay [m/rad] (ours)."""
 
 
 def completed(
@@ -57,14 +58,14 @@ def pregrasp_and_squeeze(
     hand: Hand,
     T_object_wrist: Float[Tensor, "n 4 4"],
     joints: Float[Tensor, "n n_dof"],
-    centre: Float[Tensor, 3],
+    centre: Float[Tensor, "3"],
     config: ControllerConfig | None = None,
 ) -> tuple[Float[Tensor, "n n_dof"], Float[Tensor, "n n_dof"]]:
     """Joint values q_outer and q_inner of each grasp.
 
-    Each finger joint moves away from, and towards, the object's centre; which way that is, is decided per grasp and
-    joint by the derivative of the mean distance of the downstream points to the centre. Joints that only spread the
-    fingers, joints above the palm and the wrist stay.
+    Each finger joint moves away from the object's centre, and towards it. The derivative of the mean distance between the
+    downstream points and the centre gives the direction, for each grasp and joint. Joints that only spread the fingers,
+    joints above the palm and the wrist stay.
 
     Args:
         hand: The hand.
@@ -88,15 +89,15 @@ def distance_slope(
     hand: Hand,
     T_object_wrist: Float[Tensor, "n 4 4"],
     joints: Float[Tensor, "n n_dof"],
-    centre: Float[Tensor, 3],
+    centre: Float[Tensor, "3"],
 ) -> Float[Tensor, "n n_dof"]:
     """Derivative by each joint of the mean distance of its downstream points to the object's centre [m/rad or m/m]."""
     tree = hand.tree
     poses = T_object_wrist[:, None] @ tree.forward(joints)
-    # The middle of each link's points stands for them: the mean distance hardly differs, and links are few.
+    # The mean of each link's points stands for them: the mean distance hardly differs, and links are few.
     links = hand.link_index.unique()
     middles = torch.stack([hand.link_points[hand.link_index == link].mean(0) for link in links])
-    points = (poses[:, links, :3, :3] @ middles[..., None])[..., 0] + poses[:, links, :3, 3]
+    points = se3.apply(poses[:, links], middles)
     offset = points - centre
     direction = offset / offset.norm(dim=-1, keepdim=True).clamp(min=1e-9)
     jacobian = tree.point_jacobian(poses, points, links)

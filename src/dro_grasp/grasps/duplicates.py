@@ -1,4 +1,4 @@
-"""Which grasps are the same grasp twice."""
+"""Near-duplicates among grasps."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from torch import Tensor
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 
-NEAR = 0.005
-"""Mean distance between the surface points of two posed hands below which they are one grasp [m]."""
+DUPLICATE_DISTANCE = 0.005
+"""Two posed hands whose surface points lie closer together on average count as one grasp [m] (ours)."""
 HAND_POINTS = 64
-"""Surface points that are compared."""
+"""Surface points that are compared (ours)."""
 
 
 def distinct(
-    hand: Hand, grasps: GraspBatch, near: float = NEAR, earlier: GraspBatch | None = None
+    hand: Hand, grasps: GraspBatch, near: float = DUPLICATE_DISTANCE, earlier: GraspBatch | None = None
 ) -> Bool[Tensor, " n"]:
-    """Mask of the grasps that are no near-duplicate of an earlier one of the same object.
+    """Grasps that are not near-duplicates of an earlier grasp of the same object.
 
     Args:
         hand: The grasps' hand.
         grasps: Any grasps of it.
-        near: Mean distance between corresponding surface points that makes two grasps one [m].
-        earlier: Grasps that are there already; None for no such.
+        near: Mean distance between corresponding surface points below which two grasps are duplicates [m].
+        earlier: Grasps that come before these; none by default.
     """
     n_earlier = 0 if earlier is None else len(earlier)
     joined = grasps if earlier is None else GraspBatch.concatenate([earlier.bare(), grasps.bare()])

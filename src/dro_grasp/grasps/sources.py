@@ -1,4 +1,4 @@
-"""The hand and the objects of a grasp file: by the names in it, or the files that it remembers."""
+"""The hand and the objects of a grasp file: found by name, or in the user's own files that the grasps record."""
 
 from __future__ import annotations
 
@@ -13,23 +13,29 @@ if TYPE_CHECKING:
     from dro_grasp.hands.hand import Hand
     from dro_grasp.objects.shape import ObjectModel
 
-HAND_FILE, OBJECT_FILE, OBJECT_SCALE = "hand_file", "object_file", "object_scale"
-"""Columns of grasps whose hand or object came from a file of the user's own."""
-FRAME, CAMERA = "frame", "T_frame_camera"
-"""Columns of grasps of what a camera has seen: the frame of the poses, and the camera's pose in it, row by row."""
+HAND_FILE = "hand_file"
+"""Further column: path of the hand's description, if the hand is a user's own."""
+OBJECT_FILE = "object_file"
+"""Further column: path of the object, if it is a user's own."""
+OBJECT_SCALE = "object_scale"
+"""Further column: scale of that file."""
+FRAME = "frame"
+"""Further column of grasps on a camera's cloud: name of the frame of the poses."""
+CAMERA = "T_frame_camera"
+"""Further column of such grasps: pose of the camera in that frame, row by row [m]."""
 
 
 def with_sources(
     grasps: GraspBatch, hand: str, obj: str, scale: float, camera: NamedMotion | None = None
 ) -> GraspBatch:
-    """Grasps that remember which files they were made from; names need no remembering.
+    """Grasps that record the files of their hand and object; built-in names are not recorded.
 
     Args:
-        grasps: Of one object.
+        grasps: Grasps of one object.
         hand: Name or path.
         obj: Name or path.
-        scale: Of that path.
-        camera: Where the camera stood that has seen the object, in the frame of the grasps.
+        scale: Scale of the object's file.
+        camera: Pose of the camera that saw the object, in the frame of the grasps.
     """
     import torch
 
@@ -48,16 +54,16 @@ def with_sources(
 
 
 def hand_of(grasps: GraspBatch, given: str | None) -> Hand:
-    """The hand of a file's grasps, or the one given instead.
+    """The hand of a file's grasps, or the given one instead.
 
     Raises:
-        HandError: It cannot be found; the message asks for --hand.
+        HandError: The hand is not found; the message asks for --hand.
     """
     from dro_grasp.hands.library import load_hand
 
     if given is not None:
         return load_hand(given)
-    source = _remembered(grasps, HAND_FILE) or grasps.hand
+    source = _recorded(grasps, HAND_FILE) or grasps.hand
     try:
         return load_hand(source)
     except HandError as error:
@@ -66,15 +72,15 @@ def hand_of(grasps: GraspBatch, given: str | None) -> Hand:
 
 
 def object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectModel:
-    """The object of one object's grasps, or the one given instead.
+    """The object of some grasps, or the given one instead.
 
     Args:
-        grasps: Of one object.
+        grasps: Grasps of one object.
         given: Name or path that replaces the one in the file.
-        scale: Scale of that; what the file remembers has its own.
+        scale: Scale of the object, unless the grasps record one.
 
     Raises:
-        ObjectError: It cannot be found; the message asks for --object.
+        ObjectError: The object is not found; the message asks for --object.
     """
     from dro_grasp.objects.catalogue import load_object
     from dro_grasp.perception.scan import load_scan
@@ -93,24 +99,24 @@ def object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectMode
 
 
 def object_source(grasps: GraspBatch, scale: float = 1.0) -> tuple[str, float]:
-    """File or name, and scale, of the object of one object's grasps; the scale given is that of a name."""
-    source = _remembered(grasps, OBJECT_FILE)
+    """File or name of the object of some grasps, and its scale; `scale` is for objects found by name."""
+    source = _recorded(grasps, OBJECT_FILE)
     own_scale = float(grasps.extra[OBJECT_SCALE][0]) if source and OBJECT_SCALE in grasps.extra else scale
     return source or grasps.object[0], own_scale
 
 
 def frame_of(grasps: GraspBatch) -> str | None:
-    """The frame of grasps of what a camera has seen; None for those in the object's own frame."""
-    return _remembered(grasps, FRAME)
+    """Name of the frame of grasps on a camera's cloud; None for grasps in the object's own frame."""
+    return _recorded(grasps, FRAME)
 
 
 def require_same(grasps: GraspBatch, hand: Hand, obj: ObjectModel) -> None:
-    """Refuse a hand or an object that has changed since the grasps were made for it.
+    """Refuse a hand or an object that has changed since the grasps were made.
 
     Args:
-        grasps: Of one object.
-        hand: The hand found for them.
-        obj: The object found for them.
+        grasps: Grasps of one object.
+        hand: Their hand, as found.
+        obj: Their object, as found.
 
     Raises:
         GraspFileError: A hash differs.
@@ -123,5 +129,5 @@ def require_same(grasps: GraspBatch, hand: Hand, obj: ObjectModel) -> None:
                                  f"{found[:12]}); bring that version back, or synthesise again")
 
 
-def _remembered(grasps: GraspBatch, column: str) -> str | None:
+def _recorded(grasps: GraspBatch, column: str) -> str | None:
     return next((value for value in grasps.extra.get(column, ()) if value), None)

@@ -1,6 +1,6 @@
-"""Grasp files as tables: Parquet in and out, every problem told with the file's name.
+"""Grasp files as tables: Parquet in and out, with errors that name the file.
 
-Knows columns and metadata, nothing about what they mean; `batch` gives them their meaning.
+This module knows columns and metadata; `codec` knows their meaning.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.errors import GraspFileError
@@ -21,7 +22,7 @@ from dro_grasp.errors import GraspFileError
 FORMAT_VERSION = 1
 """Version of the grasp file that this code writes and reads."""
 METADATA_KEY = b"dro_grasp"
-"""Key of the schema metadata under which the JSON header lies."""
+"""Key of the JSON header in the schema metadata."""
 
 
 def table_bytes(columns: dict[str, pa.Array], header: dict[str, Any]) -> bytes:
@@ -33,7 +34,7 @@ def table_bytes(columns: dict[str, pa.Array], header: dict[str, Any]) -> bytes:
     """
     metadata = {METADATA_KEY: json.dumps({"format_version": FORMAT_VERSION, **header}).encode()}
     table, file = pa.table(columns).replace_schema_metadata(metadata), io.BytesIO()
-    # Bytes of equal weight side by side: floats that were rounded then take half the space.
+    # Byte-stream split puts bytes of equal weight side by side: rounded floats then take half the space.
     split = [path for path, kind in _leaves(table.schema) if pa.types.is_floating(kind)]
     texts = [path for path, kind in _leaves(table.schema) if not pa.types.is_floating(kind)]
     pq.write_table(
@@ -104,7 +105,7 @@ def read_header(path: Path | str | io.BytesIO, schema: pa.Schema) -> dict[str, A
     return header
 
 
-def float_column(values: Tensor) -> pa.Array:
+def float_column(values: Float[Tensor, "n *k"]) -> pa.Array:
     """A float tensor (n) or (n k) as a column; rows with NaN become null."""
     array = values.detach().cpu().to(torch.float32).numpy()
     missing = np.isnan(array) if array.ndim == 1 else np.isnan(array).any(1)
@@ -115,13 +116,13 @@ def float_column(values: Tensor) -> pa.Array:
     return pa.ListArray.from_arrays(pa.array(offsets), flat, mask=pa.array(missing))
 
 
-def fixed_column(values: Tensor) -> pa.Array:
+def fixed_column(values: Float[Tensor, "n k"]) -> pa.Array:
     """A float tensor (n k) without missing rows as a column of fixed-size lists."""
     array = np.ascontiguousarray(values.detach().cpu().to(torch.float32).numpy())
     return pa.FixedSizeListArray.from_arrays(pa.array(array.ravel()), array.shape[1])
 
 
-def floats(column: pa.ChunkedArray, width: int | None, where: str) -> Tensor:
+def floats(column: pa.ChunkedArray, width: int | None, where: str) -> Float[Tensor, "n *width"]:
     """The inverse of `float_column` and `fixed_column`; null becomes NaN.
 
     Args:
@@ -148,5 +149,5 @@ def floats(column: pa.ChunkedArray, width: int | None, where: str) -> Tensor:
     return torch.from_numpy(result)
 
 
-def _numbers(array: pa.Array) -> np.ndarray:
+def _numbers(array: pa.Array) -> Float[np.ndarray, " n"]:
     return np.array(array.cast(pa.float32()).to_numpy(zero_copy_only=False), np.float32)

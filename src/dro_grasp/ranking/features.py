@@ -1,75 +1,156 @@
-"""How likely grasps are to hold, as far as geometry tells: what each link does at the object's surface, judged by a network.
+"""What the ranking network sees of a grasp: each link at the object's surface, and the grasp as a whole.
 
-Differs from the paper, which ranks by the grasp energy alone: the energy knows nothing of the closing motion, and being pushed
-away by fingers that arrive one after the other is what most predicted grasps fail of.
+Differs from the paper, which ranks by the grasp energy alone: the energy knows nothing of the closing motion, and most
+predicted grasps fail because fingers that arrive one after the other push the object away.
+
+A new feature is one entry of LINK_FEATURES or GRASP_FEATURES; then train the network again (scripts/train_ranking.py).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.energy.grasp_energy import GraspEnergy
+from dro_grasp.energy.grasp_energy import TERMS, GraspEnergy
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import completed
 
 NEAR = 0.005
-"""Distance from the surface at which a link counts for a third [m]."""
-LENGTH, MOTION = 0.05, 0.01
-"""Sizes of a position and of a motion that the network sees as 1 [m]."""
+"""Distance from the surface at which a link's nearness is 1/e [m] (ours)."""
+LENGTH = 0.05
+"""Positions and sizes are given to the network in this unit [m] (ours)."""
+MOTION = 0.01
+"""Gaps and motions are given to the network in this unit [m] (ours)."""
 FARTHEST = 0.05
-"""Links farther away than this are all alike [m]."""
+"""Links farther away than this look alike [m] (ours)."""
+
+
+@dataclass(frozen=True)
+class GraspState:
+    """n grasps of an object; each of the l links that have surface points stands at its point nearest to the object.
+
+    Vectors are in the object's frame; `palm_axes` turns them into the palm's, in which all hands look alike.
+    """
+
+    gap: Float[Tensor, "n l"]
+    """Signed distance to the object [m]."""
+    object_normal: Float[Tensor, "n l 3"]
+    """Outward normal of the object there."""
+    link_normal: Float[Tensor, "n l 3"]
+    """Outward normal of the link."""
+    position: Float[Tensor, "n l 3"]
+    """Position relative to the object's centre [m]."""
+    arriving: Float[Tensor, "n l 3"]
+    """Motion from the pregrasp to the grasp [m]."""
+    closing: Float[Tensor, "n l 3"]
+    """Motion from the grasp to the squeeze [m]."""
+    is_palm: Float[Tensor, "n l"]
+    """1 for the palm, 0 for other links."""
+    palm_axes: Float[Tensor, "n 3 3"]
+    """Axes of the palm as columns."""
+    terms: Float[Tensor, "n terms"]
+    """Weighted terms of the grasp energy."""
+    size: Float[Tensor, " n"]
+    """Typical distance of the object's surface from its centre [m]."""
+    offset: Float[Tensor, " n"]
+    """Distance of the grasp centre from the object's centre [m]."""
+
+    @property
+    def nearness(self) -> Float[Tensor, "n l"]:
+        """From 0, far from the object, to 1, on its surface."""
+        return torch.exp(-self.gap.clamp_min(0) / NEAR)
+
+    def along(self, vectors: Float[Tensor, "n l 3"]) -> Float[Tensor, "n l"]:
+        """Components along the object's normal."""
+        return (vectors * self.object_normal).sum(-1)
+
+
+class Feature(NamedTuple):
+    """One or several numbers for the network."""
+
+    width: int
+    """How many numbers."""
+    of: Callable[[GraspState], Tensor]
+    """Computes them: (n l) or (n l width) for each link, (n) or (n width) for the whole grasp."""
+
+
+LINK_FEATURES = {
+    "gap": Feature(1, lambda s: s.gap.clamp(-FARTHEST, FARTHEST) / MOTION),
+    "normals": Feature(1, lambda s: s.along(s.link_normal)),
+    "arriving": Feature(1, lambda s: -s.along(s.arriving) / MOTION),
+    "closing": Feature(1, lambda s: -s.along(s.closing) / MOTION),
+    "palm": Feature(1, lambda s: s.is_palm),
+    "nearness": Feature(1, lambda s: s.nearness),
+    "object normal": Feature(3, lambda s: s.object_normal @ s.palm_axes),
+    "position": Feature(3, lambda s: s.position @ s.palm_axes / LENGTH),
+    "closing vector": Feature(3, lambda s: s.closing @ s.palm_axes / MOTION),
+    "within reach": Feature(1, lambda s: (s.gap < FARTHEST).to(s.gap)),
+}
+"""Features of each link, in the order of the network's inputs."""
+GRASP_FEATURES = {
+    "energy terms": Feature(len(TERMS), lambda s: s.terms.clamp_min(0).log1p()),
+    "object size": Feature(1, lambda s: s.size / LENGTH),
+    "centre offset": Feature(1, lambda s: s.offset / LENGTH),
+}
+"""Features of the whole grasp, in the order of the network's inputs."""
 
 
 class GraspFeatures(NamedTuple):
-    """What the network sees of n grasps; in the palm's axes, so that all hands look alike."""
+    """The network's inputs for n grasps."""
 
-    links: Float[Tensor, "n l 16"]
-    """Per link with points of its own: at the one nearest to the surface, gap, object's normal, position about the object's
-    centre, motions when closing from the pregrasp and to the squeeze, and how they and the hand's normal meet the surface."""
+    links: Float[Tensor, "n l link_features"]
     nearness: Float[Tensor, "n l"]
-    """From 0 to 1."""
-    whole: Float[Tensor, "n 8"]
-    """Energy terms, object's size, closeness of the grasp centre to the object's."""
+    whole: Float[Tensor, "n grasp_features"]
 
 
-def grasp_features(energy: GraspEnergy, grasps: GraspBatch, terms: Float[Tensor, "n 6"]) -> GraspFeatures:
+def feature_names() -> list[str]:
+    """Names of all features, links first."""
+    return [*LINK_FEATURES, *GRASP_FEATURES]
+
+
+def grasp_features(energy: GraspEnergy, grasps: GraspBatch, terms: Float[Tensor, "n terms"]) -> GraspFeatures:
     """Features of grasps.
 
     Args:
-        energy: The hand on the object.
+        energy: Energy of the hand on the object.
         grasps: Grasps of the two.
         terms: Weighted terms of the energy.
     """
-    hand = energy.hand
-    grasps = completed(hand, grasps, energy.centre)
-    T, q, pregrasp, squeeze = grasps.T_object_wrist, grasps.joints, grasps.pregrasp_joints, grasps.squeeze_joints
+    state = grasp_state(energy, grasps, terms)
+
+    def table(features: dict[str, Feature], *shape: int) -> Float[Tensor, "*shape features"]:
+        return torch.cat([feature.of(state).reshape(*shape, feature.width) for feature in features.values()], -1)
+
+    return GraspFeatures(table(LINK_FEATURES, *state.gap.shape), state.nearness, table(GRASP_FEATURES, len(state.gap)))
+
+
+def grasp_state(energy: GraspEnergy, grasps: GraspBatch, terms: Float[Tensor, "n terms"]) -> GraspState:
+    """Grasps as their features see them; arguments as for `grasp_features`."""
+    hand, device = energy.hand, energy.centre.device
+    grasps = completed(energy.source, grasps, energy.centre.cpu())
+    T, q, pregrasp, squeeze = (
+        x.to(device) for x in (grasps.T_object_wrist, grasps.joints, grasps.pregrasp_joints, grasps.squeeze_joints))
     points, normals = hand.points_and_normals(q, T)
     before, after = hand.points(pregrasp, T), hand.points(squeeze, T)
     distance, gradient = energy.field.distances(points)
-    chosen = torch.stack([
-        torch.where(hand.link_index == link, distance, torch.inf).argmin(1) for link in hand.link_index.unique().tolist()], 1)
+    links = hand.link_index.unique()
+    # Index of each link's nearest point (n l): points of other links are infinitely far away.
+    nearest = torch.stack([
+        torch.where(hand.link_index == link, distance, torch.inf).argmin(1) for link in links.tolist()], 1)
 
-    def pick(values: Tensor) -> Tensor:
-        return values.gather(1, chosen[..., None].expand(-1, -1, 3))
+    def pick(values: Float[Tensor, "n p 3"]) -> Float[Tensor, "n l 3"]:
+        return values.gather(1, nearest[..., None].expand(-1, -1, 3))
 
-    axes = T[:, :3, :3] @ hand.palm_axes_wrist
-    gap = distance.gather(1, chosen)
-    normal, own, place = (pick(v) for v in (torch.nn.functional.normalize(gradient, dim=-1), normals, points))
-    arriving, closing = pick(points - before), pick(after - points)
-    palm = (hand.link_index.unique() == hand.palm).to(gap).expand_as(gap)
-    scalars = [
-        gap.clamp(-FARTHEST, FARTHEST) / MOTION, (own * normal).sum(-1), -(arriving * normal).sum(-1) / MOTION,
-        -(closing * normal).sum(-1) / MOTION, palm,
-    ]
-    nearness = torch.exp(-gap.clamp_min(0) / NEAR)
-    vectors = [normal @ axes, (place - energy.centre) @ axes / LENGTH, closing @ axes / MOTION]
-    links = torch.cat([torch.stack([*scalars, nearness], -1), *vectors], -1)
-    links = torch.cat([links, (gap < FARTHEST).to(gap)[..., None]], -1)
-    centre = (hand.grasp_centres(T) - energy.centre).norm(dim=-1)
-    size = torch.full_like(centre, energy.length)
-    whole = torch.cat([terms.clamp_min(0).log1p(), torch.stack([size, centre], -1) / LENGTH], -1)
-    return GraspFeatures(links, nearness, whole)
+    gap = distance.gather(1, nearest)
+    offset = (hand.grasp_centres(T) - energy.centre).norm(dim=-1)
+    return GraspState(
+        gap=gap, object_normal=pick(torch.nn.functional.normalize(gradient, dim=-1)), link_normal=pick(normals),
+        position=pick(points) - energy.centre, arriving=pick(points - before), closing=pick(after - points),
+        is_palm=(links == hand.palm).to(gap).expand_as(gap), palm_axes=T[:, :3, :3] @ hand.palm_axes_wrist,
+        terms=terms, size=torch.full_like(offset, energy.length), offset=offset,
+    )

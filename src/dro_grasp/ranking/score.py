@@ -18,7 +18,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.ranking.features import grasp_features
-from dro_grasp.ranking.score_network import shipped_quality
+from dro_grasp.ranking.score_network import shipped_score_network
 
 
 @dataclass(frozen=True)
@@ -56,5 +56,5 @@ def score_grasps(
         if config.by == "energy":
             scores.append(-terms.sum(-1))
         else:
-            scores.append(shipped_quality()(*grasp_features(energy, part, terms)).mean(-1))
+            scores.append(shipped_score_network()(*grasp_features(energy, part, terms)).mean(-1))
     return torch.cat(scores)

@@ -1,59 +1,90 @@
-"""A small network that judges grasps: from what each link does at the object to how likely the grasp holds."""
+"""The network that ranks grasps: from what each link does at the object to the log-odds that the grasp holds."""
 
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from dro_grasp.models.small_networks import SHIPPED_FOLDER, load_small
+from dro_grasp.errors import WeightsError
+from dro_grasp.models.small_networks import SHIPPED_FOLDER, history_of, load_small, save_small
+from dro_grasp.ranking.features import GRASP_FEATURES, LINK_FEATURES, feature_names
 
 SHIPPED = SHIPPED_FOLDER / "ranking" / "quality.safetensors"
-"""The network that scores are made with."""
-LINK_FEATURES, GRASP_FEATURES = 16, 8
-"""Numbers that describe a link and a grasp."""
+"""The network that ships."""
+FEATURES_KEY = "features"
+"""What a weights file records about the network's inputs: the list of features that it was trained with."""
+UNNAMED_FEATURES = [
+    "gap", "normals", "arriving", "closing", "palm", "nearness", "object normal", "position", "closing vector", "within reach",
+    "energy terms", "object size", "centre offset",
+]
+"""Features of weights files without such a list."""
 
 
-class QualityNetwork(nn.Module):
-    """Links are judged one by one, summed up by how near they are, and joined with what describes the whole grasp.
+class ScoreNetwork(nn.Module):
+    """A set of links: each is embedded alone, embeddings are pooled by nearness and joined with features of the whole grasp.
 
-    The order of links does not matter, nor their number, so any hand fits. Source: Deep Sets, Zaheer et al. 2017.
+    The order and the number of links do not matter, so any hand fits. Source: Deep Sets, Zaheer et al. 2017.
     """
 
     def __init__(self, trials: int, width: int = 64) -> None:
-        """Make it.
+        """Random weights.
 
         Args:
             trials: Kinds of trial whose outcome is predicted.
-            width: Of the hidden layers.
+            width: Width of the hidden layers.
         """
         super().__init__()
-        self.link = nn.Sequential(nn.Linear(LINK_FEATURES, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU())
+        of_link, of_grasp = (sum(f.width for f in table.values()) for table in (LINK_FEATURES, GRASP_FEATURES))
+        self.link = nn.Sequential(nn.Linear(of_link, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU())
         self.grasp = nn.Sequential(
-            nn.Linear(2 * width + GRASP_FEATURES, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(),
-            nn.Linear(width, trials))
+            nn.Linear(2 * width + of_grasp, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, trials))
 
     def forward(
         self, links: Float[Tensor, "n l features"], nearness: Float[Tensor, "n l"], whole: Float[Tensor, "n features_of_grasp"]
     ) -> Float[Tensor, "n trials"]:
-        """Log-odds of success in each kind of trial.
-
-        Args:
-            links: What each link does.
-            nearness: From 0, far from the object, to 1, on its surface.
-            whole: What describes the whole grasp.
-        """
+        """Log-odds of success in each kind of trial; arguments as in GraspFeatures."""
         each = self.link(links)
         pooled = torch.cat([(each * nearness[..., None]).sum(1), each.amax(1), whole], -1)
         return self.grasp(pooled)
 
 
-@cache
-def shipped_quality() -> QualityNetwork:
-    """The network that ships, loaded once."""
-    tensors = load_small(SHIPPED)
-    network = QualityNetwork(len(tensors["grasp.4.bias"]), len(tensors["link.0.bias"]))
+def save_score_network(network: ScoreNetwork, path: Path, about: dict[str, Any] | None = None) -> None:
+    """Write weights in half precision, with the features they were trained with.
+
+    Args:
+        network: The network.
+        path: The file.
+        about: How the weights were made.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    save_small(network, path, {FEATURES_KEY: feature_names()} | (about or {}))
+
+
+def load_score_network(path: Path) -> ScoreNetwork:
+    """Read weights.
+
+    Raises:
+        WeightsError: They were trained with other features than LINK_FEATURES and GRASP_FEATURES.
+    """
+    history = history_of(path)
+    trained = (history[-1] if history else {}).get(FEATURES_KEY, UNNAMED_FEATURES)
+    if trained != feature_names():
+        raise WeightsError(f"{path} was trained with the features {trained}; this version computes {feature_names()}; train "
+                           "the network again (scripts/train_ranking.py)")
+    tensors = load_small(path)
+    network = ScoreNetwork(len(tensors["grasp.4.bias"]), len(tensors["link.0.bias"]))
     network.load_state_dict(tensors)
     return network.eval().requires_grad_(False)
+
+
+@cache
+def shipped_score_network() -> ScoreNetwork:
+    """The network that ships, loaded once per process."""
+    return load_score_network(SHIPPED)
