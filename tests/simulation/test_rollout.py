@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dro_grasp.simulation.rollout import ObjectState, _matrices
+from dro_grasp.simulation.rollout import ObjectState, _matrices, quiet
 
 ROTATIONS = Rotation.random(200, random_state=0)
 

@@ -75,7 +75,7 @@ class Feature(NamedTuple):
 
     width: int
     """How many numbers."""
-    of: Callable[[GraspState], Tensor]
+    of: Callable[[GraspState], Float[Tensor, "n *rest"]]
     """Computes them: (n l) or (n l width) for each link, (n) or (n width) for the whole grasp."""
 
 
