@@ -47,7 +47,7 @@ def test_a_device_without_meaning_is_refused() -> None:
 def test_records_move_with_what_is_in_them() -> None:
     hand = toy_hand()
     moved = hand.to("meta")
-    assert {moved.link_points.device.type, moved.tree.origin.device.type, moved.opening.device.type} == {"meta"}
+    assert {moved.link_points.device.type, moved.tree.origin.device.type, moved.opening_signs.device.type} == {"meta"}
     assert moved.tree.link_names == hand.tree.link_names
     assert hand.link_points.device.type == "cpu"
     assert hand.to("cpu") is hand

@@ -80,7 +80,7 @@ def test_points_follow_the_seed() -> None:
     assert torch.equal(hand.link_index, again.link_index)
     assert not torch.equal(hand.link_points, other.link_points)
     # What is derived does not hang on the draw.
-    assert torch.equal(hand.opening, other.opening)
+    assert torch.equal(hand.opening_signs, other.opening_signs)
     assert float(hand.palm_direction_wrist @ other.palm_direction_wrist) > 0.99
 
 
@@ -94,7 +94,7 @@ def test_a_finger_joint_opens_where_the_tip_is_farthest() -> None:
             q = middle.clone()
             q[joint] = end[joint]
             at_ends.append(float((tips(hand, q) - hand.grasp_centre_wrist).norm(dim=-1).sum()))
-        assert (at_ends[1] > at_ends[0]) == (float(hand.opening[joint]) > 0)
+        assert (at_ends[1] > at_ends[0]) == (float(hand.opening_signs[joint]) > 0)
 
 
 def link_poses(hand: Hand, moving: torch.Tensor) -> torch.Tensor:

@@ -12,7 +12,8 @@ import dro_grasp as dro
 from dro_grasp.cli.main import main
 from dro_grasp.errors import HandError
 from dro_grasp.hands.check import check_hand, hand_side, picture
-from tests.helpers.claw_urdf import LIMIT, PALM, claw, joint, link, meshed, written
+from tests.helpers.bracket_hand import bracket_hand, bracket_urdf
+from tests.helpers.claw_urdf import LIMIT, claw, joint, link, meshed, written
 
 
 def test_a_lost_mesh_is_named_and_the_rest_is_used(tmp_path: Path) -> None:
@@ -67,21 +68,25 @@ def test_check_names_links_that_cannot_collide_or_have_no_volume(tmp_path: Path)
     assert "no volume" in notes(tmp_path, claw(links=link("left", '<box size="0.01 0.01 0"/>') + link("right")))["left"]
 
 
-def three_fingers_and_thumb(side: float) -> str:
-    """Fingers up along z, palm towards x, thumb at +y or -y: a right hand has it at +y."""
-    links, joints = "", ""
-    for i in range(3):
-        links += link(f"f{i}")
-        joints += joint(f"j{i}", "palm", f"f{i}", f"0 {0.03 * (i - 1)} 0.05")
-    links += link("thumb")
-    joints += joint("jt", "palm", "thumb", f"0.02 {side * 0.07} -0.02")
-    palm = PALM.replace("0.08 0.08 0.02", "0.02 0.09 0.1")
-    return f'<robot name="h">{palm}{links}{joints}</robot>'
-
-
 @pytest.mark.parametrize(("side", "name"), [(1.0, "right"), (-1.0, "left")])
 def test_sides_of_mirrored_hands(tmp_path: Path, side: float, name: str) -> None:
-    assert hand_side(dro.load_hand(written(tmp_path, three_fingers_and_thumb(side)))) == name
+    assert hand_side(bracket_hand(tmp_path, side)) == name
+
+
+def test_check_tells_the_anatomy_to_programs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = written(tmp_path, bracket_urdf())
+    assert main(["hand", "check", str(path), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["fingers"] == {
+        "distal0": {"links": ["proximal0", "distal0", "pad"], "joints": ["base0", "knuckle0"]},
+        "distal1": {"links": ["proximal1", "distal1"], "joints": ["base1", "knuckle1"]},
+        "distal2": {"links": ["proximal2", "distal2"], "joints": ["base2", "knuckle2"]},
+        "thumb": {"links": ["thumb"], "joints": ["oppose"]},
+    }
+    assert told["thumb"] == max(told["thumb_opposition"], key=told["thumb_opposition"].get) == "thumb"
+    assert told["rigid_groups"] == [["palm", "bracket"], ["proximal0", "pad"]]
+    assert set(told["opening_signs"].values()) == {-1}
+    assert set(told["open_ends"].values()) == {"lower"}
 
 
 def test_four_fingers_all_around_have_no_side(tmp_path: Path) -> None:
@@ -121,7 +126,11 @@ def test_the_command_says_everything_in_words(tmp_path: Path, capsys: pytest.Cap
     words = {name: value.strip() for name, value in said.items()}
     assert words["palm link"] == "palm"
     assert words["fingertips"] == "left, right"
-    assert words["open ends"] == "a lower, b lower"
+    assert words["fingers"] == "left (links left; joints a)"
+    assert words[""] == "right (links right; joints b)", "each finger has a line of its own"
+    assert words["thumb"] == "none"
+    assert words["rigid groups"] == "none"
+    assert words["opening signs"] == "a -1 (lower), b -1 (lower)"
     assert words["contact links"] == "palm, left"
     assert (tmp_path / "claw.png").read_bytes().startswith(b"\x89PNG")
     assert main(["hand", "check", str(path), "--json"]) == 0

@@ -176,7 +176,7 @@ def test_fingers_that_curl_past_the_centre_open_outwards(tmp_path: Path) -> None
         joints += joint(f"j{i}", "palm", f"a{i}", f"{x} {y} 0.01", axis)
         joints += joint(f"k{i}", f"a{i}", f"b{i}", "0 0 0.06", axis, LIMIT + f'<mimic joint="j{i}" multiplier="0.6"/>')
     hand = dro.load_hand(written(tmp_path, claw(links=links, joints=joints)))
-    assert hand.opening.tolist() == [-1, -1, -1]
+    assert hand.opening_signs.tolist() == [-1, -1, -1]
     assert float(hand.palm_direction_wrist[2]) > 0.99
 
 

@@ -6,6 +6,7 @@ import math
 
 import torch
 
+from dro_grasp.hands.anatomy import find_fingers, rigid_groups
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinematics.tree import FIXED, REVOLUTE, KinematicTree
 
@@ -68,10 +69,11 @@ def toy_hand(dtype: torch.dtype = torch.float32) -> Hand:
     dof = tree.n_dof
     return Hand(
         name="toy", tree=tree, link_points=torch.cat(points).to(dtype), link_normals=torch.cat(normals).to(dtype),
-        link_index=torch.cat(index), tips=(2, 4, 6), tip_offsets=torch.tensor([[0.0, 0.0, 0.04]] * 3).to(dtype),
+        link_index=torch.cat(index), fingers=find_fingers(tree, (2, 4, 6), 0),
+        rigid_group=rigid_groups(tree), tip_offsets=torch.tensor([[0.0, 0.0, 0.04]] * 3).to(dtype),
         palm=0, palm_centre=torch.tensor([0.0, 0.0, 0.01]).to(dtype),
         palm_direction=torch.tensor([0.0, 0.0, 1.0]).to(dtype), grasp_centre=torch.tensor([0.0, 0.0, 0.045]).to(dtype),
-        opening=torch.full((dof,), -1.0).to(dtype), movable=torch.ones(dof, dtype=torch.bool),
+        opening_signs=torch.full((dof,), -1.0).to(dtype), movable=torch.ones(dof, dtype=torch.bool),
         rest=torch.zeros(dof).to(dtype), abduction=torch.zeros(dof, dtype=torch.bool),
-        touching=tuple(range(tree.n_links)), sha256="toy",
+        contact_links=tuple(range(tree.n_links)), sha256="toy",
     )

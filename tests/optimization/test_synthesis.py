@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from dro_grasp.energy.contact_candidates import PALM, contact_candidates, find_thumb, finger_links
+from dro_grasp.energy.contact_candidates import contact_candidates
 from dro_grasp.energy.grasp_energy import link_spheres
 from dro_grasp.energy.object_energy import object_energy
 from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.grasps.duplicates import distinct
+from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
@@ -26,12 +27,6 @@ def ball() -> ObjectModel:
     return load_object("sphere")
 
 
-def test_fingers_of_the_toy_hand():
-    hand = toy_hand()
-    assert finger_links(hand.tree, hand.tips, hand.palm).tolist() == [PALM, 0, 0, 1, 1, 2, 2]
-    assert find_thumb(hand, 0.5) is None  # all of three fingers hold
-
-
 def test_candidates_face_inwards_and_slots_keep_to_their_fingers():
     hand = toy_hand()
     candidates = contact_candidates(hand)
@@ -42,17 +37,6 @@ def test_candidates_face_inwards_and_slots_keep_to_their_fingers():
     assert len(candidates.fingers[drawn[:, 3]].unique()) > 1
     fingers = candidates.fingers != PALM
     assert (candidates.normals[fingers, 0] < 0.5).all()  # the outer faces of the fingers look along +x
-
-
-@pytest.mark.assets
-@pytest.mark.parametrize(
-    ("name", "thumb"),
-    [("allegro_left", "link_15.0_tip"), ("ability", "thumb_L2"), ("barrett_multidex", None)],
-)
-def test_thumb_is_found(assets_folder, name, thumb):
-    hand = load_hand(f"assets/{name}")
-    found = find_thumb(hand, 0.55)
-    assert (None if found is None else hand.tree.link_names[hand.tips[found]]) == thumb
 
 
 def test_spheres_lie_in_their_links_and_may_not_meet_across_fingers():

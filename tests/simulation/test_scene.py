@@ -150,7 +150,7 @@ def deaf_links(hand: Hand) -> list[str]:
     q = hand.canonical_joints()
     points = hand.points(q)
     deaf = []
-    for link in hand.touching:
+    for link in hand.contact_links:
         name, mine = hand.tree.link_names[link], points[hand.link_index == link]
         if len(mine) and not any(name in touched(scene, hand, q, p) for p in mine[:: max(1, len(mine) // 8)]):
             deaf.append(name)
@@ -175,7 +175,7 @@ def test_the_scene_stands_as_the_tree_says(hand):
 
 
 def test_every_link_of_the_claw_collides(hand):
-    assert len(hand.touching) == 9
+    assert len(hand.contact_links) == 9
     assert deaf_links(hand) == []
 
 

@@ -23,7 +23,6 @@ from dro_grasp.viewer import pictures
 from dro_grasp.viewer.appearance import (
     OBJECT_COLOUR,
     best_camera,
-    finger_of_link,
     hand_meshes,
     link_colours,
     object_meshes,
@@ -131,7 +130,7 @@ def test_links_above_the_palm_can_be_left_out(hand, grasps) -> None:
 
 
 def test_fingers_are_counted_from_the_palm_on(hand) -> None:
-    fingers = finger_of_link(hand)
+    fingers = hand.finger_of_link.tolist()
     assert fingers[hand.palm] == -1
     assert sorted({fingers[tip] for tip in hand.tips}) == [0, 1, 2]
 

@@ -1,7 +1,4 @@
-"""What of a hand can hold: its fingers, the thumb, and the candidate contact points on their inner sides.
-
-Everything is derived from the tree, the fingertips and the surface points; nothing is annotated.
-"""
+"""Candidate contacts: points on the inner sides of a hand's fingers and palm, and the slots that draw from them."""
 
 from __future__ import annotations
 
@@ -11,11 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.hand import Hand
-from dro_grasp.kinematics.tree import KinematicTree
-
-PALM = -1
-"""The finger number of contact points that lie on the palm."""
 
 
 @dataclass(frozen=True)
@@ -80,72 +74,6 @@ class ContactCandidates:
         return torch.where(resting, substitute, own)
 
 
-def finger_links(tree: KinematicTree, tips: tuple[int, ...], palm: int) -> Int[Tensor, " n_links"]:
-    """The finger (index into `tips`) of each link; PALM for the palm and for links of several fingers.
-
-    A link belongs to the finger whose tip it carries, or else to that of its nearest ancestor which has one.
-    """
-    finger = [PALM] * tree.n_links
-    for link in range(tree.n_links):
-        carried = [i for i, tip in enumerate(tips) if bool(tree.descends[tip, link])]
-        below_palm = bool(tree.descends[link, palm]) and link != palm
-        if below_palm and len(carried) == 1:
-            finger[link] = carried[0]
-        elif below_palm and not carried:
-            finger[link] = finger[tree.parent[link]]
-    rigid = rigid_group(tree, palm)
-    return torch.tensor([PALM if rigid[i] else f for i, f in enumerate(finger)])
-
-
-def rigid_group(tree: KinematicTree, link: int) -> list[bool]:
-    """The links that are fixed to `link`, itself included."""
-    group = [False] * tree.n_links
-    for other in range(tree.n_links):
-        parent = tree.parent[other]
-        group[other] = other == link or (parent >= 0 and group[parent] and tree.link_joint[other] < 0)
-    return group
-
-
-def joints_to_tip(tree: KinematicTree, tip: int) -> Int[Tensor, " n_links"]:
-    """For each link, how many moving joints lie between it and the tip that it carries; 0 for all others."""
-    level = torch.zeros(tree.n_links, dtype=torch.int64)
-    count, link = 0, tip
-    while link >= 0:
-        level[link] = count
-        count += tree.link_joint[link] >= 0
-        link = tree.parent[link]
-    return level
-
-
-def closing_directions(hand: Hand, closing: float) -> Float[Tensor, "n_tips 3"]:
-    """Unit velocity of each fingertip in the wrist frame while the whole hand closes."""
-    q = hand.canonical_joints(1 - closing)
-    poses = hand.tree.forward(q)
-    tips = torch.tensor(hand.tips)
-    jacobian = hand.tree.point_jacobian(poses, poses[tips, :3, 3] + _tip_shift(hand, poses), tips)
-    span = hand.tree.upper - hand.tree.lower
-    rate = -hand.opening * span * (hand.movable & ~hand.abduction)
-    velocity = jacobian @ rate
-    return velocity / velocity.norm(dim=-1, keepdim=True).clamp_min(1e-9)
-
-
-def _tip_shift(hand: Hand, poses: Float[Tensor, "n_links 4 4"]) -> Float[Tensor, "n_tips 3"]:
-    rotation = poses[torch.tensor(hand.tips), :3, :3]
-    return (rotation @ hand.tip_offsets[..., None])[..., 0]
-
-
-def find_thumb(hand: Hand, closing: float) -> int | None:
-    """The finger whose closing direction opposes the others most; None for hands of two or three fingers.
-
-    Fingers of such hands all oppose each other, and all of them hold.
-    """
-    if len(hand.tips) <= 3:
-        return None
-    directions = closing_directions(hand, closing)
-    others = (directions.sum(0) - directions) / (len(directions) - 1)
-    return int((directions * others).sum(-1).argmin())
-
-
 def contact_candidates(hand: Hand, config: ContactConfig | None = None) -> ContactCandidates:
     """Candidate contacts on the inner sides of fingers and palm, and which slot may use which.
 
@@ -155,28 +83,27 @@ def contact_candidates(hand: Hand, config: ContactConfig | None = None) -> Conta
     config = config or ContactConfig()
     q = hand.canonical_joints(1 - config.closing)
     points, normals = hand.points_and_normals(q)
-    centre = hand.grasp_centre_wrist
-    towards = centre - points
+    towards = hand.grasp_centre_wrist - points
     cosine = (normals * towards).sum(-1) / towards.norm(dim=-1).clamp_min(1e-9)
-    finger = finger_links(hand.tree, hand.tips, hand.palm)[hand.link_index]
-    inner = (cosine > config.inner_cosine) & torch.isin(hand.link_index, torch.tensor(hand.touching))
-    weight = _level_weights(hand, finger, config) * cosine.clamp_min(0)
-    inner = _never_empty(inner, weight, finger, len(hand.tips)) & (weight > 0)
+    finger = hand.finger_of_link[hand.link_index]
+    inner = (cosine > config.inner_cosine) & torch.isin(hand.link_index, torch.tensor(hand.contact_links))
+    weight = _level_weights(hand, config)[hand.link_index] * cosine.clamp_min(0)
+    inner = _never_empty(inner, weight, finger, len(hand.fingers)) & (weight > 0)
     keep = inner.nonzero()[:, 0]
-    slots = _slots(finger[keep], weight[keep].clamp_min(1e-6), len(hand.tips), config)
+    slots = _slots(finger[keep], weight[keep].clamp_min(1e-6), len(hand.fingers), config)
     return ContactCandidates(
-        hand.link_points[keep], hand.link_normals[keep], hand.link_index[keep], finger[keep], *slots,
-        thumb=find_thumb(hand, config.closing),
+        hand.link_points[keep], hand.link_normals[keep], hand.link_index[keep], finger[keep], *slots, thumb=hand.thumb
     )
 
 
-def _level_weights(hand: Hand, finger: Int[Tensor, " n"], config: ContactConfig) -> Float[Tensor, " n"]:
-    table = torch.zeros(len(hand.tips) + 1, hand.tree.n_links)
+def _level_weights(hand: Hand, config: ContactConfig) -> Float[Tensor, " n_links"]:
+    """The weight of each link's candidates: by joints to the tip on a finger, the same on the palm."""
+    weights = torch.full((hand.tree.n_links,), config.palm_weight)
     levels = torch.tensor([*config.level_weights, 0.0])
-    for i, tip in enumerate(hand.tips):
-        table[i] = levels[joints_to_tip(hand.tree, tip).clamp_max(len(levels) - 1)]
-    table[PALM] = config.palm_weight
-    return table[finger, hand.link_index]
+    for finger in hand.fingers:
+        level = torch.tensor(finger.joints_to_tip, dtype=torch.int64)
+        weights[list(finger.links)] = levels[level.clamp_max(len(levels) - 1)]
+    return weights
 
 
 def _never_empty(

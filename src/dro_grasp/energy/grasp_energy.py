@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dro_grasp.devices import on_device
 from dro_grasp.energy import terms as energies
-from dro_grasp.energy.contact_candidates import ContactCandidates, ContactConfig, contact_candidates, rigid_group
+from dro_grasp.energy.contact_candidates import ContactCandidates, ContactConfig, contact_candidates
 from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.hands.hand import Hand
 
@@ -101,9 +101,8 @@ def _fill(points: Float[Tensor, "n 3"]) -> list[tuple[Tensor, Tensor]]:
 def _neighbours(hand: Hand) -> Tensor:
     """Pairs of links (n_links n_links) with at most one moving joint between them."""
     tree = hand.tree
-    rigid = torch.stack([torch.tensor(rigid_group(tree, link)) for link in range(tree.n_links)])
-    rigid = rigid | rigid.T
-    rigid = (rigid.float() @ rigid.float()) > 0
+    group = torch.tensor(hand.rigid_group)
+    rigid = group[:, None] == group
     step = torch.zeros_like(rigid)
     for link, parent in enumerate(tree.parent):
         if parent >= 0:
@@ -198,8 +197,8 @@ class GraspEnergy:
         thin = self.source.with_points(min(config.hand_points, hand.n_points)).to(hand.link_points.device)
         self.config, self.body = config, LinkPoints.of(thin.link_points, thin.link_index, hand.tree.n_links)
         room = config.closing_room * (hand.tree.upper - hand.tree.lower) * ~hand.abduction
-        self.lower = torch.where(hand.opening > 0, hand.tree.lower + room, hand.tree.lower)
-        self.upper = torch.where(hand.opening > 0, hand.tree.upper, hand.tree.upper - room)
+        self.lower = torch.where(hand.opening_signs > 0, hand.tree.lower + room, hand.tree.lower)
+        self.upper = torch.where(hand.opening_signs > 0, hand.tree.upper, hand.tree.upper - room)
 
     def __call__(
         self,

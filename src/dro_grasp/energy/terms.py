@@ -131,24 +131,16 @@ def joint_margin(
 
 
 def link_wrenches(
-    points: Float[Tensor, "*b p 3"],
-    by_point: Float[Tensor, "*b p 3"],
-    members: Float[Tensor, "p n_links"],
-    normals: Float[Tensor, "*b p 3"] | None = None,
-    by_normal: Float[Tensor, "*b p 3"] | None = None,
+    points: Float[Tensor, "*b p 3"], by_point: Float[Tensor, "*b p 3"], members: Float[Tensor, "p n_links"]
 ) -> Float[Tensor, "*b n_links 6"]:
-    """Sum derivatives by points and normals to one per rigid motion of each link (translation, rotation).
+    """Sum derivatives by points to one derivative per rigid motion of each link (translation, rotation).
 
     Args:
         points: World positions [m].
         by_point: Derivatives by them.
         members: One-hot link of each point.
-        normals: World normals fixed to the same links.
-        by_normal: Derivatives by them.
     """
     moment = torch.linalg.cross(points, by_point, dim=-1)
-    if normals is not None and by_normal is not None:
-        moment = moment + torch.linalg.cross(normals, by_normal, dim=-1)
     both = torch.cat([by_point.mT, moment.mT], -2)
     return (both.reshape(-1, len(members)) @ members).unflatten(0, both.shape[:-1]).mT
 

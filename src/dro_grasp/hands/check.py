@@ -1,4 +1,4 @@
-"""What is derived from a hand description and what is wrong with it, in words and in a picture."""
+"""A report on a hand description: what was derived from it and what is wrong with it, in words and in a picture."""
 
 from __future__ import annotations
 
@@ -9,23 +9,35 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from dro_grasp.descriptions.loader import Description
 from dro_grasp.descriptions.notes import Note
 from dro_grasp.geometry.triangles import enclosed_volume
+from dro_grasp.hands.anatomy import Finger
 from dro_grasp.hands.build import build_hand
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand_description
 from dro_grasp.rendering.rasterizer import Camera, Mesh, arrow, render
 
-TILE, TEXT = (560, 520), 30
-"""Size of one view, and height of a line of text [pixels]."""
-TOUCHING, OTHER, DIRECTION, TRACK = (0.93, 0.66, 0.30), (0.62, 0.66, 0.72), (0.85, 0.15, 0.15), (0.15, 0.39, 0.92)
-"""Colours of links that can touch, of others, of the palm direction and of the fingertips' tracks."""
+TILE = (560, 520)
+"""Width and height of one view [pixels]."""
+TEXT = 30
+"""Height of a line of text [pixels]."""
+CONTACT = (0.93, 0.66, 0.30)
+"""Colour of contact links."""
+OTHER = (0.62, 0.66, 0.72)
+"""Colour of links that cannot touch anything."""
+DIRECTION = (0.85, 0.15, 0.15)
+"""Colour of the palm direction."""
+TRACK = (0.15, 0.39, 0.92)
+"""Colour of the fingertips' tracks."""
 SIDEWAYS = 0.15
-"""Sine below which a thumb is on no side of the other fingers; hands with a side have 0.34 to 0.96."""
+"""Cosine below which a thumb is on neither side of the other fingers (ours); hands with a side have 0.34 to 0.96."""
+END = {1: "upper", -1: "lower"}
+"""Limit at which a joint is open, by opening sign."""
 THIN_VOLUME = 1e-9
-"""Volume below which a link's shapes enclose nothing [m^3]."""
+"""Volume below which a link's shapes enclose nothing [m^3] (ours)."""
 
 
 @dataclass(frozen=True)
@@ -34,21 +46,26 @@ class HandReport:
 
     hand: Hand
     facts: dict[str, Any]
-    """What was derived, by name."""
+    """Everything that was derived, by name."""
     notes: tuple[Note, ...]
-    """What was found, repaired or is wrong."""
+    """Everything that was found or repaired, or that is wrong."""
 
     def lines(self) -> list[str]:
         """The report for people."""
         width = max(len(name) for name in self.facts)
-        told = [f"{name.replace('_', ' '):<{width}}  {_words(value)}" for name, value in self.facts.items()]
+        told = []
+        for name, value in self.facts.items():
+            first, *more = _words(value)
+            told.append(f"{name.replace('_', ' '):<{width}}  {first}")
+            told.extend(f"{'':<{width}}  {line}" for line in more)
         found = [f"{note.level}: {note.subject}: {note.text}" for note in self.notes]
         return [f"hand {self.hand.name}", *told, "", *(found or ["nothing wrong was found"])]
 
     def to_dict(self) -> dict[str, Any]:
         """The report for programs."""
         notes = [{"level": n.level, "subject": n.subject, "text": n.text} for n in self.notes]
-        return {"hand": self.hand.name, **self.facts, "notes": notes}
+        ends = {joint: END[sign] for joint, sign in self.facts["opening_signs"].items()}
+        return {"hand": self.hand.name, **self.facts, "open_ends": ends, "notes": notes}
 
 
 def check_hand(name: str | Path) -> HandReport:
@@ -70,48 +87,64 @@ def _facts(hand: Hand, description: Description) -> dict[str, Any]:
         f"{tree.moving_names[c.follower]} = {c.multiplier:g} * {tree.moving_names[c.leader]} + {c.offset:g}"
         if c.leader >= 0 else f"{tree.moving_names[c.follower]} = {c.offset:g}" for c in description.couplings
     ]
-    ends = {True: "upper", False: "lower"}
+    joints, movable = tree.joint_names, hand.movable.tolist()
     return {
         "file": str(description.path),
         "wrist_link": hand.wrist_link,
         "palm_link": names[hand.palm],
         "palm_direction": [round(float(x), 3) for x in hand.palm_direction_wrist],
         "fingertips": [names[t] for t in hand.tips],
+        "fingers": {names[finger.tip]: _finger_facts(hand, finger) for finger in hand.fingers},
+        "thumb": None if hand.thumb is None else names[hand.tips[hand.thumb]],
+        "thumb_opposition": {names[t]: round(float(x), 2) for t, x in zip(hand.tips, hand.thumb_opposition, strict=True)},
         "side": hand_side(hand),
-        "free_joints": [n for n, m in zip(tree.joint_names, hand.movable.tolist(), strict=True) if m],
-        "held_joints": [n for n, m in zip(tree.joint_names, hand.movable.tolist(), strict=True) if not m],
+        "rigid_groups": _rigid_groups(hand),
+        "free_joints": [n for n, m in zip(joints, movable, strict=True) if m],
+        "held_joints": [n for n, m in zip(joints, movable, strict=True) if not m],
         "coupled_joints": couplings,
-        "open_ends": {n: ends[o > 0] for n, o in zip(tree.joint_names, hand.opening.tolist(), strict=True)},
-        "spreading_joints": [n for n, a in zip(tree.joint_names, hand.abduction.tolist(), strict=True) if a],
-        "contact_links": [names[i] for i in hand.touching],
+        "opening_signs": {n: int(sign) for n, sign in zip(joints, hand.opening_signs.tolist(), strict=True)},
+        "spreading_joints": [n for n, a in zip(joints, hand.abduction.tolist(), strict=True) if a],
+        "contact_links": [names[i] for i in hand.contact_links],
         "points": hand.n_points,
         "size_m": [round(float(x), 3) for x in np.ptp(hand.points(hand.canonical_joints()).numpy(), axis=0)],
     }
 
 
-def hand_side(hand: Hand) -> str:
-    """`left`, `right`, or `none` for a hand with fewer than four fingers or with fingers all around.
+def _finger_facts(hand: Hand, finger: Finger) -> dict[str, list[str]]:
+    """The links of a finger and the joints that move them, followers included."""
+    tree = hand.tree
+    joints = [tree.moving_names[tree.link_joint[link]] for link in finger.links if tree.link_joint[link] >= 0]
+    return {"links": [tree.link_names[link] for link in finger.links], "joints": joints}
 
-    The thumb is the finger whose tip is farthest from the others' mean. With the fingers up and the palm towards the
-    viewer, the thumb of a right hand is on the viewer's right.
+
+def _rigid_groups(hand: Hand) -> list[list[str]]:
+    """Links that never move against each other, the topmost first; links that stand alone are left out."""
+    groups: dict[int, list[str]] = {}
+    for name, top in zip(hand.tree.link_names, hand.rigid_group, strict=True):
+        groups.setdefault(top, []).append(name)
+    return [group for group in groups.values() if len(group) > 1]
+
+
+def hand_side(hand: Hand) -> str:
+    """`left`, `right`, or `none` for a hand without a thumb or with fingers all around the palm.
+
+    With the fingers up and the palm towards the viewer, the thumb of a right hand is on the viewer's right.
     """
-    if len(hand.tips) < 4:
+    if hand.thumb is None:
         return "none"
     points, index = hand.points(hand.canonical_joints(1.0)), hand.link_index
     tips = torch.stack([points[index == t].mean(0) for t in hand.tips])
     T = hand.T_wrist_palm_rest
     palm = T[:3, :3] @ hand.palm_centre + T[:3, 3]
-    apart = [float((tips[i] - torch.cat([tips[:i], tips[i + 1 :]]).mean(0)).norm()) for i in range(len(tips))]
-    thumb = int(np.argmax(apart))
-    others = torch.cat([tips[:thumb], tips[thumb + 1 :]]).mean(0)
+    others = torch.cat([tips[: hand.thumb], tips[hand.thumb + 1 :]]).mean(0)
     aside = torch.linalg.cross(others - palm, hand.palm_direction_wrist)
-    handed = float(torch.nn.functional.cosine_similarity(aside, tips[thumb] - palm, dim=0))
+    handed = float(torch.nn.functional.cosine_similarity(aside, tips[hand.thumb] - palm, dim=0))
     return "none" if abs(handed) < SIDEWAYS else "right" if handed > 0 else "left"
 
 
 def _finger_notes(hand: Hand) -> list[Note]:
     """A finger alone closes on nothing but the palm."""
-    text = "is the only fingertip; what it holds, it presses against the palm. Is a finger missing?"
+    text = "is the only fingertip; it can only press an object against the palm. Is a finger missing?"
     return [Note("warning", hand.tree.link_names[tip], text) for tip in hand.tips if len(hand.tips) == 1]
 
 
@@ -135,16 +168,19 @@ def _point_notes(hand: Hand) -> list[Note]:
     return [Note("info", name, "has too few points for a pose of its own; its neighbours place it") for name in few]
 
 
-def _words(value: Any) -> str:
+def _words(value: Any) -> list[str]:
+    """A fact in words, on one line or more."""
+    if isinstance(value, dict) and any(isinstance(v, dict) for v in value.values()):
+        return [f"{tip} (links {', '.join(v['links'])}; joints {', '.join(v['joints'])})" for tip, v in value.items()]
     if isinstance(value, dict):
-        return ", ".join(f"{k} {v}" for k, v in value.items()) or "none"
+        return [", ".join(f"{k} {v:+d} ({END[v]})" if isinstance(v, int) else f"{k} {v}" for k, v in value.items())]
     if isinstance(value, list):
-        return ", ".join(str(v) for v in value) or "none"
-    return str(value)
+        return [", ".join(" + ".join(v) if isinstance(v, list) else str(v) for v in value) or "none"]
+    return ["none" if value is None else str(value)]
 
 
 def picture(hand: Hand, path: Path | str) -> None:
-    """Draw the hand open and closed: contact links coloured, palm direction, and the way each fingertip moves.
+    """Draw the hand open and closed, with its contact links, its palm direction and the path of each fingertip.
 
     Args:
         hand: From `load_hand` or a report; it needs its description.
@@ -159,7 +195,7 @@ def picture(hand: Hand, path: Path | str) -> None:
     for column, (title, openness) in enumerate((("open", 1.0), ("closed", 0.25))):
         sheet.paste(Image.fromarray(render(_meshes(hand, openness), camera, width, height)), (column * width, TEXT))
         pen.text((column * width + 12, 6), f"{hand.name}, {title}", fill=(20, 20, 20), font=font)
-    legend = "orange: can touch   grey: cannot   red: palm direction   blue: fingertips from open to closed"
+    legend = "orange: contact links   grey: others   red: palm direction   blue: fingertips from open to closed"
     pen.text((12, height + TEXT + 6), legend, fill=(90, 90, 90), font=font)
     sheet.save(path, format="PNG")
 
@@ -182,7 +218,7 @@ def _meshes(hand: Hand, openness: float) -> list[Mesh]:
     poses = hand.tree.forward(hand.canonical_joints(openness)).numpy()
     meshes = [
         Mesh(g.vertices @ poses[g.link, :3, :3].T + poses[g.link, :3, 3], g.faces,
-             TOUCHING if g.link in hand.touching else OTHER)
+             CONTACT if g.link in hand.contact_links else OTHER)
         for g in (hand.description.geometry if hand.description else ())
         if g.visual and bool(hand.tree.descends[g.link, hand.palm])
     ]
@@ -194,8 +230,8 @@ def _meshes(hand: Hand, openness: float) -> list[Mesh]:
     return meshes
 
 
-def _tracks(hand: Hand, steps: int = 8) -> np.ndarray:
-    """Positions (n_tips steps 3) of the fingertips from open to closed [m]."""
+def _tracks(hand: Hand, steps: int = 8) -> Float[np.ndarray, "n_tips steps 3"]:
+    """Positions of the fingertips from open to closed [m]."""
     joints = torch.stack([hand.canonical_joints(float(x)) for x in torch.linspace(1, 0.25, steps)])
     poses = hand.tree.forward(joints)[:, list(hand.tips)]
     middles = torch.stack([hand.link_points[hand.link_index == t].mean(0) for t in hand.tips])

@@ -1,4 +1,4 @@
-"""A robot hand as the method sees it: tree, surface points, palm, open ends. Everything is derived, nothing annotated."""
+"""A robot hand as the method sees it: tree, surface points, anatomy, palm. Everything is derived, nothing annotated."""
 
 from __future__ import annotations
 
@@ -12,22 +12,27 @@ from torch import Tensor
 
 from dro_grasp.devices import on_device
 from dro_grasp.geometry.point_clouds import farthest_points
+from dro_grasp.hands.anatomy import PALM, THUMB_CLOSING, Finger, find_fingers, find_thumb, measure_opposition, rigid_groups
 from dro_grasp.kinematics.tree import KinematicTree, cached_tensor
 
 if TYPE_CHECKING:
     from dro_grasp.descriptions.loader import Description
 
 MIN_FINGER_OFFSET = 0.005
-"""Fingers whose middle is nearer than this to the palm's axis surround it [m]."""
+"""Fingers whose middle is nearer than this to the palm's axis surround it [m] (ours)."""
 MIN_REGISTRATION_POINTS = 4
-"""A link with fewer points, or with collinear ones, has no pose of its own to be read off its points."""
+"""Fewest points that determine a link's pose, if they are not collinear."""
 POINTS_PER_LINK = 6
-"""Points that each link keeps, where it has them, when a hand is thinned."""
+"""Points that each link keeps, if it has them, when a hand is thinned (ours)."""
+STORED_AS = {"opening_signs": "opening", "contact_links": "touching"}
+"""Fields that training bundles hold under another name."""
+DERIVED = {"fingers", "rigid_group", "thumb"}
+"""Fields that follow from the others; training bundles do not hold them."""
 
 
 @dataclass(frozen=True)
 class Hand:
-    """A hand and what was derived from its description."""
+    """A hand and everything that was derived from its description."""
 
     name: str
     """`allegro`, `assets/allegro_left`, or a file's stem."""
@@ -39,8 +44,10 @@ class Hand:
     """Outward unit normals of link_points, in their links' frames."""
     link_index: Int[Tensor, " n_hand"]
     """The link of each point, ascending."""
-    tips: tuple[int, ...]
-    """Fingertip links."""
+    fingers: tuple[Finger, ...]
+    """The fingers, in the order of their tips in the tree."""
+    rigid_group: tuple[int, ...]
+    """For each link the topmost link that it is fixed to; links with the same one move together."""
     tip_offsets: Float[Tensor, "n_tips 3"]
     """Extra target beyond each fingertip, in its link's frame [m]. Source: appendix, URDF file preprocessing."""
     palm: int
@@ -51,20 +58,45 @@ class Hand:
     """Unit vector out of the palm towards the object, in the palm frame."""
     grasp_centre: Float[Tensor, "3"]
     """Centre of the volume that the half-closed hand encloses, in the palm frame [m]."""
-    opening: Float[Tensor, " n_dof"]
-    """+1 where the upper limit is the open end of a joint, -1 where the lower one is."""
+    opening_signs: Float[Tensor, " n_dof"]
+    """+1 for joints that open towards their upper limit, -1 for those that open towards their lower limit."""
     movable: Bool[Tensor, " n_dof"]
     """False for joints above the palm, which are held at rest."""
     rest: Float[Tensor, " n_dof"]
     """Zero, or the nearest limit: the value of held joints [rad or m]."""
     abduction: Bool[Tensor, " n_dof"]
     """Joints that spread fingers and hardly close them."""
-    touching: tuple[int, ...]
-    """Links that can touch an object: the palm and below, with collision geometry."""
+    contact_links: tuple[int, ...]
+    """Links that can touch an object: the palm and links below it, if they have collision geometry."""
     sha256: str
     """Hash of the description."""
+    thumb: int | None = None
+    """Index of the finger that opposes the others; None for hands of up to three fingers (see `with_thumb`)."""
     description: Description | None = field(default=None, repr=False, compare=False)
-    """The file behind the hand; None when the hand came out of a training bundle."""
+    """The file behind the hand; None for a hand from a training bundle."""
+
+    @property
+    def tips(self) -> tuple[int, ...]:
+        """Fingertip links, one per finger."""
+        return tuple(finger.tip for finger in self.fingers)
+
+    @cached_tensor
+    def finger_of_link(self) -> Int[Tensor, " n_links"]:
+        """Index of the finger that each link belongs to, or PALM."""
+        owner = torch.full((self.tree.n_links,), PALM, device=self.link_points.device)
+        for index, finger in enumerate(self.fingers):
+            owner[list(finger.links)] = index
+        return owner
+
+    @cached_tensor
+    def thumb_opposition(self) -> Float[Tensor, " n_tips"]:
+        """How much each finger closes against the others: -1 if all close alike, 1 if the others all close the opposite way."""
+        rate = -self.opening_signs * (self.tree.upper - self.tree.lower) * (self.movable & ~self.abduction)
+        return measure_opposition(self.tree, self.canonical_joints(1 - THUMB_CLOSING), rate, self.tips, self.tip_offsets)
+
+    def with_thumb(self) -> Hand:
+        """The same hand with its thumb found."""
+        return dataclasses.replace(self, thumb=find_thumb(self.thumb_opposition))
 
     @property
     def n_points(self) -> int:
@@ -97,8 +129,9 @@ class Hand:
         return self._spread_evenly(self._between(share.expand(n, self.tree.n_dof)))
 
     def random_joints(self, n: int, generator: torch.Generator) -> Float[Tensor, "n n_dof"]:
-        """Joints uniform within their limits; held joints at rest."""
-        return self._between(torch.rand(n, self.tree.n_dof, generator=generator, device=generator.device).to(self.rest))
+        """Joints uniform within their limits [rad or m]; held joints at rest."""
+        share = torch.rand(n, self.tree.n_dof, generator=generator, device=generator.device).to(self.rest)
+        return torch.where(self.movable, self.tree.lower + share * (self.tree.upper - self.tree.lower), self.rest)
 
     def _spread_evenly(self, q: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_dof"]:
         """Joints that only spread the fingers have no open end: they stand at zero, or a quarter inside their limits."""
@@ -108,8 +141,8 @@ class Hand:
 
     def _between(self, share: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_dof"]:
         lower, upper = self.tree.lower, self.tree.upper
-        opened = torch.where(self.opening > 0, upper, lower)
-        closed = torch.where(self.opening > 0, lower, upper)
+        opened = torch.where(self.opening_signs > 0, upper, lower)
+        closed = torch.where(self.opening_signs > 0, lower, upper)
         return torch.where(self.movable, opened * share + closed * (1 - share), self.rest)
 
     def points(
@@ -164,7 +197,7 @@ class Hand:
         """
         points = self.points(self.canonical_joints())
         palm = self.link_index == self.palm
-        fingers = torch.isin(self.link_index, torch.tensor(self.touching, device=points.device)) & ~palm
+        fingers = torch.isin(self.link_index, torch.tensor(self.contact_links, device=points.device)) & ~palm
         z = torch.nn.functional.normalize(self.palm_direction_wrist, dim=0)
         offset = points[fingers].mean(0) - points[palm].mean(0)
         helper = torch.eye(3, device=z.device)[z.abs().argmin()]
@@ -199,7 +232,7 @@ class Hand:
             return self
         rank = self.spread_rank
         per_link = max(1, min(POINTS_PER_LINK, count // max(1, len(self.link_index.unique()))))
-        first = torch.zeros(self.n_points, dtype=torch.bool)
+        first = torch.zeros(self.n_points, dtype=torch.bool, device=rank.device)
         for link in self.link_index.unique().tolist():
             members = (self.link_index == link).nonzero()[:, 0]
             first[members[rank[members].argsort()[:per_link]]] = True
@@ -218,13 +251,16 @@ class Hand:
 
     def to_tensors(self) -> dict[str, Any]:
         """Tensors and plain values that `from_tensors` turns back into this hand, without its description."""
-        own = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in {"tree", "description"}}
-        return {**own, **{f"tree.{k}": v for k, v in self.tree.fields().items()}}
+        own = {f.name for f in dataclasses.fields(self)} - {"tree", "description"} - DERIVED
+        stored = {STORED_AS.get(name, name): getattr(self, name) for name in own}
+        return {**stored, "tips": self.tips, **{f"tree.{k}": v for k, v in self.tree.fields().items()}}
 
     @staticmethod
     def from_tensors(values: dict[str, Any]) -> Hand:
         """The inverse of `to_tensors`; lists are accepted for tuples."""
         plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-        tree = {k.removeprefix("tree."): v for k, v in plain.items() if k.startswith("tree.")}
-        own = {k: v for k, v in plain.items() if not k.startswith("tree.")}
-        return Hand(tree=KinematicTree(**tree), **own)
+        tree = KinematicTree(**{k.removeprefix("tree."): plain.pop(k) for k in list(plain) if k.startswith("tree.")})
+        fingers = find_fingers(tree, plain.pop("tips"), plain["palm"])
+        named = {stored: name for name, stored in STORED_AS.items()}
+        own = {named.get(k, k): v for k, v in plain.items()}
+        return Hand(tree=tree, fingers=fingers, rigid_group=rigid_groups(tree), **own).with_thumb()

@@ -30,10 +30,13 @@ class LinkSurface:
     link: Int[Tensor, " n"]
     """The link of each point."""
 
-    def coarse(self) -> LinkSurface:
-        """A quarter of the samples, enough to see where the palm looks."""
-        kept = slice(None, None, 4)
-        return LinkSurface(self.points[kept], self.normals[kept], self.link[kept])
+    def thinned(self, step: int) -> LinkSurface:
+        """Every `step`-th sample."""
+        return LinkSurface(self.points[::step], self.normals[::step], self.link[::step])
+
+    def middle(self, link: int) -> Float[Tensor, "3"]:
+        """Mean of a link's samples, in its frame [m]."""
+        return self.points[self.link == link].mean(0)
 
     def posed(self, tree: KinematicTree, q: Float[Tensor, " n_dof"]) -> tuple[np.ndarray, np.ndarray]:
         """Points (n 3) [m] and normals (n 3) in the root link's frame."""

@@ -111,8 +111,9 @@ class SampleSource:
         """
         hand, grasps = self.hands[name], self.grasps[name]
         chosen = torch.randint(len(grasps.joints), (count,), generator=generator, device=generator.device)
+        drawn = hand.random_joints(count, generator)
         known = torch.rand(count, 1, generator=generator, device=generator.device) < 0.5
-        q = torch.where(known, grasps.joints[chosen], hand.random_joints(count, generator))
+        q = torch.where(known, grasps.joints[chosen], drawn)
         if self.network.frame == "object":
             turn = random_rotations(count, generator)
         else:

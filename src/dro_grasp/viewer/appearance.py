@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.rendering.rasterizer import Camera, Colour, Mesh, dots
@@ -39,26 +40,10 @@ HIGHEST_VIEW = 0.85
 """Largest height of a camera on the unit sphere, so that none looks straight down."""
 
 
-def finger_of_link(hand: Hand) -> list[int]:
-    """The finger that each link belongs to, counted from 0; -1 for the palm and what lies above it."""
-    finger, count = [-1] * hand.tree.n_links, 0
-    for link, parent in enumerate(hand.tree.parent):
-        if parent == hand.palm:
-            # A palm may carry fixed links (covers, sensors): only branches with a moving joint are fingers.
-            finger[link], count = count, count + 1
-        elif parent >= 0:
-            finger[link] = finger[parent]
-    moving = {finger[link] for link, joint in enumerate(hand.tree.link_joint) if joint >= 0}
-    order = {f: i for i, f in enumerate(sorted(moving - {-1}))}
-    return [order.get(f, -1) for f in finger]
-
-
 def link_colours(hand: Hand) -> list[Colour]:
     """One cool colour for each finger, grey for the palm."""
-    fingers = finger_of_link(hand)
-    count = max(fingers, default=-1) + 1
-    hues = [0.62 - 0.17 * i / max(1, count - 1) for i in range(count)]
-    return [PALM_COLOUR if f < 0 else colorsys.hls_to_rgb(hues[f], 0.56, 0.48) for f in fingers]
+    hues = [0.62 - 0.17 * i / max(1, len(hand.fingers) - 1) for i in range(len(hand.fingers))]
+    return [PALM_COLOUR if f == PALM else colorsys.hls_to_rgb(hues[f], 0.56, 0.48) for f in hand.finger_of_link.tolist()]
 
 
 def success_colour(success: bool | None) -> Colour:
@@ -111,7 +96,7 @@ def best_camera(
 ) -> Camera:
     """The camera, out of many around a grasp, that shows most of the object and of the fingers."""
     of_hand = hand.points(joints, T_object_wrist).double().numpy()
-    finger = np.asarray(finger_of_link(hand))[hand.link_index.numpy()] >= 0
+    finger = (hand.finger_of_link[hand.link_index] != PALM).numpy()
     of_object = obj.cloud[:: max(1, len(obj.cloud) // 1024)].astype(float)
     points = np.concatenate([of_hand, of_object])
     owner = np.concatenate([finger.astype(int), np.full(len(of_object), 2)])

@@ -1,0 +1,198 @@
+"""A hand's anatomy, read off its tree: fingertips, palm link, rigid groups, fingers, thumb, opening signs.
+
+Nothing else in the package decides what a finger or a thumb is: `HandBuilder` calls these functions, `Hand` holds their
+results, and everyone reads the hand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from dro_grasp.errors import HandError
+from dro_grasp.kinematics.tree import FIXED, KinematicTree
+
+PALM = -1
+"""Finger number of links that belong to no finger: the palm, what is fixed to it or lies above it, and what fingers share."""
+FEWEST_WITH_THUMB = 4
+"""Hands with fewer fingers have no thumb: their fingers all oppose each other (ours)."""
+THUMB_CLOSING = 0.55
+"""Share of the way from open to closed at which thumb opposition is measured (ours). From 0.1 to 0.75 it names the thumb of
+every hand with four or five fingers, built in or among the development assets (ten hands)."""
+AXIS_ALONG_PALM = 0.75
+"""Cosine to the palm direction above which a joint's axis points out of the palm (ours)."""
+PARALLEL = 0.9
+"""Cosine above which two joint axes count as parallel (ours)."""
+
+
+@dataclass(frozen=True)
+class Finger:
+    """One fingertip and the links that belong to it."""
+
+    chain: tuple[int, ...]
+    """Links from the palm (excluded) to the tip (included); a link that several fingers share is in each of their chains."""
+    links: tuple[int, ...]
+    """Links of this finger alone: those of the chain and what hangs on them, such as a pad."""
+    joints_to_tip: tuple[int, ...]
+    """For each of `links`, the number of moving joints between it and the tip; 0 for links beside the chain."""
+
+    @property
+    def tip(self) -> int:
+        """The fingertip link."""
+        return self.chain[-1]
+
+
+def path_to(tree: KinematicTree, link: int) -> list[int]:
+    """The links from the root to this one."""
+    return tree.descends[link].nonzero()[:, 0].tolist()
+
+
+def rigid_groups(tree: KinematicTree) -> tuple[int, ...]:
+    """For each link the topmost link that it is fixed to; links with the same one never move against each other."""
+    group = list(range(tree.n_links))
+    for link, parent in enumerate(tree.parent):
+        if parent >= 0 and tree.kind[link] == FIXED:
+            group[link] = group[parent]
+    return tuple(group)
+
+
+def find_tips(tree: KinematicTree, shaped: Collection[int]) -> tuple[int, ...]:
+    """Fingertips: below each last moving joint, the deepest link with a shape.
+
+    Args:
+        tree: The hand's tree.
+        shaped: Links with a visual or collision shape.
+
+    Raises:
+        HandError: No moving joint carries a shape.
+    """
+    paths = [path_to(tree, link) for link in range(tree.n_links)]
+    last_moving = {link: max((i for i in paths[link] if tree.kind[i] != FIXED), default=None) for link in shaped}
+    tips = []
+    for link in range(tree.n_links):
+        solid = [i for i in sorted(shaped) if link in paths[i]]
+        if solid and tree.kind[link] != FIXED and all(last_moving[i] == link for i in solid):
+            tips.append(max(solid, key=lambda i: len(paths[i])))
+    if not tips:
+        raise HandError("no moving joint of this description carries a shape, so it has no fingertip; give its moving links a "
+                        "visual or collision shape")
+    return tuple(tips)
+
+
+def find_palm_link(tree: KinematicTree, tips: Sequence[int], shaped: Collection[int]) -> int:
+    """The last common ancestor of the fingertips; with one finger, the link that carries it.
+
+    If neither it nor any link fixed below it has a shape, the nearest link above that it is fixed to and that has one.
+    """
+    palm = max(tree.descends[list(tips)].all(0).nonzero()[:, 0].tolist())
+    while len(tips) == 1 and palm > 0 and any(tree.kind[i] != FIXED for i in path_to(tree, palm)):
+        palm = tree.parent[palm]
+    candidate = palm
+    while not set(shaped) & set(fixed_below(tree, candidate)):
+        if candidate == 0 or tree.kind[candidate] != FIXED:
+            return palm
+        candidate = tree.parent[candidate]
+    return candidate
+
+
+def fixed_below(tree: KinematicTree, link: int) -> list[int]:
+    """The link and all links below it that are fixed to it."""
+    group, below = rigid_groups(tree), tree.descends[:, link].tolist()
+    return [i for i in range(tree.n_links) if below[i] and group[i] == group[link]]
+
+
+def find_fingers(tree: KinematicTree, tips: Sequence[int], palm: int) -> tuple[Finger, ...]:
+    """The finger of each tip.
+
+    A link belongs to the finger whose tip alone it carries, or else to the finger of its parent. What is fixed to the palm
+    belongs to none, even if it carries one finger: it does not move.
+    """
+    still, below = set(fixed_below(tree, palm)), tree.descends[:, palm].tolist()
+    chains = [tuple(i for i in path_to(tree, tip) if below[i] and i not in still) for tip in tips]
+    owner = [PALM] * tree.n_links
+    for link in range(tree.n_links):
+        carried = [finger for finger, chain in enumerate(chains) if link in chain]
+        if below[link] and link not in still:
+            owner[link] = owner[tree.parent[link]] if not carried else carried[0] if len(carried) == 1 else PALM
+    fingers = []
+    for finger, chain in enumerate(chains):
+        links = tuple(link for link, its in enumerate(owner) if its == finger)
+        moving = [i for i in chain if tree.kind[i] != FIXED]
+        to_tip = (sum(i > link for i in moving) if link in chain else 0 for link in links)
+        fingers.append(Finger(chain, links, tuple(to_tip)))
+    return tuple(fingers)
+
+
+def measure_opposition(
+    tree: KinematicTree, q: Float[Tensor, " n_dof"], rate: Float[Tensor, " n_dof"], tips: Sequence[int],
+    tip_offsets: Float[Tensor, "n_tips 3"],
+) -> Float[Tensor, " n_tips"]:
+    """How much each fingertip, while the hand closes, moves against the others.
+
+    Args:
+        tree: The hand's tree.
+        q: Joints at which this is measured [rad or m].
+        rate: Their velocities while the whole hand closes.
+        tips: Fingertip links.
+        tip_offsets: Points beyond them whose velocity is taken, in their links' frames [m].
+
+    Returns:
+        Minus the mean cosine to the other tips' directions: -1 if all move alike, 1 if the others all move the opposite way.
+    """
+    poses, links = tree.forward(q), torch.tensor(tips, device=q.device)
+    points = poses[links, :3, 3] + (poses[links, :3, :3] @ tip_offsets[..., None])[..., 0]
+    velocity = tree.point_jacobian(poses, points, links) @ rate
+    direction = velocity / velocity.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+    others = (direction.sum(0) - direction) / max(1, len(direction) - 1)
+    return -(direction * others).sum(-1)
+
+
+def find_thumb(opposition: Float[Tensor, " n_tips"]) -> int | None:
+    """The finger with the largest thumb opposition; None for hands with too few fingers to have a thumb."""
+    return None if len(opposition) < FEWEST_WITH_THUMB else int(opposition.argmax())
+
+
+def closing_gains(
+    tree: KinematicTree, q: Float[Tensor, " n_dof"], tips: Sequence[int], tip_points: Float[Tensor, "n_tips 3"],
+    targets: Sequence[Float[Tensor, "3"]],
+) -> Float[Tensor, " n_dof"]:
+    """How much nearer to the targets the upper limit of each joint brings its fingertips than the lower limit [m].
+
+    Args:
+        tree: The hand's tree.
+        q: Values of all other joints [rad or m].
+        tips: Fingertip links.
+        tip_points: A point on each, in its link's frame [m].
+        targets: Points in the root link's frame [m]; the distances to them are added.
+
+    Returns:
+        The mean over the tips that a joint moves; 0 for a joint that moves none.
+    """
+    links, each = list(tips), torch.arange(tree.n_dof)
+    ends = q.repeat(2, tree.n_dof, 1)  # (end, joint that is moved there, joints)
+    ends[0, each, each], ends[1, each, each] = tree.lower, tree.upper
+    T = tree.forward(ends)[..., links, :, :]
+    points = (T[..., :3, :3] @ tip_points[..., None])[..., 0] + T[..., :3, 3]
+    distance = torch.stack([(points - target).norm(dim=-1) for target in targets]).sum(0)
+    moved = (tree.descends[links].to(q.dtype) @ tree.link_coupling.abs() > 0).T
+    mean = (distance * moved).sum(-1) / moved.sum(-1).clamp_min(1)
+    return mean[0] - mean[1]
+
+
+def axes_along(
+    tree: KinematicTree, q: Float[Tensor, " n_dof"], direction: Float[Tensor, "3"]
+) -> Bool[Tensor, " n_dof"]:
+    """The joints whose axes lie along a direction of the root link's frame and which bend no finger.
+
+    A joint with a parallel one below it, or with none below it, is part of a finger's flexion.
+    """
+    angular = tree.motion_axes(tree.forward(q))[1]
+    moving = torch.tensor(tree.kind) != FIXED
+    below = tree.descends & moving[:, None] & ~torch.eye(tree.n_links, dtype=torch.bool)
+    parallel = (angular @ angular.T).abs() > PARALLEL
+    along = moving & below.any(0) & ~(below & parallel).any(0) & ((angular @ direction).abs() > AXIS_ALONG_PALM)
+    return (along[:, None] | (tree.link_coupling == 0)).all(0)
