@@ -20,6 +20,7 @@ PICTURED = "assets-shadowhand.parquet"
 """The hand of the pictures."""
 COLUMNS = ("hand", "grasps", "train", "few_shot", "validate", "objects", "fewest", "without", "valid of evaluated [%]",
            "per CPU-hour", "diversity", "wrist", "joints", "all six half-axes [%]", "kB")
+"""Headings of the table."""
 
 
 def row(path: Path) -> list[str]:

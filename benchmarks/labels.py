@@ -31,6 +31,7 @@ from dro_grasp.simulation.trial import simulate
 OBJECTS = 6
 """Training objects, drawn with seed 1."""
 NARROW = StartConfig(openness=(0.45, 0.85), joint_noise=0.08)
+"""Starts around half-open joints."""
 
 
 def choices(candidates: int) -> dict[str, EngineConfig]:

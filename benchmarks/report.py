@@ -13,6 +13,7 @@ from pathlib import Path
 import torch
 
 ROOT = Path(__file__).resolve().parent.parent
+"""Folder of the repository."""
 
 
 def machine() -> dict[str, str | int]:

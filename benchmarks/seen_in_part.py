@@ -28,6 +28,7 @@ from dro_grasp.ranking.score import score_grasps
 from dro_grasp.simulation.trial import simulate
 
 PROTOCOLS = ("dro", "strict")
+"""Trials of every grasp."""
 DEEP = 0.003
 """Penetration of the opened hand beyond which a trial begins inside the object [m]."""
 

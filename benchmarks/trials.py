@@ -29,8 +29,10 @@ from dro_grasp.simulation.trial import TrialResult, simulate
 
 HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand")
 """The paper hands."""
-SAMPLE, FULL = 16, 64
-"""Grasps for each hand and object."""
+SAMPLE = 16
+"""Grasps of each hand on each object."""
+FULL = 64
+"""The same with `--full`."""
 STEPS = 120
 """Steps of the synthesis, enough for grasps that mostly hold."""
 

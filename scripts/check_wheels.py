@@ -15,6 +15,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 PROJECT = Path(__file__).parents[1] / "pyproject.toml"
+"""Where the dependencies are stated."""
 
 
 def resolve(requirements: list[str], version: str) -> str:

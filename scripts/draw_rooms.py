@@ -20,6 +20,7 @@ import matplotlib.pyplot as plt
 from matplotlib.patches import FancyBboxPatch
 
 ROOT = Path(__file__).parents[1]
+"""Folder of the repository."""
 SHADES = ("#dbe9f6", "#e8f1e4", "#fbeedb", "#f3e4ef")
 """Colours of the layers, in turn."""
 ARROW = "#555555"
