@@ -1,4 +1,4 @@
-"""What became of a new hand, as one web page."""
+"""Report on the onboarding of a hand, as one web page."""
 
 from __future__ import annotations
 
@@ -15,27 +15,31 @@ from dro_grasp.simulation.trial import simulate
 from dro_grasp.viewer.page import image, table, write_page
 from dro_grasp.viewer.pictures import draw_grasps
 
-SHOWN, OBJECTS, CANDIDATES = 8, 3, 4
-"""Grasps drawn of each object, objects drawn, and grasps of which the best one is."""
+GRASPS = 8
+"""Grasps drawn on each object."""
+OBJECTS = 3
+"""Held-out objects drawn."""
+CANDIDATES = 4
+"""Candidates for each grasp drawn."""
 
 
 def write_report(done: Onboarded, held_out: list[str]) -> Path:
-    """Write the page into the hand's folder; returns its path.
+    """Write the page into the folder of the hand, and return its path.
 
     Args:
-        done: All steps.
-        held_out: Objects that the weights were tried on, some of which are drawn.
+        done: Results of all steps.
+        held_out: Objects that the weights were evaluated on; some are drawn.
 
     Raises:
-        OutputError: It cannot be written.
+        OutputError: The page cannot be written.
     """
     path, name = done.folder / REPORT, html.escape(Path(done.hand).stem)
     parts = [
-        f"<h1>{name}</h1>", _summary(done), _rates(done), "<h2>What it grasps now</h2>", _drawn(done, held_out),
+        f"<h1>{name}</h1>", _summary(done), _rates(done), "<h2>Grasps after fine-tuning</h2>", _drawn(done, held_out),
         f"<h2>The description</h2><p class=note>{html.escape(done.hand)}</p>",
         image((done.folder / PICTURE).read_bytes(), f"{name}, open and closed"),
-        f"<pre>{html.escape(chr(10).join(done.steps['check']['lines']))}</pre>", "<h2>The grasps it learned from</h2>",
-        _data(done.steps["data"]), "<h2>To go on</h2>", _commands(done),
+        f"<pre>{html.escape(chr(10).join(done.steps['check']['lines']))}</pre>", "<h2>Training grasps</h2>",
+        _data(done.steps["data"]), "<h2>Next steps</h2>", _commands(done),
     ]
     write_page(path, f"{Path(done.hand).stem} onboarded", "".join(parts))
     return path
@@ -45,9 +49,9 @@ def _summary(done: Onboarded) -> str:
     before, after = (done.rate(step, REFINED, "dro/1") for step in ("before", "after"))
     best = done.rate("after", BEST, "dro/1")
     minutes = sum(step["seconds"] for step in done.steps.values()) / 60
-    return (f"<p>On objects that it was never trained on, {before:.0%} of its refined grasps held under protocol <i>dro</i> "
-            f"before, and {after:.0%} after fine-tuning on {done.steps['training']['grasps']:,} grasps of its own; of the best "
-            f"quarter by score {best:.0%}. All steps took {minutes:.0f} minutes.</p>")
+    return (f"<p>On held-out objects, {before:.0%} of the refined grasps pass protocol <i>dro</i> before fine-tuning, and "
+            f"{after:.0%} after fine-tuning on {done.steps['training']['grasps']:,} grasps of this hand; of the best quarter "
+            f"by score, {best:.0%} pass. All steps took {minutes:.0f} minutes.</p>")
 
 
 def _rates(done: Onboarded) -> str:
@@ -58,9 +62,10 @@ def _rates(done: Onboarded) -> str:
             rows.append([step, "network alone" if row["stage"] == RAW else row["stage"], row["num"], *rates,
                          f"{row['diversity']:.2f}"])
     labels = list(done.steps["after"]["rows"][0]["success"])
-    return table(["weights", "grasps", "tried", *labels, "diversity"], rows) + (
-        "<p class=note>Success with 95 % intervals. dro is the paper's trial and lenient; strict also limits pushing while the "
-        "hand closes and penetration. <i>generate</i> keeps the best of four by score: the rows <i>refined, ranked</i>.</p>")
+    return table(["weights", "grasps", "trials", *labels, "diversity"], rows) + (
+        "<p class=note>Success rates with 95 % intervals. dro is the paper's protocol and lenient; strict also limits "
+        "penetration and how far closing may push the object. <i>generate</i> keeps the best of four candidates by score: "
+        "the rows <i>refined, ranked</i>.</p>")
 
 
 def _drawn(done: Onboarded, held_out: list[str]) -> str:
@@ -69,7 +74,7 @@ def _drawn(done: Onboarded, held_out: list[str]) -> str:
     for name in held_out[:OBJECTS]:
         obj = load_object(name)
         path = done.folder / f"{Path(name).stem}.png"
-        grasps = predictor.predict(hand, obj, SHOWN, candidates=CANDIDATES)
+        grasps = predictor.predict(hand, obj, GRASPS, candidates=CANDIDATES)
         draw_grasps(hand, obj, grasps.with_trial(simulate(hand, obj, grasps, "strict")), path)
         parts.append(image(path.read_bytes(), f"grasps of {name}"))
     return "".join(parts)
@@ -78,7 +83,7 @@ def _drawn(done: Onboarded, held_out: list[str]) -> str:
 def _data(step: dict[str, Any]) -> str:
     rows = [[name, count, step["failures"].get(name, "")] for name, count in sorted(step["counts"].items())]
     missing = [[name, 0, why] for name, why in step["failures"].items() if name not in step["counts"]]
-    return table(["object", "grasps", "given up because"], [*rows, *missing])
+    return table(["object", "grasps", "why no more"], [*rows, *missing])
 
 
 def _commands(done: Onboarded) -> str:
