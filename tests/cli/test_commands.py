@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -16,13 +17,17 @@ from dro_grasp.cli.main import main
 from dro_grasp.grasps.batch import GraspBatch
 from tests.helpers.weights import untrained_weights
 
-COMMANDS = [
-    [], ["generate"], ["evaluate"], ["synthesize"], ["dataset"], ["dataset", "bundle"], ["dataset", "info"],
-    ["dataset", "import"],
-    ["pretrain"], ["train"], ["view"], ["picture"], ["hand"], ["hand", "check"], ["hands"], ["objects"],
-    ["weights"], ["weights", "list"], ["weights", "verify"], ["benchmark"],
-    ["export"], ["onboard"],
-]
+
+def names_of(command: Any) -> list[list[str]]:
+    """The words that reach each command below a union of commands, groups of commands included."""
+    found = []
+    for kind, settings in (get_args(part) for part in get_args(command)):
+        below = get_type_hints(kind, include_extras=True).get("command")
+        found += [[settings.name], *([settings.name, *words] for words in (names_of(below) if below else []))]
+    return found
+
+
+COMMANDS = [[], *names_of(cli.Command)]
 KEYS = {
     "hand", "object", "num", "candidates", "seed", "weights", "protocol", "success", "success_rate", "seconds",
     "output", "frame",
@@ -52,6 +57,11 @@ def test_every_command_has_help(command: list[str], capsys: pytest.CaptureFixtur
     assert stop.value.code == 0
     assert "usage: dro-grasp" in out
     assert "{None}" not in out, "options that may be left out say what happens then"
+
+
+def test_commands_within_groups_are_found() -> None:
+    assert ["generate"] in COMMANDS
+    assert ["dataset", "filter"] in COMMANDS
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:

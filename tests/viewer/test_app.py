@@ -64,7 +64,7 @@ def test_points_and_colours_follow_the_grasp(viewer: GraspViewer, grasps: GraspB
         viewer.show(index, "grasp")
         solved = viewer.hand.points(grasps.joints[index], grasps.T_object_wrist[index])
         assert np.allclose(viewer.stage.solved.points, solved, atol=1e-5)
-        assert np.allclose(viewer._predicted.points, solved + 0.001, atol=1e-3)
+        assert np.allclose(viewer._predicted.points, solved + 0.001, atol=1e-5)
         wanted = tuple(round(255 * c) for c in success_colour(bool(grasps.success[index])))
         assert tuple(viewer.stage._grid.cell_color) == wanted
         assert f"Grasp {index}" in viewer._text.content
