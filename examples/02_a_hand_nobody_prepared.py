@@ -1,5 +1,6 @@
 """A URDF that was written a moment ago: check it, then synthesise its first grasps from geometry alone."""
 
+from collections import Counter
 from pathlib import Path
 
 import dro_grasp as dro
@@ -34,5 +35,5 @@ hand = dro.load_hand(path)
 obj = dro.load_object("can")
 grasps = dro.synthesize(hand, obj, num=64)[slice(0, 16)]
 result = dro.simulate(hand, obj, grasps, "strict")
-print(f"{int(result.success.sum())} of the best {len(grasps)} synthesised grasps hold; the others failed for these reasons:")
-print({reason.split(",")[0] for reason in result.reason if reason})
+print(f"{int(result.success.sum())} of the best {len(grasps)} synthesised grasps hold; the others fail as follows:")
+print(dict(Counter(failure.value for failure in result.failure if failure)))
