@@ -33,7 +33,7 @@ for line in dro.check_hand(path).lines():
     print(line)
 hand = dro.load_hand(path)
 obj = dro.load_object("can")
-grasps = dro.synthesize(hand, obj, num=64)[slice(0, 16)]
+grasps = dro.synthesize(hand, obj, num=64)[:16]
 result = dro.simulate(hand, obj, grasps, "strict")
 print(f"{int(result.success.sum())} of the best {len(grasps)} synthesised grasps hold; the others fail as follows:")
 print(dict(Counter(failure.value for failure in result.failure if failure)))
