@@ -15,6 +15,8 @@ from dro_grasp.models.checkpoints import save_weights
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predictor import GraspPredictor
+from tests.helpers.bracket_hand import bracket_hand, bracket_urdf
+from tests.helpers.claw_urdf import joint, written
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.tiny_bundle import TINY
 
@@ -45,6 +47,14 @@ def test_axes_are_right_handed_and_follow_palm_and_fingers(name: str) -> None:
     tips = torch.stack([points[hand.link_index == tip].mean(0) for tip in hand.tips])
     if name not in {"barrett", "gripper3"}:  # whose fingers surround the palm
         assert float((tips - palm)[:, 0].mean()) > 0.05
+
+
+def test_a_palm_link_without_shape_has_the_axes_of_the_shell_on_it(tmp_path: Path) -> None:
+    plain, weld = bracket_hand(tmp_path), joint("weld", "frame", "palm", "0 0 0", kind="fixed", more="")
+    text = bracket_urdf().replace('<parent link="palm"/>', '<parent link="frame"/>')
+    framed = load_hand(written(tmp_path, text.replace("</robot>", f'<link name="frame"/>{weld}</robot>'), "framed.urdf"))
+    assert framed.tree.link_names[framed.palm] == "frame"
+    torch.testing.assert_close(framed.palm_axes_wrist, plain.palm_axes_wrist, atol=0.05, rtol=0)
 
 
 @pytest.mark.parametrize("name", ["gripper3", "leaphand"])

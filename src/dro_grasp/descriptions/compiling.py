@@ -1,4 +1,4 @@
-"""Compile a hand, repairing what MuJoCo refuses in otherwise usable descriptions, without noise on the terminal."""
+"""Compile a hand: repair usable descriptions that MuJoCo refuses, and print nothing on the terminal."""
 
 from __future__ import annotations
 
@@ -14,15 +14,17 @@ import numpy as np
 from dro_grasp.descriptions.notes import Note
 from dro_grasp.errors import HandError
 
-LEAST_MASS, LEAST_INERTIA = 1e-4, 1e-8
-"""What moving links without mass get [kg, kg m^2]."""
+LEAST_MASS = 1e-4
+"""Mass of moving links that state none [kg] (ours)."""
+LEAST_INERTIA = 1e-8
+"""Inertia of moving links that state none [kg m^2] (ours)."""
 MOST_REPAIRS = 64
-"""Attempts before compiling is given up."""
+"""Number of repairs after which compiling fails (ours)."""
 
 
 @contextmanager
 def mujoco_speaks_to(notes: list[Note], path: Path) -> Iterator[None]:
-    """Collect MuJoCo's warnings as notes; it would print them and write a log file into the working folder.
+    """Collect MuJoCo's warnings as notes; MuJoCo itself prints them and writes a log file into the working folder.
 
     Raises:
         HandError: MuJoCo refuses the description.
@@ -45,10 +47,10 @@ def one_line(error: Exception) -> str:
 
 
 def compile_hand(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> mujoco.MjModel:
-    """The compiled model; repairs change the specification, so that simulation gets them too.
+    """The compiled model. Repairs change the specification, so simulation gets them too.
 
     Raises:
-        HandError: MuJoCo refuses the description for a reason that cannot be repaired, or places something nowhere.
+        HandError: MuJoCo refuses the description for a reason that cannot be repaired, or a number is not finite.
     """
     with mujoco_speaks_to(notes, path):
         model = _compile(spec, notes)
@@ -67,7 +69,7 @@ def _compile(spec: mujoco.MjSpec, notes: list[Note]) -> mujoco.MjModel:
 
 
 def _check_finite(model: mujoco.MjModel, path: Path) -> None:
-    """MuJoCo reads NaN and infinity as numbers."""
+    """Refuse NaN and infinity, which MuJoCo reads as numbers."""
     bodies = np.concatenate([np.arange(model.nbody), model.geom_bodyid, model.jnt_bodyid])
     places = np.concatenate([
         np.concatenate([model.body_pos, model.body_quat], 1), np.concatenate([model.geom_pos, model.geom_quat], 1),
@@ -80,7 +82,7 @@ def _check_finite(model: mujoco.MjModel, path: Path) -> None:
 
 
 def _repair(spec: mujoco.MjSpec, message: str, notes: list[Note]) -> bool:
-    """Change what a message complains of; False when there is nothing to change."""
+    """Repair the fault that a message names; False if there is nothing to repair."""
     element = re.search(r"Element name '([^']*)'", message)
     mesh = next((m for m in spec.meshes if element and m.name == element.group(1)), None)
     if "volume is too small" in message and mesh is not None and mesh.inertia != mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL:
@@ -97,12 +99,12 @@ def _repair(spec: mujoco.MjSpec, message: str, notes: list[Note]) -> bool:
         spec.delete(mesh)
         return True
     if "convex hull" in message and mesh is not None:
-        touching = [g for g in spec.geoms if g.meshname == mesh.name and (g.contype or g.conaffinity)]
-        for geom in touching:
+        colliding = [g for g in spec.geoms if g.meshname == mesh.name and (g.contype or g.conaffinity)]
+        for geom in colliding:
             geom.contype = geom.conaffinity = 0
-        if touching:
+        if colliding:
             notes.append(Note("warning", mesh.name, "is a flat mesh, which cannot collide; it is only drawn"))
-        return bool(touching)
+        return bool(colliding)
     compiler = spec.compiler
     if "inertia of moving bodies" in message and compiler.boundmass < LEAST_MASS:
         compiler.boundmass, compiler.boundinertia = LEAST_MASS, LEAST_INERTIA

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from dro_grasp.errors import HandError
 
@@ -17,19 +18,20 @@ class Coupling:
     follower: int
     """Index of the following joint."""
     leader: int
-    """Index of the leading joint; -1: the follower is held at the offset."""
+    """Index of the leading joint; -1 if the follower is held at the offset."""
     multiplier: float
+    """Motion of the follower per motion of the leader."""
     offset: float
-    """[rad or m]"""
+    """Value of the follower while the leader is at zero [rad or m]."""
 
 
 def resolve_couplings(
     couplings: tuple[Coupling, ...], n_joints: int, names: list[str], path: Path
-) -> tuple[list[int], np.ndarray, np.ndarray]:
+) -> tuple[list[int], Float[np.ndarray, "n_joints n_dof"], Float[np.ndarray, " n_joints"]]:
     """Every joint as an affine function of the independent ones.
 
     Returns:
-        Indices of the independent joints, coupling (n_joints n_dof) and offset (n_joints).
+        Indices of the independent joints, coupling and offset: joints = coupling @ independent joints + offset.
 
     Raises:
         HandError: Followers follow each other in a cycle.

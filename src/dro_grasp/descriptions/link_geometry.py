@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+import mujoco
 import numpy as np
+from jaxtyping import Float, Int
 
 from dro_grasp.descriptions.tree_reading import quaternion_matrix
 
 if TYPE_CHECKING:
     import trimesh
-
-SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH = 2, 3, 4, 5, 6, 7
-"""MuJoCo's geom types."""
 
 
 @dataclass(frozen=True)
@@ -22,21 +21,21 @@ class LinkGeometry:
 
     link: int
     """Index of the link in the kinematic tree."""
-    vertices: np.ndarray
-    """(n 3) in the link frame [m]."""
-    faces: np.ndarray
-    """(m 3) vertex indices, counter-clockwise from outside."""
+    vertices: Float[np.ndarray, "n 3"]
+    """In the link frame [m]."""
+    faces: Int[np.ndarray, "m 3"]
+    """Vertex indices, counter-clockwise from outside."""
     collides: bool
-    """Whether MuJoCo lets it touch; meshes that collide are given as their convex hulls, as MuJoCo sees them."""
+    """Whether it collides in MuJoCo; the mesh of a colliding shape is its convex hull, which MuJoCo uses."""
     visual: bool
     """Whether it is drawn."""
 
 
-def read_geometry(model: Any, link_of_body: dict[int, int]) -> tuple[LinkGeometry, ...]:
+def read_geometry(model: mujoco.MjModel, link_of_body: dict[int, int]) -> tuple[LinkGeometry, ...]:
     """All shapes of a compiled model whose bodies are links.
 
     Args:
-        model: A `mujoco.MjModel`.
+        model: The compiled hand.
         link_of_body: Body index to link index; shapes of other bodies are left out.
     """
     visual_bodies = {int(model.geom_bodyid[g]) for g in range(model.ngeom) if not _collides(model, g)}
@@ -56,29 +55,29 @@ def read_geometry(model: Any, link_of_body: dict[int, int]) -> tuple[LinkGeometr
     return tuple(shapes)
 
 
-def _collides(model: Any, g: int) -> bool:
+def _collides(model: mujoco.MjModel, g: int) -> bool:
     return bool(model.geom_contype[g] or model.geom_conaffinity[g])
 
 
-def _mesh_of(model: Any, g: int, hull: bool) -> trimesh.Trimesh | None:
+def _mesh_of(model: mujoco.MjModel, g: int, hull: bool) -> trimesh.Trimesh | None:
     """The geom as triangles in its own frame; None for planes and height fields."""
     import trimesh
 
     kind, size = int(model.geom_type[g]), model.geom_size[g]
-    if kind == MESH:
+    if kind == mujoco.mjtGeom.mjGEOM_MESH:
         i = int(model.geom_dataid[g])
         vertices = model.mesh_vert[model.mesh_vertadr[i] :][: model.mesh_vertnum[i]]
         faces = model.mesh_face[model.mesh_faceadr[i] :][: model.mesh_facenum[i]]
         mesh = trimesh.Trimesh(vertices, faces, process=False)
         return trimesh.convex.convex_hull(mesh) if hull else mesh
-    if kind == SPHERE:
+    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
         return trimesh.creation.icosphere(subdivisions=2, radius=size[0])
-    if kind == CAPSULE:
+    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
         return trimesh.creation.capsule(height=2 * size[1], radius=size[0], count=(16, 16))
-    if kind == ELLIPSOID:
+    if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
         return trimesh.creation.icosphere(subdivisions=2).apply_scale(size)
-    if kind == CYLINDER:
+    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
         return trimesh.creation.cylinder(radius=size[0], height=2 * size[1], sections=24)
-    if kind == BOX:
+    if kind == mujoco.mjtGeom.mjGEOM_BOX:
         return trimesh.creation.box(extents=2 * size)
     return None

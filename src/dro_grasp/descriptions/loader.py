@@ -1,6 +1,6 @@
 """A hand description, URDF or MJCF, read once into a kinematic tree and link geometry.
 
-MuJoCo does the reading, so that kinematics and simulation agree on every link, limit and coupling.
+MuJoCo reads the file, so kinematics and simulation agree on every link, limit and coupling.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
 from dro_grasp.descriptions.compiling import compile_hand, mujoco_speaks_to
 from dro_grasp.descriptions.couplings import Coupling
@@ -32,7 +33,7 @@ def load_description(path: Path | str) -> Description:
     """Read a URDF or MJCF file.
 
     Raises:
-        HandError: The file cannot be used; the message says why and what to do.
+        HandError: The file cannot be used; the message gives the reason and a remedy.
     """
     path = Path(path).expanduser()
     root = parse_xml(path)
@@ -46,13 +47,13 @@ def load_description(path: Path | str) -> Description:
     notes.extend(keep_hand_only(spec, path))
     model = compile_hand(spec, path, notes)
     description = Description(path.resolve(), spec, model, _digest(path, files), tuple(notes))
-    _ = description.tree  # so that what is wrong is said now
+    _ = description.tree  # raises the errors of the tree now
     return description
 
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """What a file says of a hand. Bodies of the compiled model are links, the first one the root at identity."""
+    """The content of a hand's file. Each body of the compiled model is a link; the first one is the root, at identity."""
 
     path: Path
     """The file."""
@@ -62,7 +63,7 @@ class Description:
     sha256: str
     """Hash of the file and of the files it uses."""
     notes: tuple[Note, ...]
-    """What loading found or repaired."""
+    """Findings and repairs."""
 
     @property
     def name(self) -> str:
@@ -70,7 +71,7 @@ class Description:
         return self.path.stem
 
     def spec(self) -> mujoco.MjSpec:
-        """A fresh copy of the hand alone, without actuators, its couplings as joint equalities."""
+        """A new copy of the hand alone: without actuators, with couplings as joint equalities."""
         return self._spec.copy()
 
     @cached_property
@@ -80,7 +81,7 @@ class Description:
 
     @cached_property
     def tree(self) -> KinematicTree:
-        """The kinematic tree, couplings resolved."""
+        """The kinematic tree, with couplings resolved."""
         return read_tree(self.model, self.couplings, self.path)
 
     @cached_property
@@ -95,8 +96,8 @@ class Description:
         return read_geometry(self.model, self.link_of_body)
 
     @cached_property
-    def masses(self) -> np.ndarray:
-        """Mass of each link (n_links) [kg]."""
+    def masses(self) -> Float[np.ndarray, " n_links"]:
+        """Mass of each link [kg]."""
         masses = np.zeros(self.tree.n_links)
         for body, link in self.link_of_body.items():
             masses[link] = self.model.body_mass[body]

@@ -1,4 +1,4 @@
-"""What loading a hand description finds on the way."""
+"""Notes that are taken while a hand description is loaded."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Note:
-    """Something that loading found: what was derived, repaired or is wrong."""
+    """One thing that loading derived, repaired or found wrong."""
 
     level: Literal["info", "warning", "error"]
     subject: str

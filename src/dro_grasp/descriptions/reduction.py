@@ -11,16 +11,18 @@ from dro_grasp.descriptions.notes import Note
 from dro_grasp.errors import HandError
 
 CONTINUOUS_LIMIT = math.pi
-"""Limits given to hinges that state none [rad]."""
+"""Limits of hinges that state none, both ways from zero [rad] (ours)."""
 SLIDE_LIMIT = 0.05
-"""Limits given to slides that state none [m]."""
+"""Limits of slides that state none, both ways from zero [m] (ours)."""
 
 
 def keep_hand_only(spec: mujoco.MjSpec, path: Path) -> tuple[Note, ...]:
-    """Reduce a file, in place, to its largest articulated body tree, root at identity, nothing that acts or films.
+    """Reduce a file, in place, to its largest articulated body tree, with its root at identity.
+
+    Actuators, sensors, cameras, lights and everything else that is not the hand are deleted.
 
     Raises:
-        HandError: Nothing moves, or something moves as no tree of hinges and slides does.
+        HandError: Nothing moves, or a joint is neither a hinge nor a slide.
     """
     notes: list[Note] = []
     hand = _largest_tree(spec, path)
@@ -37,7 +39,7 @@ def keep_hand_only(spec: mujoco.MjSpec, path: Path) -> tuple[Note, ...]:
             notes.append(Note("info", body.name, "is not part of the hand and is left out"))
             spec.delete(body)
     hand.pos, hand.quat, hand.mocap = [0, 0, 0], [1, 0, 0, 0], False
-    # A description in Euler angles or axes would win over the quaternion.
+    # A rotation stated as Euler angles or axes would take precedence over the quaternion.
     hand.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
     for joint in list(hand.joints):
         if joint.type == mujoco.mjtJoint.mjJNT_FREE:
@@ -49,7 +51,7 @@ def keep_hand_only(spec: mujoco.MjSpec, path: Path) -> tuple[Note, ...]:
 
 
 def _largest_tree(spec: mujoco.MjSpec, path: Path) -> mujoco.MjsBody:
-    """The top-level body with most moving joints below it."""
+    """The top-level body with the most moving joints below it."""
     roots = list(spec.worldbody.bodies)
     if not roots:
         raise HandError(f"{path} has no body; expected a hand with moving joints")
@@ -64,7 +66,7 @@ def _all_joints(body: mujoco.MjsBody) -> list[mujoco.MjsJoint]:
 
 
 def _name_everything(spec: mujoco.MjSpec) -> None:
-    """MJCF may leave bodies and joints unnamed; links and joints are known by their names here."""
+    """Name bodies and joints that MJCF leaves unnamed: links and joints are known by their names here."""
     for kind, items in (("link", list(spec.bodies)[1:]), ("joint", list(spec.joints))):
         taken = {item.name for item in items}
         for number, item in enumerate(items):
@@ -77,7 +79,7 @@ def _name_everything(spec: mujoco.MjSpec) -> None:
 
 
 def _couple_tendons(spec: mujoco.MjSpec, notes: list[Note]) -> None:
-    """One actuated fixed tendon over several joints: they move together, each by the same tendon length."""
+    """Couple the joints of each actuated fixed tendon: they move together, each by the same tendon length."""
     driven = {a.target for a in spec.actuators if a.trntype == mujoco.mjtTrn.mjTRN_TENDON}
     followers = {e.name1 for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT and e.active}
     for tendon in spec.tendons:
@@ -97,15 +99,15 @@ def _couple_tendons(spec: mujoco.MjSpec, notes: list[Note]) -> None:
 
 
 def _keep_joint_equalities(spec: mujoco.MjSpec, notes: list[Note]) -> None:
-    """Only couplings that the kinematic tree can state, so that simulation and kinematics agree."""
+    """Keep only couplings that the kinematic tree can state, so simulation and kinematics agree."""
     joints = {joint.name for joint in spec.joints}
     for equality in list(spec.equalities):
         inside = equality.name1 in joints and (not equality.name2 or equality.name2 in joints)
         if equality.type == mujoco.mjtEq.mjEQ_JOINT and equality.active and inside:
             if any(abs(x) > 1e-9 for x in equality.data[2:5]):
                 equality.data[2:5] = 0.0
-                notes.append(Note("warning", equality.name1, f"follows '{equality.name2}' by a polynomial, of which only "
-                                  "the linear part is kept"))
+                notes.append(Note("warning", equality.name1, f"follows '{equality.name2}' by a polynomial; only its linear "
+                                  "part is kept"))
             continue
         if equality.active and equality.type in {mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD} and _within(spec, equality):
             notes.append(Note("warning", equality.name1, f"is tied to '{equality.name2}' in a closed loop, which a tree "
@@ -138,7 +140,7 @@ def _check_joints(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
 
 
 def _let_visuals_collide(spec: mujoco.MjSpec, notes: list[Note]) -> None:
-    """A hand without any colliding shape collides with its visual ones."""
+    """Let a hand without any collision shape collide with its visual shapes."""
     if any(g.contype or g.conaffinity for g in spec.geoms):
         return
     for geom in spec.geoms:

@@ -8,12 +8,13 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from dro_grasp.descriptions.couplings import Coupling, resolve_couplings
 from dro_grasp.kinematics.tree import FIXED, PRISMATIC, REVOLUTE, KinematicTree
 
 NARROWEST = 0.2
-"""Share of a leading joint's range that its followers' limits must leave; narrower ones are taken for mistakes."""
+"""Share of a leading joint's range that its followers' limits must leave; narrower limits count as mistakes (ours)."""
 
 
 def read_couplings(model: mujoco.MjModel) -> tuple[Coupling, ...]:
@@ -33,7 +34,7 @@ def read_couplings(model: mujoco.MjModel) -> tuple[Coupling, ...]:
 
 
 def read_tree(model: mujoco.MjModel, couplings: tuple[Coupling, ...], path: Path) -> KinematicTree:
-    """Links from bodies; a body with several joints becomes a chain of links, the last one carrying its geometry."""
+    """Links from bodies; a body with several joints becomes a chain of links, the last of which carries its geometry."""
     names, parent, link_joint, kind, origin, axis, anchor = [], [], [], [], [], [], []
     link_of_body: dict[int, int] = {}
     for b in range(1, model.nbody):
@@ -66,7 +67,7 @@ def read_tree(model: mujoco.MjModel, couplings: tuple[Coupling, ...], path: Path
     )
 
 
-def _minus_reference(model: mujoco.MjModel, j: int) -> np.ndarray:
+def _minus_reference(model: mujoco.MjModel, j: int) -> Float[np.ndarray, "4 4"]:
     """The motion that takes a joint from its reference value (MJCF `ref`) back to zero."""
     T = np.eye(4)
     if j < 0 or model.qpos0[model.jnt_qposadr[j]] == 0:
@@ -81,8 +82,11 @@ def _minus_reference(model: mujoco.MjModel, j: int) -> np.ndarray:
     return T
 
 
-def _limits(model: mujoco.MjModel, free: list[int], coupling: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Limits of the free joints, narrowed so that their followers stay within their own."""
+def _limits(
+    model: mujoco.MjModel, free: list[int], coupling: Float[np.ndarray, "n_joints n_dof"],
+    offset: Float[np.ndarray, " n_joints"],
+) -> tuple[Float[np.ndarray, " n_dof"], Float[np.ndarray, " n_dof"]]:
+    """Limits of the free joints [rad or m], narrowed so that their followers stay within their own limits."""
     lower, upper = model.jnt_range[free, 0].copy(), model.jnt_range[free, 1].copy()
     for joint in range(model.njnt):
         if joint in free:
@@ -97,8 +101,8 @@ def _limits(model: mujoco.MjModel, free: list[int], coupling: np.ndarray, offset
     return lower, upper
 
 
-def quaternion_matrix(quaternion: np.ndarray) -> np.ndarray:
-    """Rotation matrix (3 3) of a unit quaternion WXYZ."""
+def quaternion_matrix(quaternion: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
+    """Rotation matrix of a unit quaternion WXYZ."""
     matrix = np.zeros(9)
     mujoco.mju_quat2Mat(matrix, np.asarray(quaternion, float))
     return matrix.reshape(3, 3)

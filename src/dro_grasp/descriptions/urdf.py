@@ -1,6 +1,6 @@
-"""Preparing a URDF in memory: safe parsing, mesh paths, root link. No file is changed.
+"""Prepare a URDF in memory for MuJoCo: check links and joints, find meshes, name the root link. No file is changed.
 
-The result is an XML string that MuJoCo reads; everything found on the way is reported as notes.
+The result is an XML string that MuJoCo reads, with notes on every finding.
 """
 
 from __future__ import annotations
@@ -11,12 +11,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from dro_grasp.descriptions.compiling import LEAST_INERTIA, LEAST_MASS
 from dro_grasp.descriptions.notes import Note
 from dro_grasp.descriptions.urdf_meshes import resolve_meshes
 from dro_grasp.errors import HandError
 
 MOVING = {"revolute", "continuous", "prismatic"}
-"""URDF joint types that move in one way."""
+"""URDF joint types with one degree of freedom."""
 
 
 @dataclass(frozen=True)
@@ -24,18 +25,21 @@ class PreparedUrdf:
     """A URDF ready for MuJoCo."""
 
     xml: str
+    """The description as MuJoCo reads it."""
     notes: tuple[Note, ...]
+    """Findings and repairs."""
     mesh_files: tuple[Path, ...]
     """Every mesh file in use."""
     converted: dict[str, Path]
-    """Stand-in file name -> mesh in a format that MuJoCo cannot read (GLB, DAE, ...)."""
+    """Meshes in formats that MuJoCo cannot read (GLB, DAE, ...), by the file names that stand in for them."""
 
 
 def prepare_urdf(root: ET.Element, path: Path) -> PreparedUrdf:
-    """Check the link tree, resolve meshes and set what MuJoCo needs to know.
+    """Check the link tree, resolve meshes and set MuJoCo's options.
 
     Raises:
-        HandError: Names used twice, numbers that are none, no moving joint, a cycle, several roots, or no mesh to be found.
+        HandError: A name is used twice, a number is not one, no joint moves, links form a cycle or several trees, or no mesh
+            is found.
     """
     notes: list[Note] = []
     _check_names(root, path)
@@ -52,8 +56,8 @@ def prepare_urdf(root: ET.Element, path: Path) -> PreparedUrdf:
     compiler = ET.SubElement(extension, "compiler") if compiler is None else compiler
     for stale in ("meshdir", "assetdir", "texturedir"):
         compiler.attrib.pop(stale, None)
-    compiler.attrib.update(discardvisual="false", fusestatic="false", balanceinertia="true", boundmass="1e-4",
-                           boundinertia="1e-8", strippath="false")
+    compiler.attrib.update(discardvisual="false", fusestatic="false", balanceinertia="true", boundmass=str(LEAST_MASS),
+                           boundinertia=str(LEAST_INERTIA), strippath="false")
     return PreparedUrdf(ET.tostring(root, encoding="unicode"), tuple(notes), tuple(files), converted)
 
 
@@ -66,7 +70,7 @@ def _check_names(root: ET.Element, path: Path) -> None:
 
 
 def _settle_joints(root: ET.Element, path: Path, notes: list[Note]) -> None:
-    """Every joint fixed or moving in one way, about an axis, within sensible limits."""
+    """Make every joint fixed, or movable about one axis within sensible limits."""
     for joint in root.findall("joint"):
         name, kind = joint.get("name", ""), joint.get("type")
         if kind == "floating":
@@ -92,7 +96,7 @@ def _check_axis(joint: ET.Element, path: Path) -> None:
 
 
 def _check_limits(joint: ET.Element, path: Path, notes: list[Note]) -> None:
-    """Refuse limits that no joint value satisfies; one limit alone has zero opposite; a joint without range is fixed."""
+    """Refuse limits that no joint value satisfies. A limit left out is zero; a joint without range is fixed."""
     element = joint.find("limit")
     if element is None or not {"lower", "upper"} & element.attrib.keys():
         return
@@ -111,7 +115,7 @@ def _check_limits(joint: ET.Element, path: Path, notes: list[Note]) -> None:
 
 
 def _drop_empty_shapes(root: ET.Element, path: Path, notes: list[Note]) -> None:
-    """Boxes, spheres and cylinders without extent, which MuJoCo refuses."""
+    """Remove boxes, spheres and cylinders without extent, which MuJoCo refuses."""
     for link in root.findall("link"):
         for element in [*link.findall("visual"), *link.findall("collision")]:
             shape = element.find("geometry/*")
@@ -141,7 +145,7 @@ def _numbers(element: ET.Element, attribute: str, path: Path, owner: str) -> lis
 
 
 def _check_links(root: ET.Element, path: Path) -> str:
-    """The root link's name; the tree must be a tree."""
+    """The root link's name, once the links form one tree."""
     links = [link.get("name", "") for link in root.findall("link")]
     joints = root.findall("joint")
     moving = [j for j in joints if j.get("type") in MOVING]
@@ -181,7 +185,7 @@ def _link_of(joint: ET.Element, end: str, links: Iterable[str], path: Path) -> s
 
 
 def _rename_link(root: ET.Element, old: str, new: str) -> None:
-    """MuJoCo keeps the name `world` for itself."""
+    """Rename a link: MuJoCo reserves the name `world`."""
     for link in root.findall("link"):
         if link.get("name") == old:
             link.set("name", new)
@@ -193,7 +197,7 @@ def _rename_link(root: ET.Element, old: str, new: str) -> None:
 
 
 def _check_mimic(root: ET.Element, path: Path, notes: list[Note]) -> None:
-    """Report mimic tags that lead nowhere; refuse cycles of followers."""
+    """Drop mimic tags of joints that do not move; refuse cycles of followers."""
     joints = {j.get("name", ""): j for j in root.findall("joint")}
     leader = {name: j.find("mimic").get("joint", "") for name, j in joints.items() if j.find("mimic") is not None}  # type: ignore[union-attr]
     for name, target in leader.items():

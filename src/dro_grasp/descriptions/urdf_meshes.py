@@ -1,4 +1,4 @@
-"""The meshes a URDF names: where they are, and what stands in for those that are missing or in foreign formats."""
+"""The meshes that a URDF names: find them, and replace those that are missing or in formats that MuJoCo cannot read."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from dro_grasp.descriptions.notes import Note
 from dro_grasp.errors import HandError
 
 READABLE_MESHES = {".stl", ".obj", ".msh"}
-"""Mesh formats that MuJoCo reads itself; others go through trimesh."""
+"""Mesh formats that MuJoCo reads; trimesh converts the others."""
 
 
 def resolve_meshes(root: ET.Element, path: Path, notes: list[Note]) -> tuple[list[Path], dict[str, Path]]:
-    """Point every mesh to its file, in place; drop what cannot be found, if something is left.
+    """Point every mesh to its file, in place; drop shapes whose mesh cannot be found, if any shape is left.
 
     Returns:
-        The mesh files in use, and stand-in names of those in formats that MuJoCo cannot read.
+        The mesh files in use, and those in formats that MuJoCo cannot read by the names that stand in for them.
 
     Raises:
         HandError: No mesh can be found, and there is no other shape.
@@ -44,7 +44,7 @@ def resolve_meshes(root: ET.Element, path: Path, notes: list[Note]) -> tuple[lis
 
 
 def _resolve_mesh(element: ET.Element, folder: Path, files: dict[str, Path]) -> bool:
-    """Point a shape's mesh to its file, or to a stand-in; False when there is no such file."""
+    """Point a shape's mesh to its file, or to a name that stands in for it; False if there is no such file."""
     mesh = element.find("geometry/mesh")
     if mesh is None:
         return True
@@ -69,7 +69,7 @@ def as_obj(file: Path) -> bytes:
     try:
         mesh = trimesh.load_mesh(file)
         return trimesh.exchange.obj.export_obj(mesh, include_normals=False, include_texture=False).encode()
-    except Exception as error:  # every mesh format fails in its own way
+    except Exception as error:  # the reader of each mesh format raises its own errors
         raise HandError(f"mesh {file} cannot be read ({type(error).__name__}: {error}); expected STL, OBJ, GLB, DAE or "
                         "PLY, whole") from error
 
@@ -79,7 +79,7 @@ def _stand_in(name: str) -> str:
 
 
 def _collide_with_visuals(link: ET.Element, notes: list[Note]) -> None:
-    """A link whose collision meshes are all missing collides with its visual shapes."""
+    """Let a link whose collision meshes are all missing collide with its visual shapes."""
     visuals = link.findall("visual")
     for visual in visuals:
         shape = copy.deepcopy(visual)
@@ -94,14 +94,14 @@ def _has_geometry(root: ET.Element) -> bool:
 
 
 def _candidates(name: str, folder: Path) -> list[Path]:
-    """Where a mesh may lie, most likely first."""
+    """Paths at which a mesh may lie, the most likely first."""
     rest = name.replace("\\", "/").split("://", 1)[-1]
     roots = (folder, *list(folder.parents)[:4]) if "://" in name else (folder,)
     return [root / tail for root in roots for tail in dict.fromkeys((rest, rest.split("/", 1)[-1]))]
 
 
 def find_mesh(name: str, folder: Path) -> Path | None:
-    """The file behind a mesh name: relative, absolute, `package://` or `file://`; None when there is none."""
+    """The file of a mesh name (relative, absolute, `package://` or `file://`); None if there is none."""
     if not name:
         return None
     return next((file.resolve() for file in _candidates(name, folder) if file.is_file()), None)

@@ -1,4 +1,4 @@
-"""Reading description files as XML, refusing what XML can do besides describing."""
+"""Read description files as XML, and refuse entities, which can read other files or exhaust memory."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ XACRO = "{http://www.ros.org/wiki/xacro}"
 
 
 def parse_xml(path: Path) -> ET.Element:
-    """Parse a description, refusing entity tricks.
+    """Parse a description; entities are refused.
 
     Raises:
         HandError: The file is missing, is not XML, or declares entities.
@@ -45,7 +45,7 @@ def included_files(root: ET.Element, path: Path) -> tuple[Path, ...]:
     """Every file that an MJCF includes, directly or through others.
 
     Raises:
-        HandError: One is missing or cannot be parsed.
+        HandError: An included file is missing or cannot be parsed.
     """
     found: dict[Path, None] = {}
     waiting = [(root, path)]
@@ -53,7 +53,7 @@ def included_files(root: ET.Element, path: Path) -> tuple[Path, ...]:
         element, including = waiting.pop()
         for include in element.iter("include"):
             name = include.get("file", "")
-            # MuJoCo reads includes relative to the main file, at any depth.
+            # MuJoCo resolves includes relative to the main file, at any depth.
             file = next((f for f in (path.parent / name, including.parent / name) if f.is_file()), None)
             if file is None:
                 raise HandError(f"{including} includes '{name}', which does not exist in {path.parent}; put it there or "

@@ -14,26 +14,26 @@ from dro_grasp.hands.hand import Hand
 
 @dataclass(frozen=True)
 class ContactConfig:
-    """Where a hand may touch."""
+    """Selection of contact candidates."""
 
     closing: float = 0.55
-    """Share of the way from open to closed at which inner sides are judged."""
+    """Share of the way from open to closed at which inner sides are determined (ours)."""
     inner_cosine: float = 0.3
-    """Least cosine between a candidate's normal and the direction to the grasp centre."""
+    """Least cosine between a candidate's normal and the direction to the grasp centre (ours)."""
     level_weights: tuple[float, ...] = (1.0, 0.35, 0.1)
-    """Weight of a finger's links, from the distal one towards the palm; links beyond have no candidates."""
+    """Weights of a finger's links, by their number of joints to the tip (ours); links farther up have no candidates."""
     palm_weight: float = 0.3
-    """Weight of the palm as a whole, against 1 for a finger, among the contacts not tied to a finger."""
+    """Weight of the palm as a whole, against 1 for a finger, in the slots that are free (ours)."""
     min_contacts: int = 4
     """Least number of contacts. Source: DexGraspNet (four)."""
     idle: float = 0.6
-    """Probability that a finger other than the thumb holds nothing, in hands that have a thumb (ours: a hand that
-    always uses all fingers grasps everything alike). The thumb and one more finger always hold."""
+    """Probability that a finger other than the thumb holds nothing, in hands with a thumb (ours: hands that always use all
+    fingers grasp every object alike). The thumb and one more finger always hold."""
 
 
 @dataclass(frozen=True)
 class ContactCandidates:
-    """Points of a hand's surface that contacts are chosen from."""
+    """Points of a hand's surface from which contacts are drawn, one per slot."""
 
     points: Float[Tensor, "k 3"]
     """In their links' frames [m]."""
@@ -42,20 +42,20 @@ class ContactCandidates:
     links: Int[Tensor, " k"]
     """The link of each candidate."""
     fingers: Int[Tensor, " k"]
-    """The finger of each candidate, or PALM."""
+    """Index of the finger of each candidate, or PALM."""
     slot_weights: Float[Tensor, "n_slots k"]
-    """Probability of each candidate in each slot; slots that stay on one finger come first."""
+    """Probability of each candidate in each slot; the slots of the fingers come first, the free slots last."""
     slot_finger: tuple[int, ...]
     """Finger of each slot; PALM for the free slots."""
     thumb: int | None
-    """The finger that always holds; None where all of them do."""
+    """Index of the thumb, which always holds; None if all fingers do."""
 
     def draw(self, n: int, generator: torch.Generator) -> Int[Tensor, "n n_slots"]:
         """Random candidates, one for each grasp and slot, drawn on the CPU."""
         return torch.multinomial(self.slot_weights.cpu(), n, replacement=True, generator=generator).T
 
     def assign(self, n: int, idle: float, generator: torch.Generator) -> Int[Tensor, "n n_slots"]:
-        """The slot whose candidates each contact of each grasp uses: its own, or another where its finger is idle.
+        """The slot from which each contact of each grasp draws: its own, or another one if its finger is idle.
 
         Args:
             n: How many grasps.
@@ -75,10 +75,10 @@ class ContactCandidates:
 
 
 def contact_candidates(hand: Hand, config: ContactConfig | None = None) -> ContactCandidates:
-    """Candidate contacts on the inner sides of fingers and palm, and which slot may use which.
+    """Candidate contacts on the inner sides of fingers and palm, and their probabilities in each slot.
 
-    There are as many contacts as fingers, at least `min_contacts`; each finger has a slot of its own (so the
-    thumb always holds), further slots are free to use any finger or the palm.
+    There are as many slots as fingers, but at least `min_contacts`. Each finger has a slot of its own, so the thumb always
+    holds; the other slots are free to use any finger or the palm.
     """
     config = config or ContactConfig()
     q = hand.canonical_joints(1 - config.closing)
@@ -97,7 +97,7 @@ def contact_candidates(hand: Hand, config: ContactConfig | None = None) -> Conta
 
 
 def _level_weights(hand: Hand, config: ContactConfig) -> Float[Tensor, " n_links"]:
-    """The weight of each link's candidates: by joints to the tip on a finger, the same on the palm."""
+    """Weight of each link's candidates: by the number of joints to the tip on fingers, uniform on the palm."""
     weights = torch.full((hand.tree.n_links,), config.palm_weight)
     levels = torch.tensor([*config.level_weights, 0.0])
     for finger in hand.fingers:
@@ -109,7 +109,7 @@ def _level_weights(hand: Hand, config: ContactConfig) -> Float[Tensor, " n_links
 def _never_empty(
     inner: Bool[Tensor, " n"], weight: Float[Tensor, " n"], finger: Int[Tensor, " n"], n_fingers: int
 ) -> Bool[Tensor, " n"]:
-    """Let a finger without any inner point use all its points rather than none."""
+    """Give a finger without inner points all of its points."""
     result = inner.clone()
     for i in range(n_fingers):
         if not (inner & (finger == i) & (weight > 0)).any():

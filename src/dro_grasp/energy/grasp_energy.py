@@ -1,4 +1,4 @@
-"""The grasp energy of one hand on one object: the weighted terms and their gradient, batched over grasps."""
+"""The grasp energy of one hand on one object: the weighted terms and their gradient, for a batch of grasps."""
 
 from __future__ import annotations
 
@@ -6,41 +6,42 @@ from copy import copy
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.devices import on_device
 from dro_grasp.energy import terms as energies
 from dro_grasp.energy.contact_candidates import ContactCandidates, ContactConfig, contact_candidates
+from dro_grasp.geometry import se3
 from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.hands.hand import Hand
 
 TERMS = ("force_closure", "distance", "penetration", "self_penetration", "alignment", "joints")
-"""Names of the terms, the order of every table of them."""
+"""Names of the terms, in the order of every array of terms."""
 
 
 @dataclass(frozen=True)
 class EnergyConfig:
-    """Weights and geometry of the energy. Source: DexGraspNet, unless said otherwise."""
+    """Weights and geometry of the energy. Source: DexGraspNet, unless stated otherwise."""
 
     force_closure: float = 1.0
     """Weight of the squared net wrench."""
     distance: float = 100.0
     """Weight of the contacts' distance to the surface [1/m]."""
     penetration: float = 100.0
-    """Weight of the hand points' depth in the object [1/m]."""
+    """Weight of the hand points' penetration into the object [1/m]."""
     self_penetration: float = 50.0
-    """Weight of the overlap of links [1/m] (DexGraspNet: 10; its spheres are finer)."""
+    """Weight of self-penetration [1/m] (DexGraspNet: 10; its spheres are finer)."""
     alignment: float = 1.0
     """Weight of the angle between hand and object normals (ours)."""
     joints: float = 1.0
     """Weight of joints closer to their closed end than `closing_room` [1/rad or 1/m]."""
     closing_room: float = 0.1
-    """Share of a joint's range that is left for the squeeze (ours)."""
+    """Share of a joint's range that is kept for the squeeze (ours)."""
     hand_points: int = 200
-    """Points of the hand at which penetration is measured."""
+    """Number of hand points at which penetration is measured."""
     margin: float = 0.001
-    """Depth by which hand points are thought thicker than they are, for penetration [m] (ours)."""
+    """Clearance that hand points keep from the object before they count as penetrating [m] (ours)."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class LinkSpheres:
 def link_spheres(hand: Hand) -> LinkSpheres:
     """Spheres along the longest axis of each link, from its surface points.
 
-    Pairs on links that move together or are neighbours, and pairs that overlap in the open hand, may touch.
+    Pairs on links of one rigid group or of neighbouring groups, and pairs that overlap in the open hand, may touch.
     """
     centres, radii, links = [], [], []
     for link in hand.link_index.unique().tolist():
@@ -76,14 +77,14 @@ def link_spheres(hand: Hand) -> LinkSpheres:
     near = _neighbours(hand)
     pairs = pairs[~near[link_of[pairs[:, 0]], link_of[pairs[:, 1]]]]
     poses = hand.tree.forward(hand.canonical_joints(0.9))[link_of]
-    placed = (poses[:, :3, :3] @ centre[..., None])[..., 0] + poses[:, :3, 3]
+    placed = se3.apply(poses, centre)
     apart = (placed[pairs[:, 0]] - placed[pairs[:, 1]]).norm(dim=-1)
     pairs = pairs[apart > radius[pairs[:, 0]] + radius[pairs[:, 1]]]
     return LinkSpheres(centre, radius, link_of, pairs)
 
 
-def _fill(points: Float[Tensor, "n 3"]) -> list[tuple[Tensor, Tensor]]:
-    """Centres and radii of spheres along the longest axis of a set of surface points."""
+def _fill(points: Float[Tensor, "n 3"]) -> list[tuple[Float[Tensor, "3"], Float[Tensor, ""]]]:
+    """Centres [m] and radii [m] of spheres along the longest axis of a set of surface points."""
     middle = (points.amin(0) + points.amax(0)) / 2
     axes = torch.linalg.svd(points - points.mean(0), full_matrices=False)[2]
     local = (points - middle) @ axes.T
@@ -98,17 +99,15 @@ def _fill(points: Float[Tensor, "n 3"]) -> list[tuple[Tensor, Tensor]]:
     return [(middle + torch.stack([a, across[1], across[2]]) @ axes, radius) for a in along]
 
 
-def _neighbours(hand: Hand) -> Tensor:
-    """Pairs of links (n_links n_links) with at most one moving joint between them."""
-    tree = hand.tree
+def _neighbours(hand: Hand) -> Bool[Tensor, "n_links n_links"]:
+    """Whether at most one moving joint lies between two links."""
     group = torch.tensor(hand.rigid_group)
-    rigid = group[:, None] == group
-    step = torch.zeros_like(rigid)
-    for link, parent in enumerate(tree.parent):
+    adjacent = torch.eye(hand.tree.n_links, dtype=torch.bool)
+    for link, parent in enumerate(hand.tree.parent):
         if parent >= 0:
-            step[link, parent] = step[parent, link] = True
-    near = (rigid.float() @ step.float() @ rigid.float()) > 0
-    return near | rigid
+            above, below = hand.rigid_group[parent], hand.rigid_group[link]
+            adjacent[above, below] = adjacent[below, above] = True
+    return adjacent[group[:, None], group]
 
 
 @dataclass(frozen=True)
@@ -130,10 +129,14 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class LinkPoints:
-    """Points fixed to links, laid out so that one matrix product places them all."""
+    """Points fixed to links, laid out so that one matrix product places them all.
+
+    The poses of a grasp, as one row of 4 n_links entries for each of x, y and z, times the layout give the coordinates of all
+    points: each point's column holds its homogeneous coordinates in the four rows of its own link, and zeros elsewhere.
+    """
 
     layout: Float[Tensor, "rows p"]
-    """Homogeneous coordinates of each point in the four rows of its link [m]."""
+    """The columns; rows is 4 n_links [m]."""
     members: Float[Tensor, "p n_links"]
     """One-hot link of each point."""
 
@@ -152,7 +155,7 @@ class LinkPoints:
 
 
 class GraspEnergy:
-    """The energy of a hand on an object, ready to be evaluated many times."""
+    """The energy of a hand on an object, prepared for many evaluations."""
 
     def __init__(
         self,
@@ -164,7 +167,7 @@ class GraspEnergy:
         contacts: ContactConfig | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
-        """Prepare everything that does not change from step to step.
+        """Prepare everything that stays the same from step to step.
 
         Args:
             hand: The hand.
@@ -172,8 +175,8 @@ class GraspEnergy:
             centre: The object's centre of mass [m].
             length: Typical distance of its surface from there [m].
             config: Weights.
-            contacts: Where the hand may touch.
-            device: Where the energy is evaluated; hand, field and centre are given on the CPU.
+            contacts: Selection of contact candidates.
+            device: Device of the evaluations; hand, field and centre are on the CPU.
         """
         self.length = length
         self.candidates: ContactCandidates = on_device(contact_candidates(hand, contacts), device)
@@ -186,13 +189,13 @@ class GraspEnergy:
         self._weigh(config or EnergyConfig())
 
     def weighted(self, config: EnergyConfig) -> GraspEnergy:
-        """This energy under other weights; contacts, link spheres and distance field are shared."""
+        """This energy under other weights; it shares contacts, link spheres and distance field."""
         other = copy(self)
         other._weigh(config)
         return other
 
     def _weigh(self, config: EnergyConfig) -> None:
-        """Set the weights and what depends on them."""
+        """Set the weights and everything that depends on them."""
         hand = self.hand
         thin = self.source.with_points(min(config.hand_points, hand.n_points)).to(hand.link_points.device)
         self.config, self.body = config, LinkPoints.of(thin.link_points, thin.link_index, hand.tree.n_links)
@@ -211,7 +214,7 @@ class GraspEnergy:
         Args:
             T_object_wrist: Wrist poses [m].
             q: Joints [rad or m].
-            contacts: Chosen contact candidates.
+            contacts: Indices of the contact candidates.
         """
         tree, config = self.hand.tree, self.config
         poses = T_object_wrist[:, None] @ tree.forward(q)
@@ -242,24 +245,24 @@ class GraspEnergy:
         return Evaluation(terms, by_pose, (by_joint + config.joints * slope) * movable)
 
     def pivot(self, T_object_wrist: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 3"]:
-        """The hand's grasp centre, about which it is turned [m]."""
+        """The point about which the hand turns: its grasp centre [m]."""
         return self.hand.grasp_centres(T_object_wrist)
 
     def _contacts(
         self, poses: Float[Tensor, "n n_links 4 4"], contacts: Int[Tensor, "n c"]
-    ) -> tuple[tuple[Tensor, Tensor, Tensor], Float[Tensor, "n n_links 6"]]:
-        """The terms that depend on contacts, and their wrenches per link."""
+    ) -> tuple[tuple[Float[Tensor, " n"], ...], Float[Tensor, "n n_links 6"]]:
+        """Force closure, distance and alignment of the contacts, and their wrenches on the links."""
         config, candidates = self.config, self.candidates
         links = candidates.links[contacts]
         chosen = poses[torch.arange(len(poses), device=links.device)[:, None], links]
-        rotation = chosen[..., :3, :3]
-        points = (rotation @ candidates.points[contacts][..., None])[..., 0] + chosen[..., :3, 3]
-        outward = (rotation @ candidates.normals[contacts][..., None])[..., 0]
+        points = se3.apply(chosen, candidates.points[contacts])
+        outward = se3.rotate(chosen[..., :3, :3], candidates.normals[contacts])
         surface = self.field.normals(points)
         normal, bend = surface.normal, surface.bend
         closure = energies.force_closure(points - self.centre, normal, self.length)
         apart = energies.contact_distance(surface.distance, surface.gradient)
         align = energies.normal_alignment(outward, normal)
+        # The object's normal turns with the contact's position, so its derivative joins that by position through `bend`.
         by_object_normal = config.force_closure * closure.by_normal + config.alignment * outward
         by_point = (
             config.force_closure * closure.by_point + config.distance * apart.by_point

@@ -1,4 +1,4 @@
-"""The grasp energy on any object, and on grasps whose contacts nobody chose."""
+"""The grasp energy on any object, and of grasps without chosen contacts."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def object_energy(
         hand: The hand.
         obj: The object.
         config: Weights.
-        contacts: Where the hand may touch.
-        device: Where the energy is evaluated.
+        contacts: Selection of contact candidates.
+        device: Device of the evaluations.
     """
     surface = torch.as_tensor(obj.cloud, dtype=torch.float32)
     centre = torch.as_tensor(obj.centre_of_mass, dtype=torch.float32)
@@ -39,16 +39,16 @@ def object_energy(
 def evaluate_nearest(
     energy: GraspEnergy, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"]
 ) -> Evaluation:
-    """The energy with each slot's contact at its candidate nearest to the surface."""
+    """The energy with the contact of each slot at that slot's candidate nearest to the surface."""
     return energy(T_object_wrist, q, nearest_contacts(energy, T_object_wrist, q))
 
 
 def nearest_contacts(
     energy: GraspEnergy, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], reach: float = math.inf
 ) -> Int[Tensor, "n c"]:
-    """For each slot its candidate nearest to the surface; slots do not share a candidate.
+    """The candidate of each slot that is nearest to the surface; slots do not share a candidate.
 
-    A slot that has none within `reach` [m] takes one of the slot that is nearest of all.
+    A slot without a candidate within `reach` [m] takes one from the slot that is nearest to the surface.
     """
     candidates = energy.candidates
     poses = T_object_wrist[:, None] @ energy.hand.tree.forward(q)

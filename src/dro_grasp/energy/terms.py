@@ -1,9 +1,11 @@
-"""The terms of the grasp energy, each with its gradient, and the way from forces on links to joint gradients.
+"""The terms of the grasp energy with their gradients, and the map from forces on links to joint gradients.
 
-Every term returns unreduced values and their derivatives by the positions (and normals) it was given; callers
-weigh and sum. No automatic differentiation: a term's derivative is a force on a point fixed to a link, forces
-are summed to a wrench per link, and `joint_gradient` carries the wrenches down the tree. Source of the terms:
-DexGraspNet (Wang et al. 2022), which the paper names for its ranking; the differences are noted at each term.
+Every term returns unreduced values and their derivatives by the positions (and normals) given; callers weigh and sum
+them. There is no automatic differentiation: the derivative of a term is a force on a point fixed to a link, the forces on
+each link add up to a wrench, and `joint_gradient` sums the wrenches below each joint. Source of the terms: DexGraspNet
+(Wang et al. 2022), which the paper names for its ranking; each term notes its differences.
+
+Axes: *b grasps, c contacts, p points, s spheres, k values of a term.
 """
 
 from __future__ import annotations
@@ -20,43 +22,43 @@ from dro_grasp.kinematics.tree import KinematicTree
 class PointTerm(NamedTuple):
     """Values of a term that depends on positions."""
 
-    value: Tensor
-    """Unreduced, (*b k)."""
-    by_point: Tensor
-    """Derivative of the summed values by the points given, (*b c 3) [1/m times the value's unit]."""
+    value: Float[Tensor, "*b k"]
+    """Unreduced."""
+    by_point: Float[Tensor, "*b c 3"]
+    """Derivative of the summed values by the points given [unit of the value per m]."""
 
 
 class NormalTerm(NamedTuple):
     """Values of a term that depends on directions."""
 
-    value: Tensor
-    """Unreduced, (*b k)."""
-    by_normal: Tensor
-    """Derivative of the summed values by the normals given, (*b c 3)."""
+    value: Float[Tensor, "*b k"]
+    """Unreduced."""
+    by_normal: Float[Tensor, "*b c 3"]
+    """Derivative of the summed values by the normals given."""
 
 
 class ContactTerm(NamedTuple):
     """Values of a term that depends on positions and directions."""
 
-    value: Tensor
-    """Unreduced, (*b k)."""
-    by_point: Tensor
+    value: Float[Tensor, "*b k"]
+    """Unreduced."""
+    by_point: Float[Tensor, "*b c 3"]
     """As in PointTerm."""
-    by_normal: Tensor
+    by_normal: Float[Tensor, "*b c 3"]
     """As in NormalTerm."""
 
 
 def force_closure(
     points: Float[Tensor, "*b c 3"], normals: Float[Tensor, "*b c 3"], length: float
 ) -> ContactTerm:
-    """Squared components of the net wrench of unit forces along the contact normals, (*b 6).
+    """Squared six components of the net wrench of unit forces along the contact normals.
 
-    Zero means that equal normal forces alone hold the object: the differentiable relaxation of force closure.
+    Zero means that equal normal forces alone hold the object: a differentiable relaxation of force closure.
 
     Args:
         points: Contacts relative to the object's centre of mass [m].
         normals: Outward unit normals of the object at the contacts.
-        length: Torques are divided by this length [m], so that force and torque weigh alike.
+        length: Torques are divided by this length [m], so force and torque have equal weight.
     """
     # Differs from DexGraspNet: torques are about the centre of mass and scaled by the object's size.
     force = normals.sum(-2)
@@ -69,7 +71,7 @@ def force_closure(
 
 
 def contact_distance(distance: Float[Tensor, "*b c"], gradient: Float[Tensor, "*b c 3"]) -> PointTerm:
-    """Distance of each contact to the object's surface, inside or outside [m].
+    """Distance of each contact to the object's surface, from inside or outside [m].
 
     Args:
         distance: Signed distance at the contacts [m].
@@ -81,21 +83,21 @@ def contact_distance(distance: Float[Tensor, "*b c"], gradient: Float[Tensor, "*
 def normal_alignment(
     hand_normals: Float[Tensor, "*b c 3"], object_normals: Float[Tensor, "*b c 3"]
 ) -> NormalTerm:
-    """One plus the cosine between hand and object normal at each contact: 0 where they oppose.
+    """One plus the cosine between hand normal and object normal at each contact: 0 if they are opposite.
 
-    `by_normal` is the derivative by the hand's normals; that by the object's is `hand_normals` itself.
+    `by_normal` is the derivative by the hand's normals; the derivative by the object's normals is `hand_normals`.
     """
     return NormalTerm(1 + (hand_normals * object_normals).sum(-1), object_normals)
 
 
 def penetration(distance: Float[Tensor, "*b p"], gradient: Float[Tensor, "*b p 3"]) -> PointTerm:
-    """Depth of each hand point inside the object [m], zero outside.
+    """Penetration of each hand point into the object [m]; zero outside.
 
     Args:
         distance: Signed distance at points of the hand's surface [m].
         gradient: Its gradient there.
     """
-    # Differs from DexGraspNet, which sums over object points inside the hand: here hand points in the object.
+    # Differs from DexGraspNet, which sums over object points inside the hand; this sums over hand points inside the object.
     inside = (distance < 0).to(distance.dtype)
     return PointTerm(-distance * inside, -gradient * inside[..., None])
 
@@ -103,27 +105,27 @@ def penetration(distance: Float[Tensor, "*b p"], gradient: Float[Tensor, "*b p 3
 def self_penetration(
     centres: Float[Tensor, "*b s 3"], radii: Float[Tensor, " s"], pairs: Int[Tensor, "k 2"]
 ) -> PointTerm:
-    """Overlap of the pairs of spheres that stand for links which may not touch [m], (*b k)."""
+    """Overlap of each pair of spheres, on links that must not touch [m]."""
     first, second = pairs[:, 0], pairs[:, 1]
     one_hot = torch.eye(len(radii), dtype=centres.dtype, device=centres.device)
     difference = one_hot[first] - one_hot[second]
-    # As plain matrix products, several times faster than gathering and adding by index.
+    # One matrix product with the differences of one-hot rows is several times faster than gathering and adding by index.
     apart = (centres.mT.reshape(-1, len(radii)) @ difference.T).unflatten(0, (*centres.shape[:-2], 3))
     distance = apart.square().sum(-2).clamp_min(1e-12).sqrt()
     overlap = radii[first] + radii[second] - distance
-    touching = (overlap > 0).to(centres.dtype)
-    push = -apart * (touching / distance)[..., None, :]
+    overlapping = (overlap > 0).to(centres.dtype)
+    push = -apart * (overlapping / distance)[..., None, :]
     by_point = (push.reshape(-1, len(pairs)) @ difference).unflatten(0, (*centres.shape[:-2], 3)).mT
-    return PointTerm(overlap * touching, by_point)
+    return PointTerm(overlap * overlapping, by_point)
 
 
 def joint_margin(
     q: Float[Tensor, "*b n_dof"], lower: Float[Tensor, " n_dof"], upper: Float[Tensor, " n_dof"]
 ) -> tuple[Float[Tensor, "*b n_dof"], Float[Tensor, "*b n_dof"]]:
-    """How far each joint lies beyond the given limits [rad or m], and the derivative by q.
+    """Distance of each joint beyond the given limits [rad or m], and its derivative by q.
 
-    The limits are those of the hand narrowed where a joint needs room to squeeze; the hand's own are kept
-    by projection, not by this term.
+    The limits are the hand's own, narrowed to leave room for the squeeze. The optimiser keeps the hand's own limits by
+    projection; this term does not.
     """
     above, below = q - upper, lower - q
     value = above.clamp_min(0) + below.clamp_min(0)
@@ -133,7 +135,7 @@ def joint_margin(
 def link_wrenches(
     points: Float[Tensor, "*b p 3"], by_point: Float[Tensor, "*b p 3"], members: Float[Tensor, "p n_links"]
 ) -> Float[Tensor, "*b n_links 6"]:
-    """Sum derivatives by points to one derivative per rigid motion of each link (translation, rotation).
+    """Derivatives by the rigid motion of each link (translation, rotation about the world's origin), from those by points.
 
     Args:
         points: World positions [m].
@@ -156,12 +158,13 @@ def joint_gradient(
     Args:
         tree: The hand's tree.
         T_world_link: Poses of all links.
-        wrenches: Derivative by each link's translation and by its rotation about the world's origin.
-        pivot: The whole hand is turned about this point [m].
+        wrenches: Derivatives by each link's translation and by its rotation about the world's origin.
+        pivot: Point about which the whole hand turns [m].
 
     Returns:
-        Derivative by (translation, rotation about the pivot) of the hand, and by the joints.
+        Derivative by the hand's (translation, rotation about the pivot), and by the joints.
     """
+    # A joint moves every link below it, so its wrench is the sum of theirs.
     carried = tree.descends.to(wrenches.dtype).T @ wrenches
     linear, angular = tree.motion_axes(T_world_link)
     per_link = (linear * carried[..., :3] + angular * carried[..., 3:]).sum(-1)

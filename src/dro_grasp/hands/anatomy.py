@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dro_grasp.errors import HandError
+from dro_grasp.geometry import se3
 from dro_grasp.kinematics.tree import FIXED, KinematicTree
 
 PALM = -1
@@ -144,7 +145,7 @@ def measure_opposition(
         Minus the mean cosine to the other tips' directions: -1 if all move alike, 1 if the others all move the opposite way.
     """
     poses, links = tree.forward(q), torch.tensor(tips, device=q.device)
-    points = poses[links, :3, 3] + (poses[links, :3, :3] @ tip_offsets[..., None])[..., 0]
+    points = se3.apply(poses[links], tip_offsets)
     velocity = tree.point_jacobian(poses, points, links) @ rate
     direction = velocity / velocity.norm(dim=-1, keepdim=True).clamp_min(1e-9)
     others = (direction.sum(0) - direction) / max(1, len(direction) - 1)
@@ -175,8 +176,7 @@ def closing_gains(
     links, each = list(tips), torch.arange(tree.n_dof)
     ends = q.repeat(2, tree.n_dof, 1)  # (end, joint that is moved there, joints)
     ends[0, each, each], ends[1, each, each] = tree.lower, tree.upper
-    T = tree.forward(ends)[..., links, :, :]
-    points = (T[..., :3, :3] @ tip_points[..., None])[..., 0] + T[..., :3, 3]
+    points = se3.apply(tree.forward(ends)[..., links, :, :], tip_points)
     distance = torch.stack([(points - target).norm(dim=-1) for target in targets]).sum(0)
     moved = (tree.descends[links].to(q.dtype) @ tree.link_coupling.abs() > 0).T
     mean = (distance * moved).sum(-1) / moved.sum(-1).clamp_min(1)

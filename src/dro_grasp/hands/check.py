@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from dro_grasp.descriptions.loader import Description
 from dro_grasp.descriptions.notes import Note
+from dro_grasp.geometry import se3
 from dro_grasp.geometry.triangles import enclosed_volume
 from dro_grasp.hands.anatomy import Finger
 from dro_grasp.hands.build import build_hand
@@ -134,8 +135,7 @@ def hand_side(hand: Hand) -> str:
         return "none"
     points, index = hand.points(hand.canonical_joints(1.0)), hand.link_index
     tips = torch.stack([points[index == t].mean(0) for t in hand.tips])
-    T = hand.T_wrist_palm_rest
-    palm = T[:3, :3] @ hand.palm_centre + T[:3, 3]
+    palm = hand.palm_centre_wrist
     others = torch.cat([tips[: hand.thumb], tips[hand.thumb + 1 :]]).mean(0)
     aside = torch.linalg.cross(others - palm, hand.palm_direction_wrist)
     handed = float(torch.nn.functional.cosine_similarity(aside, tips[hand.thumb] - palm, dim=0))
@@ -222,8 +222,7 @@ def _meshes(hand: Hand, openness: float) -> list[Mesh]:
         for g in (hand.description.geometry if hand.description else ())
         if g.visual and bool(hand.tree.descends[g.link, hand.palm])
     ]
-    T = hand.T_wrist_palm_rest
-    start = (T[:3, :3] @ hand.palm_centre + T[:3, 3]).numpy()
+    start = hand.palm_centre_wrist.numpy()
     meshes.append(arrow(start, start + 0.1 * hand.palm_direction_wrist.numpy(), DIRECTION, radius=0.003))
     for track in _tracks(hand):
         meshes.extend(arrow(a, b, TRACK, radius=0.0012) for a, b in pairwise(track))
@@ -235,4 +234,4 @@ def _tracks(hand: Hand, steps: int = 8) -> Float[np.ndarray, "n_tips steps 3"]:
     joints = torch.stack([hand.canonical_joints(float(x)) for x in torch.linspace(1, 0.25, steps)])
     poses = hand.tree.forward(joints)[:, list(hand.tips)]
     middles = torch.stack([hand.link_points[hand.link_index == t].mean(0) for t in hand.tips])
-    return ((poses[..., :3, :3] @ middles[..., None])[..., 0] + poses[..., :3, 3]).transpose(0, 1).numpy()
+    return se3.apply(poses, middles).transpose(0, 1).numpy()

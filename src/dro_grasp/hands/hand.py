@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.devices import on_device
+from dro_grasp.geometry import se3
 from dro_grasp.geometry.point_clouds import farthest_points
 from dro_grasp.hands.anatomy import PALM, THUMB_CLOSING, Finger, find_fingers, find_thumb, measure_opposition, rigid_groups
 from dro_grasp.kinematics.tree import KinematicTree, cached_tensor
@@ -124,7 +125,7 @@ class Hand:
         return self._spread_evenly(self._between(self.rest.new_full((self.tree.n_dof,), openness)))
 
     def random_open_joints(self, n: int, generator: torch.Generator) -> Float[Tensor, "n n_dof"]:
-        """Open hands as the network is trained on: openness uniform in 0.65-0.85, one draw per hand."""
+        """Open hands like those the network is trained on: openness uniform in 0.65 to 0.85, one draw per hand."""
         share = 0.65 + 0.2 * torch.rand(n, 1, generator=generator, device=generator.device).to(self.rest)
         return self._spread_evenly(self._between(share.expand(n, self.tree.n_dof)))
 
@@ -134,12 +135,13 @@ class Hand:
         return torch.where(self.movable, self.tree.lower + share * (self.tree.upper - self.tree.lower), self.rest)
 
     def _spread_evenly(self, q: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_dof"]:
-        """Joints that only spread the fingers have no open end: they stand at zero, or a quarter inside their limits."""
+        """Put joints that only spread the fingers at zero, or a quarter of their range inside their limits."""
         margin = 0.25 * (self.tree.upper - self.tree.lower)
         neutral = torch.zeros_like(margin).clamp(self.tree.lower + margin, self.tree.upper - margin)
         return torch.where(self.abduction & self.movable, neutral, q)
 
     def _between(self, share: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_dof"]:
+        """Joints this share of the way from closed to open; held joints at rest."""
         lower, upper = self.tree.lower, self.tree.upper
         opened = torch.where(self.opening_signs > 0, upper, lower)
         closed = torch.where(self.opening_signs > 0, lower, upper)
@@ -148,25 +150,24 @@ class Hand:
     def points(
         self, q: Float[Tensor, "*batch n_dof"], T_world_wrist: Float[Tensor, "*batch 4 4"] | None = None
     ) -> Float[Tensor, "*batch n_hand 3"]:
-        """Surface points of the posed hand [m], in the world frame (the wrist's without a wrist pose)."""
-        return self._place(self.link_points, q, T_world_wrist)[0]
+        """Surface points of the posed hand [m], in the world frame, or in the wrist frame if no wrist pose is given."""
+        return se3.apply(self._point_poses(q, T_world_wrist), self.link_points)
 
     def points_and_normals(
         self, q: Float[Tensor, "*batch n_dof"], T_world_wrist: Float[Tensor, "*batch 4 4"] | None = None
     ) -> tuple[Float[Tensor, "*batch n_hand 3"], Float[Tensor, "*batch n_hand 3"]]:
-        """As `points`, and the outward unit normals there."""
-        points, poses = self._place(self.link_points, q, T_world_wrist)
-        return points, (poses[..., self.link_index, :3, :3] @ self.link_normals[..., None])[..., 0]
+        """The same points, and the outward unit normals there."""
+        T = self._point_poses(q, T_world_wrist)
+        return se3.apply(T, self.link_points), se3.rotate(T[..., :3, :3], self.link_normals)
 
-    def _place(
-        self, local: Float[Tensor, "n_hand 3"], q: Float[Tensor, "*batch n_dof"],
-        T_world_wrist: Float[Tensor, "*batch 4 4"] | None,
-    ) -> tuple[Float[Tensor, "*batch n_hand 3"], Float[Tensor, "*batch n_links 4 4"]]:
+    def _point_poses(
+        self, q: Float[Tensor, "*batch n_dof"], T_world_wrist: Float[Tensor, "*batch 4 4"] | None
+    ) -> Float[Tensor, "*batch n_hand 4 4"]:
+        """The pose of the link of each surface point."""
         poses = self.tree.forward(q)
         if T_world_wrist is not None:
             poses = T_world_wrist[..., None, :, :] @ poses
-        chosen = poses[..., self.link_index, :, :]
-        return (chosen[..., :3, :3] @ local[..., None])[..., 0] + chosen[..., :3, 3], poses
+        return poses[..., self.link_index, :, :]
 
     def T_wrist_palm(self, q: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch 4 4"]:
         """Pose of the palm link in the wrist (root link) frame."""
@@ -174,29 +175,36 @@ class Hand:
 
     @cached_tensor
     def T_wrist_palm_rest(self) -> Float[Tensor, "4 4"]:
-        """The same for held joints at rest: a constant of the hand, since no movable joint lies above the palm."""
+        """The same for held joints at rest: a constant of the hand, as no movable joint lies above the palm."""
         return self.T_wrist_palm(self.canonical_joints())
 
     @cached_tensor
     def grasp_centre_wrist(self) -> Float[Tensor, "3"]:
         """grasp_centre in the wrist frame [m]."""
-        T = self.T_wrist_palm_rest
-        return T[:3, :3] @ self.grasp_centre + T[:3, 3]
+        return se3.apply(self.T_wrist_palm_rest, self.grasp_centre)
+
+    @cached_tensor
+    def palm_centre_wrist(self) -> Float[Tensor, "3"]:
+        """palm_centre in the wrist frame [m]."""
+        return se3.apply(self.T_wrist_palm_rest, self.palm_centre)
 
     @cached_tensor
     def palm_direction_wrist(self) -> Float[Tensor, "3"]:
         """palm_direction in the wrist frame."""
-        return self.T_wrist_palm_rest[:3, :3] @ self.palm_direction
+        return se3.rotate(self.T_wrist_palm_rest[:3, :3], self.palm_direction)
 
     @cached_tensor
     def palm_axes_wrist(self) -> Float[Tensor, "3 3"]:
-        """Axes that mean the same for every hand, as columns in the wrist frame: along the fingers, across, and palm direction.
+        """Axes that every hand has, as columns in the wrist frame: along the fingers, across them, and the palm direction.
 
-        Along the fingers is where the open hand's fingers lie as seen from the palm's middle; for fingers that surround the
-        palm evenly, as those of some grippers, it is one of many alike.
+        The first axis points from the middle of the palm to that of the open fingers. If the fingers surround the palm evenly,
+        as those of some grippers do, it is one of many that would serve.
         """
         points = self.points(self.canonical_joints())
         palm = self.link_index == self.palm
+        if not palm.any():
+            palm = self.finger_of_link[self.link_index] == PALM
+        # Not `finger_of_link`: the shipped weights learned axes for which links fixed to the palm count among the fingers.
         fingers = torch.isin(self.link_index, torch.tensor(self.contact_links, device=points.device)) & ~palm
         z = torch.nn.functional.normalize(self.palm_direction_wrist, dim=0)
         offset = points[fingers].mean(0) - points[palm].mean(0)
@@ -207,21 +215,21 @@ class Hand:
         return torch.stack([x, torch.linalg.cross(z, x), z], -1)
 
     def to(self, device: torch.device | str) -> Hand:
-        """The same hand with its tensors on another device; itself where they are there already."""
+        """The same hand with its tensors on another device; this hand if they are there already."""
         if torch.device(device) == self.link_points.device:
             return self
         return on_device(self, device)
 
     def grasp_centres(self, T_world_wrist: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 3"]:
         """The grasp centre of hands at the given wrist poses [m]."""
-        return T_world_wrist[..., :3, :3] @ self.grasp_centre_wrist + T_world_wrist[..., :3, 3]
+        return se3.apply(T_world_wrist, self.grasp_centre_wrist)
 
     def palm_directions(self, T_world_wrist: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 3"]:
         """The palm direction of hands at the given wrist poses."""
-        return T_world_wrist[..., :3, :3] @ self.palm_direction_wrist
+        return se3.rotate(T_world_wrist[..., :3, :3], self.palm_direction_wrist)
 
     def with_points(self, count: int) -> Hand:
-        """The same hand with fewer points, spread evenly; each link keeps POINTS_PER_LINK where it has them.
+        """The same hand with fewer points, spread evenly; each link keeps POINTS_PER_LINK if it has them.
 
         Raises:
             ValueError: More points are asked for than the hand has.
@@ -257,7 +265,7 @@ class Hand:
 
     @staticmethod
     def from_tensors(values: dict[str, Any]) -> Hand:
-        """The inverse of `to_tensors`; lists are accepted for tuples."""
+        """The inverse of `to_tensors`; takes lists for tuples."""
         plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
         tree = KinematicTree(**{k.removeprefix("tree."): plain.pop(k) for k in list(plain) if k.startswith("tree.")})
         fingers = find_fingers(tree, plain.pop("tips"), plain["palm"])

@@ -13,7 +13,7 @@ from dro_grasp.hands.build import build_hand
 from dro_grasp.hands.hand import Hand
 
 BUILTIN_FOLDER = Path(__file__).parent / "builtin"
-"""Where our own descriptions lie."""
+"""Folder of the built-in descriptions."""
 ASSET_FILES = {
     "barrett": "barrett/bhand_model.urdf",
     "barrett_multidex": "barrett_multidex/model.urdf",
@@ -27,8 +27,9 @@ ASSET_FILES = {
     "orca": "orca/scene_right.xml",
     "ezgripper": "ezgripper/ezgripper.urdf",
 }
-"""Main files of the development assets, below their hands folder."""
+"""Main file of each development asset, in the assets' hands folder."""
 ASSET_PREFIX = "assets/"
+"""Prefix that forces a name to be that of a development asset."""
 
 
 def load_hand(name: str | Path, *, seed: int = 0, n_points: int = 512) -> Hand:
@@ -50,13 +51,13 @@ def load_hand(name: str | Path, *, seed: int = 0, n_points: int = 512) -> Hand:
 
 
 def load_hand_description(name: str | Path) -> tuple[Description, str]:
-    """The description behind a hand and the hand's name, without deriving points or palm."""
+    """The description of a hand, and the hand's name; derives neither points nor palm."""
     path, label = locate_hand(name)
     return load_description(path), label
 
 
 def hand_names() -> dict[str, str]:
-    """Names that `load_hand` takes, with where they come from: `builtin` or `assets`."""
+    """Names that `load_hand` takes, each with its source: `builtin` or `assets`."""
     names = {file.stem: "builtin" for file in sorted(BUILTIN_FOLDER.glob("*.urdf"))}
     folder = _asset_folder()
     for name, file in ASSET_FILES.items():
@@ -66,7 +67,7 @@ def hand_names() -> dict[str, str]:
 
 
 def locate_hand(name: str | Path) -> tuple[Path, str]:
-    """The file behind a name, and the name that results are filed under.
+    """The file of a hand, and the hand's name in results.
 
     Raises:
         HandError: Nothing has this name.
@@ -101,7 +102,7 @@ def _asset_file(name: str) -> Path | None:
 
 
 def _robot_description(name: str) -> Path | None:
-    """The file of a `robot_descriptions` module, when that package is installed and knows the name.
+    """The file of a `robot_descriptions` module; None if that package is not installed or does not know the name.
 
     Raises:
         HandError: It knows the name but cannot download the description.
@@ -113,7 +114,7 @@ def _robot_description(name: str) -> Path | None:
             found = importlib.import_module(f"robot_descriptions.{module}")
         except ImportError:
             continue
-        except Exception as error:  # git, the network and the disk fail in their own ways
+        except Exception as error:  # git, the network and the disk each raise their own errors
             reason = str(error).strip().splitlines()[-1:] or [type(error).__name__]
             raise HandError(f"robot_descriptions could not fetch '{module}' ({reason[0].strip()}); connect to the network, or "
                             "give the path of a URDF or MJCF file") from error

@@ -1,7 +1,7 @@
-"""Where a hand's palm is and where it looks: derived from geometry alone.
+"""The palm of a hand and the direction it faces, derived from geometry alone.
 
-The half-closed hand encloses a volume. The largest ball in it that palm and fingers surround is where an object
-would sit; its centre is the grasp centre, and the palm direction points from the palm's surface to it.
+The half-closed hand encloses a volume. An object would sit in the largest ball that palm and fingers surround there: its
+centre is the grasp centre, and the palm direction points from the palm's surface to it.
 """
 
 from __future__ import annotations
@@ -9,44 +9,47 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from dro_grasp.errors import HandError
 
 GRID_SPACING = 0.008
-"""Spacing of candidate ball centres [m]."""
+"""Spacing of candidate ball centres [m] (ours)."""
 CLOSINGS = (0.35, 0.5, 0.65)
-"""Shares of the way from open to closed at which the hand is examined."""
+"""Shares of the way from open to closed at which the hand is examined (ours)."""
 FACE_POINTS = 16
-"""Palm samples nearest to the grasp centre that make up its inner face."""
+"""Number of palm samples nearest to the grasp centre that make up the palm's inner face (ours)."""
 NOTHING_ENCLOSED = ("palm and fingers of the half-closed hand enclose no space, so nothing can be grasped; check the origins, "
                     "axes and limits of its joints")
-"""What a hand without a grasp is told."""
+"""Error message for a hand that encloses nothing."""
 LARGEST_BALL = 0.05
-"""Radius beyond which a larger empty ball is no better [m]."""
+"""Radius beyond which a larger empty ball is no better [m] (ours)."""
 
 
 @dataclass(frozen=True)
 class Palm:
     """The palm in some frame."""
 
-    centre: np.ndarray
-    """Middle of the inner face (3) [m]."""
-    direction: np.ndarray
-    """Unit vector towards the object (3)."""
-    grasp_centre: np.ndarray
-    """Centre of the enclosed ball (3) [m]."""
+    centre: Float[np.ndarray, "3"]
+    """Middle of the inner face [m]."""
+    direction: Float[np.ndarray, "3"]
+    """Unit vector towards the object."""
+    grasp_centre: Float[np.ndarray, "3"]
+    """Centre of the enclosed ball [m]."""
     score: float
     """How well palm and fingers surround the ball [m]; higher is better."""
 
 
-def find_palm(palm_points: np.ndarray, palm_normals: np.ndarray, fingers: list[np.ndarray]) -> Palm:
-    """The ball that palm and fingers enclose best.
+def find_palm(
+    palm_points: Float[np.ndarray, "n 3"], palm_normals: Float[np.ndarray, "n 3"], fingers: list[Float[np.ndarray, "_ 3"]]
+) -> Palm:
+    """The palm in front of which palm and fingers enclose a ball best.
 
     Args:
-        palm_points: Surface of the palm (n 3) [m].
-        palm_normals: Outward normals there (n 3).
-        fingers: Surface points of each finger, distal links (n_i 3 each).
+        palm_points: Surface of the palm [m].
+        palm_normals: Outward normals there.
+        fingers: Surface points of each finger [m].
 
     Raises:
         HandError: They enclose nothing.
@@ -78,8 +81,10 @@ def find_palm(palm_points: np.ndarray, palm_normals: np.ndarray, fingers: list[n
     return Palm(*_face_towards(palm_points, palm_normals, centre), centre, float(score.max()))
 
 
-def _face_towards(points: np.ndarray, normals: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Middle and mean normal of the palm's surface nearest to a point in front of it."""
+def _face_towards(
+    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "3"]
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Middle [m] and mean normal of the part of the palm's surface that is nearest to a point in front of it."""
     offset = target - points
     distance = np.linalg.norm(offset, axis=1)
     facing = (offset * normals).sum(1) > 0.5 * distance

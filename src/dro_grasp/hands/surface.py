@@ -9,14 +9,16 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dro_grasp.descriptions.link_geometry import LinkGeometry
 from dro_grasp.descriptions.loader import Description
+from dro_grasp.geometry import se3
 from dro_grasp.geometry.point_clouds import sample_surface
 from dro_grasp.kinematics.tree import KinematicTree
 
-POINTS_PER_LINK_SAMPLED = 512
+SAMPLES_PER_LINK = 512
 """Points sampled on each link before farthest point sampling. Source: appendix, robot point cloud sampling."""
 NUDGE = 5e-4
-"""Samples this close in front of another shape of their link are where the two meet, not outside [m]."""
+"""Samples this close to another shape of their link lie where the two shapes meet, not outside [m] (ours)."""
 
 
 @dataclass(frozen=True)
@@ -38,21 +40,22 @@ class LinkSurface:
         """Mean of a link's samples, in its frame [m]."""
         return self.points[self.link == link].mean(0)
 
-    def posed(self, tree: KinematicTree, q: Float[Tensor, " n_dof"]) -> tuple[np.ndarray, np.ndarray]:
-        """Points (n 3) [m] and normals (n 3) in the root link's frame."""
+    def posed(
+        self, tree: KinematicTree, q: Float[Tensor, " n_dof"]
+    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+        """Points [m] and normals in the root link's frame."""
         T = tree.forward(q)[self.link]
-        points = (T[:, :3, :3] @ self.points[..., None])[..., 0] + T[:, :3, 3]
-        return points.numpy(), (T[:, :3, :3] @ self.normals[..., None])[..., 0].numpy()
+        return se3.apply(T, self.points).numpy(), se3.rotate(T[:, :3, :3], self.normals).numpy()
 
 
 def sample_links(description: Description, links: list[int], seed: int) -> LinkSurface:
-    """Dense samples on what MuJoCo collides, or on the visual shapes of links that do not collide."""
+    """Dense samples on the collision shapes as MuJoCo uses them, or on the visual shapes of links without any."""
     generator = torch.Generator().manual_seed(seed)
     points, normals, index = [], [], []
     for link in links:
         shapes = [g for g in description.geometry if g.link == link]
         shapes = [g for g in shapes if g.collides] or shapes
-        p, n = _sample_shapes([(g.vertices, g.faces) for g in shapes], generator)
+        p, n = _sample_shapes(shapes, generator)
         points.append(p)
         normals.append(n)
         index.append(torch.full((len(p),), link))
@@ -60,28 +63,28 @@ def sample_links(description: Description, links: list[int], seed: int) -> LinkS
 
 
 def _sample_shapes(
-    shapes: list[tuple[np.ndarray, np.ndarray]], generator: torch.Generator
+    shapes: list[LinkGeometry], generator: torch.Generator
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Samples on the outside of a union of convex shapes."""
-    vertices = torch.cat([torch.tensor(v, dtype=torch.float32) for v, _ in shapes])
-    starts = np.cumsum([0, *[len(v) for v, _ in shapes]])
-    faces = torch.cat([torch.tensor(f.astype(np.int64)) + int(s) for (_, f), s in zip(shapes, starts, strict=False)])
-    owner = torch.cat([torch.full((len(f),), i) for i, (_, f) in enumerate(shapes)])
-    points, normals, face = sample_surface(vertices, faces, 4 * POINTS_PER_LINK_SAMPLED, generator)
+    """Points and normals on the outside of a union of convex shapes."""
+    vertices = torch.cat([torch.tensor(s.vertices, dtype=torch.float32) for s in shapes])
+    starts = np.cumsum([0, *[len(s.vertices) for s in shapes]])
+    faces = torch.cat([torch.tensor(s.faces.astype(np.int64)) + int(i) for s, i in zip(shapes, starts, strict=False)])
+    owner = torch.cat([torch.full((len(s.faces),), i) for i, s in enumerate(shapes)])
+    points, normals, face = sample_surface(vertices, faces, 4 * SAMPLES_PER_LINK, generator)
     hidden = torch.zeros(len(points), dtype=torch.bool)
     if len(shapes) > 1:
-        for i, (v, f) in enumerate(shapes):
+        for i, shape in enumerate(shapes):
             others = (owner[face] != i).nonzero()[:, 0]
-            hidden[others] |= _inside_convex(points[others] + NUDGE * normals[others], v, f)
+            hidden[others] |= _inside_convex(points[others] + NUDGE * normals[others], shape)
     seen = (~hidden).nonzero()[:, 0]
-    seen = seen if len(seen) >= POINTS_PER_LINK_SAMPLED // 4 else torch.arange(len(points))
-    seen = seen[:POINTS_PER_LINK_SAMPLED]
+    seen = seen if len(seen) >= SAMPLES_PER_LINK // 4 else torch.arange(len(points))
+    seen = seen[:SAMPLES_PER_LINK]
     return points[seen], normals[seen]
 
 
-def _inside_convex(points: Float[Tensor, "n 3"], vertices: np.ndarray, faces: np.ndarray) -> Bool[Tensor, " n"]:
-    """Mask of points behind all faces of a convex shape."""
-    corners = torch.tensor(vertices, dtype=torch.float32)[torch.tensor(faces.astype(np.int64))]
+def _inside_convex(points: Float[Tensor, "n 3"], shape: LinkGeometry) -> Bool[Tensor, " n"]:
+    """Whether each point lies behind all faces of a convex shape."""
+    corners = torch.tensor(shape.vertices, dtype=torch.float32)[torch.tensor(shape.faces.astype(np.int64))]
     normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     low, high = corners.amin((0, 1)), corners.amax((0, 1))
     inside = ((points >= low) & (points <= high)).all(1)
