@@ -25,7 +25,8 @@ from dro_grasp.models.checkpoints import save_weights
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.predictor import GraspPredictor
+from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.predictor import GraspPredictor, GraspRequest
 
 HANDS = ("barrett", "allegro", "shadowhand")
 """Built-in versions of the paper's hands."""
@@ -47,13 +48,13 @@ def measure(predictor: GraspPredictor, num: int, runs: int, seed: int) -> dict[s
     obj, times = load_object(OBJECT), defaultdict(list)
     for name in HANDS:
         hand = load_hand(name)
-        predictor.predict(hand, obj, num=num, seed=seed)
+        predictor.predict(hand, obj, num, seed, candidates=1)
         for run in range(runs):
             begin = time.perf_counter()
-            predictor.predict(hand, obj, num=num, seed=seed + run)
+            made = predictor.run(GraspProblem(hand, obj), GraspRequest(num, seed + run, candidates=1))
             times["whole"].append(time.perf_counter() - begin)
             for part in PARTS:
-                times[part].append(predictor.timings[part])
+                times[part].append(made.seconds[part])
     return times
 
 

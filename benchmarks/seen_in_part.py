@@ -21,10 +21,11 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimization.refinement import refine_grasps
 from dro_grasp.perception.partial_views import View, seen
-from dro_grasp.predictor import CLOUD_TEMPERATURE, GraspPredictor, PredictorConfig
-from dro_grasp.ranking.score import score_grasps
+from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.pipeline.proposal import CLOUD_TEMPERATURE
+from dro_grasp.pipeline.stages import refine, scored
+from dro_grasp.predictor import GraspPredictor, PredictorConfig
 from dro_grasp.simulation.trial import simulate
 
 PROTOCOLS = ("dro", "strict")
@@ -36,10 +37,12 @@ DEEP = 0.003
 def tried(
     hand: Hand, obj: ObjectModel, shown: ObjectModel, judged: ObjectModel, num: int
 ) -> dict[str, torch.Tensor]:
-    """Outcomes of grasps predicted from what is shown, polished and ranked on what is judged: all, and the best quarter."""
+    """Outcomes of grasps predicted from what is shown, refined and ranked on what is judged: all, and the best quarter."""
     predictor = GraspPredictor(config=PredictorConfig(temperature=CLOUD_TEMPERATURE))
-    grasps = refine_grasps(hand, judged, predictor.predict(hand, shown, num, pair_seed(0, hand, obj), refine=False))
-    best = score_grasps(hand, judged, grasps).topk(round(KEPT * num)).indices
+    raw = predictor.predict(hand, shown, num, pair_seed(0, hand, obj), candidates=1, refine=False)
+    problem = GraspProblem(hand, judged)
+    grasps = scored(problem, refine(problem, raw))
+    best = grasps.score.topk(round(KEPT * num)).indices
     found = {}
     for name in PROTOCOLS:
         success = simulate(hand, obj, grasps, name).success.float()

@@ -30,8 +30,9 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.models.checkpoints import DEFAULT
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimization.refinement import refine_grasps
 from dro_grasp.perception.partial_views import View, seen
+from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.pipeline.stages import refine
 from dro_grasp.predictor import GraspPredictor
 from dro_grasp.ranking.features import grasp_features
 from dro_grasp.ranking.score import ScoreConfig
@@ -70,7 +71,7 @@ def shaken(hand: Hand, grasps: GraspBatch, generator: torch.Generator) -> GraspB
     T[:, :3, :3] = roma.rotvec_to_rotmat(turn) @ T[:, :3, :3]
     T[:, :3, 3] += hand.grasp_centres(grasps.T_object_wrist) - hand.grasp_centres(T) + move
     q = (grasps.joints + bend * hand.tree.joint_unit * hand.movable).clamp(hand.tree.lower, hand.tree.upper)
-    return grasps.without("pregrasp_joints", "squeeze_joints", "score", "energy").replace(T_object_wrist=T, joints=q)
+    return grasps.bare().replace(T_object_wrist=T, joints=q)
 
 
 @torch.no_grad()
@@ -93,14 +94,14 @@ def collect(
         predictor.config = dataclasses.replace(predictor.config, temperature=rng.choice(TEMPERATURES))
         view = rng.choice(views)
         known = seen(obj, view, rng.randrange(10**6))
-        raw = predictor.predict(hand, known, num, seed=rng.randrange(10**6), refine=False)
-        refined = refine_grasps(hand, known, raw)
+        raw = predictor.predict(hand, known, num, seed=rng.randrange(10**6), candidates=1, refine=False)
+        refined = refine(GraspProblem(hand, known), raw)
         some = refined[slice(0, num // 8)]
         opened = hand.canonical_joints(1.0).expand_as(some.joints)
         groups = {
             "raw": raw[slice(0, num // 4)], "refined": refined,
             "shaken": shaken(hand, refined[slice(0, num // 2)], generator),
-            "opened": some.without("pregrasp_joints", "squeeze_joints", "score", "energy").replace(joints=opened),
+            "opened": some.bare().replace(joints=opened),
         }
         parts += [{"hand": name, "object": label, "kind": kind, "view": view, **evaluated(hand, obj, grasps, known)}
                   for kind, grasps in groups.items()]

@@ -13,8 +13,10 @@ from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.predictor import GraspPredictor, PredictorConfig, rotation_between
-from dro_grasp.ranking.score import score_grasps
+from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.pipeline.proposal import wrist_rotations
+from dro_grasp.pipeline.stages import scored
+from dro_grasp.predictor import GraspPredictor, GraspRequest, PredictorConfig
 from tests.helpers.toy_hand import toy_hand
 from tests.helpers.weights import untrained_weights
 
@@ -38,7 +40,7 @@ def ball() -> ObjectModel:
 
 @pytest.fixture(scope="module")
 def grasps(predictor: GraspPredictor, ball: ObjectModel) -> GraspBatch:
-    return predictor.predict(HAND, ball, num=7, seed=3)
+    return predictor.predict(HAND, ball, num=7, seed=3, candidates=1)
 
 
 def lowest_point(q: Tensor, T: Tensor) -> float:
@@ -52,7 +54,7 @@ def lowest_point(q: Tensor, T: Tensor) -> float:
 
 def test_the_same_seed_gives_the_same_grasps(predictor: GraspPredictor, ball: ObjectModel, grasps: GraspBatch) -> None:
     torch.manual_seed(99)
-    again, other = (predictor.predict(HAND, ball, num=7, seed=seed) for seed in (3, 4))
+    again, other = (predictor.predict(HAND, ball, num=7, seed=seed, candidates=1) for seed in (3, 4))
     assert torch.equal(again.T_object_wrist, grasps.T_object_wrist)
     assert torch.equal(again.joints, grasps.joints)
     assert not torch.equal(other.joints, grasps.joints)
@@ -64,7 +66,7 @@ def test_grasps_do_not_depend_on_the_batch_size(
     weights: str, ball: ObjectModel, grasps: GraspBatch, batch_size: int
 ) -> None:
     config = PredictorConfig(batch_size=batch_size, network_batch_size=batch_size)
-    other = GraspPredictor(weights, config=config).predict(HAND, ball, num=7, seed=3)
+    other = GraspPredictor(weights, config=config).predict(HAND, ball, num=7, seed=3, candidates=1)
     for name in ("T_object_wrist", "joints", "pregrasp_joints", "squeeze_joints", "score"):
         torch.testing.assert_close(getattr(other, name), getattr(grasps, name), atol=1e-4, rtol=1e-4)
 
@@ -74,9 +76,8 @@ def test_grasps_are_complete_valid_and_sorted(
 ) -> None:
     assert len(grasps) == 7
     assert grasps.score.tolist() == sorted(grasps.score.tolist(), reverse=True)
-    torch.testing.assert_close(grasps.score, score_grasps(HAND, ball, grasps), atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(grasps.score, scored(GraspProblem(HAND, ball), grasps).score, atol=1e-4, rtol=1e-4)
     for joints in (grasps.joints, grasps.pregrasp_joints, grasps.squeeze_joints):
-        assert joints is not None
         assert bool(((joints >= HAND.tree.lower - 1e-5) & (joints <= HAND.tree.upper + 1e-5)).all())
     rotation = grasps.T_object_wrist[:, :3, :3]
     torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).expand(7, 3, 3), atol=1e-5, rtol=0)
@@ -85,21 +86,21 @@ def test_grasps_are_complete_valid_and_sorted(
     assert not grasps.extra
 
 
-def test_what_the_predictor_tells_of_a_call(predictor: GraspPredictor, ball: ObjectModel) -> None:
+def test_a_run_returns_how_the_grasps_were_made(predictor: GraspPredictor, ball: ObjectModel) -> None:
     steps: list[tuple[int, int]] = []
-    made = predictor.predict(HAND, ball, num=20, progress=lambda done, wanted: steps.append((done, wanted)))
+    request = GraspRequest(num=10, candidates=2)
+    made = predictor.run(GraspProblem(HAND, ball), request, lambda done, wanted: steps.append((done, wanted)))
     assert steps == [(16, 20), (20, 20)]
-    assert predictor.candidates == 20
-    assert set(predictor.timings) == {"network", "decode", "refine", "rank"}
-    assert min(predictor.timings.values()) > 0
+    assert (len(made.grasps), made.candidates) == (10, 20)
+    assert set(made.seconds) == {"network", "decode", "refine", "rank"}
+    assert min(made.seconds.values()) > 0
     # Solved hands stay near the multilaterated points they were fitted to, row by row.
-    points = predictor.predicted_points
-    assert points is not None
     hand = HAND.with_points(predictor.network.config.n_hand)
-    solved = hand.points(made.joints, made.T_object_wrist)
-    own = (points - solved).norm(dim=-1).mean(-1)
-    others = (points - solved.roll(1, 0)).norm(dim=-1).mean(-1)
-    assert float(own.mean()) < 0.5 * float(others.mean())
+    for grasps in (made.proposed, made.grasps):
+        solved = hand.points(grasps.joints, grasps.T_object_wrist)
+        own = (made.points - solved).norm(dim=-1).mean(-1)
+        others = (made.points - solved.roll(1, 0)).norm(dim=-1).mean(-1)
+        assert float(own.mean()) < 0.5 * float(others.mean())
 
 
 @pytest.mark.parametrize("num", [0, -3])
@@ -117,13 +118,10 @@ def test_a_direction_must_point_somewhere(
 
 
 def test_of_several_candidates_the_best_are_kept(predictor: GraspPredictor, ball: ObjectModel) -> None:
-    many = predictor.predict(HAND, ball, num=12, seed=4)
-    best = predictor.predict(HAND, ball, num=3, seed=4, candidates=4)
-    assert predictor.candidates == 12
+    many = predictor.predict(HAND, ball, num=12, seed=4, candidates=1)
+    best = predictor.predict(HAND, ball, num=3, seed=4)
     torch.testing.assert_close(best.T_object_wrist, many.T_object_wrist[:3])
     torch.testing.assert_close(best.score, many.score[:3])
-    assert predictor.predicted_points is not None
-    assert len(predictor.predicted_points) == 3
     with pytest.raises(OptionError, match="candidates is 0"):
         predictor.predict(HAND, ball, num=1, candidates=0)
 
@@ -146,7 +144,7 @@ def test_the_temperature_scales_what_z_is_made_of(weights: str, ball: ObjectMode
             return honest(hand, points, noise)
 
         monkeypatch.setattr(predictor.network, "predict", predict)
-        predictor.predict(HAND, obj, num=3, seed=5)
+        predictor.predict(HAND, obj, num=3, seed=5, candidates=1)
     assert float(drawn[0.0, ball].abs().max()) == 0
     torch.testing.assert_close(drawn[0.5, ball], 0.5 * drawn[None, ball])
     torch.testing.assert_close(drawn[None, cloud], drawn[0.5, ball], msg="bare clouds get surer grasps")
@@ -154,9 +152,9 @@ def test_the_temperature_scales_what_z_is_made_of(weights: str, ball: ObjectMode
 
 @pytest.mark.parametrize("direction", [(0.0, 0.0, -5.0), (0.0, 0.0, 1e-3), (1.0, 2.0, 2.0)])
 def test_placements_face_the_direction_at_any_roll(
-    predictor: GraspPredictor, direction: tuple[float, float, float]
+    direction: tuple[float, float, float]
 ) -> None:
-    turns = predictor._rotations(HAND, 400, direction, torch.Generator().manual_seed(0))
+    turns = wrist_rotations(HAND, 400, direction, math.radians(5), torch.Generator().manual_seed(0))
     wanted = torch.nn.functional.normalize(torch.tensor(direction), dim=0)
     angles = torch.acos((turns @ HAND.palm_direction_wrist @ wanted).clamp(-1, 1))
     # Two normal tilts of 5 degrees: their length is Rayleigh distributed.
@@ -169,45 +167,38 @@ def test_placements_face_the_direction_at_any_roll(
     assert bool((torch.histc(roll, 4, -math.pi, math.pi) > 70).all())
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_rotation_between_parallel_vectors(sign: float) -> None:
-    a = torch.nn.functional.normalize(torch.tensor([1.0, -2.0, 0.5]), dim=0)
-    turn = rotation_between(a, sign * a)
-    torch.testing.assert_close(turn @ a, sign * a, atol=1e-5, rtol=0)
-    torch.testing.assert_close(torch.linalg.det(turn), torch.tensor(1.0))
-
-
 def test_a_table_drops_what_goes_below_it(predictor: GraspPredictor, ball: ObjectModel) -> None:
-    free = predictor.predict(HAND, ball, num=12)
+    free = predictor.predict(HAND, ball, num=12, candidates=1)
     heights = sorted(
         min(lowest_point(q, T), lowest_point(p, T))
         for q, p, T in zip(free.joints, free.pregrasp_joints, free.T_object_wrist, strict=True)
     )
     table = (heights[5] + heights[6]) / 2
-    kept = predictor.predict(HAND, ball, num=12, table=table)
-    assert len(kept) == 12
-    assert predictor.candidates >= 24
-    assert predictor.candidates % 12 == 0
+    run = predictor.run(GraspProblem(HAND, ball), GraspRequest(num=12, table=table, candidates=1))
+    kept = run.grasps
+    assert len(kept) == len(run.proposed) == len(run.points) == 12
+    assert run.candidates >= 24
+    assert run.candidates % 12 == 0
     for q, p, T in zip(kept.joints, kept.pregrasp_joints, kept.T_object_wrist, strict=True):
         assert min(lowest_point(q, T), lowest_point(p, T)) > table - 1e-6
-    below = predictor.predict(HAND, ball, num=12, table=heights[0] - 0.01)
-    assert torch.equal(below.joints, free.joints)
-    assert predictor.candidates == 12
+    below = predictor.run(GraspProblem(HAND, ball), GraspRequest(num=12, table=heights[0] - 0.01, candidates=1))
+    assert torch.equal(below.grasps.joints, free.joints)
+    assert below.candidates == 12
 
 
 def test_an_impossible_table_is_told(weights: str, ball: ObjectModel) -> None:
     predictor = GraspPredictor(weights, config=PredictorConfig(table_rounds=2))
     with pytest.raises(OptionError, match=r"only 0 of 6 grasps .* 3 were asked for; lower --table \(the object spans"):
-        predictor.predict(HAND, ball, num=3, table=float(ball.cloud[:, 2].max()) - 1e-4)
+        predictor.predict(HAND, ball, num=3, table=float(ball.cloud[:, 2].max()) - 1e-4, candidates=1)
 
 
 def test_a_bare_cloud_is_grasped(weights: str, ball: ObjectModel) -> None:
     predictor = GraspPredictor(weights, config=PredictorConfig(temperature=1.0))
     cloud = dataclasses.replace(ball, vertices=None, faces=None)
-    made = predictor.predict(HAND, cloud, num=7, seed=3)
+    made = predictor.predict(HAND, cloud, num=7, seed=3, candidates=1)
     assert bool(made.score.isfinite().all())
-    # The network sees points alone: the same grasps before they are polished, in an order of their own.
-    raw = [predictor.predict(HAND, o, num=7, seed=3, refine=False).joints.tolist() for o in (cloud, ball)]
+    # The network sees points alone: the same grasps before refinement, in an order of their own.
+    raw = [predictor.predict(HAND, o, num=7, seed=3, candidates=1, refine=False).joints.tolist() for o in (cloud, ball)]
     assert sorted(map(tuple, raw[0])) == sorted(map(tuple, raw[1]))
     assert sorted(map(tuple, made.joints.tolist())) != sorted(map(tuple, raw[0]))
 

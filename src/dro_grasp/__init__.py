@@ -29,12 +29,13 @@ if TYPE_CHECKING:
     from dro_grasp.models.presets import NetworkConfig
     from dro_grasp.objects.catalogue import load_object, object_names
     from dro_grasp.objects.shape import ObjectModel
-    from dro_grasp.optimization.refinement import RefineConfig, refine_grasps
+    from dro_grasp.optimization.refinement import RefineConfig
     from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
     from dro_grasp.perception.camera import DepthCamera, visible_points
     from dro_grasp.perception.scan import depth_points, scanned_object
-    from dro_grasp.predictor import GraspPredictor, PredictorConfig
-    from dro_grasp.ranking.score import score_grasps
+    from dro_grasp.pipeline.problem import GraspProblem
+    from dro_grasp.pipeline.stages import evaluate, rank, refine
+    from dro_grasp.predictor import GraspPredictor, GraspRequest, Prediction, PredictorConfig
     from dro_grasp.simulation.outcome import TrialResult
     from dro_grasp.simulation.protocols import Protocol
     from dro_grasp.simulation.trial import simulate
@@ -60,12 +61,15 @@ _EXPORTS = {
     "Frame": "export.frame",
     "GraspBatch": "grasps.batch",
     "GraspPredictor": "predictor",
+    "GraspProblem": "pipeline.problem",
+    "GraspRequest": "predictor",
     "Hand": "hands.hand",
     "HandReport": "hands.check",
     "LossConfig": "training.config",
     "MotionConfig": "training.config",
     "NetworkConfig": "models.presets",
     "ObjectModel": "objects.shape",
+    "Prediction": "predictor",
     "PredictorConfig": "predictor",
     "PretrainConfig": "training.config",
     "Protocol": "simulation.protocols",
@@ -79,6 +83,7 @@ _EXPORTS = {
     "depth_points": "perception.scan",
     "dexgraspbench": "export.dexgraspbench",
     "draw_grasps": "viewer.pictures",
+    "evaluate": "pipeline.stages",
     "hand_names": "hands.library",
     "isaac_grasp": "export.isaac_grasp",
     "load_bundle": "datasets.bundle.training_file",
@@ -92,10 +97,10 @@ _EXPORTS = {
     "pretrain": "training.pretraining",
     "pretrain_motion": "training.pretraining",
     "read_collection": "datasets.collections.collection",
-    "refine_grasps": "optimization.refinement",
+    "rank": "pipeline.stages",
+    "refine": "pipeline.stages",
     "save_weights": "models.checkpoints",
     "scanned_object": "perception.scan",
-    "score_grasps": "ranking.score",
     "simulate": "simulation.trial",
     "synthesize": "optimization.synthesis",
     "synthesize_dataset": "datasets.engine.schedule",
@@ -113,12 +118,15 @@ __all__ = [
     "Frame",
     "GraspBatch",
     "GraspPredictor",
+    "GraspProblem",
+    "GraspRequest",
     "Hand",
     "HandReport",
     "LossConfig",
     "MotionConfig",
     "NetworkConfig",
     "ObjectModel",
+    "Prediction",
     "PredictorConfig",
     "PretrainConfig",
     "Protocol",
@@ -133,6 +141,7 @@ __all__ = [
     "depth_points",
     "dexgraspbench",
     "draw_grasps",
+    "evaluate",
     "hand_names",
     "isaac_grasp",
     "load_bundle",
@@ -145,11 +154,11 @@ __all__ = [
     "palm_facing_starts",
     "pretrain",
     "pretrain_motion",
+    "rank",
     "read_collection",
-    "refine_grasps",
+    "refine",
     "save_weights",
     "scanned_object",
-    "score_grasps",
     "simulate",
     "synthesize",
     "synthesize_dataset",

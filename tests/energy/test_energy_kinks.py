@@ -19,7 +19,7 @@ from dro_grasp.energy.grasp_energy import TERMS, EnergyConfig, Evaluation, Grasp
 from dro_grasp.energy.terms import force_closure
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
-from dro_grasp.optimization.synthesis import moved
+from dro_grasp.optimization.pose_step import moved
 from tests.helpers.energy_samples import GROUPS, PER_GROUP, Samples, branches, near_kinks, place, precise, rounded_box
 from tests.helpers.toy_hand import toy_hand
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from dro_grasp.energy import terms as energies
 from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.kinematics.tree import PRISMATIC, REVOLUTE, KinematicTree
-from dro_grasp.optimization.synthesis import moved
+from dro_grasp.optimization.pose_step import moved
 from tests.helpers.energy_samples import precise, rounded_box
 from tests.helpers.toy_hand import toy_hand
 

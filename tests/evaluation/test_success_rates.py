@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from typing import Any
 
 import pytest
 import torch
@@ -33,9 +32,9 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimization.refinement import refine_grasps
-from dro_grasp.predictor import GraspPredictor
-from dro_grasp.ranking.score import score_grasps
+from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.pipeline.stages import refine, scored
+from dro_grasp.predictor import GraspPredictor, GraspRequest, Prediction
 from dro_grasp.simulation.outcome import TrialResult
 from dro_grasp.simulation.protocols import protocol
 from dro_grasp.simulation.trial import simulate
@@ -72,11 +71,11 @@ def test_raw_and_ranked_rows_are_what_single_trials_say(rows: list[Row]) -> None
         passed, passed_best, passed_first, held = [], [], [], []
         for name in OBJECTS:
             obj = load_object(name)
-            grasps = predictor.predict(hand, obj, num=8, seed=pair_seed(0, hand, obj), refine=False)
+            grasps = predictor.predict(hand, obj, num=8, seed=pair_seed(0, hand, obj), candidates=1, refine=False)
             if stage == REFINED:
-                grasps = refine_grasps(hand, obj, grasps)
+                grasps = refine(GraspProblem(hand, obj), grasps)
             passed.append(simulate(hand, obj, grasps, "strict").success)
-            order = score_grasps(hand, obj, grasps).argsort(descending=True)[:2]
+            order = scored(GraspProblem(hand, obj), grasps).score.argsort(descending=True)[:2]
             passed_best.append(simulate(hand, obj, grasps[order], "strict").success)
             passed_first.append(simulate(hand, obj, grasps[order[:1]], "strict").success)
             first = simulate(hand, obj, grasps, "dro")
@@ -96,20 +95,20 @@ def test_pairs_share_no_random_numbers() -> None:
     assert seeds == {pair_seed(6, hand, obj) + 1 for hand in hands for obj in objects}
 
 
-def test_each_look_is_from_another_side_with_grasps_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_view_is_from_another_side_with_grasps_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     shown: list[ObjectModel] = []
-    honest = GraspPredictor.predict
+    honest = GraspPredictor.run
 
-    def predict(self: GraspPredictor, hand: Hand, obj: ObjectModel, **options: Any) -> GraspBatch:
-        shown.append(obj)
-        return honest(self, hand, obj, **options)
+    def run(self: GraspPredictor, problem: GraspProblem, request: GraspRequest) -> Prediction:
+        shown.append(problem.obj)
+        return honest(self, problem, request)
 
-    monkeypatch.setattr(GraspPredictor, "predict", predict)
+    monkeypatch.setattr(GraspPredictor, "run", run)
     hand, obj = load_hand("gripper3"), load_object("can")
     config = dataclasses.replace(CONFIG, num=4, stages=(RANKED,), controls=False, view="half")
-    three = benchmark([hand], [obj], GraspPredictor(), dataclasses.replace(config, looks=3))
+    three = benchmark([hand], [obj], GraspPredictor(), dataclasses.replace(config, views=3))
     seen_one_by_one = list(shown)
-    # The best quarter of each look, not of all of them together.
+    # The best quarter of each view, not of all of them together.
     assert three[0].num == 3
     assert len({o.sha256 for o in seen_one_by_one}) == 3
     passed = []
@@ -140,14 +139,14 @@ def test_refined_grasps_cost_time_and_controls_say_what_they_are(rows: list[Row]
 
 
 def test_grasps_that_all_fail_have_no_means(monkeypatch: pytest.MonkeyPatch) -> None:
-    def far(self: GraspPredictor, hand: object, obj: object, **options: object) -> GraspBatch:
-        made = honest(self, hand, obj, **options)
-        away = made.T_object_wrist.clone()
+    def far(self: GraspPredictor, problem: GraspProblem, request: GraspRequest) -> Prediction:
+        made = honest(self, problem, request)
+        away = made.grasps.T_object_wrist.clone()
         away[:, :3, 3] += 1.0
-        return made.replace(T_object_wrist=away)
+        return dataclasses.replace(made, grasps=made.grasps.replace(T_object_wrist=away))
 
-    honest = GraspPredictor.predict
-    monkeypatch.setattr(GraspPredictor, "predict", far)
+    honest = GraspPredictor.run
+    monkeypatch.setattr(GraspPredictor, "run", far)
     config = dataclasses.replace(CONFIG, stages=(RAW,), controls=False)
     (row,) = benchmark([load_hand("gripper3")], [load_object("can")], GraspPredictor(), config)
     assert row.success["dro/1"][0] == 0
@@ -158,17 +157,17 @@ def test_grasps_that_all_fail_have_no_means(monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.parametrize("view", ["cloud", "half", "depth"])
 def test_a_view_hides_the_object_from_the_network_alone(view: str, monkeypatch: pytest.MonkeyPatch) -> None:
     shown, tried = [], []
-    honest_predict, honest_simulate = GraspPredictor.predict, simulate
+    honest_run, honest_simulate = GraspPredictor.run, simulate
 
-    def predict(self: GraspPredictor, hand: Hand, obj: ObjectModel, **options: object) -> GraspBatch:
-        shown.append(obj)
-        return honest_predict(self, hand, obj, **options)
+    def run(self: GraspPredictor, problem: GraspProblem, request: GraspRequest) -> Prediction:
+        shown.append(problem.obj)
+        return honest_run(self, problem, request)
 
     def trial(hand: Hand, obj: ObjectModel, grasps: GraspBatch, *rest: object, **options: object) -> TrialResult:
         tried.append(obj)
         return honest_simulate(hand, obj, grasps, *rest, **options)
 
-    monkeypatch.setattr(GraspPredictor, "predict", predict)
+    monkeypatch.setattr(GraspPredictor, "run", run)
     monkeypatch.setattr(evaluated, "simulate", trial)
     config = dataclasses.replace(CONFIG, num=2, stages=(REFINED,), controls=False, protocols=(protocol("dro"),), view=view)
     objects = [load_object(n) for n in OBJECTS]

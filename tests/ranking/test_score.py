@@ -13,7 +13,9 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
-from dro_grasp.ranking.score import ScoreConfig, score_grasps
+from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.pipeline.stages import scored
+from dro_grasp.ranking.score import ScoreConfig
 from dro_grasp.simulation.trial import settle, simulate
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.toy_hand import toy_hand
@@ -47,7 +49,7 @@ def spoilt(grasps: GraspBatch, how: str) -> GraspBatch:
 
 @pytest.mark.parametrize("how", ["too far", "too deep", "open"])
 def test_spoilt_grasps_have_more_energy(obj, grasps, how):
-    good, bad = (score_grasps(HAND, obj, g, ScoreConfig(by="energy")) for g in (grasps, spoilt(grasps, how)))
+    good, bad = (scored(GraspProblem(HAND, obj), g, ScoreConfig(by="energy")).score for g in (grasps, spoilt(grasps, how)))
     assert (good > bad).float().mean() > 0.9
 
 
@@ -62,21 +64,21 @@ def test_scores_tell_what_holds_from_what_does_not():
     mixed = GraspBatch.concatenate([made, bare.replace(T_object_wrist=T), bare.replace(joints=opened)])
     held = simulate(hand, can, mixed, "strict").success
     assert 4 < int(held.sum()) < 30
-    assert roc_area(score_grasps(hand, can, mixed), held) > 0.75
+    assert roc_area(scored(GraspProblem(hand, can), mixed).score, held) > 0.75
 
 
 def test_score_does_not_depend_on_the_batch(obj, grasps):
-    whole = score_grasps(HAND, obj, grasps)
-    parts = score_grasps(HAND, obj, grasps, ScoreConfig(batch_size=5))
+    whole = scored(GraspProblem(HAND, obj), grasps).score
+    parts = scored(GraspProblem(HAND, obj), grasps, ScoreConfig(batch_size=5)).score
     torch.testing.assert_close(whole, parts, atol=1e-4, rtol=1e-4)
-    assert score_grasps(HAND, obj, grasps[slice(0, 0)]).shape == (0,)
+    assert scored(GraspProblem(HAND, obj), grasps[slice(0, 0)]).score.shape == (0,)
 
 
 def test_mesh_and_cloud_agree(grasps):
     ball = load_object("sphere")
     mixed = GraspBatch.concatenate([grasps, *(spoilt(grasps, how) for how in ("too far", "too deep", "open"))])
-    on_mesh = score_grasps(HAND, ball, mixed)
-    on_cloud = score_grasps(HAND, dataclasses.replace(ball, vertices=None, faces=None), mixed)
+    on_mesh = scored(GraspProblem(HAND, ball), mixed).score
+    on_cloud = scored(GraspProblem(HAND, dataclasses.replace(ball, vertices=None, faces=None)), mixed).score
     assert torch.corrcoef(torch.stack([on_mesh, on_cloud]))[0, 1] > 0.95
 
 

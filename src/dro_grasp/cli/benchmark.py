@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Benchmark:
-    """Try grasps of the network and of its controls, before and after ranking and refinement.
+    """Evaluate grasps of the network and of its controls, before and after refinement and ranking.
 
     Example: dro-grasp benchmark --hands allegro barrett --objects builtin:test --num 20 --bundle bundle.safetensors
     """
@@ -31,21 +31,21 @@ class Benchmark:
     num: int = 100
     """Grasps of each hand on each object, of which ranking keeps the best quarter."""
     stages: tuple[Literal["raw", "ranked", "refined"], ...] = ("raw", "ranked", "refined")
-    """What becomes of the grasps before they are tried; refined ones are tried all, and the best of them apart."""
+    """What is done to the grasps before the trials; of refined grasps, all and the best by score are reported."""
     protocols: tuple[Literal["dro", "strict", "dro_static", "dexgraspbench"], ...] = ("dro", "strict", "dexgraspbench")
-    """Trials; displacement, rotation and diversity are those of successes of the first."""
+    """Trials; displacement, rotation and diversity are means over successes of the first."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Weights to measure."""
     temperature: Annotated[float | None, optional("T", "as the weights say")] = None
-    """How varied the grasps of one placement are, from 0 to 1."""
+    """Diversity of the grasps of one placement: 0 proposes the likeliest, 1 is as diverse as the training grasps."""
     controls: bool = True
-    """Also try unoptimised starts, synthesised grasps and, with a bundle, the mean grasp."""
+    """Also evaluate unoptimised starts, synthesised grasps and, with a bundle, the mean grasp."""
     bundle: Annotated[Path | None, optional("PATH", "no mean grasp")] = None
-    """Training bundle that the mean grasp is the mean of."""
+    """Training bundle whose grasps are averaged to the mean grasp."""
     view: Literal["whole", "cloud", "half", "depth"] = "whole"
     """What the network, refinement and ranking see: the mesh, its points, the paper's half of them, or a depth image."""
-    looks: int = 1
-    """From how many sides each object is seen, with --num grasps from each."""
+    views: Annotated[int, tyro.conf.arg(aliases=["--looks"])] = 1
+    """Views of each object for each hand, with --num grasps each."""
     seed: int = 0
     """The same seed gives the same grasps and views."""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -58,12 +58,12 @@ class Benchmark:
         from dro_grasp.evaluation.success_rates import BEST, TOP, BenchmarkConfig, benchmark
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.catalogue import load_object, resolve_objects
-        from dro_grasp.predictor import GraspPredictor, PredictorConfig, check_request
+        from dro_grasp.predictor import GraspPredictor, GraspRequest, PredictorConfig
         from dro_grasp.simulation.protocols import protocol
 
-        check_request(self.num, None, self.temperature)
-        if self.looks < 1:
-            raise OptionError(f"--looks is {self.looks}; give at least 1")
+        GraspRequest(self.num, candidates=1, temperature=self.temperature)
+        if self.views < 1:
+            raise OptionError(f"--views is {self.views}; give at least 1")
         for name in ("hands", "objects", "stages", "protocols"):
             if not getattr(self, name):
                 raise OptionError(f"--{name} is empty; name at least one")
@@ -73,11 +73,11 @@ class Benchmark:
         hands = [load_hand(name) for name in self.hands]
         objects = [load_object(name) for name in resolve_objects(list(self.objects))]
         if clouds := [obj.name for obj in objects if obj.is_cloud]:
-            raise ObjectError(f"{', '.join(clouds)}: bare point clouds cannot be tried; give meshes")
+            raise ObjectError(f"{', '.join(clouds)}: bare point clouds cannot be simulated; give meshes")
         stages = (*self.stages, BEST, *TOP) if "refined" in self.stages else self.stages
         config = BenchmarkConfig(
             num=self.num, stages=stages, protocols=tuple(protocol(p) for p in self.protocols), controls=self.controls,
-            seed=self.seed, view=self.view, looks=self.looks,
+            seed=self.seed, view=self.view, views=self.views,
         )
         with progress_bar("pairs", self.json) as progress:
             rows = benchmark(hands, objects, predictor, config, bundle, progress)
@@ -85,15 +85,15 @@ class Benchmark:
         if self.json:
             print_json({
                 "weights": predictor.weights_name, "objects": [obj.name for obj in objects], "num": self.num,
-                "view": self.view, "looks": self.looks, "seed": self.seed, "seconds": round(seconds, 1),
+                "view": self.view, "views": self.views, "seed": self.seed, "seconds": round(seconds, 1),
                 "rows": [dataclasses.asdict(row) for row in rows],
             })
             return 0
         title = f"weights '{predictor.weights_name}', {self.num} grasps of each hand on each of {len(objects)} objects"
         if self.view != "whole":
             title += f", view '{self.view}'"
-        if self.looks > 1:
-            title += f", {self.looks} times"
+        if self.views > 1:
+            title += f", {self.views} views"
         columns = ["grasps", "stage", "hand", "n", *rows[0].success, "shift [mm]", "turn [deg]", "diversity", "ROC area",
                    "ms a grasp"]
         say(title + "; success in % with 95 % intervals; ROC area of the score for each protocol\n")

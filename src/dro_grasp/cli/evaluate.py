@@ -1,4 +1,4 @@
-"""`dro-grasp evaluate`: try the grasps of a file."""
+"""`dro-grasp evaluate`: a trial of every grasp of a file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dro_grasp.grasps.sources import hand_of, object_of
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Try the grasps of a file in simulation and report success rates with 95 % intervals.
+    """Evaluate the grasps of a file in simulation and report success rates with 95 % intervals.
 
     Example: dro-grasp evaluate grasps.parquet --protocol strict
     """
@@ -29,7 +29,7 @@ class Evaluate:
     friction: Annotated[float | None, optional("MU", "the protocol's")] = None
     """Friction coefficient between hand and object; the official release has 3."""
     hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
-    """Hand to use instead of the one that the file names or remembers."""
+    """Hand to use instead of the one named in the file."""
     object: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Mesh to use, likewise, for a file with one object."""
     scale: float = 1.0
@@ -40,13 +40,14 @@ class Evaluate:
     """Print one JSON object instead of a table."""
 
     def run(self) -> int:
-        """Group by object, try, report."""
+        """Evaluate object by object, then report."""
         from dro_grasp.errors import OptionError
         from dro_grasp.evaluation.metrics import wilson_interval
         from dro_grasp.files import check_output
         from dro_grasp.grasps.batch import GraspBatch
+        from dro_grasp.pipeline.problem import GraspProblem
+        from dro_grasp.pipeline.stages import evaluate
         from dro_grasp.simulation.protocols import changed
-        from dro_grasp.simulation.trial import simulate
 
         rules = changed(self.protocol, friction=self.friction)
         if self.output is not None:
@@ -54,22 +55,23 @@ class Evaluate:
         begin = time.perf_counter()
         grasps = load_grasps(self.file)
         hand = hand_of(grasps, self.hand)
-        rows, tried, reasons = [], [], Counter()
+        rows, evaluated, reasons = [], [], Counter()
         names = list(dict.fromkeys(grasps.object))
         if self.object is not None and len(names) > 1:
             raise OptionError(f"{self.file} holds grasps of {len(names)} objects; --object fits a file with one")
-        with progress_bar("trying", self.json) as progress:
+        with progress_bar("evaluating", self.json) as progress:
             for name in names:
                 index = [i for i, o in enumerate(grasps.object) if o == name]
                 part = grasps[index]
                 obj = object_of(part, self.object, self.scale)
                 if part.object_sha256[0] not in {"", obj.sha256}:
-                    say_aside(f"the grasps were made for another '{name}' than the one they are tried on, {obj.name}")
-                result = simulate(hand, obj, part, rules, progress=progress)
-                tried.append(part.with_trial(result))
-                reasons.update(r for r in result.reason if r)
-                rows.append([name, len(part), int(result.success.sum()), result.success_rate])
-        done = GraspBatch.concatenate(tried)
+                    say_aside(f"the grasps were made for another '{name}' than the given {obj.name}")
+                done = evaluate(GraspProblem(hand, obj), part, rules, progress)
+                evaluated.append(done)
+                reasons.update(r for r in done.extra["reason"] if r)
+                success = int(done.success.sum())
+                rows.append([name, len(done), success, success / max(1, len(done))])
+        done = GraspBatch.concatenate(evaluated)
         if self.output is not None:
             done.save(self.output)
         success = sum(row[2] for row in rows)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,23 +13,25 @@ from dro_grasp.cli.output import optional, print_json, print_table, progress_bar
 from dro_grasp.grasps.sources import with_sources
 
 if TYPE_CHECKING:
+    from jaxtyping import Float
     from torch import Tensor
 
     from dro_grasp.frames import NamedMotion
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.hands.hand import Hand
     from dro_grasp.objects.shape import ObjectModel
-    from dro_grasp.predictor import GraspPredictor
-    from dro_grasp.simulation.trial import TrialResult
+    from dro_grasp.pipeline.problem import GraspProblem
+    from dro_grasp.predictor import GraspPredictor, GraspRequest
 
 ROWS_SHOWN = 16
 """Grasps listed in the table."""
 Flag = tyro.conf.FlagCreatePairsOff[bool]
+"""An option that takes no value."""
 
 
 @dataclass(frozen=True)
 class Generate:
-    """Predict grasps of an object by a hand, try them in simulation, and save them.
+    """Predict grasps of an object by a hand, evaluate them in simulation, and save them.
 
     Example: dro-grasp generate --hand allegro --object mug --output grasps.parquet --picture grasps.png
     """
@@ -42,20 +43,20 @@ class Generate:
     num: int = 16
     """How many grasps of each object."""
     candidates: int = 4
-    """Grasps that are predicted for each one that is kept; the best by score are. 1 is quickest."""
+    """Candidates proposed for each grasp kept; the best by score are kept. 1 is quickest."""
     seed: int = 0
     """The same seed gives the same grasps."""
     direction: Annotated[tuple[float, float, float] | None, optional("X Y Z", "any direction")] = None
     """Palm direction in the object's frame: 0 0 -1 grasps from above."""
     table: Annotated[float | None, optional("Z", "no table")] = None
-    """Height [m] of a table in the object's frame; no hand goes below it."""
+    """Height [m] of a table in the object's frame; the hand stays above it."""
     camera: Annotated[Path | None, optional("JSON", "the object's own frame")] = None
-    """File with {"frame": "base", "T_frame_camera": 4x4}: the object is a cloud in that camera's frame, and is cleaned; grasps,
-    direction and table are in the frame named."""
+    """File with {"frame": "base", "T_frame_camera": 4x4}: the object is a cloud in that camera's frame; it is cleaned. Grasps,
+    direction and table are in the named frame."""
     refine: bool = True
-    """Polish the network's grasps on the object's geometry, near where they were predicted."""
+    """Refine the candidates on the object's geometry, near where the network proposed them."""
     temperature: Annotated[float | None, optional("T", "as the weights say")] = None
-    """How varied the grasps of one placement are: 0 takes the likeliest, 1 all that the weights have learned."""
+    """Diversity of the grasps of one placement: 0 takes the likeliest, 1 is as diverse as the training grasps."""
     scale: float = 1.0
     """Multiplies the object's coordinates; 0.001 for files in millimetres."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
@@ -64,9 +65,9 @@ class Generate:
         Literal["dro", "strict", "dro_static", "dexgraspbench", "none"] | None,
         optional("{dro,strict,dro_static,dexgraspbench,none}", "dro for a mesh, none for a bare point cloud"),
     ] = None
-    """Trial that each grasp goes through."""
+    """Trial of each grasp."""
     only_successful: Flag = False
-    """Save only the grasps that passed; the success rate still counts all."""
+    """Save only the successful grasps; the success rate still counts all."""
     output: Annotated[Path | None, optional("PATH", "not saved")] = None
     """Parquet file for the grasps; with a folder of objects, an existing folder that gets one file an object."""
     picture: Annotated[Path | None, optional("PNG", "no picture")] = None
@@ -82,11 +83,11 @@ class Generate:
         from dro_grasp.frames import read_motion
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.catalogue import resolve_objects
-        from dro_grasp.predictor import GraspPredictor, PredictorConfig, check_request
+        from dro_grasp.predictor import GraspPredictor, GraspRequest
 
-        check_request(self.num, self.direction, self.temperature, self.candidates)
         check_seed(self.seed)
-        check_table(self.table)
+        request = GraspRequest(
+            self.num, self.seed, self.direction, self.table, self.candidates, self.refine, self.temperature)
         names = resolve_objects([self.object])
         several = names != [self.object]
         outputs = paths_per_object(self.output, names, several, ".parquet")
@@ -94,13 +95,11 @@ class Generate:
         camera = None if self.camera is None else read_motion(self.camera, "T_frame_camera")
         begin = time.perf_counter()
         hand = load_hand(self.hand)
-        predictor = GraspPredictor(self.weights, config=PredictorConfig(temperature=self.temperature))
-        load = time.perf_counter() - begin
-        jobs = zip(names, outputs, pictures, strict=True)
+        job = Job(hand, GraspPredictor(self.weights), request, camera, time.perf_counter() - begin)
         done, failed = [], []
-        for name, output, picture in jobs:
+        for name, output, picture in zip(names, outputs, pictures, strict=True):
             try:
-                done.append(self._one(predictor, hand, name, camera, output, picture, load))
+                done.append(self._grasp(job, name, output, picture))
             except DroGraspError as error:
                 if not several:
                     raise
@@ -115,75 +114,76 @@ class Generate:
                 view_grasps(hand, d.obj, d.grasps, d.predicted_points)
         return 2 if failed else 0
 
-    def _one(
-        self, predictor: GraspPredictor, hand: Hand, name: str, camera: NamedMotion | None, output: Path | None,
-        picture: Path | None, load: float,
-    ) -> Done:
+    def _grasp(self, job: Job, name: str, output: Path | None, picture: Path | None) -> ObjectResult:
         """One object, start to end."""
-        from dro_grasp.objects.catalogue import load_object
-        from dro_grasp.perception.scan import load_scan
+        from dro_grasp.pipeline.problem import GraspProblem
 
         begin = time.perf_counter()
-        if camera is None:
-            obj = load_object(name, scale=self.scale)
-        else:
-            obj = load_scan(Path(name).expanduser(), camera.T.double().numpy(), self.scale)
-        load += time.perf_counter() - begin
+        obj = self._load(name, job.camera)
+        load = job.load_seconds + time.perf_counter() - begin
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
+        problem = GraspProblem(job.hand, obj)
         with progress_bar("predicting", self.json) as progress:
-            grasps = predictor.predict(
-                hand, obj, self.num, self.seed, self.direction, self.table, self.refine, progress, self.candidates)
-        points, timings = predictor.predicted_points, dict(predictor.timings)
+            made = job.predictor.run(problem, job.request, progress)
         begin = time.perf_counter()
-        result, protocol = self._try(hand, obj, grasps)
-        grasps = grasps if result is None else grasps.with_trial(result)
-        seconds = {"load": load, **timings, "trial": time.perf_counter() - begin if result is not None else 0.0}
+        grasps = self._evaluate(problem, made.grasps)
+        simulated = bool(grasps.evaluated.any())
+        seconds = {"load": load, **made.seconds, "trial": time.perf_counter() - begin if simulated else 0.0}
         report = {
-            "hand": hand.name, "object": obj.name, "num": len(grasps), "candidates": predictor.candidates,
-            "seed": self.seed, "weights": predictor.weights_name, "protocol": protocol,
-            "success": None if result is None else int(result.success.sum()),
-            "success_rate": None if result is None else result.success_rate,
+            "hand": job.hand.name, "object": obj.name, "num": len(grasps), "candidates": made.candidates,
+            "seed": self.seed, "weights": job.predictor.weights_name, "protocol": self._protocol(obj),
+            "success": int(grasps.success.sum()) if simulated else None,
+            "success_rate": float(grasps.success.float().mean()) if simulated else None,
             "seconds": {k: round(v, 4) for k, v in seconds.items()},
             "output": None if output is None else str(output),
-            "frame": "object" if camera is None else camera.frame,
+            "frame": "object" if job.camera is None else job.camera.frame,
         }
-        kept = grasps
-        if result is not None and self.only_successful:
-            kept, points = grasps[result.success], None if points is None else points[result.success]
+        keep = grasps.success if simulated and self.only_successful else slice(None)
+        kept = grasps[keep]
         if output is not None:
-            with_sources(kept, self.hand, name, self.scale, camera).save(output)
+            with_sources(kept, self.hand, name, self.scale, job.camera).save(output)
         if picture is not None:
             from dro_grasp.viewer.pictures import draw_grasps
 
             report["picture"] = str(picture)
-            draw_grasps(hand, obj, kept if len(kept) else grasps, picture)
+            draw_grasps(job.hand, obj, kept if len(kept) else grasps, picture)
         if not self.json:
-            self._show(report, grasps, result)
-        return Done(report, obj, kept, points)
+            self._show(report, grasps)
+        return ObjectResult(report, obj, kept, made.points[keep])
 
-    def _try(self, hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> tuple[TrialResult | None, str]:
-        protocol = self.protocol or ("none" if obj.is_cloud else "dro")
+    def _load(self, name: str, camera: NamedMotion | None) -> ObjectModel:
+        from dro_grasp.objects.catalogue import load_object
+        from dro_grasp.perception.scan import load_scan
+
+        if camera is None:
+            return load_object(name, scale=self.scale)
+        return load_scan(Path(name).expanduser(), camera.T.double().numpy(), self.scale)
+
+    def _protocol(self, obj: ObjectModel) -> str:
+        return self.protocol or ("none" if obj.is_cloud else "dro")
+
+    def _evaluate(self, problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
+        from dro_grasp.pipeline.stages import evaluate
+
+        protocol = self._protocol(problem.obj)
         if protocol == "none":
-            return None, protocol
-        from dro_grasp.simulation.trial import simulate
+            return grasps
+        with progress_bar("evaluating", self.json) as progress:
+            return evaluate(problem, grasps, protocol, progress)
 
-        with progress_bar("trying", self.json) as progress:
-            result = simulate(hand, obj, grasps, protocol, progress=progress)
-        return result, protocol
-
-    def _show(self, report: dict[str, Any], grasps: GraspBatch, result: TrialResult | None) -> None:
+    def _show(self, report: dict[str, Any], grasps: GraspBatch) -> None:
         rows = []
         for i in range(min(len(grasps), ROWS_SHOWN)):
-            score = float(grasps.score[i])
-            tried = [None] * 4 if result is None else [
-                bool(result.success[i]), int(result.contacts[i]), float(result.penetration[i]) * 1e3, result.reason[i],
-            ]
-            rows.append([i, score, *tried])
+            outcome: list[Any] = [None] * 4
+            if grasps.evaluated[i]:
+                outcome = [bool(grasps.success[i]), len(grasps.extra["contact_links"][i]), float(grasps.penetration[i]) * 1e3,
+                           grasps.extra["reason"][i]]
+            rows.append([i, float(grasps.score[i]), *outcome])
         columns = ["grasp", "score", "success", "contacts", "penetration [mm]", "reason"]
         seconds = "  ".join(f"{k} {v:.2f} s" for k, v in report["seconds"].items())
         print_table(f"{report['hand']} on {report['object']}", columns, rows, note=seconds)
-        if result is not None:
+        if report["success"] is not None:
             say(f"{report['success']} of {report['num']} grasps succeeded under protocol {report['protocol']}")
         for what, key in (("grasps", "output"), ("picture", "picture")):
             if report.get(key):
@@ -191,16 +191,28 @@ class Generate:
 
 
 @dataclass(frozen=True)
-class Done:
-    """What one object led to."""
+class Job:
+    """What all objects of one call share."""
+
+    hand: Hand
+    predictor: GraspPredictor
+    request: GraspRequest
+    camera: NamedMotion | None
+    load_seconds: float
+    """Time to load hand and weights [s]."""
+
+
+@dataclass(frozen=True)
+class ObjectResult:
+    """The grasps of one object."""
 
     report: dict[str, Any]
     """The JSON object."""
     obj: ObjectModel
     grasps: GraspBatch
     """The grasps that were kept."""
-    predicted_points: Tensor | None
-    """Their hand points as the network placed them."""
+    predicted_points: Float[Tensor, "n n_points 3"]
+    """Their hand points as the network placed them [m]."""
 
 
 def check_seed(seed: int) -> None:
@@ -209,14 +221,6 @@ def check_seed(seed: int) -> None:
 
     if not 0 <= seed < 2**63:
         raise OptionError(f"seed is {seed}; give an integer from 0 to 2^63 - 1")
-
-
-def check_table(table: float | None) -> None:
-    """Refuse a height that is no number."""
-    from dro_grasp.errors import OptionError
-
-    if table is not None and not math.isfinite(table):
-        raise OptionError(f"table is {table}; give the height in metres, for example --table 0")
 
 
 def paths_per_object(path: Path | None, names: list[str], several: bool, suffix: str) -> list[Path | None]:

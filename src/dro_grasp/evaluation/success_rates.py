@@ -1,6 +1,6 @@
-"""The tables of the paper: grasps of a network and of its controls, before and after ranking and refinement.
+"""Success rates of a network and of its controls, before and after refinement and ranking.
 
-Source: paper section IV; the stages, the controls and the stricter trials beside the paper's are ours.
+Source: paper section IV; the stages, the controls and the trials beside the paper's are ours.
 """
 
 from __future__ import annotations
@@ -21,27 +21,41 @@ from dro_grasp.evaluation.metrics import diversity, roc_area, wilson_interval
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimization.refinement import refine_grasps
 from dro_grasp.optimization.synthesis import synthesize
 from dro_grasp.perception.partial_views import View, seen
-from dro_grasp.predictor import GraspPredictor
-from dro_grasp.ranking.score import score_grasps
+from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.pipeline.stages import refine, scored
+from dro_grasp.predictor import GraspPredictor, GraspRequest
 from dro_grasp.simulation.outcome import TrialResult
 from dro_grasp.simulation.protocols import Protocol
 from dro_grasp.simulation.trial import settle, simulate
 
-RAW, RANKED, REFINED, BEST = "raw", "ranked", "refined", "refined, ranked"
+RAW = "raw"
+"""Stage: grasps as they come."""
+RANKED = "ranked"
+"""Stage: the best quarter of them by score."""
+REFINED = "refined"
+"""Stage: refined grasps."""
+BEST = "refined, ranked"
+"""Stage: the best quarter of the refined grasps by score."""
 TOP = {f"refined, top {count}": count for count in (5, 1)}
-"""Stages that keep the few best by score of the polished grasps of a pair, and how many."""
+"""Stages that keep the few best refined grasps of a pair by score, and how many."""
 STAGES = (RAW, RANKED, REFINED, BEST, *TOP)
-"""As they come; the best quarter by score; polished; polished, then the best quarter, the best five, the best one."""
-NETWORK, MEAN, START, SYNTHESISED = "network", "mean grasp", "unoptimised start", "synthesised"
+"""All stages."""
+NETWORK = "network"
+"""Source: the network under test."""
+MEAN = "mean grasp"
+"""Source: the mean of the training grasps at random rotations."""
+START = "unoptimised start"
+"""Source: half-closed hands that face the object."""
+SYNTHESISED = "synthesised"
+"""Source: synthesised and settled grasps."""
 ALL = "average"
 """Name of the row over all hands."""
 KEPT = 0.25
-"""Share of the grasps of a pair that ranking keeps, decided before any trial."""
+"""Share of the grasps of a pair that ranking keeps, before any trial."""
 CANDIDATES = 4
-"""Candidates that synthesis makes for each grasp that it is asked for; the paper's baseline keeps its best as well."""
+"""Candidates that synthesis makes for each grasp it is asked for; the paper's baseline keeps its best as well."""
 
 
 @dataclass(frozen=True)
@@ -53,32 +67,32 @@ class BenchmarkConfig:
     stages: tuple[str, ...] = STAGES
     """Which of STAGES."""
     protocols: tuple[Protocol, ...] = ()
-    """Trials that every grasp goes through."""
+    """Trials of every grasp."""
     controls: bool = True
-    """Also the rows that success means nothing without."""
+    """Whether the controls are measured beside the network."""
     view: View = "whole"
     """What the network, refinement and ranking see of the object; controls see all of it."""
-    looks: int = 1
-    """How often each pair is taken up, with other random numbers and seen from another side, for `num` grasps each time."""
+    views: int = 1
+    """Views of each object for each hand, with other random numbers and `num` grasps each."""
     seed: int = 0
-    """Of all grasps and views; each pair's are derived from it."""
+    """Of all grasps and views; each pair's seeds are derived from it."""
     workers: int | None = None
     """Threads of the trials; all cores by default."""
 
 
 @dataclass(frozen=True)
-class Tried:
+class EvaluatedGrasps:
     """Grasps of one hand on one object, after all trials."""
 
     grasps: GraspBatch
     results: tuple[TrialResult, ...]
     """One for each protocol."""
     seconds: dict[str, float]
-    """What making one grasp took, by part [s]."""
+    """Time to make one grasp, by part [s]."""
 
-    def rows(self, index: Int[Tensor, " k"]) -> Tried:
-        """Some of the grasps; a trial's outcome depends on nothing but the grasp."""
-        return Tried(self.grasps[index], tuple(r.rows(index) for r in self.results), self.seconds)
+    def rows(self, index: Int[Tensor, " k"]) -> EvaluatedGrasps:
+        """Some of the grasps; the outcome of a trial depends on nothing but the grasp."""
+        return EvaluatedGrasps(self.grasps[index], tuple(r.rows(index) for r in self.results), self.seconds)
 
 
 @dataclass(frozen=True)
@@ -86,11 +100,11 @@ class Row:
     """One line of the table."""
 
     grasps: str
-    """Where they come from."""
+    """Their source."""
     stage: str
     hand: str
     num: int
-    """Grasps tried."""
+    """Grasps evaluated."""
     success: dict[str, tuple[float, float, float]]
     """Per protocol the share of successes and its 95 % interval (Wilson); the mean over hands in the row of all."""
     displacement: float
@@ -113,77 +127,83 @@ def benchmark(
     bundle: Bundle | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:
-    """Fill the table.
+    """Measure the success rates.
 
     Args:
         hands: Which hands.
         objects: Which objects, all with meshes.
         predictor: The network under test.
         config: Numbers, stages and protocols.
-        bundle: Training data that the mean grasp is the mean of; hands that are not in it have no such rows.
+        bundle: Training data of the mean grasp; hands that are not in it have no such rows.
         progress: Called with (pairs done, pairs in all).
     """
-    table: dict[tuple[str, str], list[list[Tried]]] = {}
+    table: dict[tuple[str, str], list[list[EvaluatedGrasps]]] = {}
     done, pairs = 0, len(hands) * len(objects)
     for hand in hands:
-        found: dict[tuple[str, str], list[Tried]] = {}
+        found: dict[tuple[str, str], list[EvaluatedGrasps]] = {}
         for obj in objects:
-            for seed in look_seeds(config, hand, obj):
-                for source, grasps, seconds, known in _sources(hand, obj, predictor, config, bundle, seed):
-                    for stage, tried in _stages(hand, obj, known, source, grasps, seconds, config):
-                        found.setdefault((source, stage), []).append(tried)
+            problem = GraspProblem(hand, obj, predictor.device)
+            for seed in view_seeds(config, hand, obj):
+                for source in _sources(problem, predictor, config, bundle, seed):
+                    for stage, evaluated in _stages(source, obj, config):
+                        found.setdefault((source.name, stage), []).append(evaluated)
             done += 1
             if progress is not None:
                 progress(done, pairs)
-        for key, tries in found.items():
-            table.setdefault(key, []).append(tries)
+        for key, evaluated in found.items():
+            table.setdefault(key, []).append(evaluated)
     rows = []
     for (source, stage), per_hand in table.items():
-        single = [_row(source, stage, tries, config.protocols) for tries in per_hand]
+        single = [_row(source, stage, evaluated, config.protocols) for evaluated in per_hand]
         rows += single if len(single) == 1 else [*single, _average(single)]
     return rows
 
 
 def pair_seed(seed: int, hand: Hand, obj: ObjectModel) -> int:
-    """Seed of one pair: the same z on all objects would pass for independent grasps."""
+    """Seed of one pair: with the same z on all objects, grasps of different pairs would not be independent."""
     return seed + zlib.crc32(f"{hand.name} {obj.name}".encode())
 
 
-def look_seeds(config: BenchmarkConfig, hand: Hand, obj: ObjectModel) -> range:
-    """Seeds of a pair's looks; the first is the pair's."""
+def view_seeds(config: BenchmarkConfig, hand: Hand, obj: ObjectModel) -> range:
+    """Seeds of a pair's views; the first is the pair's own."""
     first = pair_seed(config.seed, hand, obj)
-    return range(first, first + config.looks)
+    return range(first, first + config.views)
+
+
+@dataclass(frozen=True)
+class _Source:
+    """Grasps before any stage."""
+
+    name: str
+    problem: GraspProblem
+    """The hand, and what is seen of the object."""
+    grasps: GraspBatch
+    seconds: dict[str, float]
+    """Time to make one of them, by part [s]."""
 
 
 def _sources(
-    hand: Hand, obj: ObjectModel, predictor: GraspPredictor, config: BenchmarkConfig, bundle: Bundle | None, seed: int
-) -> Iterator[tuple[str, GraspBatch, dict[str, float], ObjectModel]]:
-    """Grasps by where they come from, unpolished, the time that one of them took [s], and what was seen of the object."""
-    num = config.num
-    known = seen(obj, config.view, seed)
-    grasps = predictor.predict(hand, known, num=num, seed=seed, refine=False)
-    yield NETWORK, grasps, {k: predictor.timings[k] / num for k in ("network", "decode")}, known
+    problem: GraspProblem, predictor: GraspPredictor, config: BenchmarkConfig, bundle: Bundle | None, seed: int
+) -> Iterator[_Source]:
+    """Grasps of the network and of the controls."""
+    hand, obj, num = problem.source, problem.obj, config.num
+    visible = problem if config.view == "whole" else GraspProblem(hand, seen(obj, config.view, seed), predictor.device)
+    made = predictor.run(visible, GraspRequest(num, seed, candidates=1, refine=False))
+    yield _Source(NETWORK, visible, made.grasps, {k: made.seconds[k] / num for k in ("network", "decode")})
     if not config.controls:
         return
     if bundle is not None and hand.name in bundle.grasps:
-        yield MEAN, mean_grasps(hand, obj, mean_grasp(bundle, hand.name), num, seed), {}, obj
-    yield START, palm_facing_starts(hand, obj, num, seed), {}, obj
+        yield _Source(MEAN, problem, mean_grasps(hand, obj, mean_grasp(bundle, hand.name), num, seed), {})
+    yield _Source(START, problem, palm_facing_starts(hand, obj, num, seed), {})
     begin = time.perf_counter()
-    made = settle(hand, obj, synthesize(hand, obj, CANDIDATES * num, seed)[slice(0, num)], workers=config.workers)
-    yield SYNTHESISED, made, {"synthesis": (time.perf_counter() - begin) / num}, obj
+    settled = settle(hand, obj, synthesize(hand, obj, CANDIDATES * num, seed)[:num], workers=config.workers)
+    yield _Source(SYNTHESISED, problem, settled, {"synthesis": (time.perf_counter() - begin) / num})
 
 
-def _stages(
-    hand: Hand,
-    obj: ObjectModel,
-    known: ObjectModel,
-    source: str,
-    grasps: GraspBatch,
-    seconds: dict[str, float],
-    config: BenchmarkConfig,
-) -> Iterator[tuple[str, Tried]]:
-    """The stages asked for; what several of them share is made once."""
-    asked = {RAW} if source in {START, SYNTHESISED} else set(config.stages)
+def _stages(source: _Source, obj: ObjectModel, config: BenchmarkConfig) -> Iterator[tuple[str, EvaluatedGrasps]]:
+    """The stages asked for; what several of them share is made once. Trials see the whole object."""
+    asked = {RAW} if source.name in {START, SYNTHESISED} else set(config.stages)
+    problem, grasps, seconds = source.problem, source.grasps, source.seconds
     quarter = max(1, round(KEPT * len(grasps)))
     for whole, best in ((RAW, {RANKED: quarter}), (REFINED, {BEST: quarter, **TOP})):
         wanted = {whole, *best} & asked
@@ -191,37 +211,37 @@ def _stages(
             continue
         if whole == REFINED:
             begin = time.perf_counter()
-            grasps = refine_grasps(hand, known, grasps)
+            grasps = refine(problem, grasps)
             seconds = seconds | {"refine": (time.perf_counter() - begin) / len(grasps)}
-        grasps = grasps.replace(score=score_grasps(hand, known, grasps))
-        results = tuple(simulate(hand, obj, grasps, rules, workers=config.workers) for rules in config.protocols)
-        tried = Tried(grasps, results, seconds)
+        grasps = scored(problem, grasps)
+        results = tuple(simulate(problem.source, obj, grasps, rules, workers=config.workers) for rules in config.protocols)
+        evaluated = EvaluatedGrasps(grasps, results, seconds)
         if whole in wanted:
-            yield whole, tried
+            yield whole, evaluated
         for stage, count in best.items():
             if stage in wanted:
-                yield stage, tried.rows(grasps.score.topk(min(count, len(grasps))).indices)
+                yield stage, evaluated.rows(grasps.score.topk(min(count, len(grasps))).indices)
 
 
-def _row(source: str, stage: str, tries: list[Tried], protocols: Sequence[Protocol]) -> Row:
+def _row(source: str, stage: str, parts: list[EvaluatedGrasps], protocols: Sequence[Protocol]) -> Row:
     """One hand's line."""
-    success = [torch.cat([t.results[i].success for t in tries]) for i in range(len(protocols))]
+    success = [torch.cat([t.results[i].success for t in parts]) for i in range(len(protocols))]
     rates = {}
     for rules, passed in zip(protocols, success, strict=True):
         k, n = int(passed.sum()), len(passed)
         rates[rules.label] = (k / n, *wilson_interval(k, n))
-    held = GraspBatch.concatenate([t.grasps.replace(extra={}) for t in tries])[success[0]]
-    first = [t.results[0] for t in tries]
+    held = GraspBatch.concatenate([t.grasps.replace(extra={}) for t in parts])[success[0]]
+    first = [t.results[0] for t in parts]
     areas = {
-        rules.label: _mean([roc_area(t.grasps.score, t.results[i].success) for t in tries])
+        rules.label: _mean([roc_area(t.grasps.score, t.results[i].success) for t in parts])
         for i, rules in enumerate(protocols)
     }
-    parts = {name: _mean([t.seconds[name] for t in tries]) for name in tries[0].seconds}
+    seconds = {name: _mean([t.seconds[name] for t in parts]) for name in parts[0].seconds}
     return Row(
-        source, stage, tries[0].grasps.hand, len(success[0]), rates,
+        source, stage, parts[0].grasps.hand, len(success[0]), rates,
         displacement=float(torch.cat([r.displacement[r.success, -1] for r in first]).mean()),
         rotation=float(torch.cat([r.rotation[r.success, -1] for r in first]).mean()),
-        diversity=diversity(held.T_object_wrist, held.joints)["all"], ranking=areas, seconds=parts,
+        diversity=diversity(held.T_object_wrist, held.joints)["all"], ranking=areas, seconds=seconds,
     )
 
 

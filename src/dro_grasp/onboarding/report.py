@@ -10,8 +10,9 @@ from dro_grasp.evaluation.success_rates import BEST, RAW, REFINED
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.onboarding.steps import DATA, PICTURE, REPORT, WEIGHTS, Onboarded
-from dro_grasp.predictor import GraspPredictor
-from dro_grasp.simulation.trial import simulate
+from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.pipeline.stages import evaluate
+from dro_grasp.predictor import GraspPredictor, GraspRequest
 from dro_grasp.viewer.page import image, table, write_page
 from dro_grasp.viewer.pictures import draw_grasps
 
@@ -74,8 +75,9 @@ def _drawn(done: Onboarded, held_out: list[str]) -> str:
     for name in held_out[:OBJECTS]:
         obj = load_object(name)
         path = done.folder / f"{Path(name).stem}.png"
-        grasps = predictor.predict(hand, obj, GRASPS, candidates=CANDIDATES)
-        draw_grasps(hand, obj, grasps.with_trial(simulate(hand, obj, grasps, "strict")), path)
+        problem = GraspProblem(hand, obj)
+        grasps = predictor.run(problem, GraspRequest(GRASPS, candidates=CANDIDATES)).grasps
+        draw_grasps(hand, obj, evaluate(problem, grasps, "strict"), path)
         parts.append(image(path.read_bytes(), f"grasps of {name}"))
     return "".join(parts)
 

@@ -1,4 +1,4 @@
-"""The way of a new hand: check, measure, synthesise, fine-tune, measure again. Each step is done once; a rerun goes on."""
+"""Onboarding of a new hand: check, benchmark, synthesise, fine-tune, benchmark again; a rerun resumes where it stopped."""
 
 from __future__ import annotations
 
@@ -29,36 +29,47 @@ from dro_grasp.simulation.protocols import protocol
 from dro_grasp.training.config import ScheduleConfig, TrainConfig
 from dro_grasp.training.loop import train
 
-STATE, WEIGHTS, REPORT, DATA, PICTURE = "onboarding.json", "weights.safetensors", "report.html", "data", "hand.png"
-"""What lies in the folder."""
-DATA_SHARE, TRAINING_SHARE = 0.45, 0.40
-"""Shares of the time for making grasps and for fine-tuning; the rest is for trying before and after."""
+STATE = "onboarding.json"
+"""File of finished steps in the hand's folder."""
+WEIGHTS = "weights.safetensors"
+"""File of the fine-tuned weights."""
+REPORT = "report.html"
+"""File of the report."""
+DATA = "data"
+"""Folder of synthesised grasps."""
+PICTURE = "hand.png"
+"""File of the hand's picture."""
+DATA_SHARE = 0.45
+"""Share of the time for synthesis (ours); what the shares leave is for the benchmarks before and after."""
+TRAINING_SHARE = 0.40
+"""Share of the time for fine-tuning (ours)."""
 MOST_GRASPS = 400
-"""Grasps of an object beyond which time is better spent on training."""
+"""Grasps of an object beyond which time is better spent on training (ours)."""
 
 
 @dataclass(frozen=True)
 class OnboardingConfig:
-    """How much is done."""
+    """How long onboarding takes, and on which objects."""
 
     minutes: float = 30.0
     """Time for data, training and trials together [min]."""
     objects: tuple[str, ...] = ("builtin:train",)
-    """Objects that grasps are made of."""
+    """Objects to synthesise grasps of."""
     held_out: tuple[str, ...] = ("builtin:test",)
-    """Objects that the weights are tried on, before and after, and never trained on."""
+    """Objects of the benchmarks before and after; never trained on."""
     num: int = 20
-    """Grasps of each held-out object in each trial."""
+    """Grasps of each held-out object in each benchmark."""
     weights: str | None = None
-    """Weights that are fine-tuned; the shipped ones by default."""
+    """Weights to fine-tune; the shipped ones by default."""
     workers: int = 2
-    """Processes that make grasps."""
+    """Processes of the synthesis."""
     learning_rate: float = 3e-4
-    """Peak rate of fine-tuning; that of training from nothing forgets what the weights know."""
+    """Peak rate of fine-tuning; the rate of training from scratch overwrites the initial weights (ours)."""
     seed: int = 0
+    """Of synthesis, benchmark and training."""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be done."""
+        """Refuse numbers out of range."""
         if not (math.isfinite(self.minutes) and self.minutes > 0):
             raise OptionError(f"minutes is {self.minutes}; give a positive number, for example --minutes 30")
         for name, value in (("num", self.num), ("workers", self.workers)):
@@ -68,7 +79,7 @@ class OnboardingConfig:
 
 @dataclass(frozen=True)
 class Onboarded:
-    """What came of it."""
+    """Result of an onboarding."""
 
     hand: str
     folder: Path
@@ -88,8 +99,8 @@ def onboard(
 
     Args:
         hand: Name or path of the description.
-        folder: Where everything is kept; made when only itself is missing.
-        config: How much is done.
+        folder: Folder of all results; made if its parent exists.
+        config: Time and objects.
         say: Called with a line about each step.
 
     Raises:
@@ -104,18 +115,18 @@ def onboard(
     path = check_folder(folder)
     objects, held_out = resolve_objects(list(config.objects)), resolve_objects(list(config.held_out))
     if both := sorted(set(objects) & set(held_out)):
-        raise OptionError(f"{', '.join(both)} would be trained on and tried as unseen; name other --objects or --held-out")
+        raise OptionError(f"{', '.join(both)} would be trained on and evaluated as unseen; name other --objects or --held-out")
     require_known([hand], [*objects, *held_out])
     locate_weights(config.weights)
-    way = _Way(hand, path, config, objects, held_out, say)
+    onboarding = _Onboarding(hand, path, config, objects, held_out, say)
     make_folder(path)
     for name in ("check", "before", "data", "training", "after"):
-        way.step(name, getattr(way, f"_{name}"))
-    return Onboarded(hand, path, way.steps)
+        onboarding.step(name, getattr(onboarding, f"_{name}"))
+    return Onboarded(hand, path, onboarding.steps)
 
 
-class _Way:
-    """One hand's way, with the state that a rerun takes up."""
+class _Onboarding:
+    """The steps of one hand, with the state that a rerun resumes from."""
 
     def __init__(
         self, hand: str, folder: Path, config: OnboardingConfig, objects: list[str], held_out: list[str],
@@ -129,14 +140,14 @@ class _Way:
         if state.exists():
             known = json.loads(state.read_text())
             if known["sha256"] != self.hand.sha256:
-                raise OptionError(f"{folder} belongs to hand '{known['hand']}', whose description is another one; name another "
-                                  "folder, or bring that description back")
+                raise OptionError(f"{folder} belongs to hand '{known['hand']}', whose description differs; name another "
+                                  "folder, or restore that description")
             self.steps = known["steps"]
 
     def step(self, name: str, work: Callable[[], dict[str, Any]]) -> None:
-        """Do a step that is not done yet, and remember its result."""
+        """Run a step unless it is finished, and store its result."""
         if name in self.steps:
-            self.say(f"{name}: done before")
+            self.say(f"{name}: finished before")
             return
         begin = time.perf_counter()
         result = work()
@@ -154,13 +165,13 @@ class _Way:
                 f"{len(self.hand.tips)} fingertips, {warnings} warnings"}
 
     def _before(self) -> dict[str, Any]:
-        return self._tried(GraspPredictor(self.config.weights))
+        return self._benchmark(GraspPredictor(self.config.weights))
 
     def _after(self) -> dict[str, Any]:
-        return self._tried(GraspPredictor(str(self.folder / WEIGHTS)))
+        return self._benchmark(GraspPredictor(str(self.folder / WEIGHTS)))
 
-    def _tried(self, predictor: GraspPredictor) -> dict[str, Any]:
-        """Success on held-out objects."""
+    def _benchmark(self, predictor: GraspPredictor) -> dict[str, Any]:
+        """Success rates on held-out objects."""
         rules = tuple(protocol(name) for name in ("dro", "strict"))
         config = BenchmarkConfig(self.config.num, (RAW, REFINED, BEST), rules, controls=False, seed=self.config.seed)
         rows = benchmark([self.hand], [load_object(name) for name in self.held_out], predictor, config)

@@ -1,4 +1,4 @@
-"""Polish grasps, however they were made, by a short descent of the grasp energy that stays near them.
+"""Refinement: a short descent of the grasp energy that stays near each grasp, wherever the grasp comes from.
 
 Differs from the paper, which takes grasps as its solver leaves them.
 """
@@ -14,28 +14,25 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.energy.grasp_energy import EnergyConfig, Evaluation, GraspEnergy
-from dro_grasp.energy.object_energy import nearest_contacts, object_energy
+from dro_grasp.energy.object_energy import nearest_contacts
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.controller import completed
-from dro_grasp.hands.hand import Hand
-from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimization.synthesis import moved
+from dro_grasp.optimization.pose_step import moved
 
 
 @dataclass(frozen=True)
 class RefineConfig:
-    """How grasps are polished, and how far they may move."""
+    """Steps of the descent, and how far a grasp may move (ours)."""
 
     steps: int = 40
     """Steps of the descent."""
     farthest: float = 0.02
-    """Farthest that the grasp centre may end from where it was predicted [m]."""
+    """Largest displacement of the grasp centre [m]."""
     largest_turn: float = math.radians(15)
-    """Largest rotation of the hand away from the prediction [rad]."""
+    """Largest rotation of the hand [rad]."""
     largest_bend: float = 0.5
     """Largest change of a joint [rad; for sliding joints in their tree's unit]."""
     reach: float = 0.03
-    """A finger that is farther than this from the surface is idle and is not drawn to it [m]."""
+    """A finger farther than this from the surface is idle; the descent does not draw it in [m]."""
     translation_step: float = 0.002
     """First step of the translation [m]."""
     rotation_step: float = 0.02
@@ -43,54 +40,49 @@ class RefineConfig:
     joint_step: float = 0.04
     """First step of each joint [rad; for sliding joints in their tree's unit]."""
     growth: float = 1.2
-    """A grasp's steps grow by this after one that lowered its energy."""
+    """Factor on a grasp's step lengths after a step that lowered its energy."""
     shrinkage: float = 0.5
-    """And shrink by this after one that did not, which is taken back."""
+    """The same after a step that did not, which is undone."""
     energy: EnergyConfig = field(default_factory=lambda: EnergyConfig(penetration=500.0, hand_points=400))
-    """Weights; nothing settles these grasps in simulation, so depth weighs more than in synthesis."""
+    """Weights; no simulation settles these grasps, so penetration weighs more than in synthesis."""
     batch_size: int = 64
-    """Grasps polished at once."""
+    """Grasps refined at once."""
 
 
-def refine_grasps(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, config: RefineConfig | None = None
-) -> GraspBatch:
-    """The same grasps after a descent of the grasp energy that stays near them; none ends with a higher energy.
+def refine_grasps(energy: GraspEnergy, grasps: GraspBatch, config: RefineConfig | None = None) -> GraspBatch:
+    """The grasps after the descent; none has a higher energy than before.
 
-    Pregrasp and squeeze are made anew, scores are dropped: they belong to the grasps before.
+    Whatever belongs to the grasps before (pregrasp, squeeze, scores, outcomes) is dropped.
 
     Args:
-        hand: The grasps' hand.
-        obj: Their object.
+        energy: Of the grasps' hand on their object, with the weights of the configuration.
         grasps: Any grasps of the two.
         config: Steps and bounds.
     """
     config = config or RefineConfig()
+    device = energy.centre.device
+    parts = zip(grasps.T_object_wrist.split(config.batch_size), grasps.joints.split(config.batch_size), strict=True)
+    with torch.no_grad():
+        ends = [_descend(energy, T.to(device), q.to(device), config) for T, q in parts]
     if not len(grasps):
         return grasps
-    energy = object_energy(hand, obj, config.energy)
-    with torch.no_grad():
-        parts = [
-            _descend(energy, T, q, config)
-            for T, q in zip(
-                grasps.T_object_wrist.split(config.batch_size), grasps.joints.split(config.batch_size), strict=True)
-        ]
-    T, q = (torch.cat(part) for part in zip(*parts, strict=True))
-    moved_grasps = grasps.without("pregrasp_joints", "squeeze_joints", "score", "energy").replace(T_object_wrist=T, joints=q)
-    return completed(hand, moved_grasps, energy.centre)
+    T, q = (torch.cat(part).cpu() for part in zip(*ends, strict=True))
+    moved_grasps = grasps.without("pregrasp_joints", "squeeze_joints", "score", "energy").without_trial()
+    return moved_grasps.replace(T_object_wrist=T, joints=q)
 
 
 def _descend(
     energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], config: RefineConfig
 ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n n_dof"]]:
-    """Steps down the gradient, each kept where it lowers the energy, within the bounds around where it began."""
+    """Steps down the gradient; each is kept where it lowers the energy, within the bounds around the start."""
     tree = energy.hand.tree
     start, pivot = T, energy.pivot(T)
     unit = tree.joint_unit
     lower = torch.maximum(tree.lower, q - config.largest_bend * unit)
     upper = torch.minimum(tree.upper, q + config.largest_bend * unit)
-    move, turn = torch.zeros(len(T), 3), torch.zeros(len(T), 3)
-    pace = torch.ones(len(T), 1)
+    # The pose is the start turned by `turn` about the pivot and shifted by `move`: both are bounded as they stand.
+    move, turn = torch.zeros_like(pivot), torch.zeros_like(pivot)
+    pace = torch.ones_like(pivot[:, :1])
     contacts = nearest_contacts(energy, T, q, config.reach)
     now = energy(T, q, contacts)
     for _ in range(config.steps):
@@ -101,14 +93,13 @@ def _descend(
         new_turn = _within(
             roma.rotmat_to_rotvec(roma.rotvec_to_rotmat(pace * config.rotation_step * spin) @ roma.rotvec_to_rotmat(turn)),
             config.largest_turn)
-        # The step is that of a joint on average, whatever their number.
+        # `bend` has unit length over all joints: scaled so that the root mean square step of a joint is joint_step.
         new_q = q + pace * config.joint_step * len(unit) ** 0.5 * bend * unit
         new_q = torch.minimum(torch.maximum(new_q, lower), upper)
         new_T = moved(start, pivot, new_move, new_turn)
         new_contacts = nearest_contacts(energy, new_T, new_q, config.reach)
         new = energy(new_T, new_q, new_contacts)
-        better = new.total < now.total
-        chosen = better[:, None]
+        chosen = (new.total < now.total)[:, None]
         move, turn = torch.where(chosen, new_move, move), torch.where(chosen, new_turn, turn)
         T, q = torch.where(chosen[..., None], new_T, T), torch.where(chosen, new_q, q)
         now = Evaluation(*(torch.where(chosen, getattr(new, k), getattr(now, k)) for k in ("terms", "by_pose", "by_joint")))

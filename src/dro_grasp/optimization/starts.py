@@ -1,27 +1,27 @@
-"""Where synthesis starts: palms that face the object from all sides, fingers half open, nothing inside."""
+"""Starts of synthesis: palms that face the object from all sides, fingers half open, nothing in penetration."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.geometry.distance_field import DistanceField
+from dro_grasp.geometry.se3 import compose, random_rotations
 from dro_grasp.hands.hand import Hand
 
 
 @dataclass(frozen=True)
 class StartConfig:
-    """How starts are spread. Source of the scheme: DexGraspNet; the numbers are ours."""
+    """Distribution of the starts. Source of the scheme: DexGraspNet; the numbers are ours."""
 
     openness: tuple[float, float] = (0.0, 1.0)
     """Range of the share of the way from closed to open, one draw a grasp."""
     joint_noise: float = 0.6
-    """Standard deviation of each joint, as a share of its range; many joints start at a limit. (Small noise makes all
-    grasps of an object alike: 0.08 halves the spread of the joints and yields no more.)"""
+    """Standard deviation of each joint, as a share of its range; many joints start at a limit. (0.08 halves the diversity of
+    the joints and yields no more.)"""
     aim: float = 0.6
     """Largest share of the way from the object's centre to a random surface point at which the palm aims."""
     gap: tuple[float, float] = (0.0, 0.01)
@@ -30,12 +30,6 @@ class StartConfig:
     """How far outside the object's bounding sphere the approach begins [radius of the hand]."""
     approach_steps: int = 24
     """Steps of the approach along the palm direction."""
-
-
-def random_rotations(n: int, generator: torch.Generator, dtype: torch.dtype) -> Float[Tensor, "n 3 3"]:
-    """Rotations uniform on SO(3)."""
-    quaternion = torch.randn(n, 4, generator=generator, dtype=dtype)
-    return roma.unitquat_to_rotmat(quaternion / quaternion.norm(dim=-1, keepdim=True))
 
 
 def start_joints(
@@ -72,7 +66,7 @@ def starts(
         surface: Points of its surface [m].
         centre: Its centre of mass [m].
         n: How many.
-        config: How they are spread.
+        config: Their distribution.
         generator: Source of randomness.
     """
     q = start_joints(hand, n, config, generator)
@@ -91,6 +85,4 @@ def starts(
     for _ in range(config.approach_steps):
         distance = field.distances(body - (back[:, None] * direction)[:, None])[0].amin(-1)
         back = (back - (distance - gap).clamp_min(0)).clamp_min(0)
-    T = torch.eye(4, dtype=q.dtype).repeat(n, 1, 1)
-    T[:, :3, :3], T[:, :3, 3] = rotation, offset - back[:, None] * direction
-    return T, q
+    return compose(rotation, offset - back[:, None] * direction), q

@@ -1,4 +1,4 @@
-"""Grasps from nothing but geometry: annealed descent of the grasp energy from many starts at once."""
+"""Synthesis: grasps from geometry alone, by annealed descent of the grasp energy from many starts at once."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.optimization.pose_step import moved
 from dro_grasp.optimization.starts import StartConfig, starts
 
 PROVENANCE = f"dro-grasp {__version__}, synthesis 2"
-"""What synthesised grasps say of their making; counts up when the method changes."""
+"""Provenance of synthesised grasps; the number counts up when the method changes."""
 
 
 @dataclass(frozen=True)
@@ -53,14 +54,14 @@ class SynthesisConfig:
     energy: EnergyConfig = field(default_factory=EnergyConfig)
     """Weights of the terms."""
     starts: StartConfig = field(default_factory=StartConfig)
-    """Where it starts."""
+    """Distribution of the starts."""
     contacts: ContactConfig = field(default_factory=ContactConfig)
-    """Where the hand may touch."""
+    """Contact candidates of the hand."""
 
 
 @dataclass(frozen=True)
 class State:
-    """n grasps in the middle of the optimisation."""
+    """n grasps during the optimisation."""
 
     T: Float[Tensor, "n 4 4"]
     """T_object_wrist [m]."""
@@ -100,7 +101,7 @@ def field_of(obj: ObjectModel) -> DistanceField:
 def synthesize(
     hand: Hand, obj: ObjectModel, num: int, seed: int = 0, config: SynthesisConfig | None = None
 ) -> GraspBatch:
-    """Grasps of an object by a hand, lowest energy first, untested.
+    """Synthesise grasps of an object by a hand, lowest energy first, not evaluated.
 
     Args:
         hand: Any hand.
@@ -206,20 +207,6 @@ def propose(
     q = torch.minimum(torch.maximum(state.q + step * bend, tree.lower), tree.upper)
     contacts = switched(energy, state, config.switch, generator)
     return State(T, q, contacts, state.slots, energy(T, q, contacts))
-
-
-def moved(
-    T: Float[Tensor, "n 4 4"],
-    pivot: Float[Tensor, "n 3"],
-    move: Float[Tensor, "n 3"],
-    turn: Float[Tensor, "n 3"],
-) -> Float[Tensor, "n 4 4"]:
-    """Poses after a turn about the pivot [rad] and a translation [m]."""
-    rotation = roma.rotvec_to_rotmat(turn)
-    result = T.clone()
-    result[:, :3, :3] = rotation @ T[:, :3, :3]
-    result[:, :3, 3] = (rotation @ (T[:, :3, 3] - pivot)[..., None])[..., 0] + pivot + move
-    return result
 
 
 def switched(

@@ -12,11 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.energy.grasp_energy import EnergyConfig
-from dro_grasp.energy.object_energy import evaluate_nearest, object_energy
+from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
+from dro_grasp.energy.object_energy import evaluate_nearest
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.hands.hand import Hand
-from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.ranking.features import grasp_features
 from dro_grasp.ranking.score_network import shipped_score_network
 
@@ -35,21 +33,18 @@ class ScoreConfig:
 
 
 @torch.no_grad()
-def score_grasps(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, config: ScoreConfig | None = None
-) -> Float[Tensor, " n"]:
+def score_grasps(energy: GraspEnergy, grasps: GraspBatch, config: ScoreConfig | None = None) -> Float[Tensor, " n"]:
     """A score each: higher is better, comparable among grasps of one hand and one object.
 
     The contacts are taken to be each finger's candidate that is nearest to the surface.
 
     Args:
-        hand: The grasps' hand.
-        obj: Their object.
+        energy: Of the grasps' hand on their object, with the weights of the configuration.
         grasps: Any grasps of the two.
         config: What the score is.
     """
     config = config or ScoreConfig()
-    energy, scores = object_energy(hand, obj, config.energy), [torch.zeros(0)]
+    scores = [torch.zeros(0)]
     for start in range(0, len(grasps), config.batch_size):
         part = grasps[slice(start, start + config.batch_size)]
         terms = evaluate_nearest(energy, part.T_object_wrist, part.joints).terms

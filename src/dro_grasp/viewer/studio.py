@@ -1,4 +1,4 @@
-"""The whole tool in a page: pick or upload a hand and an object, make grasps, watch their trials, take them away."""
+"""The whole tool in a page: pick or upload a hand and an object, generate grasps, watch their trials, download them."""
 
 from __future__ import annotations
 
@@ -24,37 +24,40 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import hand_names, load_hand
 from dro_grasp.objects.catalogue import load_object, object_names
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimization.refinement import refine_grasps
-from dro_grasp.predictor import GraspPredictor, PredictorConfig
-from dro_grasp.ranking.score import score_grasps
+from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.pipeline.stages import evaluate
+from dro_grasp.predictor import GraspPredictor, GraspRequest
 from dro_grasp.simulation.protocols import PROTOCOLS
-from dro_grasp.simulation.trial import record, simulate
+from dro_grasp.simulation.trial import record
 from dro_grasp.viewer.app import POSTURES, Posture, describe, outcome, postures_of
 from dro_grasp.viewer.serving import HOST, ServedPage, serve
 from dro_grasp.viewer.stage import Stage
 from dro_grasp.viewer.uploads import store_upload
 
 FRAME_TIME = 0.04
-"""Time between two pictures of a trial [s]."""
+"""Time between two pictures of a trial [s] (ours)."""
 ANY = "any"
+"""The choice of every palm direction."""
 GRASP_FILE = "grasp file (Parquet)"
 """Choice of the grasp file itself among the formats that can be downloaded."""
 EXPORTS = (GRASP_FILE, *(form.title for form in FORMATS.values() if not form.file_per_grasp))
 """What can be downloaded."""
-MOST = 64
-"""Most grasps made at once."""
+LARGEST_CALL = 64
+"""Most grasps of one click (ours)."""
+MOST_CANDIDATES = 8
+"""Most candidates for each of them (ours)."""
 
 
 @dataclass(frozen=True)
-class Made:
-    """What the page shows."""
+class ShownGrasps:
+    """Grasps on the page, with the outcome of their trials; bare clouds have none."""
 
     hand: Hand
     obj: ObjectModel
     raw: GraspBatch
-    """As the network predicted them, in the order of the others."""
+    """As the network proposed them, in the order of the refined ones."""
     refined: GraspBatch
-    """Polished and tried."""
+    """Best score first."""
 
 
 class Studio(ServedPage):
@@ -83,7 +86,7 @@ class Studio(ServedPage):
             host: Only this machine by default; 0.0.0.0 lets the network in.
         """
         self.predictor = GraspPredictor(weights)
-        self.made: Made | None = None
+        self.made: ShownGrasps | None = None
         self.shown: list[int] = []
         self._folder = tempfile.TemporaryDirectory(prefix="dro-grasp-")
         self._busy = threading.Lock()
@@ -91,11 +94,11 @@ class Studio(ServedPage):
         super().__init__(port, host)
         self.stage = Stage(self.server)
         self._add_choices(hand, obj)
-        self._add_looks()
+        self._add_display()
         self._say("Pick a hand and an object, or upload your own, and press *Generate*.")
 
     def stop(self) -> None:
-        """Stop serving, and delete what was uploaded."""
+        """Stop serving and delete the uploads."""
         super().stop()
         self._folder.cleanup()
 
@@ -107,33 +110,31 @@ class Studio(ServedPage):
         direction: str = ANY,
         temperature: float | None = None,
         protocol: str = "strict",
-    ) -> Made:
-        """Predict, polish, rank and try, then show the best.
+        candidates: int = 4,
+    ) -> ShownGrasps:
+        """Predict, refine, rank and evaluate, then show the best.
 
         Args:
             hand: Name or path.
             obj: Name or path.
             num: How many.
             direction: One of HALF_AXES, or `any`.
-            temperature: Of z; None leaves it to the weights.
+            temperature: Of z; the weights' own by default.
             protocol: Trial; bare clouds get none.
+            candidates: Candidates proposed for each grasp.
 
         Raises:
-            DroGraspError: Something given cannot be used.
+            DroGraspError: An argument cannot be used.
         """
-        loaded, target = load_hand(hand), load_object(obj)
-        self.predictor.config = PredictorConfig(temperature=temperature)
+        problem = GraspProblem(load_hand(hand), load_object(obj), self.predictor.device)
         along = None if direction == ANY else half_axis_direction(direction)
-        raw = self.predictor.predict(loaded, target, num, direction=along, refine=False)
-        refined = refine_grasps(loaded, target, raw)
-        refined = refined.replace(score=score_grasps(loaded, target, refined))
-        order = refined.score.argsort(descending=True)
-        raw, refined = raw[order], refined[order]
-        if not target.is_cloud:
-            refined = refined.with_trial(simulate(loaded, target, refined, protocol))
-            raw = raw.with_trial(simulate(loaded, target, raw, protocol))
-        self.made = Made(loaded, target, raw, refined)
-        self.stage.set_pair(loaded, target, refined.joints[0].float(), refined.T_object_wrist[0].float())
+        request = GraspRequest(num, direction=along, candidates=candidates, temperature=temperature)
+        found = self.predictor.run(problem, request)
+        raw, refined = found.proposed, found.grasps
+        if not problem.obj.is_cloud:
+            raw, refined = (evaluate(problem, grasps, protocol) for grasps in (raw, refined))
+        self.made = ShownGrasps(problem.source, problem.obj, raw, refined)
+        self.stage.set_pair(problem.source, problem.obj, refined.joints[0].float(), refined.T_object_wrist[0].float())
         self._filter()
         return self.made
 
@@ -146,11 +147,13 @@ class Studio(ServedPage):
             kinds = ".stl,.obj,.ply,.glb,.off,.npy,.pcd"
             object_file = gui.add_upload_button("Upload an object (STL, OBJ, PLY)", mime_type=kinds)
         with gui.add_folder("Generate"):
-            self.num = gui.add_slider("Grasps", 1, MOST, 1, 16)
+            self.num = gui.add_slider("Grasps", 1, LARGEST_CALL, 1, 16)
+            self.candidates = gui.add_slider(
+                "Candidates", 1, MOST_CANDIDATES, 1, 4, hint="Candidates proposed for each grasp; the best by score are kept.")
             self.direction = gui.add_dropdown(
                 "Palm direction", (ANY, *HALF_AXES), initial_value=ANY, hint="-z grasps from above.")
             self.temperature = gui.add_slider(
-                "Variety", 0.0, 1.0, 0.05, 1.0,
+                "Diversity", 0.0, 1.0, 0.05, 1.0,
                 hint="0: the likeliest grasp of each placement.")
             self.protocol = gui.add_dropdown("Trial", tuple(PROTOCOLS), initial_value="strict")
             self.button = gui.add_button("Generate", color="green")
@@ -159,9 +162,9 @@ class Studio(ServedPage):
         object_file.on_upload(lambda _: self._guarded(lambda: self._take(object_file.value, self.object)))
         self.button.on_click(lambda _: self._guarded(self._generate))
 
-    def _add_looks(self) -> None:
+    def _add_display(self) -> None:
         gui = self.server.gui
-        with gui.add_folder("Look"):
+        with gui.add_folder("Display"):
             self.success = gui.add_dropdown("Show", ("all", "succeeded", "failed"), initial_value="all")
             self.palm = gui.add_dropdown("Palm along", (ANY, *HALF_AXES), initial_value=ANY)
             self.slider = gui.add_slider("Grasp", 0, 1, 1, 0, disabled=True, hint="Best score first.")
@@ -169,9 +172,9 @@ class Studio(ServedPage):
             self.posture = gui.add_button_group("Posture", POSTURES)
             self.play = gui.add_button("Play the trial", disabled=True)
             self.text = gui.add_markdown("")
-        with gui.add_folder("Take away"):
+        with gui.add_folder("Download"):
             self.format = gui.add_dropdown("Format", EXPORTS, initial_value=GRASP_FILE)
-            self.download = gui.add_button("Download what is shown", disabled=True)
+            self.download = gui.add_button("Download the shown grasps", disabled=True)
         self.stage_of.value = "refined"
         self.posture.value = "grasp"
         for choice in (self.success, self.palm):
@@ -185,7 +188,7 @@ class Studio(ServedPage):
     def _guarded(self, work: Callable[[], None]) -> None:
         """Do one thing at a time, and show errors on the page."""
         if not self._busy.acquire(blocking=False):
-            self._say("Still at work; one moment.")
+            self._say("Busy; wait a moment.")
             return
         try:
             work()
@@ -212,13 +215,13 @@ class Studio(ServedPage):
         begin = time.perf_counter()
         made = self.generate(
             self.hand.value, self.object.value, int(self.num.value), self.direction.value, float(self.temperature.value),
-            self.protocol.value)
-        held = "" if not bool(made.refined.evaluated.any()) else (
+            self.protocol.value, int(self.candidates.value))
+        held = "" if made.obj.is_cloud else (
             f", **{int(made.refined.success.sum())}** held under *{self.protocol.value}*")
         self._say(f"{len(made.refined)} grasps{held}; {time.perf_counter() - begin:.1f} s")
 
     def _filter(self) -> None:
-        """Show only what was asked for."""
+        """Show the grasps that pass the filters."""
         if self.made is None:
             return
         keep = chosen(self.made.hand, self.made.refined, self.success.value, self.palm.value)
@@ -232,14 +235,14 @@ class Studio(ServedPage):
         if some:
             self._show()
         else:
-            self.text.content = "No grasp is like that."
+            self.text.content = "No grasp passes these filters."
 
     def _batch(self) -> GraspBatch:
         assert self.made is not None
         return self.made.raw if self.stage_of.value == "network" else self.made.refined
 
     def _show(self) -> None:
-        """Put the hand into the picked grasp."""
+        """Move the hand to the picked grasp."""
         if self.made is None or not self.shown:
             return
         index, grasps = self.shown[min(int(self.slider.value), len(self.shown) - 1)], self._batch()
@@ -250,7 +253,7 @@ class Studio(ServedPage):
             self.text.content = describe(grasps, index)
 
     def _play(self) -> None:
-        """Show the trial of the picked grasp as it went."""
+        """Play the trial of the picked grasp."""
         assert self.made is not None
         index, grasps = self.shown[int(self.slider.value)], self._batch()
         T = grasps.T_object_wrist[index].float()
@@ -264,14 +267,14 @@ class Studio(ServedPage):
         self._say("Played.")
 
     def _send(self, event: viser.GuiEvent) -> None:
-        """Hand the shown grasps to the browser."""
+        """Send the shown grasps to the browser."""
         name, content = self.exported(self.format.value)
         if event.client is not None:
             event.client.send_file_download(name, content, save_immediately=True)
         self._say(f"{name}: {len(self.shown)} grasps.")
 
     def exported(self, kind: str) -> tuple[str, bytes]:
-        """Name and content of a file with the grasps that are shown, in one of EXPORTS."""
+        """Name and content of a file with the shown grasps, in one of EXPORTS."""
         assert self.made is not None
         grasps = self._batch()[self.shown]
         stem = f"{Path(self.made.hand.name).name}_{Path(self.made.obj.name).name}"
@@ -284,7 +287,7 @@ class Studio(ServedPage):
 
 
 def chosen(hand: Hand, grasps: GraspBatch, success: str, palm: str) -> Bool[Tensor, " n"]:
-    """Grasps with an outcome (`all`, `succeeded`, `failed`) whose palm looks along a half-axis (or `any`)."""
+    """Grasps with an outcome (`all`, `succeeded`, `failed`) whose palm points along a half-axis (or `any`)."""
     keep = torch.ones(len(grasps), dtype=torch.bool)
     if success != "all":
         keep &= grasps.success if success == "succeeded" else grasps.evaluated & ~grasps.success

@@ -1,0 +1,62 @@
+"""A hand and an object, prepared once on one device for every stage of the pipeline."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dro_grasp.devices import require_device
+from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
+from dro_grasp.energy.object_energy import object_energy
+from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.shape import ObjectModel
+
+
+class GraspProblem:
+    """What the stages derive from a hand and an object, each thing made at first use and then shared.
+
+    Example:
+        >>> problem = GraspProblem(load_hand("allegro"), load_object("mug"))
+        >>> grasps = evaluate(problem, rank(problem, refine(problem, grasps)), "strict")
+    """
+
+    def __init__(self, hand: Hand, obj: ObjectModel, device: torch.device | str = "cpu") -> None:
+        """Put the hand on the device.
+
+        Args:
+            hand: Any hand, on the CPU.
+            obj: A mesh or a bare point cloud.
+            device: Where the network and the grasp energy run; grasps and trials stay on the CPU.
+
+        Raises:
+            OptionError: This machine has no such device.
+        """
+        require_device(str(device))
+        self.source, self.obj, self.device = hand, obj, torch.device(device)
+        self.hand = hand.to(self.device)
+        self.centre: Float[Tensor, "3"] = torch.as_tensor(obj.centre_of_mass, dtype=torch.float32)
+        self._energies: dict[EnergyConfig, GraspEnergy] = {}
+        self._thinned: dict[int, Hand] = {}
+
+    def energy(self, config: EnergyConfig) -> GraspEnergy:
+        """The grasp energy under these weights; contacts, link spheres and distance field are shared among all weights."""
+        if config not in self._energies:
+            known = next(iter(self._energies.values()), None)
+            self._energies[config] = (
+                object_energy(self.source, self.obj, config, device=self.device) if known is None else known.weighted(config))
+        return self._energies[config]
+
+    def thinned(self, count: int) -> Hand:
+        """The hand with `count` surface points, on the device.
+
+        Raises:
+            ValueError: The hand has fewer points.
+        """
+        if count not in self._thinned:
+            self._thinned[count] = self.source.with_points(count).to(self.device)
+        return self._thinned[count]
+
+    def cloud(self, count: int, generator: torch.Generator) -> Float[Tensor, "count 3"]:
+        """Random surface points of the object, on the device [m]."""
+        return self.obj.sample_points(count, generator).to(self.device)

@@ -1,0 +1,182 @@
+"""Candidates from the network: placements of the open hand, D(R,O), link poses, joints.
+
+Source: paper section III, figure 2. Differs from the paper: a placement of the open hand is chosen first, by the caller's
+direction or by the learned placement prior.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import roma
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dro_grasp import distance_matrix
+from dro_grasp.errors import OptionError
+from dro_grasp.geometry.se3 import compose, random_rotations, rotation_between
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
+from dro_grasp.models.network import DistanceNetwork
+from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.pipeline.stopwatch import Stopwatch
+
+CLOUD_TEMPERATURE = 0.5
+"""Default temperature for a bare cloud: where less of the object is known, likelier grasps are proposed (ours)."""
+HIGHEST_TEMPERATURE = 2.0
+"""Highest temperature that is accepted; 1 is what the weights were trained for (ours)."""
+Direction = tuple[float, float, float]
+"""A vector in the object's frame, of any length but zero."""
+
+
+@dataclass(frozen=True)
+class ProposalConfig:
+    """How candidates are sampled and decoded."""
+
+    rotations_per_grasp: int = 16
+    """Wrist rotations offered to the placement prior for each candidate, when no direction is given."""
+    rolls_per_grasp: int = 8
+    """Rolls about the direction that are offered instead, when one is given."""
+    direction_spread: float = math.radians(5.0)
+    """Standard deviation of the palm direction around the given one [rad]."""
+    temperature: float | None = None
+    """Spread of z: 0 proposes the likeliest grasp of each placement, 1 is as diverse as the training grasps. None takes 1,
+    and CLOUD_TEMPERATURE for a bare cloud."""
+    batch_size: int = 16
+    """Candidates that are decoded at once."""
+    network_batch_size: int = 4
+    """Candidates that pass the network at once; more do not fit a processor's cache."""
+
+    def __post_init__(self) -> None:
+        """Refuse a temperature out of range."""
+        check_temperature(self.temperature)
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """Candidates and what the network said about them."""
+
+    grasps: GraspBatch
+    """On the CPU; without pregrasp, squeeze and score."""
+    points: Float[Tensor, "n n_points 3"]
+    """Multilaterated hand points of each candidate, on the CPU [m]; the solved hand differs from them."""
+    seconds: dict[str, float]
+    """Time spent in `network` and `decode` [s]."""
+
+
+def propose(
+    problem: GraspProblem,
+    network: DistanceNetwork,
+    num: int,
+    generator: torch.Generator,
+    direction: Direction | None = None,
+    config: ProposalConfig | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Proposal:
+    """Candidates from the network.
+
+    Args:
+        problem: Hand and object.
+        network: In evaluation mode, on the problem's device.
+        num: How many.
+        generator: Source of randomness, on the CPU; its seed is recorded with the grasps.
+        direction: Palm direction in the object's frame; any by default.
+        config: Sampling and batches.
+        progress: Called with (candidates decoded, candidates wanted).
+    """
+    config = config or ProposalConfig()
+    watch = Stopwatch("network", "decode", device=problem.device)
+    hand = problem.thinned(network.config.n_hand)
+    cloud = problem.cloud(network.config.n_object, generator)
+    with watch("network"):
+        placement = _placements(hand, network, cloud, num, direction, config, generator)
+        joints = hand.random_open_joints(num, generator)
+        noise = network.sample_latent(num, generator, _temperature(problem, config)).to(problem.device)
+    found: list[tuple[Tensor, Tensor, Tensor]] = []
+    for start in range(0, num, config.batch_size):
+        part = slice(start, min(start + config.batch_size, num))
+        with watch("network"):
+            distances = _distances(hand, network, cloud, placement[part], joints[part], noise[part], config)
+        with watch("decode"):
+            links = distance_matrix.decode(hand, distances, cloud.expand(len(distances), -1, -1))
+            solution = distance_matrix.solve(hand, links, joints[part])
+        found.append((solution.T_world_wrist, solution.joints, links.points))
+        if progress is not None:
+            progress(part.stop, num)
+    T, q, points = (torch.cat(part).cpu() for part in zip(*found, strict=True))
+    grasps = GraspBatch.create(
+        problem.source, problem.obj, T, q, seed=generator.initial_seed(), provenance=f"network {network.name}")
+    return Proposal(grasps, points, watch.seconds)
+
+
+def check_temperature(temperature: float | None) -> None:
+    """Refuse a temperature out of range.
+
+    Raises:
+        OptionError: It is negative, not finite, or above HIGHEST_TEMPERATURE.
+    """
+    if temperature is not None and not 0 <= temperature <= HIGHEST_TEMPERATURE:
+        raise OptionError(f"temperature is {temperature}; give 0 for the likeliest grasps, 1 for the most diverse, or a number "
+                          f"between (at most {HIGHEST_TEMPERATURE:g})")
+
+
+def _temperature(problem: GraspProblem, config: ProposalConfig) -> float:
+    if config.temperature is not None:
+        return config.temperature
+    return CLOUD_TEMPERATURE if problem.obj.is_cloud else 1.0
+
+
+def _placements(
+    hand: Hand, network: DistanceNetwork, cloud: Float[Tensor, "m 3"], num: int, direction: Direction | None,
+    config: ProposalConfig, generator: torch.Generator,
+) -> Float[Tensor, "num 4 4"]:
+    """Wrist poses of the open hand near which the network is asked for grasps, in the object's frame."""
+    axes = network.config.axes(hand.palm_axes_wrist)
+    count = num * (config.rotations_per_grasp if direction is None else config.rolls_per_grasp)
+    rotations = wrist_rotations(hand, count, direction, config.direction_spread, generator)
+    opened = hand.points(hand.canonical_joints()) @ axes
+    rotation, position = network.sample_placements(opened, cloud, rotations @ axes, num, generator)
+    offset = (rotation @ (position - hand.grasp_centre_wrist @ axes)[..., None])[..., 0]
+    return compose(rotation @ axes.mT, cloud.mean(0) + offset)
+
+
+def wrist_rotations(
+    hand: Hand, count: int, direction: Direction | None, spread: float, generator: torch.Generator
+) -> Float[Tensor, "count 3 3"]:
+    """Random wrist rotations: uniform, or with the palm near a direction and any roll.
+
+    Args:
+        hand: The hand; its device is the result's.
+        count: How many.
+        direction: Palm direction in the object's frame.
+        spread: Standard deviation of the palm direction around it [rad].
+        generator: Source of randomness, on the CPU.
+    """
+    palm = hand.palm_direction_wrist
+    if direction is None:
+        return random_rotations(count, generator).to(palm)
+    wanted = torch.tensor(direction) / torch.tensor(direction).norm()
+    roll = torch.rand(count, generator=generator) * 2 * math.pi
+    tilt = torch.randn(count, 3, generator=generator) * spread
+    tilt = tilt - (tilt @ wanted)[:, None] * wanted
+    align = rotation_between(palm.cpu(), wanted)
+    return (roma.rotvec_to_rotmat(tilt) @ roma.rotvec_to_rotmat(roll[:, None] * wanted) @ align).to(palm)
+
+
+def _distances(
+    hand: Hand, network: DistanceNetwork, cloud: Float[Tensor, "m 3"], placement: Float[Tensor, "b 4 4"],
+    joints: Float[Tensor, "b n_dof"], noise: Float[Tensor, "b latent"], config: ProposalConfig,
+) -> Float[Tensor, "b n m"]:
+    """D(R,O) of a batch of placed open hands; distances are the same in every frame."""
+    placed = hand.points(joints, placement)
+    turned = placement[:, :3, :3] @ network.config.axes(hand.palm_axes_wrist)
+    centre, size = cloud.mean(0), config.network_batch_size
+    found = []
+    for points, axes, z in zip(placed.split(size), turned.split(size), noise.split(size), strict=True):
+        clouds = (points, cloud.expand(len(points), -1, -1))
+        framed = (network.to_frame(c, centre.expand(len(points), 3), axes) for c in clouds)
+        found.append(network.predict(*framed, z).float())
+    return torch.cat(found)

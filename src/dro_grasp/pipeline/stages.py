@@ -1,0 +1,78 @@
+"""The stages after the proposal: refine, rank, evaluate. Each takes a problem and grasps, and returns new grasps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.controller import completed
+from dro_grasp.optimization.refinement import RefineConfig, refine_grasps
+from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.ranking.score import ScoreConfig, score_grasps
+from dro_grasp.simulation.protocols import Protocol
+from dro_grasp.simulation.trial import simulate
+
+
+def complete(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
+    """Grasps that all state a pregrasp and a squeeze; the controller makes the missing ones."""
+    return completed(problem.source, grasps, problem.centre)
+
+
+def refine(problem: GraspProblem, grasps: GraspBatch, config: RefineConfig | None = None) -> GraspBatch:
+    """Grasps after a short descent of the grasp energy near each of them, with new pregrasps and squeezes.
+
+    Args:
+        problem: Hand and object.
+        grasps: Any grasps of the two; outcomes, scores and energies are dropped, since they belong to the grasps before.
+        config: Steps and bounds.
+    """
+    config = config or RefineConfig()
+    return complete(problem, refine_grasps(problem.energy(config.energy), grasps, config))
+
+
+def rank(problem: GraspProblem, grasps: GraspBatch, config: ScoreConfig | None = None) -> GraspBatch:
+    """Grasps with their score, the best first.
+
+    Args:
+        problem: Hand and object.
+        grasps: Any grasps of the two.
+        config: What the score is.
+    """
+    return scored(problem, grasps, config).sorted_by_score()
+
+
+def scored(problem: GraspProblem, grasps: GraspBatch, config: ScoreConfig | None = None) -> GraspBatch:
+    """Grasps with their score, in the same order."""
+    config = config or ScoreConfig()
+    return grasps.replace(score=score_grasps(problem.energy(config.energy), complete(problem, grasps), config))
+
+
+def evaluate(
+    problem: GraspProblem, grasps: GraspBatch, protocol: str | Protocol = "strict",
+    progress: Callable[[int, int], None] | None = None, workers: int | None = None,
+) -> GraspBatch:
+    """Grasps with the outcome of a trial each.
+
+    Args:
+        problem: Hand and object; a bare cloud cannot be simulated.
+        grasps: Grasps of the two.
+        protocol: Name of a protocol, or one of your own.
+        progress: Called with (trials done, trials in all).
+        workers: Threads; all cores by default.
+
+    Raises:
+        ObjectError: The object is a bare cloud.
+        OptionError: No protocol has the name.
+    """
+    return grasps.with_trial(simulate(problem.source, problem.obj, grasps, protocol, workers=workers, progress=progress))
+
+
+def above_table(problem: GraspProblem, grasps: GraspBatch, table: float) -> Bool[Tensor, " n"]:
+    """Which grasps keep the hand above the plane z = `table` [m], in the grasp and in the pregrasp."""
+    hand, T = problem.source, grasps.T_object_wrist
+    heights = [hand.points(q, T)[..., 2].amin(-1) for q in (grasps.joints, complete(problem, grasps).pregrasp_joints)]
+    return torch.minimum(*heights) > table
