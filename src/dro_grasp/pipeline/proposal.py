@@ -176,7 +176,8 @@ def _distances(
     centre, size = cloud.mean(0), config.network_batch_size
     found = []
     for points, axes, z in zip(placed.split(size), turned.split(size), noise.split(size), strict=True):
-        clouds = (points, cloud.expand(len(points), -1, -1))
-        framed = (network.to_frame(c, centre.expand(len(points), 3), axes) for c in clouds)
-        found.append(network.predict(*framed, z).float())
+        centres = centre.expand(len(points), 3)
+        opened = network.to_frame(points, centres, axes)
+        obj = network.to_frame(cloud.expand(len(points), -1, -1), centres, axes)
+        found.append(network.predict(opened, obj, z).float())
     return torch.cat(found)
