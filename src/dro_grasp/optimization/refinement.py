@@ -60,12 +60,12 @@ def refine_grasps(energy: GraspEnergy, grasps: GraspBatch, config: RefineConfig 
         config: Steps and bounds.
     """
     config = config or RefineConfig()
+    if not len(grasps):
+        return grasps
     device = energy.centre.device
     parts = zip(grasps.T_object_wrist.split(config.batch_size), grasps.joints.split(config.batch_size), strict=True)
     with torch.no_grad():
         ends = [_descend(energy, T.to(device), q.to(device), config) for T, q in parts]
-    if not len(grasps):
-        return grasps
     T, q = (torch.cat(part).cpu() for part in zip(*ends, strict=True))
     moved_grasps = grasps.without("pregrasp_joints", "squeeze_joints", "score", "energy").without_trial()
     return moved_grasps.replace(T_object_wrist=T, joints=q)
