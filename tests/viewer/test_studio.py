@@ -35,7 +35,7 @@ def studio(tmp_path_factory: pytest.TempPathFactory):
 
 
 @pytest.fixture(scope="module")
-def made(studio: Studio) -> module.Made:
+def made(studio: Studio) -> module.ShownGrasps:
     studio.num.value = 6
     studio._guarded(studio._generate)
     assert studio.made is not None, studio.status.content
@@ -47,7 +47,7 @@ def test_it_starts_empty_and_for_this_machine_alone(studio: Studio) -> None:
     assert "Generate" in studio.status.content or "held" in studio.status.content
 
 
-def test_generating_shows_the_best_and_says_what_held(studio: Studio, made: module.Made) -> None:
+def test_generating_shows_the_best_and_says_what_held(studio: Studio, made: module.ShownGrasps) -> None:
     assert len(made.refined) == len(made.raw) == 6
     scores = made.refined.score.tolist()
     assert scores == sorted(scores, reverse=True)
@@ -61,7 +61,7 @@ def test_generating_shows_the_best_and_says_what_held(studio: Studio, made: modu
     studio.stage_of.value = "refined"
 
 
-def test_filters_keep_what_they_say(studio: Studio, made: module.Made) -> None:
+def test_filters_keep_what_they_say(studio: Studio, made: module.ShownGrasps) -> None:
     half = made.refined.replace(success=torch.arange(6) % 2 == 0)
     assert chosen(made.hand, half, "succeeded", "any").tolist() == [True, False] * 3
     assert chosen(made.hand, half, "failed", "any").tolist() == [False, True] * 3
@@ -72,15 +72,19 @@ def test_filters_keep_what_they_say(studio: Studio, made: module.Made) -> None:
         counts += int(keep.sum())
         assert bool((palms[keep] @ torch.tensor(half_axis_direction(axis)) > 0.57).all())
     assert counts == 6
-    studio.palm.value = next(a for a in HALF_AXES if not chosen(made.hand, made.refined, "all", a).any())
+    studio.success.value, studio.palm.value = next(
+        (outcome, axis) for outcome in ("succeeded", "failed") for axis in HALF_AXES
+        if not chosen(made.hand, made.refined, outcome, axis).any())
     studio._filter()
-    assert studio.text.content == "No grasp is like that."
+    assert studio.text.content == "No grasp passes these filters."
     assert studio.play.disabled
-    studio.palm.value = "any"
+    studio.success.value, studio.palm.value = "all", "any"
     studio._filter()
 
 
-def test_a_trial_plays_and_ends_where_it_began(studio: Studio, made: module.Made, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trial_plays_and_ends_where_it_began(
+    studio: Studio, made: module.ShownGrasps, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(module.time, "sleep", lambda _: None)
     seen = []
     honest = studio.stage.show
@@ -98,7 +102,7 @@ def test_a_trial_plays_and_ends_where_it_began(studio: Studio, made: module.Made
 
 
 @pytest.mark.parametrize("kind", EXPORTS)
-def test_what_is_taken_away_is_what_is_shown(studio: Studio, made: module.Made, kind: str) -> None:
+def test_what_is_taken_away_is_what_is_shown(studio: Studio, made: module.ShownGrasps, kind: str) -> None:
     name, content = studio.exported(kind)
     assert name.startswith("gripper3_sphere")
     if name.endswith(".parquet"):
@@ -125,7 +129,7 @@ def test_uploads_are_picked_and_errors_are_shown(studio: Studio) -> None:
 def test_one_thing_at_a_time(studio: Studio) -> None:
     with studio._busy:
         studio._guarded(lambda: pytest.fail("done beside other work"))
-    assert "Still at work" in studio.status.content
+    assert "Busy" in studio.status.content
 
 
 def zipped(**files: bytes) -> bytes:
@@ -182,7 +186,7 @@ def test_a_browser_goes_all_the_way(tmp_path: Path) -> None:
         page.get_by_text("Played.").wait_for(timeout=180_000)
         time.sleep(1)
         with page.expect_download(timeout=60_000) as download:
-            page.get_by_role("button", name="Download what is shown").click()
+            page.get_by_role("button", name="Download the shown grasps").click()
         saved = tmp_path / "taken.parquet"
         download.value.save_as(saved)
         time.sleep(3)
