@@ -11,7 +11,7 @@ import pytest
 import roma
 import torch
 
-from dro_grasp.errors import GraspFileError, OutputError
+from dro_grasp.errors import GraspFileError, OptionError, OutputError
 from dro_grasp.files import check_output
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.simulation.outcome import Failure
@@ -100,10 +100,11 @@ def test_quaternion_on_disk_is_wxyz(tmp_path):
 MASK = torch.tensor([True, False, True, False, False])
 
 
-@pytest.mark.parametrize("index", [1, -1, slice(1, 4, 2), [3, 0], MASK])
+@pytest.mark.parametrize("index", [1, -1, slice(1, 4, 2), [3, 0], [], MASK, [True, False, False, False, True], torch.tensor(2)])
 def test_selection_agrees_between_tensors_and_tuples(index):
     grasps = evaluated(5).replace(extra={"row": torch.arange(5), "text": list("abcde")})
     chosen = grasps[index]
+    assert chosen.extra["row"].tolist() == torch.arange(5)[index if index != [] else slice(0)].reshape(-1).tolist()
     for place, row in enumerate(chosen.extra["row"].tolist()):
         assert torch.equal(chosen.joints[place], grasps.joints[row])
         assert chosen.extra["text"][place] == "abcde"[row]
@@ -111,7 +112,10 @@ def test_selection_agrees_between_tensors_and_tuples(index):
 
 
 def test_iterating_ends_and_out_of_range_is_an_index_error():
-    assert len(list(make(3))) == 3
+    grasps = make(3)
+    singles = list(grasps)
+    assert [len(single) for single in singles] == [1, 1, 1]
+    assert torch.equal(torch.cat([single.joints for single in singles]), grasps.joints)
     with pytest.raises(IndexError):
         make(3)[3]
 
@@ -136,6 +140,75 @@ def test_joining_other_hands_is_refused():
 def test_sorting_puts_the_best_first_and_the_unscored_last():
     grasps = make(4, score=torch.tensor([0.1, torch.nan, 0.5, 0.1])).replace(extra={"row": torch.arange(4)})
     assert grasps.sorted_by_score().extra["row"].tolist() == [2, 0, 3, 1]
+
+
+def test_sorting_by_energy_puts_the_lowest_first_and_the_unknown_last():
+    energies = make(4, energy=torch.tensor([0.1, torch.nan, 0.5, 0.1])).replace(extra={"row": torch.arange(4)})
+    assert energies.sorted_by_energy().extra["row"].tolist() == [0, 3, 2, 1]
+
+
+def test_every_column_exists_and_says_what_is_unknown():
+    grasps = make(3)
+    for name in ("score", "energy", "displacement", "rotation", "penetration"):
+        assert getattr(grasps, name).isnan().tolist() == [True] * 3, name
+    for name in ("pregrasp_joints", "squeeze_joints"):
+        assert getattr(grasps, name).isnan().sum() == grasps.joints.numel(), name
+    assert not (grasps.success | grasps.evaluated).any()
+    assert grasps.protocol == ("",) * 3
+
+
+def test_a_success_without_a_trial_and_columns_that_cannot_be_left_out_are_refused():
+    with pytest.raises(ValueError, match="name the protocol"):
+        make(2).replace(success=torch.tensor([True, False]))
+    with pytest.raises(ValueError, match="names of fields"):
+        make(2).replace(extra={"energy": torch.zeros(2)})
+    for name in ("joints", "success", "typo"):
+        with pytest.raises(ValueError, match=name):
+            make(2).without(name)
+    assert make(2, success=torch.tensor([True, False])).protocol == ("unknown",) * 2
+
+
+def test_leaving_out_a_trial_leaves_the_rest():
+    grasps = evaluated(4, score=torch.rand(4)).replace(extra={"reason": ["slipped by 30 mm"] * 4, "depth": torch.rand(4)})
+    again = grasps.without_trial()
+    assert not again.evaluated.any()
+    assert again.penetration.isnan().all()
+    assert list(again.extra) == ["depth"]
+    assert torch.equal(again.score, grasps.score)
+    assert list(grasps.without("score", "depth").extra) == ["reason"]
+
+
+def test_further_columns_that_some_lack_are_unknown_there_and_survive_the_file(tmp_path):
+    some = evaluated(2).replace(extra={"links": [["tip"], []], "depth": torch.ones(2), "count": torch.arange(2)})
+    GraspBatch.concatenate([make(1), some]).save(tmp_path / "g.parquet")
+    back = GraspBatch.load(tmp_path / "g.parquet")
+    assert back.extra["links"] == [None, ["tip"], []]
+    assert back.extra["count"] == [None, 0, 1]
+    assert back.extra["depth"].isnan().tolist() == [True, False, False]
+
+
+def test_a_file_saved_again_is_the_same_file(tmp_path):
+    grasps = GraspBatch.concatenate([make(2, energy=torch.rand(2)), evaluated(3, score=torch.rand(3), obj=CUBE)])
+    grasps.save(tmp_path / "first.parquet")
+    back = GraspBatch.load(tmp_path / "first.parquet")
+    back.save(tmp_path / "second.parquet")
+    first, second = (pq.read_table(tmp_path / f"{name}.parquet") for name in ("first", "second"))
+    turned = "wrist_quaternion_wxyz"
+    assert first.drop_columns([turned]).equals(second.drop_columns([turned]))
+    for one, two in zip(first[turned].to_pylist(), second[turned].to_pylist(), strict=True):
+        assert one == pytest.approx(two, abs=2e-7)
+
+
+def test_a_batch_says_what_it_holds():
+    grasps = GraspBatch.concatenate([evaluated(4, score=torch.tensor([1.0, 0.5, -2.0, 0.0])), make(1, obj=CUBE)])
+    assert repr(grasps) == ("GraspBatch(5 grasps, hand 'toy', objects 'ball', 'cube', 2 of 4 hold under dro/1, "
+                            "1 not evaluated, score -2.00 to 1.00)")
+    assert "not evaluated" in repr(make(2))
+    assert repr(make(0)) == "GraspBatch(0 grasps, hand 'toy')"
+    page = grasps.replace(hand="<b>")._repr_html_()
+    assert page.count("<tr>") == 6
+    assert "&lt;b&gt;" in page
+    assert "slipped by 30 mm" in page
 
 
 def test_empty_batch_round_trip(tmp_path):
@@ -217,6 +290,12 @@ def test_pandas_sees_the_columns():
     assert len(frame) == 3
     assert set(frame["object"]) == {"ball"}
     assert frame["success"].tolist() == [True, False, True]
+
+
+def test_without_pandas_the_error_says_what_to_install(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(OptionError, match="pip install pandas"):
+        make(1).to_pandas()
 
 
 def test_unequal_columns_are_refused():

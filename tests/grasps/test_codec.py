@@ -25,3 +25,17 @@ def test_columns_say_what_a_stranger_would_compute() -> None:
     assert again["object"] == grasps.object
     # They have no trial: neither a success nor a failure.
     assert columns["success"].null_count == len(grasps) - int(grasps.evaluated.sum())
+
+
+def test_files_without_energies_hold_them_as_scores_of_synthesised_grasps() -> None:
+    """What earlier versions wrote: the score of a synthesised grasp is minus its energy; predicted ones have log-odds."""
+    terms = torch.tensor([1.0, 2.0, torch.nan, 1.0])
+    grasps = made_up_grasps(toy_hand(), count=4, score=torch.tensor([-7.0, -9.0, 2.0, -3.0]), extra={"energy_distance": terms})
+    made = ("dro-grasp 0.1.0, synthesis 2", "dro-grasp 0.1.0, synthesis 2, 200 to 400 steps", "network multi", "network multi")
+    columns, header = encode(grasps.replace(provenance=made))
+    early = decode(pa.table(columns).drop_columns(["energy"]), header, "memory")
+    np.testing.assert_array_equal(early["energy"], [7.0, 9.0, np.nan, np.nan])
+    np.testing.assert_array_equal(early["score"], [np.nan, np.nan, 2.0, -3.0])
+    now = decode(pa.table(columns), header, "memory")
+    np.testing.assert_array_equal(now["score"], [-7.0, -9.0, 2.0, -3.0])
+    assert now["energy"].isnan().all()

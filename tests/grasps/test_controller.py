@@ -1,9 +1,12 @@
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
-from dro_grasp.grasps.controller import ControllerConfig, distance_slope, pregrasp_and_squeeze
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.controller import ControllerConfig, completed, distance_slope, pregrasp_and_squeeze
 from dro_grasp.hands.hand import Hand
 from tests.helpers.claw import claw, wrist_below
 from tests.helpers.toy_hand import toy_hand
@@ -93,3 +96,23 @@ def test_opening_and_closing_change_the_distance_as_named(tmp_path):
         return float(real.points(joints, T)[0][real.link_index > 0].norm(dim=-1).mean())
 
     assert fingers(outer) > fingers(q) > fingers(inner)
+
+
+def test_only_what_is_not_stated_is_completed(hand):
+    n, generator = 4, torch.Generator().manual_seed(0)
+    T = wrist_below(0.05).double().expand(n, 4, 4).clone()
+    joints = hand.random_joints(n, generator).double()
+    centre = torch.zeros(3, dtype=torch.float64)
+    before, after = pregrasp_and_squeeze(hand, T, joints, centre)
+    hints = torch.rand(n, hand.tree.n_dof, generator=generator, dtype=torch.float64)
+    nothing = torch.full_like(hints, torch.nan)
+    some = torch.tensor([True, True, False, False])[:, None]
+    other = torch.tensor([True, False, True, False])[:, None]
+    tree = SimpleNamespace(link_names=hand.tree.link_names, joint_names=hand.tree.joint_names)
+    owner, thing = SimpleNamespace(name="toy", sha256="a", tree=tree), SimpleNamespace(name="b", sha256="b", split=None)
+    grasps = GraspBatch.create(owner, thing, T, joints, pregrasp_joints=torch.where(some, hints, nothing),
+                               squeeze_joints=torch.where(other, hints, nothing))
+    whole = completed(hand, grasps, centre)
+    torch.testing.assert_close(whole.pregrasp_joints, torch.where(some, hints, before))
+    torch.testing.assert_close(whole.squeeze_joints, torch.where(other, hints, after))
+    assert completed(hand, whole, centre) is whole

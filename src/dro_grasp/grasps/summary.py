@@ -20,7 +20,7 @@ NAMES = 3
 
 def sentence(grasps: GraspBatch) -> str:
     """Number of grasps, hand, objects, outcome and range of score or energy."""
-    parts = [f"{len(grasps)} grasps", f"hand '{grasps.hand}'", _objects(grasps)]
+    parts = [f"{len(grasps)} grasp{'' if len(grasps) == 1 else 's'}", f"hand '{grasps.hand}'", _objects(grasps)]
     for protocol, count in Counter(p for p in grasps.protocol if p != NOT_EVALUATED).items():
         held = sum(s for s, p in zip(grasps.success.tolist(), grasps.protocol, strict=True) if p == protocol)
         parts.append(f"{held} of {count} hold under {protocol}")
