@@ -82,3 +82,4 @@ def test_tuned_weights_say_what_they_come_from(command: list[str], tmp_path: Pat
     assert about["history"] == [{"stage": "before"}, {"stage": "first"}]
     assert (about["about"]["initial"], about["about"]["steps"]) == (str(initial), 1)
     assert about["about"]["data"]["grasps"] == 48
+    assert about["about"]["settings"]["schedule"]["learning_rate"] == 1e-9

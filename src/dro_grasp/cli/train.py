@@ -13,14 +13,57 @@ from dro_grasp.cli.output import optional, print_json, print_table
 if TYPE_CHECKING:
     from dro_grasp.models.network import DistanceNetwork
     from dro_grasp.models.presets import NetworkConfig
+    from dro_grasp.training.config import ScheduleConfig
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
-Preset = Annotated[
-    Literal["slim", "paper", "multi"] | None,
-    tyro.conf.arg(aliases=["--size"], metavar="{slim,paper,multi}", help_behavior_hint="(default: slim)"),
-]
-Latent = Annotated[int | None, optional("N", "the preset's")]
-LatentForm = Annotated[Literal["kernel", "motion"] | None, optional("{kernel,motion}", "the preset's")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """Options of both stages of training."""
+
+    bundle: Path
+    """Bundle from `dro-grasp dataset bundle`."""
+    run_folder: Path
+    """Folder for log and checkpoints; a run in it is resumed. Its parent must exist."""
+    output: Path
+    """Weights file to write."""
+    preset: Annotated[
+        Literal["slim", "paper", "multi"] | None,
+        tyro.conf.arg(aliases=["--size"], metavar="{slim,paper,multi}", help_behavior_hint="(default: slim)"),
+    ] = None
+    """Network: slim (narrow, the paper's latent), paper, or multi (that of the shipped weights)."""
+    latent: Annotated[int | None, optional("N", "the preset's")] = None
+    """Numbers in z."""
+    latent_form: Annotated[Literal["kernel", "motion"] | None, optional("{kernel,motion}", "the preset's")] = None
+    """kernel: z enters the kernel alone, the paper's form; motion: z also moves the open hand, as pretraining taught it."""
+    minutes: Annotated[float | None, optional("MINUTES", "no limit")] = None
+    """Time limit (of each part of pretraining); the learning rate follows steps or time, whichever is further on."""
+    shards: int = 1
+    """Independent parts of a step's batch, of 16 samples each; the processes of torchrun share them."""
+    tensorboard: Flag = False
+    """Also write the log for TensorBoard, which must be installed."""
+    device: Annotated[str, optional("DEVICE", "cuda where there is one, else cpu")] = "auto"
+    """Where to compute: cpu, cuda, or cuda:1."""
+    seed: int = 0
+    """Seed of everything."""
+    json: Flag = False
+    """Print one JSON object at the end."""
+
+    def schedule(self, **more: Any) -> ScheduleConfig:
+        """The schedule, which can be carried out here.
+
+        Raises:
+            OptionError: It cannot.
+        """
+        from dro_grasp.devices import choose_device
+        from dro_grasp.training.config import ScheduleConfig
+        from dro_grasp.training.runs import check_schedule
+
+        schedule = ScheduleConfig(minutes=self.minutes, shards=self.shards, tensorboard=self.tensorboard,
+                                  device=choose_device(self.device), seed=self.seed, **more)
+        check_schedule(schedule)
+        return schedule
 
 
 def network_config(preset: str | None, initial: DistanceNetwork | None = None, **options: Any) -> NetworkConfig:
@@ -51,41 +94,17 @@ def network_config(preset: str | None, initial: DistanceNetwork | None = None, *
     return network
 
 
-@dataclass(frozen=True)
-class Pretrain:
+@dataclass(frozen=True, kw_only=True)
+class Pretrain(Stage):
     """Pretrain the hand encoder so that a point's features do not depend on the joints.
 
     Example: dro-grasp pretrain --bundle bundle.safetensors --run-folder runs/pre --output pretrained.safetensors
     """
 
-    bundle: Path
-    """Bundle from `dro-grasp dataset bundle`."""
-    run_folder: Path
-    """Folder for log and checkpoints; a run in it is resumed. Its parent must exist."""
-    output: Path
-    """Weights file to write."""
-    preset: Preset = None
-    """Network: slim (narrow, the paper's latent), paper, or multi (that of the shipped weights)."""
-    latent: Latent = None
-    """Numbers in z."""
-    latent_form: LatentForm = None
-    """With `motion`, z also learns how hands move, after the encoder and in its own folder in the run folder."""
     steps: int = 3000
     """Optimiser steps."""
     motion_steps: int = 5000
-    """Optimiser steps of the motion."""
-    minutes: Annotated[float | None, optional("MINUTES", "no limit")] = None
-    """Time limit of each stage; the learning rate follows steps or time, whichever is further on."""
-    shards: int = 1
-    """Independent parts of a step's batch, of 16 samples each; the processes of torchrun share them."""
-    tensorboard: Flag = False
-    """Also write the log for TensorBoard, which must be installed."""
-    device: Annotated[str, optional("DEVICE", "cuda where there is one, else cpu")] = "auto"
-    """Where to compute: cpu, cuda, or cuda:1."""
-    seed: int = 0
-    """Seed of everything."""
-    json: Flag = False
-    """Print one JSON object at the end."""
+    """Optimiser steps of the motion, which is learned after the encoder, in its own folder in the run folder."""
 
     def run(self) -> int:
         """Pretrain, save, and report the matching rank."""
@@ -94,31 +113,30 @@ class Pretrain:
         import torch
 
         from dro_grasp.datasets.bundle.training_file import load_bundle
-        from dro_grasp.devices import choose_device
         from dro_grasp.evaluation.correspondence import matching_rank
         from dro_grasp.files import check_output
         from dro_grasp.models.checkpoints import save_weights
-        from dro_grasp.training.config import AugmentationConfig, MotionConfig, PretrainConfig, ScheduleConfig
+        from dro_grasp.training.config import AugmentationConfig, MotionConfig, PretrainConfig
         from dro_grasp.training.pretraining import pretrain, pretrain_motion
         from dro_grasp.training.processes import is_first
-        from dro_grasp.training.runs import check_schedule
         from dro_grasp.training.samples import SampleSource
 
         check_output(self.output)
         network = network_config(self.preset, latent=self.latent, latent_form=self.latent_form)
-        schedule = ScheduleConfig(
-            steps=self.steps, minutes=self.minutes, shards=self.shards, tensorboard=self.tensorboard,
-            device=choose_device(self.device), seed=self.seed,
-        )
-        check_schedule(schedule)
+        schedule = self.schedule(steps=self.steps)
         bundle = load_bundle(self.bundle)
-        model = pretrain(bundle, network, PretrainConfig(schedule=schedule), self.run_folder)
+        config = PretrainConfig(schedule)
+        motion = MotionConfig(dataclasses.replace(schedule, steps=self.motion_steps))
+        model = pretrain(bundle, network, config, self.run_folder)
         if network.latent_form == "motion":
-            motion = MotionConfig(dataclasses.replace(schedule, steps=self.motion_steps))
             model = pretrain_motion(model, bundle, motion, self.run_folder / "motion")
         if not is_first():
             return 0
-        about = how_long(self.run_folder) | {"stage": "pretraining", "data": bundle.summary()}
+        settings = {"encoder": config} | ({"motion": motion} if network.latent_form == "motion" else {})
+        about = how_long(self.run_folder) | {
+            "stage": "pretraining", "data": bundle.summary(),
+            "settings": {name: dataclasses.asdict(part) for name, part in settings.items()},
+        }
         save_weights(model, self.output, about)
         source = SampleSource(bundle, network, AugmentationConfig())
         ranks = matching_rank(model.hand_encoder, source, torch.Generator().manual_seed(1))
@@ -131,43 +149,25 @@ class Pretrain:
         return 0
 
 
-@dataclass(frozen=True)
-class Train:
+@dataclass(frozen=True, kw_only=True)
+class Train(Stage):
     """Train the D(R,O) network on a bundle; a stopped run resumes from its last checkpoint.
 
     Example: dro-grasp train --bundle bundle.safetensors --run-folder runs/main --pretrained pretrained.safetensors
     --output my_weights.safetensors
     """
 
-    bundle: Path
-    """Bundle from `dro-grasp dataset bundle`."""
-    run_folder: Path
-    """Folder for log and checkpoints; a run in it is resumed. Its parent must exist."""
-    output: Path
-    """Weights file to write."""
     pretrained: Annotated[str | None, optional("PATH", "none")] = None
     """Weights from `dro-grasp pretrain`; without them, and without --initial, the hand encoder is trained along."""
     initial: Annotated[str | None, optional("NAME|PATH", "none")] = None
     """Weights to fine-tune on the bundle. They decide the network; their hand encoder stays as it is."""
-    preset: Preset = None
-    """Network: slim (narrow, the paper's latent), paper, or multi (that of the shipped weights)."""
     steps: int = 10_000
     """Optimiser steps."""
-    minutes: Annotated[float | None, optional("MINUTES", "no limit")] = None
-    """Time limit; the learning rate follows steps or time, whichever is further on."""
-    shards: int = 1
-    """Independent parts of a step's batch, of 16 samples each; the processes of torchrun share them."""
-    tensorboard: Flag = False
-    """Also write the log for TensorBoard, which must be installed."""
     learning_rate: float = 1e-3
     """Peak of the learning rate."""
     prior: Annotated[
         Literal["standard", "learned", "flow"] | None, optional("{standard,learned,flow}", "the preset's")] = None
     """Distribution of z: standard (N(0, I), the paper's form), or a Gaussian or a flow learned from hand and object."""
-    latent: Latent = None
-    """Numbers in z."""
-    latent_form: LatentForm = None
-    """kernel: z enters the kernel alone, the paper's form; motion: z also moves the placed open hand."""
     divergence: float = 0.01
     """KL weight; a lower value lets z carry more information."""
     divergence_warmup: float = 0.0
@@ -182,31 +182,23 @@ class Train:
     """Multiply in bfloat16 in encoders and transformers; for GPUs."""
     partial: float = 0.0
     """Share of samples with half of the object cut away."""
-    device: Annotated[str, optional("DEVICE", "cuda where there is one, else cpu")] = "auto"
-    """Where to compute: cpu, cuda, or cuda:1."""
     validation: Annotated[Path | None, optional("PATH", "no errors")] = None
     """Bundle of grasps that are not trained on; the weights' distance errors on them are reported in the end."""
     validation_samples: int = 400
     """Validation grasps of each hand."""
-    seed: int = 0
-    """Seed of everything."""
-    json: Flag = False
-    """Print one JSON object at the end."""
 
     def run(self) -> int:
         """Train and save."""
         import dataclasses
 
         from dro_grasp.datasets.bundle.training_file import load_bundle
-        from dro_grasp.devices import choose_device
         from dro_grasp.evaluation.distance_error import distance_errors
         from dro_grasp.files import check_output
         from dro_grasp.models.checkpoints import load_weights, locate_weights, save_weights
         from dro_grasp.models.small_networks import history_of
-        from dro_grasp.training.config import AugmentationConfig, LossConfig, ScheduleConfig, TrainConfig
+        from dro_grasp.training.config import AugmentationConfig, LossConfig, TrainConfig
         from dro_grasp.training.loop import train
         from dro_grasp.training.processes import is_first
-        from dro_grasp.training.runs import check_schedule
 
         check_output(self.output)
         given = [name for name in (self.initial, self.pretrained) if name is not None]
@@ -214,16 +206,12 @@ class Train:
         network = network_config(
             self.preset, initial, latent=self.latent, prior=self.prior, latent_form=self.latent_form)
         config = TrainConfig(
-            schedule=ScheduleConfig(
-                steps=self.steps, minutes=self.minutes, shards=self.shards, tensorboard=self.tensorboard,
-                learning_rate=self.learning_rate, mixed=self.mixed, device=choose_device(self.device), seed=self.seed,
-            ),
+            schedule=self.schedule(steps=self.steps, learning_rate=self.learning_rate, mixed=self.mixed),
             samples_per_hand=self.samples_per_hand, columns=self.columns,
             losses=LossConfig(
                 divergence=self.divergence, divergence_warmup=self.divergence_warmup, free_bits=self.free_bits),
             augmentation=AugmentationConfig(partial=self.partial),
         )
-        check_schedule(config.schedule)
         bundle = load_bundle(self.bundle)
         validation = None if self.validation is None else load_bundle(self.validation)
         model = train(bundle, network, config, self.run_folder, pretrained, name=self.output.stem, initial=initial)
@@ -231,6 +219,7 @@ class Train:
             return 0
         about = how_long(self.run_folder) | {
             "stage": "training", "pretrained": self.pretrained is not None, "initial": self.initial, "data": bundle.summary(),
+            "settings": dataclasses.asdict(config),
         }
         save_weights(model, self.output, about, [entry for name in given for entry in history_of(locate_weights(name))])
         errors = [] if validation is None else distance_errors(load_weights(self.output), validation, self.validation_samples)

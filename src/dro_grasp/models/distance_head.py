@@ -53,9 +53,9 @@ class DistanceHead(nn.Module):
         both = torch.cat([left, right])
         hand_sides = _sides(hand @ both.T)
         object_sides = _sides(obj @ both.T + self.first.bias.repeat(2)).flip(0)
-        logits = _pair_layers(
-            hand_sides, object_sides, self.second.weight, self.second.bias, self.last.weight[0]
-        ) + self.last.bias
+        pairs: Tensor = _PairLayers.apply(  # type: ignore[assignment]
+            hand_sides, object_sides, self.second.weight, self.second.bias, self.last.weight[0])
+        logits = pairs + self.last.bias
         if base is not None:
             offset = inverse_softplus(torch.tensor(self.initial_distance)).to(base)
             logits = logits - offset + inverse_softplus(base)
@@ -65,20 +65,6 @@ class DistanceHead(nn.Module):
 def _sides(x: Float[Tensor, "b n h2"]) -> Float[Tensor, "2 b n h"]:
     """First-layer values of points as left and as right argument; in single precision from here on."""
     return torch.stack(x.float().chunk(2, -1))
-
-
-def _pair_layers(
-    hand: Float[Tensor, "2 b n h"],
-    obj: Float[Tensor, "2 b m h"],
-    weight: Float[Tensor, "k h"],
-    bias: Float[Tensor, " k"],
-    last: Float[Tensor, " k"],
-) -> Float[Tensor, "b n m"]:
-    """Mean over both orders of the hidden layers' output, for every pair."""
-    if torch.is_grad_enabled():
-        result: Tensor = _PairLayers.apply(hand, obj, weight, bias, last)  # type: ignore[assignment]
-        return result
-    return _forward(hand, obj, weight, bias, last)
 
 
 def _chunks(hand: Float[Tensor, "2 b n h"], obj: Float[Tensor, "2 b m h"]) -> Iterator[tuple[slice, slice]]:
@@ -100,23 +86,11 @@ def _hidden(
     return x, torch.addmm(bias, x, weight.T).relu_()
 
 
-def _forward(
-    hand: Float[Tensor, "2 b n h"],
-    obj: Float[Tensor, "2 b m h"],
-    weight: Float[Tensor, "k h"],
-    bias: Float[Tensor, " k"],
-    last: Float[Tensor, " k"],
-) -> Float[Tensor, "b n m"]:
-    out = hand.new_empty(*hand.shape[1:3], obj.shape[2])
-    for samples, rows in _chunks(hand, obj):
-        _, y = _hidden(hand[:, samples, rows], obj[:, samples], weight, bias)
-        target = out[samples, rows]
-        torch.mean((y @ last).view(2, *target.shape), 0, out=target)
-    return out
-
-
 class _PairLayers(torch.autograd.Function):
-    """`_forward` with a backward pass that computes each chunk again and keeps nothing of it."""
+    """Mean over both orders of the hidden layers' output, for every pair of a hand point and an object point.
+
+    Chunks of pairs are computed one after the other, and once more in the backward pass, which keeps none of them.
+    """
 
     @staticmethod
     def forward(
@@ -128,7 +102,12 @@ class _PairLayers(torch.autograd.Function):
         last: Float[Tensor, " k"],
     ) -> Float[Tensor, "b n m"]:
         ctx.save_for_backward(hand, obj, weight, bias, last)
-        return _forward(hand, obj, weight, bias, last)
+        out = hand.new_empty(*hand.shape[1:3], obj.shape[2])
+        for samples, rows in _chunks(hand, obj):
+            _, y = _hidden(hand[:, samples, rows], obj[:, samples], weight, bias)
+            target = out[samples, rows]
+            torch.mean((y @ last).view(2, *target.shape), 0, out=target)
+        return out
 
     @staticmethod
     @once_differentiable
