@@ -214,3 +214,12 @@ def test_gradients_are_left_alone(predictor: GraspPredictor, grasps: GraspBatch)
     assert torch.is_grad_enabled()
     assert not grasps.joints.requires_grad
     assert not grasps.joints.is_inference()
+
+
+def test_prediction_runs_wholly_on_the_device_it_is_told(
+    weights: str, ball: ObjectModel, grasps: GraspBatch, device: str
+) -> None:
+    there = GraspPredictor(weights, device=device).predict(HAND, ball, num=7, seed=3, candidates=1)
+    for name in ("T_object_wrist", "joints", "pregrasp_joints", "squeeze_joints", "score"):
+        assert type(getattr(there, name)) is Tensor, "grasps come back to the CPU"
+        torch.testing.assert_close(getattr(there, name), getattr(grasps, name), atol=1e-4, rtol=1e-4)

@@ -139,8 +139,8 @@ class GraspPredictor:
         Raises:
             OptionError: An argument is out of range, or too few grasps stay above the table.
         """
-        request = GraspRequest(num, seed, direction, table, candidates, refine)
-        return self.run(GraspProblem(hand, obj, self.device), request).grasps
+        problem = GraspProblem(hand, obj, self.device)
+        return self.run(problem, GraspRequest(num, seed, direction, table, candidates, refine)).grasps
 
     # no_grad, not inference_mode: roma caches a tensor at first use, which training could then not use.
     @torch.no_grad()

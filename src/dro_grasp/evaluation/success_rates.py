@@ -186,7 +186,7 @@ def _sources(
     problem: GraspProblem, predictor: GraspPredictor, config: BenchmarkConfig, bundle: Bundle | None, seed: int
 ) -> Iterator[_Source]:
     """Grasps of the network and of the controls."""
-    hand, obj, num = problem.source, problem.obj, config.num
+    hand, obj, num = problem.hand, problem.obj, config.num
     visible = problem if config.view == "whole" else GraspProblem(hand, seen(obj, config.view, seed), predictor.device)
     made = predictor.run(visible, GraspRequest(num, seed, candidates=1, refine=False))
     yield _Source(NETWORK, visible, made.grasps, {k: made.seconds[k] / num for k in ("network", "decode")})
@@ -214,7 +214,7 @@ def _stages(source: _Source, obj: ObjectModel, config: BenchmarkConfig) -> Itera
             grasps = refine(problem, grasps)
             seconds = seconds | {"refine": (time.perf_counter() - begin) / len(grasps)}
         grasps = scored(problem, grasps)
-        results = tuple(simulate(problem.source, obj, grasps, rules, workers=config.workers) for rules in config.protocols)
+        results = tuple(simulate(problem.hand, obj, grasps, rules, workers=config.workers) for rules in config.protocols)
         evaluated = EvaluatedGrasps(grasps, results, seconds)
         if whole in wanted:
             yield whole, evaluated

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+from functools import cached_property
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -13,6 +16,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 
 
+@dataclass(frozen=True, eq=False)
 class GraspProblem:
     """What the stages derive from a hand and an object, each thing made at first use and then shared.
 
@@ -21,30 +25,34 @@ class GraspProblem:
         >>> grasps = evaluate(problem, rank(problem, refine(problem, grasps)), "strict")
     """
 
-    def __init__(self, hand: Hand, obj: ObjectModel, device: torch.device | str = "cpu") -> None:
-        """Put the hand on the device.
+    hand: Hand
+    """On the CPU, where grasps and trials stay."""
+    obj: ObjectModel
+    """A mesh or a bare point cloud."""
+    device: torch.device | str = "cpu"
+    """Where the network and the grasp energy run."""
+    _energies: dict[EnergyConfig, GraspEnergy] = field(default_factory=dict, init=False, repr=False)
+    _thinned: dict[int, Hand] = field(default_factory=dict, init=False, repr=False)
 
-        Args:
-            hand: Any hand, on the CPU.
-            obj: A mesh or a bare point cloud.
-            device: Where the network and the grasp energy run; grasps and trials stay on the CPU.
+    def __post_init__(self) -> None:
+        """Refuse an absent device.
 
         Raises:
             OptionError: This machine has no such device.
         """
-        require_device(str(device))
-        self.source, self.obj, self.device = hand, obj, torch.device(device)
-        self.hand = hand.to(self.device)
-        self.centre: Float[Tensor, "3"] = torch.as_tensor(obj.centre_of_mass, dtype=torch.float32)
-        self._energies: dict[EnergyConfig, GraspEnergy] = {}
-        self._thinned: dict[int, Hand] = {}
+        require_device(str(self.device))
+
+    @cached_property
+    def centre(self) -> Float[Tensor, "3"]:
+        """The object's centre of mass, on the CPU [m]."""
+        return torch.as_tensor(self.obj.centre_of_mass, dtype=torch.float32)
 
     def energy(self, config: EnergyConfig) -> GraspEnergy:
         """The grasp energy under these weights; contacts, link spheres and distance field are shared among all weights."""
         if config not in self._energies:
             known = next(iter(self._energies.values()), None)
             self._energies[config] = (
-                object_energy(self.source, self.obj, config, device=self.device) if known is None else known.weighted(config))
+                object_energy(self.hand, self.obj, config, device=self.device) if known is None else known.weighted(config))
         return self._energies[config]
 
     def thinned(self, count: int) -> Hand:
@@ -54,7 +62,7 @@ class GraspProblem:
             ValueError: The hand has fewer points.
         """
         if count not in self._thinned:
-            self._thinned[count] = self.source.with_points(count).to(self.device)
+            self._thinned[count] = self.hand.with_points(count).to(self.device)
         return self._thinned[count]
 
     def cloud(self, count: int, generator: torch.Generator) -> Float[Tensor, "count 3"]:

@@ -108,7 +108,7 @@ def propose(
             progress(part.stop, num)
     T, q, points = (torch.cat(part).cpu() for part in zip(*found, strict=True))
     grasps = GraspBatch.create(
-        problem.source, problem.obj, T, q, seed=generator.initial_seed(), provenance=f"network {network.name}")
+        problem.hand, problem.obj, T, q, seed=generator.initial_seed(), provenance=f"network {network.name}")
     return Proposal(grasps, points, watch.seconds)
 
 

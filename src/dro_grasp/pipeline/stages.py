@@ -19,7 +19,7 @@ from dro_grasp.simulation.trial import simulate
 
 def complete(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
     """Grasps that all state a pregrasp and a squeeze; the controller makes the missing ones."""
-    return completed(problem.source, grasps, problem.centre)
+    return completed(problem.hand, grasps, problem.centre)
 
 
 def refine(problem: GraspProblem, grasps: GraspBatch, config: RefineConfig | None = None) -> GraspBatch:
@@ -68,11 +68,11 @@ def evaluate(
         ObjectError: The object is a bare cloud.
         OptionError: No protocol has the name.
     """
-    return grasps.with_trial(simulate(problem.source, problem.obj, grasps, protocol, workers=workers, progress=progress))
+    return grasps.with_trial(simulate(problem.hand, problem.obj, grasps, protocol, workers=workers, progress=progress))
 
 
 def above_table(problem: GraspProblem, grasps: GraspBatch, table: float) -> Bool[Tensor, " n"]:
     """Which grasps keep the hand above the plane z = `table` [m], in the grasp and in the pregrasp."""
-    hand, T = problem.source, grasps.T_object_wrist
+    hand, T = problem.hand, grasps.T_object_wrist
     heights = [hand.points(q, T)[..., 2].amin(-1) for q in (grasps.joints, complete(problem, grasps).pregrasp_joints)]
     return torch.minimum(*heights) > table

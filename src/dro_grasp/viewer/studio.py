@@ -133,8 +133,8 @@ class Studio(ServedPage):
         raw, refined = found.proposed, found.grasps
         if not problem.obj.is_cloud:
             raw, refined = (evaluate(problem, grasps, protocol) for grasps in (raw, refined))
-        self.made = ShownGrasps(problem.source, problem.obj, raw, refined)
-        self.stage.set_pair(problem.source, problem.obj, refined.joints[0].float(), refined.T_object_wrist[0].float())
+        self.made = ShownGrasps(problem.hand, problem.obj, raw, refined)
+        self.stage.set_pair(problem.hand, problem.obj, refined.joints[0].float(), refined.T_object_wrist[0].float())
         self._filter()
         return self.made
 
