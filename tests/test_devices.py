@@ -13,12 +13,15 @@ from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.devices import choose_device, on_device, require_device
 from dro_grasp.energy.grasp_energy import link_spheres
 from dro_grasp.errors import OptionError
+from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
+from dro_grasp.predictor import GraspPredictor
 from dro_grasp.training import loop, pretraining
 from dro_grasp.training.batch_statistics import recalibrate
 from tests.helpers.claw import ball
 from tests.helpers.toy_hand import toy_hand
 from tests.helpers.training_stages import SCHEDULE, STAGES, curve, run_stage
+from tests.helpers.weights import untrained_weights
 
 SHORT = dataclasses.replace(SCHEDULE, steps=2, log_every=1)
 NEARLY = {"atol": 1e-5, "rtol": 1e-4}
@@ -62,6 +65,17 @@ def test_synthesis_on_a_device_gives_the_grasps_of_the_cpu(device: str) -> None:
     assert there.joints.device.type == "cpu"
     torch.testing.assert_close(there.joints, here.joints, **NEARLY)
     torch.testing.assert_close(there.T_object_wrist, here.T_object_wrist, **NEARLY)
+
+
+@pytest.mark.parametrize("refine", [False, True])
+def test_prediction_on_a_device_gives_the_grasps_of_the_cpu(device: str, refine: bool, tmp_path: Path) -> None:
+    weights, obj = str(untrained_weights(tmp_path)), load_object("sphere")
+    here, there = (
+        GraspPredictor(weights, device=place).predict(toy_hand(), obj, 2, seed=3, candidates=2, refine=refine)
+        for place in ("cpu", device))
+    assert there.joints.device.type == "cpu"
+    for name in ("joints", "T_object_wrist", "pregrasp_joints", "squeeze_joints", "score"):
+        torch.testing.assert_close(getattr(there, name), getattr(here, name), atol=1e-3, rtol=1e-3)
 
 
 @pytest.mark.parametrize("stage", STAGES)

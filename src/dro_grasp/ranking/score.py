@@ -43,13 +43,13 @@ def score_grasps(energy: GraspEnergy, grasps: GraspBatch, config: ScoreConfig | 
         grasps: Any grasps of the two.
         config: What the score is.
     """
-    config = config or ScoreConfig()
+    config, device = config or ScoreConfig(), energy.centre.device
     scores = [torch.zeros(0)]
     for start in range(0, len(grasps), config.batch_size):
         part = grasps[slice(start, start + config.batch_size)]
-        terms = evaluate_nearest(energy, part.T_object_wrist, part.joints).terms
+        terms = evaluate_nearest(energy, part.T_object_wrist.to(device), part.joints.to(device)).terms
         if config.by == "energy":
-            scores.append(-terms.sum(-1))
-        else:
-            scores.append(shipped_score_network()(*grasp_features(energy, part, terms)).mean(-1))
+            scores.append(-terms.sum(-1).cpu())
+        else:  # the network is small and stays on the CPU
+            scores.append(shipped_score_network()(*(x.cpu() for x in grasp_features(energy, part, terms))).mean(-1))
     return torch.cat(scores)
