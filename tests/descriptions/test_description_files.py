@@ -1,4 +1,4 @@
-"""What lies beneath hand loading: couplings in chains, XML that is refused, includes, and where meshes are looked for."""
+"""The parts of hand loading: chains of couplings, refused XML, includes, and the search for meshes."""
 
 from __future__ import annotations
 

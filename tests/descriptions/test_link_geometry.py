@@ -1,4 +1,4 @@
-"""Shapes of links against what each kind of shape is by its formula, and against SciPy's rotations."""
+"""Shapes of links against the formula of each kind of shape, and against SciPy's rotations."""
 
 from __future__ import annotations
 
@@ -60,10 +60,10 @@ def test_meshes_that_collide_are_hulls_and_others_are_as_drawn(tmp_path) -> None
     bowl.export(tmp_path / "ring.stl")
     asset = f"<mesh name='ring' file='{tmp_path / 'ring.stl'}'/>"
     model = model_of("<geom type='mesh' mesh='ring'/><geom type='mesh' mesh='ring' contype='0' conaffinity='0'/>", asset)
-    touching, drawn = read_geometry(model, {1: 0})
-    assert (touching.collides, touching.visual) == (True, False), "what is drawn is another shape"
+    colliding, drawn = read_geometry(model, {1: 0})
+    assert (colliding.collides, colliding.visual) == (True, False), "another shape is drawn"
     assert (drawn.collides, drawn.visual) == (False, True)
-    hull, ring = (trimesh.Trimesh(s.vertices, s.faces) for s in (touching, drawn))
+    hull, ring = (trimesh.Trimesh(s.vertices, s.faces) for s in (colliding, drawn))
     assert hull.volume == pytest.approx(bowl.convex_hull.volume, rel=1e-3)
     assert ring.volume == pytest.approx(bowl.volume, rel=1e-3)
 

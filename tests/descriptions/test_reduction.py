@@ -1,4 +1,4 @@
-"""What is left of a description, and what is mended when MuJoCo refuses it."""
+"""The reduction of a description to the hand, and the repairs of descriptions that MuJoCo refuses."""
 
 from __future__ import annotations
 

@@ -78,18 +78,18 @@ def displaced(energy: GraspEnergy, samples: Samples, x: Tensor) -> Samples:
 
 def one_sided(energy: GraspEnergy, samples: Samples, scale: float) -> Sides:
     """Differences of second order, so that the energy's curvature does not set the two sides apart."""
-    def look(x: Tensor) -> tuple[Tensor, Tensor]:
+    def value_at(x: Tensor) -> tuple[Tensor, Tensor]:
         at = displaced(energy, samples, x)
         result = energy(at.T, at.q, at.contacts)
         return torch.cat([result.total[:, None], result.terms], -1), branches(energy, at)
 
     dof = samples.q.shape[1]
     steps = scale * torch.tensor([MOVE] * 3 + [TURN] * (3 + dof), dtype=torch.float64)
-    value, choice = look(torch.zeros(len(samples.q), 6 + dof, dtype=torch.float64))
+    value, choice = value_at(torch.zeros(len(samples.q), 6 + dof, dtype=torch.float64))
     slopes, kept = [], []
     for sign in (-1, 1):
         for step in sign * torch.diag(steps):
-            (one, first), (two, second) = (look(k * step.expand(len(value), -1)) for k in (1, 2))
+            (one, first), (two, second) = (value_at(k * step.expand(len(value), -1)) for k in (1, 2))
             slopes.append((4 * one - two - 3 * value) / (2 * step.sum()))
             kept.append(((first == choice) & (second == choice)).all(-1, keepdim=True))
     return Sides(*torch.stack(slopes, 1).chunk(2, 1), *torch.stack(kept, 1).chunk(2, 1))
@@ -110,7 +110,7 @@ def evaluate(name: str, part: str = "all") -> Evaluation:
 
 
 def gradient(name: str, part: str = "all") -> Tensor:
-    """What the energy says of itself, by the same coordinates."""
+    """The energy's own gradient, by the same coordinates."""
     result = evaluate(name, part)
     return torch.cat([result.by_pose, result.by_joint], -1)
 

@@ -1,6 +1,6 @@
 """The pieces of the grasp energy: their gradients by central differences in double precision, and known values.
 
-Each piece is looked at away from its kinks; test_energy_kinks.py puts them together and goes to the kinks.
+Each piece is tested away from its kinks; test_energy_kinks.py tests their sum, at the kinks too.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What is derived from the built-in hands, against their own geometry and against the real hands' descriptions."""
+"""The facts derived from the built-in hands, against their own geometry and against the real hands' descriptions."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_points_follow_the_seed() -> None:
     assert torch.equal(hand.link_points, again.link_points)
     assert torch.equal(hand.link_index, again.link_index)
     assert not torch.equal(hand.link_points, other.link_points)
-    # What is derived does not hang on the draw.
+    # The derived facts do not depend on the draw.
     assert torch.equal(hand.opening_signs, other.opening_signs)
     assert float(hand.palm_direction_wrist @ other.palm_direction_wrist) > 0.99
 

@@ -1,4 +1,4 @@
-"""What `hand check` says and draws: what was derived, and each thing that is wrong."""
+"""`hand check` tells and draws the derived facts, and names each fault."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_a_single_finger_is_warned_of(tmp_path: Path) -> None:
 
 
 def notes(folder: Path, text: str) -> dict[str, str]:
-    """What `hand check` finds, by link or joint."""
+    """Notes of `hand check`, by link or joint."""
     return {note.subject: note.text for note in check_hand(written(folder, text)).notes}
 
 

@@ -1,4 +1,4 @@
-"""URDF texts of a claw: two facing fingers on a palm, parts of which may be replaced."""
+"""URDF texts of a claw: two facing fingers on a palm; its links and joints may be replaced."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What makes a configuration of hand and object a grasp: the terms of the grasp energy."""
+"""The grasp energy of a hand on an object: contact candidates, terms and their weighted sum."""

@@ -1,7 +1,7 @@
 """A hand's anatomy, read off its tree: fingertips, palm link, rigid groups, fingers, thumb, opening signs.
 
-Nothing else in the package decides what a finger or a thumb is: `HandBuilder` calls these functions, `Hand` holds their
-results, and everyone reads the hand.
+This is the only definition of fingers and thumb in the package: `HandBuilder` calls these functions, `Hand` holds their
+results, and all other code reads the hand.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dro_grasp.geometry import se3
 from dro_grasp.kinematics.tree import FIXED, KinematicTree
 
 PALM = -1
-"""Finger number of links that belong to no finger: the palm, what is fixed to it or lies above it, and what fingers share."""
+"""Finger number of links that belong to no finger: the palm, links fixed to it or above it, and links that fingers share."""
 FEWEST_WITH_THUMB = 4
 """Hands with fewer fingers have no thumb: their fingers all oppose each other (ours)."""
 THUMB_CLOSING = 0.55
@@ -37,7 +37,7 @@ class Finger:
     chain: tuple[int, ...]
     """Links from the palm (excluded) to the tip (included); a link that several fingers share is in each of their chains."""
     links: tuple[int, ...]
-    """Links of this finger alone: those of the chain and what hangs on them, such as a pad."""
+    """Links of this finger alone: those of the chain and their side links, such as a pad."""
     joints_to_tip: tuple[int, ...]
     """For each of `links`, the number of moving joints between it and the tip; 0 for links beside the chain."""
 
@@ -109,8 +109,8 @@ def fixed_below(tree: KinematicTree, link: int) -> list[int]:
 def find_fingers(tree: KinematicTree, tips: Sequence[int], palm: int) -> tuple[Finger, ...]:
     """The finger of each tip.
 
-    A link belongs to the finger whose tip alone it carries, or else to the finger of its parent. What is fixed to the palm
-    belongs to none, even if it carries one finger: it does not move.
+    A link that carries one tip belongs to that finger; a link that carries none belongs to the finger of its parent. A link
+    fixed to the palm belongs to no finger, even if it carries one, because it does not move.
     """
     still, below = set(fixed_below(tree, palm)), tree.descends[:, palm].tolist()
     chains = [tuple(i for i in path_to(tree, tip) if below[i] and i not in still) for tip in tips]

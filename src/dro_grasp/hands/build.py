@@ -64,7 +64,7 @@ def build_hand(description: Description, *, name: str | None = None, seed: int =
 
 @dataclass(frozen=True)
 class Closing:
-    """How a hand closes, and the palm in front of which it does."""
+    """The closing of a hand: direction of each joint, and the palm."""
 
     opening_signs: Float[Tensor, " n_dof"]
     """As in `Hand`."""

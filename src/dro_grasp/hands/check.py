@@ -1,4 +1,4 @@
-"""A report on a hand description: what was derived from it and what is wrong with it, in words and in a picture."""
+"""A report on a hand description: the derived facts and the faults, in words and in a picture."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ class HandReport:
 
     hand: Hand
     facts: dict[str, Any]
-    """Everything that was derived, by name."""
+    """Derived facts, by name."""
     notes: tuple[Note, ...]
-    """Everything that was found or repaired, or that is wrong."""
+    """Findings, repairs and faults."""
 
     def lines(self) -> list[str]:
         """The report for people."""
@@ -70,7 +70,7 @@ class HandReport:
 
 
 def check_hand(name: str | Path) -> HandReport:
-    """Derive a hand and look for what is wrong with its description.
+    """Derive a hand and look for faults in its description.
 
     Raises:
         HandError: The description cannot be used at all.
