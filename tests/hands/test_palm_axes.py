@@ -11,10 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import BUILTIN_FOLDER, load_hand
-from dro_grasp.models.checkpoints import save_weights
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.predictor import GraspPredictor
+from dro_grasp.pipeline.proposal import ProposalConfig, _placements
 from tests.helpers.bracket_hand import bracket_hand, bracket_urdf
 from tests.helpers.claw_urdf import joint, written
 from tests.helpers.loaded_hands import loaded_hand
@@ -75,9 +74,7 @@ def test_the_open_hand_looks_alike_however_its_wrist_is_turned(name: str, tmp_pa
 def test_placements_put_the_grasp_centre_where_the_prior_says(
     frame: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    torch.manual_seed(0)
-    save_weights(DistanceNetwork(dataclasses.replace(TINY, frame=frame)), tmp_path / "w.safetensors")
-    predictor = GraspPredictor(str(tmp_path / "w.safetensors"))
+    network = DistanceNetwork(dataclasses.replace(TINY, frame=frame))
     hand, obj = on_a_flange("leaphand", tmp_path).with_points(TINY.n_hand), load_object("mug")
     offset = torch.tensor([0.01, -0.02, 0.03])
     given: list[torch.Tensor] = []
@@ -86,9 +83,9 @@ def test_placements_put_the_grasp_centre_where_the_prior_says(
         given.append(opened)
         return rotations[:num], offset.expand(num, 3)
 
-    monkeypatch.setattr(predictor.network, "sample_placements", sample)
+    monkeypatch.setattr(network, "sample_placements", sample)
     points = torch.from_numpy(obj.cloud)
-    T = predictor._placements(hand, points, 5, (0.0, 1.0, 0.0), torch.Generator().manual_seed(0))
+    T = _placements(hand, network, points, 5, (0.0, 1.0, 0.0), ProposalConfig(), torch.Generator().manual_seed(0))
     axes = T[:, :3, :3] @ (hand.palm_axes_wrist if frame == "palm" else torch.eye(3))
     torch.testing.assert_close(hand.grasp_centres(T), points.mean(0) + (axes @ offset), atol=1e-5, rtol=0)
     assert float(hand.palm_directions(T)[:, 1].min()) > 0.9
