@@ -25,7 +25,9 @@ from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.completion import completed, looked_at
 from dro_grasp.perception.partial_views import seen_side
-from dro_grasp.rendering.rasterizer import Camera, Mesh, dots, render
+from dro_grasp.rendering.camera import Camera
+from dro_grasp.rendering.meshes import Mesh, dots
+from dro_grasp.rendering.rasterizer import render
 from dro_grasp.viewer.pictures import contact_sheet
 
 GROUPS = ("assets:train", "assets:validate")

@@ -19,7 +19,9 @@ from dro_grasp.hands.anatomy import Finger
 from dro_grasp.hands.build import build_hand
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand_description
-from dro_grasp.rendering.rasterizer import Camera, Mesh, arrow, render
+from dro_grasp.rendering.camera import Camera
+from dro_grasp.rendering.meshes import Mesh, arrow
+from dro_grasp.rendering.rasterizer import render
 
 TILE = (560, 520)
 """Width and height of one view [pixels]."""

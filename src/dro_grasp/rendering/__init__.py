@@ -1,1 +1,1 @@
-"""Arrays in, pixels out: a small software rasterizer."""
+"""Pictures of triangle meshes: arrays in, pixels out."""

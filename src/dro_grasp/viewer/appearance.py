@@ -13,7 +13,8 @@ from torch import Tensor
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.rendering.rasterizer import Camera, Colour, Mesh, dots
+from dro_grasp.rendering.camera import Camera
+from dro_grasp.rendering.meshes import Colour, Mesh, dots
 
 OBJECT_COLOUR: Colour = (0.95, 0.62, 0.28)
 """Orange of the object."""

@@ -17,7 +17,8 @@ from dro_grasp.errors import OutputError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.rendering.rasterizer import Colour, dots, render
+from dro_grasp.rendering.meshes import Colour, dots
+from dro_grasp.rendering.rasterizer import render
 from dro_grasp.viewer.appearance import best_camera, hand_meshes, object_meshes, success_colour
 
 TILE = (320, 280)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.rendering.rasterizer import Colour
+from dro_grasp.rendering.meshes import Colour
 from dro_grasp.viewer.appearance import (
     OBJECT_COLOUR,
     SOLVED_COLOUR,
