@@ -21,7 +21,7 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.loading import cloud_object
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.perception.partial_views import seen, seen_side
+from dro_grasp.perception.partial_views import partial_view, visible_side
 from dro_grasp.predictor import GraspPredictor
 from dro_grasp.simulation.trial import simulate
 
@@ -31,9 +31,10 @@ PROTOCOLS = ("dro", "strict")
 
 def shown(obj: ObjectModel, seed: int) -> dict[str, ObjectModel]:
     """The three views of an object; the two halves are the same half."""
-    points, normals, _ = seen_side(obj, "half", seed)
+    points, normals, _ = visible_side(obj, "half", seed)
     bare = cloud_object(f"{obj.name}, bare half", np.concatenate([points, normals], 1), origin=obj.name)
-    return {"all points": seen(obj, "cloud", seed), "bare half": bare, "completed half": seen(obj, "half", seed)}
+    whole, completed = (partial_view(obj, view, seed) for view in ("cloud", "half"))
+    return {"all points": whole, "bare half": bare, "completed half": completed}
 
 
 def main() -> None:

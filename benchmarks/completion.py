@@ -23,8 +23,8 @@ from scipy.spatial import KDTree
 
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.perception.completion import completed, looked_at
-from dro_grasp.perception.partial_views import seen_side
+from dro_grasp.perception.completion import complete_cloud, to_view_axes
+from dro_grasp.perception.partial_views import visible_side
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.rendering.meshes import Mesh, dots
 from dro_grasp.rendering.rasterizer import render
@@ -52,7 +52,7 @@ def likeliest(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None
 ) -> Float[np.ndarray, "k 3"]:
     """The other side by the best symmetry alone."""
-    side, axes, middle = looked_at(points, normals, camera)
+    side, axes, middle = to_view_axes(points, normals, camera)
     return side.guesses(None, 1)[0].points[len(side.points):] @ axes.T + middle
 
 
@@ -79,9 +79,9 @@ def draw(path: Path) -> None:
 
 def tile(obj: ObjectModel) -> np.ndarray:
     """One object, half transparent, with the points that were seen and added."""
-    points, normals, camera = seen_side(obj, "depth", 0)
+    points, normals, camera = visible_side(obj, "depth", 0)
     assert camera is not None
-    whole = completed(points, normals, camera)
+    whole = complete_cloud(points, normals, camera)
     towards = (camera - points.mean(0)) / np.linalg.norm(camera - points.mean(0))
     across = np.cross(towards, np.eye(3)[np.abs(towards).argmin()])
     across /= np.linalg.norm(across)
@@ -113,9 +113,9 @@ def main() -> None:
             for name in resolve_objects([group]):
                 obj = load_object(name)
                 for seed in range(options.views):
-                    points, normals, camera = seen_side(obj, view, seed)
+                    points, normals, camera = visible_side(obj, view, seed)
                     begin = time.perf_counter()
-                    whole = completed(points, normals, camera)
+                    whole = complete_cloud(points, normals, camera)
                     seconds += time.perf_counter() - begin
                     added = {"mirror": mirrored(points, normals, camera), "symmetry": likeliest(points, normals, camera),
                              "network": whole.points[whole.added]}

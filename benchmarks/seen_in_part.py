@@ -21,7 +21,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.perception.partial_views import View, seen
+from dro_grasp.perception.partial_views import View, partial_view
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.proposal import CLOUD_TEMPERATURE
 from dro_grasp.pipeline.stages import refine, scored
@@ -64,7 +64,7 @@ def main() -> None:
     for hand in map(load_hand, HANDS):
         for obj in map(load_object, resolve_objects(["assets:validate"])):
             for view in options.views:
-                part = seen(obj, view, pair_seed(0, hand, obj))
+                part = partial_view(obj, view, pair_seed(0, hand, obj))
                 for shown, judged in (("view", "view"), ("view", "mesh"), ("mesh", "view")):
                     models = {"view": part, "mesh": obj}
                     outcome = tried(hand, obj, models[shown], models[judged], options.num)

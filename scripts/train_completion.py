@@ -29,9 +29,9 @@ from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.loading import mesh_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.objects.surface_distances import signed_distances
-from dro_grasp.perception.camera import DepthCamera
-from dro_grasp.perception.completion import GUESSES, THINNEST, looked_at, surface_features
-from dro_grasp.perception.partial_views import seen_side
+from dro_grasp.perception.completion import GUESSES, THINNEST, surface_features, to_view_axes
+from dro_grasp.perception.depth_camera import DepthCamera
+from dro_grasp.perception.partial_views import visible_side
 
 Kind = Literal["half", "depth"]
 KINDS: tuple[Kind, ...] = ("half", "depth")
@@ -102,10 +102,10 @@ def view_of(
 ) -> tuple[Float[Tensor, "n guesses"], Float[Tensor, "n features"], Float[Tensor, " n"], Bool[Tensor, " n"]] | None:
     """One view: guessed distances, features, true distances, and which points are unseen; None if too little is seen."""
     camera = DepthCamera(distance=rng.uniform(*DISTANCE), noise=rng.uniform(*NOISE))
-    points, normals, place = seen_side(obj, kind, int(rng.integers(1 << 30)), camera)
+    points, normals, place = visible_side(obj, kind, int(rng.integers(1 << 30)), camera)
     if len(points) < FEWEST:
         return None
-    side, axes, middle = looked_at(points, normals, place)
+    side, axes, middle = to_view_axes(points, normals, place)
     if side.width < THINNEST:
         return None
     up = axes[2] if place is not None and rng.uniform() < STANDING else None
@@ -119,7 +119,7 @@ def view_of(
     assert obj.vertices is not None
     assert obj.faces is not None
     truth = signed_distances(obj.vertices, obj.faces, places @ axes.T + middle)
-    unseen = side.space.query(places)[0] > AWAY
+    unseen = side.tree.query(places)[0] > AWAY
     return told.guessed, told.features, torch.from_numpy(truth).float(), torch.from_numpy(unseen)
 
 

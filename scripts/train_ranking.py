@@ -30,7 +30,7 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.models.checkpoints import DEFAULT
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.perception.partial_views import View, seen
+from dro_grasp.perception.partial_views import View, partial_view
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import refine
 from dro_grasp.predictor import GraspPredictor
@@ -93,7 +93,7 @@ def collect(
         obj = load_object(label)
         predictor.config = dataclasses.replace(predictor.config, temperature=rng.choice(TEMPERATURES))
         view = rng.choice(views)
-        known = seen(obj, view, rng.randrange(10**6))
+        known = partial_view(obj, view, rng.randrange(10**6))
         raw = predictor.predict(hand, known, num, seed=rng.randrange(10**6), candidates=1, refine=False)
         refined = refine(GraspProblem(hand, known), raw)
         some = refined[slice(0, num // 8)]

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from dro_grasp.objects.shape import ObjectModel
     from dro_grasp.optimization.refinement import RefineConfig
     from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
-    from dro_grasp.perception.camera import DepthCamera, visible_points
+    from dro_grasp.perception.depth_camera import DepthCamera, visible_points
     from dro_grasp.perception.scan import depth_points, scanned_object
     from dro_grasp.pipeline.problem import GraspProblem
     from dro_grasp.pipeline.stages import evaluate, rank, refine
@@ -56,7 +56,7 @@ from dro_grasp._version import __version__
 
 _EXPORTS = {
     "AugmentationConfig": "training.config",
-    "DepthCamera": "perception.camera",
+    "DepthCamera": "perception.depth_camera",
     "DroGraspError": "errors",
     "Frame": "export.frame",
     "GraspBatch": "grasps.batch",
@@ -106,7 +106,7 @@ _EXPORTS = {
     "synthesize_dataset": "datasets.engine.schedule",
     "train": "training.loop",
     "view_grasps": "viewer.app",
-    "visible_points": "perception.camera",
+    "visible_points": "perception.depth_camera",
     "wilson_interval": "evaluation.metrics",
 }
 """Module of each public name, below this package."""

@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from dro_grasp.models.completion_network import SurfaceNetwork, shipped_surface
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.perception.camera import DepthCamera, visible_points
-from dro_grasp.perception.completion import GUESSES, completed, looked_at, surface_features
-from dro_grasp.perception.partial_views import seen_side
-from dro_grasp.perception.symmetry import Guess, SeenSide
+from dro_grasp.perception.completion import GUESSES, complete_cloud, surface_features, to_view_axes
+from dro_grasp.perception.depth_camera import DepthCamera, visible_points
+from dro_grasp.perception.partial_views import visible_side
+from dro_grasp.perception.symmetry import Guess, VisibleSide
 
 Shape = tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]
 
@@ -83,7 +83,7 @@ def likeliest(
     points: np.ndarray, normals: np.ndarray, camera: np.ndarray | None, up: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """What the best symmetry alone adds, and its normals."""
-    side, axes, middle = looked_at(points, normals, camera)
+    side, axes, middle = to_view_axes(points, normals, camera)
     guess = side.guesses(None if up is None else up @ axes, 1)[0]
     n = len(side.points)
     np.testing.assert_array_equal(guess.points[:n], side.points)
@@ -105,7 +105,7 @@ def test_bodies_seen_askew_are_closed_on_their_surface(shape: Callable[[], Shape
         found.append(distance(added).mean())
         naive.append(distance(mirrored(points[shown], towards)).mean())
         assert (outward * added).sum(1).mean() > 0, "normals look outward"
-        whole = completed(points[shown], normals[shown], camera)
+        whole = complete_cloud(points[shown], normals[shown], camera)
         np.testing.assert_allclose(np.linalg.norm(whole.normals, axis=1), 1, atol=1e-9)
         assert (whole.normals * whole.points).sum(1)[whole.added].mean() > 0
         learned.append(distance(whole.points[whole.added]).mean())
@@ -122,7 +122,7 @@ def test_both_sides_are_about_as_dense() -> None:
         unit = rng.normal(size=(many, 3))
         unit /= np.linalg.norm(unit, axis=1, keepdims=True)
         shown = unit[:, 2] > 0
-        whole = completed(0.04 * unit[shown], unit[shown], None)
+        whole = complete_cloud(0.04 * unit[shown], unit[shown], None)
         share = whole.added.mean()
         assert 0.35 < share < 0.65, f"{share} of the points were added to half a sphere of {shown.sum()}"
 
@@ -132,7 +132,7 @@ def test_a_die_is_not_thinned_away() -> None:
     points = rng.uniform(-1, 1, (3000, 3))
     normals = np.eye(3)[np.abs(points).argmax(1)] * np.sign(points)
     points = 0.004 * np.where(normals == 0, points, normals)
-    whole = completed(points[points[:, 2] > 0], normals[points[:, 2] > 0], None)
+    whole = complete_cloud(points[points[:, 2] > 0], normals[points[:, 2] > 0], None)
     assert (~whole.added).sum() > 100
     assert whole.added.sum() > 50
     assert np.abs(np.abs(whole.points).max(1) - 0.004)[whole.added].mean() < 0.001
@@ -146,7 +146,7 @@ def test_where_the_network_finds_no_surface_the_best_guess_stays() -> None:
     with torch.no_grad():
         # Everything is a metre away.
         network.leave.bias[GUESSES] = 100.0
-    whole = completed(points[shown], normals[shown], camera, network=network)
+    whole = complete_cloud(points[shown], normals[shown], camera, network=network)
     added, _ = likeliest(points[shown], normals[shown], camera)
     assert KDTree(added).query(whole.points[whole.added])[0].max() < 1e-9
     assert whole.added.sum() > 0.3 * len(added)
@@ -162,15 +162,15 @@ def test_an_untrained_network_believes_the_best_symmetry() -> None:
     with torch.no_grad():
         # Sure of the first guess instead of only rather so.
         network.leave.bias[0] = 50.0
-    whole = completed(points[shown], normals[shown], camera, network=network)
+    whole = complete_cloud(points[shown], normals[shown], camera, network=network)
     both = np.concatenate([points[shown], added])
     # Between points and on edges, where a grid of 5 mm is round.
     assert np.quantile(KDTree(both).query(whole.points[whole.added])[0], 0.95) < 0.005
     assert np.quantile(KDTree(whole.points).query(added)[0], 0.95) < 0.005
 
 
-def _told(points: np.ndarray, normals: np.ndarray, camera: np.ndarray) -> tuple[SeenSide, list[Guess]]:
-    side, _, _ = looked_at(points, normals, camera)
+def _told(points: np.ndarray, normals: np.ndarray, camera: np.ndarray) -> tuple[VisibleSide, list[Guess]]:
+    side, _, _ = to_view_axes(points, normals, camera)
     return side, side.guesses(None, GUESSES)
 
 
@@ -194,8 +194,8 @@ def test_the_network_is_nearer_to_unseen_surfaces_than_symmetry() -> None:
     for name in ("rubber_duck", "spray_bottle", "wine_glass"):
         obj = load_object(name)
         for seed in range(2):
-            points, normals, camera = seen_side(obj, "depth", seed)
-            whole = completed(points, normals, camera)
+            points, normals, camera = visible_side(obj, "depth", seed)
+            whole = complete_cloud(points, normals, camera)
             added, _ = likeliest(points, normals, camera)
             for kept, errors in ((whole.points[whole.added], off), (added, symmetric)):
                 errors.append(np.abs(igl.signed_distance(kept, obj.vertices, obj.faces)[0]).mean())
@@ -225,7 +225,7 @@ def test_a_ball_in_a_real_depth_image() -> None:
     view = torch.tensor([0.0, 0.0, 1.0])
     points = visible_points(ball, view, torch.Generator().manual_seed(0), DepthCamera(noise=0)).double().numpy()
     normals = points / np.linalg.norm(points, axis=1, keepdims=True)
-    whole = completed(points, normals, DepthCamera().place(ball, view))
+    whole = complete_cloud(points, normals, DepthCamera().place(ball, view))
     length = np.linalg.norm(whole.points, axis=1)
     off = np.abs(length - radius)
     assert np.mean(off) < 0.1 * radius
@@ -236,7 +236,7 @@ def test_a_ball_in_a_real_depth_image() -> None:
 @pytest.mark.parametrize("end", [(0.05, 0.0, 0.5), (0.0, 0.0, 0.6)], ids=["across", "along the ray"])
 def test_a_line_is_no_reason_to_stumble(end: tuple[float, float, float]) -> None:
     line = np.linspace((0.0, 0.0, 0.5), end, 40)
-    whole = completed(line, np.tile([0.0, 0.0, -1.0], (40, 1)), np.zeros(3))
+    whole = complete_cloud(line, np.tile([0.0, 0.0, -1.0], (40, 1)), np.zeros(3))
     assert np.isfinite(whole.points).all()
     assert np.isfinite(whole.normals).all()
     assert (~whole.added).sum() >= 10
@@ -254,7 +254,7 @@ def test_what_stands_is_guessed_upright() -> None:
         shown = normals @ towards > 0.15
         added, _ = likeliest(points[shown], normals[shown], 100 * towards, up)
         assert np.abs(igl.signed_distance(added, pot.vertices, pot.faces)[0]).mean() < 0.003
-        whole = completed(points[shown], normals[shown], 100 * towards, up)
+        whole = complete_cloud(points[shown], normals[shown], 100 * towards, up)
         assert np.abs(igl.signed_distance(whole.points[whole.added], pot.vertices, pot.faces)[0]).mean() < 0.004
         other, _ = likeliest(points[shown], normals[shown], 100 * towards)
         anyhow.append(np.abs(igl.signed_distance(other, pot.vertices, pot.faces)[0]).mean())

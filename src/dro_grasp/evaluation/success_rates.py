@@ -22,7 +22,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.synthesis import synthesize
-from dro_grasp.perception.partial_views import View, seen
+from dro_grasp.perception.partial_views import View, partial_view
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import refine, scored
 from dro_grasp.predictor import GraspPredictor, GraspRequest
@@ -187,7 +187,7 @@ def _sources(
 ) -> Iterator[_Source]:
     """Grasps of the network and of the controls."""
     hand, obj, num = problem.hand, problem.obj, config.num
-    visible = problem if config.view == "whole" else GraspProblem(hand, seen(obj, config.view, seed), predictor.device)
+    visible = problem if config.view == "whole" else GraspProblem(hand, partial_view(obj, config.view, seed), predictor.device)
     made = predictor.run(visible, GraspRequest(num, seed, candidates=1, refine=False))
     yield _Source(NETWORK, visible, made.grasps, {k: made.seconds[k] / num for k in ("network", "decode")})
     if not config.controls:

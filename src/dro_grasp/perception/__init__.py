@@ -1,1 +1,1 @@
-"""What cameras see: depth images and clouds, and the side of an object that they do not see."""
+"""Views of objects: depth images and clouds, and completion of the unseen side."""

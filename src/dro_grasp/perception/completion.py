@@ -1,4 +1,4 @@
-"""The side of an object that nobody saw: symmetries propose it, a network decides between them, place by place.
+"""Completion of an object's unseen side: symmetries propose it, and a network chooses between them, point by point.
 
 Source: the network weighs the symmetries of `perception/symmetry.py`; its surface is where the signed distance is zero, as in
 Park et al. 2019 (DeepSDF).
@@ -15,121 +15,128 @@ from torch import Tensor
 
 from dro_grasp.models.completion_network import SurfaceNetwork, shipped_surface
 from dro_grasp.objects.surface_distances import cloud_distances
-from dro_grasp.perception.symmetry import Guess, SeenSide, nearest_points, projected
+from dro_grasp.perception.symmetry import Guess, VisibleSide, nearest_points, project
 
 GUESSES = 5
-"""Symmetries that the network decides between."""
-SEEN = 2048
-"""Seen points that guesses are made of."""
+"""Symmetries that the network chooses between (ours)."""
+VISIBLE_POINTS = 2048
+"""Most visible points that guesses are made of (ours)."""
 THINNEST = 1e-4
-"""Width in the image below which nothing can be said of the other side [m]."""
+"""Width in the image below which nothing can be said of the other side [m] (ours)."""
 CELLS = 20_000
-"""About how many cells the grid has on which the surface is looked for: edges of 5 mm for a large can, 1 mm for a die."""
+"""Approximate number of grid cells for the surface (ours): edges of 5 mm for a large can, 1 mm for a die."""
 MARGIN = 0.01
-"""How far the grid reaches beyond all guesses [m]."""
-SPREAD, STEPS, CLOSE = 40_000, 4, 0.0005
-"""Points that are moved to the surface, in so many steps, and how close they have to come [m]."""
-NEAR, FINE, COARSE = 40, 0.002, 10
-"""Of seen points one is kept in each cube whose edge is the object's width over the first number, but at least so long [m],
-unless that is more than the width over the last."""
-SMALL, LENGTH = 0.01, 0.05
-"""Distances that the network sees as about 1/2, and lengths that it sees as 1 [m]."""
+"""Distance that the grid extends beyond all guesses [m] (ours)."""
+SPREAD = 40_000
+"""Points that are moved onto the surface (ours)."""
+STEPS = 4
+"""Newton steps of these points (ours)."""
+CLOSE = 0.0005
+"""Distance from the surface within which a point counts as arrived [m] (ours)."""
+THINNING = 40
+"""One visible point is kept per cube; its edge is the object's width over this (ours)."""
+FINEST = 0.002
+"""Shortest edge of these cubes [m] (ours), unless it is more than a share of the width; see COARSEST."""
+COARSEST = 10
+"""The shortest edge is at most the object's width over this (ours)."""
+SMALL = 0.01
+"""Distance that the network receives as about 1/2 [m] (ours)."""
+LENGTH = 0.05
+"""Length that the network receives as 1 [m] (ours)."""
 
 
 class CompletedCloud(NamedTuple):
-    """Both sides of an object of which one was seen."""
+    """Both sides of an object."""
 
     points: Float[np.ndarray, "k 3"]
     normals: Float[np.ndarray, "k 3"]
     """Outward, of length 1."""
     added: Bool[np.ndarray, " k"]
-    """Which points nobody saw; they come last."""
+    """Which points are completed, not seen; they come last."""
 
 
 class SurfaceFeatures(NamedTuple):
-    """What the network is told of n places."""
+    """Input of the network at n places."""
 
     guessed: Float[Tensor, "n 5"]
     """Signed distances to the guesses [m]."""
     features: Float[Tensor, "n 20"]
-    """The same, squeezed. Squeezed likewise: distance to the nearest seen point, height over its tangent plane, distance from
-    the seen image, height over its surface there, heights above the end and the top of what was seen. Place along the view and
-    across it; how little each guess agrees with what was seen; the seen width; whether there was a camera."""
+    """The same distances, squeezed by asinh. Squeezed likewise: distance to the nearest visible point, height over its tangent
+    plane, distance from the image, height over the surface there, heights above the end and the top of the visible side.
+    Then: position along the view and across it, the cost of each guess, the visible width, and whether there is a camera."""
 
 
-def completed(
+def complete_cloud(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None = None,
     up: Float[np.ndarray, "3"] | None = None, network: SurfaceNetwork | None = None,
 ) -> CompletedCloud:
-    """Both sides of an object of which one was seen, about as dense on either; of the seen points some are left out for that.
+    """Complete the unseen side. Both sides get about the same density, for which visible points are thinned.
 
-    To a line to the camera nothing is added.
+    If all points lie on one viewing ray, the cloud is returned unchanged.
 
     Args:
-        points: Of the seen side [m].
-        normals: Outward unit normals there.
-        camera: Where it stands [m]. Without it the points are taken to be all that lies on one side of a plane, whose normal is
-            then the mean of theirs.
-        up: Unit vector along which the object stands, if it does: what stands is rather turned or mirrored upright.
-        network: Decides between symmetries; the one that ships by default.
+        points: Points of the visible side [m].
+        normals: Their outward unit normals.
+        camera: Position of the camera [m]. Without it, the points are taken to be all points on one side of a plane, whose
+            normal is the mean of theirs.
+        up: Up direction, if known; symmetries that preserve it are preferred.
+        network: Chooses between symmetries; the shipped one by default.
     """
-    side, axes, middle = looked_at(points, normals, camera)
+    side, axes, middle = to_view_axes(points, normals, camera)
     if side.width < THINNEST:
         return CompletedCloud(points, normals, np.zeros(len(points), bool))
     guesses = side.guesses(None if up is None else up @ axes, GUESSES)
-    surface, outward = zero_level(side, guesses, network or shipped_surface())
-    apart = max(side.width / NEAR, min(FINE, side.width / COARSE))
+    surface, outward = extract_surface(side, guesses, network or shipped_surface())
+    apart = max(side.width / THINNING, min(FINEST, side.width / COARSEST))
     seen, seen_normals = _thinned(side.points, side.normals, apart)
     between = 2 * float(np.median(nearest_points(seen).query(seen, k=2)[0][:, 1]))
-    near = side.space.query(surface)[0] < 1.5 * max(apart, between)
-    # The points near the seen side have the density that is to be, over an area that has too many or too few.
+    near = side.tree.query(surface)[0] < 1.5 * max(apart, between)
+    # Extracted points near the visible side cover the same area as the thinned visible points: the ratio of the two
+    # counts is the share of extracted points that gives the other side the same density.
     share = min(1.0, len(seen) / max(1, int(near.sum())))
     added = np.flatnonzero(~near)[: round(share * int((~near).sum()))]
     both, both_normals = np.concatenate([seen, surface[added]]), np.concatenate([seen_normals, outward[added]])
     return CompletedCloud(both @ axes.T + middle, both_normals @ axes.T, np.arange(len(both)) >= len(seen))
 
 
-def looked_at(
+def to_view_axes(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None
-) -> tuple[SeenSide, Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-    """What was seen, in axes with z to the camera; the axes as columns; and the middle, from which they start [m]."""
-    if len(points) > SEEN:
-        kept = np.random.default_rng(0).permutation(len(points))[:SEEN]
+) -> tuple[VisibleSide, Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+    """The visible side in view axes, with z to the camera; these axes as columns; and their origin, the middle [m]."""
+    if len(points) > VISIBLE_POINTS:
+        kept = np.random.default_rng(0).permutation(len(points))[:VISIBLE_POINTS]
         points, normals = points[kept], normals[kept]
     middle = points.mean(0)
     view = normals.mean(0) if camera is None else camera - middle
-    away = float(np.linalg.norm(view))
-    view = view / max(away, 1e-9)
+    length = float(np.linalg.norm(view))
+    view = view / max(length, 1e-9)
     helper = np.eye(3)[np.abs(view).argmin()]
     across = np.cross(view, helper) / np.linalg.norm(np.cross(view, helper))
     axes = np.stack([across, np.cross(view, across), view], 1)
-    return SeenSide.of((points - middle) @ axes, normals @ axes, None if camera is None else away), axes, middle
+    return VisibleSide.of((points - middle) @ axes, normals @ axes, None if camera is None else length), axes, middle
 
 
-def surface_features(side: SeenSide, guesses: list[Guess], places: Float[np.ndarray, "n 3"]) -> SurfaceFeatures:
-    """What the network is told of places in the axes of the seen side [m]; nothing in it depends on turns about the view."""
+def surface_features(side: VisibleSide, guesses: list[Guess], places: Float[np.ndarray, "n 3"]) -> SurfaceFeatures:
+    """Input of the network at places in view axes [m]; it does not depend on rotations about the view."""
     guessed = np.stack([cloud_distances(g.points, g.normals, places) for g in guesses], 1)
-    distance, nearest = side.space.query(places)
+    distance, nearest = side.tree.query(places)
     over = ((places - side.points[nearest]) * side.normals[nearest]).sum(1)
-    beside, hiding = side.image.query(projected(places, side.away))
+    beside, hiding = side.image_tree.query(project(places, side.camera_distance))
     height = places[:, 2]
     metres = np.column_stack([
         guessed, distance, over, beside, height - side.points[hiding, 2], height - side.end, height - side.top])
     across = np.linalg.norm(places[:, :2], axis=1)
-    whole = np.array([*(g.cost for g in guesses), side.width / LENGTH, float(side.away is not None)])
+    whole = np.array([*(g.cost for g in guesses), side.width / LENGTH, float(side.camera_distance is not None)])
     features = np.column_stack([
         np.arcsinh(metres / SMALL) / 2, height / LENGTH, across / LENGTH, np.broadcast_to(whole, (len(places), len(whole)))])
     return SurfaceFeatures(torch.from_numpy(guessed).float(), torch.from_numpy(features).float())
 
 
 @torch.no_grad()
-def zero_level(
-    side: SeenSide, guesses: list[Guess], network: SurfaceNetwork
+def extract_surface(
+    side: VisibleSide, guesses: list[Guess], network: SurfaceNetwork
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
-    """Points all over the surface and unit normals there, in the axes of the seen side.
-
-    Where the network finds no surface they are those of the best guess.
-    """
+    """Points on the network's zero level and their unit normals, in view axes; those of the best guess if there is none."""
     from scipy.interpolate import RegularGridInterpolator
 
     everything = np.concatenate([g.points for g in guesses])
@@ -149,6 +156,7 @@ def zero_level(
     if not len(close):
         return guesses[0].points, guesses[0].normals
     points = close[rng.integers(len(close), size=SPREAD)] + rng.uniform(-0.5, 0.5, (SPREAD, 3)) * spacing
+    # Newton steps x - s grad s / |grad s|^2; the floor on the slope limits steps where the field is flat.
     for _ in range(STEPS):
         here = values(points)
         points = points - here[:, :1] * here[:, 1:] / np.maximum((here[:, 1:] ** 2).sum(1, keepdims=True), 0.1)
@@ -161,6 +169,6 @@ def zero_level(
 def _thinned(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], spacing: float
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
-    """One point of each cell of a grid."""
+    """The first point in each cell of a grid."""
     first = np.unique(np.floor(points / spacing).astype(np.int64), axis=0, return_index=True)[1]
     return points[first], normals[first]

@@ -1,4 +1,4 @@
-"""What a hand that stands before an object sees of it: all of it, all of its points, the paper's half, or one depth image."""
+"""Partial views of an object: its whole cloud, the paper's half of it, or one depth image."""
 
 from __future__ import annotations
 
@@ -10,39 +10,42 @@ from jaxtyping import Float
 
 from dro_grasp.objects.loading import cloud_object, estimate_normals
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.perception.camera import DepthCamera, visible_points
-from dro_grasp.perception.completion import completed
+from dro_grasp.perception.completion import complete_cloud
+from dro_grasp.perception.depth_camera import DepthCamera, visible_points
 
 View = Literal["whole", "cloud", "half", "depth"]
-"""The mesh; all of the surface points, without the mesh; half of them; the points of a depth image."""
+"""The mesh; all surface points without the mesh; half of them; the points of a depth image."""
 POINTS = 1024
-"""Points of the paper's half of a cloud."""
+"""Points of the paper's half of a cloud (twice the network's 512 points)."""
 
 
-def seen(obj: ObjectModel, view: View, seed: int, camera: DepthCamera | None = None) -> ObjectModel:
-    """The object as it is seen: itself, or a bare cloud in its frame, to which the side that is not seen is added.
+def partial_view(obj: ObjectModel, view: View, seed: int, camera: DepthCamera | None = None) -> ObjectModel:
+    """The object in a view: itself, or a bare cloud in its frame with the unseen side completed.
 
     Args:
         obj: An object with a mesh.
-        view: `cloud` keeps all points and normals, to which nothing is added; `half` keeps the half of the points farthest
-            along a random direction, as in the paper's appendix, and knows nothing of the camera; `depth` is one noisy depth
-            image from a random direction, with normals towards the camera.
-        seed: Of direction and noise.
-        camera: Place and quality of the depth camera.
+        view: `whole` is the object itself. `cloud` keeps all points and normals and completes nothing. `half` keeps the
+            half of the points farthest along a random direction, as in the paper's appendix, without a camera. `depth` is
+            one noisy depth image from a random direction.
+        seed: Seed of direction and noise.
+        camera: Distance and quality of the depth camera.
     """
     if view == "whole":
         return obj
     name = f"{obj.name}, {view} seen"
     if view == "cloud":
         return cloud_object(name, np.concatenate([obj.cloud, obj.cloud_normals], 1), origin=name)
-    both = completed(*seen_side(obj, view, seed, camera))
+    both = complete_cloud(*visible_side(obj, view, seed, camera))
     return cloud_object(name, np.concatenate([both.points, both.normals], 1), origin=name)
 
 
-def seen_side(
+def visible_side(
     obj: ObjectModel, view: Literal["half", "depth"], seed: int, camera: DepthCamera | None = None
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Float[np.ndarray, "3"] | None]:
-    """What is seen alone: points [m], normals, and where the camera stands if that is known [m]; arguments as for `seen`."""
+    """Points of the visible side alone [m], their normals, and the camera's position if there is one [m].
+
+    Arguments are those of `partial_view`.
+    """
     generator = torch.Generator().manual_seed(seed)
     if view == "half":
         half = cloud_object(obj.name, obj.sample_partial(POINTS, generator).numpy(), origin=obj.name)
@@ -50,5 +53,5 @@ def seen_side(
     direction = torch.nn.functional.normalize(torch.randn(3, generator=generator), dim=0)
     camera = camera or DepthCamera()
     points = visible_points(obj, direction, generator, camera).numpy().astype(np.float64)
-    place = camera.place(obj, direction)
-    return points, estimate_normals(points.astype(np.float32), place).astype(np.float64), place
+    position = camera.place(obj, direction)
+    return points, estimate_normals(points.astype(np.float32), position).astype(np.float64), position

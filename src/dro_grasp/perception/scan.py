@@ -1,4 +1,4 @@
-"""Objects as a depth camera sees them: from its image or its cloud to an object in the frame that grasps are wanted in."""
+"""From a camera's depth image or cloud to an object in the frame in which grasps are wanted."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from jaxtyping import Bool, Float, Num
 from dro_grasp.errors import ObjectError
 from dro_grasp.objects.loading import cloud_object, estimate_normals, read_points
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
-from dro_grasp.perception.completion import completed
+from dro_grasp.perception.completion import complete_cloud
 
 NEIGHBOURS = 12
-"""Points that decide whether a point is an outlier."""
+"""Neighbours that decide whether a point is an outlier (ours)."""
 TOLERANCE = 2.5
-"""Outliers are farther from their neighbours than the mean by this many standard deviations."""
+"""Outliers are farther from their neighbours than the mean by this many standard deviations (ours)."""
 FARTHEST = 10.0
-"""Depths beyond this are in another unit [m]."""
+"""Larger depths are taken to be in another unit [m] (ours)."""
 
 
 def depth_points(
@@ -26,9 +26,9 @@ def depth_points(
     """Points of a depth image in the camera's frame: x right, y down, z forward [m].
 
     Args:
-        depth: Depth along z [m]; 0 and NaN where nothing was measured.
+        depth: Depth along z [m]; 0 or NaN where there is no measurement.
         intrinsics: Pinhole matrix: focal lengths and principal point [pixels].
-        mask: The object's pixels; all that have a depth when None.
+        mask: The object's pixels; all pixels with a depth by default.
 
     Raises:
         ObjectError: Mask and image differ in shape, nothing is left, or depths are not in metres.
@@ -36,29 +36,29 @@ def depth_points(
     if mask is not None and mask.shape != depth.shape:
         raise ObjectError(f"the mask has shape {mask.shape}, the depth image {depth.shape}; give one of the same size")
     with np.errstate(invalid="ignore"):
-        seen = np.isfinite(depth) & (depth > 0)
-    seen = seen if mask is None else seen & mask
-    if not seen.any():
+        valid = np.isfinite(depth) & (depth > 0)
+    valid = valid if mask is None else valid & mask
+    if not valid.any():
         raise ObjectError("no pixel of the depth image has a depth" + ("" if mask is None else " within the mask")
                           + "; give depths in metres, and a mask that is true on the object")
-    if float(np.median(depth[seen])) > FARTHEST:
-        raise ObjectError(f"the median depth is {np.median(depth[seen]):g}, too far for metres; divide millimetres by 1000")
-    row, column = np.nonzero(seen)
-    z = depth[seen].astype(np.float64)
+    if float(np.median(depth[valid])) > FARTHEST:
+        raise ObjectError(f"the median depth is {np.median(depth[valid]):g}, too far for metres; divide millimetres by 1000")
+    row, column = np.nonzero(valid)
+    z = depth[valid].astype(np.float64)
     rays = np.linalg.solve(intrinsics.astype(np.float64), np.stack([column, row, np.ones_like(row)]).astype(np.float64))
     return (rays / rays[2] * z).T
 
 
 def load_scan(path: Path, T_frame_camera: Float[np.ndarray, "4 4"], scale: float = 1.0) -> ObjectModel:
-    """The object that a camera has seen, from a cloud file in the camera's frame; as `scanned_object` makes it.
+    """The object in a cloud file in the camera's frame; see `scanned_object`.
 
     Args:
-        path: PLY, NPY or PCD; points that are NaN, as organised clouds have them, and strays are dropped.
+        path: PLY, NPY or PCD; outliers and the NaN points of organised clouds are dropped.
         T_frame_camera: The camera's pose in the wanted frame.
         scale: Multiplies the points; 0.001 for millimetres.
 
     Raises:
-        ObjectError: It is no cloud, or none of an object's size.
+        ObjectError: The file holds no cloud, or none of an object's size.
     """
     return scanned_object(path.stem, read_points(path) * scale, T_frame_camera)
 
@@ -70,15 +70,15 @@ def scanned_object(
     denoise: bool = True,
     complete: bool = True,
 ) -> ObjectModel:
-    """An object from points that a camera at the origin has seen; grasps of it are in the frame given.
+    """An object from the points of a camera at the origin; its grasps are in the given frame.
 
     Args:
-        name: What to call it.
-        points: In the camera's frame [m].
-        T_frame_camera: The camera's pose in the wanted frame, in which up, `direction` and `table` mean something; the
-            camera's own when None.
-        denoise: Drop points that lie apart from all others.
-        complete: Add the side that the camera does not see; leave it out for a scan from all sides.
+        name: Name of the object.
+        points: Points in the camera's frame [m].
+        T_frame_camera: The camera's pose in the wanted frame, whose z axis points up and in which `direction` and `table`
+            are given; the camera's own frame by default.
+        denoise: Drop outliers.
+        complete: Add the unseen side; switch it off for a scan from all sides.
 
     Raises:
         ObjectError: Too few points are left, or they are not in metres.
@@ -95,7 +95,7 @@ def scanned_object(
     normals = estimate_normals(kept.astype(np.float32), camera).astype(np.float64)
     if complete:
         up = None if T_frame_camera is None else T_frame_camera[2, :3].astype(np.float64)
-        kept, normals, _ = completed(kept, normals, camera, up)
+        kept, normals, _ = complete_cloud(kept, normals, camera, up)
     if T_frame_camera is not None:
         R = T_frame_camera[:3, :3]
         kept, normals = kept @ R.T + T_frame_camera[:3, 3], normals @ R.T
@@ -103,7 +103,7 @@ def scanned_object(
 
 
 def without_outliers(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
-    """Points whose mean distance to their neighbours is like the others'. Source: Rusu et al. 2008."""
+    """Remove points whose mean distance to their neighbours is unusually large. Source: Rusu et al. 2008."""
     from scipy.spatial import KDTree
 
     distance = KDTree(points).query(points, k=min(NEIGHBOURS, len(points) - 1) + 1)[0][:, 1:].mean(1)

@@ -1,6 +1,13 @@
-"""What the side that nobody saw may look like: symmetries that agree with the side that was seen.
+"""Guesses of an object's unseen side: symmetries that agree with its visible side.
 
-Source: symmetries judged by what the camera sees, Thrun and Wegbreit 2005, Bohg et al. 2011; kinds and costs are our own.
+A symmetry is a motion x -> M (x - c) + c that is its own inverse (M^2 = I): the inversion M = -I, a half turn
+M = 2 a a^T - I about the axis a, or a mirror M = I - 2 m m^T with the normal m. It maps the visible side onto a guess of the
+hidden one. A guess is good if the camera could not have seen it (it lies behind the visible side, inside its image), and if
+it meets the visible side at the rim without a gap or a kink.
+
+Lengths are in units of the object's width in the image, unless a unit is given.
+
+Source: symmetries judged by visibility, Thrun and Wegbreit 2005, Bohg et al. 2011; motions and costs are ours.
 """
 
 from __future__ import annotations
@@ -15,30 +22,46 @@ from jaxtyping import Float, Int
 if TYPE_CHECKING:
     from scipy.spatial import KDTree
 
-SAMPLE, MOST = 300, 1200
-"""Seen points that symmetries are judged by, and among which the rim is looked for."""
+SAMPLE = 300
+"""Visible points that judge a symmetry (ours)."""
+RIM_SAMPLE = 1200
+"""Visible points among which the rim is searched (ours)."""
 DEPTHS = (-0.1, -0.05, 0.0, 0.05, 0.1, 0.2, 0.3, 0.5)
-"""Centres that are tried, behind the rim of the seen side, in widths of the object."""
-TILTS, TURNS = (0.3, 0.6, 0.9), 8
-"""Angles between mirror planes and the image that are tried [rad], and directions of the tilt; half turns have as many axes."""
-VISIBLE, GAP = 3.0, 1.0
-"""Weights of what should have been seen, and of gaps at the rim."""
-KINK, SEEN_KINK = 0.5, 0.1
-"""Weights of kinks at the rim: of a cut, and of an image, where normals are less sure."""
-LEANING, FLAT = 0.1, 0.999
-"""Cost of symmetries that do not keep the vertical; cosine to the view from which a camera looks straight down."""
-APART = 0.05
-"""Guesses closer to each other than this are one, in widths."""
+"""Depths of the centre c behind the rim [widths] (ours)."""
+TILTS = (0.3, 0.6, 0.9)
+"""Angles between mirror planes and the image [rad] (ours)."""
+TURNS = 8
+"""Directions of the tilt, and axes of half turns in the image (ours)."""
+VISIBLE_WEIGHT = 3.0
+"""Weight of points that the camera should have seen (ours)."""
+GAP_WEIGHT = 1.0
+"""Weight of gaps at the rim (ours)."""
+CUT_KINK_WEIGHT = 0.5
+"""Weight of kinks at the rim of a cloud cut by a plane (ours)."""
+IMAGE_KINK_WEIGHT = 0.1
+"""Weight of kinks at the rim of a depth image, where normals are less certain (ours)."""
+LEANING = 0.1
+"""Cost of a symmetry that does not keep the vertical (ours)."""
+STRAIGHT_DOWN = 0.999
+"""Cosine between view and vertical above which a camera counts as looking straight down (ours)."""
+SAME_GUESS = 0.05
+"""Guesses with a smaller mean distance count as one [widths] (ours)."""
 WORST = 0.5
-"""Distances beyond this count no more, in widths."""
+"""Larger distances cost no more than this one [widths] (ours)."""
 TOLERANCE = 0.003
-"""Deviation from what was seen that is taken for noise [m]."""
-LAST, CUT = 0.02, 0.12
-"""Shares of points that may lie behind where the seen side ends, and that are its rim when no camera is known."""
-RIM, LOPSIDED, FEWEST = 0.12, 0.35, 8
-"""With a camera, rim points are those whose neighbours, within so many widths, lie so far aside; and the fewest of them."""
-ROUND = 0.35
-"""Cosine between the normal and the ray below which a surface at the rim is taken to turn away, not to end at an edge."""
+"""Deviation from the visible side that counts as noise [m] (ours)."""
+STRAY = 0.02
+"""Share of points that may lie below the end of the visible side, and above its top (ours)."""
+CUT_RIM = 0.12
+"""Share of the lowest points that form the rim if there is no camera (ours)."""
+RIM_RADIUS = 0.12
+"""With a camera: radius of the neighbourhood that tells rim points [widths] (ours)."""
+LOPSIDED = 0.35
+"""A rim point is this far from the middle of its neighbours, in units of RIM_RADIUS (ours)."""
+FEWEST_RIM = 8
+"""Fewest rim points (ours)."""
+TURNS_AWAY = 0.35
+"""Cosine between normal and ray below which the surface at the rim turns away; above, it ends at an edge (ours)."""
 
 
 def _lean(linear: Float[np.ndarray, "3 3"], up: Float[np.ndarray, "3"] | None) -> float:
@@ -47,78 +70,88 @@ def _lean(linear: Float[np.ndarray, "3 3"], up: Float[np.ndarray, "3"] | None) -
 
 
 def nearest_points(points: Float[np.ndarray, "n d"]) -> KDTree:
-    """A tree that finds the nearest of some points; SciPy is loaded when needed."""
+    """A search tree for nearest points; SciPy is loaded when needed."""
     from scipy.spatial import KDTree
 
     return KDTree(points)
 
 
-def projected(points: Float[np.ndarray, "n 3"], away: float | None) -> Float[np.ndarray, "n 2"]:
-    """Where points are in the image of a camera so far along z, in metres at the height 0."""
-    return points[:, :2] if away is None else points[:, :2] / (1 - points[:, 2:] / away)
+def project(points: Float[np.ndarray, "n 3"], camera_distance: float | None) -> Float[np.ndarray, "n 2"]:
+    """Image coordinates for a camera on the z axis, in metres at height 0; parallel rays without a camera."""
+    return points[:, :2] if camera_distance is None else points[:, :2] / (1 - points[:, 2:] / camera_distance)
 
 
 @dataclass(frozen=True)
 class Guess:
-    """A side that was seen together with what a symmetry adds, in the axes of the seen side."""
+    """The visible side together with its image under a symmetry, in view axes."""
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
     cost: float
-    """How little it agrees with what was seen; 0 is best."""
+    """Disagreement with the visible side; 0 is best."""
 
 
 @dataclass(frozen=True)
-class SeenSide:
-    """What was seen, in axes with z to the camera."""
+class VisibleSide:
+    """The visible side of an object in view axes: z points to the camera."""
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
-    away: float | None
-    """Distance of the camera along z, where one is known [m]."""
+    camera_distance: float | None
+    """Distance of the camera along z, if there is one [m]."""
     sample: Int[np.ndarray, " sample"]
-    """Indices of the points that symmetries are judged by."""
+    """Indices of the points that judge symmetries."""
     rim: Int[np.ndarray, " rim"]
-    """Indices of those where the seen side ends."""
-    expected: Float[np.ndarray, " rim"]
-    """Gap that is to be left at each rim point [m]: the thickness of what is seen face on."""
-    smooth: Float[np.ndarray, " rim"]
-    """Weight of kinks there: how sure it is that the surface goes on without an edge."""
+    """Indices of the points where the visible side ends."""
+    expected_gap: Float[np.ndarray, " rim"]
+    """Expected gap between both sides at each rim point [m]: the hidden thickness there."""
+    smoothness: Float[np.ndarray, " rim"]
+    """Weight of a kink at each rim point: confidence that the surface continues without an edge."""
     width: float
+    """Smallest extent in the image [m]."""
     end: float
-    """Height below which nothing was seen [m]."""
+    """Height below which nothing is visible [m]."""
     top: float
-    """Height above which nothing was seen [m]."""
+    """Height above which nothing is visible [m]."""
 
     @classmethod
-    def of(cls, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], away: float | None) -> SeenSide:
-        """Find the rim, and how the surface goes on there."""
-        image, height = projected(points, away), points[:, 2]
+    def of(
+        cls, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], camera_distance: float | None
+    ) -> VisibleSide:
+        """Find the rim, and predict how the surface continues there.
+
+        In an image, a point belongs to the rim if its neighbours lie to one side of it. A cloud cut by a plane has its rim
+        along the cut, at its lowest points.
+        """
+        image, height = project(points, camera_distance), points[:, 2]
         angles = np.linspace(0, np.pi, 16, endpoint=False)
         width = float(np.ptp(image @ np.stack([np.cos(angles), np.sin(angles)]), axis=0).min())
-        end, top = np.quantile(height, (LAST, 1 - LAST))
+        end, top = np.quantile(height, (STRAY, 1 - STRAY))
         shuffled = np.random.default_rng(0).permutation(len(points))
-        if away is None:
-            rim = shuffled[height[shuffled] <= np.quantile(height, CUT)][:SAMPLE]
+        if camera_distance is None:
+            rim = shuffled[height[shuffled] <= np.quantile(height, CUT_RIM)][:SAMPLE]
             rays, flat = np.array([[0.0, 0.0, 1.0]]), 0.0
         else:
-            some = shuffled[:MOST]
-            near = nearest_points(image).query_ball_point(image[some], RIM * width)
+            some = shuffled[:RIM_SAMPLE]
+            near = nearest_points(image).query_ball_point(image[some], RIM_RADIUS * width)
             aside = np.array([np.linalg.norm(image[i].mean(0) - image[k]) for i, k in zip(near, some, strict=True)])
-            rim = some[aside >= min(LOPSIDED * RIM * width, np.sort(aside)[-min(FEWEST, len(aside))])]
-            rays, flat = np.array([0.0, 0.0, away]) - points[rim], max(0.0, width - float(top - end))
+            rim = some[aside >= min(LOPSIDED * RIM_RADIUS * width, np.sort(aside)[-min(FEWEST_RIM, len(aside))])]
+            rays, flat = np.array([0.0, 0.0, camera_distance]) - points[rim], max(0.0, width - float(top - end))
         facing = np.clip((normals[rim] * rays).sum(1) / np.linalg.norm(rays, axis=1), 0, 1)
-        # A surface that turns away goes on as a circle; one that faces the camera ends at an edge.
-        expected = facing * np.where(facing < ROUND, width, flat)
-        smooth = KINK * (1 - facing) if away is None else SEEN_KINK * np.clip(1 - facing / ROUND, 0, 1)
-        return cls(points, normals, away, shuffled[:SAMPLE], rim, expected, smooth, width, float(end), float(top))
+        # A surface that turns away continues as a circle: where the ray meets a circle of diameter w with the cosine f to
+        # its normal, the chord is f w. One that faces the camera ends at an edge: it is taken to be as thick as wide, less
+        # the depth that is visible.
+        expected = facing * np.where(facing < TURNS_AWAY, width, flat)
+        in_image = IMAGE_KINK_WEIGHT * np.clip(1 - facing / TURNS_AWAY, 0, 1)
+        smooth = CUT_KINK_WEIGHT * (1 - facing) if camera_distance is None else in_image
+        return cls(points, normals, camera_distance, shuffled[:SAMPLE], rim, expected, smooth, width, float(end), float(top))
 
     def guesses(self, up: Float[np.ndarray, "3"] | None, count: int) -> list[Guess]:
-        """Both sides by the likeliest symmetries that differ, best first; the last is repeated where there are too few.
+        """Both sides by the best symmetries that differ, best first; the last one repeats if there are too few.
 
         Args:
-            up: Unit vector along which the object stands, if it does: what stands is rather turned or mirrored upright.
-            count: How many.
+            up: Up direction in view axes, if known; symmetries that preserve it are preferred.
+            count: Number of guesses.
         """
         motions = self.symmetries(up)
         costs = np.array([self.cost(*motion) + _lean(motion[0], up) for motion in motions])
@@ -127,7 +160,7 @@ class SeenSide:
         for k in costs.argsort():
             linear, centre = motions[k]
             some = (self.points[self.sample] - centre) @ linear.T + centre
-            if any(tree.query(some)[0].mean() < APART * self.width for tree in sampled):
+            if any(tree.query(some)[0].mean() < SAME_GUESS * self.width for tree in sampled):
                 continue
             sampled.append(nearest_points(some))
             behind = (self.points - centre) @ linear.T + centre
@@ -138,11 +171,12 @@ class SeenSide:
         return found + found[-1:] * (count - len(found))
 
     def symmetries(self, up: Float[np.ndarray, "3"] | None) -> list[tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]]:
-        """Linear parts and fixed points of the motions that are tried."""
+        """Linear parts M and fixed points c of the candidate motions."""
         across = self.points[:, :2]
         axes = np.linalg.eigh(np.cov(across.T))[1]
-        if up is not None and abs(up[2]) < FLAT:
-            # What stands has its middle along the horizon; of what lies anyhow, the principal axes are the best guess.
+        if up is not None and abs(up[2]) < STRAIGHT_DOWN:
+            # An object that stands is symmetric about its middle along the horizon. Without a vertical, the principal axes
+            # of the image are the best guess.
             axes = np.array([[up[1], up[0]], [-up[0], up[1]]]) / np.hypot(up[0], up[1])
         along = across @ axes
         middle = axes @ (along.max(0) + along.min(0)) / 2
@@ -151,9 +185,9 @@ class SeenSide:
         mirrors = [np.array([0.0, 0.0, 1.0])] + [
             np.array([np.sin(tilt) * np.cos(a), np.sin(tilt) * np.sin(a), np.cos(tilt)]) for tilt in TILTS for a in turns]
         if up is not None:
-            # Of what is upright, the half turn and the mirrors that the image's axes do not offer.
+            # The half turn about the vertical, and mirrors in vertical planes, are not among the motions in image axes.
             half_turns.append(up)
-            ahead = np.array([0.0, 0.0, 1.0]) - up[2] * up if abs(up[2]) < FLAT else np.cross(up, [1.0, 0.0, 0.0])
+            ahead = np.array([0.0, 0.0, 1.0]) - up[2] * up if abs(up[2]) < STRAIGHT_DOWN else np.cross(up, [1.0, 0.0, 0.0])
             ahead /= np.linalg.norm(ahead)
             mirrors += [np.cos(a) * ahead + np.sin(a) * np.cross(up, ahead) for t in (0.0, *TILTS) for a in {t, -t}]
         linear = [-np.eye(3), *(2 * np.outer(a, a) - np.eye(3) for a in half_turns),
@@ -162,32 +196,38 @@ class SeenSide:
         return [(M, np.array([*middle, start - depth * self.width])) for depth in DEPTHS for M in linear]
 
     def cost(self, linear: Float[np.ndarray, "3 3"], centre: Float[np.ndarray, "3"]) -> float:
-        """How little a symmetry agrees with what was seen; 0 is best."""
-        wrong = self._shown((self.points[self.sample] - centre) @ linear.T + centre)
-        # Every motion that is tried is its own inverse: what it takes to the rim is where it takes the rim.
-        taken = (self.points[self.rim] - centre) @ linear.T + centre
-        gap, nearest = self.space.query(taken)
-        # Before the seen side instead of behind it, the object would be thinner than nothing.
-        gap = gap * np.where(taken[:, 2] > self.points[nearest, 2], -1.0, 1.0)
+        """Disagreement of a symmetry with the visible side; 0 is best.
+
+        The sum of three means: the distance of moved points from where they would be hidden, the deviation of the gap at
+        the rim from the expected one, and the kink 1 - n_moved . n_rim between the normals that meet there.
+        """
+        wrong = self._exposure((self.points[self.sample] - centre) @ linear.T + centre)
+        # The guess is the image of the visible side. As the motion is its own inverse, the distance of a rim point from the
+        # guess equals the distance of the moved rim point from the visible side, so one search tree serves all motions.
+        moved = (self.points[self.rim] - centre) @ linear.T + centre
+        gap, nearest = self.tree.query(moved)
+        # In front of the visible side the thickness would be negative.
+        gap = gap * np.where(moved[:, 2] > self.points[nearest, 2], -1.0, 1.0)
         kink = 1 - (self.normals[nearest] @ linear.T * self.normals[self.rim]).sum(1)
         most = WORST * self.width
-        far = VISIBLE * np.minimum(wrong, most).mean() + GAP * np.minimum(np.abs(gap - self.expected), most).mean()
-        return float(far / self.width + (kink * self.smooth).mean())
+        misfit = np.minimum(np.abs(gap - self.expected_gap), most)
+        far = VISIBLE_WEIGHT * np.minimum(wrong, most).mean() + GAP_WEIGHT * misfit.mean()
+        return float(far / self.width + (kink * self.smoothness).mean())
 
     @cached_property
-    def space(self) -> KDTree:
-        """For seen points that are nearest."""
+    def tree(self) -> KDTree:
+        """Search tree of the visible points."""
         return nearest_points(self.points)
 
     @cached_property
-    def image(self) -> KDTree:
-        """For seen points that are nearest in the image."""
-        return nearest_points(projected(self.points, self.away))
+    def image_tree(self) -> KDTree:
+        """Search tree of the visible points in the image."""
+        return nearest_points(project(self.points, self.camera_distance))
 
-    def _shown(self, moved: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
-        """How far points lie from where they would have been hidden [m]."""
-        if self.away is None:
-            return np.where(moved[:, 2] > self.end, self.space.query(moved)[0], 0.0)
-        aside, nearest = self.image.query(projected(moved, self.away))
+    def _exposure(self, moved: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
+        """Distance of points from where they would be hidden from the camera [m]: inside the image, behind the surface."""
+        if self.camera_distance is None:
+            return np.where(moved[:, 2] > self.end, self.tree.query(moved)[0], 0.0)
+        aside, nearest = self.image_tree.query(project(moved, self.camera_distance))
         before = moved[:, 2] - self.points[nearest, 2]
         return np.hypot(np.maximum(0, aside - TOLERANCE), np.maximum(0, before - TOLERANCE))

@@ -8,7 +8,7 @@ import trimesh
 from dro_grasp.errors import OptionError
 from dro_grasp.objects.loading import cloud_object, mesh_object
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.perception.camera import DepthCamera, visible_points
+from dro_grasp.perception.depth_camera import DepthCamera, visible_points
 
 CLEAR = DepthCamera(noise=0.0)
 
@@ -94,7 +94,7 @@ def test_direction_without_length_is_refused(direction: tuple[float, float, floa
 
 
 def test_impossible_cameras_are_refused():
-    with pytest.raises(OptionError, match="stands within the object"):
+    with pytest.raises(OptionError, match="is inside the object"):
         visible_points(ball(), torch.tensor([0.0, 0, 1]), seeded(), DepthCamera(distance=0.05))
     for wrong in ({"distance": 0.0}, {"pixel": -1.0}, {"noise": -0.1}, {"lost": 1.0}):
         with pytest.raises(OptionError, match="cannot see"):
