@@ -9,7 +9,7 @@ import roma
 import torch
 
 from dro_grasp import distance_matrix
-from dro_grasp.geometry.point_clouds import partial_view
+from dro_grasp.geometry.point_clouds import random_half
 from dro_grasp.hands.hand import Hand
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.toy_hand import toy_hand
@@ -38,7 +38,7 @@ def clouds() -> dict[str, torch.Tensor]:
     dense = ellipsoid(1024)
     return {
         "full": ellipsoid(512),
-        "partial": dense[partial_view(dense, 512, torch.Generator().manual_seed(2))],
+        "partial": dense[random_half(dense, 512, torch.Generator().manual_seed(2))],
         "plane": ellipsoid(512) * torch.tensor([1.0, 1.0, 0.0]),
     }
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-FORBIDDEN = ("mujoco", "trimesh", "viser", "igl", "coacd", "fpsample", "matplotlib", "PIL", "rich", "tyro")
+FORBIDDEN = ("mujoco", "trimesh", "viser", "igl", "coacd", "matplotlib", "PIL", "rich", "tyro")
 
 
 def test_imports_point_downwards_only() -> None:

@@ -1,23 +1,28 @@
 from __future__ import annotations
 
-import fpsample
 import numpy as np
 import pytest
 import torch
 
-from dro_grasp.geometry.point_clouds import farthest_points, partial_view, sample_surface
+from dro_grasp.geometry.point_clouds import farthest_points, random_half, sample_surface
 
 
 def seeded(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def test_farthest_points_agree_with_fpsample():
+def test_each_next_point_is_farthest_from_all_before_it():
     points = torch.randn(3, 400, 3, generator=seeded())
     chosen = farthest_points(points, 40)
-    for cloud, own in zip(points, chosen, strict=True):
-        oracle = fpsample.fps_sampling(cloud.numpy(), 40, start_idx=0)
-        np.testing.assert_array_equal(own, oracle.astype(np.int64))
+    for cloud, own in zip(points.double(), chosen, strict=True):
+        apart = torch.cdist(cloud, cloud[own])
+        for i in range(1, 40):
+            assert int(apart[:, :i].amin(1).argmax()) == own[i]
+
+
+def test_equally_far_points_are_chosen_in_their_order():
+    points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0]])
+    assert farthest_points(points, 4).tolist() == [0, 1, 2, 3]
 
 
 def test_farthest_points_start_and_shape():
@@ -60,9 +65,9 @@ def test_a_mesh_without_area_is_refused(faces):
         sample_surface(torch.eye(3), faces, 10, seeded())
 
 
-def test_a_partial_view_is_a_half_space_of_its_draw():
+def test_a_random_half_is_a_half_space_of_its_draw():
     points = torch.randn(400, 3, generator=seeded())
-    kept = partial_view(points, 200, seeded(3))
+    kept = random_half(points, 200, seeded(3))
     assert len(kept.unique()) == 200
     rest = torch.tensor(sorted(set(range(400)) - set(kept.tolist())))
     normal = points[kept].mean(0) - points[rest].mean(0)
@@ -73,6 +78,6 @@ def test_a_partial_view_is_a_half_space_of_its_draw():
     assert normal @ direction > 0
 
 
-def test_a_small_cloud_has_no_partial_view():
-    with pytest.raises(ValueError, match="needs a cloud of 20, got 19"):
-        partial_view(torch.randn(19, 3), 10, seeded())
+def test_a_small_cloud_has_no_random_half():
+    with pytest.raises(ValueError, match="needs a cloud of 20 points, got 19"):
+        random_half(torch.randn(19, 3), 10, seeded())

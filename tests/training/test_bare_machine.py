@@ -9,7 +9,7 @@ from pathlib import Path
 from tests.helpers.tiny_bundle import tiny_bundle
 
 BLOCKED = (
-    "PIL", "coacd", "defusedxml", "fast_simplification", "fpsample", "igl", "matplotlib", "mujoco", "pandas", "rich",
+    "PIL", "coacd", "defusedxml", "fast_simplification", "igl", "matplotlib", "mujoco", "pandas", "rich",
     "scipy", "tensorboard", "trimesh", "tyro", "viser",
 )
 SCRIPT = f'''

@@ -16,7 +16,7 @@ def sample_surface(
     """Points uniform on a triangle mesh.
 
     Returns:
-        Points [m], unit normals (counter-clockwise faces look outward), and the face of each point.
+        Points [m], unit normals (outward for counter-clockwise faces), and the face of each point.
 
     Raises:
         ValueError: The mesh has no area.
@@ -39,15 +39,15 @@ def sample_surface(
 def farthest_points(
     points: Float[Tensor, "*batch n 3"], count: int, start: int = 0
 ) -> Int[Tensor, "*batch count"]:
-    """Farthest point sampling: each next point is the one farthest from all before it.
+    """Farthest point sampling: each next point is the one farthest from all before it; the first of several wins.
 
     Args:
-        points: Clouds to choose from.
-        count: How many to choose, at most n.
-        start: Index of the first one.
+        points: Clouds to choose from [m].
+        count: Number of points to choose, at most n.
+        start: Index of the first point.
 
     Raises:
-        ValueError: More points are asked for than there are.
+        ValueError: `count` exceeds the number of points.
     """
     n = points.shape[-2]
     if count > n:
@@ -64,24 +64,24 @@ def farthest_points(
     return chosen.reshape(*points.shape[:-2], count)
 
 
-def partial_view(
+def random_half(
     points: Float[Tensor, "n 3"], count: int, generator: torch.Generator
 ) -> Int[Tensor, " count"]:
-    """Indices of the points that stay when the far half-space of a random direction is cut away.
+    """Indices of random points in the half of a cloud that lies along a random direction.
 
-    Source: appendix, partial object point cloud sampling: twice as many points as wanted are drawn, and the
-    half with the smaller product of position and a random direction is removed.
+    Source: appendix, partial object point cloud sampling: draw twice as many points as wanted, and remove the half with
+    the smaller product of position and direction.
 
     Raises:
         ValueError: The cloud has fewer than 2 * count points.
     """
     if len(points) < 2 * count:
-        raise ValueError(f"a partial view of {count} points needs a cloud of {2 * count}, got {len(points)}")
+        raise ValueError(f"a random half of {count} points needs a cloud of {2 * count} points, got {len(points)}")
     drawn = torch.randperm(len(points), generator=generator)[: 2 * count]
     return drawn[nearer_half(points[drawn], torch.randn(3, generator=generator).to(points))]
 
 
 def nearer_half(points: Float[Tensor, "*b n 3"], direction: Float[Tensor, "*b 3"]) -> Int[Tensor, "*b half"]:
-    """Indices of the half of the points that is farthest along a direction, in the order of the points."""
+    """Indices of the half of the points farthest along a direction, in ascending order."""
     along = (points @ direction[..., None])[..., 0]
     return along.topk(points.shape[-2] // 2, dim=-1).indices.sort(dim=-1).values

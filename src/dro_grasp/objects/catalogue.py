@@ -23,10 +23,11 @@ if TYPE_CHECKING:
     import trimesh
 
 ASSET_PREFIX = "assets/"
+"""Prefix of a name that forces the asset."""
 GROUP = re.compile(r"(builtin|assets):(\w+)")
-"""A group of objects: where they come from, and their split."""
+"""A group of objects: their source and split."""
 MESH_SUFFIXES = {".obj", ".stl", ".ply", ".glb", ".gltf", ".off", ".dae", ".npy", ".pcd", ".3mf"}
-"""Files that count as objects in a folder."""
+"""Suffixes of the files in a folder that count as objects."""
 
 
 def load_object(name: str | Path, *, scale: float = 1.0) -> ObjectModel:
@@ -37,7 +38,7 @@ def load_object(name: str | Path, *, scale: float = 1.0) -> ObjectModel:
         scale: Multiplies all coordinates.
 
     Raises:
-        ObjectError: No such object, it cannot be used, or `scale` is not positive.
+        ObjectError: The object does not exist, it is unusable, or `scale` is not positive.
     """
     if not (math.isfinite(scale) and scale > 0):
         raise ObjectError(f"scale is {scale}; give a positive number, for example --scale 0.001 for millimetres")

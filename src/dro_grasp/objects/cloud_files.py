@@ -5,20 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from dro_grasp.errors import ObjectError
 
 CLOUD_SUFFIXES = {".npy", ".pcd"}
 """Files that hold a bare cloud."""
 PCD_KINDS = {"F": "f", "I": "i", "U": "u"}
-"""PCD's letters for number types, and numpy's."""
+"""NumPy's letters for the number types of PCD."""
 
 
-def read_cloud(path: Path) -> np.ndarray:
-    """Points of an NPY or PCD file as float64: (n 3), or (n 6) with normals.
+def read_cloud(path: Path) -> Float[np.ndarray, "..."]:
+    """Points of an NPY or PCD file: (n 3), or (n 6) with normals; an NPY file may hold any shape.
 
     Raises:
-        ObjectError: The file is damaged, cut short, or of a kind that is not read.
+        ObjectError: The file is damaged, truncated or of an unsupported kind.
     """
     try:
         return _read_npy(path) if path.suffix.lower() == ".npy" else _read_pcd(path)
@@ -26,14 +27,15 @@ def read_cloud(path: Path) -> np.ndarray:
         raise ObjectError(f"{path} cannot be read: {error.strerror or error}") from error
 
 
-def _read_npy(path: Path) -> np.ndarray:
+def _read_npy(path: Path) -> Float[np.ndarray, "..."]:
     try:
         return np.asarray(np.load(path, allow_pickle=False), np.float64)
     except (ValueError, TypeError, EOFError) as error:
         raise ObjectError(f"{path} is no plain NPY array ({error}); save it with numpy.save as floats") from error
 
 
-def _read_pcd(path: Path) -> np.ndarray:
+def _read_pcd(path: Path) -> Float[np.ndarray, "n columns"]:
+    """Points, and normals if there are any. A field may take several columns (COUNT)."""
     raw = path.read_bytes()
     header, start = _pcd_header(raw, path)
     try:
@@ -56,12 +58,12 @@ def _read_pcd(path: Path) -> np.ndarray:
     except (KeyError, ValueError, IndexError, TypeError) as error:
         raise ObjectError(f"{path} is a damaged PCD file ({error}); expected x y z and all its points") from error
     if len(table) != count:
-        raise ObjectError(f"{path} is cut short: its header promises {count} points, it holds {len(table)}")
+        raise ObjectError(f"{path} is truncated: its header promises {count} points, it holds {len(table)}")
     return table
 
 
 def _pcd_header(raw: bytes, path: Path) -> tuple[dict[str, list[str]], int]:
-    """Header entries, and where the data begin."""
+    """Header entries, and the offset of the data."""
     header: dict[str, list[str]] = {}
     position = 0
     while "DATA" not in header:

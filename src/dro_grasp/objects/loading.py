@@ -1,4 +1,4 @@
-"""From a file to an ObjectModel: reading, checks, safe repairs, all of it reported."""
+"""From a file to an ObjectModel: reading, checks and safe repairs, each reported in a note."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float, Int, Num
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.objects.cache import content_hash
@@ -18,22 +19,24 @@ from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
 if TYPE_CHECKING:
     import trimesh
 
-LARGEST, SMALLEST = 1.0, 0.005
-"""Extents between which an object is believed to be in metres [m]."""
+LARGEST = 1.0
+"""Largest extent of an object that counts as metres [m] (ours)."""
+SMALLEST = 0.005
+"""Smallest such extent [m] (ours)."""
 USUAL = 0.03
-"""A suggested scale gives a size between this and ten times this [m]."""
+"""A suggested scale gives an extent between this and ten times this [m] (ours)."""
 MIN_CLOUD = 16
-"""Fewest distinct points of a bare cloud."""
+"""Fewest distinct points of a bare cloud (ours)."""
 NEIGHBOURS = 16
-"""Neighbours for the normals of a bare cloud."""
+"""Neighbours that estimate the normals of a bare cloud (ours)."""
 
 
 def load_file(path: Path, *, scale: float = 1.0) -> ObjectModel:
     """Read a mesh in any format trimesh knows, or a point cloud (PLY without faces, NPY, PCD).
 
     Args:
-        path: The file. A unit that it states (glTF, 3MF, DAE) is honoured.
-        scale: Multiplies all coordinates; 0.001 for files in millimetres that do not say so.
+        path: The file. A unit stated in it (glTF, 3MF, DAE) is honoured.
+        scale: Multiplies all coordinates; 0.001 for files in millimetres that state no unit.
 
     Raises:
         ObjectError: The file cannot be used; the message says why and what to do.
@@ -51,15 +54,15 @@ def load_file(path: Path, *, scale: float = 1.0) -> ObjectModel:
     return mesh_object(path.stem, geometry, origin=str(path), scale=scale)
 
 
-def read_points(path: Path) -> np.ndarray:
-    """Points (n 3) of a cloud file as float64 [its unit, metres where it states one], as they are: NaN and strays as well.
+def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
+    """Points of a cloud file, NaN and outliers included [the file's unit; metres if it states one].
 
     Raises:
         ObjectError: There is no such file, it is damaged, or it holds a mesh.
     """
     if not path.is_file():
-        raise ObjectError(f"no file at {path}; with --camera give a cloud (PLY, NPY, PCD). What has a name is a mesh, which no "
-                          "camera has seen")
+        raise ObjectError(f"no file at {path}; with --camera give a cloud file (PLY, NPY, PCD), because named objects "
+                          "are meshes, not camera clouds")
     if path.suffix.lower() in CLOUD_SUFFIXES:
         points = read_cloud(path)
         if points.ndim != 2 or points.shape[1] < 3:
@@ -67,15 +70,15 @@ def read_points(path: Path) -> np.ndarray:
         return points[:, :3]
     geometry, unit = read_geometry(path)
     if not isinstance(geometry, np.ndarray):
-        raise ObjectError(f"{path} is a mesh, which no camera has seen; leave out --camera, or give a cloud (PLY, NPY, PCD)")
+        raise ObjectError(f"{path} is a mesh, not a camera cloud; leave out --camera, or give a cloud (PLY, NPY, PCD)")
     return geometry * unit
 
 
-def read_geometry(path: Path) -> tuple[trimesh.Trimesh | np.ndarray, float]:
-    """One mesh, scenes merged, or the points (n 3) of a file without faces; and its stated unit [m].
+def read_geometry(path: Path) -> tuple[trimesh.Trimesh | Float[np.ndarray, "n 3"], float]:
+    """One mesh, scenes merged, or the points of a file without faces; and the file's unit [m], 1 if it states none.
 
     Raises:
-        ObjectError: No reader can make a mesh or cloud of it.
+        ObjectError: No reader finds a mesh or cloud in the file.
     """
     import trimesh
 
@@ -83,7 +86,7 @@ def read_geometry(path: Path) -> tuple[trimesh.Trimesh | np.ndarray, float]:
         loaded = trimesh.load(path, process=False)
         unit = trimesh.units.unit_conversion(loaded.units, "meters") if loaded.units else 1.0
         geometry = _merge(loaded) if isinstance(loaded, trimesh.Scene) else loaded
-    except Exception as error:  # every reader behind trimesh has errors of its own
+    except Exception as error:  # each reader behind trimesh raises its own errors
         raise ObjectError(f"{path} cannot be read as a mesh or cloud: {error}. Expected a format that trimesh reads "
                           "(STL, OBJ, PLY, GLB, OFF, ...), NPY or PCD") from error
     if isinstance(geometry, trimesh.PointCloud):
@@ -95,7 +98,7 @@ def read_geometry(path: Path) -> tuple[trimesh.Trimesh | np.ndarray, float]:
 
 
 def _merge(scene: trimesh.Scene) -> trimesh.Trimesh | trimesh.PointCloud:
-    """All meshes of a scene where they stand in it, or its point clouds where it has no mesh."""
+    """All meshes of a scene in its frame, or its point clouds if it has no mesh."""
     import trimesh
 
     mesh = scene.to_mesh()
@@ -112,13 +115,13 @@ def mesh_object(
     Args:
         name: Name of the object.
         mesh: Its mesh, in metres after scaling.
-        origin: Where the mesh comes from, for messages.
-        scale: Multiplies all coordinates, those of the parts too.
-        split: `train`, `validate`, `test`, or None for an object of the user's.
-        parts: Convex parts where they are known.
+        origin: Source of the mesh, for messages.
+        scale: Multiplies all coordinates, including those of the parts.
+        split: `train`, `validate`, `test`, or None for a user's object.
+        parts: Convex parts, if known.
 
     Raises:
-        ObjectError: NaN vertices, no faces, no volume, or a size that is no object's in metres.
+        ObjectError: NaN vertices, no faces, no volume, or an implausible size in metres.
     """
     import trimesh
 
@@ -129,7 +132,7 @@ def mesh_object(
     _check_size(np.ptp(vertices[used], axis=0), origin, scale)
     merged = trimesh.Trimesh(vertices, faces, process=True)
     duplicated = int(used.sum()) - len(merged.vertices)
-    soup = used.sum() == 3 * len(faces)  # as in every STL file, where it says nothing about the mesh
+    soup = used.sum() == 3 * len(faces)  # every STL file repeats its vertices: not worth a note
     if duplicated and not soup:
         notes.append(f"merged {duplicated} duplicated vertices")
     clean = repair(merged, notes)
@@ -145,11 +148,11 @@ def mesh_object(
     )
 
 
-def cloud_object(name: str, points: np.ndarray, *, origin: str, scale: float = 1.0) -> ObjectModel:
-    """A bare point cloud (n 3) or cloud with normals (n 6); only the points are scaled.
+def cloud_object(name: str, points: Num[np.ndarray, "..."], *, origin: str, scale: float = 1.0) -> ObjectModel:
+    """An object from a bare point cloud (n 3), or a cloud with normals (n 6); only the points are scaled.
 
     Raises:
-        ObjectError: NaN, too few distinct points, or a size that is no object's in metres.
+        ObjectError: Another shape, NaN, too few distinct points, or an implausible size in metres.
     """
     if points.ndim != 2 or points.shape[1] not in (3, 6):
         raise ObjectError(f"{origin} holds an array of shape {points.shape}; expected (n, 3) points or (n, 6) points "
@@ -179,8 +182,10 @@ def cloud_object(name: str, points: np.ndarray, *, origin: str, scale: float = 1
     )
 
 
-def estimate_normals(points: np.ndarray, camera: np.ndarray | None = None) -> np.ndarray:
-    """Unit normals of a cloud (n 3) by local principal axes, turned to the camera (3), or away from the cloud's middle."""
+def estimate_normals(
+    points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None = None
+) -> Float[np.ndarray, "n 3"]:
+    """Unit normals of a cloud by local principal axes, turned to the camera, or away from the cloud's mean without one."""
     from scipy.spatial import KDTree
 
     neighbours = KDTree(points).query(points, k=min(NEIGHBOURS, len(points)))[1]
@@ -191,7 +196,8 @@ def estimate_normals(points: np.ndarray, camera: np.ndarray | None = None) -> np
     return np.where(outward[:, None], normals, -normals).astype(np.float32)
 
 
-def _check_numbers(vertices: np.ndarray, faces: np.ndarray, origin: str) -> None:
+def _check_numbers(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "..."], origin: str) -> None:
+    """Refuse meshes without faces, with wrong indices or with NaN."""
     if len(faces) == 0:
         raise ObjectError(f"{origin} has {len(vertices)} vertices and no faces; give a triangle mesh, or a point cloud "
                           "as PLY, NPY or PCD")
@@ -203,8 +209,8 @@ def _check_numbers(vertices: np.ndarray, faces: np.ndarray, origin: str) -> None
         raise ObjectError(f"{origin} has {bad} vertices with NaN or infinite coordinates; repair the mesh first")
 
 
-def _check_size(extents: np.ndarray, origin: str, scale: float) -> None:
-    """Refuse what is no object in metres: most files do not say their unit, and a wrong guess would grasp air."""
+def _check_size(extents: Float[np.ndarray, "3"], origin: str, scale: float) -> None:
+    """Refuse sizes that are implausible in metres: most files state no unit, and a wrong guess would grasp air."""
     largest = float(extents.max())
     if SMALLEST <= largest <= LARGEST:
         return

@@ -7,22 +7,24 @@ from itertools import pairwise
 
 import numpy as np
 import trimesh
+from jaxtyping import Float
 
 SEGMENTS = 24
-"""Corners of round cross-sections."""
+"""Corners of round cross-sections (ours)."""
 TUBE_CORNERS = 10
-"""Corners of the tube of a ring."""
+"""Corners of the tube of a ring (ours)."""
 SAME_POINT = 1e-6
-"""Points nearer than this may be one [m]."""
+"""Points closer than this are merged [m] (ours)."""
 
 Point = tuple[float, float, float]
+"""Coordinates [m]."""
 
 
 @dataclass(frozen=True)
 class Solid:
-    """A solid that is not convex, beside the convex parts that fill it.
+    """A solid that is not convex, and the convex parts that fill it.
 
-    The surface is written down, not united from the parts: parts that only touch leave cracks in their union.
+    The surface is made directly, not as a union: parts that only touch leave cracks in their union.
     """
 
     mesh: trimesh.Trimesh
@@ -33,12 +35,12 @@ class Solid:
         return Solid(_at(self.mesh, by), [_at(part, by) for part in self.parts])
 
 
-def hull(points: np.ndarray) -> trimesh.Trimesh:
-    """Convex hull of points (n 3) [m]."""
+def hull(points: Float[np.ndarray, "n 3"]) -> trimesh.Trimesh:
+    """Convex hull of points [m]."""
     mesh = trimesh.convex.convex_hull(points)
     if mesh.is_watertight and mesh.is_convex:
         return mesh
-    # Points that nearly coincide, as at the pole of a superquadric, leave slivers.
+    # Points that nearly coincide, for example at the pole of a superquadric, leave slivers.
     first = np.unique(np.round(points / SAME_POINT), axis=0, return_index=True)[1]
     return trimesh.convex.convex_hull(points[first])
 
@@ -68,7 +70,7 @@ def superquadric(size: Point, exponents: tuple[float, float], at: Point = (0, 0,
     An exponent of 1 makes an ellipsoid, near 0 a box, 2 an octahedron.
     """
 
-    def power(values: np.ndarray, exponent: float) -> np.ndarray:
+    def power(values: Float[np.ndarray, "..."], exponent: float) -> Float[np.ndarray, "..."]:
         return np.sign(values) * np.abs(values) ** exponent
 
     latitude, longitude = np.meshgrid(np.linspace(-np.pi / 2, np.pi / 2, 17), np.linspace(-np.pi, np.pi, 33)[:-1])
@@ -143,7 +145,7 @@ def _revolved(outline: list[tuple[float, float]], corners: int) -> trimesh.Trime
                     + _fan(corners * (len(middle) - 1), corners, corners * len(middle) + 1))
 
 
-def _swept(loops: list[np.ndarray], closed: bool) -> trimesh.Trimesh:
+def _swept(loops: list[Float[np.ndarray, "corners 3"]], closed: bool) -> trimesh.Trimesh:
     """Surface through loops of equally many points, closed upon itself or capped at both ends."""
     count, corners = len(loops), len(loops[0])
     faces = _bands(count, corners, closed)
@@ -170,18 +172,20 @@ def _fan(first: int, corners: int, centre: int) -> list[tuple[int, int, int]]:
     return [(first + j, first + (j + 1) % corners, centre) for j in range(corners)]
 
 
-def _outward(points: np.ndarray, faces: list[tuple[int, int, int]]) -> trimesh.Trimesh:
+def _outward(points: Float[np.ndarray, "n 3"], faces: list[tuple[int, int, int]]) -> trimesh.Trimesh:
+    """A mesh with all faces turned outward."""
     mesh = trimesh.Trimesh(points, faces)
     trimesh.repair.fix_normals(mesh)
     return mesh
 
 
 def _at(mesh: trimesh.Trimesh, by: Point) -> trimesh.Trimesh:
+    """A copy of a mesh, shifted [m]."""
     mesh = mesh.copy()
     mesh.apply_translation(by)
     return mesh
 
 
-def _along(points: np.ndarray, axis: str) -> np.ndarray:
-    """Points whose z becomes the given axis."""
+def _along(points: Float[np.ndarray, "n 3"], axis: str) -> Float[np.ndarray, "n 3"]:
+    """Rotate points so that z becomes the given axis."""
     return {"z": points, "x": points[:, [2, 0, 1]], "y": points[:, [1, 2, 0]]}[axis]

@@ -1,10 +1,11 @@
-"""Safe repairs of a mesh, and its mass properties, each with a note of what was found."""
+"""Safe repairs of a mesh, and its mass properties; each finding gets a note."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.geometry.triangles import enclosed_volume
@@ -13,27 +14,31 @@ if TYPE_CHECKING:
     import trimesh
 
 MANY_FACES = 100_000
-"""Meshes with more faces are decimated."""
+"""Meshes with more faces are decimated (ours)."""
 KEPT_FACES = 50_000
-"""Faces that decimation leaves."""
+"""Faces after decimation (ours)."""
 LEAST_VOLUME = 1e-9
-"""Volume of the convex hull below which a mesh encloses nothing [m^3]."""
+"""Smallest volume of a convex hull [m^3] (ours); less encloses nothing."""
 LEAST_FILL = 1e-3
-"""Share of its bounding box that a hull, and share of its hull that a closed mesh must fill; less is a sheet."""
+"""Share of its bounding box that a hull must fill, and share of its hull that a closed mesh must fill (ours); less is a
+sheet."""
 OPEN_FILL = 0.05
-"""Share of its hull that a mesh with holes must fill; a bent sheet seems to fill a little."""
+"""Share of its hull that a mesh with holes must fill (ours); a bent sheet appears to fill a little."""
 OVERLAP = 1e-3
-"""Share of the volume by which bodies may overlap unnoticed."""
+"""Share of the volume by which bodies may overlap without being joined (ours)."""
 PROBES = 48
-"""Points along the longest side of the grid that measures a mesh with holes."""
+"""Points along the longest side of the grid that measures a mesh with holes (ours)."""
+
+MassProperties = tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]
+"""Volume [m^3], centre of mass [m], and inertia about it at unit density [m^5]."""
 
 
 def repair(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
-    """Decimate, close, turn outward and join, as far as that is safe; a sound mesh comes back as it is.
+    """Decimate, close, turn outward and join, as far as that is safe; a sound mesh is returned unchanged.
 
     Args:
         mesh: Mesh with merged vertices.
-        notes: Gets a line for everything that was found.
+        notes: Gets a line for each finding.
     """
     if len(mesh.faces) > MANY_FACES:
         before = len(mesh.faces)
@@ -46,12 +51,10 @@ def repair(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
     return _join(mesh, notes)
 
 
-def mass_properties(
-    mesh: trimesh.Trimesh, origin: str, notes: list[str]
-) -> tuple[float, np.ndarray, np.ndarray]:
-    """Volume [m^3], centre of mass (3) [m], and inertia (3 3) at unit density about it [m^5].
+def mass_properties(mesh: trimesh.Trimesh, origin: str, notes: list[str]) -> MassProperties:
+    """Volume, centre of mass and inertia.
 
-    A mesh with holes is measured by where its winding number says inside, a mere sheet by its convex hull.
+    A mesh with holes is measured by the points inside by their winding number, a sheet by its convex hull.
 
     Raises:
         ObjectError: Not even the convex hull encloses a volume.
@@ -81,7 +84,7 @@ def _close(mesh: trimesh.Trimesh, notes: list[str]) -> None:
 
 
 def _turn_outward(mesh: trimesh.Trimesh) -> bool:
-    """Make the faces counter-clockwise seen from outside; whether any had to be turned."""
+    """Make all faces counter-clockwise from outside; returns whether any was turned."""
     import trimesh
 
     before = np.array(mesh.faces)
@@ -89,13 +92,13 @@ def _turn_outward(mesh: trimesh.Trimesh) -> bool:
         with np.errstate(invalid="ignore", divide="ignore"):  # flat bodies have no centre of mass
             trimesh.repair.fix_normals(mesh, multibody=True)
     if not mesh.is_watertight and _winding(mesh)[0].sum() < 0:
-        # The volume of an open mesh depends on where the origin is, so it cannot tell inside from outside.
+        # The volume of an open mesh depends on the origin, so it cannot tell inside from outside.
         mesh.invert()
     return not np.array_equal(before, mesh.faces)
 
 
 def _join(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
-    """The union of bodies that overlap, which would count twice in mass and hide surface inside."""
+    """The union of overlapping bodies; without it, overlaps count twice in the mass and hide surface inside."""
     import trimesh
 
     if not mesh.is_watertight or mesh.body_count == 1:
@@ -131,8 +134,8 @@ def _hull(mesh: trimesh.Trimesh) -> trimesh.Trimesh | None:
         return None
 
 
-def _winding(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray, float]:
-    """Winding numbers on a grid over the mesh's box, the grid's points, and the volume of a cell [m^3]."""
+def _winding(mesh: trimesh.Trimesh) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"], float]:
+    """Winding numbers on a grid over the mesh's box, the grid's points [m], and the volume of a cell [m^3]."""
     import igl
 
     spacing = float(mesh.extents.max()) / PROBES
@@ -143,19 +146,20 @@ def _winding(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray, float]:
     return np.asarray(winding), points, spacing**3
 
 
-def _inside(mesh: trimesh.Trimesh) -> tuple[np.ndarray, float]:
+def _inside(mesh: trimesh.Trimesh) -> tuple[Float[np.ndarray, "n 3"], float]:
+    """Grid points inside the mesh [m], and the volume of a cell [m^3]."""
     winding, points, cell = _winding(mesh)
     return points[np.abs(winding) > 0.5], cell
 
 
-def _of_solid(body: trimesh.Trimesh) -> tuple[float, np.ndarray, np.ndarray]:
+def _of_solid(body: trimesh.Trimesh) -> MassProperties:
     body = body.copy()
     body.density = 1.0
     return float(body.volume), np.asarray(body.center_mass), np.asarray(body.moment_inertia)
 
 
-def _of_points(points: np.ndarray, cell: float) -> tuple[float, np.ndarray, np.ndarray]:
-    """Mass properties of cubic cells of a volume `cell` around points (n 3)."""
+def _of_points(points: Float[np.ndarray, "n 3"], cell: float) -> MassProperties:
+    """Mass properties of cubic cells of volume `cell` [m^3] around points [m]."""
     volume, centre = len(points) * cell, points.mean(0)
     second = (points - centre).T @ (points - centre) * cell + np.eye(3) * volume * cell ** (2 / 3) / 12
     return volume, centre, np.trace(second) * np.eye(3) - second

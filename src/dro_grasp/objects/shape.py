@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.geometry.distance_field import DistanceField
-from dro_grasp.geometry.point_clouds import partial_view
+from dro_grasp.geometry.point_clouds import random_half
 from dro_grasp.objects.cache import cached_arrays
 from dro_grasp.objects.convex_parts import Part, decompose
 from dro_grasp.objects.surface_distances import GRID_SPACING, bake_grid, cloud_distances, signed_distances
@@ -101,8 +101,8 @@ class ObjectModel:
         return torch.from_numpy(self.cloud)[index]
 
     def sample_partial(self, count: int, generator: torch.Generator) -> Float[Tensor, "count 3"]:
-        """A partial cloud as in the paper's appendix: the half facing a random direction."""
+        """A partial cloud as in the paper's appendix: the half along a random direction [m]."""
         cloud = torch.from_numpy(self.cloud)
         if len(cloud) < 2 * count:
             cloud = self.sample_points(2 * count, generator)
-        return cloud[partial_view(cloud, count, generator)]
+        return cloud[random_half(cloud, count, generator)]
