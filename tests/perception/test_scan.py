@@ -180,8 +180,8 @@ def test_what_depth_cameras_leave_behind_is_dropped(
 @pytest.mark.parametrize(("content", "word"), [
     ({"T_frame_camera": np.eye(4).tolist()}, "no entry 'frame'"),
     ({"frame": "base"}, "no entry 'T_frame_camera'"),
-    ({"frame": "", "T_frame_camera": np.eye(4).tolist()}, "no name"),
-    ({"frame": 5, "T_frame_camera": np.eye(4).tolist()}, "no name"),
+    ({"frame": "", "T_frame_camera": np.eye(4).tolist()}, "not a name"),
+    ({"frame": 5, "T_frame_camera": np.eye(4).tolist()}, "not a name"),
     ({"frame": "base", "T_frame_camera": [[1, 0, 0, 400], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, "millimetres"),
 ])
 def test_frames_that_mean_nothing_are_refused(content: dict[str, object], word: str, tmp_path: Path) -> None:
