@@ -36,9 +36,9 @@ CELLS = 28
 VIEWPOINTS = 48
 """Half the number of viewpoints spread over the sphere."""
 LOWEST_VIEW = -0.5
-"""Smallest height of a camera on the unit sphere, so that none looks straight up."""
+"""Smallest height of a camera on the unit sphere, so that none points straight up."""
 HIGHEST_VIEW = 0.85
-"""Largest height of a camera on the unit sphere, so that none looks straight down."""
+"""Largest height of a camera on the unit sphere, so that none points straight down."""
 
 
 def link_colours(hand: Hand) -> list[Colour]:

@@ -79,11 +79,11 @@ class Studio(ServedPage):
         """Start serving.
 
         Args:
-            hand: Picked at first.
-            obj: Picked at first.
+            hand: Hand chosen at first.
+            obj: Object chosen at first.
             weights: Name or path of weights.
-            port: The next free one is taken.
-            host: Only this machine by default; 0.0.0.0 lets the network in.
+            port: Port to serve on; if it is taken, the next free one.
+            host: Address to serve at; 0.0.0.0 serves the whole network.
         """
         self.predictor = GraspPredictor(weights)
         self.made: ShownGrasps | None = None
@@ -153,8 +153,7 @@ class Studio(ServedPage):
             self.direction = gui.add_dropdown(
                 "Palm direction", (ANY, *HALF_AXES), initial_value=ANY, hint="-z grasps from above.")
             self.temperature = gui.add_slider(
-                "Diversity", 0.0, 1.0, 0.05, 1.0,
-                hint="0: the likeliest grasp of each placement.")
+                "Diversity", 0.0, 1.0, 0.05, 1.0, hint="0: the likeliest grasp of each placement.")
             self.protocol = gui.add_dropdown("Trial", tuple(PROTOCOLS), initial_value="strict")
             self.button = gui.add_button("Generate", color="green")
         self.status = gui.add_markdown("")
