@@ -1,12 +1,12 @@
-"""Scores of grasps, however they were made: how likely they are to hold, or minus their energy.
+"""Scores of grasps, predicted or synthesised: the log-odds that they hold.
 
-Source: the paper's appendix ranks predictions by DexGraspNet's energy and reports the best; the release does not.
+Source: the paper's appendix ranks predictions by DexGraspNet's energy and reports the best; the release does not rank.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -21,35 +21,43 @@ from dro_grasp.ranking.score_network import shipped_score_network
 
 @dataclass(frozen=True)
 class ScoreConfig:
-    """How grasps are judged that the optimiser did not make."""
+    """How grasps are scored."""
 
-    by: Literal["quality", "energy"] = "quality"
-    """`quality` is the mean log-odds of success in trials, of a network that has seen many; `energy` is minus the energy."""
     energy: EnergyConfig = field(default_factory=lambda: EnergyConfig(penetration=30.0))
-    """Weights; predictions penetrate more than synthesised grasps, which closing partly repairs. The network was trained with
-    these terms."""
+    """Weights of the energy terms, as in the network's training. Predictions penetrate more than synthesised grasps, which
+    closing partly repairs."""
     batch_size: int = 64
-    """Grasps judged at once."""
+    """Grasps scored at once."""
 
 
 @torch.no_grad()
 def score_grasps(energy: GraspEnergy, grasps: GraspBatch, config: ScoreConfig | None = None) -> Float[Tensor, " n"]:
-    """A score each: higher is better, comparable among grasps of one hand and one object.
-
-    The contacts are taken to be each finger's candidate that is nearest to the surface.
+    """Mean log-odds of success in trials; higher is better, comparable among grasps of one hand and one object.
 
     Args:
-        energy: Of the grasps' hand on their object, with the weights of the configuration.
+        energy: Energy of the hand on the object, under the weights of the configuration.
         grasps: Any grasps of the two.
-        config: What the score is.
+        config: Batch size.
     """
-    config, device = config or ScoreConfig(), energy.centre.device
-    scores = [torch.zeros(0)]
-    for start in range(0, len(grasps), config.batch_size):
-        part = grasps[slice(start, start + config.batch_size)]
-        terms = evaluate_nearest(energy, part.T_object_wrist.to(device), part.joints.to(device)).terms
-        if config.by == "energy":
-            scores.append(-terms.sum(-1).cpu())
-        else:  # the network is small and stays on the CPU
-            scores.append(shipped_score_network()(*(x.cpu() for x in grasp_features(energy, part, terms))).mean(-1))
+    network, scores = shipped_score_network(), [torch.zeros(0)]
+    for part, terms in _terms(energy, grasps, config or ScoreConfig()):
+        features = grasp_features(energy, part, terms)  # the network is small and stays on the CPU
+        scores.append(network(*(values.cpu() for values in features)).mean(-1))
     return torch.cat(scores)
+
+
+@torch.no_grad()
+def energies_of(energy: GraspEnergy, grasps: GraspBatch, config: ScoreConfig | None = None) -> Float[Tensor, " n"]:
+    """Grasp energy, lower is better; arguments as for `score_grasps`."""
+    parts = [terms.sum(-1).cpu() for _, terms in _terms(energy, grasps, config or ScoreConfig())]
+    return torch.cat([torch.zeros(0), *parts])
+
+
+def _terms(
+    energy: GraspEnergy, grasps: GraspBatch, config: ScoreConfig
+) -> Iterator[tuple[GraspBatch, Float[Tensor, "b terms"]]]:
+    """Parts of the grasps with their weighted energy terms; each finger touches with its candidate nearest to the surface."""
+    device = energy.centre.device
+    for start in range(0, len(grasps), config.batch_size):
+        part = grasps[start : start + config.batch_size]
+        yield part, evaluate_nearest(energy, part.T_object_wrist.to(device), part.joints.to(device)).terms
