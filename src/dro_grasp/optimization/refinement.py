@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.energy.grasp_energy import EnergyConfig, Evaluation, GraspEnergy
+from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.energy.object_energy import nearest_contacts
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.optimization.pose_step import moved
@@ -99,10 +99,11 @@ def _descend(
         new_T = moved(start, pivot, new_move, new_turn)
         new_contacts = nearest_contacts(energy, new_T, new_q, config.reach)
         new = energy(new_T, new_q, new_contacts)
-        chosen = (new.total < now.total)[:, None]
+        lower_energy = new.total < now.total
+        chosen = lower_energy[:, None]
         move, turn = torch.where(chosen, new_move, move), torch.where(chosen, new_turn, turn)
         T, q = torch.where(chosen[..., None], new_T, T), torch.where(chosen, new_q, q)
-        now = Evaluation(*(torch.where(chosen, getattr(new, k), getattr(now, k)) for k in ("terms", "by_pose", "by_joint")))
+        now = now.where(lower_energy, new)
         pace = pace * torch.where(chosen, config.growth, config.shrinkage)
     return T, q
 

@@ -76,15 +76,10 @@ class State:
 
     def where(self, keep: Bool[Tensor, " n"], other: State) -> State:
         """The other state's grasps where `keep` is true, these elsewhere."""
-        def choose(a: Tensor, b: Tensor) -> Tensor:
-            return torch.where(keep.reshape(-1, *[1] * (a.ndim - 1)), b, a)
-
-        a, b = self.result, other.result
-        result = Evaluation(
-            choose(a.terms, b.terms), choose(a.by_pose, b.by_pose), choose(a.by_joint, b.by_joint)
-        )
-        T, q, contacts = (choose(getattr(self, k), getattr(other, k)) for k in ("T", "q", "contacts"))
-        return State(T, q, contacts, self.slots, result)
+        row = keep[:, None]
+        result = self.result.where(keep, other.result)
+        T, q = torch.where(row[..., None], other.T, self.T), torch.where(row, other.q, self.q)
+        return State(T, q, torch.where(row, other.contacts, self.contacts), self.slots, result)
 
 
 def field_of(obj: ObjectModel) -> DistanceField:
