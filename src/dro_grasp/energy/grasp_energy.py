@@ -126,6 +126,11 @@ class Evaluation:
         """Sum of the terms."""
         return self.terms.sum(-1)
 
+    def where(self, keep: Bool[Tensor, " n"], other: Evaluation) -> Evaluation:
+        """The other's rows where `keep` is true, these elsewhere."""
+        return Evaluation(*(
+            torch.where(keep[:, None], getattr(other, name), getattr(self, name)) for name in ("terms", "by_pose", "by_joint")))
+
 
 @dataclass(frozen=True)
 class LinkPoints:

@@ -281,8 +281,7 @@ class Studio(ServedPage):
             return f"{stem}.parquet", grasps.to_bytes()
         name, form = next((name, form) for name, form in FORMATS.items() if form.title == kind)
         content = form.content(ExportJob(grasps, Frame(), self.made.hand))
-        assert isinstance(content, bytes)
-        return f"{stem}_{name}{form.suffix}", content
+        return f"{stem}_{name}{form.suffix}", cast(bytes, content)
 
 
 def chosen(hand: Hand, grasps: GraspBatch, success: str, palm: str) -> Bool[Tensor, " n"]:
