@@ -6,6 +6,8 @@ import roma
 from jaxtyping import Float
 from torch import Tensor
 
+from dro_grasp.geometry.se3 import compose, rotate
+
 
 def moved(
     T: Float[Tensor, "n 4 4"], pivot: Float[Tensor, "n 3"], move: Float[Tensor, "n 3"], turn: Float[Tensor, "n 3"]
@@ -19,7 +21,4 @@ def moved(
         turn: Rotation vector [rad].
     """
     rotation = roma.rotvec_to_rotmat(turn)
-    result = T.clone()
-    result[:, :3, :3] = rotation @ T[:, :3, :3]
-    result[:, :3, 3] = (rotation @ (T[:, :3, 3] - pivot)[..., None])[..., 0] + pivot + move
-    return result
+    return compose(rotation @ T[:, :3, :3], rotate(rotation, T[:, :3, 3] - pivot) + pivot + move)

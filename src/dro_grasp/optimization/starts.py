@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.geometry.distance_field import DistanceField
-from dro_grasp.geometry.se3 import compose, random_rotations
+from dro_grasp.geometry.se3 import compose, random_rotations, rotate
 from dro_grasp.hands.hand import Hand
 
 
@@ -80,7 +80,7 @@ def starts(
     size = float((points - hand.grasp_centre_wrist).norm(dim=-1).max())
     low, high = config.gap
     gap = low + (high - low) * torch.rand(n, generator=generator)
-    body = (rotation[:, None] @ points[..., None])[..., 0] + offset[:, None]
+    body = rotate(rotation[:, None], points) + offset[:, None]
     back = torch.full((n,), 2 * reach + config.clearance * size, dtype=q.dtype)
     for _ in range(config.approach_steps):
         distance = field.distances(body - (back[:, None] * direction)[:, None])[0].amin(-1)
