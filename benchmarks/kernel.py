@@ -19,6 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
 from report import emit
 from torch import Tensor
 from torch.nn import functional
@@ -29,19 +30,26 @@ from dro_grasp.models.presets import NetworkConfig
 
 BLOCKS = 4
 """Blocks along each side of the matrix in the naive form. Source: appendix, matrix block computation."""
-RUNS, FULL = 5, 21
+RUNS = 5
+"""Repetitions, of which the median time counts."""
+FULL = 21
+"""The same with `--full`."""
 
 Form = Callable[[DistanceHead, Tensor, Tensor], Tensor]
 
 
-def naive(head: DistanceHead, hand: Tensor, obj: Tensor) -> Tensor:
+def naive(
+    head: DistanceHead, hand: Float[Tensor, "1 n d"], obj: Float[Tensor, "1 m d"]
+) -> Float[Tensor, "1 n m"]:
     """Block by block, every pair concatenated."""
     return torch.cat([
         torch.cat([_block(head, rows, columns) for columns in obj.chunk(BLOCKS, 1)], 2) for rows in hand.chunk(BLOCKS, 1)
     ], 1)
 
 
-def _block(head: DistanceHead, hand: Tensor, obj: Tensor) -> Tensor:
+def _block(
+    head: DistanceHead, hand: Float[Tensor, "1 k d"], obj: Float[Tensor, "1 l d"]
+) -> Float[Tensor, "1 k l"]:
     left = hand[:, :, None].expand(-1, -1, obj.shape[1], -1)
     right = obj[:, None].expand(-1, hand.shape[1], -1, -1)
     forwards = _perceptron(head, torch.cat([left, right], -1))
@@ -49,11 +57,13 @@ def _block(head: DistanceHead, hand: Tensor, obj: Tensor) -> Tensor:
     return functional.softplus(0.5 * (forwards + backwards))
 
 
-def _perceptron(head: DistanceHead, x: Tensor) -> Tensor:
+def _perceptron(head: DistanceHead, x: Float[Tensor, "*b d"]) -> Float[Tensor, "*b"]:
     return head.last(functional.relu(head.second(functional.relu(head.first(x)))))[..., 0]
 
 
-def factorised(head: DistanceHead, hand: Tensor, obj: Tensor) -> Tensor:
+def factorised(
+    head: DistanceHead, hand: Float[Tensor, "1 n d"], obj: Float[Tensor, "1 m d"]
+) -> Float[Tensor, "1 n m"]:
     """The package's form."""
     return head(hand, obj)
 
@@ -61,7 +71,7 @@ def factorised(head: DistanceHead, hand: Tensor, obj: Tensor) -> Tensor:
 FORMS: dict[str, Form] = {"naive, 4x4 blocks": naive, "factorised": factorised}
 
 
-def case(seed: int) -> tuple[DistanceHead, Tensor, Tensor]:
+def case(seed: int) -> tuple[DistanceHead, Float[Tensor, "1 n d"], Float[Tensor, "1 m d"]]:
     """A kernel of the paper's size and features of one grasp."""
     torch.manual_seed(seed)
     config = NetworkConfig.preset("paper")
