@@ -1,1 +1,1 @@
-"""Grasps: the batch type, controller, energies, synthesis, ranking."""
+"""Grasps: the batch type, its columns and files, the controller, duplicates."""
