@@ -17,7 +17,7 @@ import torch
 from report import emit
 from synthesis import HANDS, training_objects
 
-from dro_grasp.datasets.engine.production import EngineConfig, valid_grasps
+from dro_grasp.datasets.engine.worker import EngineConfig, valid_grasps
 from dro_grasp.energy.contact_candidates import ContactConfig
 from dro_grasp.evaluation.metrics import diversity
 from dro_grasp.grasps.batch import GraspBatch
@@ -41,7 +41,7 @@ def choices(candidates: int) -> dict[str, EngineConfig]:
         "the engine's": EngineConfig(candidates=candidates),
         "labels as synthesised": EngineConfig(candidates=candidates, settle=False),
         "400 steps, best third evaluated": EngineConfig(
-            candidates=candidates, tried_share=0.34, synthesis=SynthesisConfig(steps=400)),
+            candidates=candidates, trial_share=0.34, synthesis=SynthesisConfig(steps=400)),
         "every finger holds": EngineConfig(candidates=candidates, synthesis=SynthesisConfig(contacts=all_hold)),
         "narrow starts, every finger holds": EngineConfig(
             candidates=candidates, synthesis=SynthesisConfig(starts=NARROW, contacts=all_hold)),
@@ -55,7 +55,7 @@ def measure(hand_name: str, objects: list[str], config: EngineConfig) -> list[ob
         obj = load_object(name)
         _ = obj.distance_field, obj.parts
         start = time.process_time()
-        grasps, _ = valid_grasps(hand, obj, 5, "strict", config)
+        grasps, _ = valid_grasps(hand, obj, 5, config)
         seconds += time.process_time() - start
         batches.append(grasps)
     joined = GraspBatch.concatenate(batches)

@@ -20,7 +20,7 @@ from pathlib import Path
 import torch
 from report import emit
 
-from dro_grasp.datasets.engine.production import EngineConfig, valid_grasps
+from dro_grasp.datasets.engine.worker import EngineConfig, valid_grasps
 from dro_grasp.grasps.duplicates import DUPLICATE_DISTANCE
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
@@ -56,7 +56,7 @@ def measure(hand_name: str, objects: list[str], seed: int, device: str) -> tuple
         _ = obj.distance_field, obj.parts
         start = time.process_time()
         preparation += start - begin
-        grasps, _ = valid_grasps(hand, obj, seed, "strict", config)
+        grasps, _ = valid_grasps(hand, obj, seed, config)
         rows.append((name, len(grasps), time.process_time() - start))
         print(f"{hand_name} on {name}: {len(grasps)} grasps in {rows[-1][2]:.1f} CPU seconds", file=sys.stderr)
     return rows, preparation

@@ -21,7 +21,7 @@ OBJECTS = ("sphere", "can", "bottle", "mug")
 def run(workers: int) -> DatasetReport:
     """One shard of every pair."""
     with tempfile.TemporaryDirectory() as folder:
-        return synthesize_dataset(HANDS, OBJECTS, 1, Path(folder) / "data", workers, config=EngineConfig(barren_rounds=1))
+        return synthesize_dataset(HANDS, OBJECTS, 1, Path(folder) / "data", workers, config=EngineConfig(max_barren_rounds=1))
 
 
 def main() -> None:

@@ -9,8 +9,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dro_grasp.datasets.bundle.bundling import make_bundle
     from dro_grasp.datasets.bundle.training_file import load_bundle
+    from dro_grasp.datasets.collections.bundling import make_bundle
     from dro_grasp.datasets.collections.collection import read_collection
     from dro_grasp.datasets.engine.schedule import synthesize_dataset
     from dro_grasp.errors import DroGraspError
@@ -90,7 +90,7 @@ _EXPORTS = {
     "load_hand": "hands.library",
     "load_object": "objects.catalogue",
     "load_weights": "models.checkpoints",
-    "make_bundle": "datasets.bundle.bundling",
+    "make_bundle": "datasets.collections.bundling",
     "moveit_grasps": "export.moveit",
     "object_names": "objects.catalogue",
     "palm_facing_starts": "evaluation.controls",

@@ -128,8 +128,8 @@ def test_yields_add_up_and_name_the_obstacle():
     assert both.failures == {"slipped": 2, "lost": 5}
     assert both.tried == 11
     assert both.per_cpu_hour == pytest.approx(1200)
-    assert both.main_obstacle() == "lost (38% of what was tried)"
-    assert Yield().main_obstacle() == "nothing was worth a trial"
+    assert both.main_obstacle() == "lost (38% of the tested candidates)"
+    assert Yield().main_obstacle() == "no candidate was tested"
     assert Yield().per_cpu_hour == 0
     assert Yield.from_dict(both.to_dict() | {"of another version": 1}) == both
     assert math.isclose(sum(both.to_dict()["failures"].values()), 7)

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from dro_grasp.datasets.engine.production import Job
 from dro_grasp.datasets.engine.shards import find_shards
+from dro_grasp.datasets.engine.worker import Job
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
 
@@ -40,7 +40,7 @@ if __name__ == "__main__":
     node = cluster.add_node(num_cpus=1, object_store_memory=100 * 2**20)
     cluster.wait_for_nodes()
     report = synthesize_dataset(["a", "b", "broken"], ["x", "y"], 30, sys.argv[1], progress=lambda _: None,
-                                make_pool=lambda job: Watched(job, 1, 60, cluster.address, slow))
+                                workers=lambda job: Watched(job, 1, 60, cluster.address, slow))
     print(json.dumps({"grasps": report.grasps, "shards": report.shards, "failures": sorted(map(list, report.failures))}))
 """
 
@@ -61,9 +61,10 @@ def ray_starts() -> None:
 def test_a_node_that_dies_costs_nothing(tmp_path):
     script = tmp_path / "cluster.py"
     script.write_text(CLUSTER)
+    path = os.pathsep.join(map(str, [ROOT, ROOT / "src"]))
     done = subprocess.run(
         [sys.executable, script, tmp_path / "data"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, timeout=300,
-        env=os.environ | {"PYTHONPATH": str(ROOT), "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0"}, check=True)
+        env=os.environ | {"PYTHONPATH": path, "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0"}, check=True)
     report = json.loads(done.stdout.splitlines()[-1])
     assert report == {"grasps": 120, "shards": 24, "failures": [["broken", "x"], ["broken", "y"]]}
     shards = find_shards(tmp_path / "data")
@@ -80,7 +81,7 @@ def test_an_address_where_nobody_listens_is_told_at_once():
         taken.bind(("127.0.0.1", 0))  # and not listening
         address = f"127.0.0.1:{taken.getsockname()[1]}"
         with pytest.raises(OptionError, match=f"no Ray cluster answers at {address}.*ray start --head"):
-            RayPool(Job(0, "strict", EngineConfig()), 1, 60.0, address)
+            RayPool(Job(0, EngineConfig()), 1, 60.0, address)
 
 
 def test_without_ray_the_engine_says_what_to_install(monkeypatch):
@@ -89,4 +90,4 @@ def test_without_ray_the_engine_says_what_to_install(monkeypatch):
 
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(OptionError, match=r"pip install 'ray"):
-        RayPool(Job(0, "strict", EngineConfig()), 1, 60.0)
+        RayPool(Job(0, EngineConfig()), 1, 60.0)

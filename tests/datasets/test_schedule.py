@@ -11,12 +11,12 @@ import trimesh
 
 from dro_grasp.cli.main import main
 from dro_grasp.datasets.collections.collection import read_collection
-from dro_grasp.datasets.engine import production
 from dro_grasp.datasets.engine import schedule as engine
+from dro_grasp.datasets.engine import worker
 from dro_grasp.datasets.engine.pools import Outcome, Work, failure_of
-from dro_grasp.datasets.engine.production import Job, Task, make_shard, shard_seed, valid_grasps
 from dro_grasp.datasets.engine.schedule import EngineConfig, PairState, next_pair, synthesize_dataset
 from dro_grasp.datasets.engine.shards import Shard, find_shards
+from dro_grasp.datasets.engine.worker import Job, Task, make_shard, shard_seed, valid_grasps
 from dro_grasp.datasets.engine.yields import Yield
 from dro_grasp.errors import OptionError, OutputError
 from dro_grasp.grasps import table
@@ -28,7 +28,7 @@ from dro_grasp.optimization.synthesis import SynthesisConfig
 from tests.helpers.engine_work import GRASPS, easy
 
 TINY = EngineConfig(
-    candidates=64, least_candidates=64, tried_share=0.5, synthesis=SynthesisConfig(steps=150, batch_size=64))
+    candidates=64, min_candidates=64, trial_share=0.5, synthesis=SynthesisConfig(steps=150, batch_size=64))
 
 
 class HerePool:
@@ -67,7 +67,7 @@ def run(folder: Path, hands, objects, goal, work: Work = easy, **options):
         pools.append(HerePool(job, work))
         return pools[0]
 
-    report = synthesize_dataset(hands, objects, goal, folder, progress=lines.append, make_pool=make_pool, **options)
+    report = synthesize_dataset(hands, objects, goal, folder, progress=lines.append, workers=make_pool, **options)
     assert pools[0].closed
     return report, pools[0].tasks, lines
 
@@ -94,7 +94,7 @@ def test_a_rerun_does_only_what_is_missing_and_a_higher_goal_extends(tmp_path):
 
 
 def test_later_shards_know_the_earlier_ones_and_are_as_large_as_the_yield_asks(tmp_path):
-    _, tasks, _ = run(tmp_path, ["a"], ["x"], 100, config=EngineConfig(candidates=64, largest_shard=512))
+    _, tasks, _ = run(tmp_path, ["a"], ["x"], 100, config=EngineConfig(candidates=64, max_candidates=512))
     assert [len(t.earlier) for t in tasks[:4]] == [0, 1, 2, 3]
     assert GraspBatch.load(Shard("a", "x", 0).path(tmp_path)).object == ("x",) * GRASPS
     # 5 of 64, so 95 more would take 1216: the largest shard there is.
@@ -137,15 +137,15 @@ def test_a_failing_pair_is_reported_and_the_others_go_on(tmp_path, hand, obj, re
 
 def test_a_barren_pair_is_given_up_with_the_main_reason_and_not_tried_again(tmp_path):
     report, tasks, _ = run(tmp_path, ["a"], ["barren", "x"], 10)
-    assert report.failures["a", "barren"] == "0 grasps, none in the last 3 rounds: slipped (100% of what was tried)"
-    assert sum(t.shard.object == "barren" for t in tasks) == EngineConfig().barren_rounds
+    assert report.failures["a", "barren"] == "0 grasps, none in the last 3 rounds: slipped (100% of the tested candidates)"
+    assert sum(t.shard.object == "barren" for t in tasks) == EngineConfig().max_barren_rounds
     report, tasks, _ = run(tmp_path, ["a"], ["barren", "x"], 10)
     assert not tasks
     assert ("a", "barren") in report.failures
 
 
 def test_a_pair_that_eats_candidates_is_given_up(tmp_path):
-    report, _, _ = run(tmp_path, ["a"], ["x"], 1000, config=EngineConfig(most_candidates=2000))
+    report, _, _ = run(tmp_path, ["a"], ["x"], 1000, config=EngineConfig(candidate_budget=2000))
     assert "given up" in report.failures["a", "x"]
     assert report.grasps < 1000
 
@@ -199,7 +199,7 @@ def test_impossible_requests_are_refused_before_the_work(tmp_path):
     ):
         (tmp_path / "file").write_text("")
         with pytest.raises(error):
-            synthesize_dataset(["a"], ["x"], goal, folder, make_pool=HerePool)
+            synthesize_dataset(["a"], ["x"], goal, folder, workers=HerePool)
 
 
 def test_a_missing_gpu_is_told_at_once(tmp_path, monkeypatch):
@@ -228,8 +228,8 @@ def test_real_shards_hold_valid_grasps_repeat_and_add_up(tmp_path):
     points = load_hand("barrett").with_points(64).points(found.joints, found.T_object_wrist)
     apart = (points[:, None] - points).norm(dim=-1).mean(-1) + torch.eye(len(found))
     assert apart.min() >= DUPLICATE_DISTANCE  # also across shards
-    hand, can = production._hand("barrett"), production._object("can", 1.0)
-    again, _ = valid_grasps(hand, can, shard_seed(0, Shard("barrett", "can", 0)), "strict", TINY)
+    hand, can = worker._hand("barrett"), worker._object("can", 1.0)
+    again, _ = valid_grasps(hand, can, shard_seed(0, Shard("barrett", "can", 0)), TINY)
     assert torch.equal(again.joints, GraspBatch.load(Shard("barrett", "can", 0).path(tmp_path)).joints)
 
 
@@ -246,8 +246,8 @@ def test_the_same_command_makes_the_same_grasps_however_many_work(tmp_path):
 
 def test_a_success_that_hardly_anything_touches_is_not_kept():
     hand, can = load_hand("barrett"), load_object("can")
-    kept, made = valid_grasps(hand, can, 3, "strict", TINY)
-    strict, fewer = valid_grasps(hand, can, 3, "strict", replace(TINY, least_contacts=5))
+    kept, made = valid_grasps(hand, can, 3, TINY)
+    strict, fewer = valid_grasps(hand, can, 3, replace(TINY, min_contact_links=5))
     held = [len(links) for links in kept.extra["contact_links"]]
     assert min(held) < 5 <= max(held)
     assert made.failures.get("held by too few links", 0) == 0
@@ -259,8 +259,8 @@ def test_settled_labels_move_only_joints_that_hold(tmp_path):
     from dro_grasp.simulation.trial import settle, simulate
 
     hand, can = load_hand("allegro"), load_object("can")
-    grasps = valid_grasps(hand, can, 1, "strict", EngineConfig(
-        candidates=48, tried_share=0.5, settle=False, synthesis=SynthesisConfig(steps=80, batch_size=48)))[0]
+    grasps = valid_grasps(hand, can, 1, EngineConfig(
+        candidates=48, trial_share=0.5, settle=False, synthesis=SynthesisConfig(steps=80, batch_size=48)))[0]
     settled = settle(hand, can, grasps, "strict")
     held = simulate(hand, can, grasps, "strict").contact_links
     moved = settled.joints != grasps.joints
@@ -273,7 +273,7 @@ def test_settled_labels_move_only_joints_that_hold(tmp_path):
 
 def test_a_hand_that_cannot_hold_the_object_is_told_why(tmp_path):
     trimesh.creation.box((0.9, 0.9, 0.9)).export(tmp_path / "house.stl")
-    config = replace(TINY, barren_rounds=1)
+    config = replace(TINY, max_barren_rounds=1)
     (tmp_path / "data").mkdir()
     report, _, _ = run(tmp_path / "data", ["barrett"], [str(tmp_path / "house.stl"), "can"], 1, make_shard, config=config)
     (why,) = report.failures.values()
@@ -311,7 +311,7 @@ def test_grasps_of_files_remember_them(tmp_path):
 @pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_time_that_is_none_is_refused(tmp_path, seconds):
     with pytest.raises(OptionError, match="seconds is "):
-        synthesize_dataset(["a"], ["x"], 1, tmp_path / "data", make_pool=HerePool, seconds=seconds)
+        synthesize_dataset(["a"], ["x"], 1, tmp_path / "data", workers=HerePool, seconds=seconds)
     assert not (tmp_path / "data").exists()
 
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from dro_grasp.datasets.bundle.splits import FEW_SHOT, HELD_OUT_HANDS
 from dro_grasp.datasets.collections.checking import check
 from dro_grasp.datasets.collections.collection import YIELDS, read_collection
 from dro_grasp.datasets.collections.merging import file_name
-from dro_grasp.datasets.splits import FEW_SHOT, HELD_OUT_HANDS
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.duplicates import DUPLICATE_DISTANCE
 from dro_grasp.grasps.table import read_footer

@@ -14,10 +14,10 @@ from safetensors.torch import save_file
 
 from dro_grasp.cli.main import main
 from dro_grasp.datasets.bundle import training_file as bundle_module
-from dro_grasp.datasets.bundle.bundling import sources
+from dro_grasp.datasets.bundle.splits import SPLITS, split_of
 from dro_grasp.datasets.bundle.training_file import ObjectCloud, load_bundle, write_bundle
+from dro_grasp.datasets.collections.bundling import sources
 from dro_grasp.datasets.engine.shards import Shard
-from dro_grasp.datasets.splits import SPLITS, split_of
 from dro_grasp.errors import BundleError, GraspFileError, OutputError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import with_sources

@@ -86,7 +86,7 @@ def test_a_hand_is_measured_object_by_object(hand, pairs):
     assert can.rolls == 8
     assert can.contact_links == (1, 2)
     assert can.reason == ""
-    assert wall.reason == "lost (100% of what was tried)"
+    assert wall.reason == "lost (100% of the tested candidates)"
     assert wall.half_axes == (0,) * 6
     assert found.yields.candidates == 464
     assert found.diversity == diversity(pairs[0].grasps.T_object_wrist, pairs[0].grasps.joints)
@@ -104,7 +104,7 @@ def test_the_page_names_everything_and_holds_its_pictures(pairs, tmp_path, capsy
     text = page.read_text()
     assert "60 grasps of 1 hand<" in text
     assert text.count("data:image/png;base64,") == 2
-    for word in ("barrett", "can", "wall", "slipped", "not evaluated: energy too high", "lost (100% of what was tried)"):
+    for word in ("barrett", "can", "wall", "slipped", "not evaluated: energy too high", "lost (100% of the tested candidates)"):
         assert word in text
     assert main(["dataset", "report", str(tmp_path / "barrett.parquet"), "--output", str(tmp_path / "no" / "x.html")]) == 2
     assert "create it first" in capsys.readouterr().err

@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
-from dro_grasp.datasets.engine.production import Job, Made, Task
 from dro_grasp.datasets.engine.shards import notes_of
+from dro_grasp.datasets.engine.worker import FinishedShard, Job, Task
 from dro_grasp.datasets.engine.yields import Yield
 from dro_grasp.errors import HandError, ObjectError
 from tests.datasets.test_shards import grasps
@@ -17,7 +18,7 @@ GRASPS = 5
 """Grasps of a shard."""
 
 
-def easy(job: Job, task: Task) -> Made:
+def easy(job: Job, task: Task) -> FinishedShard:
     """Five grasps at once; the object `barren` gives none, the hand `broken` an error."""
     if task.shard.hand == "broken":
         raise HandError("no hand is called 'broken'")
@@ -25,26 +26,41 @@ def easy(job: Job, task: Task) -> Made:
         raise ObjectError("the mesh cannot be cut into convex parts (CoACD found none); repair or simplify it")
     count = 0 if task.shard.object == "barren" else GRASPS
     made = Yield(candidates=task.candidates, failures={"slipped": 20 - count}, valid=count)
-    return Made(task.shard, grasps(count, task.shard.hand, task.shard.object).to_bytes(notes_of(made)), made)
+    return FinishedShard(task.shard, grasps(count, task.shard.hand, task.shard.object).to_bytes(notes_of(made)), made)
 
 
-def slow(job: Job, task: Task) -> Made:
+def slow(job: Job, task: Task) -> FinishedShard:
     """The same after a moment, in which something can be killed."""
     time.sleep(0.2)
     return easy(job, task)
 
 
-def dying(job: Job, task: Task) -> Made:
-    """The worker dies on `deadly`, always, and on `fragile`, the first time."""
-    mark = Path(job.protocol) / "died"
+class Heavy:
+    """Kills the process that pickles it."""
+
+    def __reduce__(self):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def dying(job: Job, task: Task) -> FinishedShard:
+    """The worker dies on `deadly`, always, on `fragile`, the first time, and while it hands over the shard of `heavy`."""
+    mark = Path(job.config.protocol) / "died"
     if task.shard.object == "deadly" or (task.shard.object == "fragile" and not mark.exists()):
         mark.touch()
         os.kill(os.getpid(), signal.SIGKILL)
-    return easy(job, task)
+    made = easy(job, task)
+    return replace(made, payload=Heavy()) if task.shard.object == "heavy" else made
 
 
-def endless(job: Job, task: Task) -> Made:
+def endless(job: Job, task: Task) -> FinishedShard:
     """`endless` never ends, like a mesh that is hard to cut."""
     if task.shard.object == "endless":
         time.sleep(3600)
     return easy(job, task)
+
+
+def telling_threads(job: Job, task: Task) -> FinishedShard:
+    """Fails with the number of threads that the libraries of this process use."""
+    import torch
+
+    raise ObjectError(f"{os.environ.get('OMP_NUM_THREADS')} {torch.get_num_threads()}")

@@ -34,7 +34,7 @@ class BundleCommand:
 
     def run(self) -> int:
         """Select the grasps of the split, find their hands and objects, write the bundle."""
-        from dro_grasp.datasets.bundle.bundling import make_bundle
+        from dro_grasp.datasets.collections.bundling import make_bundle
         from dro_grasp.files import check_output
 
         check_output(self.output)

@@ -11,7 +11,7 @@ from dro_grasp.cli.output import Flag, optional, print_json, print_table, say_as
 
 if TYPE_CHECKING:
     from dro_grasp.datasets.engine.pools import Pool
-    from dro_grasp.datasets.engine.production import Job
+    from dro_grasp.datasets.engine.worker import Job
 
 
 @dataclass(frozen=True)
@@ -57,12 +57,12 @@ class Synthesize:
         self._check_numbers()
         objects = resolve_objects(list(self.object))
         require_known(self.hand, objects)
+        config = EngineConfig(
+            self.protocol, self.scale, None if self.minutes is None else 60 * self.minutes,
+            synthesis=SynthesisConfig(device=self.device))
         report = synthesize_dataset(
-            self.hand, objects, self.grasps, self.output, workers=self.workers, seed=self.seed, protocol=self.protocol,
-            config=EngineConfig(synthesis=SynthesisConfig(device=self.device)), scale=self.scale, progress=say_aside,
-            make_pool=self._ray_pool if self.engine == "ray" else None,
-            seconds=None if self.minutes is None else 60 * self.minutes,
-        )
+            self.hand, objects, self.grasps, self.output, self._ray_pool if self.engine == "ray" else self.workers, self.seed,
+            config, say_aside)
         failures = [{"hand": h, "object": o, "reason": why} for (h, o), why in report.failures.items()]
         values = {"output": str(self.output), "grasps": report.grasps, "added": report.added, "shards": report.shards,
                   "seconds": round(report.seconds, 2), "failures": failures}
@@ -93,4 +93,4 @@ class Synthesize:
     def _ray_pool(self, job: Job) -> Pool:
         from dro_grasp.datasets.engine.ray_pool import RayPool
 
-        return RayPool(job, self.workers, job.config.shard_limit, self.ray_address)
+        return RayPool(job, self.workers, job.config.shard_seconds, self.ray_address)

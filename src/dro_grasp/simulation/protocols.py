@@ -1,4 +1,4 @@
-"""Named, versioned protocols of a grasp trial; every number with its unit and source."""
+"""Named, versioned protocols of grasp trials."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from dro_grasp.grasps.controller import ControllerConfig
 
 @dataclass(frozen=True)
 class Protocol:
-    """How a grasp is tried and when it counts as a success."""
+    """How a trial runs and when it counts as a success."""
 
     name: str
     version: int = 1
-    """Raised whenever a change can change a verdict."""
+    """Goes up with every change that can change a verdict."""
     closing: bool = True
     """Start at the pregrasp and close onto the squeeze target; otherwise start and stay at the grasp."""
     controller: ControllerConfig = field(default_factory=ControllerConfig)
-    """Makes pregrasp and squeeze where a grasp does not state them."""
+    """Makes a pregrasp and a squeeze for grasps that do not state them."""
     friction: float = 1.0
     """Coefficient between hand and object. (The official release has 3.0.)"""
     mass: float | None = None
     """Mass of every object [kg]; None leaves the object's own."""
     mass_factor: float = 1.0
-    """Multiplies the object's mass, and with it the disturbing forces."""
+    """Multiplies the object's mass and with it the disturbing forces."""
     torsional_friction: float = 0.02
     """[m]"""
     force: float = 0.5
@@ -33,11 +33,12 @@ class Protocol:
     closing_time: float = 1.0
     """[s]"""
     gradual: bool = False
-    """Lead the hand from the pregrasp through the grasp to the squeeze, half of the closing time each; otherwise the
-    squeeze is the target from the start."""
+    """Move the targets from the pregrasp to the grasp and on to the squeeze, each in half of the closing time; otherwise
+    the squeeze is the target from the start."""
     reset: bool = False
-    """Begin each force where the closing ended; otherwise each begins where the one before it ended. The object's
-    motion then counts from the labelled grasp, not from the end of closing, and every force must be withstood."""
+    """Start each force from the end of closing; otherwise each starts where the previous one ended. With a reset the
+    object's motion counts from the labelled grasp, not from the end of closing, and the grasp must withstand every
+    force."""
     force_time: float = 1.0
     """Duration of the force along each of +x +y +z -x -y -z of the object's frame [s]."""
     max_displacement: float = 0.02
@@ -57,7 +58,7 @@ class Protocol:
     impratio: float = 10.0
     """Friction to normal impedance; at 1 objects creep."""
     noslip: int = 0
-    """Iterations of the solver that removes what slip is left."""
+    """Iterations of the solver that removes residual slip."""
     stiffness: float = 3.0
     """Gain of the position servos [Nm/rad]; 100 ejects objects."""
     damping: float = 0.3
@@ -67,11 +68,11 @@ class Protocol:
     force_limit: float = 20.0
     """Largest servo torque [Nm]."""
     lever: float = 0.03
-    """Sliding joints get the servo of a turning joint that acts at this distance [m]."""
+    """Lever arm of sliding joints [m]: they get the servo of a turning joint that acts at this distance."""
 
     @property
     def label(self) -> str:
-        """Name and version, as stored with results; it says when friction or anything else is not as named."""
+        """Name and version, as stored with results, marked if friction or anything else was changed."""
         named = PROTOCOLS.get(self.name, self)
         friction = "" if self.friction == named.friction else f"+friction{self.friction:g}"
         changed = "" if replace(self, friction=named.friction) == named else "+changed"
@@ -91,11 +92,11 @@ PROTOCOLS = {
         force_limit=3.0,
     ),
 }
-"""Every protocol by name."""
+"""Every protocol by name. Sources: the paper for `dro`, ours for `strict` and `dro_static`, the settings of DexGraspBench."""
 
 
 def protocol(name: str | Protocol) -> Protocol:
-    """The protocol of a name; a Protocol is returned as it is.
+    """The protocol of a name; a Protocol is returned unchanged.
 
     Raises:
         OptionError: No protocol has this name.
@@ -112,7 +113,7 @@ def changed(name: str | Protocol, *, friction: float | None = None, mass_factor:
 
     Args:
         name: The protocol.
-        friction: Coefficient between hand and object; None leaves the protocol's.
+        friction: Coefficient between hand and object; None keeps the protocol's.
         mass_factor: Multiplies the object's mass.
 
     Raises:

@@ -1,7 +1,7 @@
-"""Everything that training needs in one portable file: hands, object clouds, grasps.
+"""The training bundle: hands, object clouds and grasps in one portable file.
 
-The file is safetensors. Object points have 16 bits within the cloud's box, normals 8 bits. Reading it needs torch and
-safetensors alone.
+The file is safetensors. Object points have 16 bits within the cloud's box, normals 8 bits. Reading it needs neither a
+simulator nor a mesh library.
 """
 
 from __future__ import annotations
@@ -14,26 +14,30 @@ from typing import Any
 
 import roma
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from dro_grasp.datasets.splits import TRAINING
+from dro_grasp.datasets.bundle.splits import TRAINING
 from dro_grasp.devices import on_device
 from dro_grasp.errors import BundleError
 from dro_grasp.files import replacing
+from dro_grasp.geometry.se3 import compose
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 
+Tensors = dict[str, Shaped[Tensor, "..."]]
+"""The tensors of a file by key."""
 FORMAT_VERSION = 1
+"""Version of the bundle file that this code writes and reads."""
 MAX_BYTES = 25_000_000
-"""Largest bundle [bytes]."""
+"""Largest bundle [bytes]. Ours: a repository takes it as it is."""
 
 
 @dataclass(frozen=True)
 class ObjectCloud:
-    """An object as training sees it."""
+    """Surface points of an object."""
 
     points: Float[Tensor, "k 3"]
     """[m]"""
@@ -59,7 +63,7 @@ class HandGrasps:
 
 @dataclass(frozen=True)
 class Bundle:
-    """What a bundle file holds."""
+    """The content of a bundle file."""
 
     hands: dict[str, Hand]
     objects: dict[str, ObjectCloud]
@@ -77,7 +81,7 @@ class Bundle:
         return sum(len(g.joints) for g in self.grasps.values())
 
     def summary(self) -> dict[str, Any]:
-        """Counts for people."""
+        """Counts of hands, objects and grasps."""
         return {
             "hands": {name: len(g.joints) for name, g in self.grasps.items()},
             "objects": len(self.objects), "grasps": self.n_grasps,
@@ -111,7 +115,7 @@ def write_bundle(
     if not grasps:
         raise BundleError("no grasps were given; synthesise some on objects for training first")
     names = list(objects)
-    tensors: dict[str, Tensor] = {}
+    tensors: Tensors = {}
     header: dict[str, Any] = {"format_version": FORMAT_VERSION, "objects": names, "hands": []}
     for i, (name, cloud) in enumerate(objects.items()):
         tensors |= _pack_cloud(f"object.{i}", cloud, name)
@@ -148,7 +152,7 @@ def load_bundle(path: Path | str) -> Bundle:
         raise BundleError(f"{path} lacks a part ({error}); make it again with `dro-grasp dataset bundle`") from error
 
 
-def _unpack(header: dict[str, Any], tensors: dict[str, Tensor]) -> Bundle:
+def _unpack(header: dict[str, Any], tensors: Tensors) -> Bundle:
     objects = {name: _unpack_cloud(f"object.{i}", tensors) for i, name in enumerate(header["objects"])}
     hands, grasps = {}, {}
     for i, plain in enumerate(header["hands"]):
@@ -158,7 +162,7 @@ def _unpack(header: dict[str, Any], tensors: dict[str, Tensor]) -> Bundle:
     return Bundle(hands, objects, grasps)
 
 
-def _pack_cloud(key: str, cloud: ObjectCloud, name: str) -> dict[str, Tensor]:
+def _pack_cloud(key: str, cloud: ObjectCloud, name: str) -> Tensors:
     if not (cloud.points.isfinite().all() and cloud.normals.isfinite().all()):
         raise BundleError(f"the cloud of object '{name}' has non-finite values; check its mesh")
     low = cloud.points.amin(0)
@@ -170,13 +174,13 @@ def _pack_cloud(key: str, cloud: ObjectCloud, name: str) -> dict[str, Tensor]:
     }
 
 
-def _unpack_cloud(key: str, tensors: dict[str, Tensor]) -> ObjectCloud:
+def _unpack_cloud(key: str, tensors: Tensors) -> ObjectCloud:
     low, size = tensors[f"{key}.box"]
     points = (tensors[f"{key}.points"].float() + 32768) / 65535 * size + low
     return ObjectCloud(points, torch.nn.functional.normalize(tensors[f"{key}.normals"].float(), dim=-1))
 
 
-def _pack_hand(key: str, hand: Hand, tensors: dict[str, Tensor]) -> dict[str, Any]:
+def _pack_hand(key: str, hand: Hand, tensors: Tensors) -> dict[str, Any]:
     """Tensors go into the file, plain values into its header."""
     plain = {}
     for field, value in hand.to_tensors().items():
@@ -187,7 +191,7 @@ def _pack_hand(key: str, hand: Hand, tensors: dict[str, Tensor]) -> dict[str, An
     return plain
 
 
-def _unpack_hand(key: str, plain: dict[str, Any], tensors: dict[str, Tensor]) -> Hand:
+def _unpack_hand(key: str, plain: dict[str, Any], tensors: Tensors) -> Hand:
     prefix = f"{key}."
     own = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
     return Hand.from_tensors(plain | own)
@@ -195,7 +199,7 @@ def _unpack_hand(key: str, plain: dict[str, Any], tensors: dict[str, Tensor]) ->
 
 def _pack_grasps(
     key: str, hand: Hand, batches: list[GraspBatch], names: list[str], splits: Set[str]
-) -> dict[str, Tensor]:
+) -> Tensors:
     if not batches:
         raise BundleError(f"no grasps of hand '{hand.name}'; synthesise some or leave the hand out")
     known = {name: i for i, name in enumerate(names)}
@@ -216,15 +220,13 @@ def _pack_grasps(
     }
 
 
-def _unpack_grasps(key: str, tensors: dict[str, Tensor]) -> HandGrasps:
+def _unpack_grasps(key: str, tensors: Tensors) -> HandGrasps:
     quaternion = roma.quat_wxyz_to_xyzw(tensors[f"{key}.quaternion_wxyz"])
-    T = torch.eye(4).repeat(len(quaternion), 1, 1)
-    T[:, :3, :3] = roma.unitquat_to_rotmat(torch.nn.functional.normalize(quaternion, dim=-1))
-    T[:, :3, 3] = tensors[f"{key}.position"]
-    return HandGrasps(T, tensors[f"{key}.joints"], tensors[f"{key}.object"].long())
+    rotation = roma.unitquat_to_rotmat(torch.nn.functional.normalize(quaternion, dim=-1))
+    return HandGrasps(compose(rotation, tensors[f"{key}.position"]), tensors[f"{key}.joints"], tensors[f"{key}.object"].long())
 
 
-def _save(path: Path, tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
+def _save(path: Path, tensors: Tensors, header: dict[str, Any]) -> None:
     size = sum(t.numel() * t.element_size() for t in tensors.values())
     if size > MAX_BYTES:
         raise BundleError(f"the bundle would have {size / 1e6:.1f} MB, at most {MAX_BYTES / 1e6:.0f} MB are allowed; take "

@@ -1,1 +1,1 @@
-"""Collections of grasp files: merge, filter, check, import."""
+"""Collections of grasp files: merge, filter, check, import, bundle."""

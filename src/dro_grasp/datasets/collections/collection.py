@@ -1,4 +1,4 @@
-"""Grasps of many pairs, however they are kept: a folder of shards, a folder of files, or one file."""
+"""Collections of grasps of many pairs: a folder of shards, a folder of files, or one file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.table import read_footer
 
 YIELDS = "yields"
-"""Entry of a file's notes with what became of the candidates of each of its objects."""
+"""Entry of a file's notes with the yield of each of its objects."""
 
 
 @dataclass(frozen=True)
@@ -21,14 +21,14 @@ class PairGrasps:
     """The grasps of one hand on one object."""
 
     hand: str
-    """Name of the hand, or the path it was asked for by."""
+    """Name of the hand, or the path under which it was requested."""
     object: str
     """Likewise."""
     grasps: GraspBatch
-    """May be none."""
+    """May be empty."""
     made: Yield
-    """What became of their candidates when they were made; a merged file may hold a choice of the valid ones, and of
-    grasps from elsewhere only `valid` is known."""
+    """Yield of their production. A merged file may hold a choice of the valid grasps; for grasps from elsewhere only
+    `valid` is known."""
 
 
 def read_collection(path: Path | str, only_successful: bool = True) -> Iterator[PairGrasps]:
@@ -36,10 +36,10 @@ def read_collection(path: Path | str, only_successful: bool = True) -> Iterator[
 
     Args:
         path: A folder that `synthesize` filled, a folder of grasp files, or one grasp file.
-        only_successful: Leave out grasps that failed their trial or had none.
+        only_successful: Leave out grasps that failed their trial or have none.
 
     Raises:
-        GraspFileError: There is nothing of that kind at the path, or a file is damaged.
+        GraspFileError: The path holds no grasps, or a file is damaged.
     """
     path = Path(path)
     if path.is_file():
@@ -74,7 +74,7 @@ def count_collection(path: Path | str) -> dict[str, dict[str, int]]:
 
 
 def successful(grasps: GraspBatch) -> GraspBatch:
-    """Those that passed their trial."""
+    """The grasps that passed their trial."""
     return grasps[grasps.success]
 
 
@@ -104,10 +104,10 @@ def _pairs_of_shards(folder: Path) -> Iterator[PairGrasps]:
 
 
 def _of_one_hand(batches: Sequence[GraspBatch], hand: str, obj: str) -> Sequence[GraspBatch]:
-    """Refuse shards that were made with different versions of a hand or an object.
+    """Refuse shards made with different versions of a hand or an object.
 
     Raises:
-        GraspFileError: They are of different versions.
+        GraspFileError: The versions differ.
     """
     hands = {b.hand_sha256 for b in batches}
     objects = {sha for b in batches for sha in b.object_sha256}

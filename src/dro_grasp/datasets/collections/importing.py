@@ -1,4 +1,4 @@
-"""From grasps as other projects' files have them to grasp batches of hands and objects known here."""
+"""Import grasps of other projects: match their hands, objects and joints with ours."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dro_grasp.datasets.collections.foreign import ForeignGrasp, Format, in_order, read_foreign
+from dro_grasp.datasets.collections.foreign_files import ForeignGrasp, Format, in_order, read_foreign
 from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import with_sources
@@ -23,15 +23,15 @@ def import_grasps(
 
     Args:
         paths: The files.
-        kind: Whose format they have.
-        hands: Names or paths here, by the names in the files; an empty name stands for all that is not named.
+        kind: Their project.
+        hands: Our names or paths of hands, by the names in the files; the entry '' stands for all others.
         obj: Object of all grasps, for files that name it otherwise or not at all.
 
     Returns:
         Grasps by hand, and why objects are missing, by their names.
 
     Raises:
-        OptionError: No file is given, or one names no hand or no object, and nor do the arguments.
+        OptionError: No file is given, or neither a file nor the arguments name its hand or object.
         HandError: A hand cannot be loaded.
         GraspFileError: A file cannot be read, or its grasps are of other joints.
     """

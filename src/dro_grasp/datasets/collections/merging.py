@@ -1,4 +1,4 @@
-"""Join data sets: near-duplicates once, an even choice of grasps for each pair, one compact file a hand."""
+"""Merge data sets: near-duplicates once, an even choice of grasps for each pair, one compact file for each hand."""
 
 from __future__ import annotations
 
@@ -15,17 +15,22 @@ from dro_grasp._version import __version__
 from dro_grasp.datasets.collections.collection import YIELDS, PairGrasps, read_collection
 from dro_grasp.datasets.engine.yields import Yield
 from dro_grasp.errors import GraspFileError
+from dro_grasp.geometry.se3 import compose
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.duplicates import distinct
 from dro_grasp.grasps.sources import hand_of
 from dro_grasp.hands.hand import Hand
 
-POSITION_STEP, ANGLE_STEP, UNIT_STEP = 2.0**-16, 2.0**-13, 2.0**-15
-"""Grid on which merged files keep positions [m], joints [rad or m] and quaternions: 0.015 mm, 0.12 mrad, 0.03 mrad."""
+POSITION_STEP = 2.0**-16
+"""Grid of positions in merged files [m]. Ours: 0.015 mm."""
+ANGLE_STEP = 2.0**-13
+"""Grid of joints in merged files [rad or m]. Ours: 0.12 mrad."""
+UNIT_STEP = 2.0**-15
+"""Grid of quaternions in merged files. Ours: 0.03 mrad."""
 MANTISSA = 10
-"""Bits of the mantissa that merged files keep of all other numbers: three digits."""
+"""Bits of the mantissa of all other numbers in merged files. Ours: three digits."""
 PLAIN_COLUMNS = ("reason", "failure")
-"""Columns that say nothing of grasps that succeeded."""
+"""Columns that are empty for successes."""
 
 
 @dataclass(frozen=True)
@@ -52,11 +57,11 @@ class Merged:
 
 
 def merge(paths: Sequence[Path | str], per_pair: int | None = None) -> list[Merged]:
-    """Join data sets, hand by hand.
+    """Merge data sets, hand by hand.
 
     Args:
-        paths: What `read_collection` takes.
-        per_pair: Most grasps of a pair; of more, those are kept that spread best over palm directions.
+        paths: As in `read_collection`.
+        per_pair: Most grasps of a pair; the choice spreads best over palm directions.
 
     Raises:
         GraspFileError: A path holds no grasps, or data sets know different versions of a hand or object.
@@ -70,12 +75,12 @@ def merge(paths: Sequence[Path | str], per_pair: int | None = None) -> list[Merg
 
 
 def file_name(hand: str) -> str:
-    """Name of a merged file: the hand's, with its source, as hands of two sources may have one name."""
+    """Name of a merged file: the hand's with its source, as hands of two sources may share a name."""
     return f"{hand.replace('/', '-')}.parquet"
 
 
 def _name(pair: PairGrasps) -> str:
-    """The name that the grasps give their object, which may have been asked for by path."""
+    """The object's name in its grasps; the pair may have been requested by path."""
     return pair.grasps.object[0] if len(pair.grasps) else pair.object
 
 
@@ -100,9 +105,10 @@ def _merge_hand(name: str, pairs: dict[str, list[PairGrasps]], per_pair: int | N
 
 
 def spread(hand: Hand, grasps: GraspBatch, count: int) -> Int[Tensor, " k"]:
-    """Indices of the grasps whose palm directions cover the sphere best, at most `count`, in their order.
+    """Indices of at most `count` grasps whose palm directions cover the sphere best, in their order.
 
-    One after the other, the grasp whose palm direction is farthest from all chosen ones; the first has the best energy.
+    Farthest-first: the choice starts with the first grasp and adds the one whose palm direction is farthest from all
+    chosen ones.
     """
     if len(grasps) <= count:
         return torch.arange(len(grasps))
@@ -117,11 +123,10 @@ def spread(hand: Hand, grasps: GraspBatch, count: int) -> Int[Tensor, " k"]:
 
 
 def compact(hand: Hand, grasps: GraspBatch) -> GraspBatch:
-    """Grasps with numbers rounded to what they mean, so that files compress; joints stay within their limits."""
-    T = grasps.T_object_wrist.clone()
-    quaternion = _on_grid(roma.rotmat_to_unitquat(T[:, :3, :3]), UNIT_STEP)
-    T[:, :3, :3] = roma.unitquat_to_rotmat(quaternion / quaternion.norm(dim=-1, keepdim=True))
-    T[:, :3, 3] = _on_grid(T[:, :3, 3], POSITION_STEP)
+    """The grasps with rounded numbers, so that files compress; joints stay within their limits."""
+    quaternion = _on_grid(roma.rotmat_to_unitquat(grasps.T_object_wrist[:, :3, :3]), UNIT_STEP)
+    rotation = roma.unitquat_to_rotmat(quaternion / quaternion.norm(dim=-1, keepdim=True))
+    T = compose(rotation, _on_grid(grasps.T_object_wrist[:, :3, 3], POSITION_STEP))
     joints = _on_grid(grasps.joints, ANGLE_STEP)
     joints = torch.minimum(torch.maximum(joints, hand.tree.lower), hand.tree.upper)
     extra = {

@@ -1,1 +1,1 @@
-"""Production of grasp data: shards, made by pools of processes or machines."""
+"""Production of grasp data: shards, made by processes of this machine or by a cluster."""

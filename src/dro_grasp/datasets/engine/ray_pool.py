@@ -1,7 +1,7 @@
-"""Where shards are made: a Ray cluster of any number of machines.
+"""Workers on a Ray cluster of any number of machines.
 
-Files travel as bytes, so nodes need no shared folder; hands and objects that are given by path must lie at that path on
-every node, and every node needs the same version of dro-grasp.
+Files travel as bytes, so nodes need no shared folder. Hands and objects named by path must lie at that path on every
+node, and every node needs the same version of dro-grasp.
 """
 
 from __future__ import annotations
@@ -11,19 +11,19 @@ import socket
 import time
 from typing import TYPE_CHECKING, Any
 
-from dro_grasp.datasets.engine.pools import Failed, Outcome, Work, failure_of
-from dro_grasp.datasets.engine.production import Job, Task, make_shard
+from dro_grasp.datasets.engine.pools import Failed, Outcome, Work, attempt
+from dro_grasp.datasets.engine.worker import Job, Task, make_shard
 from dro_grasp.errors import OptionError
 
 if TYPE_CHECKING:
     import ray
 
 CONNECT_TIME = 5.0
-"""Longest wait for a cluster's head to accept a connection [s]."""
+"""Longest wait for a cluster's head to accept a connection [s]. Ours."""
 GPU_SHARE = 0.25
-"""Share of a GPU that a shard takes when energies are computed there: trials, on the CPU, take most of its time."""
+"""Share of a GPU for a shard whose energies are computed there. Ours: trials, on the CPU, take most of its time."""
 RETRIES = 3
-"""Times that Ray starts a shard again, elsewhere, when its process or node is gone. Shards are functions of their seed."""
+"""Times that Ray starts a shard again elsewhere when its process or node is gone. Ours; a shard depends on its seed alone."""
 
 
 class RayPool:
@@ -33,11 +33,11 @@ class RayPool:
         """Join a cluster, or start one on this machine.
 
         Args:
-            job: What all shards share.
-            workers: Processes, where a cluster has to be started; a running one is used whole.
+            job: Settings that all shards share.
+            workers: Processes of a cluster that has to be started; a running cluster is used whole.
             limit: A shard that takes longer is stopped [s].
-            address: Of the cluster's head, `host:port`, or `auto` for the one that runs here; None takes RAY_ADDRESS, and
-                without it starts a cluster on this machine.
+            address: Address `host:port` of the cluster's head, or `auto` for the one that runs here; None takes
+                RAY_ADDRESS, and without it starts a cluster on this machine.
             work: Makes a shard.
 
         Raises:
@@ -51,26 +51,27 @@ class RayPool:
         if not ray.is_initialized():
             self.started_here = True
             _connect(address or os.environ.get("RAY_ADDRESS"), workers)
-        self.ray = ray
+        self.ray, self.work = ray, work
         self.job = ray.put(job)
         options: dict[str, Any] = {"num_cpus": 1, "max_retries": RETRIES, "scheduling_strategy": "SPREAD"}
         if job.config.synthesis.device != "cpu":
             options["num_gpus"] = GPU_SHARE
-        self.start = ray.remote(**options)(_make(work))
+        # Errors come back as values, so Ray retries lost machines and nothing else.
+        self.start = ray.remote(**options)(attempt)
         self.running: dict[ray.ObjectRef, tuple[Task, float]] = {}
 
     @property
     def free(self) -> int:
-        """CPUs of the cluster as it is now, less the shards in flight; at least one may wait for a node to come."""
+        """CPUs of the cluster now, less the shards in flight; at least one shard may wait for a node."""
         cpus = max(1, int(self.ray.cluster_resources().get("CPU", 0)))
         return max(0, cpus - len(self.running))
 
     def submit(self, task: Task) -> None:
         """Hand a shard to the cluster."""
-        self.running[self.start.remote(self.job, task)] = (task, time.monotonic())
+        self.running[self.start.remote(self.work, self.job, task)] = (task, time.monotonic())
 
     def wait(self, timeout: float) -> list[Outcome]:
-        """Shards made, errors, and shards whose machine is gone for good or that took too long."""
+        """Finished shards, errors, and shards whose machine is gone for good or that took too long."""
         done, _ = self.ray.wait(list(self.running), num_returns=1, timeout=timeout)
         outcomes = [self._collect(ref) for ref in done]
         for ref in [r for r, (_, since) in self.running.items() if time.monotonic() - since > self.limit]:
@@ -114,22 +115,11 @@ def _connect(address: str | None, workers: int) -> None:
 
 
 def _knock(address: str) -> None:
-    """Find out in seconds whether anybody listens at `host:port`; Ray itself waits for minutes.
+    """Check in seconds that something listens at `host:port`; Ray itself waits for minutes.
 
     Raises:
-        OSError: Nobody does.
+        OSError: Nothing does.
     """
     host, _, port = address.rpartition(":")
     if host and port.isdecimal():
         socket.create_connection((host, int(port)), CONNECT_TIME).close()
-
-
-def _make(work: Work) -> Any:
-    """The task: errors come back as values, so that Ray retries lost machines and nothing else."""
-    def make(job: Job, task: Task) -> Any:
-        try:
-            return work(job, task)
-        except Exception as error:
-            return failure_of(error)
-
-    return make

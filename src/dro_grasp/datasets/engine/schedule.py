@@ -1,10 +1,11 @@
-"""Synthesise and try grasps for many hands and objects: independent shards, here or on many machines.
+"""Fill a folder with grasps of many hands on many objects: independent shards, made here or on many machines.
 
-Killing it at any time loses the shards in flight at most; a rerun does only what is missing.
+Killing a run at any time loses at most the shards in flight; a rerun makes only what is missing.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 import sys
@@ -12,10 +13,12 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from dro_grasp.datasets.engine.pools import Failed, LocalPool, Outcome, Pool
-from dro_grasp.datasets.engine.production import EngineConfig, Job, Task
+from dro_grasp.datasets.engine.local_pool import LocalPool
+from dro_grasp.datasets.engine.pools import Failed, Outcome, Pool
 from dro_grasp.datasets.engine.shards import Shard, find_shards, read_yield, remove_leftovers, sole_run
+from dro_grasp.datasets.engine.worker import EngineConfig, Job, Task
 from dro_grasp.datasets.engine.yields import Yield
 from dro_grasp.devices import require_device
 from dro_grasp.errors import GraspFileError, OptionError
@@ -26,9 +29,9 @@ from dro_grasp.objects.catalogue import ASSET_PREFIX, load_object, object_names
 __all__ = ["DatasetReport", "EngineConfig", "require_known", "synthesize_dataset"]
 
 REPORT_EVERY = 10.0
-"""Time between lines of progress [s]."""
+"""Time between lines of progress [s]. Ours."""
 CANDIDATE_STEP = 64
-"""Shards have a multiple of this many candidates."""
+"""Shards have a multiple of this many candidates. Ours."""
 Pair = tuple[str, str]
 
 
@@ -37,15 +40,15 @@ class PairState:
     """Progress of one (hand, object) pair."""
 
     total: Yield = field(default_factory=Yield)
-    """Of all its shards."""
+    """Sum over its shards."""
     done: set[int] = field(default_factory=set)
-    """Rounds that are finished; those of a damaged shard may be missing in between."""
+    """Finished rounds; damaged shards leave gaps."""
     barren: int = 0
-    """Rounds without a grasp since the last one with."""
+    """Rounds without a grasp since the last one with a grasp."""
     crashes: int = 0
-    """Times that a worker died on it."""
+    """Deaths of workers on it since its last shard."""
     error: str = ""
-    """Why it was given up, empty while it is not."""
+    """The error that ended it, empty without one."""
 
     @property
     def grasps(self) -> int:
@@ -64,22 +67,32 @@ class PairState:
         self.barren = 0 if made.valid else self.barren + 1
 
     def next_candidates(self, goal: int, config: EngineConfig) -> int:
-        """Size of the next shard: what is missing, at the pair's yield so far, within the config's bounds."""
+        """Size of the next shard: the missing grasps at the pair's yield so far, within the config's bounds."""
         if not self.total.candidates or not self.grasps:
             return config.candidates
         wanted = (goal - self.grasps) * self.total.candidates / self.grasps
         steps = math.ceil(wanted / CANDIDATE_STEP) * CANDIDATE_STEP
-        return min(max(steps, config.least_candidates), config.largest_shard)
+        return min(max(steps, config.min_candidates), config.max_candidates)
+
+    def why_given_up(self, goal: int, config: EngineConfig) -> str:
+        """Why the pair gets no more shards although it has too few grasps; empty if it is full or goes on."""
+        if self.error or self.grasps >= goal:
+            return self.error
+        if self.barren >= config.max_barren_rounds:
+            return f"{self.grasps} grasps, none in the last {self.barren} rounds: {self.total.main_obstacle()}"
+        if self.total.candidates >= config.candidate_budget:
+            return f"{self.grasps} grasps of {self.total.candidates} candidates, then given up: {self.total.main_obstacle()}"
+        return ""
 
 
 @dataclass(frozen=True)
 class DatasetReport:
-    """What a run of the engine did."""
+    """Result of one run."""
 
     grasps: int
     """Grasps in the folder for the pairs asked for."""
     added: int
-    """Of these, made in this run."""
+    """Grasps added in this run."""
     shards: int
     """Shards made in this run."""
     seconds: float
@@ -93,14 +106,11 @@ def synthesize_dataset(
     objects: Sequence[str],
     grasps_per_pair: int,
     output_dir: Path | str,
-    workers: int = 2,
+    workers: int | Callable[[Job], Pool] = 2,
     seed: int = 0,
-    protocol: str = "strict",
     config: EngineConfig | None = None,
-    scale: float = 1.0,
     progress: Callable[[str], None] | None = None,
-    make_pool: Callable[[Job], Pool] | None = None,
-    seconds: float | None = None,
+    **settings: Any,
 ) -> DatasetReport:
     """Fill a folder with valid grasps of every hand on every object.
 
@@ -108,46 +118,42 @@ def synthesize_dataset(
 
     Args:
         hands: Names or paths of hands.
-        objects: Names or paths of objects with meshes.
+        objects: Names or paths of objects.
         grasps_per_pair: A pair is finished when it has this many valid grasps.
         output_dir: The folder; made when missing (its parent must exist).
-        workers: Processes, of one thread each.
-        seed: With hand, object, round and the number of candidates it determines every shard.
-        protocol: The trial that grasps must pass.
-        config: Sizes.
-        scale: Multiplies the coordinates of all objects.
+        workers: Processes, of one thread each; or a function that makes another pool for a job.
+        seed: Determines every shard, together with hand, object, round and number of candidates.
+        config: Settings.
         progress: Called with a line of text now and then; None prints to stderr.
-        make_pool: Where shards are made; None makes them in processes of this machine.
-        seconds: No shard is begun after this time [s]; those in the making are finished.
+        settings: Fields of EngineConfig that differ from `config`: `protocol`, `scale`, `seconds` and others.
 
     Raises:
         OptionError: A number is not positive, the time is not finite, or this machine lacks the device.
         OutputError: The folder cannot be made or written, or another run is filling it.
     """
-    if grasps_per_pair < 1 or workers < 1:
+    config = dataclasses.replace(config or EngineConfig(), **settings)
+    if grasps_per_pair < 1 or (isinstance(workers, int) and workers < 1):
         raise OptionError(f"grasps_per_pair is {grasps_per_pair}, workers {workers}; both must be at least 1")
-    if seconds is not None and not (math.isfinite(seconds) and seconds > 0):
-        raise OptionError(f"seconds is {seconds}; give a positive number, or None for no limit")
-    config = config or EngineConfig()
-    if make_pool is None:
+    if config.seconds is not None and not (math.isfinite(config.seconds) and config.seconds > 0):
+        raise OptionError(f"seconds is {config.seconds}; give a positive number, or None for no limit")
+    if isinstance(workers, int):
         require_device(config.synthesis.device)
     folder = make_folder(output_dir)
     say = progress or (lambda line: print(line, file=sys.stderr, flush=True))
     with sole_run(folder):
         states = {(hand, obj): PairState() for hand in hands for obj in objects}
         resume(folder, states, say)
-        before, started = sum(s.grasps for s in states.values()), time.perf_counter()
-        job = Job(seed, protocol, config, scale)
-        pool = make_pool(job) if make_pool else LocalPool(job, workers, config.shard_limit)
-        end = math.inf if seconds is None else started + seconds
-        shards = Run(pool, folder, states, grasps_per_pair, config, say, end).finish()
+        before, started, job = sum(s.grasps for s in states.values()), time.perf_counter(), Job(seed, config)
+        pool = LocalPool(job, workers, config.shard_seconds) if isinstance(workers, int) else workers(job)
+        end = math.inf if config.seconds is None else started + config.seconds
+        shards = Production(pool, folder, states, grasps_per_pair, config, say, end).finish()
     total = sum(s.grasps for s in states.values())
-    failures = {pair: s.error for pair, s in states.items() if s.error}
+    failures = {pair: why for pair, s in states.items() if (why := s.why_given_up(grasps_per_pair, config))}
     return DatasetReport(total, total - before, shards, time.perf_counter() - started, failures)
 
 
 def require_known(hands: Sequence[str], objects: Sequence[str]) -> None:
-    """Refuse names that stand for nothing and files that do not exist, without reading any that do.
+    """Refuse unknown names and missing files, without reading any file that exists.
 
     Args:
         hands: Names or paths of hands.
@@ -159,7 +165,7 @@ def require_known(hands: Sequence[str], objects: Sequence[str]) -> None:
     """
     for hand in hands:
         if not locate_hand(hand)[0].expanduser().is_file():
-            load_hand(hand)  # says what is wrong
+            load_hand(hand)  # its error says what is wrong
     names = object_names()
     for obj in objects:
         if obj.removeprefix(ASSET_PREFIX) not in names and not Path(obj).expanduser().is_file():
@@ -167,7 +173,7 @@ def require_known(hands: Sequence[str], objects: Sequence[str]) -> None:
 
 
 def resume(folder: Path, states: dict[Pair, PairState], say: Callable[[str], None]) -> None:
-    """Take up what earlier runs have left in the folder; a damaged or foreign shard is named and made again."""
+    """Take up the shards of earlier runs; a damaged or foreign shard is named and made again."""
     remove_leftovers(folder)
     for shard in find_shards(folder):
         state = states.get((shard.hand, shard.object))
@@ -180,14 +186,13 @@ def resume(folder: Path, states: dict[Pair, PairState], say: Callable[[str], Non
 
 
 def next_pair(states: dict[Pair, PairState], busy: set[Pair], goal: int, config: EngineConfig) -> Pair | None:
-    """The unfinished pair with the fewest rounds that no worker is busy with, or None.
+    """The unfinished, idle pair with the fewest rounds, or None.
 
-    Objects that come for the first time are spread over the workers, since preparing one can take minutes; pairs on
-    which a worker died come last.
+    New objects are spread over the workers, as preparing one can take minutes; pairs on which a worker died come last.
     """
     open_pairs = [
         pair for pair, s in states.items()
-        if pair not in busy and not s.error and s.grasps < goal and _worth_trying(s, config)
+        if pair not in busy and s.grasps < goal and not s.why_given_up(goal, config)
     ]
     prepared_now = {obj for hand, obj in busy if not states[hand, obj].total.candidates}
     return min(
@@ -195,17 +200,8 @@ def next_pair(states: dict[Pair, PairState], busy: set[Pair], goal: int, config:
     )
 
 
-def _worth_trying(state: PairState, config: EngineConfig) -> bool:
-    if state.barren >= config.barren_rounds:
-        state.error = f"{state.grasps} grasps, none in the last {state.barren} rounds: {state.total.main_obstacle()}"
-    elif state.total.candidates >= config.most_candidates:
-        state.error = (f"{state.grasps} grasps of {state.total.candidates} candidates, then given up: "
-                       f"{state.total.main_obstacle()}")
-    return not state.error
-
-
 @dataclass
-class Run:
+class Production:
     """One run of the engine over a folder."""
 
     pool: Pool
@@ -215,9 +211,10 @@ class Run:
     config: EngineConfig
     say: Callable[[str], None]
     end: float = math.inf
-    """When no more shards are begun, by the performance counter [s]."""
+    """Deadline (`time.perf_counter`) after which no new shard starts."""
     busy: set[Pair] = field(default_factory=set)
-    made: int = 0
+    shards: int = 0
+    """Finished so far."""
 
     def finish(self) -> int:
         """Keep the pool busy until every pair is finished or given up; returns the number of shards made."""
@@ -228,11 +225,11 @@ class Run:
                     self._collect(outcome)
                 if time.perf_counter() - told > REPORT_EVERY:
                     told = time.perf_counter()
-                    self.say(summary(self.states, self.goal, told - started))
+                    self.say(self._summary(told - started))
         finally:
             self.pool.close()
-        self.say(summary(self.states, self.goal, time.perf_counter() - started))
-        return self.made
+        self.say(self._summary(time.perf_counter() - started))
+        return self.shards
 
     def _fill(self) -> bool:
         """Start shards while there is room; false when none is left and none in flight."""
@@ -260,19 +257,17 @@ class Run:
             task.shard.save(result.payload, self.folder)
             state.note(task.shard, result.result)
             state.crashes = 0
-            self.made += 1
+            self.shards += 1
             return
         state.crashes += result.died
-        if not result.died or state.crashes >= self.config.most_crashes:
+        if not result.died or state.crashes >= self.config.max_crashes:
             state.error = result.reason + (f", {state.crashes} times" if result.died else "")
             self.say(f"{pair[0]} on {pair[1]}: {state.error}")
 
-
-def summary(states: dict[Pair, PairState], goal: int, seconds: float) -> str:
-    """One line about where a run stands."""
-    grasps = sum(s.grasps for s in states.values())
-    full = sum(s.grasps >= goal for s in states.values())
-    given_up = sum(bool(s.error) for s in states.values())
-    fewest = min((len(s.done) for s in states.values() if not s.error), default=0)
-    return (f"{grasps} grasps; {full} of {len(states)} pairs full, {given_up} given up, round {fewest}; "
-            f"{seconds:.0f} s")
+    def _summary(self, seconds: float) -> str:
+        """One line about the state of the run."""
+        states = self.states.values()
+        going = [s for s in states if not s.why_given_up(self.goal, self.config)]
+        return (f"{sum(s.grasps for s in states)} grasps; {sum(s.grasps >= self.goal for s in states)} of {len(states)} pairs "
+                f"full, {len(states) - len(going)} given up, round {min((len(s.done) for s in going), default=0)}; "
+                f"{seconds:.0f} s")

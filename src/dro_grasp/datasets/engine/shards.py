@@ -1,12 +1,11 @@
 """A folder of grasp shards: one Parquet file for each (hand, object, round), there whole or not at all.
 
-The folder is the state of a data set's making: what is there is done, everything else is still to do.
+The folder is the state of the production: a shard that is there is done, every other one is still to do.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import fcntl
 import os
 import re
 import time
@@ -17,6 +16,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote
 
+from filelock import FileLock, Timeout
+
 from dro_grasp._version import __version__
 from dro_grasp.datasets.engine.yields import Yield
 from dro_grasp.errors import GraspFileError, OutputError
@@ -24,9 +25,11 @@ from dro_grasp.files import replacing
 from dro_grasp.grasps.table import read_footer
 
 LOCK = ".lock"
-"""File in a data set's folder that a run holds while it fills it."""
+"""File in a data set's folder that a run locks while it fills the folder."""
+HOLDER = ".process"
+"""File with the number of the process that holds the lock; other systems than Linux let nobody read a locked file."""
 STALE = 3600.0
-"""Age after which a temporary file is taken as left behind by a killed process [s]."""
+"""Age from which a temporary file counts as left behind by a killed process [s]. Ours."""
 
 
 @dataclass(frozen=True, order=True)
@@ -61,7 +64,7 @@ class Shard:
 
 
 def notes_of(result: Yield) -> dict[str, Any]:
-    """What a shard's header says of its making."""
+    """Notes on its production in a shard's header."""
     return {"yield": result.to_dict(), "version": __version__}
 
 
@@ -82,7 +85,7 @@ def find_shards(folder: Path | str) -> list[Shard]:
 
 
 def read_yield(folder: Path, shard: Shard) -> Yield:
-    """What became of the candidates of a shard, from the file's footer; `valid` is the number of grasps it holds.
+    """Yield of a shard, from the file's footer; `valid` is the number of grasps it holds.
 
     Raises:
         GraspFileError: The file cannot be read, or is of another version.
@@ -99,19 +102,21 @@ def sole_run(folder: Path) -> Iterator[None]:
     Raises:
         OutputError: Another run is filling the folder.
     """
-    with (folder / LOCK).open("ab+", buffering=0) as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            lock.seek(0)
-            raise OutputError(f"another run is filling {folder} (process {lock.read().decode() or 'unknown'}); wait for it, or "
-                              "give another folder and join both with `dro-grasp dataset merge`") from error
-        except OSError:
-            pass  # a file system without locks
-        with suppress(OSError):  # a full disk is told by what needs the space
-            lock.truncate(0)
-            lock.write(str(os.getpid()).encode())
+    lock, holder = FileLock(folder / LOCK, timeout=0, fallback_to_soft=False), folder / HOLDER
+    try:
+        lock.acquire()
+    except Timeout as error:
+        process = holder.read_text() if holder.exists() else ""
+        raise OutputError(f"another run is filling {folder} (process {process or 'unknown'}); wait for it, or give another "
+                          "folder and join both with `dro-grasp dataset merge`") from error
+    except OSError:
+        pass  # a file system without locks
+    with suppress(OSError):  # on a full disk the first shard tells
+        holder.write_text(str(os.getpid()))
+    try:
         yield
+    finally:
+        lock.release()
 
 
 def remove_leftovers(folder: Path) -> int:

@@ -1,4 +1,4 @@
-"""What became of the candidates of a shard, a pair or a whole data set: numbers that add up."""
+"""Yield: where the candidates of a shard, a pair or a whole data set end up, in numbers that add up."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ class Yield:
     candidates: int = 0
     """Grasps synthesised."""
     ranked_out: int = 0
-    """Of these, not tried because their energy was too high."""
+    """Without a trial because their energy was too high."""
     deep: int = 0
-    """Not tried because they lie too deep in the object."""
+    """Without a trial because they penetrate the object too far."""
     moved: int = 0
-    """Not tried because closing moved the object too far."""
+    """Without a trial because closing moved the object too far."""
     failures: dict[str, int] = field(default_factory=dict)
-    """Tried and failed, by reason."""
+    """Failed trials by reason."""
     duplicates: int = 0
     """Passed, but near-duplicates of an earlier grasp."""
     valid: int = 0
     """Passed and stored."""
     cpu_seconds: float = 0.0
-    """Time of the process for all of it [s]; loading hand and object is not counted."""
+    """CPU time without loading hand and object [s]."""
     preparation_seconds: float = 0.0
-    """Time of the process for loading hand and object, convex parts and grid included where not cached [s]."""
+    """CPU time of loading hand and object, with convex parts and grid where they are not cached [s]."""
 
     @property
     def tried(self) -> int:
-        """Candidates that went through a trial."""
+        """Number of trials."""
         return sum(self.failures.values()) + self.duplicates + self.valid
 
     @property
@@ -47,13 +47,13 @@ class Yield:
         return Yield(**sums, failures=dict(Counter(self.failures) + Counter(other.failures)))
 
     def main_obstacle(self) -> str:
-        """Where most candidates that might have been grasps were lost, in words."""
+        """Where most of the tested candidates were lost, in words."""
         lost = self.failures | {
             "hand too deep in the object": self.deep, "closing moves the object too far": self.moved,
         }
         reason = max(lost, key=lambda name: lost[name], default="")
         share = lost[reason] / max(1, self.tried + self.deep + self.moved) if reason else 0.0
-        return f"{reason} ({share:.0%} of what was tried)" if share else "nothing was worth a trial"
+        return f"{reason} ({share:.0%} of the tested candidates)" if share else "no candidate was tested"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""

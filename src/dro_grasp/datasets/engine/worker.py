@@ -1,4 +1,4 @@
-"""Make one shard of a data set: synthesise candidates, close the hand on the object, keep what passes the trial."""
+"""The work of one shard: synthesise candidates, close the hand on the object, keep those that pass the trial."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from collections import Counter
 from dataclasses import dataclass, field
 from functools import lru_cache
 
+from dro_grasp.datasets.bundle.splits import split_of
 from dro_grasp.datasets.engine.shards import Shard, notes_of
 from dro_grasp.datasets.engine.yields import Yield
-from dro_grasp.datasets.splits import split_of
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.duplicates import distinct
 from dro_grasp.grasps.sources import with_sources
@@ -24,50 +24,53 @@ from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
 from dro_grasp.simulation.trial import settle, simulate
 
 LOOSE = "held by too few links"
-"""Reason against grasps that pass the trial without enough contact."""
+"""Reason that counts grasps which pass the trial without enough contact."""
 
 
 @dataclass(frozen=True)
 class EngineConfig:
-    """How a data set is made."""
+    """Settings of a data set's production."""
 
+    protocol: str = "strict"
+    """Trial that grasps must pass."""
+    scale: float = 1.0
+    """Multiplies the coordinates of all objects."""
+    seconds: float | None = None
+    """No new shard starts after this time [s]; those in flight are finished. None for no limit."""
     candidates: int = 256
-    """Grasps synthesised for the first shard of a pair; later ones are as large as the pair's yield asks for."""
-    least_candidates: int = 128
+    """Candidates of a pair's first shard; the size of later shards follows the pair's yield."""
+    min_candidates: int = 128
     """Smallest later shard."""
-    largest_shard: int = 768
+    max_candidates: int = 768
     """Largest later shard."""
-    tried_share: float = 0.7
-    """Share of them, lowest energy first, that are tried in simulation."""
-    deepest: float = 0.01
-    """Candidates that penetrate deeper than this by the signed distances are not tried [m]."""
+    trial_share: float = 0.7
+    """Share of the candidates, lowest energy first, that may get a trial."""
+    max_penetration: float = 0.01
+    """Candidates that penetrate deeper by the signed distances get no trial [m]."""
     settle: bool = True
     """Take the labels after the hand has closed on the object in simulation, which drives out penetration."""
-    farthest: float = 0.03
-    """Candidates that the closing moves farther than this relative to the object are not tried [m]."""
-    least_contacts: int = 2
+    max_shift: float = 0.03
+    """Candidates that closing moves farther relative to the object get no trial [m]."""
+    min_contact_links: int = 2
     """Links that must touch the object after closing; with fewer, a success is a cage or luck."""
-    barren_rounds: int = 3
-    """A pair is given up after this many rounds without a single valid grasp."""
-    most_candidates: int = 8192
+    max_barren_rounds: int = 3
+    """A pair is given up after this many rounds in a row without a valid grasp."""
+    candidate_budget: int = 8192
     """A pair is given up after this many candidates."""
-    most_crashes: int = 2
-    """A pair is given up when workers died on it this often in a row."""
-    shard_limit: float = 1800.0
-    """A shard that takes longer is stopped, as if its worker had died [s]; preparing the object counts."""
+    max_crashes: int = 2
+    """A pair is given up after this many deaths of workers in a row."""
+    shard_seconds: float = 1800.0
+    """A shard that takes longer is stopped, as if its worker had died [s]; this includes preparing the object."""
     synthesis: SynthesisConfig = field(default_factory=SynthesisConfig)
     """The optimiser."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """What all shards of a run share."""
+    """Settings that all shards of a run share."""
 
     seed: int
-    protocol: str
     config: EngineConfig
-    scale: float = 1.0
-    """Multiplies the coordinates of all objects."""
 
 
 @dataclass(frozen=True)
@@ -78,12 +81,12 @@ class Task:
     candidates: int
     """Grasps to synthesise."""
     earlier: tuple[bytes, ...] = ()
-    """The pair's shards so far, as files: what is in them counts as a duplicate."""
+    """The pair's shards so far, as files; a grasp close to one of theirs is a duplicate."""
 
 
 @dataclass(frozen=True)
-class Made:
-    """One shard, made."""
+class FinishedShard:
+    """The outcome of one task."""
 
     shard: Shard
     payload: bytes
@@ -107,30 +110,29 @@ def _object(name: str, scale: float) -> ObjectModel:
     return load_object(name, scale=scale)
 
 
-def make_shard(job: Job, task: Task) -> Made:
-    """Synthesise and try one shard. Files go to and from it as bytes, so that it runs where the folder is not."""
+def make_shard(job: Job, task: Task) -> FinishedShard:
+    """Make one shard. Files come and go as bytes, so that it runs on machines without the folder."""
     started = time.process_time()
-    hand, obj = _hand(task.shard.hand), _object(task.shard.object, job.scale)
+    hand, obj = _hand(task.shard.hand), _object(task.shard.object, job.config.scale)
     _ = obj.distance_field, obj.parts
     prepared = time.process_time()
     earlier = [GraspBatch.load(io.BytesIO(payload)) for payload in task.earlier]
     grasps, result = valid_grasps(
-        hand, obj, shard_seed(job.seed, task.shard), job.protocol, job.config, task.candidates,
+        hand, obj, shard_seed(job.seed, task.shard), job.config, task.candidates,
         GraspBatch.concatenate(earlier) if earlier else None,
     )
-    grasps = with_sources(grasps, task.shard.hand, task.shard.object, job.scale)
+    grasps = with_sources(grasps, task.shard.hand, task.shard.object, job.config.scale)
     grasps = grasps.replace(split=tuple(split_of(task.shard.hand, split) for split in grasps.split))
     result = dataclasses.replace(
         result, cpu_seconds=time.process_time() - prepared, preparation_seconds=prepared - started
     )
-    return Made(task.shard, grasps.to_bytes(notes_of(result)), result)
+    return FinishedShard(task.shard, grasps.to_bytes(notes_of(result)), result)
 
 
 def valid_grasps(
     hand: Hand,
     obj: ObjectModel,
     seed: int,
-    protocol: str,
     config: EngineConfig,
     candidates: int | None = None,
     earlier: GraspBatch | None = None,
@@ -141,25 +143,23 @@ def valid_grasps(
         hand: The hand.
         obj: The object, with a mesh.
         seed: The same seed gives the same grasps.
-        protocol: The trial.
-        config: Sizes and thresholds.
-        candidates: How many to synthesise; the config's number by default.
-        earlier: Grasps of the pair that are there already.
+        config: Protocol, sizes and thresholds.
+        candidates: Grasps to synthesise; the config's number by default.
+        earlier: Grasps that the pair has already.
     """
     count = candidates or config.candidates
     drawn = synthesize(hand, obj, count, seed, config.synthesis)
-    ranked = drawn[0 : max(1, round(config.tried_share * count))]
-    grasps = ranked[ranked.extra["depth"] < config.deepest]
+    ranked = drawn[0 : max(1, round(config.trial_share * count))]
+    grasps = ranked[ranked.extra["depth"] < config.max_penetration]
     made = Yield(candidates=count, ranked_out=count - len(ranked), deep=len(ranked) - len(grasps))
     if config.settle and len(grasps):
-        closed = settle(hand, obj, grasps, protocol, workers=1)
+        closed = settle(hand, obj, grasps, config.protocol, workers=1)
         shift = (hand.grasp_centres(closed.T_object_wrist) - hand.grasp_centres(grasps.T_object_wrist)).norm(dim=-1)
-        made = dataclasses.replace(made, moved=int((shift >= config.farthest).sum()))
-        grasps = closed[shift < config.farthest]
-    trial = simulate(hand, obj, grasps, protocol, workers=1)
-    tried = grasps.with_trial(trial)
-    loose = trial.success & (trial.contacts < config.least_contacts)
-    passed = tried[trial.success & ~loose]
+        made = dataclasses.replace(made, moved=int((shift >= config.max_shift).sum()))
+        grasps = closed[shift < config.max_shift]
+    trial = simulate(hand, obj, grasps, config.protocol, workers=1)
+    loose = trial.success & (trial.contacts < config.min_contact_links)
+    passed = grasps.with_trial(trial)[trial.success & ~loose]
     new = distinct(hand, passed, earlier=earlier)
     failures = Counter(failure.value for failure in trial.failure if failure)
     if loose.any():

@@ -1,4 +1,4 @@
-"""From grasp files to a training bundle: which grasps may enter, and their hands and objects found again."""
+"""From collections to a training bundle: choose the grasps that may enter, find their hands and objects."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from pathlib import Path
 
 import torch
 
+from dro_grasp.datasets.bundle.splits import SPLITS
 from dro_grasp.datasets.bundle.training_file import Bundle, ObjectCloud, write_bundle
 from dro_grasp.datasets.collections.collection import read_collection
 from dro_grasp.datasets.collections.merging import spread
-from dro_grasp.datasets.splits import SPLITS
 from dro_grasp.errors import BundleError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import hand_of, object_of, require_same
@@ -29,7 +29,7 @@ def make_bundle(
         output: The bundle.
         split: One of SPLITS.
         hands: Only these; all when none is named.
-        per_pair: Most grasps of a hand on an object; of more, those that spread best over palm directions are kept.
+        per_pair: Most grasps of a pair; the choice spreads best over palm directions.
 
     Raises:
         BundleError: It cannot be made of these grasps.
@@ -58,12 +58,12 @@ def make_bundle(
 
 
 def _why_none(split: str, seen: Counter[str], hands: Sequence[str], hands_seen: Set[str]) -> str:
-    """What was there instead of grasps of a split, and what to do."""
+    """Error text: the grasps that were given instead of the split's, and what to do."""
     if not seen:
         if hands and not hands_seen & set(hands):
             return (f"no grasps of {', '.join(hands)} were given, but of {', '.join(sorted(hands_seen))}; name one of these "
                     "with --hands, or leave it out")
-        return "no grasps that held in a trial were given; `dro-grasp synthesize` makes some, `dro-grasp evaluate` tries others"
+        return "no grasps that held in a trial were given; `dro-grasp synthesize` makes some, `dro-grasp evaluate` tests others"
     counts = ", ".join(f"{number} of split '{name}'" for name, number in sorted(seen.items()))
     fitting = sorted(name for name, allowed in SPLITS.items() if allowed & set(seen))
     advice = f"choose --split {' or '.join(fitting)}" if fitting else "grasps on test objects are never bundled"
@@ -72,7 +72,7 @@ def _why_none(split: str, seen: Counter[str], hands: Sequence[str], hands_seen: 
 
 
 def sources(batches: list[GraspBatch]) -> tuple[list[Hand], dict[str, ObjectCloud]]:
-    """The hands and the object clouds of grasps, each once, checked to be those the grasps were made for.
+    """The hands and object clouds of grasps, each once; their hashes are checked.
 
     Args:
         batches: Each of one hand and one object.

@@ -1,7 +1,7 @@
-"""Grasps of other projects' data sets: the official CMapDataset, DexGraspNet and DexGraspBench.
+"""Grasp files of other projects: the official CMapDataset, DexGraspNet and DexGraspBench.
 
-Their files are pickles, which can run code; here nothing is built but numbers, names and arrays. Sources: the loaders of
-the official D(R,O) release (roll, pitch and yaw turn about moving axes), the data set's description of DexGraspNet (about fixed
+Their files are pickles, which can run code; these readers build numbers, names and arrays only. Sources: the loaders of
+the official D(R,O) release (roll, pitch and yaw about moving axes), DexGraspNet's description of its data (about fixed
 axes), the readme of DexGraspBench.
 """
 
@@ -17,39 +17,42 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from jaxtyping import Float, Shaped
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from dro_grasp.errors import GraspFileError
 
 Format = Literal["cmap", "dexgraspnet", "dexgraspbench"]
 WRIST = ("WRJTx", "WRJTy", "WRJTz", "WRJRx", "WRJRy", "WRJRz")
-"""Names of the wrist's six coordinates in DexGraspNet."""
+"""Names of the wrist's six coordinates. Source: DexGraspNet."""
 HARMLESS = {
     ("numpy.core.multiarray", "_reconstruct"), ("numpy._core.multiarray", "_reconstruct"), ("numpy", "ndarray"),
     ("numpy", "dtype"), ("numpy.core.multiarray", "scalar"), ("numpy._core.multiarray", "scalar"),
     ("collections", "OrderedDict"),
 }
-"""All that a file may name."""
+"""Classes that a pickle may name. Source: the pickles that NumPy writes."""
 EXPECTED = {
     "cmap": "'metadata', a list of (wrist and joints, object, hand)",
     "dexgraspnet": "a list of grasps, each with 'scale' and 'qpos', and in that WRJTx to WRJRz and the joints",
     "dexgraspbench": "'grasp_qpos', and where it applies 'joint_names', 'obj_pose', 'obj_scale', 'obj_path' and 'hand'",
 }
-"""Entries of each format."""
+"""Entries of each format, for messages."""
 
 
 @dataclass(frozen=True)
 class ForeignGrasp:
-    """One grasp as a file has it."""
+    """One grasp in a file's own terms."""
 
     hand: str
-    """Name of the hand, empty where the format has none."""
+    """Name of the hand; empty if the format has none."""
     object: str
-    """Name of the object, empty where the format has none."""
+    """Name of the object; empty if the format has none."""
     scale: float
-    """Of the object."""
-    T_object_wrist: np.ndarray
-    """(4 4) [m]"""
-    joints: dict[str, float] | np.ndarray
+    """Scale of the object."""
+    T_object_wrist: Float[np.ndarray, "4 4"]
+    """Wrist pose [m]."""
+    joints: dict[str, float] | Float[np.ndarray, " n_joints"]
     """By name, or in the order of the hand's moving joints [rad or m]."""
 
 
@@ -58,10 +61,10 @@ def read_foreign(path: Path, kind: Format) -> list[ForeignGrasp]:
 
     Args:
         path: `cmap_dataset.pt`, or an npy file.
-        kind: Whose format it is.
+        kind: The project.
 
     Raises:
-        GraspFileError: No such file, one that holds something else, or one that wants to run code.
+        GraspFileError: The file is missing, holds something else, or could run code.
     """
     readers = {"cmap": _cmap, "dexgraspnet": _dexgraspnet, "dexgraspbench": _dexgraspbench}
     if path.is_dir():
@@ -84,7 +87,7 @@ def read_foreign(path: Path, kind: Format) -> list[ForeignGrasp]:
 
 
 class _MoreThanData(Exception):
-    """A pickle that wants to build something else than data; the text names it."""
+    """A pickle would build something other than data; the text names it."""
 
 
 class _NoEntry(Exception):
@@ -106,10 +109,10 @@ def _entry(entries: dict[str, Any], name: str) -> Any:
 
 
 def _load_tensors(path: Path) -> Any:
-    """What torch reads without building anything but tensors and containers.
+    """Read a torch file of tensors and containers only.
 
     Raises:
-        _MoreThanData: There is something else.
+        _MoreThanData: It holds something else.
     """
     try:
         with warnings.catch_warnings():
@@ -122,36 +125,32 @@ def _load_tensors(path: Path) -> Any:
         raise ValueError("it is no file that torch.save wrote") from error
 
 
-def _cmap(path: Path) -> Iterator[ForeignGrasp]:
-    from scipy.spatial.transform import Rotation
+def _pose(rotation: Rotation, position: ArrayLike) -> Float[np.ndarray, "4 4"]:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation.as_matrix(), position
+    return T
 
+
+def _cmap(path: Path) -> Iterator[ForeignGrasp]:
     for q, obj, hand in _entry(_load_tensors(path), "metadata"):
         values = np.asarray(q, np.float64)
-        T = np.eye(4)
-        T[:3, 3], T[:3, :3] = values[:3], Rotation.from_euler("XYZ", values[3:6]).as_matrix()
+        T = _pose(Rotation.from_euler("XYZ", values[3:6]), values[:3])
         yield ForeignGrasp(str(hand), str(obj), 1.0, T, values[6:])
 
 
 def _dexgraspnet(path: Path) -> Iterator[ForeignGrasp]:
-    from scipy.spatial.transform import Rotation
-
     for entry in _load_npy(path):
         qpos = {str(name): float(value) for name, value in _entry(entry, "qpos").items()}
         position = [_entry(qpos, name) for name in WRIST[:3]]
         angles = [_entry(qpos, name) for name in WRIST[3:]]
         joints = {name: value for name, value in qpos.items() if name not in WRIST}
-        T = np.eye(4)
-        T[:3, 3], T[:3, :3] = position, Rotation.from_euler("xyz", angles).as_matrix()
+        T = _pose(Rotation.from_euler("xyz", angles), position)
         yield ForeignGrasp("", path.stem, float(_entry(entry, "scale")), T, joints)
 
 
 def _dexgraspbench(path: Path) -> Iterator[ForeignGrasp]:
-    from scipy.spatial.transform import Rotation
-
-    def pose(row: np.ndarray) -> np.ndarray:
-        T = np.eye(4)
-        T[:3, 3], T[:3, :3] = row[:3], Rotation.from_quat(row[3:7], scalar_first=True).as_matrix()
-        return T
+    def pose(row: Float[np.ndarray, " k"]) -> Float[np.ndarray, "4 4"]:
+        return _pose(Rotation.from_quat(row[3:7], scalar_first=True), row[:3])
 
     entry = _load_npy(path).item()
     rows = np.atleast_2d(np.asarray(_entry(entry, "grasp_qpos"), np.float64))
@@ -173,7 +172,7 @@ class _Harmless(pickle.Unpickler):
         return super().find_class(module, name)
 
 
-def _load_npy(path: Path) -> np.ndarray:
+def _load_npy(path: Path) -> Shaped[np.ndarray, "..."]:
     """An array of objects from a npy file."""
     with path.open("rb") as file:
         version = np.lib.format.read_magic(file)

@@ -1,15 +1,15 @@
-"""Which grasps may be trained on."""
+"""Splits: the grasps that training may use."""
 
 from __future__ import annotations
 
 HELD_OUT_HANDS = frozenset(f"assets/{name}" for name in ("inspire", "ability", "dclaw", "orca", "ezgripper"))
-"""Hands that no shipped weights were trained on, so that zero-shot and few-shot results mean something."""
+"""Hands that no shipped weights were trained on, for zero-shot and few-shot results. Ours."""
 FEW_SHOT = "few_shot"
 """Split of a held-out hand's grasps on training objects: for fine-tuning studies, never for shipped weights."""
 TRAINING = frozenset({"train", ""})
-"""Splits that a training bundle takes; the empty one is an object of the user's own."""
+"""Splits of a training bundle; the empty one stands for an object of the user's own."""
 SPLITS = {"train": TRAINING, "few_shot": frozenset({FEW_SHOT}), "validate": frozenset({"validate"})}
-"""What a bundle may be made of, by name."""
+"""Splits that a bundle may hold, by the bundle's own split."""
 
 
 def split_of(hand: str, object_split: str) -> str:
