@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from dro_grasp.datasets.collections.bundling import make_bundle
     from dro_grasp.datasets.collections.collection import read_collection
     from dro_grasp.datasets.engine.schedule import synthesize_dataset
+    from dro_grasp.datasets.engine.worker import EngineConfig
     from dro_grasp.errors import DroGraspError
     from dro_grasp.evaluation.controls import palm_facing_starts
     from dro_grasp.evaluation.metrics import wilson_interval
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
     from dro_grasp.pipeline.problem import GraspProblem
     from dro_grasp.pipeline.stages import evaluate, rank, refine
     from dro_grasp.predictor import GraspPredictor, GraspRequest, Prediction, PredictorConfig
-    from dro_grasp.simulation.outcome import TrialResult
+    from dro_grasp.simulation.outcome import Failure, TrialResult
     from dro_grasp.simulation.protocols import Protocol
     from dro_grasp.simulation.trial import simulate
     from dro_grasp.training.config import (
@@ -58,6 +59,8 @@ _EXPORTS = {
     "AugmentationConfig": "training.config",
     "DepthCamera": "perception.depth_camera",
     "DroGraspError": "errors",
+    "EngineConfig": "datasets.engine.worker",
+    "Failure": "simulation.outcome",
     "Frame": "export.frame",
     "GraspBatch": "grasps.batch",
     "GraspPredictor": "predictor",
@@ -115,6 +118,8 @@ __all__ = [
     "AugmentationConfig",
     "DepthCamera",
     "DroGraspError",
+    "EngineConfig",
+    "Failure",
     "Frame",
     "GraspBatch",
     "GraspPredictor",

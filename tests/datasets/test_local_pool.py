@@ -24,11 +24,12 @@ from tests.helpers.engine_work import GRASPS
 
 ROOT = Path(__file__).parents[2]
 PARENT = """
-import sys
+import signal, sys
 from dro_grasp.datasets.engine.schedule import EngineConfig, synthesize_dataset
 from dro_grasp.datasets.engine.local_pool import LocalPool
 from tests.helpers.engine_work import {work}
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where tests run in the background
     synthesize_dataset(["a", "b"], ["x", "y"], 40, sys.argv[1], workers=lambda job: LocalPool(job, 2, 60, {work}))
 """
 PATIENCE = 300.0

@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+import sys
 from pathlib import Path
 
+import grimp
 import pytest
 import torch
 from safetensors import safe_open
@@ -292,3 +294,11 @@ def test_what_cannot_be_bundled_is_counted_by_split(tmp_path: Path, capsys: pyte
     assert "but 1 of split 'test', 2 of split 'validate'; choose --split validate, or" in told
     held.replace(success=torch.zeros(3, dtype=torch.bool)).save(tmp_path / "mug.parquet")
     assert "no grasps that held in a trial" in refused("--hands", "toy")
+
+
+def test_the_bundle_needs_only_what_a_bare_training_machine_has():
+    graph = grimp.build_graph("dro_grasp", include_external_packages=True, exclude_type_checking_imports=True)
+    bundle = {"dro_grasp.datasets.bundle", *graph.find_descendants("dro_grasp.datasets.bundle")}
+    needed = {name.partition(".")[0] for module in bundle for name in graph.find_upstream_modules(module)}
+    assert needed - set(sys.stdlib_module_names) == {
+        "dro_grasp", "jaxtyping", "numpy", "pyarrow", "roma", "safetensors", "torch"}
