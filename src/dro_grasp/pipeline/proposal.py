@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dro_grasp import distance_matrix
 from dro_grasp.errors import OptionError
-from dro_grasp.geometry.se3 import compose, random_rotations, rotation_between
+from dro_grasp.geometry.se3 import compose, random_rotations, rotate, rotation_between
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.models.network import DistanceNetwork
@@ -139,7 +139,7 @@ def _placements(
     rotations = wrist_rotations(hand, count, direction, config.direction_spread, generator)
     opened = hand.points(hand.canonical_joints()) @ axes
     rotation, position = network.sample_placements(opened, cloud, rotations @ axes, num, generator)
-    offset = (rotation @ (position - hand.grasp_centre_wrist @ axes)[..., None])[..., 0]
+    offset = rotate(rotation, position - hand.grasp_centre_wrist @ axes)
     return compose(rotation @ axes.mT, cloud.mean(0) + offset)
 
 
