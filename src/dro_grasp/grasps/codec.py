@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import re
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -19,9 +19,6 @@ from dro_grasp.grasps.columns import COLUMNS, FLOATS, NOT_EVALUATED, POSTURES, T
 from dro_grasp.grasps.table import fixed_column, float_column, floats
 from dro_grasp.grasps.trial_columns import CONTACT_LINKS, FAILURE, REASON
 
-if TYPE_CHECKING:
-    from dro_grasp.grasps.batch import GraspBatch
-
 REQUIRED = ("object", "wrist_position", "wrist_quaternion_wxyz", "joints")
 """Columns without which a file holds no grasps."""
 HEADER = ("hand", "hand_sha256", "wrist_link", "joint_names")
@@ -32,7 +29,7 @@ SYNTHESISED = re.compile(r"\bsynthesis \d+\b")
 """Provenance of synthesised grasps, whose `score` is minus the energy in files without a column `energy`."""
 
 
-def encode(batch: GraspBatch) -> tuple[dict[str, pa.Array], dict[str, Any]]:
+def encode(batch: Any) -> tuple[dict[str, pa.Array], dict[str, Any]]:
     """Columns and header of a GraspBatch's file."""
     xyzw = roma.rotmat_to_unitquat(batch.T_object_wrist[:, :3, :3].to(torch.float64))
     columns: dict[str, pa.Array] = {
@@ -118,7 +115,7 @@ def _energy_apart(score: Float[Tensor, " n"], provenance: tuple[str, ...], table
     return {"energy": torch.where(synthesised, -score, nothing), "score": torch.where(synthesised, nothing, score)}
 
 
-def data_frame(batch: GraspBatch) -> Any:
+def data_frame(batch: Any) -> Any:
     """A pandas DataFrame with the columns of the batch's file.
 
     Raises:

@@ -1,16 +1,13 @@
-"""A grasp batch in words: one sentence, or an HTML table for notebooks."""
+"""A GraspBatch in words: one sentence, or an HTML table for notebooks."""
 
 from __future__ import annotations
 
 import html
 from collections import Counter
-from typing import TYPE_CHECKING
+from typing import Any
 
 from dro_grasp.grasps.columns import NOT_EVALUATED
 from dro_grasp.grasps.trial_columns import REASON
-
-if TYPE_CHECKING:
-    from dro_grasp.grasps.batch import GraspBatch
 
 ROWS = 10
 """Most grasps in the HTML table (ours)."""
@@ -18,7 +15,7 @@ NAMES = 3
 """Most objects that are named (ours)."""
 
 
-def sentence(grasps: GraspBatch) -> str:
+def sentence(grasps: Any) -> str:
     """Number of grasps, hand, objects, outcome and range of score or energy."""
     parts = [f"{len(grasps)} grasp{'' if len(grasps) == 1 else 's'}", f"hand '{grasps.hand}'", _objects(grasps)]
     for protocol, count in Counter(p for p in grasps.protocol if p != NOT_EVALUATED).items():
@@ -34,7 +31,7 @@ def sentence(grasps: GraspBatch) -> str:
     return ", ".join(part for part in parts if part)
 
 
-def _objects(grasps: GraspBatch) -> str:
+def _objects(grasps: Any) -> str:
     names = list(dict.fromkeys(grasps.object))
     if not names:
         return ""
@@ -43,7 +40,7 @@ def _objects(grasps: GraspBatch) -> str:
     return f"object{'s' if len(names) > 1 else ''} {named}{more}"
 
 
-def html_table(grasps: GraspBatch) -> str:
+def html_table(grasps: Any) -> str:
     """The sentence above a table of the first grasps."""
     reasons = grasps.extra.get(REASON) or [None] * len(grasps)
     lines = []
