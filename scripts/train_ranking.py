@@ -10,12 +10,12 @@ lowest loss on objects left out is written to the package. Needs the development
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import random
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, get_args
+from zlib import crc32
 
 import roma
 import torch
@@ -27,14 +27,15 @@ from dro_grasp.evaluation.metrics import roc_area
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
-from dro_grasp.models.checkpoints import DEFAULT
+from dro_grasp.models.checkpoints import DEFAULT, load_weights
+from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.partial_views import View, partial_view
 from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.stages import refine
-from dro_grasp.predictor import GraspPredictor
-from dro_grasp.ranking.features import grasp_features
+from dro_grasp.pipeline.proposal import ProposalConfig, propose
+from dro_grasp.pipeline.stages import complete, refine
+from dro_grasp.ranking.features import feature_names, grasp_features
 from dro_grasp.ranking.score import ScoreConfig
 from dro_grasp.ranking.score_network import SHIPPED, ScoreNetwork, save_score_network
 from dro_grasp.simulation.trial import simulate
@@ -44,6 +45,8 @@ HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand", 
 """Training hands."""
 TRIALS = ("strict", "dexgraspbench")
 """Protocols whose outcome the network predicts; the score is the mean of their log-odds."""
+FEATURES = f"{crc32(repr(feature_names()).encode()):08x}"
+"""Part of the names of stored trials: trials stored with other features are not used."""
 TEMPERATURES = (0.2, 0.5, 0.8, 1.0)
 """Temperatures of z, one drawn for each object."""
 SHAKE = (0.01, 0.15, 0.2)
@@ -84,18 +87,20 @@ def evaluated(hand: Hand, obj: ObjectModel, grasps: GraspBatch, known: ObjectMod
 
 
 def collect(
-    predictor: GraspPredictor, name: str, objects: int, num: int, seed: int, views: Sequence[View]
+    network: DistanceNetwork, name: str, objects: int, num: int, seed: int, views: Sequence[View]
 ) -> list[dict[str, Any]]:
     """Trials of one hand on some training objects."""
     hand, rng = load_hand(name), random.Random(f"{name} {seed}")
     generator, parts = torch.Generator().manual_seed(seed), []
     for label in rng.sample(resolve_objects(["assets:train"]), objects):
         obj = load_object(label)
-        predictor.config = dataclasses.replace(predictor.config, temperature=rng.choice(TEMPERATURES))
+        config = ProposalConfig(temperature=rng.choice(TEMPERATURES))
         view = rng.choice(views)
         known = partial_view(obj, view, rng.randrange(10**6))
-        raw = predictor.predict(hand, known, num, seed=rng.randrange(10**6), candidates=1, refine=False)
-        refined = refine(GraspProblem(hand, known), raw)
+        problem = GraspProblem(hand, known)
+        # Proposed without ranking: the network in use must neither choose its successor's data nor know its features.
+        proposal = propose(problem, network, num, torch.Generator().manual_seed(rng.randrange(10**6)), config=config)
+        raw, refined = complete(problem, proposal.grasps), refine(problem, proposal.grasps)
         some = refined[slice(0, num // 8)]
         opened = hand.canonical_joints(1.0).expand_as(some.joints)
         groups = {
@@ -177,15 +182,15 @@ def main() -> None:
     torch.set_num_threads(1)
     options.folder.mkdir(exist_ok=True)
     for name in options.hands:
-        path = options.folder / f"{name.replace('/', '-')}-{options.seed}.pt"
+        path = options.folder / f"{name.replace('/', '-')}-{options.seed}-{FEATURES}.pt"
         if not path.exists():
             found = collect(
-                GraspPredictor(options.weights), name, options.objects, options.num, options.seed, options.views)
+                load_weights(options.weights), name, options.objects, options.num, options.seed, options.views)
             torch.save(found, path)
             print(name, flush=True)
     if options.collect_only:
         return
-    parts = [part for path in sorted(options.folder.glob("*.pt")) for part in torch.load(path, weights_only=True)]
+    parts = [part for path in sorted(options.folder.glob(f"*-{FEATURES}.pt")) for part in torch.load(path, weights_only=True)]
     names = sorted({part["object"] for part in parts})
     left_out = set(random.Random(0).sample(names, LEFT_OUT))
     network, found, loss = fit(parts, left_out, options.seed)

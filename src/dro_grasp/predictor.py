@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.devices import require_device
@@ -18,7 +18,7 @@ from dro_grasp.models.checkpoints import load_weights
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.proposal import Direction, ProposalConfig, check_temperature, propose
+from dro_grasp.pipeline.proposal import Direction, Proposal, ProposalConfig, check_temperature, propose
 from dro_grasp.pipeline.stages import above_table, complete, refine, scored
 from dro_grasp.pipeline.stopwatch import Stopwatch
 
@@ -129,6 +129,7 @@ class GraspPredictor:
         obj: ObjectModel,
         num: int = 16,
         seed: int = 0,
+        *,
         direction: Direction | None = None,
         table: float | None = None,
         candidates: int = 4,
@@ -157,35 +158,25 @@ class GraspPredictor:
         """
         _check_table(problem.obj, request)
         wanted, generator = request.num * request.candidates, torch.Generator().manual_seed(request.seed)
-        temperature = self.config.temperature if request.temperature is None else request.temperature
-        config = replace(self.config, temperature=temperature)
+        config = self.config if request.temperature is None else replace(self.config, temperature=request.temperature)
         watch = Stopwatch("network", "decode", "refine", "rank", device=problem.device)
-        kept: list[tuple[GraspBatch, GraspBatch, Tensor]] = []
-        decoded = 0
-        for _ in range(1 if request.table is None else self.config.table_rounds):
-            proposal = propose(problem, self.network, wanted, generator, request.direction, config, progress)
-            decoded += wanted
-            watch.add(proposal.seconds)
+        refined: list[GraspBatch] = []
+        proposals: list[Proposal] = []
+        while sum(map(len, refined)) < wanted and len(refined) < (1 if request.table is None else config.table_rounds):
+            proposal = propose(problem, self.network, wanted, generator, request.direction, config, watch, progress)
             with watch("refine"):
                 grasps = refine(problem, proposal.grasps) if request.refine else complete(problem, proposal.grasps)
             above = slice(None) if request.table is None else above_table(problem, grasps, request.table)
-            kept.append((grasps[above], proposal.grasps[above], proposal.points[above]))
-            if sum(len(part[0]) for part in kept) >= wanted:
-                break
-        refined, proposed, points = zip(*kept, strict=True)
-        grasps = GraspBatch.concatenate(refined)[:wanted]
+            refined.append(grasps[above])
+            proposals.append(proposal[above])
+        grasps, decoded = GraspBatch.concatenate(refined)[:wanted], wanted * len(refined)
         if len(grasps) < request.num:
             raise _too_few(problem.obj, request, len(grasps), decoded)
         with watch("rank"):
             grasps = scored(problem, grasps)
-        best = _best(grasps, request.num)
-        proposed = complete(problem, GraspBatch.concatenate(proposed)[best])
-        return Prediction(grasps[best], proposed, torch.cat(points)[best], decoded, watch.seconds)
-
-
-def _best(grasps: GraspBatch, num: int) -> Int[Tensor, " k"]:
-    """Indices of the `num` highest scores, best first; equal scores keep their order."""
-    return (-grasps.score).argsort(stable=True)[:num]
+        best = (-grasps.score).argsort(stable=True)[: request.num]
+        chosen = Proposal.concatenate(proposals)[best]
+        return Prediction(grasps[best], complete(problem, chosen.grasps), chosen.points, decoded, watch.seconds)
 
 
 def _check_table(obj: ObjectModel, request: GraspRequest) -> None:

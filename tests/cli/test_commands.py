@@ -237,12 +237,15 @@ def test_folder_of_objects_needs_a_folder_for_results(weights: str, tmp_path: Pa
 
 def test_table_keeps_hands_above_it(generate, tmp_path: Path) -> None:
     from dro_grasp.hands.library import load_hand
-    from dro_grasp.predictor import above_table
+    from dro_grasp.objects.catalogue import load_object
+    from dro_grasp.pipeline.problem import GraspProblem
+    from dro_grasp.pipeline.stages import above_table
 
     path = tmp_path / "grasps.parquet"
     report = generate("--table", "-0.15", "--protocol", "none", "--output", str(path))
     assert report["candidates"] >= report["num"] == 3
-    assert above_table(load_hand("gripper3"), GraspBatch.load(path), -0.15).all()
+    problem = GraspProblem(load_hand("gripper3"), load_object("sphere"))
+    assert above_table(problem, GraspBatch.load(path), -0.15).all()
 
 
 def test_impossible_table_says_so(weights: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -263,13 +266,13 @@ def test_evaluate_and_view_take_the_file_that_generate_wrote(generate, tmp_path:
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_grasps_tried_on_another_object_are_told(generate, tmp_path: Path, capsys) -> None:
+def test_evaluation_on_another_object_is_told(generate, tmp_path: Path, capsys) -> None:
     path = tmp_path / "grasps.parquet"
     generate("--output", str(path), "--protocol", "none")
     assert main(["evaluate", str(path)]) == 0
     assert "made for another" not in capsys.readouterr().err
     assert main(["evaluate", str(path), "--object", "can"]) == 0
-    assert "made for another 'sphere' than the one they are tried on, can" in capsys.readouterr().err
+    assert "made for another 'sphere' than the given can" in capsys.readouterr().err
 
 
 def test_foreign_and_empty_grasp_files_are_status_2(generate, tmp_path: Path, capsys) -> None:

@@ -50,7 +50,7 @@ def test_a_rerun_does_nothing_again(home: Path, monkeypatch: pytest.MonkeyPatch,
         monkeypatch.setattr(steps, name, working)
     assert main(command(home)) == 0
     said = capsys.readouterr()
-    assert said.err.count("done before") == 5
+    assert said.err.count("finished before") == 5
     assert "report: " in said.out
     assert (home / "out" / "weights.safetensors").read_bytes() == before
 
@@ -61,7 +61,7 @@ def test_a_run_that_stopped_goes_on(home: Path, monkeypatch: pytest.MonkeyPatch,
     (home / "out" / steps.STATE).write_text(json.dumps(state | {"steps": kept}))
     monkeypatch.setattr(steps, "synthesize_dataset", None)
     assert main(command(home)) == 0
-    assert capsys.readouterr().err.count("done before") == 3
+    assert capsys.readouterr().err.count("finished before") == 3
 
 
 def test_the_folder_of_another_hand_is_refused(home: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -213,7 +213,8 @@ def _stages(source: _Source, obj: ObjectModel, config: BenchmarkConfig) -> Itera
             begin = time.perf_counter()
             grasps = refine(problem, grasps)
             seconds = seconds | {"refine": (time.perf_counter() - begin) / len(grasps)}
-        grasps = scored(problem, grasps)
+        if grasps.score.isnan().any():
+            grasps = scored(problem, grasps)
         results = tuple(simulate(problem.hand, obj, grasps, rules, workers=config.workers) for rules in config.protocols)
         evaluated = EvaluatedGrasps(grasps, results, seconds)
         if whole in wanted:

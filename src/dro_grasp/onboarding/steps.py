@@ -120,8 +120,7 @@ def onboard(
     locate_weights(config.weights)
     onboarding = _Onboarding(hand, path, config, objects, held_out, say)
     make_folder(path)
-    for name in ("check", "before", "data", "training", "after"):
-        onboarding.step(name, getattr(onboarding, f"_{name}"))
+    onboarding.run()
     return Onboarded(hand, path, onboarding.steps)
 
 
@@ -144,6 +143,14 @@ class _Onboarding:
                                   "folder, or restore that description")
             self.steps = known["steps"]
 
+    def run(self) -> None:
+        """Run every step that is not finished."""
+        self.step("check", self._check)
+        self.step("before", lambda: self._benchmark(self.config.weights))
+        self.step("data", self._data)
+        self.step("training", self._training)
+        self.step("after", lambda: self._benchmark(str(self.folder / WEIGHTS)))
+
     def step(self, name: str, work: Callable[[], dict[str, Any]]) -> None:
         """Run a step unless it is finished, and store its result."""
         if name in self.steps:
@@ -164,14 +171,9 @@ class _Onboarding:
         return {"facts": report.to_dict(), "lines": report.lines(), "said": f"{self.hand.tree.n_dof} joints, "
                 f"{len(self.hand.tips)} fingertips, {warnings} warnings"}
 
-    def _before(self) -> dict[str, Any]:
-        return self._benchmark(GraspPredictor(self.config.weights))
-
-    def _after(self) -> dict[str, Any]:
-        return self._benchmark(GraspPredictor(str(self.folder / WEIGHTS)))
-
-    def _benchmark(self, predictor: GraspPredictor) -> dict[str, Any]:
+    def _benchmark(self, weights: str | None) -> dict[str, Any]:
         """Success rates on held-out objects."""
+        predictor = GraspPredictor(weights)
         rules = tuple(protocol(name) for name in ("dro", "strict"))
         config = BenchmarkConfig(self.config.num, (RAW, REFINED, BEST), rules, controls=False, seed=self.config.seed)
         rows = benchmark([self.hand], [load_object(name) for name in self.held_out], predictor, config)

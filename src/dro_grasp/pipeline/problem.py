@@ -25,9 +25,9 @@ class GraspProblem:
         >>> grasps = evaluate(problem, rank(problem, refine(problem, grasps)), "strict")
     """
 
-    hand: Hand
+    hand: Hand = field(repr=False)
     """On the CPU, where grasps and trials stay."""
-    obj: ObjectModel
+    obj: ObjectModel = field(repr=False)
     """A mesh or a bare point cloud."""
     device: torch.device | str = "cpu"
     """Where the network and the grasp energy run."""
@@ -50,10 +50,12 @@ class GraspProblem:
     def energy(self, config: EnergyConfig) -> GraspEnergy:
         """The grasp energy under these weights; contacts, link spheres and distance field are shared among all weights."""
         if config not in self._energies:
-            known = next(iter(self._energies.values()), None)
-            self._energies[config] = (
-                object_energy(self.hand, self.obj, config, device=self.device) if known is None else known.weighted(config))
+            self._energies[config] = self._default_energy.weighted(config)
         return self._energies[config]
+
+    @cached_property
+    def _default_energy(self) -> GraspEnergy:
+        return object_energy(self.hand, self.obj, device=self.device)
 
     def thinned(self, count: int) -> Hand:
         """The hand with `count` surface points, on the device.

@@ -7,12 +7,12 @@ direction or by the learned placement prior.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import roma
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp import distance_matrix
@@ -63,8 +63,15 @@ class Proposal:
     """On the CPU; without pregrasp, squeeze and score."""
     points: Float[Tensor, "n n_points 3"]
     """Multilaterated hand points of each candidate, on the CPU [m]; the solved hand differs from them."""
-    seconds: dict[str, float]
-    """Time spent in `network` and `decode` [s]."""
+
+    def __getitem__(self, rows: slice | Int[Tensor, " k"] | Bool[Tensor, " n"]) -> Proposal:
+        """Some of the candidates."""
+        return Proposal(self.grasps[rows], self.points[rows])
+
+    @staticmethod
+    def concatenate(parts: Sequence[Proposal]) -> Proposal:
+        """One proposal after the other."""
+        return Proposal(GraspBatch.concatenate([p.grasps for p in parts]), torch.cat([p.points for p in parts]))
 
 
 def propose(
@@ -74,6 +81,7 @@ def propose(
     generator: torch.Generator,
     direction: Direction | None = None,
     config: ProposalConfig | None = None,
+    watch: Stopwatch | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Proposal:
     """Candidates from the network.
@@ -85,10 +93,11 @@ def propose(
         generator: Source of randomness, on the CPU; its seed is recorded with the grasps.
         direction: Palm direction in the object's frame; any by default.
         config: Sampling and batches.
+        watch: Counts the seconds of `network` and `decode`.
         progress: Called with (candidates decoded, candidates wanted).
     """
     config = config or ProposalConfig()
-    watch = Stopwatch("network", "decode", device=problem.device)
+    watch = watch or Stopwatch(device=problem.device)
     hand = problem.thinned(network.config.n_hand)
     cloud = problem.cloud(network.config.n_object, generator)
     with watch("network"):
@@ -109,7 +118,7 @@ def propose(
     T, q, points = (torch.cat(part).cpu() for part in zip(*found, strict=True))
     grasps = GraspBatch.create(
         problem.hand, problem.obj, T, q, seed=generator.initial_seed(), provenance=f"network {network.name}")
-    return Proposal(grasps, points, watch.seconds)
+    return Proposal(grasps, points)
 
 
 def check_temperature(temperature: float | None) -> None:
@@ -158,7 +167,8 @@ def wrist_rotations(
     palm = hand.palm_direction_wrist
     if direction is None:
         return random_rotations(count, generator).to(palm)
-    wanted = torch.tensor(direction) / torch.tensor(direction).norm()
+    wanted = torch.tensor(direction, dtype=torch.float32)
+    wanted = wanted / wanted.norm()
     roll = torch.rand(count, generator=generator) * 2 * math.pi
     tilt = torch.randn(count, 3, generator=generator) * spread
     tilt = tilt - (tilt @ wanted)[:, None] * wanted

@@ -18,7 +18,12 @@ from dro_grasp.simulation.trial import simulate
 
 
 def complete(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
-    """Grasps that all state a pregrasp and a squeeze; the controller makes the missing ones."""
+    """Grasps that all state a pregrasp and a squeeze; the controller makes the missing ones.
+
+    Raises:
+        GraspFileError: The grasps are of another hand.
+    """
+    grasps.require_hand(problem.hand)
     return completed(problem.hand, grasps, problem.centre)
 
 
@@ -31,6 +36,7 @@ def refine(problem: GraspProblem, grasps: GraspBatch, config: RefineConfig | Non
         config: Steps and bounds.
     """
     config = config or RefineConfig()
+    grasps.require_hand(problem.hand)
     return complete(problem, refine_grasps(problem.energy(config.energy), grasps, config))
 
 

@@ -30,8 +30,3 @@ class Stopwatch:
         if self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
-
-    def add(self, seconds: dict[str, float]) -> None:
-        """Add times that were measured elsewhere."""
-        for name, value in seconds.items():
-            self.seconds[name] = self.seconds.get(name, 0.0) + value

@@ -58,6 +58,8 @@ class ShownGrasps:
     """As the network proposed them, in the order of the refined ones."""
     refined: GraspBatch
     """Best score first."""
+    protocol: str
+    """Protocol of the trials."""
 
 
 class Studio(ServedPage):
@@ -133,7 +135,7 @@ class Studio(ServedPage):
         raw, refined = found.proposed, found.grasps
         if not problem.obj.is_cloud:
             raw, refined = (evaluate(problem, grasps, protocol) for grasps in (raw, refined))
-        self.made = ShownGrasps(problem.hand, problem.obj, raw, refined)
+        self.made = ShownGrasps(problem.hand, problem.obj, raw, refined, protocol)
         self.stage.set_pair(problem.hand, problem.obj, refined.joints[0].float(), refined.T_object_wrist[0].float())
         self._filter()
         return self.made
@@ -256,8 +258,8 @@ class Studio(ServedPage):
         assert self.made is not None
         index, grasps = self.shown[int(self.slider.value)], self._batch()
         T = grasps.T_object_wrist[index].float()
-        self._say("Playing: closing, then six pushes.")
-        poses, joints = record(self.made.hand, self.made.obj, grasps, index, self.protocol.value)
+        self._say(f"Playing the trial under *{self.made.protocol}*.")
+        poses, joints = record(self.made.hand, self.made.obj, grasps, index, self.made.protocol)
         for pose, q in zip(poses, joints, strict=True):
             self.stage.show(q, T, T @ pose)
             time.sleep(FRAME_TIME)
