@@ -67,15 +67,10 @@ class Stage:
 
 
 def network_config(preset: str | None, initial: DistanceNetwork | None = None, **options: Any) -> NetworkConfig:
-    """The configuration of a preset, or of initial weights, with the options that are given.
-
-    Args:
-        preset: Name of a preset, if one is asked for.
-        initial: Weights that training begins with; they decide the configuration.
-        options: Other values of single settings; None where none is asked for.
+    """The configuration of a preset, else of the initial weights, with the options that are given (not None).
 
     Raises:
-        OptionError: A value is out of range, or the initial weights have another configuration than is asked for.
+        OptionError: A value is out of range.
     """
     import dataclasses
 
@@ -86,12 +81,7 @@ def network_config(preset: str | None, initial: DistanceNetwork | None = None, *
     if asked.get("latent", 1) < 1:
         raise OptionError(f"latent is {asked['latent']}; z needs at least one number")
     network = NetworkConfig.preset(preset or "slim") if initial is None or preset is not None else initial.config
-    network = dataclasses.replace(network, **asked)
-    if initial is not None and (other := network.differences(initial.config)):
-        told = ", ".join(f"{name} {mine} instead of {theirs}" for name, (mine, theirs) in other.items())
-        raise OptionError(f"the initial weights '{initial.name}' have another configuration than is asked for: {told}; leave "
-                          "out --preset and the options of the latent, which the weights decide")
-    return network
+    return dataclasses.replace(network, **asked)
 
 
 @dataclass(frozen=True, kw_only=True)

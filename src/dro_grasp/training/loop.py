@@ -66,7 +66,7 @@ def train(
     processes, device = begin(config.schedule)
     model = untrained_network(network, config.schedule.seed, name)
     if initial is not None:
-        take_weights(model, initial, initial.name)
+        take_initial(model, initial)
     if pretrained is not None:
         take_pretrained(model, pretrained)
     frozen = (pretrained is not None or initial is not None) and config.freeze_hand_encoder
@@ -92,13 +92,21 @@ def train(
     return model.cpu().eval()
 
 
-def take_weights(model: nn.Module, given: nn.Module, name: str) -> None:
-    """Copy all weights of another network of the same form.
+def take_initial(model: DistanceNetwork, initial: DistanceNetwork) -> None:
+    """Copy all weights of a network of the same configuration.
 
-    Args:
-        model: Receives the weights.
-        given: Has them.
-        name: How they are called, for the error.
+    Raises:
+        WeightsError: The configurations differ. Settings such as the frame change what the weights mean, but no shape.
+    """
+    if other := model.config.differences(initial.config):
+        told = ", ".join(f"{name} {mine} instead of {theirs}" for name, (mine, theirs) in other.items())
+        raise WeightsError(f"the initial weights '{initial.name}' have another configuration than is asked for: {told}; train "
+                           "with theirs, which `train --initial` does without --preset and the options of the latent")
+    model.load_state_dict(initial.state_dict())
+
+
+def take_weights(model: nn.Module, given: nn.Module, name: str) -> None:
+    """Copy the weights of a part of another network; `name` is that network's.
 
     Raises:
         WeightsError: The two differ in a tensor's name or shape.
