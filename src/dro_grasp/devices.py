@@ -1,10 +1,11 @@
-"""Devices and cores of this machine, and moving records of tensors to a device."""
+"""Devices and cores of this machine; records of tensors: moved to a device, cached."""
 
 from __future__ import annotations
 
 import dataclasses
 import os
-from typing import TypeVar
+from functools import cached_property
+from typing import Any, TypeVar
 
 import torch
 
@@ -51,3 +52,11 @@ def on_device(record: Record, device: torch.device | str) -> Record:
     values = {f.name: getattr(record, f.name) for f in dataclasses.fields(record)}  # type: ignore[arg-type]
     moved = {name: value.to(device) for name, value in values.items() if hasattr(value, "to")}
     return dataclasses.replace(record, **moved)  # type: ignore[type-var]
+
+
+class cached_tensor(cached_property):  # type: ignore[type-arg]  # reads like the decorator it extends
+    """A cached property whose tensors still work in training after inference has computed them."""
+
+    def __get__(self, instance: Any, owner: type | None = None) -> Any:
+        with torch.inference_mode(False):
+            return super().__get__(instance, owner)

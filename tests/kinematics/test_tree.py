@@ -153,6 +153,14 @@ def test_descends_follows_the_parents():
         assert set(tree.descends[i].nonzero()[:, 0].tolist()) == ancestors
 
 
+def test_moves_tells_which_poses_a_joint_changes(awkward):
+    for tree in (awkward.tree.double, described(BUILTIN[0]).tree.double):
+        q = random_joints(tree, 3)[1]
+        changed = (tree.forward(q + 0.1 * torch.eye(tree.n_dof).to(q)) - tree.forward(q)).abs().amax((-2, -1)) > 1e-9
+        assert torch.equal(tree.moves, changed.T)
+        assert 0 < changed.sum() < changed.numel()
+
+
 def test_a_copy_in_another_precision_agrees(awkward):
     q = random_joints(awkward.tree, 2)
     precise = awkward.tree.to(dtype=torch.float64).forward(q.double())

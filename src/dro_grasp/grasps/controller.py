@@ -102,5 +102,5 @@ def distance_slope(
     direction = offset / offset.norm(dim=-1, keepdim=True).clamp(min=1e-9)
     jacobian = tree.point_jacobian(poses, points, links)
     rate = (direction[..., None] * jacobian).sum(-2)
-    moved = ((tree.descends[links].to(rate.dtype) @ tree.link_coupling.abs().to(rate.dtype)) > 0).to(rate.dtype)
+    moved = tree.moves[links].to(rate.dtype)
     return (rate * moved).sum(1) / moved.sum(0).clamp(min=1)

@@ -178,7 +178,7 @@ def closing_gains(
     ends[0, each, each], ends[1, each, each] = tree.lower, tree.upper
     points = se3.apply(tree.forward(ends)[..., links, :, :], tip_points)
     distance = torch.stack([(points - target).norm(dim=-1) for target in targets]).sum(0)
-    moved = (tree.descends[links].to(q.dtype) @ tree.link_coupling.abs() > 0).T
+    moved = tree.moves[links].T
     mean = (distance * moved).sum(-1) / moved.sum(-1).clamp_min(1)
     return mean[0] - mean[1]
 

@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dro_grasp.devices import on_device
+from dro_grasp.devices import cached_tensor, on_device
 from dro_grasp.geometry import se3
 from dro_grasp.geometry.point_clouds import farthest_points
 from dro_grasp.hands.anatomy import PALM, THUMB_CLOSING, Finger, find_fingers, find_thumb, measure_opposition, rigid_groups
-from dro_grasp.kinematics.tree import KinematicTree, cached_tensor
+from dro_grasp.kinematics.tree import KinematicTree
 
 if TYPE_CHECKING:
     from dro_grasp.descriptions.loader import Description

@@ -7,13 +7,13 @@ Mimic joints and stated couplings are resolved once, when the tree is built: all
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dro_grasp.devices import cached_tensor
 from dro_grasp.geometry.se3 import apply, rotate
 
 FIXED = 0
@@ -24,14 +24,6 @@ PRISMATIC = 2
 """Kind of a link that slides along its joint's axis (ours)."""
 SLIDING_UNIT = 0.03
 """Travel of a prismatic joint that moves a hand about as much as 1 rad of a revolute one [m] (ours)."""
-
-
-class cached_tensor(cached_property):  # type: ignore[type-arg]  # reads like the decorator it extends
-    """A cached property whose tensors still work in training after inference has computed them."""
-
-    def __get__(self, instance: Any, owner: type | None = None) -> Any:
-        with torch.inference_mode(False):
-            return super().__get__(instance, owner)
 
 
 @dataclass(frozen=True)
@@ -167,6 +159,11 @@ class KinematicTree:
                 table[link] = table[parent]
             table[link, link] = True
         return table
+
+    @cached_tensor
+    def moves(self) -> Bool[Tensor, "n_links n_dof"]:
+        """moves[i, d]: independent joint d moves link i."""
+        return (self.descends.float() @ (self.link_coupling != 0).float()) > 0
 
     def forward(self, q: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_links 4 4"]:
         """Pose of every link in the root link's frame, T_root_link.

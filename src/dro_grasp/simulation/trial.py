@@ -20,8 +20,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.contacts import find_contact_links, measure_penetration
 from dro_grasp.simulation.outcome import DIRECTIONS, GIVE_UP, Failure, Measurements, TrialResult
-from dro_grasp.simulation.protocols import Protocol
-from dro_grasp.simulation.protocols import protocol as find_protocol
+from dro_grasp.simulation.protocols import Protocol, protocol as find_protocol
 from dro_grasp.simulation.rollout import Rollout
 from dro_grasp.simulation.scene import Scene, cached_scene
 
@@ -163,5 +162,4 @@ def _holding_joints(hand: Hand, contact_links: Sequence[Sequence[str]]) -> Bool[
     touching = torch.zeros(len(contact_links), hand.tree.n_links)
     for row, links in zip(touching, contact_links, strict=True):
         row[[names[link] for link in links if link in names]] = 1
-    moves = hand.tree.descends.float() @ (hand.tree.link_coupling != 0).float()
-    return touching @ moves > 0
+    return touching @ hand.tree.moves.float() > 0
