@@ -8,170 +8,101 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from dro_grasp.datasets.bundle.training_file import load_bundle
-    from dro_grasp.datasets.collections.bundling import make_bundle
-    from dro_grasp.datasets.collections.collection import read_collection
-    from dro_grasp.datasets.engine.schedule import synthesize_dataset
-    from dro_grasp.datasets.engine.worker import EngineConfig
-    from dro_grasp.errors import DroGraspError
-    from dro_grasp.evaluation.controls import palm_facing_starts
-    from dro_grasp.evaluation.metrics import wilson_interval
-    from dro_grasp.export.csv_table import csv_table
-    from dro_grasp.export.dexgraspbench import dexgraspbench
-    from dro_grasp.export.frame import Frame
-    from dro_grasp.export.isaac_grasp import isaac_grasp
-    from dro_grasp.export.moveit import moveit_grasps
-    from dro_grasp.grasps.batch import GraspBatch
-    from dro_grasp.hands.check import HandReport, check_hand
-    from dro_grasp.hands.hand import Hand
-    from dro_grasp.hands.library import hand_names, load_hand
-    from dro_grasp.models.checkpoints import load_weights, save_weights
-    from dro_grasp.models.presets import NetworkConfig
-    from dro_grasp.objects.catalogue import load_object, object_names
-    from dro_grasp.objects.shape import ObjectModel
-    from dro_grasp.optimization.refinement import RefineConfig
-    from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
-    from dro_grasp.perception.depth_camera import DepthCamera, visible_points
-    from dro_grasp.perception.scan import depth_points, scanned_object
-    from dro_grasp.pipeline.problem import GraspProblem
-    from dro_grasp.pipeline.stages import evaluate, rank, refine
-    from dro_grasp.predictor import GraspPredictor, GraspRequest, Prediction, PredictorConfig
-    from dro_grasp.simulation.outcome import Failure, TrialResult
-    from dro_grasp.simulation.protocols import Protocol
-    from dro_grasp.simulation.trial import simulate
-    from dro_grasp.training.config import (
-        AugmentationConfig,
-        LossConfig,
-        MotionConfig,
-        PretrainConfig,
-        ScheduleConfig,
-        TrainConfig,
-    )
-    from dro_grasp.training.loop import train
-    from dro_grasp.training.pretraining import pretrain, pretrain_motion
-    from dro_grasp.viewer.app import view_grasps
-    from dro_grasp.viewer.pictures import draw_grasps
+from dro_grasp._version import __version__ as __version__
 
-from dro_grasp._version import __version__
-
-_EXPORTS = {
-    "AugmentationConfig": "training.config",
-    "DepthCamera": "perception.depth_camera",
-    "DroGraspError": "errors",
-    "EngineConfig": "datasets.engine.worker",
-    "Failure": "simulation.outcome",
-    "Frame": "export.frame",
-    "GraspBatch": "grasps.batch",
-    "GraspPredictor": "predictor",
-    "GraspProblem": "pipeline.problem",
-    "GraspRequest": "predictor",
-    "Hand": "hands.hand",
-    "HandReport": "hands.check",
-    "LossConfig": "training.config",
-    "MotionConfig": "training.config",
-    "NetworkConfig": "models.presets",
-    "ObjectModel": "objects.shape",
-    "Prediction": "predictor",
-    "PredictorConfig": "predictor",
-    "PretrainConfig": "training.config",
-    "Protocol": "simulation.protocols",
-    "RefineConfig": "optimization.refinement",
-    "ScheduleConfig": "training.config",
-    "SynthesisConfig": "optimization.synthesis",
-    "TrainConfig": "training.config",
-    "TrialResult": "simulation.outcome",
-    "check_hand": "hands.check",
-    "csv_table": "export.csv_table",
-    "depth_points": "perception.scan",
-    "dexgraspbench": "export.dexgraspbench",
-    "draw_grasps": "viewer.pictures",
-    "evaluate": "pipeline.stages",
-    "hand_names": "hands.library",
-    "isaac_grasp": "export.isaac_grasp",
-    "load_bundle": "datasets.bundle.training_file",
-    "load_hand": "hands.library",
-    "load_object": "objects.catalogue",
-    "load_weights": "models.checkpoints",
-    "make_bundle": "datasets.collections.bundling",
-    "moveit_grasps": "export.moveit",
-    "object_names": "objects.catalogue",
-    "palm_facing_starts": "evaluation.controls",
-    "pretrain": "training.pretraining",
-    "pretrain_motion": "training.pretraining",
-    "read_collection": "datasets.collections.collection",
-    "rank": "pipeline.stages",
-    "refine": "pipeline.stages",
-    "save_weights": "models.checkpoints",
-    "scanned_object": "perception.scan",
-    "simulate": "simulation.trial",
-    "synthesize": "optimization.synthesis",
-    "synthesize_dataset": "datasets.engine.schedule",
-    "train": "training.loop",
-    "view_grasps": "viewer.app",
-    "visible_points": "perception.depth_camera",
-    "wilson_interval": "evaluation.metrics",
+_NAMES = {
+    "datasets.bundle.training_file": "load_bundle",
+    "datasets.collections.bundling": "make_bundle",
+    "datasets.collections.collection": "read_collection",
+    "datasets.engine.schedule": "synthesize_dataset",
+    "datasets.engine.worker": "EngineConfig",
+    "errors": "DroGraspError",
+    "evaluation.controls": "palm_facing_starts",
+    "evaluation.metrics": "wilson_interval",
+    "export.csv_table": "csv_table",
+    "export.dexgraspbench": "dexgraspbench",
+    "export.frame": "Frame",
+    "export.isaac_grasp": "isaac_grasp",
+    "export.moveit": "moveit_grasps",
+    "grasps.batch": "GraspBatch",
+    "hands.check": "HandReport check_hand",
+    "hands.hand": "Hand",
+    "hands.library": "hand_names load_hand",
+    "models.checkpoints": "load_weights save_weights",
+    "models.presets": "NetworkConfig",
+    "objects.catalogue": "load_object object_names",
+    "objects.shape": "ObjectModel",
+    "optimization.refinement": "RefineConfig",
+    "optimization.synthesis": "SynthesisConfig synthesize",
+    "perception.depth_camera": "DepthCamera visible_points",
+    "perception.scan": "depth_points scanned_object",
+    "pipeline.problem": "GraspProblem",
+    "pipeline.stages": "evaluate rank refine",
+    "predictor": "GraspPredictor GraspRequest Prediction PredictorConfig",
+    "simulation.outcome": "Failure TrialResult",
+    "simulation.protocols": "Protocol",
+    "simulation.trial": "simulate",
+    "training.config": "AugmentationConfig LossConfig MotionConfig PretrainConfig ScheduleConfig TrainConfig",
+    "training.loop": "train",
+    "training.pretraining": "pretrain pretrain_motion",
+    "viewer.app": "view_grasps",
+    "viewer.pictures": "draw_grasps",
 }
-"""Module of each public name, below this package."""
+"""Public names by the module below this package that defines them."""
+_EXPORTS = {name: module for module, names in _NAMES.items() for name in names.split()}
+"""Module of each public name."""
 
-__all__ = [
-    "AugmentationConfig",
-    "DepthCamera",
-    "DroGraspError",
-    "EngineConfig",
-    "Failure",
-    "Frame",
-    "GraspBatch",
-    "GraspPredictor",
-    "GraspProblem",
-    "GraspRequest",
-    "Hand",
-    "HandReport",
-    "LossConfig",
-    "MotionConfig",
-    "NetworkConfig",
-    "ObjectModel",
-    "Prediction",
-    "PredictorConfig",
-    "PretrainConfig",
-    "Protocol",
-    "RefineConfig",
-    "ScheduleConfig",
-    "SynthesisConfig",
-    "TrainConfig",
-    "TrialResult",
-    "__version__",
-    "check_hand",
-    "csv_table",
-    "depth_points",
-    "dexgraspbench",
-    "draw_grasps",
-    "evaluate",
-    "hand_names",
-    "isaac_grasp",
-    "load_bundle",
-    "load_hand",
-    "load_object",
-    "load_weights",
-    "make_bundle",
-    "moveit_grasps",
-    "object_names",
-    "palm_facing_starts",
-    "pretrain",
-    "pretrain_motion",
-    "rank",
-    "read_collection",
-    "refine",
-    "save_weights",
-    "scanned_object",
-    "simulate",
-    "synthesize",
-    "synthesize_dataset",
-    "train",
-    "view_grasps",
-    "visible_points",
-    "wilson_interval",
-]
+if TYPE_CHECKING:
+    from dro_grasp.datasets.bundle.training_file import load_bundle as load_bundle
+    from dro_grasp.datasets.collections.bundling import make_bundle as make_bundle
+    from dro_grasp.datasets.collections.collection import read_collection as read_collection
+    from dro_grasp.datasets.engine.schedule import synthesize_dataset as synthesize_dataset
+    from dro_grasp.datasets.engine.worker import EngineConfig as EngineConfig
+    from dro_grasp.errors import DroGraspError as DroGraspError
+    from dro_grasp.evaluation.controls import palm_facing_starts as palm_facing_starts
+    from dro_grasp.evaluation.metrics import wilson_interval as wilson_interval
+    from dro_grasp.export.csv_table import csv_table as csv_table
+    from dro_grasp.export.dexgraspbench import dexgraspbench as dexgraspbench
+    from dro_grasp.export.frame import Frame as Frame
+    from dro_grasp.export.isaac_grasp import isaac_grasp as isaac_grasp
+    from dro_grasp.export.moveit import moveit_grasps as moveit_grasps
+    from dro_grasp.grasps.batch import GraspBatch as GraspBatch
+    from dro_grasp.hands.check import HandReport as HandReport, check_hand as check_hand
+    from dro_grasp.hands.hand import Hand as Hand
+    from dro_grasp.hands.library import hand_names as hand_names, load_hand as load_hand
+    from dro_grasp.models.checkpoints import load_weights as load_weights, save_weights as save_weights
+    from dro_grasp.models.presets import NetworkConfig as NetworkConfig
+    from dro_grasp.objects.catalogue import load_object as load_object, object_names as object_names
+    from dro_grasp.objects.shape import ObjectModel as ObjectModel
+    from dro_grasp.optimization.refinement import RefineConfig as RefineConfig
+    from dro_grasp.optimization.synthesis import SynthesisConfig as SynthesisConfig, synthesize as synthesize
+    from dro_grasp.perception.depth_camera import DepthCamera as DepthCamera, visible_points as visible_points
+    from dro_grasp.perception.scan import depth_points as depth_points, scanned_object as scanned_object
+    from dro_grasp.pipeline.problem import GraspProblem as GraspProblem
+    from dro_grasp.pipeline.stages import evaluate as evaluate, rank as rank, refine as refine
+    from dro_grasp.predictor import (
+        GraspPredictor as GraspPredictor,
+        GraspRequest as GraspRequest,
+        Prediction as Prediction,
+        PredictorConfig as PredictorConfig,
+    )
+    from dro_grasp.simulation.outcome import Failure as Failure, TrialResult as TrialResult
+    from dro_grasp.simulation.protocols import Protocol as Protocol
+    from dro_grasp.simulation.trial import simulate as simulate
+    from dro_grasp.training.config import (
+        AugmentationConfig as AugmentationConfig,
+        LossConfig as LossConfig,
+        MotionConfig as MotionConfig,
+        PretrainConfig as PretrainConfig,
+        ScheduleConfig as ScheduleConfig,
+        TrainConfig as TrainConfig,
+    )
+    from dro_grasp.training.loop import train as train
+    from dro_grasp.training.pretraining import pretrain as pretrain, pretrain_motion as pretrain_motion
+    from dro_grasp.viewer.app import view_grasps as view_grasps
+    from dro_grasp.viewer.pictures import draw_grasps as draw_grasps
+else:
+    __all__ = ["__version__", *_EXPORTS]
 
 
 def __getattr__(name: str) -> Any:
@@ -181,4 +112,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return sorted(["__version__", *_EXPORTS])

@@ -11,8 +11,7 @@ import trimesh
 
 from dro_grasp.cli.main import main
 from dro_grasp.datasets.collections.collection import read_collection
-from dro_grasp.datasets.engine import schedule as engine
-from dro_grasp.datasets.engine import worker
+from dro_grasp.datasets.engine import schedule as engine, worker
 from dro_grasp.datasets.engine.pools import Outcome, Work, failure_of
 from dro_grasp.datasets.engine.schedule import EngineConfig, PairState, next_pair, synthesize_dataset
 from dro_grasp.datasets.engine.shards import Shard, find_shards
