@@ -111,13 +111,12 @@ def test_a_network_comes_back_as_it_was_saved(tmp_path: Path) -> None:
     assert not any(p.requires_grad for p in again.parameters())
 
 
-@pytest.mark.parametrize("named", [True, False])
-def test_a_network_of_other_features_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, named: bool) -> None:
-    """A feature more than the weights know: both lists are named, and files without a list are those of the first features."""
-    if named:
-        save_score_network(ScoreNetwork(2), tmp_path / "old.safetensors")
-    else:
-        save_small(ScoreNetwork(2), tmp_path / "old.safetensors")
+def test_a_network_of_other_features_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A feature more than the weights know: both lists are named. A file without a list is refused as well."""
+    save_small(ScoreNetwork(2), tmp_path / "unnamed.safetensors")
+    with pytest.raises(WeightsError, match=r"unnamed.safetensors states the features None"):
+        load_score_network(tmp_path / "unnamed.safetensors")
+    save_score_network(ScoreNetwork(2), tmp_path / "old.safetensors")
     monkeypatch.setitem(LINK_FEATURES, "spin", Feature(1, lambda s: s.gap))
     with pytest.raises(WeightsError, match=r"old.safetensors.*'within reach', 'energy terms'.*'within reach', 'spin'"):
         load_score_network(tmp_path / "old.safetensors")

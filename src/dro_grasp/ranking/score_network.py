@@ -18,11 +18,6 @@ SHIPPED = SHIPPED_FOLDER / "ranking" / "quality.safetensors"
 """The network that ships."""
 FEATURES_KEY = "features"
 """What a weights file records about the network's inputs: the list of features that it was trained with."""
-UNNAMED_FEATURES = [
-    "gap", "normals", "arriving", "closing", "palm", "nearness", "object normal", "position", "closing vector", "within reach",
-    "energy terms", "object size", "centre offset",
-]
-"""Features of weights files without such a list."""
 
 
 class ScoreNetwork(nn.Module):
@@ -71,12 +66,11 @@ def load_score_network(path: Path) -> ScoreNetwork:
     """Read weights.
 
     Raises:
-        WeightsError: They were trained with other features than LINK_FEATURES and GRASP_FEATURES.
+        WeightsError: They were trained with other features than LINK_FEATURES and GRASP_FEATURES, or do not state them.
     """
-    history = history_of(path)
-    trained = (history[-1] if history else {}).get(FEATURES_KEY, UNNAMED_FEATURES)
+    trained = next((entry.get(FEATURES_KEY) for entry in reversed(history_of(path))), None)
     if trained != feature_names():
-        raise WeightsError(f"{path} was trained with the features {trained}; this version computes {feature_names()}; train "
+        raise WeightsError(f"{path} states the features {trained}; this version computes {feature_names()}; train "
                            "the network again (scripts/train_ranking.py)")
     tensors = load_small(path)
     network = ScoreNetwork(len(tensors["grasp.4.bias"]), len(tensors["link.0.bias"]))
