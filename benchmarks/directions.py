@@ -11,17 +11,27 @@ from __future__ import annotations
 import argparse
 
 import torch
+from jaxtyping import Float
 from report import emit
 from synthesis import HANDS
+from torch import Tensor
 
-from dro_grasp.evaluation.coverage import palm_angles
 from dro_grasp.geometry.half_axes import HALF_AXES, half_axis, half_axis_direction
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.predictor import GraspPredictor
 
 KEPT = 20.0
 """Angle within which a direction counts as kept [degrees]."""
+
+
+def palm_angles(hand: Hand, grasps: GraspBatch, direction: tuple[float, float, float]) -> Float[Tensor, " n"]:
+    """Angle between the palm direction of each grasp and a requested direction of any length [rad]."""
+    actual, requested = hand.palm_directions(grasps.T_object_wrist), torch.tensor(direction)
+    sine = torch.linalg.cross(actual, requested.expand_as(actual), dim=-1).norm(dim=-1)
+    return torch.atan2(sine, actual @ requested)
 
 
 def main() -> None:

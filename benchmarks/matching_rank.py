@@ -14,12 +14,16 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from counterparts import counterparts
 from distance_error import validation_bundle
+from jaxtyping import Float, Int
 from PIL import Image
 from report import emit
 from synthesis import HANDS
+from torch import Tensor
+from torch.nn import functional
 
-from dro_grasp.evaluation.correspondence import matching_rank, matching_rank_between, most_similar
+from dro_grasp.evaluation.correspondence import matching_rank, mean_rank
 from dro_grasp.models.checkpoints import load_weights
 from dro_grasp.models.encoder import StaticGraphEncoder
 from dro_grasp.rendering.camera import Camera
@@ -57,6 +61,15 @@ def tile(points: torch.Tensor, colours: torch.Tensor) -> np.ndarray:
     return render(meshes, Camera.around(cloud, (0.6, -1.0, 0.5), aspect=TILE[0] / TILE[1]), *TILE)
 
 
+@torch.no_grad()
+def most_similar(
+    encoder: StaticGraphEncoder, points: Float[Tensor, "n 3"], reference: Float[Tensor, "m 3"]
+) -> Int[Tensor, " n"]:
+    """For each point of a hand, the point of a reference hand with the most similar feature; both in the network's axes."""
+    features = [functional.normalize(encoder((c - c.mean(0))[None])[0], dim=-1) for c in (points, reference)]
+    return (features[0] @ features[1].mT).argmax(1)
+
+
 def main() -> None:
     """Measure, draw and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -71,8 +84,9 @@ def main() -> None:
     within = matching_rank(network.hand_encoder, source, generator)
     rows = []
     for a in source.names:
-        across = [within[a] if a == b else matching_rank_between(network.hand_encoder, source, a, b, generator)
-                  for b in source.names]
+        across = [within[a] if a == b else mean_rank(
+            network.hand_encoder, source, (a, b), counterparts(source.hands[a], source.hands[b]), generator)
+            for b in source.names]
         rows.append([a, *across])
     if options.picture is not None:
         draw(network.hand_encoder, source, options.picture)

@@ -1,4 +1,4 @@
-"""Ranks of counterparts with encoders whose features are known, and counterparts of hands whose geometry is."""
+"""Ranks of matches with encoders whose features are known."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ import torch
 from torch import Tensor, nn
 
 from dro_grasp.datasets.bundle.training_file import Bundle
-from dro_grasp.evaluation.correspondence import counterparts, matching_rank, matching_rank_between, most_similar
+from dro_grasp.evaluation.correspondence import matching_rank, mean_rank
 from dro_grasp.models.encoder import StaticGraphEncoder
 from dro_grasp.training.config import AugmentationConfig
 from dro_grasp.training.samples import SampleSource
-from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.tiny_bundle import TINY
 
 
@@ -32,19 +31,5 @@ def test_ranks_are_one_for_known_points_and_half_for_unknown_ones(bundle: Bundle
     torch.manual_seed(0)
     rank = matching_rank(Known(True), source, seed, 16)["toy"]
     assert abs(rank - (TINY.n_hand + 1) / 2) < 3
-    assert matching_rank_between(Known(False), source, "toy", "toy", seed, 4) == 1.0
-
-
-def test_counterparts_lie_on_the_same_part_of_the_hand() -> None:
-    hand, other = loaded_hand("allegro"), loaded_hand("leaphand")
-    assert torch.equal(counterparts(hand, hand), torch.arange(hand.n_points))
-    index = counterparts(hand, other)
-    on_palm, lands_on_palm = hand.link_index == hand.palm, other.link_index[index] == other.palm
-    assert float(lands_on_palm[on_palm].float().mean()) > 0.6
-    tips = torch.isin(hand.link_index, torch.tensor(hand.tips))
-    assert float(lands_on_palm[tips].float().mean()) < 0.1
-
-
-def test_the_most_similar_point_has_the_most_similar_feature() -> None:
-    points = torch.randn(10, 3)
-    assert torch.equal(most_similar(Known(False), points, points), torch.arange(10))
+    others = torch.arange(TINY.n_hand).roll(1)
+    assert mean_rank(Known(False), source, ("toy", "toy"), others, seed, 4) == 2.0, "one point is more similar"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import numpy as np
@@ -13,7 +12,6 @@ from scipy.stats import mannwhitneyu
 
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.evaluation.controls import mean_grasp, mean_grasps, palm_facing_starts
-from dro_grasp.evaluation.coverage import palm_angles
 from dro_grasp.evaluation.metrics import diversity, roc_area, wilson_interval
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.shape import ObjectModel
@@ -118,13 +116,3 @@ def test_controls_know_no_network(bundle: Bundle, monkeypatch: pytest.MonkeyPatc
     assert torch.equal(before.T_object_wrist, again.T_object_wrist)
     assert not torch.equal(before.T_object_wrist, palm_facing_starts(HAND, obj, 8, 2).T_object_wrist)
     mean_grasps(HAND, obj, mean_grasp(bundle, "toy"), 8, 1)
-
-
-def test_palm_angles_are_scipys() -> None:
-    grasps = made_up_grasps(HAND, count=15)
-    requested = np.array([1.0, 2.0, -2.0])
-    turned = Rotation.from_matrix(grasps.T_object_wrist[:, :3, :3].numpy()).apply(HAND.palm_direction_wrist.numpy())
-    np.testing.assert_allclose(palm_angles(HAND, grasps, (1.0, 2.0, -2.0)), np.arccos(turned @ requested / 3), atol=1e-5)
-    twice = dataclasses.replace(grasps[[0]], T_object_wrist=torch.eye(4)[None])
-    opposite = tuple((-HAND.palm_direction_wrist).tolist())
-    assert float(palm_angles(HAND, twice, opposite)) == pytest.approx(math.pi, abs=1e-5)

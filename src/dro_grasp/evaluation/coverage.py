@@ -109,13 +109,6 @@ def _of_pair(hand: Hand, pair: PairGrasps) -> PairCoverage:
     )
 
 
-def palm_angles(hand: Hand, grasps: GraspBatch, direction: tuple[float, float, float]) -> Float[Tensor, " n"]:
-    """Angle between the palm direction of each grasp and a requested direction of any length [rad]."""
-    actual, requested = hand.palm_directions(grasps.T_object_wrist), torch.tensor(direction)
-    sine = torch.linalg.cross(actual, requested.expand_as(actual), dim=-1).norm(dim=-1)
-    return torch.atan2(sine, actual @ requested)
-
-
 def wrist_rolls(hand: Hand, grasps: GraspBatch) -> Float[Tensor, " n"]:
     """Roll of each wrist about its palm direction, from 0 to 2 pi [rad].
 

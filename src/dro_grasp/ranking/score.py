@@ -46,13 +46,6 @@ def score_grasps(energy: GraspEnergy, grasps: GraspBatch, config: ScoreConfig | 
     return torch.cat(scores)
 
 
-@torch.no_grad()
-def energies_of(energy: GraspEnergy, grasps: GraspBatch, config: ScoreConfig | None = None) -> Float[Tensor, " n"]:
-    """Grasp energy, lower is better; arguments as for `score_grasps`."""
-    parts = [terms.sum(-1).cpu() for _, terms in _terms(energy, grasps, config or ScoreConfig())]
-    return torch.cat([torch.zeros(0), *parts])
-
-
 def _terms(
     energy: GraspEnergy, grasps: GraspBatch, config: ScoreConfig
 ) -> Iterator[tuple[GraspBatch, Float[Tensor, "b terms"]]]:
