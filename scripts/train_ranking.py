@@ -74,7 +74,7 @@ def shaken(hand: Hand, grasps: GraspBatch, generator: torch.Generator) -> GraspB
     T[:, :3, :3] = roma.rotvec_to_rotmat(turn) @ T[:, :3, :3]
     T[:, :3, 3] += hand.grasp_centres(grasps.T_object_wrist) - hand.grasp_centres(T) + move
     q = (grasps.joints + bend * hand.tree.joint_unit * hand.movable).clamp(hand.tree.lower, hand.tree.upper)
-    return grasps.bare().replace(T_object_wrist=T, joints=q)
+    return grasps.moved_to(T, q)
 
 
 @torch.no_grad()
@@ -106,7 +106,7 @@ def collect(
         groups = {
             "raw": raw[slice(0, num // 4)], "refined": refined,
             "shaken": shaken(hand, refined[slice(0, num // 2)], generator),
-            "opened": some.bare().replace(joints=opened),
+            "opened": some.moved_to(some.T_object_wrist, opened),
         }
         parts += [{"hand": name, "object": label, "kind": kind, "view": view, **evaluated(hand, obj, grasps, known)}
                   for kind, grasps in groups.items()]

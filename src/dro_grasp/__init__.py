@@ -37,7 +37,7 @@ _NAMES = {
     "perception.depth_camera": "DepthCamera visible_points",
     "perception.scan": "depth_points scanned_object",
     "pipeline.problem": "GraspProblem",
-    "pipeline.stages": "evaluate rank refine",
+    "pipeline.stages": "complete evaluate rank refine",
     "predictor": "GraspPredictor GraspRequest Prediction PredictorConfig",
     "simulation.outcome": "Failure TrialResult",
     "simulation.protocols": "Protocol",
@@ -79,7 +79,7 @@ if TYPE_CHECKING:
     from dro_grasp.perception.depth_camera import DepthCamera as DepthCamera, visible_points as visible_points
     from dro_grasp.perception.scan import depth_points as depth_points, scanned_object as scanned_object
     from dro_grasp.pipeline.problem import GraspProblem as GraspProblem
-    from dro_grasp.pipeline.stages import evaluate as evaluate, rank as rank, refine as refine
+    from dro_grasp.pipeline.stages import complete as complete, evaluate as evaluate, rank as rank, refine as refine
     from dro_grasp.predictor import (
         GraspPredictor as GraspPredictor,
         GraspRequest as GraspRequest,

@@ -178,6 +178,36 @@ def test_leaving_out_a_trial_leaves_the_rest():
     assert list(grasps.without("score", "depth").extra) == ["reason"]
 
 
+def test_moved_grasps_keep_nothing_of_the_poses_before():
+    numbers, joints = torch.rand(4), torch.rand(4, 2)
+    outcome = evaluated(4, score=numbers, energy=numbers, pregrasp_joints=joints, squeeze_joints=joints)
+    before = outcome.replace(extra=outcome.extra | {
+        "depth": torch.rand(4), "energy_contact": torch.rand(4), "object_file": ("ball.stl",) * 4})
+    moved = before.moved_to(before.T_object_wrist.flip(0), before.joints + 1)
+    assert torch.equal(moved.joints, before.joints + 1)
+    assert torch.equal(moved.T_object_wrist, before.T_object_wrist.flip(0))
+    for name in ("score", "energy", "pregrasp_joints", "squeeze_joints", "displacement", "rotation", "penetration"):
+        assert getattr(moved, name).isnan().all(), name
+    assert not moved.evaluated.any()
+    assert list(moved.extra) == ["object_file"]
+    assert (moved.object, moved.provenance) == (before.object, before.provenance)
+
+
+def test_grasps_come_apart_by_object_in_their_order():
+    mixed = GraspBatch.concatenate([make(1, obj=CUBE, seed=1), make(2, seed=2), make(1, obj=CUBE, seed=3)])
+    assert [(name, part.object, part.seed.tolist()) for name, part in mixed.by_object()] == [
+        ("cube", ("cube",) * 2, [1, 3]), ("ball", ("ball",) * 2, [2, 2])]
+    assert list(make(0).by_object()) == []
+
+
+def test_closing_is_stated_by_a_pregrasp_and_a_squeeze():
+    rows = torch.zeros(4, 2)
+    pregrasps, squeezes = rows.clone(), rows.clone()
+    pregrasps[[1, 3], 0], squeezes[[2, 3], 1] = torch.nan, torch.nan
+    assert make(4, pregrasp_joints=pregrasps, squeeze_joints=squeezes).states_closing.tolist() == [True, False, False, False]
+    assert not make(1).states_closing.any()
+
+
 def test_further_columns_that_some_lack_are_unknown_there_and_survive_the_file(tmp_path):
     some = evaluated(2).replace(extra={"links": [["tip"], []], "depth": torch.ones(2), "count": torch.arange(2)})
     GraspBatch.concatenate([make(1), some]).save(tmp_path / "g.parquet")

@@ -59,6 +59,10 @@ def test_no_energy_rises_and_most_fall(obj: ObjectModel, disturbed: GraspBatch) 
     assert bool((after <= before + 1e-3).all())
     assert (after < 0.8 * before).float().mean() > 0.8
     assert refined.score.isnan().all()
+    stale = {"depth", *(name for name in disturbed.extra if name.startswith("energy_"))}
+    assert stale <= disturbed.extra.keys()
+    assert len(stale) > 1
+    assert not refined.extra.keys() & stale
     assert not torch.equal(refined.squeeze_joints, refined.joints)
 
 

@@ -192,8 +192,12 @@ def test_the_controller_fills_single_rows(hand, obj, name):
 
 def test_settled_labels_touch_without_penetrating(hand, obj):
     loose = power_grasp(hand, obj, 2).replace(joints=torch.tensor([[0.0, 0.4] * 4, [0.05, 0.7] * 4]))
-    settled = settle(hand, obj, loose)
-    assert settled.squeeze_joints.isnan().all()
+    known = loose.replace(score=torch.ones(2), energy=torch.ones(2), extra={"depth": torch.ones(2)})
+    settled = settle(hand, obj, known.with_trial(simulate(hand, obj, loose, "dro")))
+    for gone in (settled.squeeze_joints, settled.score, settled.displacement):
+        assert gone.isnan().all()
+    assert not settled.evaluated.any()
+    assert settled.energy.tolist() == settled.extra["depth"].tolist() == [1, 1], "those before settling"
     assert (settled.joints >= hand.tree.lower).all()
     distance = hand.points(settled.joints, settled.T_object_wrist).norm(dim=-1) - 0.03
     # Contacts are soft: the squeeze presses fingers into so light a ball by millimetres.

@@ -49,18 +49,18 @@ class Export:
 
         frame = Frame() if self.frame is None else Frame.load(self.frame)
         grasps, form = self._load(), FORMATS[self.format]
-        names = list(dict.fromkeys(grasps.object))
-        folder = form.file_per_grasp or len(names) > 1
+        batches = dict(grasps.by_object())
+        folder = form.file_per_grasp or len(batches) > 1
         target = check_folder(self.output) if folder else check_output(self.output)
         if form.file_per_grasp:
             refuse_mixing(target, form.suffix)
-        jobs = [self._job(grasps[[i for i, o in enumerate(grasps.object) if o == name]], frame) for name in names]
+        jobs = {name: self._job(batch, frame) for name, batch in batches.items()}
         if folder:
             make_folder(target)
         written: list[Path] = []
-        for name, job in zip(names, jobs, strict=True):
+        for name, job in jobs.items():
             label = name.replace("/", "-") + ("" if form.file_per_grasp else form.suffix)
-            written += write(form.content(job), target / label if len(names) > 1 else target, form.suffix)
+            written += write(form.content(job), target / label if len(jobs) > 1 else target, form.suffix)
         if self.json:
             print_json({"format": self.format, "frame": frame.name, "num": len(grasps), "files": [str(p) for p in written]})
         else:
@@ -86,7 +86,7 @@ class Export:
         from dro_grasp.grasps.controller import completed
         from dro_grasp.grasps.sources import hand_of, object_of, object_source
 
-        stated = bool(torch.stack([grasps.pregrasp_joints, grasps.squeeze_joints]).isfinite().all())
+        stated = bool(grasps.states_closing.all())
         hand = hand_of(grasps, self.hand) if FORMATS[self.format].needs_hand or not stated else None
         if hand is not None and not stated:
             centre = torch.as_tensor(object_of(grasps, self.object, 1.0).centre_of_mass, dtype=grasps.joints.dtype)

@@ -39,5 +39,5 @@ def load_grasps_of_one_object(
     grasps = load_grasps(file)
     hand = hand_of(grasps, hand_name)
     name = object_name if object_name in grasps.object else grasps.object[0]
-    chosen = grasps[[i for i, o in enumerate(grasps.object) if o == name]]
+    chosen = dict(grasps.by_object())[name]
     return hand, object_of(chosen, None if object_name == name else object_name, scale), chosen

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import torch
 import yaml
 from jaxtyping import Float
 from torch import Tensor
@@ -24,11 +23,10 @@ def postures(grasps: GraspBatch) -> dict[str, Float[Tensor, "n n_dof"]]:
     Raises:
         OptionError: A grasp states no pregrasp or squeeze.
     """
-    found = {"pregrasp": grasps.pregrasp_joints, "grasp": grasps.joints, "squeeze": grasps.squeeze_joints}
-    if not bool(torch.stack(list(found.values())).isfinite().all()):
+    if not bool(grasps.states_closing.all()):
         raise OptionError("these grasps have no pregrasp and squeeze; `dro-grasp export` makes them, and so does "
-                          "`dro_grasp.grasps.controller.completed`")
-    return found
+                          "`dro_grasp.complete(problem, grasps)`")
+    return {"pregrasp": grasps.pregrasp_joints, "grasp": grasps.joints, "squeeze": grasps.squeeze_joints}
 
 
 def confidence(grasps: GraspBatch, i: int) -> float | None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -16,26 +16,14 @@ from torch import Tensor
 
 from dro_grasp.errors import GraspFileError
 from dro_grasp.files import check_output, replacing
-from dro_grasp.grasps import codec, summary
-from dro_grasp.grasps.columns import COLUMNS, MAY_BE_UNKNOWN, NOT_EVALUATED, UNKNOWN_PROTOCOL, joined, taken, unknown
+from dro_grasp.grasps import codec, columns, summary
 from dro_grasp.grasps.table import read_table, table_bytes
-from dro_grasp.grasps.trial_columns import FURTHER, MEASURED, Trial, columns_of
+
+if TYPE_CHECKING:
+    from dro_grasp.hands.hand import Hand
+    from dro_grasp.objects.shape import ObjectModel
 
 __all__ = ["GraspBatch"]
-
-
-@runtime_checkable
-class HandIdentity(Protocol):
-    """What a batch records of a hand; every Hand has it."""
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def sha256(self) -> str: ...
-
-    @property
-    def tree(self) -> Any: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,26 +83,26 @@ class GraspBatch:
         Raises:
             ValueError: The columns do not fit together.
         """
-        columns = {name: getattr(self, name) for name in COLUMNS} | self.extra
-        wrong = {name: len(column) for name, column in columns.items() if len(column) != len(self)}
+        every = {name: getattr(self, name) for name in columns.COLUMNS} | self.extra
+        wrong = {name: len(column) for name, column in every.items() if len(column) != len(self)}
         if wrong:
             raise ValueError(f"a batch of {len(self)} grasps has columns of other lengths: {wrong}")
         if self.joints.shape[1] != len(self.joint_names):
             raise ValueError(f"{self.joints.shape[1]} values for {len(self.joint_names)} joint names")
-        if taken_names := sorted(self.extra.keys() & set(COLUMNS)):
+        if taken_names := sorted(self.extra.keys() & set(columns.COLUMNS)):
             raise ValueError(f"further columns have the names of fields: {taken_names}; set the fields instead")
         if bool((self.success & ~self.evaluated).any()):
             raise ValueError("some grasps succeeded without a protocol; name the protocol of their trial")
 
     @staticmethod
     def create(
-        hand: Any,
-        obj: Any,
+        hand: Hand,
+        obj: ObjectModel | Sequence[ObjectModel],
         T_object_wrist: Float[Tensor, "n 4 4"],
         joints: Float[Tensor, "n n_dof"],
         **optional: Any,
     ) -> GraspBatch:
-        """A batch for a Hand and an ObjectModel, or a sequence of n ObjectModels.
+        """A batch for a hand and one or several objects.
 
         Args:
             hand: The hand: name, sha256 and tree are recorded.
@@ -125,14 +113,14 @@ class GraspBatch:
         """
         n = len(joints)
         objects = list(obj) if isinstance(obj, Sequence) else [obj] * n
-        fields: dict[str, Any] = {name: unknown(name, joints) for name in COLUMNS[2:]}
+        fields: dict[str, Any] = {name: columns.unknown(name, joints) for name in columns.COLUMNS[2:]}
         fields |= {
             "hand": hand.name, "hand_sha256": hand.sha256, "wrist_link": hand.tree.link_names[0],
             "joint_names": tuple(hand.tree.joint_names), "object": tuple(o.name for o in objects),
             "object_sha256": tuple(o.sha256 for o in objects), "split": tuple(o.split or "" for o in objects),
         }
         if "success" in optional:
-            fields["protocol"] = (UNKNOWN_PROTOCOL,) * n
+            fields["protocol"] = (columns.UNKNOWN_PROTOCOL,) * n
         fields |= optional
         if isinstance(fields["seed"], int):
             fields["seed"] = torch.full((n,), fields["seed"], dtype=torch.int64)
@@ -159,8 +147,15 @@ class GraspBatch:
         return self._take(rows[chosen if chosen.numel() else chosen.long()].reshape(-1))
 
     def _take(self, rows: Int[Tensor, " k"]) -> GraspBatch:
-        fields = {name: taken(getattr(self, name), rows) for name in COLUMNS}
-        return self.replace(**fields, extra={name: taken(column, rows) for name, column in self.extra.items()})
+        fields = {name: columns.taken(getattr(self, name), rows) for name in columns.COLUMNS}
+        return self.replace(**fields, extra={name: columns.taken(column, rows) for name, column in self.extra.items()})
+
+    def by_object(self) -> Iterator[tuple[str, GraspBatch]]:
+        """Each object's name with its grasps, in the order in which the objects first appear."""
+        rows: dict[str, list[int]] = {}
+        for i, name in enumerate(self.object):
+            rows.setdefault(name, []).append(i)
+        return ((name, self[own]) for name, own in rows.items())
 
     def replace(self, **changes: Any) -> GraspBatch:
         """The same batch with other values for some fields."""
@@ -172,15 +167,20 @@ class GraspBatch:
         Raises:
             ValueError: No such column, or one that is always known, or one of the trial's (see `without_trial`).
         """
-        if wrong := [name for name in names if name not in {*MAY_BE_UNKNOWN, *self.extra}]:
-            raise ValueError(f"columns {wrong} cannot be left out; these can: {[*MAY_BE_UNKNOWN, *self.extra]}")
-        fields = {name: unknown(name, self.joints) for name in names if name in MAY_BE_UNKNOWN}
+        if wrong := [name for name in names if name not in {*columns.MAY_BE_UNKNOWN, *self.extra}]:
+            raise ValueError(f"columns {wrong} cannot be left out; these can: {[*columns.MAY_BE_UNKNOWN, *self.extra]}")
+        fields = {name: columns.unknown(name, self.joints) for name in names if name in columns.MAY_BE_UNKNOWN}
         return self.replace(**fields, extra={name: c for name, c in self.extra.items() if name not in names})
 
     @cached_property
     def evaluated(self) -> Bool[Tensor, " n"]:
         """Which grasps have been through a trial."""
-        return torch.tensor([p != NOT_EVALUATED for p in self.protocol], dtype=torch.bool, device=self.success.device)
+        return torch.tensor([p != columns.NOT_EVALUATED for p in self.protocol], dtype=torch.bool, device=self.success.device)
+
+    @property
+    def states_closing(self) -> Bool[Tensor, " n"]:
+        """Which grasps state both pregrasp and squeeze."""
+        return torch.stack([self.pregrasp_joints, self.squeeze_joints]).isfinite().all(-1).all(0)
 
     @property
     def tried(self) -> Bool[Tensor, " n"]:
@@ -200,9 +200,10 @@ class GraspBatch:
         for other in batches[1:]:
             if (other.hand_sha256, other.joint_names) != (first.hand_sha256, first.joint_names):
                 raise ValueError(f"grasps of hand '{other.hand}' cannot join those of '{first.hand}'")
-        fields = {name: joined([getattr(b, name) for b in batches], lengths) for name in COLUMNS}
+        fields = {name: columns.joined([getattr(b, name) for b in batches], lengths) for name in columns.COLUMNS}
         names = dict.fromkeys(name for b in batches for name in b.extra)
-        return first.replace(**fields, extra={name: joined([b.extra.get(name) for b in batches], lengths) for name in names})
+        extra = {name: columns.joined([b.extra.get(name) for b in batches], lengths) for name in names}
+        return first.replace(**fields, extra=extra)
 
     def sorted_by_score(self) -> GraspBatch:
         """Best score first; equal scores keep their order, grasps without score come last."""
@@ -214,21 +215,28 @@ class GraspBatch:
 
     def bare(self) -> GraspBatch:
         """Poses, joints, objects and their making alone, without outcomes and further columns."""
-        return self.replace(extra={}).without(*MAY_BE_UNKNOWN).without_trial()
+        return self.replace(extra={}).without(*columns.MAY_BE_UNKNOWN).without_trial()
 
-    def with_trial(self, trial: Trial) -> GraspBatch:
-        """The batch with a trial's outcome; why grasps failed and what they touched are further columns.
+    def moved_to(self, T_object_wrist: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"]) -> GraspBatch:
+        """The batch at other poses and joints; everything that belongs to the poses before is unknown or gone."""
+        stale = [name for name in self.extra if name == columns.DEPTH or name.startswith(columns.ENERGY_TERM)]
+        rest = self.without(*columns.MAY_BE_UNKNOWN, *stale).without_trial()
+        return rest.replace(T_object_wrist=T_object_wrist, joints=joints)
 
-        Args:
-            trial: A TrialResult; its displacement and rotation are (n) or (n directions).
-        """
-        fields, further = columns_of(trial)
-        return self.replace(**fields, protocol=(trial.protocol,) * len(self), extra=self.extra | further)
+    def with_trial(self, trial: Any) -> GraspBatch:
+        """The batch with the outcome of a trial, a TrialResult; why grasps failed and what they touched are further columns."""
+        further = {
+            columns.REASON: list(trial.reason), columns.CONTACT_LINKS: [list(links) for links in trial.contact_links],
+            columns.FAILURE: [failure.name if failure else None for failure in trial.failure],
+        }
+        return self.replace(
+            success=trial.success, displacement=trial.displacement.amax(-1), rotation=trial.rotation.amax(-1),
+            penetration=trial.penetration, protocol=(trial.protocol,) * len(self), extra=self.extra | further)
 
     def without_trial(self) -> GraspBatch:
         """The batch as if no grasp had been evaluated."""
-        fields = {name: unknown(name, self.joints) for name in MEASURED}
-        return self.replace(**fields, extra={name: c for name, c in self.extra.items() if name not in FURTHER})
+        fields = {name: columns.unknown(name, self.joints) for name in columns.MEASURED}
+        return self.replace(**fields, extra={name: c for name, c in self.extra.items() if name not in columns.FURTHER})
 
     def save(self, path: Path | str, notes: dict[str, Any] | None = None) -> None:
         """Write a grasp file (Parquet, format version 1); it appears whole or not at all.
@@ -246,8 +254,8 @@ class GraspBatch:
 
     def to_bytes(self, notes: dict[str, Any] | None = None) -> bytes:
         """The grasp file that `save` writes."""
-        columns, header = codec.encode(self)
-        return table_bytes(columns, header if notes is None else header | {"notes": notes})
+        table, header = codec.encode(self)
+        return table_bytes(table, header if notes is None else header | {"notes": notes})
 
     @staticmethod
     def load(path: Path | str | BytesIO) -> GraspBatch:
@@ -267,7 +275,7 @@ class GraspBatch:
         """
         return codec.data_frame(self)
 
-    def require_hand(self, hand: HandIdentity) -> None:
+    def require_hand(self, hand: Hand) -> None:
         """Refuse a hand whose joints are not those of these grasps.
 
         Raises:

@@ -15,9 +15,19 @@ from torch import Tensor
 
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.geometry import se3
-from dro_grasp.grasps.columns import COLUMNS, FLOATS, NOT_EVALUATED, POSTURES, TEXTS, UNKNOWN_PROTOCOL
+from dro_grasp.grasps.columns import (
+    COLUMNS,
+    CONTACT_LINKS,
+    ENERGY_TERM,
+    FAILURE,
+    FLOATS,
+    NOT_EVALUATED,
+    POSTURES,
+    REASON,
+    TEXTS,
+    UNKNOWN_PROTOCOL,
+)
 from dro_grasp.grasps.table import fixed_column, float_column, floats
-from dro_grasp.grasps.trial_columns import CONTACT_LINKS, FAILURE, REASON
 
 REQUIRED = ("object", "wrist_position", "wrist_quaternion_wxyz", "joints")
 """Columns without which a file holds no grasps."""
@@ -108,7 +118,7 @@ def _poses(position: Float[Tensor, "n 3"], quaternion: Float[Tensor, "n 4"]) -> 
 
 def _energy_apart(score: Float[Tensor, " n"], provenance: tuple[str, ...], table: pa.Table) -> dict[str, Float[Tensor, " n"]]:
     """Energy and score in a file without a column `energy`: the score of its synthesised grasps is minus the energy."""
-    terms = [name for name in table.column_names if name.startswith("energy_")]
+    terms = [name for name in table.column_names if name.startswith(ENERGY_TERM)]
     has_terms = ~torch.from_numpy(np.array(table[terms[0]].is_null())) if terms else torch.zeros(len(score), dtype=torch.bool)
     synthesised = has_terms & torch.tensor([SYNTHESISED.search(p) is not None for p in provenance], dtype=torch.bool)
     nothing = torch.full_like(score, torch.nan)

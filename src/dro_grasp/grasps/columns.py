@@ -23,6 +23,20 @@ NOT_EVALUATED = ""
 """Protocol of a grasp without a trial."""
 UNKNOWN_PROTOCOL = "unknown"
 """Protocol of a grasp whose outcome is known without its protocol."""
+MEASURED = ("success", "protocol", "displacement", "rotation", "penetration")
+"""Fields of a batch that a trial fills."""
+REASON = "reason"
+"""Further column: why a grasp failed, in words; empty for a success."""
+FAILURE = "failure"
+"""Further column: name of the kind of failure (`Failure`); None for a success."""
+CONTACT_LINKS = "contact_links"
+"""Further column: names of the links that touch the object after closing."""
+FURTHER = (REASON, FAILURE, CONTACT_LINKS)
+"""Further columns that a trial adds."""
+DEPTH = "depth"
+"""Further column of synthesised grasps: deepest penetration of a surface point [m]."""
+ENERGY_TERM = "energy_"
+"""How the names of further columns with the terms of the grasp energy begin."""
 
 
 def unknown(name: str, joints: Float[Tensor, "n n_dof"]) -> Any:

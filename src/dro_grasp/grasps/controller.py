@@ -40,17 +40,16 @@ def completed(
         centre: The object's centre of mass, in the object's frame [m].
         config: Amounts.
     """
-    stated = torch.stack([grasps.pregrasp_joints, grasps.squeeze_joints]).isfinite().all(-1)
-    open_rows = (~stated).any(0)
+    open_rows = ~grasps.states_closing
     if not bool(open_rows.any()):
         return grasps
     made = pregrasp_and_squeeze(
         hand, grasps.T_object_wrist[open_rows], grasps.joints[open_rows], centre.to(grasps.joints), config)
     postures = []
-    for given, known, new in zip((grasps.pregrasp_joints, grasps.squeeze_joints), stated, made, strict=True):
+    for given, new in zip((grasps.pregrasp_joints, grasps.squeeze_joints), made, strict=True):
         whole = given.clone()
         whole[open_rows] = new
-        postures.append(torch.where(known[:, None], given, whole))
+        postures.append(torch.where(given.isfinite().all(-1, keepdim=True), given, whole))
     return grasps.replace(pregrasp_joints=postures[0], squeeze_joints=postures[1])
 
 

@@ -6,8 +6,7 @@ import html
 from collections import Counter
 from typing import Any
 
-from dro_grasp.grasps.columns import NOT_EVALUATED
-from dro_grasp.grasps.trial_columns import REASON
+from dro_grasp.grasps.columns import NOT_EVALUATED, REASON
 
 ROWS = 10
 """Most grasps in the HTML table (ours)."""

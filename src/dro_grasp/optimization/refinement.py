@@ -52,7 +52,7 @@ class RefineConfig:
 def refine_grasps(energy: GraspEnergy, grasps: GraspBatch, config: RefineConfig | None = None) -> GraspBatch:
     """The grasps after the descent; none has a higher energy than before.
 
-    Whatever belongs to the grasps before (pregrasp, squeeze, scores, outcomes) is dropped.
+    Whatever belongs to the grasps before (pregrasp, squeeze, scores, energies, outcomes) is dropped.
 
     Args:
         energy: Of the grasps' hand on their object, with the weights of the configuration.
@@ -67,8 +67,7 @@ def refine_grasps(energy: GraspEnergy, grasps: GraspBatch, config: RefineConfig 
     with torch.no_grad():
         ends = [_descend(energy, T.to(device), q.to(device), config) for T, q in parts]
     T, q = (torch.cat(part).cpu() for part in zip(*ends, strict=True))
-    moved_grasps = grasps.without("pregrasp_joints", "squeeze_joints", "score", "energy").without_trial()
-    return moved_grasps.replace(T_object_wrist=T, joints=q)
+    return grasps.moved_to(T, q)
 
 
 def _descend(

@@ -20,6 +20,10 @@ from dro_grasp.simulation.trial import simulate
 def complete(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
     """Grasps that all state a pregrasp and a squeeze; the controller makes the missing ones.
 
+    Args:
+        problem: Hand and object.
+        grasps: Any grasps of the two; what they state stays.
+
     Raises:
         GraspFileError: The grasps are of another hand.
     """

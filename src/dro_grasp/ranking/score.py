@@ -5,7 +5,6 @@ Source: the paper's appendix ranks predictions by DexGraspNet's energy and repor
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import torch
@@ -39,18 +38,12 @@ def score_grasps(energy: GraspEnergy, grasps: GraspBatch, config: ScoreConfig | 
         grasps: Any grasps of the two.
         config: Batch size.
     """
-    network, scores = shipped_score_network(), [torch.zeros(0)]
-    for part, terms in _terms(energy, grasps, config or ScoreConfig()):
+    network, scores, device = shipped_score_network(), [torch.zeros(0)], energy.centre.device
+    size = (config or ScoreConfig()).batch_size
+    for start in range(0, len(grasps), size):
+        part = grasps[start : start + size]
+        # Each finger touches with its candidate nearest to the surface.
+        terms = evaluate_nearest(energy, part.T_object_wrist.to(device), part.joints.to(device)).terms
         features = grasp_features(energy, part, terms)  # the network is small and stays on the CPU
         scores.append(network(*(values.cpu() for values in features)).mean(-1))
     return torch.cat(scores)
-
-
-def _terms(
-    energy: GraspEnergy, grasps: GraspBatch, config: ScoreConfig
-) -> Iterator[tuple[GraspBatch, Float[Tensor, "b terms"]]]:
-    """Parts of the grasps with their weighted energy terms; each finger touches with its candidate nearest to the surface."""
-    device = energy.centre.device
-    for start in range(0, len(grasps), config.batch_size):
-        part = grasps[start : start + config.batch_size]
-        yield part, evaluate_nearest(energy, part.T_object_wrist.to(device), part.joints.to(device)).terms

@@ -71,7 +71,8 @@ def settle(
 
     A joint above a link that touches the object takes the value it reached, held back by the contact, so that the
     label touches the surface. The other joints keep their values: closing would only drive them towards a fist. A
-    grasp whose simulation is unstable keeps its label.
+    grasp whose simulation is unstable keeps its label. Energies and depth stay those before settling; scores and
+    outcomes are dropped.
 
     Raises:
         ObjectError: The object is a bare point cloud.
@@ -88,7 +89,7 @@ def settle(
         T_object_wrist = torch.linalg.inv(torch.where(stable[:, None, None], T, torch.eye(4, dtype=T.dtype)))
         joints.append(torch.where(held, reached, part.joints))
         poses.append(torch.where(stable[:, None, None], T_object_wrist.to(reached.dtype), part.T_object_wrist))
-    unsettled = grasps.without("pregrasp_joints", "squeeze_joints")
+    unsettled = grasps.without("pregrasp_joints", "squeeze_joints", "score").without_trial()
     return unsettled.replace(T_object_wrist=torch.cat(poses), joints=torch.cat(joints))
 
 

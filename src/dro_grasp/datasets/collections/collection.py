@@ -78,16 +78,12 @@ def successful(grasps: GraspBatch) -> GraspBatch:
     return grasps[grasps.success]
 
 
-def rows_of(grasps: GraspBatch, obj: str) -> GraspBatch:
-    """The grasps of one object."""
-    return grasps[[i for i, name in enumerate(grasps.object) if name == obj]]
-
-
 def _pairs_of_file(path: Path) -> Iterator[PairGrasps]:
     grasps = GraspBatch.load(path)
     yields = (read_footer(path)[1].get("notes") or {}).get(YIELDS) or {}
-    for obj in dict.fromkeys((*grasps.object, *yields)):
-        part = rows_of(grasps, obj)
+    parts = dict(grasps.by_object())
+    for obj in dict.fromkeys((*parts, *yields)):
+        part = parts.get(obj, grasps[[]])
         made = Yield.from_dict(yields[obj]) if obj in yields else Yield(valid=len(part))
         yield PairGrasps(grasps.hand, obj, part, made)
 
