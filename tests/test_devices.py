@@ -17,7 +17,7 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predictor import GraspPredictor
 from dro_grasp.training import loop, pretraining
-from dro_grasp.training.batch_statistics import recalibrate
+from dro_grasp.training.runs import recalibrate
 from tests.helpers.claw import ball
 from tests.helpers.toy_hand import toy_hand
 from tests.helpers.training_stages import SCHEDULE, STAGES, curve, run_stage

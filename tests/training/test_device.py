@@ -12,10 +12,10 @@ import torch
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.models.network import untrained_network
 from dro_grasp.training import loop, pretraining
-from dro_grasp.training.batch_statistics import recalibrate
 from dro_grasp.training.config import MotionConfig, TrainConfig
 from dro_grasp.training.loop import train
 from dro_grasp.training.pretraining import pretrain_motion
+from dro_grasp.training.runs import recalibrate
 from tests.helpers.tiny_bundle import TINY
 from tests.helpers.training_stages import SCHEDULE, STAGES, curve, quiet, run_stage
 

@@ -14,10 +14,11 @@ from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.errors import TrainingError
 from dro_grasp.evaluation.correspondence import matching_rank
 from dro_grasp.models.network import DistanceNetwork
-from dro_grasp.training import batch_statistics, loop
+from dro_grasp.training import loop
 from dro_grasp.training.config import AugmentationConfig, LossConfig, MotionConfig, PretrainConfig, TrainConfig
 from dro_grasp.training.loop import train
 from dro_grasp.training.pretraining import contrastive_step, pretrain_motion
+from dro_grasp.training.runs import recalibrate
 from dro_grasp.training.samples import SampleSource
 from tests.helpers.tiny_bundle import TINY
 from tests.helpers.training_stages import SCHEDULE, STAGES, curve, quiet, run_stage
@@ -69,7 +70,7 @@ def test_recalibration_measures_what_the_weights_make_of_the_data(bundle: Bundle
     for parameter in encoder.parameters():
         nn.init.normal_(parameter)
     encoder.add_module("frozen", frozen)
-    batch_statistics.recalibrate(
+    recalibrate(
         encoder, lambda: contrastive_step(encoder, source, PretrainConfig(hands_per_step=1), generator), batches=5
     )
     assert len(inputs) == 5

@@ -24,11 +24,7 @@ MOST_REPAIRS = 64
 
 @contextmanager
 def mujoco_speaks_to(notes: list[Note], path: Path) -> Iterator[None]:
-    """Collect MuJoCo's warnings as notes; MuJoCo itself prints them and writes a log file into the working folder.
-
-    Raises:
-        HandError: MuJoCo refuses the description.
-    """
+    """Collect MuJoCo's warnings as notes; MuJoCo itself prints them and writes a log file into the working folder."""
     before: Callable[[str], None] | None = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda text: notes.append(Note("warning", path.name, text.strip())))
     try:

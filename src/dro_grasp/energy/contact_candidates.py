@@ -57,10 +57,7 @@ class ContactCandidates:
     def assign(self, n: int, idle: float, generator: torch.Generator) -> Int[Tensor, "n n_slots"]:
         """The slot from which each contact of each grasp draws: its own, or another one if its finger is idle.
 
-        Args:
-            n: How many grasps.
-            idle: Probability that a finger other than the thumb is idle.
-            generator: Source of randomness.
+        `idle` is the probability of that for a finger other than the thumb.
         """
         own = torch.arange(len(self.slot_finger)).repeat(n, 1)
         if self.thumb is None:

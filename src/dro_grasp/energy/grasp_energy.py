@@ -175,12 +175,9 @@ class GraspEnergy:
         """Prepare everything that stays the same from step to step.
 
         Args:
-            hand: The hand.
             field: Signed distances of the object.
             centre: The object's centre of mass [m].
             length: Typical distance of its surface from there [m].
-            config: Weights.
-            contacts: Selection of contact candidates.
             device: Device of the evaluations; hand, field and centre are on the CPU.
         """
         self.length = length
@@ -214,13 +211,7 @@ class GraspEnergy:
         q: Float[Tensor, "n n_dof"],
         contacts: Int[Tensor, "n c"],
     ) -> Evaluation:
-        """Energy and gradient of n grasps.
-
-        Args:
-            T_object_wrist: Wrist poses [m].
-            q: Joints [rad or m].
-            contacts: Indices of the contact candidates.
-        """
+        """Energy and gradient of n grasps: wrist poses, joints [rad or m], indices of their contact candidates."""
         tree, config = self.hand.tree, self.config
         poses = T_object_wrist[:, None] @ tree.forward(q)
         contact_terms, wrenches = self._contacts(poses, contacts)

@@ -21,15 +21,7 @@ def object_energy(
     contacts: ContactConfig | None = None,
     device: torch.device | str = "cpu",
 ) -> GraspEnergy:
-    """The energy on the object's grid of signed distances.
-
-    Args:
-        hand: The hand.
-        obj: The object.
-        config: Weights.
-        contacts: Selection of contact candidates.
-        device: Device of the evaluations.
-    """
+    """The energy on the object's grid of signed distances."""
     surface = torch.as_tensor(obj.cloud, dtype=torch.float32)
     centre = torch.as_tensor(obj.centre_of_mass, dtype=torch.float32)
     length = float((surface - centre).norm(dim=-1).mean())

@@ -71,12 +71,7 @@ def force_closure(
 
 
 def contact_distance(distance: Float[Tensor, "*b c"], gradient: Float[Tensor, "*b c 3"]) -> PointTerm:
-    """Distance of each contact to the object's surface, from inside or outside [m].
-
-    Args:
-        distance: Signed distance at the contacts [m].
-        gradient: Its gradient there.
-    """
+    """Distance of each contact to the object's surface, from inside or outside, given the signed distance [m]."""
     return PointTerm(distance.abs(), distance.sign()[..., None] * gradient)
 
 
@@ -91,12 +86,7 @@ def normal_alignment(
 
 
 def penetration(distance: Float[Tensor, "*b p"], gradient: Float[Tensor, "*b p 3"]) -> PointTerm:
-    """Penetration of each hand point into the object [m]; zero outside.
-
-    Args:
-        distance: Signed distance at points of the hand's surface [m].
-        gradient: Its gradient there.
-    """
+    """Penetration of each hand point into the object, given its signed distance [m]; zero outside."""
     # Differs from DexGraspNet, which sums over object points inside the hand; this sums over hand points inside the object.
     inside = (distance < 0).to(distance.dtype)
     return PointTerm(-distance * inside, -gradient * inside[..., None])
@@ -156,8 +146,6 @@ def joint_gradient(
     """Derivatives by a small motion of the whole hand and by each independent joint.
 
     Args:
-        tree: The hand's tree.
-        T_world_link: Poses of all links.
         wrenches: Derivatives by each link's translation and by its rotation about the world's origin.
         pivot: Point about which the whole hand turns [m].
 

@@ -49,7 +49,6 @@ def choose_sides(
         candidates: The two positions of each point [m].
         misfit: Mean squared error of the distances at each candidate [m^2].
         reference: The body whose side the others take if both sides fit alike.
-        config: See SideConfig.
     """
     config = config or SideConfig()
     cut = _cut(local, weight, (candidates[:, 0] - candidates[:, 1]).norm(dim=-1) / 2, config)

@@ -61,7 +61,6 @@ def multilaterate(
     Args:
         distances: Distance of each point to each anchor [m].
         anchors: Known positions [m].
-        config: See MultilaterationConfig.
 
     Returns:
         The candidates on the two sides of the anchors' plane [m], equal where the cloud is not thin; and the mask of

@@ -43,8 +43,6 @@ def farthest_points(
 
     Args:
         points: Clouds to choose from [m].
-        count: Number of points to choose, at most n.
-        start: Index of the first point.
 
     Raises:
         ValueError: `count` exceeds the number of points.

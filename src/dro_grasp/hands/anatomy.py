@@ -62,11 +62,7 @@ def rigid_groups(tree: KinematicTree) -> tuple[int, ...]:
 
 
 def find_tips(tree: KinematicTree, shaped: Collection[int]) -> tuple[int, ...]:
-    """Fingertips: below each last moving joint, the deepest link with a shape.
-
-    Args:
-        tree: The hand's tree.
-        shaped: Links with a visual or collision shape.
+    """Fingertips: below each last moving joint, the deepest link with a (visual or collision) shape.
 
     Raises:
         HandError: No moving joint carries a shape.
@@ -135,7 +131,6 @@ def measure_opposition(
     """How much each fingertip, while the hand closes, moves against the others.
 
     Args:
-        tree: The hand's tree.
         q: Joints at which this is measured [rad or m].
         rate: Their velocities while the whole hand closes.
         tips: Fingertip links.
@@ -164,7 +159,6 @@ def closing_gains(
     """How much nearer to the targets the upper limit of each joint brings its fingertips than the lower limit [m].
 
     Args:
-        tree: The hand's tree.
         q: Values of all other joints [rad or m].
         tips: Fingertip links.
         tip_points: A point on each, in its link's frame [m].

@@ -47,10 +47,8 @@ def build_hand(description: Description, *, name: str | None = None, seed: int =
     """Derive everything the method needs from a description.
 
     Args:
-        description: From `load_description`.
         name: Name of the hand in files and tables; the file's stem by default.
         seed: Seed of the point sampling; the same seed gives the same points.
-        n_points: Points of the whole hand.
 
     Raises:
         HandError: The description has no finger, no link with a surface, or a size that no hand has.

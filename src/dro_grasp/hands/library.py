@@ -38,11 +38,6 @@ def load_hand(name: str | Path, *, seed: int = 0, n_points: int = 512) -> Hand:
     A bare name is a built-in hand first, then one of the development assets (folder `DRO_GRASP_ASSETS`), then a
     `robot_descriptions` module; `assets/NAME` forces the asset.
 
-    Args:
-        name: Name or path.
-        seed: Seed of the point sampling.
-        n_points: Points of the hand's cloud.
-
     Raises:
         HandError: No such hand, or its description cannot be used.
     """
@@ -67,11 +62,7 @@ def hand_names() -> dict[str, str]:
 
 
 def locate_hand(name: str | Path) -> tuple[Path, str]:
-    """The file of a hand, and the hand's name in results.
-
-    Raises:
-        HandError: Nothing has this name.
-    """
+    """The file of a hand, and the hand's name in results."""
     text = str(name)
     builtin = BUILTIN_FOLDER / f"{text}.urdf"
     if "/" not in text and builtin.is_file():
@@ -102,11 +93,7 @@ def _asset_file(name: str) -> Path | None:
 
 
 def _robot_description(name: str) -> Path | None:
-    """The file of a `robot_descriptions` module; None if that package is not installed or does not know the name.
-
-    Raises:
-        HandError: It knows the name but cannot download the description.
-    """
+    """The file of a `robot_descriptions` module; None if that package is not installed or does not know the name."""
     if not name.replace("_", "").isalnum():
         return None
     for module in (name, f"{name}_description", f"{name}_mj_description"):

@@ -31,7 +31,6 @@ def read_joints(
     """Joints that reproduce the relative poses of neighbouring known links, inside their limits.
 
     Args:
-        tree: The kinematic tree.
         T_world_link: Link poses; noise is allowed.
         valid: Links whose pose is known.
         q: Where the sweeps start; joints that no pair of known links encloses keep these values [rad or m].

@@ -176,7 +176,6 @@ def solve_joints(
         T_world_wrist: Initial pose of the root link.
         q: Initial independent joints; clamped to the limits [rad or m].
         movable: False for joints that keep their initial value, inside the limits or not; all move by default.
-        config: See JointSolverConfig.
 
     Raises:
         OptionError: There is no target.

@@ -65,7 +65,6 @@ def best_step(
         upper: Largest allowed step, at least 0 [rad or m].
         damping: Multiple of the identity that is added to the normal equations [1/m].
         sharpness: Between IRLS (0, the default) and Newton's method (1).
-        config: See StepConfig.
     """
     config = config or StepConfig()
     step = torch.zeros_like(lower)
@@ -127,9 +126,7 @@ def _minimum_in_box(
     sets settle in two or three passes; passes after the first one see only the rows whose set has changed.
 
     Args:
-        quadratic: The problem.
         held: Unknowns held at their lower and upper bounds by the previous reweighting.
-        passes: Most passes.
 
     Returns:
         The minimum, clamped to the box, and the unknowns held at either bound.

@@ -166,11 +166,7 @@ class KinematicTree:
         return (self.descends.float() @ (self.link_coupling != 0).float()) > 0
 
     def forward(self, q: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_links 4 4"]:
-        """Pose of every link in the root link's frame, T_root_link.
-
-        Args:
-            q: Values of the independent joints [rad or m].
-        """
+        """Pose of every link in the root link's frame, T_root_link, at values of the independent joints [rad or m]."""
         x = (q @ self.link_coupling.T + self.link_offset)[..., None, None]
         basis = self._local_basis
         local = basis[0] + torch.sin(x) * basis[1] + (1 - torch.cos(x)) * basis[2] + x * basis[3]

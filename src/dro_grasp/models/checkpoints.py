@@ -37,7 +37,6 @@ def save_weights(
 
     Args:
         network: The network; its configuration goes along.
-        path: The file to write.
         about: How the weights were made, and on what data.
         history: The same of the weights that training began with, oldest first (`small_networks.history_of`).
 
@@ -74,11 +73,7 @@ def load_weights(name: str | Path | None = None) -> DistanceNetwork:
 
 
 def locate_weights(name: str | Path | None = None) -> Path:
-    """The file behind a name.
-
-    Raises:
-        WeightsError: Nothing has this name.
-    """
+    """The file behind a name."""
     text = str(name or DEFAULT)
     shipped = SHIPPED_FOLDER / f"{text}.safetensors"
     if "/" not in text and shipped.is_file():

@@ -28,7 +28,6 @@ class SurfaceNetwork(nn.Module):
         Args:
             guesses: Number of guessed distances, best guess first.
             features: Number of other features of a point.
-            width: Of the hidden layers.
             depth: Residual blocks.
         """
         super().__init__()

@@ -180,10 +180,7 @@ class DistanceNetwork(nn.Module):
     ) -> Float[Tensor, "num latent"]:
         """Draws that `predict` turns into z, on the network's device; without a learned prior they are z.
 
-        Args:
-            num: How many.
-            generator: Source of randomness.
-            temperature: Standard deviation of the draws: 1 as in training, 0 for the likeliest z.
+        Their standard deviation is `temperature`: 1 as in training, 0 for the likeliest z.
         """
         noise = torch.randn(num, self.config.latent, generator=generator, device=generator.device) * temperature
         return noise.to(self.head.first.weight.device)
@@ -202,8 +199,6 @@ class DistanceNetwork(nn.Module):
             hand: The open hand in its axes (`NetworkConfig.axes`) [m].
             obj: The object's cloud in its own frame [m].
             rotations: Candidate rotations of these axes.
-            num: How many placements.
-            generator: Source of randomness.
         """
         feature = self.hand_encoder((hand - hand.mean(0))[None]).mean(1)[0]
         return self.placement.sample(

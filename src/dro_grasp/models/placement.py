@@ -75,7 +75,6 @@ class PlacementPrior(nn.Module):
             hand: Mean feature of the open hand's points.
             rotations: Candidate wrist rotations in the object's axes.
             num: How many to choose, without repetition.
-            generator: Source of randomness.
             temperature: Scales the spread of the drawn positions.
 
         Returns:

@@ -70,11 +70,7 @@ class NetworkConfig:
         return self.frame != "object"
 
     def axes(self, palm_axes: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
-        """The hand's axes in which the network works, as columns in the wrist frame.
-
-        Args:
-            palm_axes: The hand's `palm_axes_wrist`.
-        """
+        """The axes in which the network works, as columns in the wrist frame, of a hand with these `palm_axes_wrist`."""
         return palm_axes if self.frame == "palm" else torch.eye(3, device=palm_axes.device)
 
     def differences(self, other: NetworkConfig) -> dict[str, tuple[Any, Any]]:

@@ -38,11 +38,7 @@ def header(about: dict[str, Any] | None, history: Sequence[dict[str, Any]] = (),
 def save_small(
     network: nn.Module, path: Path, about: dict[str, Any] | None = None, history: Sequence[dict[str, Any]] = ()
 ) -> None:
-    """Write weights in half precision; `header` explains the last two.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write weights in half precision; `header` explains the last two."""
     tensors = {name: value.half().contiguous() for name, value in network.state_dict().items()}
     with replacing(path, "weights") as temporary:
         save_file(tensors, temporary, metadata=header(about, history))

@@ -35,7 +35,6 @@ def load_object(name: str | Path, *, scale: float = 1.0) -> ObjectModel:
 
     Args:
         name: A built-in name, an asset's name (`contactdb+apple`), or a path; `assets/NAME` forces the asset.
-        scale: Multiplies all coordinates.
 
     Raises:
         ObjectError: The object does not exist, it is unusable, or `scale` is not positive.

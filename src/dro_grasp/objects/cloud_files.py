@@ -16,11 +16,7 @@ PCD_KINDS = {"F": "f", "I": "i", "U": "u"}
 
 
 def read_cloud(path: Path) -> Float[np.ndarray, "..."]:
-    """Points of an NPY or PCD file: (n 3), or (n 6) with normals; an NPY file may hold any shape.
-
-    Raises:
-        ObjectError: The file is damaged, truncated or of an unsupported kind.
-    """
+    """Points of an NPY or PCD file: (n 3), or (n 6) with normals; an NPY file may hold any shape."""
     try:
         return _read_npy(path) if path.suffix.lower() == ".npy" else _read_pcd(path)
     except OSError as error:

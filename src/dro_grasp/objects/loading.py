@@ -55,11 +55,7 @@ def load_file(path: Path, *, scale: float = 1.0) -> ObjectModel:
 
 
 def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
-    """Points of a cloud file, NaN and outliers included [the file's unit; metres if it states one].
-
-    Raises:
-        ObjectError: There is no such file, it is damaged, or it holds a mesh.
-    """
+    """Points of a cloud file, NaN and outliers included [the file's unit; metres if it states one]."""
     if not path.is_file():
         raise ObjectError(f"no file at {path}; with --camera give a cloud file (PLY, NPY, PCD), because named objects "
                           "are meshes, not camera clouds")
@@ -75,11 +71,7 @@ def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
 
 
 def read_geometry(path: Path) -> tuple[trimesh.Trimesh | Float[np.ndarray, "n 3"], float]:
-    """One mesh, scenes merged, or the points of a file without faces; and the file's unit [m], 1 if it states none.
-
-    Raises:
-        ObjectError: No reader finds a mesh or cloud in the file.
-    """
+    """One mesh, scenes merged, or the points of a file without faces; and the file's unit [m], 1 if it states none."""
     import trimesh
 
     try:
@@ -113,12 +105,10 @@ def mesh_object(
     """Check and repair a mesh, and derive mass properties and the stored cloud.
 
     Args:
-        name: Name of the object.
         mesh: Its mesh, in metres after scaling.
         origin: Source of the mesh, for messages.
         scale: Multiplies all coordinates, including those of the parts.
         split: `train`, `validate`, `test`, or None for a user's object.
-        parts: Convex parts, if known.
 
     Raises:
         ObjectError: NaN vertices, no faces, no volume, or an implausible size in metres.

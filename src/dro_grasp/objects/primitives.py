@@ -94,8 +94,6 @@ def hollow(profile: list[tuple[float, float]], wall: float, floor: float, corner
     Args:
         profile: (radius, height) pairs of the outside, bottom to top; the floor lies below the second.
         wall: Thickness of the wall, measured level.
-        floor: Thickness of the floor.
-        corners: Corners of the cross-section.
     """
     (low, bottom), (wide, above) = profile[:2]
     level = bottom + floor

@@ -36,9 +36,7 @@ MassProperties = tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]
 def repair(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
     """Decimate, close, turn outward and join, as far as that is safe; a sound mesh is returned unchanged.
 
-    Args:
-        mesh: Mesh with merged vertices.
-        notes: Gets a line for each finding.
+    The mesh has merged vertices; `notes` gets a line for each finding.
     """
     if len(mesh.faces) > MANY_FACES:
         before = len(mesh.faces)

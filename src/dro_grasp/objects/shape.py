@@ -68,11 +68,7 @@ class ObjectModel:
 
     @cached_property
     def parts(self) -> tuple[Part, ...]:
-        """Convex parts that fill the object.
-
-        Raises:
-            ObjectError: The object is a bare cloud.
-        """
+        """Convex parts that fill the object, which is no bare cloud."""
         if self.exact_parts is not None:
             return self.exact_parts
         if self.vertices is None or self.faces is None:

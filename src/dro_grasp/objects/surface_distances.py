@@ -22,12 +22,7 @@ DISC_NEIGHBOURS = 7
 def bake_grid(
     surface: Float[np.ndarray, "n 3"], distance: Callable[[Float[np.ndarray, "_ 3"]], Float[np.ndarray, " _"]]
 ) -> Arrays:
-    """Signed distances on a grid around a surface: `values` (nx ny nz), `origin` (3) and `spacing` [m].
-
-    Args:
-        surface: Points that the grid encloses [m].
-        distance: Gives the signed distances of points [m].
-    """
+    """Signed distances on a grid around a surface: `values` (nx ny nz), `origin` (3) and `spacing` [m]."""
     low, high = surface.min(0) - GRID_PADDING, surface.max(0) + GRID_PADDING
     spacing = max(GRID_SPACING, float((np.prod(high - low) / LARGEST_GRID) ** (1 / 3)))
     counts = np.ceil((high - low) / spacing).astype(int) + 1

@@ -53,10 +53,8 @@ def visible_points(
     Rays are cast at a mesh. Of a bare cloud, the visible points are those that no others hide.
 
     Args:
-        obj: Mesh or bare cloud.
         direction: From the object towards the camera, of any length.
         generator: Draws noise and lost pixels.
-        camera: Distance and quality of the camera.
 
     Raises:
         OptionError: The direction has no length, or the camera stands inside the object.

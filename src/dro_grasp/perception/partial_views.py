@@ -27,8 +27,6 @@ def partial_view(obj: ObjectModel, view: View, seed: int, camera: DepthCamera | 
         view: `whole` is the object itself. `cloud` keeps all points and normals and completes nothing. `half` keeps the
             half of the points farthest along a random direction, as in the paper's appendix, without a camera. `depth` is
             one noisy depth image from a random direction.
-        seed: Seed of direction and noise.
-        camera: Distance and quality of the depth camera.
     """
     if view == "whole":
         return obj

@@ -73,7 +73,6 @@ def scanned_object(
     """An object from the points of a camera at the origin; its grasps are in the given frame.
 
     Args:
-        name: Name of the object.
         points: Points in the camera's frame [m].
         T_frame_camera: The camera's pose in the wanted frame, whose z axis points up and in which `direction` and `table`
             are given; the camera's own frame by default.

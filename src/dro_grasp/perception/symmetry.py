@@ -149,9 +149,7 @@ class VisibleSide:
     def guesses(self, up: Float[np.ndarray, "3"] | None, count: int) -> list[Guess]:
         """Both sides by the best symmetries that differ, best first; the last one repeats if there are too few.
 
-        Args:
-            up: Up direction in view axes, if known; symmetries that preserve it are preferred.
-            count: Number of guesses.
+        Symmetries that preserve `up` [view axes] are preferred.
         """
         motions = self.symmetries(up)
         costs = np.array([self.cost(*motion) + _lean(motion[0], up) for motion in motions])

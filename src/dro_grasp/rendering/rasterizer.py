@@ -63,13 +63,9 @@ def render(
     """Draw meshes with perspective, smooth shading and soft outlines.
 
     Args:
-        meshes: What to draw.
-        camera: From where.
         width: Of the picture [pixels].
         height: Of the picture [pixels].
-        background: Colour where there is nothing.
         oversampling: Samples per pixel and axis; 2 smooths the edges.
-        style: Light and finish.
     """
     style = style or Style()
     canvas = _Canvas.empty(width * oversampling, height * oversampling, background)

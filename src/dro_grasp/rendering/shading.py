@@ -40,8 +40,6 @@ def shade(
     Args:
         points: In the camera's axes [m].
         normals: Likewise, of any length.
-        colours: Before shading.
-        style: Light and finish.
     """
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     view = -points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-12)
@@ -60,7 +58,6 @@ def outlines(depth: Float[np.ndarray, "h w"], radius: int, style: Style) -> Floa
     Args:
         depth: Depth of each pixel [m], infinite where nothing is drawn.
         radius: Distance of the eight neighbours [pixels].
-        style: Strength and scale.
     """
     padded = np.pad(depth, radius, mode="edge")
     h, w = depth.shape

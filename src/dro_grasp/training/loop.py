@@ -14,7 +14,6 @@ from dro_grasp.errors import WeightsError
 from dro_grasp.geometry.se3 import apply
 from dro_grasp.models.network import DistanceNetwork, NetworkOutput, untrained_network
 from dro_grasp.models.presets import NetworkConfig
-from dro_grasp.training.batch_statistics import recalibrate
 from dro_grasp.training.config import TrainConfig
 from dro_grasp.training.losses import (
     distance_loss,
@@ -25,7 +24,7 @@ from dro_grasp.training.losses import (
     pose_loss,
 )
 from dro_grasp.training.reports import Report, console_report
-from dro_grasp.training.runs import Losses, TrainingRun, begin
+from dro_grasp.training.runs import Losses, TrainingRun, begin, recalibrate
 from dro_grasp.training.samples import HandSamples, SampleSource
 
 NAMED = 4
@@ -45,14 +44,10 @@ def train(
     """Train on a bundle.
 
     Args:
-        bundle: Hands, objects and grasps.
-        network: Sizes and forms.
-        config: Losses, augmentation and schedule.
         folder: Run folder; a checkpoint in it is resumed and reproduces the curve.
         pretrained: Source of the hand encoder, and of the motion where z moves the hand. Without it, and without
             `initial`, the hand encoder is trained along.
         report: Called every few steps; the console by default.
-        name: Name of the weights.
         initial: Weights to begin with, as in fine-tuning; `network` must be their configuration.
 
     Returns:
@@ -144,9 +139,6 @@ def step_losses(
 
     Args:
         model: The network, in training mode.
-        groups: Samples of one or several hands.
-        config: Weights.
-        generator: Source of the draws of z.
         progress: Share of the schedule that is done.
     """
     placed, obj, grasp = _clouds(groups)

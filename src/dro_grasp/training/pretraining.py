@@ -15,11 +15,10 @@ from dro_grasp.models.encoder import StaticGraphEncoder
 from dro_grasp.models.latent import HandMotion, sample_posterior
 from dro_grasp.models.network import DistanceNetwork, untrained_network
 from dro_grasp.models.presets import NetworkConfig
-from dro_grasp.training.batch_statistics import recalibrate
 from dro_grasp.training.config import AugmentationConfig, MotionConfig, PretrainConfig
 from dro_grasp.training.losses import contrastive_loss, divergence
 from dro_grasp.training.reports import Report, console_report
-from dro_grasp.training.runs import Losses, TrainingRun, begin
+from dro_grasp.training.runs import Losses, TrainingRun, begin, recalibrate
 from dro_grasp.training.samples import SampleSource, random_turns
 
 
@@ -33,9 +32,6 @@ def pretrain(
     """Pretrain the hand encoder on the bundle's grasps.
 
     Args:
-        bundle: Hands and grasps.
-        network: Sizes and forms.
-        config: Loss and schedule.
         folder: Run folder; a checkpoint in it is resumed.
         report: Called every few steps; the console by default.
 
@@ -75,8 +71,6 @@ def pretrain_motion(
 
     Args:
         model: A network whose z moves the hand, with a pretrained hand encoder.
-        bundle: Hands and grasps.
-        config: Loss and schedule.
         folder: Run folder; a checkpoint in it is resumed.
         report: Called every few steps; the console by default.
 

@@ -49,11 +49,7 @@ def console_report(title: str) -> Report:
 
 
 def require_tensorboard() -> None:
-    """Refuse to log for TensorBoard where it is not installed.
-
-    Raises:
-        OptionError: It is not installed.
-    """
+    """Refuse to log for TensorBoard where it is not installed."""
     try:
         from torch.utils.tensorboard import SummaryWriter  # noqa: F401
     except ImportError as error:

@@ -30,11 +30,7 @@ class RunFolder:
     path: Path
 
     def write_checkpoint(self, state: dict[str, Any]) -> None:
-        """Replace the checkpoint, whole or not at all.
-
-        Raises:
-            OutputError: It cannot be written.
-        """
+        """Replace the checkpoint, whole or not at all."""
         path, temporary = self.path / CHECKPOINT, self.path / f"{CHECKPOINT}.part"
         try:
             with writing_into(self.path):
@@ -73,11 +69,7 @@ class RunFolder:
                              "configuration it was made with")
 
     def append_to_log(self, line: dict[str, float]) -> None:
-        """Write one line of the log.
-
-        Raises:
-            OutputError: It cannot be written.
-        """
+        """Write one line of the log."""
         with writing_into(self.path), (self.path / LOG).open("a") as file:
             file.write(json.dumps(line) + "\n")
 
@@ -103,11 +95,7 @@ def last_logged(folder: Path) -> dict[str, float]:
 
 @contextmanager
 def writing_into(folder: Path) -> Iterator[None]:
-    """Explain a full disk or a missing permission; PyTorch's writer raises RuntimeError for both.
-
-    Raises:
-        OutputError: The block could not write.
-    """
+    """Explain a full disk or a missing permission; PyTorch's writer raises RuntimeError for both."""
     try:
         yield
     except (OSError, RuntimeError) as error:

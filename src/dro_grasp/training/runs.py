@@ -42,7 +42,6 @@ class TrainingRun:
         Args:
             folder: For log and checkpoint.
             model: What is trained, on its device; parameters that require no gradient stay as they are.
-            schedule: Steps, learning rate, bookkeeping.
             generator: Source of all random numbers of the losses, on the model's device.
             processes: Those that train together; this one alone by default.
         """
@@ -91,11 +90,7 @@ class TrainingRun:
         self.generator.manual_seed((self.schedule.seed * 1_000_003 + self.step) * 1_009 + shard)
 
     def save(self) -> None:
-        """Write the checkpoint into the folder, which exists; the first process does.
-
-        Raises:
-            OutputError: It cannot be written.
-        """
+        """Write the checkpoint into the folder, which exists; the first process does."""
         if self.processes.first:
             self.folder.write_checkpoint({
                 "step": self.step, "seconds": self.seconds, "model": self.model.state_dict(),
@@ -191,11 +186,7 @@ class TrainingRun:
 
 
 def begin(schedule: ScheduleConfig) -> tuple[Processes, str]:
-    """Check a schedule before any work for it, join the other processes, and take a device.
-
-    Raises:
-        OptionError: As in `check_schedule` and `join`.
-    """
+    """Check a schedule before any work for it, join the other processes, and take a device."""
     check_schedule(schedule)
     return join(schedule.device)
 
@@ -223,3 +214,25 @@ def check_schedule(schedule: ScheduleConfig) -> None:
                           f"{process_count()}")
     if schedule.tensorboard:
         require_tensorboard()
+
+
+@torch.no_grad()
+def recalibrate(model: nn.Module, forward: Callable[[], object], batches: int = 64) -> None:
+    """Measure the statistics of BatchNorm for the averaged weights.
+
+    The averages kept during training belong to other weights: with them the distance error in evaluation mode is
+    twice that in training mode. Layers in evaluation mode, as in a frozen encoder, keep their statistics.
+
+    Args:
+        model: A model in training mode, with the averaged weights.
+        forward: Passes the next batch of training data through it.
+    """
+    layers = [layer for layer in model.modules() if isinstance(layer, nn.BatchNorm1d) and layer.training]
+    momenta = [layer.momentum for layer in layers]
+    for layer in layers:
+        layer.reset_running_stats()
+        layer.momentum = None
+    for _ in range(batches):
+        forward()
+    for layer, momentum in zip(layers, momenta, strict=True):
+        layer.momentum = momentum

@@ -55,9 +55,7 @@ class SampleSource:
         """Put hands, grasps and objects on the device on which samples are drawn.
 
         Args:
-            bundle: Hands, objects and grasps.
             network: Numbers of points, and the frame.
-            augmentation: How a sample differs from the stored grasp.
             device: Device of the samples, and of the generators that draw them.
 
         Raises:
