@@ -32,12 +32,7 @@ class LinkGeometry:
 
 
 def read_geometry(model: mujoco.MjModel, link_of_body: dict[int, int]) -> tuple[LinkGeometry, ...]:
-    """All shapes of a compiled model whose bodies are links.
-
-    Args:
-        model: The compiled hand.
-        link_of_body: Body index to link index; shapes of other bodies are left out.
-    """
+    """All shapes of a compiled model whose bodies are links, given the link index by body index."""
     visual_bodies = {int(model.geom_bodyid[g]) for g in range(model.ngeom) if not _collides(model, g)}
     shapes = []
     for g in range(model.ngeom):

@@ -59,11 +59,7 @@ def _resolve_mesh(element: ET.Element, folder: Path, files: dict[str, Path]) -> 
 
 
 def as_obj(file: Path) -> bytes:
-    """A mesh in any format trimesh reads, as OBJ text.
-
-    Raises:
-        HandError: trimesh cannot read it either.
-    """
+    """A mesh in any format trimesh reads, as OBJ text."""
     import trimesh
 
     try:

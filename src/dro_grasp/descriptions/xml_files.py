@@ -42,11 +42,7 @@ def parse_xml(path: Path) -> ET.Element:
 
 
 def included_files(root: ET.Element, path: Path) -> tuple[Path, ...]:
-    """Every file that an MJCF includes, directly or through others.
-
-    Raises:
-        HandError: An included file is missing or cannot be parsed.
-    """
+    """Every file that an MJCF includes, directly or through others."""
     found: dict[Path, None] = {}
     waiting = [(root, path)]
     while waiting:

@@ -127,10 +127,7 @@ def link_wrenches(
 ) -> Float[Tensor, "*b n_links 6"]:
     """Derivatives by the rigid motion of each link (translation, rotation about the world's origin), from those by points.
 
-    Args:
-        points: World positions [m].
-        by_point: Derivatives by them.
-        members: One-hot link of each point.
+    The points are world positions [m]; `members` is the one-hot link of each.
     """
     moment = torch.linalg.cross(points, by_point, dim=-1)
     both = torch.cat([by_point.mT, moment.mT], -2)

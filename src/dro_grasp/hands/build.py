@@ -48,7 +48,7 @@ def build_hand(description: Description, *, name: str | None = None, seed: int =
 
     Args:
         name: Name of the hand in files and tables; the file's stem by default.
-        seed: Seed of the point sampling; the same seed gives the same points.
+        seed: Seed of the point sampling.
 
     Raises:
         HandError: The description has no finger, no link with a surface, or a size that no hand has.

@@ -137,9 +137,7 @@ def step_losses(
 ) -> Losses:
     """All losses of one batch, by name, with their weighted sum as `total`, and the plain divergence as `nats`.
 
-    Args:
-        model: The network, in training mode.
-        progress: Share of the schedule that is done.
+    The model is in training mode; `progress` is the share of the schedule that is done.
     """
     placed, obj, grasp = _clouds(groups)
     output = model(placed, obj, grasp, generator, columns=config.columns)

@@ -40,10 +40,7 @@ class RunFolder:
             temporary.unlink(missing_ok=True)
 
     def read_checkpoint(self, plan: dict[str, Any]) -> dict[str, Any] | None:
-        """The checkpoint; None where there is none.
-
-        Args:
-            plan: What determines a run's curve, beside model and data: the checkpoint must have the same.
+        """The checkpoint, which must have the same plan; None where there is none.
 
         Raises:
             TrainingError: The checkpoint is damaged, or of a run with another plan.
