@@ -257,13 +257,12 @@ class Studio(ServedPage):
         """Play the trial of the picked grasp."""
         assert self.made is not None
         index, grasps = self.shown[int(self.slider.value)], self._batch()
-        T = grasps.T_object_wrist[index].float()
         self._say(f"Playing the trial under *{self.made.protocol}*.")
         poses, joints = record(self.made.hand, self.made.obj, grasps, index, self.made.protocol)
+        T = grasps.T_object_wrist[index].float()
         for pose, q in zip(poses, joints, strict=True):
             self.stage.show(q, T, T @ pose)
             time.sleep(FRAME_TIME)
-        time.sleep(0.5)
         self._show()
         self._say("Played.")
 
