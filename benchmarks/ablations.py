@@ -61,7 +61,7 @@ class Ablation:
 
     hands: tuple[str, ...] = HANDS
     """Hands trained on."""
-    tried: tuple[str, ...] = HANDS
+    evaluated: tuple[str, ...] = HANDS
     """Hands that the weights are evaluated with."""
     pretrained: bool = True
     network: dict[str, Any] = field(default_factory=dict)
@@ -92,11 +92,11 @@ ROWS = {
     "z: flow": Ablation(network={"prior": "flow"}, losses=LossConfig(divergence=0.0003)),
     "z: motion, flow": Ablation(network={"prior": "flow", **MOTION}, losses=LossConfig(divergence=0.0003)),
     "z: motion, flow, 0.001": Ablation(network={"prior": "flow", **MOTION}, losses=LossConfig(divergence=0.001)),
-    "ten hands, wrist axes": Ablation(hands=(*HANDS, *OTHERS), tried=HELD_OUT, network={"frame": "wrist"}),
-    "ten hands, palm axes": Ablation(hands=(*HANDS, *OTHERS), tried=HELD_OUT),
+    "ten hands, wrist axes": Ablation(hands=(*HANDS, *OTHERS), evaluated=HELD_OUT, network={"frame": "wrist"}),
+    "ten hands, palm axes": Ablation(hands=(*HANDS, *OTHERS), evaluated=HELD_OUT),
     **{
         f"{hand.split('/')[1]}, {count} grasps": Ablation(
-            hands=(hand,), tried=(hand,), fine_tuned=True, grasps=count, share=0.3)
+            hands=(hand,), evaluated=(hand,), fine_tuned=True, grasps=count, share=0.3)
         for hand in FEW_SHOT for count in (0, 50, 200, 1000)
     },
 }
@@ -153,9 +153,9 @@ def measured(name: str, ablation: Ablation, folder: Path, steps: int, num: int, 
     predictor.network, predictor.weights_name = model, name
     objects = [load_object(o) for o in resolve_objects(object_names)]
     config = BenchmarkConfig(num, (RAW, REFINED), (protocol("dro"), protocol("strict")), controls=False, view=ablation.view)
-    rows = benchmark([load_hand(h) for h in ablation.tried], objects, predictor, config)
+    rows = benchmark([load_hand(h) for h in ablation.evaluated], objects, predictor, config)
     errors = []
-    if set(ablation.tried) <= set(HANDS):
+    if set(ablation.evaluated) <= set(HANDS):
         validate = folder / "validate.safetensors"
         if not validate.exists():
             command(["dataset", "bundle", str(ROOT / "data" / "grasps"), "--split", "validate", "--hands", *HANDS, "--output",

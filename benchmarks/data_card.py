@@ -30,7 +30,7 @@ def row(path: Path) -> list[str]:
     counts = [p.grasps for p in hand.pairs]
     splits = Counter(hand.grasps.split)
     cells = [hand.grasps.hand, len(hand.grasps), splits["train"], splits["few_shot"], splits["validate"], len(counts),
-             min(counts), sum(c == 0 for c in counts), f"{100 * made.valid / max(1, made.tried):.0f}",
+             min(counts), sum(c == 0 for c in counts), f"{100 * made.valid / max(1, made.evaluated):.0f}",
              f"{made.per_cpu_hour:,.0f}", *(f"{v:.3f}" for v in hand.diversity.values()),
              f"{100 * sum(min(p.half_axes) > 0 for p in hand.pairs) / len(hand.pairs):.0f}", path.stat().st_size // 1000]
     return [f"{c:,}" if isinstance(c, int) else c for c in cells]

@@ -47,8 +47,8 @@ def again(pairs: list[PairGrasps], sample: int) -> list[list[object]]:
     rows = []
     for name, friction, mass in TRIALS:
         found = check(pairs, sample, changed("strict", friction=friction, mass_factor=mass))
-        low, high = wilson_interval(found.succeeded, found.tried)
-        rows.append([name, found.tried, 100 * found.succeeded / found.tried, f"{100 * low:.1f}-{100 * high:.1f}"])
+        low, high = wilson_interval(found.succeeded, found.evaluated)
+        rows.append([name, found.evaluated, 100 * found.succeeded / found.evaluated, f"{100 * low:.1f}-{100 * high:.1f}"])
     return rows
 
 
@@ -56,7 +56,7 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="a data set with the paper hands")
-    parser.add_argument("--sample", type=int, default=500, help="grasps to try again, of all hands")
+    parser.add_argument("--sample", type=int, default=500, help="grasps to evaluate again, of all hands")
     parser.add_argument("--goal", type=int, default=150, help="grasps of a complete pair")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
@@ -64,16 +64,16 @@ def main() -> None:
     pairs = list(read_collection(options.folder))
     rows = making(pairs, options.goal)
     speeds = {str(row[0]): row[2] for row in rows}
-    tried = again(pairs, options.sample)
+    repeated = again(pairs, options.sample)
     table = [[row[0], row[1], row[2], row[3], row[4], f"{row[5]:.3f}", f"{row[6]:.3f}", f"{row[7]:.3f}"] for row in rows]
     if not options.json:
         emit("Making", table, ["hand", "grasps", "valid per CPU-hour", "preparation share", f"pairs with {options.goal}",
                                "diversity", "of the wrist", "of the joints"], {}, False)
         print()
-    emit(f"{options.sample} random grasps of {len({p.hand for p in pairs})} hands evaluated again", tried,
+    emit(f"{options.sample} random grasps of {len({p.hand for p in pairs})} hands evaluated again", repeated,
          ["trial", "grasps", "success [%]", "95 %"],
          {"valid_per_cpu_hour": speeds, "diversity": {str(r[0]): r[5] for r in rows},
-          "pairs": {str(r[0]): r[4] for r in rows}, "success_again": {str(r[0]): r[2] for r in tried}}, options.json)
+          "pairs": {str(r[0]): r[4] for r in rows}, "success_again": {str(r[0]): r[2] for r in repeated}}, options.json)
 
 
 if __name__ == "__main__":

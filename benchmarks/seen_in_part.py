@@ -34,7 +34,7 @@ DEEP = 0.003
 """Penetration of the opened hand beyond which a trial begins inside the object [m]."""
 
 
-def tried(
+def outcomes(
     hand: Hand, obj: ObjectModel, shown: ObjectModel, judged: ObjectModel, num: int
 ) -> dict[str, torch.Tensor]:
     """Outcomes of grasps predicted from what is shown, refined and ranked on what is judged: all, and the best quarter."""
@@ -67,7 +67,7 @@ def main() -> None:
                 part = partial_view(obj, view, pair_seed(0, hand, obj))
                 for shown, judged in (("view", "view"), ("view", "mesh"), ("mesh", "view")):
                     models = {"view": part, "mesh": obj}
-                    outcome = tried(hand, obj, models[shown], models[judged], options.num)
+                    outcome = outcomes(hand, obj, models[shown], models[judged], options.num)
                     found.setdefault((view, shown, judged), []).append(outcome)
     rows = []
     for key, parts in found.items():

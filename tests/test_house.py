@@ -31,6 +31,7 @@ def functions(tree: ast.Module) -> Iterator[Function]:
 
 def parameters(function: Function) -> list[ast.arg]:
     named = function.args.posonlyargs + function.args.args + function.args.kwonlyargs
+    named += [arg for arg in (function.args.vararg, function.args.kwarg) if arg is not None]
     return [arg for arg in named if arg.arg not in {"self", "cls"}]
 
 
@@ -109,7 +110,7 @@ def test_no_two_modules_share_a_name() -> None:
 BROKEN = {
     long_modules: "x = 0\n" * (LONGEST_MODULE + 1),
     long_functions: "def f() -> None:\n" + "    pass\n" * LONGEST_FUNCTION,
-    many_parameters: f"def f(self, {', '.join(f'x{i}: int' for i in range(MOST_PARAMETERS + 1))}) -> None: ...",
+    many_parameters: f"def f(self, {', '.join(f'x{i}: int' for i in range(MOST_PARAMETERS))}, **others: int) -> None: ...",
     bare_arrays: "class A:\n    def f(self, x: list[np.ndarray]) -> None: ...",
     bare_constants: "A = 1\nB = 2\n'''Only of B.'''",
 }

@@ -78,10 +78,11 @@ def test_hand_in_object_in_grasps_out(tmp_path: Path) -> None:
     predictor = dro.GraspPredictor(str(untrained_weights(tmp_path)))
     grasps = predictor.predict(hand, obj, num=4)
     result = dro.simulate(hand, obj, grasps)
-    tried = grasps.with_trial(result)
-    chosen = tried[tried.success]
+    evaluated = grasps.with_trial(result)
+    assert dro.evaluate(dro.GraspProblem(hand, obj), grasps).protocol == evaluated.protocol == ("dro/1",) * 4
+    chosen = evaluated[evaluated.success]
     assert len(chosen) == int(result.success.sum())
-    tried.save(tmp_path / "grasps.parquet")
+    evaluated.save(tmp_path / "grasps.parquet")
     again = dro.GraspBatch.load(tmp_path / "grasps.parquet")
-    assert (again.joints == tried.joints).all()
-    assert len(tried.to_pandas()) == 4
+    assert (again.joints == evaluated.joints).all()
+    assert len(evaluated.to_pandas()) == 4

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +12,7 @@ from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
+import torch
 
 from dro_grasp._version import __version__
 from dro_grasp.cli import main as cli
@@ -273,6 +276,41 @@ def test_evaluation_on_another_object_is_told(generate, tmp_path: Path, capsys) 
     assert "made for another" not in capsys.readouterr().err
     assert main(["evaluate", str(path), "--object", "can"]) == 0
     assert "made for another 'sphere' than the given can" in capsys.readouterr().err
+
+
+def test_evaluate_counts_reasons_by_kind(generate, tmp_path: Path, capsys) -> None:
+    path = tmp_path / "grasps.parquet"
+    generate("--output", str(path), "--protocol", "none", num=1)
+    grasps = GraspBatch.load(path)
+    # The wrist inside the object, at different depths.
+    poses = torch.eye(4).expand(3, 4, 4).clone()
+    poses[:, 2, 3] = torch.tensor([0.0, 0.005, 0.01])
+    GraspBatch.concatenate([grasps] * 3).replace(T_object_wrist=poses).save(path)
+    assert main(["evaluate", str(path), "--protocol", "strict", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["reasons"] == {"hand penetrates object": 3}
+    assert main(["evaluate", str(path), "--protocol", "strict"]) == 0
+    assert "3 failed: hand penetrates object\n" in capsys.readouterr().out
+
+
+RUNS_TRIALS = [["generate"], ["evaluate"], ["benchmark"], ["synthesize"], ["dataset", "check"], ["dataset", "filter"]]
+
+
+def test_a_new_protocol_is_a_choice_of_every_command() -> None:
+    code = f"""
+from dataclasses import replace
+from dro_grasp.simulation.protocols import PROTOCOLS
+PROTOCOLS["brand_new"] = replace(PROTOCOLS["dro"], name="brand_new")
+from dro_grasp.cli.main import main
+for words in {RUNS_TRIALS}:
+    try:
+        main([*words, "--help"])
+    except SystemExit:
+        print("end of", *words)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True,
+                          env=os.environ | {"COLUMNS": "300"})
+    pages = re.split(r"^end of .*$", done.stdout, flags=re.MULTILINE)[:-1]
+    assert ["brand_new" in page for page in pages] == [True] * len(RUNS_TRIALS)
 
 
 def test_foreign_and_empty_grasp_files_are_status_2(generate, tmp_path: Path, capsys) -> None:

@@ -22,7 +22,7 @@ from dro_grasp.simulation.trial import simulate
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A file of tried grasps of two objects, successes and failures."""
+    """A file of evaluated grasps of two objects, successes and failures."""
     hand, batches = load_hand("barrett"), []
     for name in ("can", "sphere"):
         obj = load_object(name)
@@ -37,7 +37,7 @@ def test_the_same_trial_agrees_and_a_lie_is_found(stored, tmp_path):
     pairs = list(read_collection(stored, only_successful=False))
     found = check(pairs, 1000, changed("dro"))
     grasps = GraspBatch.load(stored)
-    assert found.tried == found.agreed == 48
+    assert found.evaluated == found.agreed == 48
     assert found.succeeded == int(grasps.success.sum())
     assert found.hands == {"barrett": (48, found.succeeded)}
     assert not found.reasons
@@ -45,13 +45,13 @@ def test_the_same_trial_agrees_and_a_lie_is_found(stored, tmp_path):
     assert failures > 0
     grasps.replace(success=torch.ones(48, dtype=torch.bool)).save(tmp_path / "lie.parquet")
     lie = check(read_collection(tmp_path / "lie.parquet"), 1000, changed("dro"))
-    assert lie.tried - lie.agreed == failures == lie.reasons.total()
+    assert lie.evaluated - lie.agreed == failures == lie.reasons.total()
 
 
 def test_a_sample_is_a_sample_and_repeats(stored):
     pairs = list(read_collection(stored))
     one, again, other = (check(pairs, 10, changed("dro"), seed) for seed in (1, 1, 2))
-    assert one.tried == other.tried == 10
+    assert one.evaluated == other.evaluated == 10
     assert one == again
     with pytest.raises(OptionError, match="at least one"):
         check(pairs, 0, changed("dro"))
@@ -83,7 +83,7 @@ def test_filter_keeps_what_passes_with_its_new_numbers(stored):
 def test_commands(stored, tmp_path, capsys):
     assert main(["dataset", "check", str(stored), "--sample", "12", "--protocol", "dro", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert (told["tried"], told["agreed"], told["protocol"]) == (12, 12, "dro/1")
+    assert (told["evaluated"], told["agreed"], told["protocol"]) == (12, 12, "dro/1")
     assert told["interval_95"][0] < 1.0
     assert main(["dataset", "check", str(stored), "--sample", "5", "--protocol", "dro"]) == 0
     assert "100.0%" in capsys.readouterr().out

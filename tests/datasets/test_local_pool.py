@@ -48,13 +48,14 @@ def whole(folder: Path) -> int:
     return sum(len(GraspBatch.load(s.path(folder))) for s in shards)
 
 
+@pytest.mark.slow
 def test_a_killed_worker_costs_its_shard_and_a_deadly_pair_itself(tmp_path):
     """On `heavy` it dies within the transfer of its shard, holding whatever lock that needs."""
     marks, folder, lines = tmp_path / "marks", tmp_path / "data", []
     marks.mkdir()
     report = synthesize_dataset(
-        ["a"], ["x", "fragile", "deadly", "heavy", "y"], 10, folder, protocol=str(marks), progress=lines.append,
-        workers=pool(engine_work.dying))
+        ["a"], ["x", "fragile", "deadly", "heavy", "y"], 10, folder, workers=pool(engine_work.dying),
+        config=EngineConfig(protocol=str(marks)), progress=lines.append)
     assert report.grasps == whole(folder) == 30
     assert set(report.failures) == {("a", "deadly"), ("a", "heavy")}
     assert all("process died (exit code -9), 2 times" in why for why in report.failures.values())
@@ -86,6 +87,7 @@ def test_an_idle_worker_that_dies_is_replaced():
     assert not [p for p in multiprocessing.active_children() if "pebble" in p.name]
 
 
+@pytest.mark.slow
 def test_an_object_that_takes_too_long_is_stopped_and_the_rest_goes_on(tmp_path):
     config = EngineConfig(max_crashes=1)
     report = synthesize_dataset(["a"], ["endless", "x", "y"], 10, tmp_path, config=config, progress=lambda _: None,
@@ -131,6 +133,7 @@ def alive(pid: int) -> bool:
         return False
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_killed_parent_leaves_whole_shards_and_no_process_and_a_rerun_finishes(tmp_path):
     folder = tmp_path / "data"
@@ -168,6 +171,7 @@ def small_disk(tmp_path):
     library.umount2(str(folder).encode(), 2)
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_the_run_clearly_and_loses_nothing(small_disk):
     folder, enlarge = small_disk
     with pytest.raises(OutputError, match=r"No space left on device.*free some space"):
@@ -180,6 +184,7 @@ def test_a_full_disk_ends_the_run_clearly_and_loses_nothing(small_disk):
     assert whole(folder) == 150
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @pytest.mark.parametrize("everyone", [False, True])
 def test_ctrl_c_ends_the_workers(tmp_path, everyone):

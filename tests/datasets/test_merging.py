@@ -126,7 +126,7 @@ def test_yields_add_up_and_name_the_obstacle():
     a = Yield(candidates=10, ranked_out=2, deep=1, moved=1, failures={"slipped": 2, "lost": 1}, valid=3, cpu_seconds=6.0)
     both = a + Yield(candidates=5, failures={"lost": 4}, valid=1, cpu_seconds=6.0)
     assert both.failures == {"slipped": 2, "lost": 5}
-    assert both.tried == 11
+    assert both.evaluated == 11
     assert both.per_cpu_hour == pytest.approx(1200)
     assert both.main_obstacle() == "lost (38% of the tested candidates)"
     assert Yield().main_obstacle() == "no candidate was tested"

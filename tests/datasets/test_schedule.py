@@ -222,7 +222,7 @@ def test_real_shards_hold_valid_grasps_repeat_and_add_up(tmp_path):
     assert all(len(links) >= 2 for links in found.extra["contact_links"])
     assert {name for name in found.extra if name.startswith("energy_")} >= {"energy_force_closure", "energy_penetration"}
     assert made.candidates == sum(t.candidates for t in tasks)
-    assert made.candidates == made.ranked_out + made.deep + made.moved + made.tried
+    assert made.candidates == made.ranked_out + made.deep + made.moved + made.evaluated
     assert made.cpu_seconds > 0
     points = load_hand("barrett").with_points(64).points(found.joints, found.T_object_wrist)
     apart = (points[:, None] - points).norm(dim=-1).mean(-1) + torch.eye(len(found))
@@ -300,7 +300,7 @@ def test_an_object_that_coacd_cannot_cut_is_told_in_one_line(tmp_path, monkeypat
 def test_grasps_of_files_remember_them(tmp_path):
     trimesh.creation.icosphere(radius=0.03).export(tmp_path / "ball.stl")
     (tmp_path / "data").mkdir()
-    run(tmp_path / "data", ["barrett"], [str(tmp_path / "ball.stl")], 1, make_shard, config=TINY, scale=1.2)
+    run(tmp_path / "data", ["barrett"], [str(tmp_path / "ball.stl")], 1, make_shard, config=replace(TINY, scale=1.2))
     (pair,) = read_collection(tmp_path / "data")
     assert set(pair.grasps.extra["object_file"]) == {str(tmp_path / "ball.stl")}
     assert pair.grasps.extra["object_scale"].unique().tolist() == [pytest.approx(1.2)]
@@ -310,7 +310,7 @@ def test_grasps_of_files_remember_them(tmp_path):
 @pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_time_that_is_none_is_refused(tmp_path, seconds):
     with pytest.raises(OptionError, match="seconds is "):
-        synthesize_dataset(["a"], ["x"], 1, tmp_path / "data", workers=HerePool, seconds=seconds)
+        synthesize_dataset(["a"], ["x"], 1, tmp_path / "data", workers=HerePool, config=EngineConfig(seconds=seconds))
     assert not (tmp_path / "data").exists()
 
 

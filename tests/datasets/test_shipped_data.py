@@ -1,4 +1,4 @@
-"""The data set that ships: sizes, splits, what every grasp must have, and a sample tried again."""
+"""The data set that ships: sizes, splits, what every grasp must have, and a sample evaluated again."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from dro_grasp.errors import ObjectError, OptionError
+from dro_grasp.errors import GraspFileError, ObjectError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import ControllerConfig
 from dro_grasp.hands.hand import Hand
@@ -256,7 +256,7 @@ def test_progress_and_empty_batches(hand, obj, monkeypatch):
 
 def test_grasps_of_another_hand_are_refused(hand, obj, tmp_path):
     other = claw(tmp_path, fingers=3)
-    with pytest.raises(OptionError, match="Load the hand that the grasps name"):
+    with pytest.raises(GraspFileError, match="Load the hand that the grasps name"):
         simulate(other, obj, power_grasp(hand, obj))
 
 

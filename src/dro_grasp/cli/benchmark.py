@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from dro_grasp.cli.output import optional, print_json, progress_bar, say
+from dro_grasp.cli.output import Flag, optional, print_json, progress_bar, say
+from dro_grasp.cli.protocol_name import ProtocolName
 
 if TYPE_CHECKING:
     from dro_grasp.evaluation.success_rates import Row
@@ -32,7 +33,7 @@ class Benchmark:
     """Grasps of each hand on each object, of which ranking keeps the best quarter."""
     stages: tuple[Literal["raw", "ranked", "refined"], ...] = ("raw", "ranked", "refined")
     """What is done to the grasps before the trials; of refined grasps, all and the best by score are reported."""
-    protocols: tuple[Literal["dro", "strict", "dro_static", "dexgraspbench"], ...] = ("dro", "strict", "dexgraspbench")
+    protocols: tuple[ProtocolName, ...] = ("dro", "strict", "dexgraspbench")
     """Trials; displacement, rotation and diversity are means over successes of the first."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Weights to measure."""
@@ -48,7 +49,7 @@ class Benchmark:
     """Views of each object for each hand, with --num grasps each."""
     seed: int = 0
     """The same seed gives the same grasps and views."""
-    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    json: Flag = False
     """Print one JSON object instead of a Markdown table."""
 
     def run(self) -> int:

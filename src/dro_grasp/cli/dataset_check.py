@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
 from dro_grasp.cli.output import Flag, optional, print_json, print_table, progress_bar, say
+from dro_grasp.cli.protocol_name import ProtocolName
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class Check:
     """Output folders of `dro-grasp synthesize`, folders of grasp files, or grasp files."""
     sample: int = 100
     """Grasps to evaluate, drawn uniformly from all grasps."""
-    protocol: Literal["strict", "dro", "dro_static", "dexgraspbench"] = "strict"
+    protocol: ProtocolName = "strict"
     """Protocol of the trial."""
     friction: Annotated[float | None, optional("MU", "the protocol's")] = None
     """Friction coefficient between hand and object."""
@@ -44,17 +45,17 @@ class Check:
         pairs = (pair for path in self.inputs for pair in read_collection(path, only_successful=False))
         with progress_bar("evaluating", self.json) as progress:
             found = check(pairs, self.sample, rules, self.seed, progress)
-        low, high = wilson_interval(found.agreed, found.tried)
+        low, high = wilson_interval(found.agreed, found.evaluated)
         if self.json:
             print_json({
-                "protocol": found.protocol, "tried": found.tried, "agreed": found.agreed,
-                "agreement": found.agreed / found.tried, "interval_95": [low, high], "succeeded": found.succeeded,
+                "protocol": found.protocol, "evaluated": found.evaluated, "agreed": found.agreed,
+                "agreement": found.agreed / found.evaluated, "interval_95": [low, high], "succeeded": found.succeeded,
                 "reasons": dict(found.reasons.most_common()), "hands": {h: list(c) for h, c in found.hands.items()},
             })
             return 0
-        rows = [[hand, tried, success, success / tried] for hand, (tried, success) in found.hands.items()]
+        rows = [[hand, count, success, success / count] for hand, (count, success) in found.hands.items()]
         print_table(f"evaluated again, protocol {found.protocol}", ["hand", "grasps", "success", "rate"], rows)
-        say(f"{found.agreed} of {found.tried} results agree with the stored ones: {found.agreed / found.tried:.1%} "
+        say(f"{found.agreed} of {found.evaluated} results agree with the stored ones: {found.agreed / found.evaluated:.1%} "
             f"(95 %: {low:.1%} to {high:.1%})")
         for reason, count in found.reasons.most_common(5):
             say(f"  {count} stored as successful now fail: {reason}")

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
 from dro_grasp.cli.output import Flag, optional, print_json, print_table, progress_bar
+from dro_grasp.cli.protocol_name import ProtocolName
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class Filter:
     """Output folders of `dro-grasp synthesize`, folders of grasp files, or grasp files."""
     output: Path
     """Folder for the files, one per hand; created if missing, inside an existing folder."""
-    protocol: Literal["strict", "dro", "dro_static", "dexgraspbench"] = "strict"
+    protocol: ProtocolName = "strict"
     """Protocol of the trial."""
     friction: Annotated[float | None, optional("MU", "the protocol's")] = None
     """Friction coefficient between hand and object."""

@@ -6,12 +6,13 @@ import time
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
 from dro_grasp.cli.grasp_files import load_grasps
-from dro_grasp.cli.output import optional, print_json, print_table, progress_bar, say_aside
+from dro_grasp.cli.output import Flag, optional, print_json, print_table, progress_bar, say, say_aside
+from dro_grasp.cli.protocol_name import ProtocolName
 from dro_grasp.grasps.sources import hand_of, object_of
 
 
@@ -24,7 +25,7 @@ class Evaluate:
 
     file: tyro.conf.Positional[Path]
     """Grasp file."""
-    protocol: Literal["dro", "strict", "dro_static", "dexgraspbench"] = "dro"
+    protocol: ProtocolName = "dro"
     """The trial."""
     friction: Annotated[float | None, optional("MU", "the protocol's")] = None
     """Friction coefficient between hand and object; the official release has 3."""
@@ -36,7 +37,7 @@ class Evaluate:
     """Scale of the mesh given with --object."""
     output: Annotated[Path | None, optional("PATH", "not saved")] = None
     """Save the grasps with their results."""
-    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    json: Flag = False
     """Print one JSON object instead of a table."""
 
     def run(self) -> int:
@@ -47,6 +48,7 @@ class Evaluate:
         from dro_grasp.grasps.batch import GraspBatch
         from dro_grasp.pipeline.problem import GraspProblem
         from dro_grasp.pipeline.stages import evaluate
+        from dro_grasp.simulation.outcome import Failure
         from dro_grasp.simulation.protocols import changed
 
         rules = changed(self.protocol, friction=self.friction)
@@ -68,7 +70,7 @@ class Evaluate:
                     say_aside(f"the grasps were made for another '{name}' than the given {obj.name}")
                 done = evaluate(GraspProblem(hand, obj), part, rules, progress)
                 evaluated.append(done)
-                reasons.update(r for r in done.extra["reason"] if r)
+                reasons.update(Failure[name].value for name in done.extra["failure"] if name)
                 success = int(done.success.sum())
                 rows.append([name, len(done), success, success / max(1, len(done))])
         done = GraspBatch.concatenate(evaluated)
@@ -80,7 +82,7 @@ class Evaluate:
             "file": str(self.file), "hand": hand.name, "protocol": rules.label, "num": len(grasps), "success": success,
             "success_rate": success / max(1, len(grasps)), "interval_95": [low, high],
             "objects": {row[0]: {"num": row[1], "success": row[2]} for row in rows},
-            "reasons": dict(reasons.most_common(10)), "seconds": round(time.perf_counter() - begin, 3),
+            "reasons": dict(reasons.most_common()), "seconds": round(time.perf_counter() - begin, 3),
             "output": None if self.output is None else str(self.output),
         }
         if self.json:
@@ -89,4 +91,6 @@ class Evaluate:
         rate = success / max(1, len(grasps))
         note = f"{success} of {len(grasps)} succeeded: {rate:.1%} (95 %: {low:.1%} to {high:.1%})"
         print_table(f"{hand.name}, protocol {rules.label}", ["object", "grasps", "success", "rate"], rows, note=note)
+        for reason, count in reasons.most_common():
+            say(f"  {count} failed: {reason}")
         return 0

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import tyro
-
-from dro_grasp.cli.output import optional, print_json, print_table, progress_bar, say, say_aside
+from dro_grasp.cli.output import Flag, optional, print_json, print_table, progress_bar, say, say_aside
+from dro_grasp.cli.protocol_name import ProtocolName
 from dro_grasp.grasps.sources import with_sources
+from dro_grasp.simulation.protocols import PROTOCOLS
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
 ROWS_SHOWN = 16
 """Grasps listed in the table."""
-Flag = tyro.conf.FlagCreatePairsOff[bool]
-"""An option that takes no value."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +60,8 @@ class Generate:
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Name of shipped weights (see `dro-grasp weights list`) or the path of a weights file."""
     protocol: Annotated[
-        Literal["dro", "strict", "dro_static", "dexgraspbench", "none"] | None,
-        optional("{dro,strict,dro_static,dexgraspbench,none}", "dro for a mesh, none for a bare point cloud"),
+        ProtocolName | Literal["none"] | None,
+        optional(f"{{{','.join(PROTOCOLS)},none}}", "dro for a mesh, none for a bare point cloud"),
     ] = None
     """Trial of each grasp."""
     only_successful: Flag = False

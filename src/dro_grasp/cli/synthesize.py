@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from dro_grasp.cli.output import Flag, optional, print_json, print_table, say_aside
+from dro_grasp.cli.protocol_name import ProtocolName
 
 if TYPE_CHECKING:
     from dro_grasp.datasets.engine.pools import Pool
@@ -43,7 +44,7 @@ class Synthesize:
     """Factor for the coordinates of the objects: 0.001 for millimetres."""
     seed: int = 0
     """The same seed gives the same grasps."""
-    protocol: Literal["strict", "dro"] = "strict"
+    protocol: ProtocolName = "strict"
     """Protocol of the trial that grasps must pass."""
     json: Flag = False
     """Print one JSON object instead of a table."""

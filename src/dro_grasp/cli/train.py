@@ -8,14 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from dro_grasp.cli.output import optional, print_json, print_table
+from dro_grasp.cli.output import Flag, optional, print_json, print_table
 
 if TYPE_CHECKING:
     from dro_grasp.models.network import DistanceNetwork
     from dro_grasp.models.presets import NetworkConfig
     from dro_grasp.training.config import ScheduleConfig
-
-Flag = tyro.conf.FlagCreatePairsOff[bool]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -284,7 +284,7 @@ class GraspBatch:
         if tuple(hand.tree.joint_names) != self.joint_names or hand.tree.link_names[0] != self.wrist_link:
             raise GraspFileError(
                 f"these grasps are for hand '{self.hand}' with joints {list(self.joint_names)}; "
-                f"hand '{hand.name}' has {list(hand.tree.joint_names)}"
+                f"hand '{hand.name}' has {list(hand.tree.joint_names)}. Load the hand that the grasps name"
             )
 
     def __repr__(self) -> str:

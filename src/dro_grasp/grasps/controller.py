@@ -5,28 +5,14 @@ Source: paper, appendix, grasp controller; amounts as in the official release.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.geometry import se3
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.controller_config import ControllerConfig
 from dro_grasp.hands.hand import Hand
-
-
-@dataclass(frozen=True)
-class ControllerConfig:
-    """How far joints move from a grasp."""
-
-    outer: float = 0.25
-    """Share of the remaining range by which the pregrasp opens. Source: official release."""
-    inner: float = 0.30
-    """Share of the remaining range by which the squeeze closes."""
-    # Differs from the paper's release (0.15), which leaves small objects without contact; the controls gain as well.
-    dead_zone: float = 1e-3
-    """Joints whose downstream points approach the object's centre more slowly stay [m/rad] (ours)."""
 
 
 def completed(

@@ -15,7 +15,7 @@ from dro_grasp.datasets.bundle.splits import split_of
 from dro_grasp.datasets.bundle.training_file import load_bundle
 from dro_grasp.datasets.collections.bundling import make_bundle
 from dro_grasp.datasets.collections.collection import count_collection
-from dro_grasp.datasets.engine.schedule import require_known, synthesize_dataset
+from dro_grasp.datasets.engine.schedule import EngineConfig, require_known, synthesize_dataset
 from dro_grasp.errors import BundleError, OptionError
 from dro_grasp.evaluation.success_rates import BEST, RAW, REFINED, BenchmarkConfig, benchmark
 from dro_grasp.files import check_folder, make_folder, replacing
@@ -183,7 +183,7 @@ class _Onboarding:
     def _data(self) -> dict[str, Any]:
         report = synthesize_dataset(
             [self.name], self.objects, MOST_GRASPS, self.folder / DATA, workers=self.config.workers, seed=self.config.seed,
-            progress=self.say, seconds=60 * self.config.minutes * DATA_SHARE)
+            config=EngineConfig(seconds=60 * self.config.minutes * DATA_SHARE), progress=self.say)
         counts = next(iter(count_collection(self.folder / DATA).values()), {})
         failures = {obj: why for (_, obj), why in report.failures.items()}
         if not sum(counts.values()):

@@ -62,7 +62,7 @@ def scored(problem: GraspProblem, grasps: GraspBatch, config: ScoreConfig | None
 
 
 def evaluate(
-    problem: GraspProblem, grasps: GraspBatch, protocol: str | Protocol = "strict",
+    problem: GraspProblem, grasps: GraspBatch, protocol: str | Protocol = "dro",
     progress: Callable[[int, int], None] | None = None, workers: int | None = None,
 ) -> GraspBatch:
     """Grasps with the outcome of a trial each.

@@ -42,8 +42,8 @@ def find_contact_links(scene: Scene, qpos: Float[np.ndarray, "n nq"]) -> tuple[t
     names = [scene.model.body(i).name.removeprefix(PREFIX) for i in range(scene.model.nbody)]
     found = []
     for bodies, _ in _contacts(scene, qpos):
-        touching = bodies[(bodies == scene.object_body).any(1)]
-        found.append(tuple(sorted({names[i] for i in touching[touching != scene.object_body]})))
+        involved = bodies[(bodies == scene.object_body).any(1)]
+        found.append(tuple(sorted({names[i] for i in involved[involved != scene.object_body]})))
     return tuple(found)
 
 

@@ -82,9 +82,8 @@ class TrialResult:
     def join(results: Sequence[TrialResult], label: str) -> TrialResult:
         """One result after the other, all of the same protocol."""
         if not results:
-            none = np.zeros(0)
-            empty = Measurements(Penetration(none, none), none, none, (), none > 0, np.zeros((0, 6)), np.zeros((0, 6)))
-            return empty.result([], label)
+            none, six = torch.zeros(0), torch.zeros(0, len(DIRECTIONS))
+            return TrialResult(none > 0, six, six, none, none, (), none, none, (), (), label)
         columns: dict[str, Any] = {name: torch.cat([getattr(r, name) for r in results]) for name in NUMBERS}
         columns |= {name: tuple(x for r in results for x in getattr(r, name)) for name in TEXTS}
         return TrialResult(**columns, protocol=label)
@@ -109,11 +108,9 @@ class Measurements:
     rotation: Float[np.ndarray, "n 6"]
 
     def judged(self, rules: Protocol) -> TrialResult:
-        """Success, or the first reason against it, of every trial."""
-        return self.result([self._verdict(i, rules) for i in range(len(self.shift))], rules.label)
+        """Success, or the first reason against it, of every trial; unstable trials measure nothing: NaN."""
+        verdicts = [self._verdict(i, rules) for i in range(len(self.shift))]
 
-    def result(self, verdicts: Sequence[tuple[Failure | None, str]], label: str) -> TrialResult:
-        """These measurements with their verdicts; numbers of unstable trials mean nothing and become NaN."""
         def tensor(values: Float[np.ndarray, "n *k"], measured: bool = False) -> Float[Tensor, "n *k"]:
             kept = np.where(self.stable, values.T, np.nan).T if measured else values
             return torch.from_numpy(np.asarray(kept, np.float32))
@@ -124,7 +121,7 @@ class Measurements:
             closing_shift=tensor(self.shift, True), closing_rotation=tensor(self.turn, True), contact_links=self.contacts,
             penetration=tensor(self.penetration.object), self_penetration=tensor(self.penetration.own),
             failure=tuple(failure for failure, _ in verdicts),
-            reason=tuple(failure.value + detail if failure else "" for failure, detail in verdicts), protocol=label,
+            reason=tuple(failure.value + detail if failure else "" for failure, detail in verdicts), protocol=rules.label,
         )
 
     def _verdict(self, i: int, rules: Protocol) -> tuple[Failure | None, str]:

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 from dro_grasp.errors import OptionError
-from dro_grasp.grasps.controller import ControllerConfig
+from dro_grasp.grasps.controller_config import ControllerConfig
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,10 @@ PROTOCOLS = {
         force_limit=3.0,
     ),
 }
-"""Every protocol by name. Sources: the paper for `dro`, ours for `strict` and `dro_static`, the settings of DexGraspBench."""
+"""Every protocol by name, in the order of lists of choices; a new one is one entry here.
+
+Sources: the paper for `dro`, ours for `strict` and `dro_static`, the settings of DexGraspBench.
+"""
 
 
 def protocol(name: str | Protocol) -> Protocol:

@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dro_grasp.devices import cores
-from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import completed
 from dro_grasp.hands.hand import Hand
@@ -45,14 +44,15 @@ def simulate(
         hand: The hand of the grasps.
         obj: Their object; it needs a mesh.
         grasps: The controller makes each pregrasp and squeeze that a grasp does not state.
-        protocol: `dro`, `strict`, `dro_static`, `dexgraspbench`, or a Protocol of your own.
+        protocol: A name in PROTOCOLS, or a Protocol of your own.
         workers: Threads; all cores by default. The result does not depend on it.
         progress: Called with (grasps evaluated, grasps in all).
 
     Raises:
         ObjectError: The object is a bare point cloud.
         HandError: The hand came without its description.
-        OptionError: The grasps are of another hand, or the protocol does not exist.
+        GraspFileError: The grasps are of another hand.
+        OptionError: The protocol does not exist.
     """
     scene = _scene(hand, obj, grasps, protocol)
     results, done = [], 0
@@ -77,7 +77,8 @@ def settle(
     Raises:
         ObjectError: The object is a bare point cloud.
         HandError: The hand came without its description.
-        OptionError: The grasps are of another hand, or the protocol does not exist.
+        GraspFileError: The grasps are of another hand.
+        OptionError: The protocol does not exist.
     """
     scene = _scene(hand, obj, grasps, protocol)
     joints, poses = [grasps.joints[:0]], [grasps.T_object_wrist[:0]]
@@ -112,7 +113,8 @@ def record(
     Raises:
         ObjectError: The object is a bare point cloud.
         HandError: The hand came without its description.
-        OptionError: The grasps are of another hand, or the protocol does not exist.
+        GraspFileError: The grasps are of another hand.
+        OptionError: The protocol does not exist.
     """
     scene = _scene(hand, obj, grasps, protocol)
     (grasp, rollout), = _rollouts(scene, hand, grasps[index], workers=1, stride=stride)
@@ -124,11 +126,8 @@ def record(
 
 def _scene(hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol) -> Scene:
     """The scene in which the grasps are simulated."""
-    rules = find_protocol(protocol)
-    if tuple(grasps.joint_names) != tuple(hand.tree.joint_names):
-        raise OptionError(f"these grasps are of hand '{grasps.hand}' with {len(grasps.joint_names)} joints; hand "
-                          f"'{hand.name}' has {hand.tree.n_dof}. Load the hand that the grasps name")
-    return cached_scene(hand, obj, rules)
+    grasps.require_hand(hand)
+    return cached_scene(hand, obj, find_protocol(protocol))
 
 
 def _rollouts(
@@ -158,9 +157,9 @@ def _run(rollout: Rollout, grasps: GraspBatch) -> TrialResult:
 
 
 def _holding_joints(hand: Hand, contact_links: Sequence[Sequence[str]]) -> Bool[Tensor, "n n_dof"]:
-    """Joints that move a link which touches the object."""
+    """Joints that move a contact link."""
     names = {name: i for i, name in enumerate(hand.tree.link_names)}
-    touching = torch.zeros(len(contact_links), hand.tree.n_links)
-    for row, links in zip(touching, contact_links, strict=True):
+    in_contact = torch.zeros(len(contact_links), hand.tree.n_links)
+    for row, links in zip(in_contact, contact_links, strict=True):
         row[[names[link] for link in links if link in names]] = 1
-    return touching @ hand.tree.moves.float() > 0
+    return in_contact @ hand.tree.moves.float() > 0

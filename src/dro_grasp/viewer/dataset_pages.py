@@ -52,8 +52,8 @@ def write_report(hands: Sequence[HandCoverage], path: Path, progress: Callable[[
 
 def _overview(hands: Sequence[HandCoverage]) -> str:
     rows = [
-        [h.grasps.hand, len(h.grasps), len(h.pairs), sum(not p.grasps for p in h.pairs), y.candidates, y.tried,
-         _percent(y.valid, y.tried), round(y.per_cpu_hour), *(f"{value:.3f}" for value in h.diversity.values())]
+        [h.grasps.hand, len(h.grasps), len(h.pairs), sum(not p.grasps for p in h.pairs), y.candidates, y.evaluated,
+         _percent(y.valid, y.evaluated), round(y.per_cpu_hour), *(f"{value:.3f}" for value in h.diversity.values())]
         for h, y in ((h, h.yields) for h in hands)
     ]
     head = ["hand", "grasps", "objects", "without a grasp", "candidates", "trials", "valid", "per CPU-hour",

@@ -26,7 +26,7 @@ class Agreement:
 
     protocol: str
     """Protocol of the new trials."""
-    tried: int = 0
+    evaluated: int = 0
     """Number of new trials."""
     agreed: int = 0
     """Trials with the stored verdict."""
@@ -43,7 +43,7 @@ class Agreement:
         success = int(trial.success.sum())
         of_hand = self.hands.get(grasps.hand, (0, 0))
         return replace(
-            self, tried=self.tried + len(grasps), agreed=self.agreed + int((trial.success == grasps.success).sum()),
+            self, evaluated=self.evaluated + len(grasps), agreed=self.agreed + int((trial.success == grasps.success).sum()),
             succeeded=self.succeeded + success, reasons=self.reasons + failed,
             hands=self.hands | {grasps.hand: (of_hand[0] + len(grasps), of_hand[1] + success)},
         )
@@ -79,7 +79,7 @@ def check(
         if mask.any():
             result = result.extended(grasps[mask], _evaluate(grasps[mask], rules, hands))
             if progress is not None:
-                progress(result.tried, int(chosen.sum()))
+                progress(result.evaluated, int(chosen.sum()))
     return result
 
 

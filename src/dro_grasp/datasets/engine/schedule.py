@@ -5,7 +5,6 @@ Killing a run at any time loses at most the shards in flight; a rerun makes only
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 import sys
@@ -13,7 +12,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from dro_grasp.datasets.engine.local_pool import LocalPool
 from dro_grasp.datasets.engine.pools import Failed, Outcome, Pool
@@ -110,7 +108,6 @@ def synthesize_dataset(
     seed: int = 0,
     config: EngineConfig | None = None,
     progress: Callable[[str], None] | None = None,
-    **settings: Any,
 ) -> DatasetReport:
     """Fill a folder with valid grasps of every hand on every object.
 
@@ -123,15 +120,14 @@ def synthesize_dataset(
         output_dir: The folder; made when missing (its parent must exist).
         workers: Processes, of one thread each; or a function that makes another pool for a job.
         seed: Determines every shard, together with hand, object, round and number of candidates.
-        config: Settings.
+        config: Protocol, scale, time limit and other settings.
         progress: Called with a line of text now and then; None prints to stderr.
-        settings: Fields of EngineConfig that differ from `config`: `protocol`, `scale`, `seconds` and others.
 
     Raises:
         OptionError: A number is not positive, the time is not finite, or this machine lacks the device.
         OutputError: The folder cannot be made or written, or another run is filling it.
     """
-    config = dataclasses.replace(config or EngineConfig(), **settings)
+    config = config or EngineConfig()
     if grasps_per_pair < 1 or (isinstance(workers, int) and workers < 1):
         raise OptionError(f"grasps_per_pair is {grasps_per_pair}, workers {workers}; both must be at least 1")
     if config.seconds is not None and not (math.isfinite(config.seconds) and config.seconds > 0):

@@ -32,7 +32,7 @@ class Yield:
     """CPU time of loading hand and object, with convex parts and grid where they are not cached [s]."""
 
     @property
-    def tried(self) -> int:
+    def evaluated(self) -> int:
         """Number of trials."""
         return sum(self.failures.values()) + self.duplicates + self.valid
 
@@ -52,7 +52,7 @@ class Yield:
             "hand too deep in the object": self.deep, "closing moves the object too far": self.moved,
         }
         reason = max(lost, key=lambda name: lost[name], default="")
-        share = lost[reason] / max(1, self.tried + self.deep + self.moved) if reason else 0.0
+        share = lost[reason] / max(1, self.evaluated + self.deep + self.moved) if reason else 0.0
         return f"{reason} ({share:.0%} of the tested candidates)" if share else "no candidate was tested"
 
     def to_dict(self) -> dict[str, Any]:

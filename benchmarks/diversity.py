@@ -1,6 +1,6 @@
 """Diversity of predicted grasps beside that of the stored grasps of the same objects, of wrist and joints apart.
 
-    python benchmarks/variety.py [--weights NAME|PATH] [--num N] [--temperature T] [--json]
+    python benchmarks/diversity.py [--weights NAME|PATH] [--num N] [--temperature T] [--json]
 
 The paper's measure, over successes and failures. Needs the development assets.
 """
