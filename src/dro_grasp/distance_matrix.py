@@ -61,19 +61,14 @@ class _Segments:
     """The points in their link's frame [m]."""
 
 
-def build(
-    hand_points: Float[Tensor, "*b n 3"], object_points: Float[Tensor, "*b m 3"]
-) -> Float[Tensor, "*b n m"]:
+def build(hand_points: Float[Tensor, "*b n 3"], object_points: Float[Tensor, "*b m 3"]) -> Float[Tensor, "*b n m"]:
     """D(R,O) of a posed hand and an object [m]."""
     # The matrix-product form of cdist loses half of the significant digits.
     return torch.cdist(hand_points, object_points, compute_mode="donot_use_mm_for_euclid_dist")
 
 
 def decode(
-    hand: Hand,
-    distances: Float[Tensor, "*b n m"],
-    object_points: Float[Tensor, "*b m 3"],
-    config: DecodeConfig | None = None,
+    hand: Hand, distances: Float[Tensor, "*b n m"], object_points: Float[Tensor, "*b m 3"], config: DecodeConfig | None = None
 ) -> LinkPoses:
     """Multilaterate each row and register each link; differentiable.
 
@@ -151,10 +146,7 @@ def targets(hand: Hand, poses: LinkPoses) -> Targets:
 
 @torch.no_grad()
 def solve(
-    hand: Hand,
-    link_poses: LinkPoses,
-    q_start: Float[Tensor, "*b n_dof"] | None = None,
-    config: JointSolverConfig | None = None,
+    hand: Hand, link_poses: LinkPoses, q_start: Float[Tensor, "*b n_dof"] | None = None, config: JointSolverConfig | None = None
 ) -> JointSolution:
     """Wrist pose and joints whose links come closest to decoded link poses.
 

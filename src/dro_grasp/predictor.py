@@ -124,16 +124,8 @@ class GraspPredictor:
         return self.network.name
 
     def predict(
-        self,
-        hand: Hand,
-        obj: ObjectModel,
-        num: int = 16,
-        seed: int = 0,
-        *,
-        direction: Direction | None = None,
-        table: float | None = None,
-        candidates: int = 4,
-        refine: bool = True,
+        self, hand: Hand, obj: ObjectModel, num: int = 16, seed: int = 0, *, direction: Direction | None = None,
+        table: float | None = None, candidates: int = 4, refine: bool = True,
     ) -> GraspBatch:
         """Grasps with pregrasp, squeeze and score, the best score first; the arguments are fields of `GraspRequest`.
 

@@ -163,14 +163,8 @@ class GraspEnergy:
     """The energy of a hand on an object, prepared for many evaluations."""
 
     def __init__(
-        self,
-        hand: Hand,
-        field: DistanceField,
-        centre: Float[Tensor, 3],
-        length: float,
-        config: EnergyConfig | None = None,
-        contacts: ContactConfig | None = None,
-        device: torch.device | str = "cpu",
+        self, hand: Hand, field: DistanceField, centre: Float[Tensor, 3], length: float, config: EnergyConfig | None = None,
+        contacts: ContactConfig | None = None, device: torch.device | str = "cpu",
     ) -> None:
         """Prepare everything that stays the same from step to step.
 
@@ -206,10 +200,7 @@ class GraspEnergy:
         self.upper = torch.where(hand.opening_signs > 0, hand.tree.upper, hand.tree.upper - room)
 
     def __call__(
-        self,
-        T_object_wrist: Float[Tensor, "n 4 4"],
-        q: Float[Tensor, "n n_dof"],
-        contacts: Int[Tensor, "n c"],
+        self, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], contacts: Int[Tensor, "n c"]
     ) -> Evaluation:
         """Energy and gradient of n grasps: wrist poses, joints [rad or m], indices of their contact candidates."""
         tree, config = self.hand.tree, self.config

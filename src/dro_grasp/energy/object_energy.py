@@ -15,10 +15,7 @@ from dro_grasp.objects.shape import ObjectModel
 
 
 def object_energy(
-    hand: Hand,
-    obj: ObjectModel,
-    config: EnergyConfig | None = None,
-    contacts: ContactConfig | None = None,
+    hand: Hand, obj: ObjectModel, config: EnergyConfig | None = None, contacts: ContactConfig | None = None,
     device: torch.device | str = "cpu",
 ) -> GraspEnergy:
     """The energy on the object's grid of signed distances."""
@@ -28,9 +25,7 @@ def object_energy(
     return GraspEnergy(hand, obj.distance_field, centre, length, config, contacts, device)
 
 
-def evaluate_nearest(
-    energy: GraspEnergy, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"]
-) -> Evaluation:
+def evaluate_nearest(energy: GraspEnergy, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"]) -> Evaluation:
     """The energy with the contact of each slot at that slot's candidate nearest to the surface."""
     return energy(T_object_wrist, q, nearest_contacts(energy, T_object_wrist, q))
 

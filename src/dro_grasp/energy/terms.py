@@ -48,9 +48,7 @@ class ContactTerm(NamedTuple):
     """As in NormalTerm."""
 
 
-def force_closure(
-    points: Float[Tensor, "*b c 3"], normals: Float[Tensor, "*b c 3"], length: float
-) -> ContactTerm:
+def force_closure(points: Float[Tensor, "*b c 3"], normals: Float[Tensor, "*b c 3"], length: float) -> ContactTerm:
     """Squared six components of the net wrench of unit forces along the contact normals.
 
     Zero means that equal normal forces alone hold the object: a differentiable relaxation of force closure.
@@ -75,9 +73,7 @@ def contact_distance(distance: Float[Tensor, "*b c"], gradient: Float[Tensor, "*
     return PointTerm(distance.abs(), distance.sign()[..., None] * gradient)
 
 
-def normal_alignment(
-    hand_normals: Float[Tensor, "*b c 3"], object_normals: Float[Tensor, "*b c 3"]
-) -> NormalTerm:
+def normal_alignment(hand_normals: Float[Tensor, "*b c 3"], object_normals: Float[Tensor, "*b c 3"]) -> NormalTerm:
     """One plus the cosine between hand normal and object normal at each contact: 0 if they are opposite.
 
     `by_normal` is the derivative by the hand's normals; the derivative by the object's normals is `hand_normals`.
@@ -92,9 +88,7 @@ def penetration(distance: Float[Tensor, "*b p"], gradient: Float[Tensor, "*b p 3
     return PointTerm(-distance * inside, -gradient * inside[..., None])
 
 
-def self_penetration(
-    centres: Float[Tensor, "*b s 3"], radii: Float[Tensor, " s"], pairs: Int[Tensor, "k 2"]
-) -> PointTerm:
+def self_penetration(centres: Float[Tensor, "*b s 3"], radii: Float[Tensor, " s"], pairs: Int[Tensor, "k 2"]) -> PointTerm:
     """Overlap of each pair of spheres, on links that must not touch [m]."""
     first, second = pairs[:, 0], pairs[:, 1]
     one_hot = torch.eye(len(radii), dtype=centres.dtype, device=centres.device)
@@ -135,9 +129,7 @@ def link_wrenches(
 
 
 def joint_gradient(
-    tree: KinematicTree,
-    T_world_link: Float[Tensor, "*b n_links 4 4"],
-    wrenches: Float[Tensor, "*b n_links 6"],
+    tree: KinematicTree, T_world_link: Float[Tensor, "*b n_links 4 4"], wrenches: Float[Tensor, "*b n_links 6"],
     pivot: Float[Tensor, "*b 3"],
 ) -> tuple[Float[Tensor, "*b 6"], Float[Tensor, "*b n_dof"]]:
     """Derivatives by a small motion of the whole hand and by each independent joint.

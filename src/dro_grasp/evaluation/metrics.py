@@ -21,9 +21,7 @@ def wilson_interval(success: int, total: int) -> tuple[float, float]:
     return float(interval.low), float(interval.high)
 
 
-def diversity(
-    T_object_wrist: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"]
-) -> dict[str, float]:
+def diversity(T_object_wrist: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"]) -> dict[str, float]:
     """The paper's diversity: the standard deviation of each wrist coordinate and joint over grasps, averaged.
 
     The wrist coordinates are x, y, z [m] and roll, pitch, yaw [rad]. The mean mixes units, as in the paper, so wrist and

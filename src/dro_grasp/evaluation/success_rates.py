@@ -120,12 +120,8 @@ class Row:
 
 
 def benchmark(
-    hands: Sequence[Hand],
-    objects: Sequence[ObjectModel],
-    predictor: GraspPredictor,
-    config: BenchmarkConfig,
-    bundle: Bundle | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    hands: Sequence[Hand], objects: Sequence[ObjectModel], predictor: GraspPredictor, config: BenchmarkConfig,
+    bundle: Bundle | None = None, progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:
     """Measure the success rates.
 

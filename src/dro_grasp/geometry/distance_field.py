@@ -45,9 +45,7 @@ class DistanceField:
     """Edge of a voxel [m]."""
 
     @staticmethod
-    def from_values(
-        values: Float[Tensor, "nx ny nz"], origin: Float[Tensor, "3"], spacing: float
-    ) -> DistanceField:
+    def from_values(values: Float[Tensor, "nx ny nz"], origin: Float[Tensor, "3"], spacing: float) -> DistanceField:
         """Derive the gradients from a grid of signed distances [m]; the precision is that of the values."""
         gradient = _differences(_smooth(values), spacing)
         gradient = gradient / gradient.norm(dim=-1, keepdim=True).clamp_min(1e-6)
@@ -66,9 +64,7 @@ class DistanceField:
                 curvature.select(axis, end).zero_()
         return curvature.flatten(-2).flatten(0, 2).contiguous()
 
-    def distances(
-        self, points: Float[Tensor, "*b 3"]
-    ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
+    def distances(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
         """Signed distance [m] and its gradient: nearest voxel and first order; linear beyond the grid."""
         row, offset = self._locate(points)
         near = self.slopes.index_select(0, row.flatten()).reshape(*points.shape[:-1], 4)

@@ -30,12 +30,8 @@ class SideConfig:
 
 @torch.no_grad()
 def choose_sides(
-    local: Float[Tensor, "l p 3"],
-    weight: Float[Tensor, "l p"],
-    candidates: Float[Tensor, "b 2 l p 3"],
-    misfit: Float[Tensor, "b 2 l p"],
-    reference: int,
-    config: SideConfig | None = None,
+    local: Float[Tensor, "l p 3"], weight: Float[Tensor, "l p"], candidates: Float[Tensor, "b 2 l p 3"],
+    misfit: Float[Tensor, "b 2 l p"], reference: int, config: SideConfig | None = None,
 ) -> Bool[Tensor, "b l p"]:
     """Whether each point takes its second candidate.
 

@@ -45,9 +45,7 @@ class _Cloud:
 
 
 def multilaterate(
-    distances: Float[Tensor, "*b n m"],
-    anchors: Float[Tensor, "*b m 3"],
-    config: MultilaterationConfig | None = None,
+    distances: Float[Tensor, "*b n m"], anchors: Float[Tensor, "*b m 3"], config: MultilaterationConfig | None = None
 ) -> tuple[Float[Tensor, "*b 2 n 3"], Bool[Tensor, "*b"]]:
     """Points whose distances to the anchors are closest to the given ones: both candidates where the anchors are flat.
 
@@ -98,9 +96,7 @@ def _spread(anchors: Float[Tensor, "*b m 3"]) -> _Cloud:
     return _Cloud(centre, points, axes, variance.clamp(min=0))
 
 
-def _closed_form(
-    distances: Float[Tensor, "*b n m"], cloud: _Cloud, config: MultilaterationConfig
-) -> Float[Tensor, "*b n 3"]:
+def _closed_form(distances: Float[Tensor, "*b n m"], cloud: _Cloud, config: MultilaterationConfig) -> Float[Tensor, "*b n 3"]:
     """Linear least squares about the anchors' mean: one 3x3 inverse per cloud, one product for all rows.
 
     With anchors q of zero mean, |p|^2 - 2 q.p = d^2 - |q|^2. Its mean over the anchors removes |p|^2 and leaves
@@ -115,9 +111,7 @@ def _closed_form(
     return (squared - squared.mean(-1, keepdim=True)) @ weights
 
 
-def _height(
-    start: Float[Tensor, "*b n 3"], distances: Float[Tensor, "*b n m"], cloud: _Cloud
-) -> Float[Tensor, "*b n"]:
+def _height(start: Float[Tensor, "*b n 3"], distances: Float[Tensor, "*b n m"], cloud: _Cloud) -> Float[Tensor, "*b n"]:
     """Distance of each point from the anchors' plane, by Pythagoras from its distances and its place in the plane [m]."""
     normal = cloud.axes[..., :, 0]
     level = start - (start * normal[..., None, :]).sum(-1, keepdim=True) * normal[..., None, :]

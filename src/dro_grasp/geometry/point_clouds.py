@@ -8,10 +8,7 @@ from torch import Tensor
 
 
 def sample_surface(
-    vertices: Float[Tensor, "n_vertices 3"],
-    faces: Int[Tensor, "n_faces 3"],
-    count: int,
-    generator: torch.Generator,
+    vertices: Float[Tensor, "n_vertices 3"], faces: Int[Tensor, "n_faces 3"], count: int, generator: torch.Generator
 ) -> tuple[Float[Tensor, "count 3"], Float[Tensor, "count 3"], Int[Tensor, " count"]]:
     """Points uniform on a triangle mesh.
 
@@ -36,9 +33,7 @@ def sample_surface(
     return points, torch.nn.functional.normalize(cross[chosen], dim=-1), chosen
 
 
-def farthest_points(
-    points: Float[Tensor, "*batch n 3"], count: int, start: int = 0
-) -> Int[Tensor, "*batch count"]:
+def farthest_points(points: Float[Tensor, "*batch n 3"], count: int, start: int = 0) -> Int[Tensor, "*batch count"]:
     """Farthest point sampling: each next point is the one farthest from all before it; the first of several wins.
 
     Args:
@@ -62,9 +57,7 @@ def farthest_points(
     return chosen.reshape(*points.shape[:-2], count)
 
 
-def random_half(
-    points: Float[Tensor, "n 3"], count: int, generator: torch.Generator
-) -> Int[Tensor, " count"]:
+def random_half(points: Float[Tensor, "n 3"], count: int, generator: torch.Generator) -> Int[Tensor, " count"]:
     """Indices of random points in the half of a cloud that lies along a random direction.
 
     Source: appendix, partial object point cloud sampling: draw twice as many points as wanted, and remove the half with

@@ -16,9 +16,7 @@ from dro_grasp.geometry.se3 import compose
 
 
 def register(
-    source: Float[Tensor, "*b n 3"],
-    target: Float[Tensor, "*b n 3"],
-    weights: Float[Tensor, "*b n"] | None = None,
+    source: Float[Tensor, "*b n 3"], target: Float[Tensor, "*b n 3"], weights: Float[Tensor, "*b n"] | None = None
 ) -> tuple[Float[Tensor, "*b 4 4"], Float[Tensor, "*b"]]:
     """The rigid motion, never a reflection, that maps source points closest to target points.
 

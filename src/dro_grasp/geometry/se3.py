@@ -37,9 +37,7 @@ def invert(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
     return compose(back, -(back @ T[..., :3, 3:])[..., 0])
 
 
-def random_rotations(
-    n: int, generator: torch.Generator, dtype: torch.dtype = torch.float32
-) -> Float[Tensor, "n 3 3"]:
+def random_rotations(n: int, generator: torch.Generator, dtype: torch.dtype = torch.float32) -> Float[Tensor, "n 3 3"]:
     """Rotations uniform on SO(3), on the generator's device."""
     quaternion = torch.randn(n, 4, generator=generator, dtype=dtype, device=generator.device)
     return roma.unitquat_to_rotmat(torch.nn.functional.normalize(quaternion, dim=-1))

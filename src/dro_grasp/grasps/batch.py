@@ -96,11 +96,8 @@ class GraspBatch:
 
     @staticmethod
     def create(
-        hand: Hand,
-        obj: ObjectModel | Sequence[ObjectModel],
-        T_object_wrist: Float[Tensor, "n 4 4"],
-        joints: Float[Tensor, "n n_dof"],
-        **optional: Any,
+        hand: Hand, obj: ObjectModel | Sequence[ObjectModel], T_object_wrist: Float[Tensor, "n 4 4"],
+        joints: Float[Tensor, "n n_dof"], **optional: Any,
     ) -> GraspBatch:
         """A batch for a hand and one or several objects.
 

@@ -15,9 +15,7 @@ from dro_grasp.grasps.controller_config import ControllerConfig
 from dro_grasp.hands.hand import Hand
 
 
-def completed(
-    hand: Hand, grasps: GraspBatch, centre: Float[Tensor, "3"], config: ControllerConfig | None = None
-) -> GraspBatch:
+def completed(hand: Hand, grasps: GraspBatch, centre: Float[Tensor, "3"], config: ControllerConfig | None = None) -> GraspBatch:
     """The same grasps, each with pregrasp and squeeze; rows that are stated stay.
 
     Args:
@@ -40,10 +38,7 @@ def completed(
 
 
 def pregrasp_and_squeeze(
-    hand: Hand,
-    T_object_wrist: Float[Tensor, "n 4 4"],
-    joints: Float[Tensor, "n n_dof"],
-    centre: Float[Tensor, "3"],
+    hand: Hand, T_object_wrist: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"], centre: Float[Tensor, "3"],
     config: ControllerConfig | None = None,
 ) -> tuple[Float[Tensor, "n n_dof"], Float[Tensor, "n n_dof"]]:
     """Joint values q_outer and q_inner of each grasp.
@@ -71,10 +66,7 @@ def pregrasp_and_squeeze(
 
 
 def distance_slope(
-    hand: Hand,
-    T_object_wrist: Float[Tensor, "n 4 4"],
-    joints: Float[Tensor, "n n_dof"],
-    centre: Float[Tensor, "3"],
+    hand: Hand, T_object_wrist: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"], centre: Float[Tensor, "3"]
 ) -> Float[Tensor, "n n_dof"]:
     """Derivative by each joint of the mean distance of its downstream points to the object's centre [m/rad or m/m]."""
     tree = hand.tree

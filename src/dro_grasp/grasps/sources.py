@@ -25,9 +25,7 @@ CAMERA = "T_frame_camera"
 """Further column of such grasps: pose of the camera in that frame, row by row [m]."""
 
 
-def with_sources(
-    grasps: GraspBatch, hand: str, obj: str, scale: float, camera: NamedMotion | None = None
-) -> GraspBatch:
+def with_sources(grasps: GraspBatch, hand: str, obj: str, scale: float, camera: NamedMotion | None = None) -> GraspBatch:
     """Grasps that record the files of their hand and object; built-in names are not recorded.
 
     Args:

@@ -177,9 +177,7 @@ def closing_gains(
     return mean[0] - mean[1]
 
 
-def axes_along(
-    tree: KinematicTree, q: Float[Tensor, " n_dof"], direction: Float[Tensor, "3"]
-) -> Bool[Tensor, " n_dof"]:
+def axes_along(tree: KinematicTree, q: Float[Tensor, " n_dof"], direction: Float[Tensor, "3"]) -> Bool[Tensor, " n_dof"]:
     """The joints whose axes lie along a direction of the root link's frame and which bend no finger.
 
     A joint with a parallel one below it, or with none below it, is part of a finger's flexion.

@@ -62,9 +62,7 @@ def sample_links(description: Description, links: list[int], seed: int) -> LinkS
     return LinkSurface(torch.cat(points), torch.cat(normals), torch.cat(index))
 
 
-def _sample_shapes(
-    shapes: list[LinkGeometry], generator: torch.Generator
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+def _sample_shapes(shapes: list[LinkGeometry], generator: torch.Generator) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
     """Points and normals on the outside of a union of convex shapes."""
     vertices = torch.cat([torch.tensor(s.vertices, dtype=torch.float32) for s in shapes])
     starts = np.cumsum([0, *[len(s.vertices) for s in shapes]])

@@ -23,9 +23,7 @@ RIDGE = 1e-6
 
 @torch.no_grad()
 def read_joints(
-    tree: KinematicTree,
-    T_world_link: Float[Tensor, "*b n_links 4 4"],
-    valid: Bool[Tensor, " n_links"],
+    tree: KinematicTree, T_world_link: Float[Tensor, "*b n_links 4 4"], valid: Bool[Tensor, " n_links"],
     q: Float[Tensor, "*b n_dof"],
 ) -> Float[Tensor, "*b n_dof"]:
     """Joints that reproduce the relative poses of neighbouring known links, inside their limits.
@@ -106,8 +104,7 @@ def _joint_value(
 
 
 def _independent(
-    tree: KinematicTree, x: Float[Tensor, "*b n_joints"], q: Float[Tensor, "*b n_dof"],
-    known: Bool[Tensor, " n_joints"],
+    tree: KinematicTree, x: Float[Tensor, "*b n_joints"], q: Float[Tensor, "*b n_dof"], known: Bool[Tensor, " n_joints"]
 ) -> Float[Tensor, "*b n_dof"]:
     """Independent joints that fit all known joints best; the fit is exact without couplings."""
     rows = tree.coupling[known]

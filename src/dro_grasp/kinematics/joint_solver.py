@@ -158,12 +158,8 @@ class _Result:
 
 @torch.no_grad()
 def solve_joints(
-    tree: KinematicTree,
-    targets: Targets,
-    T_world_wrist: Float[Tensor, "*b 4 4"],
-    q: Float[Tensor, "*b n_dof"],
-    movable: Bool[Tensor, " n_dof"] | None = None,
-    config: JointSolverConfig | None = None,
+    tree: KinematicTree, targets: Targets, T_world_wrist: Float[Tensor, "*b 4 4"], q: Float[Tensor, "*b n_dof"],
+    movable: Bool[Tensor, " n_dof"] | None = None, config: JointSolverConfig | None = None,
 ) -> JointSolution:
     """Wrist pose and joints that bring points on links closest to target positions.
 
@@ -262,9 +258,7 @@ def _problem(
     )
 
 
-def _state(
-    problem: _Problem, T: Float[Tensor, "b 4 4"], q: Float[Tensor, "b n_dof"], config: JointSolverConfig
-) -> _State:
+def _state(problem: _Problem, T: Float[Tensor, "b 4 4"], q: Float[Tensor, "b n_dof"], config: JointSolverConfig) -> _State:
     """Kinematics, residuals and their derivative, all in the wrist frame, where the wrist Jacobian is simplest."""
     poses = problem.tree.forward(q)
     points = apply(poses[:, problem.links], problem.local)

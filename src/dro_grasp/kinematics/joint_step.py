@@ -48,13 +48,8 @@ class _Quadratic:
 
 
 def best_step(
-    jacobian: Float[Tensor, "b p k"],
-    residual: Float[Tensor, "b k"],
-    lower: Float[Tensor, "b p"],
-    upper: Float[Tensor, "b p"],
-    damping: Float[Tensor, " b"],
-    sharpness: Float[Tensor, " b"] | None = None,
-    config: StepConfig | None = None,
+    jacobian: Float[Tensor, "b p k"], residual: Float[Tensor, "b k"], lower: Float[Tensor, "b p"], upper: Float[Tensor, "b p"],
+    damping: Float[Tensor, " b"], sharpness: Float[Tensor, " b"] | None = None, config: StepConfig | None = None,
 ) -> Float[Tensor, "b p"]:
     """The step that brings all points closest to their targets, to first order.
 
@@ -81,8 +76,7 @@ def best_step(
 
 
 def _model(
-    jacobian: Float[Tensor, "b p k"], left: Float[Tensor, "b k"], sharpness: Float[Tensor, " b"] | None,
-    config: StepConfig,
+    jacobian: Float[Tensor, "b p k"], left: Float[Tensor, "b k"], sharpness: Float[Tensor, " b"] | None, config: StepConfig
 ) -> tuple[Float[Tensor, "b p p"], Float[Tensor, "b p"]]:
     """Curvature H and slope g of the sum of norms at the residuals `left`.
 
@@ -162,9 +156,7 @@ def _pass(
     return step, next_lower, next_upper, changed
 
 
-def _solve_free(
-    quadratic: _Quadratic, at_lower: Bool[Tensor, "b p"], at_upper: Bool[Tensor, "b p"]
-) -> Float[Tensor, "b p"]:
+def _solve_free(quadratic: _Quadratic, at_lower: Bool[Tensor, "b p"], at_upper: Bool[Tensor, "b p"]) -> Float[Tensor, "b p"]:
     """Minimum over the free unknowns, with the others at their bounds.
 
     Rows and columns of held unknowns become those of the identity, so that all problems of the batch keep one size.

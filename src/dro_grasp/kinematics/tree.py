@@ -191,9 +191,7 @@ class KinematicTree:
         return linear, angular
 
     def point_jacobian(
-        self,
-        T_world_link: Float[Tensor, "*batch n_links 4 4"],
-        points: Float[Tensor, "*batch n_points 3"],
+        self, T_world_link: Float[Tensor, "*batch n_links 4 4"], points: Float[Tensor, "*batch n_points 3"],
         links: Int[Tensor, " n_points"],
     ) -> Float[Tensor, "*batch n_points 3 n_dof"]:
         """Derivative of world points, each fixed to a link, with respect to the independent joints.

@@ -42,9 +42,7 @@ class SurfaceNetwork(nn.Module):
         with torch.no_grad():
             self.leave.bias[0] = 1.0
 
-    def forward(
-        self, guessed: Float[Tensor, "*n guesses"], features: Float[Tensor, "*n features"]
-    ) -> Float[Tensor, "*n"]:
+    def forward(self, guessed: Float[Tensor, "*n guesses"], features: Float[Tensor, "*n features"]) -> Float[Tensor, "*n"]:
         """Signed distances to the surface [m].
 
         Args:

@@ -37,10 +37,7 @@ class DistanceHead(nn.Module):
             self.last.bias.fill_(float(inverse_softplus(torch.tensor(initial_distance))))
 
     def forward(
-        self,
-        hand: Float[Tensor, "b n width"],
-        obj: Float[Tensor, "b m width"],
-        base: Float[Tensor, "b n m"] | None = None,
+        self, hand: Float[Tensor, "b n width"], obj: Float[Tensor, "b m width"], base: Float[Tensor, "b n m"] | None = None
     ) -> Float[Tensor, "b n m"]:
         """Distances [m].
 
@@ -94,12 +91,8 @@ class _PairLayers(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,
-        hand: Float[Tensor, "2 b n h"],
-        obj: Float[Tensor, "2 b m h"],
-        weight: Float[Tensor, "k h"],
-        bias: Float[Tensor, " k"],
-        last: Float[Tensor, " k"],
+        ctx: Any, hand: Float[Tensor, "2 b n h"], obj: Float[Tensor, "2 b m h"], weight: Float[Tensor, "k h"],
+        bias: Float[Tensor, " k"], last: Float[Tensor, " k"],
     ) -> Float[Tensor, "b n m"]:
         ctx.save_for_backward(hand, obj, weight, bias, last)
         out = hand.new_empty(*hand.shape[1:3], obj.shape[2])

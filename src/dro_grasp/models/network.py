@@ -101,12 +101,8 @@ class DistanceNetwork(nn.Module):
         return torch.autocast(like.device.type, torch.bfloat16) if self.mixed else nullcontext()
 
     def forward(
-        self,
-        hand: Float[Tensor, "b n 3"],
-        obj: Float[Tensor, "b m 3"],
-        grasp: Float[Tensor, "b n 3"],
-        generator: torch.Generator,
-        columns: int | None = None,
+        self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], grasp: Float[Tensor, "b n 3"],
+        generator: torch.Generator, columns: int | None = None,
     ) -> NetworkOutput:
         """One training pass: z comes from the true grasp.
 
@@ -175,9 +171,7 @@ class DistanceNetwork(nn.Module):
         centred = points - centre[:, None]
         return centred @ rotation if self.config.placed else centred
 
-    def sample_latent(
-        self, num: int, generator: torch.Generator, temperature: float = 1.0
-    ) -> Float[Tensor, "num latent"]:
+    def sample_latent(self, num: int, generator: torch.Generator, temperature: float = 1.0) -> Float[Tensor, "num latent"]:
         """Draws that `predict` turns into z, on the network's device; without a learned prior they are z.
 
         Their standard deviation is `temperature`: 1 as in training, 0 for the likeliest z.
@@ -186,11 +180,7 @@ class DistanceNetwork(nn.Module):
         return noise.to(self.head.first.weight.device)
 
     def sample_placements(
-        self,
-        hand: Float[Tensor, "n 3"],
-        obj: Float[Tensor, "m 3"],
-        rotations: Float[Tensor, "r 3 3"],
-        num: int,
+        self, hand: Float[Tensor, "n 3"], obj: Float[Tensor, "m 3"], rotations: Float[Tensor, "r 3 3"], num: int,
         generator: torch.Generator,
     ) -> tuple[Float[Tensor, "num 3 3"], Float[Tensor, "num 3"]]:
         """Rotations of the hand's axes, and positions of the grasp centre in them about the object's centre [m].

@@ -60,13 +60,8 @@ class PlacementPrior(nn.Module):
         return torch.logsumexp(torch.log_softmax(logits, -1) + normal.sum(-1), -1), score
 
     def sample(
-        self,
-        obj: Float[Tensor, "m 3"],
-        hand: Float[Tensor, " c"],
-        rotations: Float[Tensor, "r 3 3"],
-        num: int,
-        generator: torch.Generator,
-        temperature: float,
+        self, obj: Float[Tensor, "m 3"], hand: Float[Tensor, " c"], rotations: Float[Tensor, "r 3 3"], num: int,
+        generator: torch.Generator, temperature: float,
     ) -> tuple[Float[Tensor, "num 3 3"], Float[Tensor, "num 3"]]:
         """Choose rotations by their scores and draw a position of the grasp centre for each.
 

@@ -52,8 +52,7 @@ def box(size: Point, at: Point = (0, 0, 0)) -> trimesh.Trimesh:
 
 
 def frustum(
-    radii: tuple[float, float], heights: tuple[float, float], at: Point = (0, 0, 0), axis: str = "z",
-    corners: int = SEGMENTS,
+    radii: tuple[float, float], heights: tuple[float, float], at: Point = (0, 0, 0), axis: str = "z", corners: int = SEGMENTS
 ) -> trimesh.Trimesh:
     """A cone frustum between two heights along an axis [m]; equal radii make a cylinder."""
     angle = np.linspace(0, 2 * np.pi, corners, endpoint=False)

@@ -32,9 +32,7 @@ class StartConfig:
     """Steps of the approach along the palm direction."""
 
 
-def start_joints(
-    hand: Hand, n: int, config: StartConfig, generator: torch.Generator
-) -> Float[Tensor, "n n_dof"]:
+def start_joints(hand: Hand, n: int, config: StartConfig, generator: torch.Generator) -> Float[Tensor, "n n_dof"]:
     """Partly closed hands with some noise on every joint, within limits [rad or m]."""
     low, high = config.openness
     share = low + (high - low) * torch.rand(n, 1, generator=generator)
@@ -47,12 +45,7 @@ def start_joints(
 
 
 def starts(
-    hand: Hand,
-    field: DistanceField,
-    surface: Float[Tensor, "k 3"],
-    centre: Float[Tensor, 3],
-    n: int,
-    config: StartConfig,
+    hand: Hand, field: DistanceField, surface: Float[Tensor, "k 3"], centre: Float[Tensor, 3], n: int, config: StartConfig,
     generator: torch.Generator,
 ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n n_dof"]]:
     """Wrist poses and joints to start from.

@@ -93,9 +93,7 @@ def field_of(obj: ObjectModel) -> DistanceField:
     return obj.distance_field
 
 
-def synthesize(
-    hand: Hand, obj: ObjectModel, num: int, seed: int = 0, config: SynthesisConfig | None = None
-) -> GraspBatch:
+def synthesize(hand: Hand, obj: ObjectModel, num: int, seed: int = 0, config: SynthesisConfig | None = None) -> GraspBatch:
     """Synthesise grasps of an object by a hand, lowest energy first, not evaluated.
 
     Args:
@@ -129,13 +127,8 @@ def synthesize(
 
 
 def _batch(
-    hand: Hand,
-    obj: ObjectModel,
-    T: Float[Tensor, "n 4 4"],
-    q: Float[Tensor, "n n_dof"],
-    terms: Float[Tensor, "n 6"],
-    depths: Float[Tensor, " n"],
-    seed: int,
+    hand: Hand, obj: ObjectModel, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], terms: Float[Tensor, "n 6"],
+    depths: Float[Tensor, " n"], seed: int,
 ) -> GraspBatch:
     """Grasps with rotations orthonormal to rounding, lowest energy first."""
     T[:, :3, :3] = torch.as_tensor(roma.special_procrustes(T[:, :3, :3]))
@@ -151,10 +144,7 @@ def depth(energy: GraspEnergy, state: State) -> Float[Tensor, " n"]:
 
 
 def optimise(
-    energy: GraspEnergy,
-    T: Float[Tensor, "n 4 4"],
-    q: Float[Tensor, "n n_dof"],
-    config: SynthesisConfig,
+    energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], config: SynthesisConfig,
     generator: torch.Generator,
 ) -> State:
     """Run n grasps from where they start to the end of the annealing.
@@ -185,11 +175,7 @@ def optimise(
 
 
 def propose(
-    energy: GraspEnergy,
-    state: State,
-    squares: Float[Tensor, "n k"],
-    pace: float,
-    config: SynthesisConfig,
+    energy: GraspEnergy, state: State, squares: Float[Tensor, "n k"], pace: float, config: SynthesisConfig,
     generator: torch.Generator,
 ) -> State:
     """A step down the gradient, scaled per coordinate, with some contacts moved to other candidates."""
@@ -204,9 +190,7 @@ def propose(
     return State(T, q, contacts, state.slots, energy(T, q, contacts))
 
 
-def switched(
-    energy: GraspEnergy, state: State, probability: float, generator: torch.Generator
-) -> Int[Tensor, "n c"]:
+def switched(energy: GraspEnergy, state: State, probability: float, generator: torch.Generator) -> Int[Tensor, "n c"]:
     """Contacts with one of some grasps drawn anew from its slot."""
     n, c = state.contacts.shape
     slot = torch.randint(c, (n,), generator=generator)

@@ -79,9 +79,7 @@ def _middle(obj: ObjectModel) -> Float[np.ndarray, "3"]:
     return (obj.cloud.min(0).astype(np.float64) + obj.cloud.max(0)) / 2
 
 
-def _looking_at(
-    middle: Float[np.ndarray, "3"], towards: Float[np.ndarray, "3"], distance: float
-) -> Float[np.ndarray, "4 4"]:
+def _looking_at(middle: Float[np.ndarray, "3"], towards: Float[np.ndarray, "3"], distance: float) -> Float[np.ndarray, "4 4"]:
     """Camera pose with z from the camera to the middle."""
     helper = np.eye(3)[np.abs(towards).argmin()]
     x = np.cross(helper, -towards)

@@ -64,10 +64,7 @@ def load_scan(path: Path, T_frame_camera: Float[np.ndarray, "4 4"], scale: float
 
 
 def scanned_object(
-    name: str,
-    points: Float[np.ndarray, "n 3"],
-    T_frame_camera: Float[np.ndarray, "4 4"] | None = None,
-    denoise: bool = True,
+    name: str, points: Float[np.ndarray, "n 3"], T_frame_camera: Float[np.ndarray, "4 4"] | None = None, denoise: bool = True,
     complete: bool = True,
 ) -> ObjectModel:
     """An object from the points of a camera at the origin; its grasps are in the given frame.

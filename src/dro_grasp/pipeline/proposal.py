@@ -75,14 +75,8 @@ class Proposal:
 
 
 def propose(
-    problem: GraspProblem,
-    network: DistanceNetwork,
-    num: int,
-    generator: torch.Generator,
-    direction: Direction | None = None,
-    config: ProposalConfig | None = None,
-    watch: Stopwatch | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    problem: GraspProblem, network: DistanceNetwork, num: int, generator: torch.Generator, direction: Direction | None = None,
+    config: ProposalConfig | None = None, watch: Stopwatch | None = None, progress: Callable[[int, int], None] | None = None,
 ) -> Proposal:
     """Candidates from the network.
 

@@ -28,12 +28,8 @@ class Camera:
 
     @staticmethod
     def around(
-        points: Num[np.ndarray, "n 3"],
-        direction: tuple[float, float, float],
-        up: tuple[float, float, float] = (0.0, 0.0, 1.0),
-        field_of_view: float = 0.6,
-        aspect: float = 4 / 3,
-        margin: float = 0.06,
+        points: Num[np.ndarray, "n 3"], direction: tuple[float, float, float], up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+        field_of_view: float = 0.6, aspect: float = 4 / 3, margin: float = 0.06,
     ) -> Camera:
         """The nearest camera in a direction that has all points in its picture.
 

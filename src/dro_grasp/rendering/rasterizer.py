@@ -51,14 +51,8 @@ class _Canvas:
 
 
 def render(
-    meshes: Sequence[Mesh],
-    camera: Camera,
-    width: int = 640,
-    height: int = 480,
-    *,
-    background: Colour = WHITE,
-    oversampling: int = 2,
-    style: Style | None = None,
+    meshes: Sequence[Mesh], camera: Camera, width: int = 640, height: int = 480, *, background: Colour = WHITE,
+    oversampling: int = 2, style: Style | None = None,
 ) -> UInt8[np.ndarray, "{height} {width} 3"]:
     """Draw meshes with perspective, smooth shading and soft outlines.
 

@@ -68,9 +68,7 @@ class Scene:
         names = [self.model.actuator(i).name.removeprefix(PREFIX) for i in range(self.model.nu)]
         return np.array([self.hand.tree.joint_names.index(n) for n in names])
 
-    def qpos(
-        self, T_object_wrist: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"]
-    ) -> Float[np.ndarray, "n nq"]:
+    def qpos(self, T_object_wrist: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"]) -> Float[np.ndarray, "n nq"]:
         """Configurations of the hand at these joints and the object at its pose in the wrist frame."""
         n = len(joints)
         q = np.tile(self.model.qpos0, (n, 1))

@@ -30,12 +30,7 @@ CHUNK = 64
 
 
 def simulate(
-    hand: Hand,
-    obj: ObjectModel,
-    grasps: GraspBatch,
-    protocol: str | Protocol = "dro",
-    *,
-    workers: int | None = None,
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = "dro", *, workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> TrialResult:
     """Evaluate grasps of one object in MuJoCo.

@@ -32,14 +32,8 @@ NAMED = 4
 
 
 def train(
-    bundle: Bundle,
-    network: NetworkConfig,
-    config: TrainConfig,
-    folder: Path,
-    pretrained: DistanceNetwork | None = None,
-    report: Report | None = None,
-    name: str = "trained",
-    initial: DistanceNetwork | None = None,
+    bundle: Bundle, network: NetworkConfig, config: TrainConfig, folder: Path, pretrained: DistanceNetwork | None = None,
+    report: Report | None = None, name: str = "trained", initial: DistanceNetwork | None = None,
 ) -> DistanceNetwork:
     """Train on a bundle.
 
@@ -167,9 +161,7 @@ def step_losses(
     return {"total": total, **parts, "nats": nats.sum(-1).mean()}
 
 
-def _clouds(
-    groups: list[HandSamples],
-) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b m 3"], Float[Tensor, "b n 3"]]:
+def _clouds(groups: list[HandSamples]) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b m 3"], Float[Tensor, "b n 3"]]:
     """The network's inputs: open hands, objects, grasps [m]."""
     placed, obj, grasp = (torch.cat([getattr(g, n) for g in groups]) for n in ("placed", "obj", "grasp"))
     return placed, obj, grasp

@@ -10,9 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 
-def distance_loss(
-    predicted: Float[Tensor, "b n m"], true: Float[Tensor, "b n m"]
-) -> Float[Tensor, ""]:
+def distance_loss(predicted: Float[Tensor, "b n m"], true: Float[Tensor, "b n m"]) -> Float[Tensor, ""]:
     """Mean absolute error of D(R,O) [m]. Source: paper section III-E."""
     return (predicted - true).abs().mean()
 
@@ -56,9 +54,7 @@ def penetration_loss(
 
 
 def divergence(
-    mean: Float[Tensor, "b d"],
-    log_variance: Float[Tensor, "b d"],
-    prior_mean: Float[Tensor, "b d"] | float = 0.0,
+    mean: Float[Tensor, "b d"], log_variance: Float[Tensor, "b d"], prior_mean: Float[Tensor, "b d"] | float = 0.0,
     prior_log_variance: Float[Tensor, "b d"] | float = 0.0,
 ) -> Float[Tensor, "b d"]:
     """KL divergence of the posterior from the prior, N(0, I) by default [nat], per grasp and latent dimension."""
@@ -84,11 +80,8 @@ def divergence_loss(
 
 
 def contrastive_loss(
-    features_a: Float[Tensor, "b n c"],
-    features_b: Float[Tensor, "b n c"],
-    points_b: Float[Tensor, "b n 3"],
-    temperature: float,
-    sharpness: float,
+    features_a: Float[Tensor, "b n c"], features_b: Float[Tensor, "b n c"], points_b: Float[Tensor, "b n 3"],
+    temperature: float, sharpness: float,
 ) -> Float[Tensor, " b"]:
     """Configuration-invariant contrastive loss, mean over points.
 

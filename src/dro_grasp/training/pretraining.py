@@ -23,11 +23,7 @@ from dro_grasp.training.samples import SampleSource, random_turns
 
 
 def pretrain(
-    bundle: Bundle,
-    network: NetworkConfig,
-    config: PretrainConfig,
-    folder: Path,
-    report: Report | None = None,
+    bundle: Bundle, network: NetworkConfig, config: PretrainConfig, folder: Path, report: Report | None = None
 ) -> DistanceNetwork:
     """Pretrain the hand encoder on the bundle's grasps.
 
@@ -61,11 +57,7 @@ def pretrain(
 
 
 def pretrain_motion(
-    model: DistanceNetwork,
-    bundle: Bundle,
-    config: MotionConfig,
-    folder: Path,
-    report: Report | None = None,
+    model: DistanceNetwork, bundle: Bundle, config: MotionConfig, folder: Path, report: Report | None = None
 ) -> DistanceNetwork:
     """Train z to encode how hands move, without objects; the hand encoder stays as it is.
 

@@ -46,11 +46,7 @@ class SampleSource:
     """Draws samples of the bundle's hands; all randomness comes from the generator of each call."""
 
     def __init__(
-        self,
-        bundle: Bundle,
-        network: NetworkConfig,
-        augmentation: AugmentationConfig,
-        device: torch.device | str = "cpu",
+        self, bundle: Bundle, network: NetworkConfig, augmentation: AugmentationConfig, device: torch.device | str = "cpu"
     ) -> None:
         """Put hands, grasps and objects on the device on which samples are drawn.
 

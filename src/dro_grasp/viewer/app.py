@@ -33,13 +33,8 @@ class GraspViewer(ServedPage):
     """
 
     def __init__(
-        self,
-        hand: Hand,
-        obj: ObjectModel,
-        grasps: GraspBatch,
-        predicted_points: Float[Tensor, "n n_points 3"] | None = None,
-        port: int = 8080,
-        host: str = HOST,
+        self, hand: Hand, obj: ObjectModel, grasps: GraspBatch, predicted_points: Float[Tensor, "n n_points 3"] | None = None,
+        port: int = 8080, host: str = HOST,
     ) -> None:
         """Start serving.
 
@@ -102,12 +97,8 @@ class GraspViewer(ServedPage):
 
 
 def view_grasps(
-    hand: Hand,
-    obj: ObjectModel,
-    grasps: GraspBatch,
-    predicted_points: Float[Tensor, "n n_points 3"] | None = None,
-    port: int = 8080,
-    host: str = HOST,
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, predicted_points: Float[Tensor, "n n_points 3"] | None = None,
+    port: int = 8080, host: str = HOST,
 ) -> None:
     """Serve the viewer until Ctrl-C; arguments as for `GraspViewer`."""
     serve(GraspViewer(hand, obj, grasps, predicted_points, port, host))

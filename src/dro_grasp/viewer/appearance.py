@@ -60,8 +60,7 @@ def link_shapes(hand: Hand) -> list[tuple[int, Float[np.ndarray, "_ 3"], Int[np.
 
 
 def hand_meshes(
-    hand: Hand, joints: Float[Tensor, " n_dof"], T_object_wrist: Float[Tensor, "4 4"] | None = None,
-    *, above_palm: bool = True,
+    hand: Hand, joints: Float[Tensor, " n_dof"], T_object_wrist: Float[Tensor, "4 4"] | None = None, *, above_palm: bool = True
 ) -> list[Mesh]:
     """The posed hand in the object's frame; without a description, its surface points.
 
@@ -92,8 +91,7 @@ def object_meshes(obj: ObjectModel) -> list[Mesh]:
 
 
 def best_camera(
-    hand: Hand, joints: Float[Tensor, " n_dof"], T_object_wrist: Float[Tensor, "4 4"], obj: ObjectModel,
-    aspect: float = 4 / 3,
+    hand: Hand, joints: Float[Tensor, " n_dof"], T_object_wrist: Float[Tensor, "4 4"], obj: ObjectModel, aspect: float = 4 / 3
 ) -> Camera:
     """The camera, out of many around a grasp, that shows most of the object and of the fingers."""
     of_hand = hand.points(joints, T_object_wrist).double().numpy()
@@ -116,9 +114,7 @@ def _directions() -> tuple[tuple[float, float, float], ...]:
     return tuple(row for row in rows if LOWEST_VIEW < row[2] < HIGHEST_VIEW)
 
 
-def _clarity(
-    points: Float[np.ndarray, "n 3"], owner: Int[np.ndarray, " n"], direction: tuple[float, float, float]
-) -> float:
+def _clarity(points: Float[np.ndarray, "n 3"], owner: Int[np.ndarray, " n"], direction: tuple[float, float, float]) -> float:
     """Number of cells of a coarse picture that show the object or the fingers; the scarcer of the two counts more.
 
     Args:

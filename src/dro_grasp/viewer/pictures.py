@@ -56,12 +56,7 @@ class PictureStyle:
 
 
 def draw_grasps(
-    hand: Hand,
-    obj: ObjectModel,
-    grasps: GraspBatch,
-    path: Path | str,
-    count: int = MAX_PICTURES,
-    columns: int = COLUMNS,
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, path: Path | str, count: int = MAX_PICTURES, columns: int = COLUMNS,
     style: PictureStyle | None = None,
 ) -> None:
     """Write a PNG with pictures of the first `count` grasps, captioned with score and trial outcome.

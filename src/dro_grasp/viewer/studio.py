@@ -71,12 +71,7 @@ class Studio(ServedPage):
     """
 
     def __init__(
-        self,
-        hand: str = "allegro",
-        obj: str = "rubber_duck",
-        weights: str | None = None,
-        port: int = 8080,
-        host: str = HOST,
+        self, hand: str = "allegro", obj: str = "rubber_duck", weights: str | None = None, port: int = 8080, host: str = HOST
     ) -> None:
         """Start serving.
 
@@ -105,14 +100,8 @@ class Studio(ServedPage):
         self._folder.cleanup()
 
     def generate(
-        self,
-        hand: str,
-        obj: str,
-        num: int = 16,
-        direction: str = ANY,
-        temperature: float | None = None,
-        protocol: str = "strict",
-        candidates: int = 4,
+        self, hand: str, obj: str, num: int = 16, direction: str = ANY, temperature: float | None = None,
+        protocol: str = "strict", candidates: int = 4,
     ) -> ShownGrasps:
         """Predict, refine, rank and evaluate, then show the best.
 

@@ -89,10 +89,7 @@ class Bundle:
 
 
 def write_bundle(
-    path: Path | str,
-    hands: Sequence[Hand],
-    objects: Mapping[str, ObjectCloud],
-    grasps: Sequence[GraspBatch],
+    path: Path | str, hands: Sequence[Hand], objects: Mapping[str, ObjectCloud], grasps: Sequence[GraspBatch],
     splits: Set[str] = TRAINING,
 ) -> Bundle:
     """Write a training bundle.
@@ -197,9 +194,7 @@ def _unpack_hand(key: str, plain: dict[str, Any], tensors: Tensors) -> Hand:
     return Hand.from_tensors(plain | own)
 
 
-def _pack_grasps(
-    key: str, hand: Hand, batches: list[GraspBatch], names: list[str], splits: Set[str]
-) -> Tensors:
+def _pack_grasps(key: str, hand: Hand, batches: list[GraspBatch], names: list[str], splits: Set[str]) -> Tensors:
     if not batches:
         raise BundleError(f"no grasps of hand '{hand.name}'; synthesise some or leave the hand out")
     known = {name: i for i, name in enumerate(names)}

@@ -100,13 +100,8 @@ class DatasetReport:
 
 
 def synthesize_dataset(
-    hands: Sequence[str],
-    objects: Sequence[str],
-    grasps_per_pair: int,
-    output_dir: Path | str,
-    workers: int | Callable[[Job], Pool] = 2,
-    seed: int = 0,
-    config: EngineConfig | None = None,
+    hands: Sequence[str], objects: Sequence[str], grasps_per_pair: int, output_dir: Path | str,
+    workers: int | Callable[[Job], Pool] = 2, seed: int = 0, config: EngineConfig | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> DatasetReport:
     """Fill a folder with valid grasps of every hand on every object.

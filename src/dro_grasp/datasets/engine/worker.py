@@ -130,11 +130,7 @@ def make_shard(job: Job, task: Task) -> FinishedShard:
 
 
 def valid_grasps(
-    hand: Hand,
-    obj: ObjectModel,
-    seed: int,
-    config: EngineConfig,
-    candidates: int | None = None,
+    hand: Hand, obj: ObjectModel, seed: int, config: EngineConfig, candidates: int | None = None,
     earlier: GraspBatch | None = None,
 ) -> tuple[GraspBatch, Yield]:
     """Candidates of one seed that pass the protocol, near-duplicates once, best energy first.
