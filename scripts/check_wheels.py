@@ -23,7 +23,7 @@ def resolve(requirements: list[str], version: str) -> str:
     with TemporaryDirectory() as folder:
         done = subprocess.run(
             [sys.executable, "-m", "pip", "install", "--dry-run", "--quiet", "--ignore-installed", "--only-binary", ":all:",
-             "--retries", "1", "--timeout", "20", "--python-version", version, "--target", folder, *requirements],
+             "--retries", "3", "--timeout", "20", "--python-version", version, "--target", folder, *requirements],
             capture_output=True, text=True)
     if done.returncode == 0:
         return ""

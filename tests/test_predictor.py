@@ -150,12 +150,12 @@ def test_the_temperature_scales_what_z_is_made_of(weights: str, ball: ObjectMode
     torch.testing.assert_close(drawn[None, cloud], drawn[0.5, ball], msg="bare clouds get surer grasps")
 
 
-@pytest.mark.parametrize("direction", [(0.0, 0.0, -5.0), (0.0, 0.0, 1e-3), (1.0, 2.0, 2.0)])
+@pytest.mark.parametrize("direction", [(0, 0, -1), (0.0, 0.0, -5.0), (0.0, 0.0, 1e-3), (1.0, 2.0, 2.0)])
 def test_placements_face_the_direction_at_any_roll(
     direction: tuple[float, float, float]
 ) -> None:
     turns = wrist_rotations(HAND, 400, direction, math.radians(5), torch.Generator().manual_seed(0))
-    wanted = torch.nn.functional.normalize(torch.tensor(direction), dim=0)
+    wanted = torch.nn.functional.normalize(torch.tensor(direction, dtype=torch.float32), dim=0)
     angles = torch.acos((turns @ HAND.palm_direction_wrist @ wanted).clamp(-1, 1))
     # Two normal tilts of 5 degrees: their length is Rayleigh distributed.
     expected = math.radians(5) * math.sqrt(math.pi / 2)

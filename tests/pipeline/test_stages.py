@@ -1,0 +1,66 @@
+"""The stages between proposal and trial: what they share, what they refuse, what they leave alone."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+import torch
+
+from dro_grasp.energy.grasp_energy import EnergyConfig
+from dro_grasp.energy.object_energy import evaluate_nearest, object_energy
+from dro_grasp.errors import GraspFileError
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.library import load_hand
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
+from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.pipeline.stages import complete, evaluate, rank, refine, scored
+from dro_grasp.pipeline.stopwatch import Stopwatch
+from tests.helpers.toy_hand import toy_hand
+
+HAND, CAN = load_hand("gripper3"), load_object("can")
+PROBLEM = GraspProblem(HAND, CAN)
+
+
+@pytest.fixture(scope="module")
+def grasps() -> GraspBatch:
+    return synthesize(HAND, CAN, 6, 0, SynthesisConfig(batch_size=6, steps=20))
+
+
+@pytest.mark.parametrize("stage", [complete, refine, scored, rank, evaluate])
+def test_a_stage_refuses_grasps_of_another_hand(stage, grasps: GraspBatch) -> None:
+    with pytest.raises(GraspFileError, match="these grasps are for hand 'gripper3'"):
+        stage(GraspProblem(toy_hand(), CAN), grasps)
+
+
+def test_weights_share_geometry_and_mean_what_a_fresh_energy_means(grasps: GraspBatch) -> None:
+    configs = EnergyConfig(), EnergyConfig(penetration=500.0, hand_points=100)
+    first, second = (PROBLEM.energy(config) for config in configs)
+    assert first.candidates is second.candidates
+    assert PROBLEM.energy(configs[0]) is first
+    for config, shared in zip(configs, (first, second), strict=True):
+        fresh = object_energy(HAND, CAN, config)
+        terms = [evaluate_nearest(e, grasps.T_object_wrist, grasps.joints).terms for e in (shared, fresh)]
+        assert torch.equal(*terms)
+
+
+def test_stages_return_new_grasps_and_leave_the_given_ones(grasps: GraspBatch) -> None:
+    before = grasps.T_object_wrist.clone()
+    moved = refine(PROBLEM, grasps)
+    assert torch.equal(grasps.T_object_wrist, before)
+    assert not torch.equal(moved.T_object_wrist, before)
+    assert bool(moved.states_closing.all())
+    ranked = rank(PROBLEM, moved)
+    assert ranked.score.tolist() == sorted(scored(PROBLEM, moved).score.tolist(), reverse=True)
+    assert not moved.evaluated.any()
+    assert bool(evaluate(PROBLEM, ranked[:2], workers=1).evaluated.all())
+
+
+def test_a_stopwatch_adds_up_and_lists_what_never_ran() -> None:
+    watch = Stopwatch("slept", "never")
+    for _ in range(2):
+        with watch("slept"):
+            time.sleep(0.01)
+    assert watch.seconds["never"] == 0
+    assert watch.seconds["slept"] >= 0.02
