@@ -221,7 +221,7 @@ def _check_kinds(operation: Any, leaves: list[Any], result_is_ours: bool) -> Non
                 here, there = (DEVICE, "cpu") if result_is_ours else ("cpu", DEVICE)
                 raise RuntimeError(f"Expected a '{here}' device type for generator but found '{there}' ({operation})")
         elif type(x) is not DeviceTensor and x.device.type == DEVICE:
-            raise NotImplementedError(f"a meta tensor without values came to {operation}; the fake device missed its making")
+            raise RuntimeError(f"a meta tensor without values came to {operation}; the fake device missed its making")
 
 
 def _check_mixture(operation: Any, form: _Form, args: tuple, kwargs: dict[str, Any], written: list[Any]) -> None:
@@ -241,7 +241,7 @@ def _check_mixture(operation: Any, form: _Form, args: tuple, kwargs: dict[str, A
 def _same_objects(result: Any, written: list[Any]) -> Any:
     """The written arguments themselves, since callers go on with those."""
     if any(type(x) is DeviceTensor and x.shape != x.held.shape for x in written):
-        raise NotImplementedError("the fake device cannot resize a tensor that is written to")
+        raise RuntimeError("the fake device cannot resize a tensor that is written to")
     if result is None:
         return None
     return written[0] if len(written) == 1 else tuple(written)
