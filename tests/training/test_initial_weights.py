@@ -72,6 +72,7 @@ def test_weights_of_another_configuration_are_refused(bundle: Bundle, tmp_path: 
     other = dataclasses.replace(TINY, width=20)
     refused(r"'given' do not fit this network: .*final\.linear\.weight has shape \(20, 40\), not \(16, 40\)", TINY,
             pretrained=other)
+    refused("neighbours of each point", dataclasses.replace(TINY, neighbours=TINY.neighbours + 1), pretrained=TINY)
     refused(r"hold a pretrained motion, but z does not move the hand", TINY, pretrained=MOVING)
     refused(r"code\.4\.weight has shape", dataclasses.replace(MOVING, latent=6), pretrained=MOVING)
     assert not (tmp_path / "run").exists()

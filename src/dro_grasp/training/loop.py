@@ -118,6 +118,9 @@ def take_pretrained(model: DistanceNetwork, pretrained: DistanceNetwork) -> None
     Raises:
         WeightsError: They do not fit, or there is a pretrained motion and z does not move the hand.
     """
+    if pretrained.config.neighbours != model.config.neighbours:
+        raise WeightsError(f"the hand encoder of '{pretrained.name}' looks at {pretrained.config.neighbours} neighbours of each "
+                           f"point, this network at {model.config.neighbours}; pretrain with the network that is trained")
     take_weights(model.hand_encoder, pretrained.hand_encoder, pretrained.name)
     if pretrained.motion is not None and model.motion is None:
         raise WeightsError(f"weights '{pretrained.name}' hold a pretrained motion, but z does not move the hand in this "
