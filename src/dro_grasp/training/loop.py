@@ -119,7 +119,7 @@ def take_pretrained(model: DistanceNetwork, pretrained: DistanceNetwork) -> None
         WeightsError: They do not fit, or there is a pretrained motion and z does not move the hand.
     """
     if pretrained.config.neighbours != model.config.neighbours:
-        raise WeightsError(f"the hand encoder of '{pretrained.name}' looks at {pretrained.config.neighbours} neighbours of each "
+        raise WeightsError(f"the hand encoder of '{pretrained.name}' sees {pretrained.config.neighbours} neighbours of each "
                            f"point, this network at {model.config.neighbours}; pretrain with the network that is trained")
     take_weights(model.hand_encoder, pretrained.hand_encoder, pretrained.name)
     if pretrained.motion is not None and model.motion is None:
