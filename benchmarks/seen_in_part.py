@@ -15,7 +15,7 @@ import torch
 from report import emit
 from synthesis import HANDS
 
-from dro_grasp.energy.object_energy import object_energy
+from dro_grasp.energy.grasp_energy import GraspEnergy
 from dro_grasp.evaluation.success_rates import KEPT, pair_seed
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
@@ -48,7 +48,7 @@ def outcomes(
         success = simulate(hand, obj, grasps, name).success.float()
         found |= {name: success, f"{name}, ranked": success[best]}
     points = hand.points(grasps.pregrasp_joints, grasps.T_object_wrist)
-    inside = -object_energy(hand, obj).field.distances(points)[0].amin(1) > DEEP
+    inside = -GraspEnergy.of_object(hand, obj).field.distances(points)[0].amin(1) > DEEP
     return found | {"begins inside": inside.float()}
 
 

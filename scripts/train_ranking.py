@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dro_grasp.energy.object_energy import evaluate_nearest, object_energy
+from dro_grasp.energy.grasp_energy import GraspEnergy
 from dro_grasp.evaluation.metrics import roc_area
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
@@ -80,8 +80,8 @@ def shaken(hand: Hand, grasps: GraspBatch, generator: torch.Generator) -> GraspB
 @torch.no_grad()
 def evaluated(hand: Hand, obj: ObjectModel, grasps: GraspBatch, known: ObjectModel) -> dict[str, Tensor]:
     """Features of grasps from the known part of the object, and outcomes of their trials on the whole object."""
-    energy = object_energy(hand, known, ScoreConfig().energy)
-    features = grasp_features(energy, grasps, evaluate_nearest(energy, grasps.T_object_wrist, grasps.joints).terms)
+    energy = GraspEnergy.of_object(hand, known, ScoreConfig().energy)
+    features = grasp_features(energy, grasps, energy(grasps.T_object_wrist, grasps.joints).terms)
     outcomes = torch.stack([simulate(hand, obj, grasps, rules).success for rules in TRIALS], 1)
     return {**features._asdict(), "outcomes": outcomes.float()}
 

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.devices import require_device
+from dro_grasp.devices import Stopwatch, require_device
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
@@ -20,7 +20,6 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.proposal import Direction, Proposal, ProposalConfig, check_temperature, propose
 from dro_grasp.pipeline.stages import above_table, complete, refine, scored
-from dro_grasp.pipeline.stopwatch import Stopwatch
 
 LARGEST_CALL = 100_000
 """Most candidates of one call; more do not fit memory."""
@@ -151,7 +150,7 @@ class GraspPredictor:
         _check_table(problem.obj, request)
         wanted, generator = request.num * request.candidates, torch.Generator().manual_seed(request.seed)
         config = self.config if request.temperature is None else replace(self.config, temperature=request.temperature)
-        watch = Stopwatch("network", "decode", "refine", "rank", device=problem.device)
+        watch = Stopwatch("network", "decode", "refine", "rank")
         refined: list[GraspBatch] = []
         proposals: list[Proposal] = []
         while sum(map(len, refined)) < wanted and len(refined) < (1 if request.table is None else config.table_rounds):

@@ -17,9 +17,9 @@ from torch import Tensor
 
 from dro_grasp.energy.grasp_energy import TERMS, EnergyConfig, Evaluation, GraspEnergy
 from dro_grasp.energy.terms import force_closure
+from dro_grasp.geometry.se3 import turned_about
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
-from dro_grasp.optimization.pose_step import moved
 from tests.helpers.energy_samples import GROUPS, PER_GROUP, Samples, branches, near_kinks, place, precise, rounded_box
 from tests.helpers.toy_hand import toy_hand
 
@@ -72,7 +72,7 @@ class Sides:
 
 def displaced(energy: GraspEnergy, samples: Samples, x: Tensor) -> Samples:
     """Samples moved by the coordinates x: translation, rotation about the pivot, joints."""
-    T = moved(samples.T, energy.pivot(samples.T), x[:, :3], x[:, 3:6])
+    T = turned_about(samples.T, energy.pivot(samples.T), x[:, :3], x[:, 3:6])
     return dataclasses.replace(samples, T=T, q=samples.q + x[:, 6:])
 
 

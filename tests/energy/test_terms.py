@@ -13,8 +13,8 @@ from torch import Tensor
 
 from dro_grasp.energy import terms as energies
 from dro_grasp.geometry.distance_field import DistanceField
+from dro_grasp.geometry.se3 import turned_about
 from dro_grasp.kinematics.tree import PRISMATIC, REVOLUTE, KinematicTree
-from dro_grasp.optimization.pose_step import moved
 from tests.helpers.energy_samples import precise, rounded_box
 from tests.helpers.toy_hand import toy_hand
 
@@ -144,8 +144,8 @@ def test_forces_on_points_become_the_gradient_by_pose_and_joints():
 
     wrenches = energies.link_wrenches(points(T, q), force, torch.eye(tree.n_links, dtype=torch.float64)[links])
     by_pose, by_joint = energies.joint_gradient(tree, T[:, None] @ tree.forward(q), wrenches, pivot)
-    by_move = numeric(lambda x: work(moved(T, pivot, x, zero), q), zero)
-    by_turn = numeric(lambda x: work(moved(T, pivot, zero, x), q), zero)
+    by_move = numeric(lambda x: work(turned_about(T, pivot, x, zero), q), zero)
+    by_turn = numeric(lambda x: work(turned_about(T, pivot, zero, x), q), zero)
     torch.testing.assert_close(by_pose, torch.cat([by_move, by_turn], -1), rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(by_joint, numeric(lambda x: work(T, x), q), rtol=1e-6, atol=1e-6)
 

@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 import torch
 
-from dro_grasp.energy.object_energy import evaluate_nearest, nearest_contacts, object_energy
+from dro_grasp.energy.grasp_energy import GraspEnergy
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
@@ -49,10 +49,10 @@ def test_the_simulator_finds_less_depth_and_more_successes(disturbed: GraspBatch
 
 def test_no_energy_rises_and_most_fall(obj: ObjectModel, disturbed: GraspBatch) -> None:
     refined = refine(GraspProblem(HAND, obj), disturbed)
-    energy = object_energy(HAND, obj, CONFIG.energy)
+    energy = GraspEnergy.of_object(HAND, obj, CONFIG.energy)
 
     def total(grasps: GraspBatch) -> torch.Tensor:
-        contacts = nearest_contacts(energy, grasps.T_object_wrist, grasps.joints, CONFIG.reach)
+        contacts = energy.nearest_contacts(grasps.T_object_wrist, grasps.joints, CONFIG.reach)
         return energy(grasps.T_object_wrist, grasps.joints, contacts).total
 
     before, after = total(disturbed), total(refined)
@@ -93,15 +93,15 @@ def test_the_batch_size_changes_nothing(disturbed: GraspBatch) -> None:
 
 def test_idle_fingers_are_left_alone() -> None:
     can = load_object("can")
-    energy = object_energy(HAND, can, CONFIG.energy)
+    energy = GraspEnergy.of_object(HAND, can, CONFIG.energy)
     far = torch.eye(4)[None].clone()
     far[:, :3, 3] = 0.06
     q = HAND.canonical_joints(0.0)[None]
-    near = nearest_contacts(energy, far, q)
+    near = energy.nearest_contacts(far, q)
     every = energy.candidates.fingers[near[0]]
-    reached = nearest_contacts(energy, far, q, reach=0.0)
+    reached = energy.nearest_contacts(far, q, reach=0.0)
     one = energy.candidates.fingers[reached[0]]
     assert len(set(every.tolist())) > 1
     assert len(set(one.tolist())) == 1  # out of reach, all slots go to the finger that is nearest
     assert len(set(reached[0].tolist())) == reached.shape[1]
-    assert evaluate_nearest(energy, far, q).total.isfinite().all()
+    assert energy(far, q).total.isfinite().all()

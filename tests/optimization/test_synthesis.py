@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from dro_grasp.energy.contact_candidates import contact_candidates
-from dro_grasp.energy.grasp_energy import link_spheres
-from dro_grasp.energy.object_energy import object_energy
+from dro_grasp.energy.grasp_energy import GraspEnergy, link_spheres
 from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.grasps.duplicates import distinct
 from dro_grasp.hands.anatomy import PALM
@@ -54,7 +53,7 @@ def test_spheres_lie_in_their_links_and_may_not_meet_across_fingers():
 
 def test_starts_face_the_object_from_all_sides_and_touch_nothing(ball):
     hand = toy_hand()
-    energy = object_energy(hand, ball)
+    energy = GraspEnergy.of_object(hand, ball)
     surface, config = torch.from_numpy(ball.cloud), StartConfig(gap=(0.002, 0.01))
     T, q = starts(hand, energy.field, surface, energy.centre, 256, config, torch.Generator().manual_seed(0))
     clearance = energy.field.distances(hand.points(q, T))[0].amin(-1)
@@ -69,7 +68,7 @@ def test_starts_face_the_object_from_all_sides_and_touch_nothing(ball):
 
 def test_energy_falls_and_limits_hold(ball):
     hand = toy_hand()
-    energy, surface = object_energy(hand, ball, SHORT.energy, SHORT.contacts), torch.from_numpy(ball.cloud)
+    energy, surface = GraspEnergy.of_object(hand, ball, SHORT.energy, SHORT.contacts), torch.from_numpy(ball.cloud)
     generator = torch.Generator().manual_seed(0)
     start = starts(hand, energy.field, surface, energy.centre, 32, SHORT.starts, generator)
     before = optimise(energy, *start, SynthesisConfig(steps=1), generator)
@@ -123,7 +122,7 @@ def test_idle_fingers_hold_nothing_and_two_always_hold():
 
 def test_energy_runs_wholly_on_the_device_it_is_told(ball):
     hand = toy_hand()
-    here, there = (object_energy(hand, ball, device=device) for device in ("cpu", "meta"))
+    here, there = (GraspEnergy.of_object(hand, ball, device=device) for device in ("cpu", "meta"))
     T, q = torch.eye(4).repeat(5, 1, 1), torch.zeros(5, hand.tree.n_dof)
     contacts = torch.zeros(5, 4, dtype=torch.int64)
     expected, found = here(T, q, contacts), there(T.to("meta"), q.to("meta"), contacts.to("meta"))

@@ -7,8 +7,8 @@ import time
 import pytest
 import torch
 
-from dro_grasp.energy.grasp_energy import EnergyConfig
-from dro_grasp.energy.object_energy import evaluate_nearest, object_energy
+from dro_grasp.devices import Stopwatch
+from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.errors import GraspFileError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand
@@ -16,7 +16,6 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import complete, evaluate, rank, refine, scored
-from dro_grasp.pipeline.stopwatch import Stopwatch
 from tests.helpers.toy_hand import toy_hand
 
 HAND, CAN = load_hand("gripper3"), load_object("can")
@@ -40,8 +39,8 @@ def test_weights_share_geometry_and_mean_what_a_fresh_energy_means(grasps: Grasp
     assert first.candidates is second.candidates
     assert PROBLEM.energy(configs[0]) is first
     for config, shared in zip(configs, (first, second), strict=True):
-        fresh = object_energy(HAND, CAN, config)
-        terms = [evaluate_nearest(e, grasps.T_object_wrist, grasps.joints).terms for e in (shared, fresh)]
+        fresh = GraspEnergy.of_object(HAND, CAN, config)
+        terms = [e(grasps.T_object_wrist, grasps.joints).terms for e in (shared, fresh)]
         assert torch.equal(*terms)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from dro_grasp.energy.object_energy import evaluate_nearest, object_energy
+from dro_grasp.energy.grasp_energy import GraspEnergy
 from dro_grasp.errors import WeightsError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
@@ -38,8 +38,8 @@ def grasps(ball: ObjectModel) -> GraspBatch:
 
 
 def features(obj: ObjectModel, grasps: GraspBatch) -> GraspFeatures:
-    energy = object_energy(HAND, obj)
-    return grasp_features(energy, grasps, evaluate_nearest(energy, grasps.T_object_wrist, grasps.joints).terms)
+    energy = GraspEnergy.of_object(HAND, obj)
+    return grasp_features(energy, grasps, energy(grasps.T_object_wrist, grasps.joints).terms)
 
 
 def test_links_are_described_at_their_point_nearest_to_a_ball(ball: ObjectModel, grasps: GraspBatch) -> None:

@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 import torch
 
-from dro_grasp.energy.object_energy import nearest_contacts, object_energy
+from dro_grasp.energy.grasp_energy import GraspEnergy
 from dro_grasp.evaluation.metrics import roc_area
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
@@ -77,8 +77,8 @@ def test_mesh_and_cloud_agree(grasps):
 
 
 def test_nearest_contacts_agree_with_a_plain_search(grasps):
-    energy = object_energy(HAND, load_object("sphere"), ScoreConfig().energy)
-    chosen = nearest_contacts(energy, grasps.T_object_wrist, grasps.joints)
+    energy = GraspEnergy.of_object(HAND, load_object("sphere"), ScoreConfig().energy)
+    chosen = energy.nearest_contacts(grasps.T_object_wrist, grasps.joints)
     candidates = energy.candidates
     for i in range(len(grasps)):
         poses = grasps.T_object_wrist[i] @ HAND.tree.forward(grasps.joints[i])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from copy import copy
 from dataclasses import dataclass
 
@@ -12,9 +13,11 @@ from torch import Tensor
 from dro_grasp.devices import on_device
 from dro_grasp.energy import terms as energies
 from dro_grasp.energy.contact_candidates import ContactCandidates, ContactConfig, contact_candidates
+from dro_grasp.energy.link_spheres import link_spheres
 from dro_grasp.geometry import se3
 from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.shape import ObjectModel
 
 TERMS = ("force_closure", "distance", "penetration", "self_penetration", "alignment", "joints")
 """Names of the terms, in the order of every array of terms."""
@@ -42,72 +45,6 @@ class EnergyConfig:
     """Number of hand points at which penetration is measured."""
     margin: float = 0.001
     """Clearance that hand points keep from the object before they count as penetrating [m] (ours)."""
-
-
-@dataclass(frozen=True)
-class LinkSpheres:
-    """Spheres that fill the links, and the pairs of them that must not overlap."""
-
-    centres: Float[Tensor, "s 3"]
-    """In their links' frames [m]."""
-    radii: Float[Tensor, " s"]
-    """[m]"""
-    links: Int[Tensor, " s"]
-    """The link of each sphere."""
-    pairs: Int[Tensor, "k 2"]
-    """Pairs to keep apart."""
-
-
-def link_spheres(hand: Hand) -> LinkSpheres:
-    """Spheres along the longest axis of each link, from its surface points.
-
-    Pairs on links of one rigid group or of neighbouring groups, and pairs that overlap in the open hand, may touch.
-    """
-    centres, radii, links = [], [], []
-    for link in hand.link_index.unique().tolist():
-        points = hand.link_points[hand.link_index == link]
-        if len(points) < 4:
-            continue
-        for centre, radius in _fill(points):
-            centres.append(centre)
-            radii.append(radius)
-            links.append(link)
-    centre, radius, link_of = torch.stack(centres), torch.stack(radii), torch.tensor(links)
-    pairs = torch.combinations(torch.arange(len(links)), 2)
-    near = _neighbours(hand)
-    pairs = pairs[~near[link_of[pairs[:, 0]], link_of[pairs[:, 1]]]]
-    poses = hand.tree.forward(hand.canonical_joints(0.9))[link_of]
-    placed = se3.apply(poses, centre)
-    apart = (placed[pairs[:, 0]] - placed[pairs[:, 1]]).norm(dim=-1)
-    pairs = pairs[apart > radius[pairs[:, 0]] + radius[pairs[:, 1]]]
-    return LinkSpheres(centre, radius, link_of, pairs)
-
-
-def _fill(points: Float[Tensor, "n 3"]) -> list[tuple[Float[Tensor, "3"], Float[Tensor, ""]]]:
-    """Centres [m] and radii [m] of spheres along the longest axis of a set of surface points."""
-    middle = (points.amin(0) + points.amax(0)) / 2
-    axes = torch.linalg.svd(points - points.mean(0), full_matrices=False)[2]
-    local = (points - middle) @ axes.T
-    low, high = local.amin(0), local.amax(0)
-    half = (high - low) / 2
-    radius = half[1:].amin().clamp_min(0.002)
-    count = max(1, min(6, round(float(half[0] / radius))))
-    along = (high[0] + low[0]) / 2 + (half[0] - radius).clamp_min(0) * torch.linspace(-1, 1, count)
-    if count == 1:
-        along = ((high[0] + low[0]) / 2)[None]
-    across = (high + low) / 2
-    return [(middle + torch.stack([a, across[1], across[2]]) @ axes, radius) for a in along]
-
-
-def _neighbours(hand: Hand) -> Bool[Tensor, "n_links n_links"]:
-    """Whether at most one moving joint lies between two links."""
-    group = torch.tensor(hand.rigid_group)
-    adjacent = torch.eye(hand.tree.n_links, dtype=torch.bool)
-    for link, parent in enumerate(hand.tree.parent):
-        if parent >= 0:
-            above, below = hand.rigid_group[parent], hand.rigid_group[link]
-            adjacent[above, below] = adjacent[below, above] = True
-    return adjacent[group[:, None], group]
 
 
 @dataclass(frozen=True)
@@ -184,6 +121,17 @@ class GraspEnergy:
         self.ball = LinkPoints.of(self.spheres.centres, self.spheres.links, hand.tree.n_links)
         self._weigh(config or EnergyConfig())
 
+    @staticmethod
+    def of_object(
+        hand: Hand, obj: ObjectModel, config: EnergyConfig | None = None, contacts: ContactConfig | None = None,
+        device: torch.device | str = "cpu",
+    ) -> GraspEnergy:
+        """The energy on the object's grid of signed distances."""
+        surface = torch.as_tensor(obj.cloud, dtype=torch.float32)
+        centre = torch.as_tensor(obj.centre_of_mass, dtype=torch.float32)
+        length = float((surface - centre).norm(dim=-1).mean())
+        return GraspEnergy(hand, obj.distance_field, centre, length, config, contacts, device)
+
     def weighted(self, config: EnergyConfig) -> GraspEnergy:
         """This energy under other weights; it shares contacts, link spheres and distance field."""
         other = copy(self)
@@ -200,9 +148,17 @@ class GraspEnergy:
         self.upper = torch.where(hand.opening_signs > 0, hand.tree.upper, hand.tree.upper - room)
 
     def __call__(
-        self, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], contacts: Int[Tensor, "n c"]
+        self, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], contacts: Int[Tensor, "n c"] | None = None
     ) -> Evaluation:
-        """Energy and gradient of n grasps: wrist poses, joints [rad or m], indices of their contact candidates."""
+        """Energy and gradient of n grasps.
+
+        Args:
+            T_object_wrist: Wrist poses [m].
+            q: Joints [rad or m].
+            contacts: Indices of their contact candidates; those nearest to the surface by default.
+        """
+        if contacts is None:
+            contacts = self.nearest_contacts(T_object_wrist, q)
         tree, config = self.hand.tree, self.config
         poses = T_object_wrist[:, None] @ tree.forward(q)
         contact_terms, wrenches = self._contacts(poses, contacts)
@@ -230,6 +186,28 @@ class GraspEnergy:
         ], -1)
         movable = self.hand.movable.to(q.dtype)
         return Evaluation(terms, by_pose, (by_joint + config.joints * slope) * movable)
+
+    def nearest_contacts(
+        self, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], reach: float = math.inf
+    ) -> Int[Tensor, "n c"]:
+        """The candidate of each slot that is nearest to the surface; slots do not share a candidate.
+
+        A slot without a candidate within `reach` [m] takes one from the slot that is nearest to the surface.
+        """
+        candidates = self.candidates
+        poses = T_object_wrist[:, None] @ self.hand.tree.forward(q)
+        distance = self.field.distances(self.contact_points.place(poses))[0].abs()
+        taken = torch.zeros_like(distance)
+        allowed = candidates.slot_weights > 0
+        nearest = torch.where(allowed, distance[:, None], torch.inf).amin(-1)
+        chosen = []
+        for slot in range(len(allowed)):
+            own = allowed[slot].expand(len(T_object_wrist), -1)
+            own = torch.where(nearest[:, slot, None] > reach, allowed[nearest.argmin(-1)], own)
+            index = (distance + taken + torch.where(own, 0.0, torch.inf)).argmin(-1, keepdim=True)
+            taken = taken.scatter(-1, index, 1.0)
+            chosen.append(index)
+        return torch.cat(chosen, -1)
 
     def pivot(self, T_object_wrist: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 3"]:
         """The point about which the hand turns: its grasp centre [m]."""

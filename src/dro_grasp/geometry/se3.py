@@ -37,6 +37,14 @@ def invert(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
     return compose(back, -(back @ T[..., :3, 3:])[..., 0])
 
 
+def turned_about(
+    T: Float[Tensor, "n 4 4"], pivot: Float[Tensor, "n 3"], move: Float[Tensor, "n 3"], turn: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 4 4"]:
+    """Poses turned about a pivot by a rotation vector [rad], and then shifted by `move` [m]."""
+    rotation = roma.rotvec_to_rotmat(turn)
+    return compose(rotation @ T[:, :3, :3], rotate(rotation, T[:, :3, 3] - pivot) + pivot + move)
+
+
 def random_rotations(n: int, generator: torch.Generator, dtype: torch.dtype = torch.float32) -> Float[Tensor, "n 3 3"]:
     """Rotations uniform on SO(3), on the generator's device."""
     quaternion = torch.randn(n, 4, generator=generator, dtype=dtype, device=generator.device)

@@ -14,9 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
-from dro_grasp.energy.object_energy import nearest_contacts
+from dro_grasp.geometry.se3 import turned_about
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.optimization.pose_step import moved
 
 
 @dataclass(frozen=True)
@@ -82,7 +81,7 @@ def _descend(
     # The pose is the start turned by `turn` about the pivot and shifted by `move`: both are bounded as they stand.
     move, turn = torch.zeros_like(pivot), torch.zeros_like(pivot)
     pace = torch.ones_like(pivot[:, :1])
-    contacts = nearest_contacts(energy, T, q, config.reach)
+    contacts = energy.nearest_contacts(T, q, config.reach)
     now = energy(T, q, contacts)
     for _ in range(config.steps):
         slope = -torch.cat([now.by_pose, now.by_joint * unit], -1)
@@ -95,8 +94,8 @@ def _descend(
         # `bend` has unit length over all joints: scaled so that the root mean square step of a joint is joint_step.
         new_q = q + pace * config.joint_step * len(unit) ** 0.5 * bend * unit
         new_q = torch.minimum(torch.maximum(new_q, lower), upper)
-        new_T = moved(start, pivot, new_move, new_turn)
-        new_contacts = nearest_contacts(energy, new_T, new_q, config.reach)
+        new_T = turned_about(start, pivot, new_move, new_turn)
+        new_contacts = energy.nearest_contacts(new_T, new_q, config.reach)
         new = energy(new_T, new_q, new_contacts)
         lower_energy = new.total < now.total
         chosen = lower_energy[:, None]

@@ -12,13 +12,12 @@ from torch import Tensor
 from dro_grasp._version import __version__
 from dro_grasp.energy.contact_candidates import ContactConfig
 from dro_grasp.energy.grasp_energy import TERMS, EnergyConfig, Evaluation, GraspEnergy
-from dro_grasp.energy.object_energy import object_energy
 from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.geometry.distance_field import DistanceField
+from dro_grasp.geometry.se3 import turned_about
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimization.pose_step import moved
 from dro_grasp.optimization.starts import StartConfig, starts
 
 PROVENANCE = f"dro-grasp {__version__}, synthesis 2"
@@ -111,7 +110,7 @@ def synthesize(hand: Hand, obj: ObjectModel, num: int, seed: int = 0, config: Sy
         raise OptionError(f"num is {num}; ask for at least one grasp")
     config = config or SynthesisConfig()
     field = field_of(obj)
-    energy = object_energy(hand, obj, config.energy, config.contacts, config.device)
+    energy = GraspEnergy.of_object(hand, obj, config.energy, config.contacts, config.device)
     generator = torch.Generator().manual_seed(seed)
     surface = torch.as_tensor(obj.cloud, dtype=torch.float32)
     centre = energy.centre.cpu()
@@ -182,7 +181,7 @@ def propose(
     scale = 1 / squares.sqrt().clamp_min(1e-3)
     move, turn = (-pace * state.result.by_pose * scale[:, :6]).split(3, -1)
     bend = -pace * state.result.by_joint * scale[:, 6:]
-    T = moved(state.T, energy.pivot(state.T), config.translation_step * move, config.rotation_step * turn)
+    T = turned_about(state.T, energy.pivot(state.T), config.translation_step * move, config.rotation_step * turn)
     tree = energy.hand.tree
     step = config.joint_step * tree.joint_unit
     q = torch.minimum(torch.maximum(state.q + step * bend, tree.lower), tree.upper)

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from dro_grasp.devices import require_device
 from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
-from dro_grasp.energy.object_energy import object_energy
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 
@@ -55,7 +54,7 @@ class GraspProblem:
 
     @cached_property
     def _default_energy(self) -> GraspEnergy:
-        return object_energy(self.hand, self.obj, device=self.device)
+        return GraspEnergy.of_object(self.hand, self.obj, device=self.device)
 
     def thinned(self, count: int) -> Hand:
         """The hand with `count` surface points, on the device.

@@ -16,13 +16,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp import distance_matrix
+from dro_grasp.devices import Stopwatch
 from dro_grasp.errors import OptionError
 from dro_grasp.geometry.se3 import compose, random_rotations, rotate, rotation_between
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.stopwatch import Stopwatch
 
 CLOUD_TEMPERATURE = 0.5
 """Default temperature for a bare cloud: where less of the object is known, likelier grasps are proposed (ours)."""
@@ -91,7 +91,7 @@ def propose(
         progress: Called with (candidates decoded, candidates wanted).
     """
     config = config or ProposalConfig()
-    watch = watch or Stopwatch(device=problem.device)
+    watch = watch or Stopwatch()
     hand = problem.thinned(network.config.n_hand)
     cloud = problem.cloud(network.config.n_object, generator)
     with watch("network"):

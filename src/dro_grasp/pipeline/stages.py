@@ -58,7 +58,8 @@ def rank(problem: GraspProblem, grasps: GraspBatch, config: ScoreConfig | None =
 def scored(problem: GraspProblem, grasps: GraspBatch, config: ScoreConfig | None = None) -> GraspBatch:
     """Grasps with their score, in the same order."""
     config = config or ScoreConfig()
-    return grasps.replace(score=score_grasps(problem.energy(config.energy), complete(problem, grasps), config))
+    grasps.require_hand(problem.hand)
+    return grasps.replace(score=score_grasps(problem.energy(config.energy), grasps, config))
 
 
 def evaluate(
@@ -82,7 +83,6 @@ def evaluate(
 
 
 def above_table(problem: GraspProblem, grasps: GraspBatch, table: float) -> Bool[Tensor, " n"]:
-    """Which grasps keep the hand above the plane z = `table` [m], in the grasp and in the pregrasp."""
+    """Which complete grasps keep the hand above the plane z = `table` [m], in the grasp and in the pregrasp."""
     hand, T = problem.hand, grasps.T_object_wrist
-    heights = [hand.points(q, T)[..., 2].amin(-1) for q in (grasps.joints, complete(problem, grasps).pregrasp_joints)]
-    return torch.minimum(*heights) > table
+    return torch.minimum(*(hand.points(q, T)[..., 2].amin(-1) for q in (grasps.joints, grasps.pregrasp_joints))) > table

@@ -12,7 +12,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
-from dro_grasp.energy.object_energy import evaluate_nearest
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.ranking.features import grasp_features
 from dro_grasp.ranking.score_network import shipped_score_network
@@ -43,7 +42,7 @@ def score_grasps(energy: GraspEnergy, grasps: GraspBatch, config: ScoreConfig | 
     for start in range(0, len(grasps), size):
         part = grasps[start : start + size]
         # Each finger touches with its candidate nearest to the surface.
-        terms = evaluate_nearest(energy, part.T_object_wrist.to(device), part.joints.to(device)).terms
+        terms = energy(part.T_object_wrist.to(device), part.joints.to(device)).terms
         features = grasp_features(energy, part, terms)  # the network is small and stays on the CPU
         scores.append(network(*(values.cpu() for values in features)).mean(-1))
     return torch.cat(scores)
