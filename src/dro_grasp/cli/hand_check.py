@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from dro_grasp.cli.hand_make import Make
 from dro_grasp.cli.listing import Hands
 from dro_grasp.cli.output import Flag, optional, print_json, say
 
@@ -48,9 +49,13 @@ class Check:
 
 @dataclass(frozen=True)
 class HandCommand:
-    """Check and list hands."""
+    """Check, make and list hands."""
 
-    command: Annotated[Check, tyro.conf.subcommand("check")] | Annotated[Hands, tyro.conf.subcommand("list")]
+    command: (
+        Annotated[Check, tyro.conf.subcommand("check")]
+        | Annotated[Make, tyro.conf.subcommand("make")]
+        | Annotated[Hands, tyro.conf.subcommand("list")]
+    )
 
     def run(self) -> int:
         """Run the subcommand."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import mujoco
-import torch
 from jaxtyping import Float
 from torch import Tensor
 

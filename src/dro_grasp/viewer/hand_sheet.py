@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
 from dro_grasp.errors import OutputError
 from dro_grasp.files import replacing
@@ -49,16 +49,15 @@ def draw_hand(hand: Hand) -> UInt8[np.ndarray, "height width 3"]:
     with torch.no_grad():
         meshes = hand_meshes(hand, joints, above_palm=False)
     points = np.concatenate([mesh.vertices for mesh in meshes])
-    return render(meshes, Camera.around(points, *_view(hand, points), aspect=TILE[0] / TILE[1]), *TILE)
+    return render(meshes, Camera.around(points, *_view(hand), aspect=TILE[0] / TILE[1]), *TILE)
 
 
-def _view(
-    hand: Hand, points: Float[np.ndarray, "n 3"]
-) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Direction to the camera and direction that points up: along the fingers, or away from a palm that they surround."""
+def _view(hand: Hand) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Direction to the camera and direction that points up: along the fingers, or out of a palm from which they stand up."""
     front = hand.palm_direction_wrist.double().numpy()
     x, y, _ = hand.palm_axes_wrist.double().numpy().T
-    along = (points.mean(0) - hand.palm_centre_wrist.double().numpy()) @ x
-    surrounded = along < 0.25 * ((points - points.mean(0)) @ front).max()
-    towards, up = (y + 0.45 * front + 0.5 * x, front) if surrounded else (front + 0.7 * y + 0.25 * x, x)
+    origins = hand.tree.forward(hand.canonical_joints(1.0))[:, :3, 3].double().numpy()
+    fingers = np.mean([origins[finger.tip] - origins[finger.chain[0]] for finger in hand.fingers], 0)
+    away = fingers @ front > 0.7 * np.linalg.norm(fingers)
+    towards, up = (y + 0.45 * front + 0.5 * x, front) if away else (front + 0.7 * y + 0.25 * x, x)
     return tuple(towards.tolist()), tuple(up.tolist())

@@ -43,6 +43,11 @@ class MadeHand:
                 "folds_back": plan.folds_back, "redrawn": len(self.redrawn)}
 
 
+def hand_name(seed: int) -> str:
+    """Name of the hand of a seed."""
+    return f"hand_{seed:05d}"
+
+
 def make_hand(seed: int) -> MadeHand:
     """Make the procedural hand of a seed: the same seed gives the same hand, another one another hand.
 
@@ -57,7 +62,7 @@ def make_hand(seed: int) -> MadeHand:
     """
     if seed < 0:
         raise OptionError(f"seed is {seed}; give 0 or more")
-    name, generator, redrawn = f"hand_{seed:05d}", np.random.default_rng(seed), []
+    name, generator, redrawn = hand_name(seed), np.random.default_rng(seed), []
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"{name}.urdf"
         for _ in range(MOST_DRAWS):

@@ -97,7 +97,8 @@ def finger_plan(name: str, mount: Mount, style: Style, length: float, turn: Turn
     frame, radius = mount.frame, style.radius
     segments, position, rpy = [], vector(mount.position), rpy_of(frame)
     if turn is not None:
-        segments.append(Segment(position, vector(frame.T @ turn.axis), turn.lower, turn.upper, _knuckle(style), rpy, turn.open, bends=False))
+        axis = vector(frame.T @ turn.axis)
+        segments.append(Segment(position, axis, turn.lower, turn.upper, _knuckle(style), rpy, turn.open, bends=False))
         position, rpy = (0.0, 0.0, KNUCKLE * radius), (0.0, 0.0, 0.0)
     before = 1.0
     for number, share in enumerate(SHARES[style.phalanges]):

@@ -6,6 +6,7 @@ import dataclasses
 from typing import TypeVar
 
 import numpy as np
+from jaxtyping import Float
 
 from dro_grasp.hands.procedural.parts import Block, Mount, Style, Turn, finger_plan, lifted, plate, unit
 from dro_grasp.hands.procedural.plan import FingerPlan, HandPlan
@@ -115,7 +116,7 @@ def _block(dice: Dice, style: Style, width: float) -> Block:
     return Block(shape, depth, width, height)
 
 
-def _meeting_point(style: Style, block: Block) -> np.ndarray:
+def _meeting_point(style: Style, block: Block) -> Float[np.ndarray, "3"]:
     """Where the half-closed fingers and the thumb meet, in front of the palm [m]."""
     return np.array([block.depth / 2 + 0.5 * style.length, 0.0, 0.15 * style.length])
 
