@@ -5,12 +5,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from dro_grasp.hands.procedural.plan import FingerPlan, Segment, Solid, Vector, rpy_of
+from dro_grasp.hands.procedural.plan import Coupling, FingerPlan, FingerShape, PalmShape, Segment, Solid, Vector, rpy_of
 
 SHARES = {1: (1.0,), 2: (0.56, 0.44), 3: (0.45, 0.30, 0.25)}
 """Shares of a finger's length, from the palm outwards, by its number of phalanges (ours; human fingers are close)."""
@@ -32,12 +31,12 @@ class Style:
     """Length of the longest finger [m]."""
     phalanges: int
     """Phalanges of a finger, 2 or 3."""
-    shape: Literal["capsule", "box"]
+    shape: FingerShape
     """Shape of the phalanges."""
     width: float
     """Width of a box-shaped phalanx as a share of its thickness."""
-    coupling: Literal["free", "tip", "all"]
-    """Joints that follow the one before: none, the last one, or all but the first."""
+    coupling: Coupling
+    """Joints that follow the one before."""
     ratios: tuple[float, float]
     """Angle of the second and of the third joint per angle of the one before, where they follow."""
     spread: float
@@ -145,7 +144,8 @@ def phalanx(style: Style, radius: float, length: float, tip: bool) -> tuple[Soli
 class Block:
     """A palm that faces along its first axis: x is its depth, y its width, z its height, up to its upper end."""
 
-    shape: Literal["box", "disc", "rounded", "two-part"]
+    shape: PalmShape
+    """Seen from above."""
     depth: float
     """Along the palm direction [m]."""
     width: float
@@ -180,29 +180,29 @@ class Block:
         return self.width * (0.375 if self.shape == "two-part" and z < -0.55 * self.height else 0.5)
 
 
-def plate(shape: str, extent: tuple[float, float], depth: float) -> tuple[Solid, ...]:
+def plate(shape: PalmShape, half: tuple[float, float], depth: float) -> tuple[Solid, ...]:
     """A palm that faces along z, with its upper face at z = 0.
 
     Args:
-        shape: As in `Block`.
-        extent: Along x and y [m].
-        depth: [m].
+        shape: Seen from above.
+        half: Half its extents along x and y [m].
+        depth: Along z [m].
     """
-    x, y = extent
+    x, y = half
     middle = (0.0, 0.0, -depth / 2)
+    block = Solid((2 * x, 2 * y, depth), middle)
     if shape == "disc":
-        return (Solid((max(extent) / 2, depth), middle),)
+        return (Solid((max(half), depth), middle),)
     if shape == "rounded":
-        ends = (Solid((x / 2, depth), (0.0, side, -depth / 2)) for side in (-y / 2, y / 2))
-        return Solid((x, y, depth), middle), *ends
+        return block, *(Solid((x, depth), (0.0, side, -depth / 2)) for side in (-y, y))
     if shape == "two-part":
-        return Solid((x, y, depth), middle), Solid((0.35 * min(extent), depth), (0.0, 0.0, -1.4 * depth))
-    return (Solid((x, y, depth), middle),)
+        return block, Solid((0.7 * min(half), depth), (0.0, 0.0, -1.4 * depth))
+    return (block,)
 
 
-def lifted(solids: Sequence[Solid], fingers: Sequence[FingerPlan], height: float) -> tuple[
-    tuple[Solid, ...], tuple[FingerPlan, ...]
-]:
+def lifted(
+    solids: Sequence[Solid], fingers: Sequence[FingerPlan], height: float
+) -> tuple[tuple[Solid, ...], tuple[FingerPlan, ...]]:
     """Palm and fingers with the root link's origin this far below [m]."""
     up = lambda p: (p[0], p[1], p[2] + height)  # noqa: E731
     raised = tuple(dataclasses.replace(solid, position=up(solid.position)) for solid in solids)

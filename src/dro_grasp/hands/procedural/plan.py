@@ -16,6 +16,14 @@ Side = Literal["left", "right", "none"]
 """Handedness; none for hands without a thumb, or whose thumb is on neither side."""
 Thumb = Literal["opposed", "lateral", "none"]
 """Where the thumb is mounted: before the palm, beside it, or nowhere."""
+Family = Literal["row", "ring", "facing"]
+"""Fingers in a row with a thumb, around a disc, or in two rows that face each other."""
+PalmShape = Literal["box", "disc", "rounded", "two-part"]
+"""Shape of the palm: a cylinder if it is a disc; `rounded` is a box with cylinders at its sides."""
+FingerShape = Literal["capsule", "box"]
+"""Shape of the phalanges: a cylinder with spheres at its ends, or a box with cylinders across its ends."""
+Coupling = Literal["free", "tip", "all"]
+"""Joints of a finger that follow the one before: none, the last one, or all but the first."""
 
 
 def rotation_of(rpy: Vector) -> Float[np.ndarray, "3 3"]:
@@ -117,14 +125,14 @@ class FingerPlan:
 class HandPlan:
     """A hand before it is written. Its root link is the palm."""
 
-    family: Literal["row", "ring", "facing"]
-    """Fingers in a row with a thumb, around a disc, or in two rows that face each other."""
+    family: Family
+    """Arrangement of the fingers."""
     side: Side
     """Left or right, by design."""
     thumb: Thumb
     """Mount of the thumb, which is the last finger if there is one."""
-    palm_shape: str
-    """`box`, `disc`, `rounded` or `two-part`."""
+    palm_shape: PalmShape
+    """Shape of the palm."""
     palm_direction: Vector
     """Direction in which the palm faces, in the root link's frame."""
     palm: tuple[Solid, ...]

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from dro_grasp.hands.procedural.parts import Block, Mount, Style, Turn, finger_plan, lifted, plate, unit
-from dro_grasp.hands.procedural.plan import FingerPlan, HandPlan
+from dro_grasp.hands.procedural.plan import Coupling, Family, FingerPlan, FingerShape, HandPlan, PalmShape, Thumb
 
-FAMILIES = {"row": 0.6, "ring": 0.2, "facing": 0.2}
+FAMILIES: dict[Family, float] = {"row": 0.6, "ring": 0.2, "facing": 0.2}
 """Share of each family among all hands drawn (ours)."""
 FINGERS_IN_ROW = {1: 0.08, 2: 0.22, 3: 0.35, 4: 0.35}
 """Share of hands with this many fingers beside the thumb, in the family `row` (ours)."""
@@ -19,9 +19,17 @@ FINGERS_IN_RING = {2: 0.15, 3: 0.40, 4: 0.25, 5: 0.20}
 """Share of hands with this many fingers, in the family `ring` (ours)."""
 FINGERS_FACING = {(1, 1): 0.15, (2, 1): 0.35, (2, 2): 0.2, (3, 1): 0.15, (3, 2): 0.15}
 """Share of hands with this many fingers on either side, in the family `facing` (ours)."""
-PALM_SHAPES = {"box": 0.4, "disc": 0.15, "rounded": 0.3, "two-part": 0.15}
+PALM_SHAPES: dict[PalmShape, float] = {"box": 0.4, "disc": 0.15, "rounded": 0.3, "two-part": 0.15}
 """Share of each shape of palm (ours)."""
-COUPLINGS = {"free": 0.5, "tip": 0.25, "all": 0.25}
+RING_PALMS: dict[PalmShape, float] = {"disc": 0.75, "two-part": 0.25}
+"""The same, in the family `ring` (ours)."""
+FACING_PALMS: dict[PalmShape, float] = {"box": 0.4, "rounded": 0.3, "two-part": 0.3}
+"""The same, in the family `facing` (ours)."""
+THUMBS: dict[Thumb, float] = {"lateral": 0.6, "opposed": 0.4}
+"""Share of each mount of the thumb, in the family `row` (ours)."""
+FINGER_SHAPES: dict[FingerShape, float] = {"capsule": 0.6, "box": 0.4}
+"""Share of each shape of fingers (ours)."""
+COUPLINGS: dict[Coupling, float] = {"free": 0.5, "tip": 0.25, "all": 0.25}
 """Share of hands whose joints all move freely, whose last joints follow, and whose joints all follow the first (ours)."""
 LENGTHS = (0.055, 0.12)
 """Range of the longest finger's length [m] (ours; a human middle finger has about 0.08)."""
@@ -74,7 +82,7 @@ def _style(dice: Dice) -> tuple[Style, bool]:
     lower = 0.0 if coupling == "all" else -dice.between(0.0, 0.35)
     style = Style(
         radius=length * dice.between(*THICKNESS), length=length, phalanges=dice.among({2: 0.4, 3: 0.6}),
-        shape=dice.among({"capsule": 0.6, "box": 0.4}), width=dice.between(0.8, 1.2), coupling=coupling,
+        shape=dice.among(FINGER_SHAPES), width=dice.between(0.8, 1.2), coupling=coupling,
         ratios=(dice.between(0.8, 1.2), dice.between(0.5, 1.0)),
         spread=dice.between(0.2, 0.5) if dice.chance(0.5) else 0.0,
         lower=-dice.between(0.9, 1.6) if folds_back else lower,
@@ -98,7 +106,7 @@ def _row(dice: Dice, style: Style, folds_back: bool) -> HandPlan:
         turn = Turn(mount.frame[:, 0], -style.spread, style.spread) if style.spread and count > 1 else None
         length = style.length * (1 - 0.06 * abs(place + 0.3)) * dice.between(0.92, 1.0)
         fingers.append(finger_plan(f"finger{i}", mount, style, length, turn))
-    thumb = dice.among({"lateral": 0.6, "opposed": 0.4})
+    thumb = dice.among(THUMBS)
     fingers.append(_lateral_thumb(dice, style, block) if thumb == "lateral" else _opposed_thumb(dice, style, block))
     palm, raised = lifted(block.solids(), fingers, dice.among({0.0: 1, 0.5: 1, 1.0: 1}) * block.height)
     return HandPlan("row", "right" if thumb == "lateral" else "none", thumb, block.shape, (1.0, 0.0, 0.0), palm, raised,
@@ -170,11 +178,11 @@ def _ring(dice: Dice, style: Style, folds_back: bool) -> HandPlan:
         mount = Mount(radius * out, np.sin(tilt) * out + np.cos(tilt) * np.array([0.0, 0.0, 1.0]), -out)
         turn = Turn(mount.frame[:, 2], -style.spread, style.spread) if style.spread else None
         fingers.append(finger_plan(f"finger{i}", mount, style, style.length * dice.between(0.95, 1.0), turn))
-    shape = dice.among({"disc": 0.75, "two-part": 0.25})
+    shape = dice.among(RING_PALMS)
     depth = style.radius * dice.between(2.0, 4.0)
-    solids = plate("disc", (2 * (radius + style.radius),) * 2, depth)
+    solids = plate("disc", (radius + style.radius, radius + style.radius), depth)
     if shape == "two-part":
-        solids = (*solids, plate("disc", (1.2 * radius,) * 2, 2 * depth)[0])
+        solids = (*solids, *plate("disc", (0.6 * radius, 0.6 * radius), 2 * depth))
     palm, raised = lifted(solids, fingers, depth * dice.among({0: 1, 1: 1}))
     return HandPlan("ring", "none", "none", shape, (0.0, 0.0, 1.0), palm, raised, dice.between(*DENSITIES), folds_back)
 
@@ -195,9 +203,9 @@ def _facing(dice: Dice, style: Style, folds_back: bool) -> HandPlan:
             alone = sign < 0 and sides[1] == 1 and sides[0] > 1
             name = "thumb" if alone else f"finger{len(fingers)}"
             fingers.append(finger_plan(name, mount, style, style.length * dice.between(0.92, 1.0), turn))
-    shape = dice.among({"box": 0.4, "rounded": 0.3, "two-part": 0.3})
+    shape = dice.among(FACING_PALMS)
     depth = style.radius * dice.between(2.0, 4.0)
-    solids = plate(shape, (2 * half + 2 * style.radius, max(sides) * pitch), depth)
+    solids = plate(shape, (half + style.radius, max(sides) * pitch / 2), depth)
     palm, raised = lifted(solids, fingers, depth * dice.among({0: 1, 1: 1}))
-    thumb = "opposed" if sides[1] == 1 and sides[0] > 1 else "none"
+    thumb: Thumb = "opposed" if sides[1] == 1 and sides[0] > 1 else "none"
     return HandPlan("facing", "none", thumb, shape, (0.0, 0.0, 1.0), palm, raised, dice.between(*DENSITIES), folds_back)
