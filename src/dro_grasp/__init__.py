@@ -29,6 +29,7 @@ _NAMES = {
     "hands.hand": "Hand",
     "hands.library": "hand_names load_hand",
     "hands.procedural.making": "MadeHand make_hand",
+    "hands.variants": "vary_hand",
     "models.checkpoints": "load_weights save_weights",
     "models.presets": "NetworkConfig",
     "objects.catalogue": "load_object object_names",
@@ -72,6 +73,7 @@ if TYPE_CHECKING:
     from dro_grasp.hands.hand import Hand as Hand
     from dro_grasp.hands.library import hand_names as hand_names, load_hand as load_hand
     from dro_grasp.hands.procedural.making import MadeHand as MadeHand, make_hand as make_hand
+    from dro_grasp.hands.variants import vary_hand as vary_hand
     from dro_grasp.models.checkpoints import load_weights as load_weights, save_weights as save_weights
     from dro_grasp.models.presets import NetworkConfig as NetworkConfig
     from dro_grasp.objects.catalogue import load_object as load_object, object_names as object_names

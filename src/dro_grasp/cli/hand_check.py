@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from dro_grasp.cli.hand_make import Make
+from dro_grasp.cli.hand_vary import Vary
 from dro_grasp.cli.listing import Hands
 from dro_grasp.cli.output import Flag, optional, print_json, say
 
@@ -49,11 +50,12 @@ class Check:
 
 @dataclass(frozen=True)
 class HandCommand:
-    """Check, make and list hands."""
+    """Check, make, vary and list hands."""
 
     command: (
         Annotated[Check, tyro.conf.subcommand("check")]
         | Annotated[Make, tyro.conf.subcommand("make")]
+        | Annotated[Vary, tyro.conf.subcommand("vary")]
         | Annotated[Hands, tyro.conf.subcommand("list")]
     )
 
