@@ -39,7 +39,9 @@ def main() -> None:
         stored = GraspBatch.load(ROOT / "data" / "grasps" / file_name(name))
         stored = stored[torch.tensor([split == "validate" for split in stored.split])]
         made = GraspBatch.concatenate([
-            predictor.predict(hand, obj, options.num, pair_seed(0, hand, obj), candidates=1, refine=False) for obj in objects])
+            predictor.predict(
+                hand, obj, options.num, pair_seed(0, hand, obj), candidates=1, refine=False, method="network")
+            for obj in objects])
         for kind, grasps in (("stored", stored), ("predicted", made)):
             spread = diversity(grasps.T_object_wrist, grasps.joints)
             rows.append([hand.name, kind, len(grasps), spread["wrist"], spread["joints"], spread["all"]])

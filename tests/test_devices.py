@@ -68,7 +68,10 @@ def test_synthesis_on_a_device_gives_the_grasps_of_the_cpu(device: str) -> None:
 
 
 @pytest.mark.parametrize("refine", [False, True])
-def test_prediction_on_a_device_gives_the_grasps_of_the_cpu(device: str, refine: bool, tmp_path: Path) -> None:
+def test_prediction_on_a_device_gives_the_grasps_of_the_cpu(
+    device: str, refine: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dro_grasp.predictor.OPTIMISED_PER_GRASP", 2)
     weights, obj = str(untrained_weights(tmp_path)), load_object("sphere")
     here, there = (
         GraspPredictor(weights, device=place).predict(toy_hand(), obj, 2, seed=3, candidates=2, refine=refine)

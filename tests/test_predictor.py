@@ -13,8 +13,8 @@ from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.optimization.starts import wrist_rotations
 from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.proposal import wrist_rotations
 from dro_grasp.pipeline.stages import scored
 from dro_grasp.predictor import GraspPredictor, GraspRequest, PredictorConfig
 from tests.helpers.toy_hand import toy_hand
@@ -40,7 +40,7 @@ def ball() -> ObjectModel:
 
 @pytest.fixture(scope="module")
 def grasps(predictor: GraspPredictor, ball: ObjectModel) -> GraspBatch:
-    return predictor.predict(HAND, ball, num=7, seed=3, candidates=1)
+    return predictor.predict(HAND, ball, num=7, seed=3, candidates=1, method="network")
 
 
 def lowest_point(q: Tensor, T: Tensor) -> float:
@@ -54,7 +54,7 @@ def lowest_point(q: Tensor, T: Tensor) -> float:
 
 def test_the_same_seed_gives_the_same_grasps(predictor: GraspPredictor, ball: ObjectModel, grasps: GraspBatch) -> None:
     torch.manual_seed(99)
-    again, other = (predictor.predict(HAND, ball, num=7, seed=seed, candidates=1) for seed in (3, 4))
+    again, other = (predictor.predict(HAND, ball, num=7, seed=seed, candidates=1, method="network") for seed in (3, 4))
     assert torch.equal(again.T_object_wrist, grasps.T_object_wrist)
     assert torch.equal(again.joints, grasps.joints)
     assert not torch.equal(other.joints, grasps.joints)
@@ -66,7 +66,7 @@ def test_grasps_do_not_depend_on_the_batch_size(
     weights: str, ball: ObjectModel, grasps: GraspBatch, batch_size: int
 ) -> None:
     config = PredictorConfig(batch_size=batch_size, network_batch_size=batch_size)
-    other = GraspPredictor(weights, config=config).predict(HAND, ball, num=7, seed=3, candidates=1)
+    other = GraspPredictor(weights, config=config).predict(HAND, ball, num=7, seed=3, candidates=1, method="network")
     for name in ("T_object_wrist", "joints", "pregrasp_joints", "squeeze_joints", "score"):
         torch.testing.assert_close(getattr(other, name), getattr(grasps, name), atol=1e-4, rtol=1e-4)
 
@@ -88,12 +88,12 @@ def test_grasps_are_complete_valid_and_sorted(
 
 def test_a_run_returns_how_the_grasps_were_made(predictor: GraspPredictor, ball: ObjectModel) -> None:
     steps: list[tuple[int, int]] = []
-    request = GraspRequest(num=10, candidates=2)
+    request = GraspRequest(num=10, candidates=2, method="network")
     made = predictor.run(GraspProblem(HAND, ball), request, lambda done, wanted: steps.append((done, wanted)))
     assert steps == [(16, 20), (20, 20)]
     assert (len(made.grasps), made.candidates) == (10, 20)
-    assert set(made.seconds) == {"network", "decode", "refine", "rank"}
-    assert min(made.seconds.values()) > 0
+    assert set(made.seconds) == {"network", "decode", "optimise", "refine", "rank"}
+    assert min(v for k, v in made.seconds.items() if k != "optimise") > 0
     # Solved hands stay near the multilaterated points they were fitted to, row by row.
     hand = HAND.with_points(predictor.network.config.n_hand)
     for grasps in (made.proposed, made.grasps):
@@ -118,8 +118,8 @@ def test_a_direction_must_point_somewhere(
 
 
 def test_of_several_candidates_the_best_are_kept(predictor: GraspPredictor, ball: ObjectModel) -> None:
-    many = predictor.predict(HAND, ball, num=12, seed=4, candidates=1)
-    best = predictor.predict(HAND, ball, num=3, seed=4)
+    many = predictor.predict(HAND, ball, num=12, seed=4, candidates=1, method="network")
+    best = predictor.predict(HAND, ball, num=3, seed=4, method="network")
     torch.testing.assert_close(best.T_object_wrist, many.T_object_wrist[:3])
     torch.testing.assert_close(best.score, many.score[:3])
     with pytest.raises(OptionError, match="candidates is 0"):
@@ -139,12 +139,12 @@ def test_the_temperature_scales_what_z_is_made_of(weights: str, ball: ObjectMode
         predictor = GraspPredictor(weights, config=PredictorConfig(temperature=temperature))
         honest = predictor.network.predict
 
-        def predict(hand: Tensor, points: Tensor, noise: Tensor, at=(temperature, obj), honest=honest) -> Tensor:
+        def predict(hand: Tensor, points: Tensor, noise: Tensor, choose, at=(temperature, obj), honest=honest) -> Tensor:
             drawn[at] = noise
-            return honest(hand, points, noise)
+            return honest(hand, points, noise, choose)
 
         monkeypatch.setattr(predictor.network, "predict", predict)
-        predictor.predict(HAND, obj, num=3, seed=5, candidates=1)
+        predictor.predict(HAND, obj, num=3, seed=5, candidates=1, method="network")
     assert float(drawn[0.0, ball].abs().max()) == 0
     torch.testing.assert_close(drawn[0.5, ball], 0.5 * drawn[None, ball])
     torch.testing.assert_close(drawn[None, cloud], drawn[0.5, ball], msg="bare clouds get surer grasps")
@@ -168,20 +168,21 @@ def test_placements_face_the_direction_at_any_roll(
 
 
 def test_a_table_drops_what_goes_below_it(predictor: GraspPredictor, ball: ObjectModel) -> None:
-    free = predictor.predict(HAND, ball, num=12, candidates=1)
+    free = predictor.predict(HAND, ball, num=12, candidates=1, method="network")
     heights = sorted(
         min(lowest_point(q, T), lowest_point(p, T))
         for q, p, T in zip(free.joints, free.pregrasp_joints, free.T_object_wrist, strict=True)
     )
     table = (heights[5] + heights[6]) / 2
-    run = predictor.run(GraspProblem(HAND, ball), GraspRequest(num=12, table=table, candidates=1))
+    run = predictor.run(GraspProblem(HAND, ball), GraspRequest(num=12, table=table, candidates=1, method="network"))
     kept = run.grasps
     assert len(kept) == len(run.proposed) == len(run.points) == 12
     assert run.candidates >= 24
     assert run.candidates % 12 == 0
     for q, p, T in zip(kept.joints, kept.pregrasp_joints, kept.T_object_wrist, strict=True):
         assert min(lowest_point(q, T), lowest_point(p, T)) > table - 1e-6
-    below = predictor.run(GraspProblem(HAND, ball), GraspRequest(num=12, table=heights[0] - 0.01, candidates=1))
+    low = GraspRequest(num=12, table=heights[0] - 0.01, candidates=1, method="network")
+    below = predictor.run(GraspProblem(HAND, ball), low)
     assert torch.equal(below.grasps.joints, free.joints)
     assert below.candidates == 12
 
@@ -189,16 +190,18 @@ def test_a_table_drops_what_goes_below_it(predictor: GraspPredictor, ball: Objec
 def test_an_impossible_table_is_told(weights: str, ball: ObjectModel) -> None:
     predictor = GraspPredictor(weights, config=PredictorConfig(table_rounds=2))
     with pytest.raises(OptionError, match=r"only 0 of 6 grasps .* 3 were asked for; lower --table \(the object spans"):
-        predictor.predict(HAND, ball, num=3, table=float(ball.cloud[:, 2].max()) - 1e-4, candidates=1)
+        predictor.predict(HAND, ball, num=3, table=float(ball.cloud[:, 2].max()) - 1e-4, candidates=1, method="network")
 
 
 def test_a_bare_cloud_is_grasped(weights: str, ball: ObjectModel) -> None:
     predictor = GraspPredictor(weights, config=PredictorConfig(temperature=1.0))
     cloud = dataclasses.replace(ball, vertices=None, faces=None)
-    made = predictor.predict(HAND, cloud, num=7, seed=3, candidates=1)
+    made = predictor.predict(HAND, cloud, num=7, seed=3, candidates=1, method="network")
     assert bool(made.score.isfinite().all())
     # The network sees points alone: the same grasps before refinement, in an order of their own.
-    raw = [predictor.predict(HAND, o, num=7, seed=3, candidates=1, refine=False).joints.tolist() for o in (cloud, ball)]
+    raw = [
+        predictor.predict(HAND, o, num=7, seed=3, candidates=1, refine=False, method="network").joints.tolist()
+        for o in (cloud, ball)]
     assert sorted(map(tuple, raw[0])) == sorted(map(tuple, raw[1]))
     assert sorted(map(tuple, made.joints.tolist())) != sorted(map(tuple, raw[0]))
 
@@ -207,7 +210,7 @@ def test_a_cloud_with_too_few_points_is_grasped(predictor: GraspPredictor, ball:
     few = dataclasses.replace(
         ball, cloud=ball.cloud[:40], cloud_normals=ball.cloud_normals[:40], vertices=None, faces=None
     )
-    assert bool(predictor.predict(HAND, few, num=2).joints.isfinite().all())
+    assert bool(predictor.predict(HAND, few, num=2, method="network").joints.isfinite().all())
 
 
 def test_gradients_are_left_alone(predictor: GraspPredictor, grasps: GraspBatch) -> None:
@@ -219,7 +222,46 @@ def test_gradients_are_left_alone(predictor: GraspPredictor, grasps: GraspBatch)
 def test_prediction_runs_wholly_on_the_device_it_is_told(
     weights: str, ball: ObjectModel, grasps: GraspBatch, device: str
 ) -> None:
-    there = GraspPredictor(weights, device=device).predict(HAND, ball, num=7, seed=3, candidates=1)
+    there = GraspPredictor(weights, device=device).predict(HAND, ball, num=7, seed=3, candidates=1, method="network")
     for name in ("T_object_wrist", "joints", "pregrasp_joints", "squeeze_joints", "score"):
         assert type(getattr(there, name)) is Tensor, "grasps come back to the CPU"
         torch.testing.assert_close(getattr(there, name), getattr(grasps, name), atol=1e-4, rtol=1e-4)
+
+
+def test_auto_lets_the_optimiser_help_only_where_the_score_distrusts_the_network(
+    predictor: GraspPredictor, ball: ObjectModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dro_grasp.predictor.OPTIMISED_PER_GRASP", 3)
+    problem, alone = GraspProblem(HAND, ball), GraspRequest(4, seed=1, candidates=2, method="network")
+    network = predictor.run(problem, alone)
+    assert network.origin == ["network"] * 4
+    trusted = sorted(network.grasps.score.tolist())[1]  # three of the four best are above it
+    monkeypatch.setattr("dro_grasp.predictor.TRUSTED_SCORE", trusted - 1e-6)
+    helped = predictor.run(problem, dataclasses.replace(alone, method="auto"))
+    assert helped.candidates == network.candidates + 3
+    assert float(helped.grasps.score.min()) >= float(network.grasps.score.min())
+    monkeypatch.setattr("dro_grasp.predictor.TRUSTED_SCORE", -math.inf)
+    assert predictor.run(problem, dataclasses.replace(alone, method="auto")).candidates == network.candidates
+
+
+def test_the_optimiser_alone_asks_no_network(
+    predictor: GraspPredictor, ball: ObjectModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dro_grasp.predictor.OPTIMISED_PER_GRASP", 4)
+    monkeypatch.setattr(predictor.network, "predict", None)
+    cloud = dataclasses.replace(ball, vertices=None, faces=None)
+    direction = torch.tensor([0.0, 0.6, -0.8])
+    for obj in (ball, cloud):
+        request = GraspRequest(2, seed=1, direction=tuple(direction.tolist()), method="optimise")
+        made = predictor.run(GraspProblem(HAND, obj), request)
+        assert made.origin == ["optimiser"] * 2
+        assert 2 <= made.candidates <= 8  # the descent turned some away from the direction
+        assert made.seconds["optimise"] > 0 == made.seconds["network"]
+        angles = torch.rad2deg(torch.acos(HAND.palm_directions(made.proposed.T_object_wrist) @ direction))
+        assert float(angles.max()) < 20
+        solved = HAND.with_points(predictor.network.config.n_hand).points(made.proposed.joints, made.proposed.T_object_wrist)
+        torch.testing.assert_close(made.points, solved)
+    request = GraspRequest()
+    object.__setattr__(request, "method", "magic")  # past the type checker of the tests
+    with pytest.raises(OptionError, match="method is 'magic'; choose auto, network, optimise"):
+        request.__post_init__()

@@ -123,7 +123,7 @@ def test_training_pass_has_gradients_everywhere(frame: str) -> None:
 
 def test_zero_centred_hand_forgets_its_place_unless_placed() -> None:
     torch.manual_seed(0)
-    hand, obj, z = torch.randn(1, 40, 3) * 0.1, torch.randn(1, 32, 3) * 0.1, torch.randn(1, 8)
+    hand, obj, z = torch.randn(1, 40, 3) * 0.1, torch.randn(1, 32, 3) * 0.1, torch.randn(1, 1, 8)
     moved = hand + torch.tensor([0.2, 0.0, 0.0])
     paper = DistanceNetwork(SMALL).eval()
     torch.testing.assert_close(paper.predict(hand, obj, z), paper.predict(moved, obj, z), rtol=1e-4, atol=1e-5)
@@ -146,7 +146,7 @@ def test_a_learned_prior_changes_nothing_before_training_and_much_after() -> Non
     paper = DistanceNetwork(SMALL).eval()
     ours = DistanceNetwork(dataclasses.replace(SMALL, prior="learned")).eval()
     assert not ours.load_state_dict(paper.state_dict(), strict=False).unexpected_keys
-    hand, obj, noise = torch.randn(3, 40, 3) * 0.1, torch.randn(3, 32, 3) * 0.1, torch.randn(3, 8)
+    hand, obj, noise = torch.randn(3, 40, 3) * 0.1, torch.randn(3, 32, 3) * 0.1, torch.randn(3, 1, 8)
     torch.testing.assert_close(ours.predict(hand, obj, noise), paper.predict(hand, obj, noise))
     assert not ours(hand, obj, hand, torch.Generator()).prior_mean.any()
     with torch.no_grad():
@@ -193,8 +193,8 @@ def test_a_latent_that_moves_the_hand_moves_its_points_apart() -> None:
     hand, obj, grasp = torch.randn(3, 40, 3) * 0.1, torch.randn(3, 32, 3) * 0.1, torch.randn(3, 40, 3) * 0.1
     features = network.hand_encoder(hand - hand.mean(1, keepdim=True))
     z = torch.randn(2, 3, 8)
-    moved = [network.motion(features, hand, one) for one in z]
-    assert (moved[0] - moved[1]).norm(dim=-1).std(-1).min() > 1e-3
+    moved = network.motion(features, hand, z.transpose(0, 1))
+    assert (moved[:, 0] - moved[:, 1]).norm(dim=-1).std(-1).min() > 1e-3
     mean, _ = network.motion.encode(features, hand, grasp)
     other, _ = network.motion.encode(features, hand, hand)
     assert (mean - other).norm(dim=-1).min() > 1e-2  # the code sees where the hand goes
@@ -222,7 +222,7 @@ def test_all_randomness_comes_from_the_generator(changes: dict) -> None:
 def test_prediction_does_not_depend_on_the_batch() -> None:
     torch.manual_seed(0)
     network = DistanceNetwork(SMALL).eval()
-    hand, obj, z = torch.randn(5, 40, 3) * 0.1, torch.randn(5, 32, 3) * 0.1, torch.randn(5, 8)
+    hand, obj, z = torch.randn(5, 40, 3) * 0.1, torch.randn(5, 32, 3) * 0.1, torch.randn(5, 1, 8)
     whole = network.predict(hand, obj, z)
     for i in range(5):
         torch.testing.assert_close(network.predict(hand[i : i + 1], obj[i : i + 1], z[i : i + 1])[0], whole[i],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -51,6 +52,9 @@ class Generate:
     camera: Annotated[Path | None, optional("JSON", "the object's own frame")] = None
     """File with {"frame": "base", "T_frame_camera": 4x4}: the object is a cloud in that camera's frame; it is cleaned. Grasps,
     direction and table are in the named frame."""
+    method: Literal["auto", "network", "optimise"] = "auto"
+    """Source of candidates: the network; the optimiser that also makes training data (any hand, nothing learned); or auto, the
+    network, and the optimiser for the grasps with which the score does not trust it."""
     refine: bool = True
     """Refine the candidates on the object's geometry, near where the network proposed them."""
     temperature: Annotated[float | None, optional("T", "as the weights say")] = None
@@ -85,7 +89,7 @@ class Generate:
 
         check_seed(self.seed)
         request = GraspRequest(
-            self.num, self.seed, self.direction, self.table, self.candidates, self.refine, self.temperature)
+            self.num, self.seed, self.direction, self.table, self.candidates, self.refine, self.temperature, self.method)
         names = resolve_objects([self.object])
         several = names != [self.object]
         outputs = paths_per_object(self.output, names, several, ".parquet")
@@ -130,6 +134,7 @@ class Generate:
         seconds = {"load": load, **made.seconds, "trial": time.perf_counter() - begin if simulated else 0.0}
         report = {
             "hand": job.hand.name, "object": obj.name, "num": len(grasps), "candidates": made.candidates,
+            "origin": dict(Counter(made.origin)),
             "seed": self.seed, "weights": job.predictor.weights_name, "protocol": self._protocol(obj),
             "success": int(grasps.success.sum()) if simulated else None,
             "success_rate": float(grasps.success.float().mean()) if simulated else None,
@@ -147,7 +152,7 @@ class Generate:
             report["picture"] = str(picture)
             draw_grasps(job.hand, obj, kept if len(kept) else grasps, picture)
         if not self.json:
-            self._show(report, grasps)
+            self._show(report, grasps, made.origin)
         return ObjectResult(report, obj, kept, made.points[keep])
 
     def _load(self, name: str, camera: NamedMotion | None) -> ObjectModel:
@@ -170,15 +175,15 @@ class Generate:
         with progress_bar("evaluating", self.json) as progress:
             return evaluate(problem, grasps, protocol, progress)
 
-    def _show(self, report: dict[str, Any], grasps: GraspBatch) -> None:
+    def _show(self, report: dict[str, Any], grasps: GraspBatch, origin: list[str]) -> None:
         rows = []
         for i in range(min(len(grasps), ROWS_SHOWN)):
             outcome: list[Any] = [None] * 4
             if grasps.evaluated[i]:
                 outcome = [bool(grasps.success[i]), len(grasps.extra["contact_links"][i]), float(grasps.penetration[i]) * 1e3,
                            grasps.extra["reason"][i]]
-            rows.append([i, float(grasps.score[i]), *outcome])
-        columns = ["grasp", "score", "success", "contacts", "penetration [mm]", "reason"]
+            rows.append([i, origin[i], float(grasps.score[i]), *outcome])
+        columns = ["grasp", "origin", "score", "success", "contacts", "penetration [mm]", "reason"]
         seconds = "  ".join(f"{k} {v:.2f} s" for k, v in report["seconds"].items())
         print_table(f"{report['hand']} on {report['object']}", columns, rows, note=seconds)
         if report["success"] is not None:

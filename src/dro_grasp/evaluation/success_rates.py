@@ -184,7 +184,7 @@ def _sources(
     """Grasps of the network and of the controls."""
     hand, obj, num = problem.hand, problem.obj, config.num
     visible = problem if config.view == "whole" else GraspProblem(hand, partial_view(obj, config.view, seed), predictor.device)
-    made = predictor.run(visible, GraspRequest(num, seed, candidates=1, refine=False))
+    made = predictor.run(visible, GraspRequest(num, seed, candidates=1, refine=False, method="network"))
     yield _Source(NETWORK, visible, made.grasps, {k: made.seconds[k] / num for k in ("network", "decode")})
     if not config.controls:
         return

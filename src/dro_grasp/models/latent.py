@@ -173,10 +173,10 @@ class HandMotion(nn.Module):
         return mean, log_variance.clamp(-MAX_LOG_VARIANCE, MAX_LOG_VARIANCE)
 
     def forward(
-        self, features: Float[Tensor, "b n c"], hand: Float[Tensor, "b n 3"], z: Float[Tensor, "b latent"]
-    ) -> Float[Tensor, "b n 3"]:
-        """The hand's points after the motion [m]."""
-        return hand + self.SCALE * self.last(self.shift(self._points(features, hand), z[:, None]))
+        self, features: Float[Tensor, "b n c"], hand: Float[Tensor, "b n 3"], z: Float[Tensor, "b k latent"]
+    ) -> Float[Tensor, "b k n 3"]:
+        """The hand's points after each of k motions [m]."""
+        return hand[:, None] + self.SCALE * self.last(self.shift(self._points(features, hand)[:, None], z[:, :, None]))
 
     def _points(self, features: Float[Tensor, "b n c"], hand: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n d"]:
         return torch.cat([features, (hand - hand.mean(1, keepdim=True)) / self.SCALE], -1)
@@ -193,8 +193,8 @@ class Modulated(nn.Module):
         self.layers = nn.ModuleList(nn.Linear(inputs if i == 0 else width, width) for i in range(depth))
         self.controls = nn.ModuleList(nn.Linear(control, 2 * width) for _ in range(depth))
 
-    def forward(self, x: Float[Tensor, "b n c"], control: Float[Tensor, "b k d"]) -> Float[Tensor, "b n width"]:
-        """Values of the points; the control is one for all or one for each of them."""
+    def forward(self, x: Float[Tensor, "*#b n c"], control: Float[Tensor, "*#b k d"]) -> Float[Tensor, "*b n width"]:
+        """Values of the points; the control is one for all or one for each of them, and batch axes broadcast."""
         for layer, modulation in zip(self.layers, self.controls, strict=True):
             scale, shift = modulation(control).chunk(2, -1)
             x = functional.leaky_relu(layer(x) * (1 + scale) + shift, SLOPE)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from dro_grasp.models.attention import CrossTransformer
@@ -29,6 +30,10 @@ EXACT = "donot_use_mm_for_euclid_dist"
 """Mode of `torch.cdist` for the placed hand's distances: the matrix-product form loses half of the digits."""
 PLACE_SCALE = 10.0
 """Factor of the placed hand's coordinates, a tenth of a metre large, at the network's input [1/m]. Source: ours."""
+
+
+Choose = Callable[[Float[Tensor, "b k n 3"]], Int[Tensor, " b"]]
+"""Chooses one of k moved hands [m], in the network's frame."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +122,7 @@ class DistanceNetwork(nn.Module):
         if self.motion is not None:
             mean, log_variance = self.motion.encode(phi_hand, hand, grasp)
             z = sample_posterior(mean, log_variance, generator)
-            moved = self.motion(phi_hand, hand, z)
+            moved = self.motion(phi_hand, hand, z[:, None])[:, 0]
             psi_hand, psi_object = self.relate(phi_hand, phi_object, moved)
         else:
             psi_hand, psi_object = self.relate(phi_hand, phi_object, hand)
@@ -139,15 +144,29 @@ class DistanceNetwork(nn.Module):
             distances, mean, log_variance, prior_mean, prior_log_variance, flow_error, moved, phi_hand.mean(1))
 
     def predict(
-        self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], noise: Float[Tensor, "b latent"]
+        self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], noise: Float[Tensor, "b k latent"],
+        choose: Choose | None = None,
     ) -> Float[Tensor, "b n m"]:
-        """D(R,O) [m] for draws of `sample_latent`, which the prior turns into z; `forward` explains the clouds."""
+        """D(R,O) [m].
+
+        Args:
+            hand: As in `forward`.
+            obj: As in `forward`.
+            noise: Draws of `sample_latent`, k for each hand, which the prior turns into z.
+            choose: Chooses one of them by the hands that they move. The first by default, and where z moves nothing.
+        """
         with fast_products():
             phi_hand, phi_object = self.encode(hand, obj)
+            rows = torch.arange(len(hand), device=hand.device)
+            if self.motion is None or choose is None:
+                noise = noise[:, :1]
             z = noise
             if self.condition is not None and self.prior is not None:
-                z = self.prior(noise, self.condition(phi_hand, phi_object, hand, obj))
-            moved = hand if self.motion is None else self.motion(phi_hand, hand, z)
+                condition = self.condition(phi_hand, phi_object, hand, obj)[:, None].expand(-1, noise.shape[1], -1)
+                z = self.prior(noise.flatten(0, 1), condition.flatten(0, 1)).unflatten(0, noise.shape[:2])
+            moves = hand[:, None] if self.motion is None else self.motion(phi_hand, hand, z)
+            best = rows.new_zeros(len(hand)) if moves.shape[1] == 1 or choose is None else choose(moves)
+            z, moved = z[rows, best], moves[rows, best]
             psi_hand, psi_object = self.relate(phi_hand, phi_object, moved)
             return self._distances(psi_hand, psi_object, z, moved, obj)
 
@@ -171,12 +190,14 @@ class DistanceNetwork(nn.Module):
         centred = points - centre[:, None]
         return centred @ rotation if self.config.placed else centred
 
-    def sample_latent(self, num: int, generator: torch.Generator, temperature: float = 1.0) -> Float[Tensor, "num latent"]:
+    def sample_latent(
+        self, num: int, generator: torch.Generator, temperature: float = 1.0, draws: int = 1
+    ) -> Float[Tensor, "num draws latent"]:
         """Draws that `predict` turns into z, on the network's device; without a learned prior they are z.
 
         Their standard deviation is `temperature`: 1 as in training, 0 for the likeliest z.
         """
-        noise = torch.randn(num, self.config.latent, generator=generator, device=generator.device) * temperature
+        noise = torch.randn(num, draws, self.config.latent, generator=generator, device=generator.device) * temperature
         return noise.to(self.head.first.weight.device)
 
     def sample_placements(

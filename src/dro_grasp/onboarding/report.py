@@ -76,7 +76,7 @@ def _drawn(done: Onboarded, held_out: list[str]) -> str:
         obj = load_object(name)
         path = done.folder / f"{Path(name).stem}.png"
         problem = GraspProblem(hand, obj)
-        grasps = predictor.run(problem, GraspRequest(GRASPS, candidates=CANDIDATES)).grasps
+        grasps = predictor.run(problem, GraspRequest(GRASPS, candidates=CANDIDATES, method="network")).grasps
         draw_grasps(hand, obj, evaluate(problem, grasps, "strict"), path)
         parts.append(image(path.read_bytes(), f"grasps of {name}"))
     return "".join(parts)

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
+import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.geometry.distance_field import DistanceField
-from dro_grasp.geometry.se3 import compose, random_rotations, rotate
+from dro_grasp.geometry.se3 import compose, random_rotations, rotate, rotation_between
 from dro_grasp.hands.hand import Hand
+
+Direction = tuple[float, float, float]
+"""A vector in the object's frame, of any length but zero."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +29,10 @@ class StartConfig:
     the joints and yields no more.)"""
     aim: float = 0.6
     """Largest share of the way from the object's centre to a random surface point at which the palm aims."""
+    direction: Direction | None = None
+    """Palm direction in the object's frame; any by default."""
+    direction_spread: float = math.radians(5.0)
+    """Standard deviation of the palm direction around the given one [rad]."""
     gap: tuple[float, float] = (0.0, 0.01)
     """Range of the distance between hand and object [m]."""
     clearance: float = 0.6
@@ -64,7 +73,7 @@ def starts(
     """
     q = start_joints(hand, n, config, generator)
     points = hand.points(q)
-    rotation = random_rotations(n, generator, q.dtype)
+    rotation = wrist_rotations(hand, n, config.direction, config.direction_spread, generator)
     pick = torch.randint(len(surface), (n,), generator=generator)
     aim = centre + config.aim * torch.rand(n, 1, generator=generator) * (surface[pick] - centre)
     direction = rotation @ hand.palm_direction_wrist
@@ -79,3 +88,27 @@ def starts(
         distance = field.distances(body - (back[:, None] * direction)[:, None])[0].amin(-1)
         back = (back - (distance - gap).clamp_min(0)).clamp_min(0)
     return compose(rotation, offset - back[:, None] * direction), q
+
+
+def wrist_rotations(
+    hand: Hand, count: int, direction: Direction | None, spread: float, generator: torch.Generator
+) -> Float[Tensor, "count 3 3"]:
+    """Random wrist rotations: uniform, or with the palm near a direction and any roll.
+
+    Args:
+        hand: The hand; its device is the result's.
+        count: How many.
+        direction: Palm direction in the object's frame.
+        spread: Standard deviation of the palm direction around it [rad].
+        generator: Source of randomness, on the CPU.
+    """
+    palm = hand.palm_direction_wrist
+    if direction is None:
+        return random_rotations(count, generator).to(palm)
+    wanted = torch.tensor(direction, dtype=torch.float32)
+    wanted = wanted / wanted.norm()
+    roll = torch.rand(count, generator=generator) * 2 * math.pi
+    tilt = torch.randn(count, 3, generator=generator) * spread
+    tilt = tilt - (tilt @ wanted)[:, None] * wanted
+    align = rotation_between(palm.cpu(), wanted)
+    return (roma.rotvec_to_rotmat(tilt) @ roma.rotvec_to_rotmat(roll[:, None] * wanted) @ align).to(palm)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import roma
@@ -109,31 +110,41 @@ def synthesize(hand: Hand, obj: ObjectModel, num: int, seed: int = 0, config: Sy
     if num < 1:
         raise OptionError(f"num is {num}; ask for at least one grasp")
     config = config or SynthesisConfig()
-    field = field_of(obj)
+    field_of(obj)
     energy = GraspEnergy.of_object(hand, obj, config.energy, config.contacts, config.device)
-    generator = torch.Generator().manual_seed(seed)
-    surface = torch.as_tensor(obj.cloud, dtype=torch.float32)
-    centre = energy.centre.cpu()
-    sizes = [min(config.batch_size, num - start) for start in range(0, num, config.batch_size)]
-    T, q, terms, depths = [], [], [], []
-    with torch.no_grad():
-        for size in sizes:
-            start = starts(hand, field, surface, centre, size, config.starts, generator)
-            end = optimise(energy, *start, config, generator)
-            T, q, terms = [*T, end.T.cpu()], [*q, end.q.cpu()], [*terms, end.result.terms.cpu()]
-            depths.append(depth(energy, end).cpu())
-    return _batch(hand, obj, torch.cat(T), torch.cat(q), torch.cat(terms), torch.cat(depths), seed)
+    return optimised(hand, obj, energy, num, seed, config).sorted_by_energy()
 
 
-def _batch(
-    hand: Hand, obj: ObjectModel, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], terms: Float[Tensor, "n 6"],
-    depths: Float[Tensor, " n"], seed: int,
+@torch.no_grad()
+def optimised(
+    hand: Hand, obj: ObjectModel, energy: GraspEnergy, num: int, seed: int, config: SynthesisConfig,
+    progress: Callable[[int, int], None] | None = None,
 ) -> GraspBatch:
-    """Grasps with rotations orthonormal to rounding, lowest energy first."""
+    """Grasps at the end of the annealing, in the order of their starts; a bare cloud will do.
+
+    Args:
+        hand: The hand, on the CPU.
+        obj: The object.
+        energy: Of the two.
+        num: How many grasps.
+        seed: The same seed gives the same grasps.
+        config: The optimiser.
+        progress: Called with (grasps optimised, grasps wanted).
+    """
+    generator = torch.Generator().manual_seed(seed)
+    surface, centre = torch.as_tensor(obj.cloud, dtype=torch.float32), energy.centre.cpu()
+    parts = []
+    for begin in range(0, num, config.batch_size):
+        size = min(config.batch_size, num - begin)
+        start = starts(hand, obj.distance_field, surface, centre, size, config.starts, generator)
+        end = optimise(energy, *start, config, generator)
+        parts.append([x.cpu() for x in (end.T, end.q, end.result.terms, depth(energy, end))])
+        if progress is not None:
+            progress(begin + size, num)
+    T, q, terms, depths = (torch.cat(part) for part in zip(*parts, strict=True))
     T[:, :3, :3] = torch.as_tensor(roma.special_procrustes(T[:, :3, :3]))
     columns = {"depth": depths} | {f"energy_{name}": terms[:, i] for i, name in enumerate(TERMS)}
-    batch = GraspBatch.create(hand, obj, T, q, energy=terms.sum(-1), seed=seed, provenance=PROVENANCE, extra=columns)
-    return batch.sorted_by_energy()
+    return GraspBatch.create(hand, obj, T, q, energy=terms.sum(-1), seed=seed, provenance=PROVENANCE, extra=columns)
 
 
 def depth(energy: GraspEnergy, state: State) -> Float[Tensor, " n"]:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from dro_grasp.devices import require_device
 from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
+from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 
@@ -45,6 +46,11 @@ class GraspProblem:
     def centre(self) -> Float[Tensor, "3"]:
         """The object's centre of mass, on the CPU [m]."""
         return torch.as_tensor(self.obj.centre_of_mass, dtype=torch.float32)
+
+    @property
+    def field(self) -> DistanceField:
+        """Signed distances of the object, on the device."""
+        return self._default_energy.field
 
     def energy(self, config: EnergyConfig) -> GraspEnergy:
         """The grasp energy under these weights; contacts, link spheres and distance field are shared among all weights."""

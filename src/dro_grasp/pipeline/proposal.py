@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-import roma
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -18,18 +17,18 @@ from torch import Tensor
 from dro_grasp import distance_matrix
 from dro_grasp.devices import Stopwatch
 from dro_grasp.errors import OptionError
-from dro_grasp.geometry.se3 import compose, random_rotations, rotate, rotation_between
+from dro_grasp.geometry.se3 import compose, rotate
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.models.network import DistanceNetwork
+from dro_grasp.optimization.starts import Direction, wrist_rotations
+from dro_grasp.pipeline.choice import ChoiceConfig, choice_scores
 from dro_grasp.pipeline.problem import GraspProblem
 
 CLOUD_TEMPERATURE = 0.5
 """Default temperature for a bare cloud: where less of the object is known, likelier grasps are proposed (ours)."""
 HIGHEST_TEMPERATURE = 2.0
 """Highest temperature that is accepted; 1 is what the weights were trained for (ours)."""
-Direction = tuple[float, float, float]
-"""A vector in the object's frame, of any length but zero."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +44,8 @@ class ProposalConfig:
     temperature: float | None = None
     """Spread of z: 0 proposes the likeliest grasp of each placement, 1 is as diverse as the training grasps. None takes 1,
     and CLOUD_TEMPERATURE for a bare cloud."""
+    choice: ChoiceConfig = field(default_factory=ChoiceConfig)
+    """How one of several z is chosen for each placement."""
     batch_size: int = 16
     """Candidates that are decoded at once."""
     network_batch_size: int = 4
@@ -97,12 +98,12 @@ def propose(
     with watch("network"):
         placement = _placements(hand, network, cloud, num, direction, config, generator)
         joints = hand.random_open_joints(num, generator)
-        noise = network.sample_latent(num, generator, _temperature(problem, config)).to(problem.device)
+        noise = network.sample_latent(num, generator, _temperature(problem, config), config.choice.draws).to(problem.device)
     found: list[tuple[Tensor, Tensor, Tensor]] = []
     for start in range(0, num, config.batch_size):
         part = slice(start, min(start + config.batch_size, num))
         with watch("network"):
-            distances = _distances(hand, network, cloud, placement[part], joints[part], noise[part], config)
+            distances = _distances(problem, network, cloud, placement[part], joints[part], noise[part], config)
         with watch("decode"):
             links = distance_matrix.decode(hand, distances, cloud.expand(len(distances), -1, -1))
             solution = distance_matrix.solve(hand, links, joints[part])
@@ -146,35 +147,12 @@ def _placements(
     return compose(rotation @ axes.mT, cloud.mean(0) + offset)
 
 
-def wrist_rotations(
-    hand: Hand, count: int, direction: Direction | None, spread: float, generator: torch.Generator
-) -> Float[Tensor, "count 3 3"]:
-    """Random wrist rotations: uniform, or with the palm near a direction and any roll.
-
-    Args:
-        hand: The hand; its device is the result's.
-        count: How many.
-        direction: Palm direction in the object's frame.
-        spread: Standard deviation of the palm direction around it [rad].
-        generator: Source of randomness, on the CPU.
-    """
-    palm = hand.palm_direction_wrist
-    if direction is None:
-        return random_rotations(count, generator).to(palm)
-    wanted = torch.tensor(direction, dtype=torch.float32)
-    wanted = wanted / wanted.norm()
-    roll = torch.rand(count, generator=generator) * 2 * math.pi
-    tilt = torch.randn(count, 3, generator=generator) * spread
-    tilt = tilt - (tilt @ wanted)[:, None] * wanted
-    align = rotation_between(palm.cpu(), wanted)
-    return (roma.rotvec_to_rotmat(tilt) @ roma.rotvec_to_rotmat(roll[:, None] * wanted) @ align).to(palm)
-
-
 def _distances(
-    hand: Hand, network: DistanceNetwork, cloud: Float[Tensor, "m 3"], placement: Float[Tensor, "b 4 4"],
-    joints: Float[Tensor, "b n_dof"], noise: Float[Tensor, "b latent"], config: ProposalConfig,
+    problem: GraspProblem, network: DistanceNetwork, cloud: Float[Tensor, "m 3"], placement: Float[Tensor, "b 4 4"],
+    joints: Float[Tensor, "b n_dof"], noise: Float[Tensor, "b k latent"], config: ProposalConfig,
 ) -> Float[Tensor, "b n m"]:
-    """D(R,O) of a batch of placed open hands; distances are the same in every frame."""
+    """D(R,O) of a batch of placed open hands, each with the best of k draws; distances are the same in every frame."""
+    hand = problem.thinned(network.config.n_hand)
     placed = hand.points(joints, placement)
     turned = placement[:, :3, :3] @ network.config.axes(hand.palm_axes_wrist)
     centre, size = cloud.mean(0), config.network_batch_size
@@ -183,5 +161,10 @@ def _distances(
         centres = centre.expand(len(points), 3)
         opened = network.to_frame(points, centres, axes)
         obj = network.to_frame(cloud.expand(len(points), -1, -1), centres, axes)
-        found.append(network.predict(opened, obj, z).float())
+
+        def choose(moves: Float[Tensor, "b k n 3"], axes: Float[Tensor, "b 3 3"] = axes) -> Int[Tensor, " b"]:
+            points = moves @ axes[:, None].mT + centre
+            return choice_scores(hand, problem.field, points, config.choice).argmax(-1)
+
+        found.append(network.predict(opened, obj, z, choose).float())
     return torch.cat(found)

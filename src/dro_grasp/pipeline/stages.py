@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -11,10 +12,15 @@ from torch import Tensor
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import completed
 from dro_grasp.optimization.refinement import RefineConfig, refine_grasps
+from dro_grasp.optimization.starts import Direction, StartConfig
+from dro_grasp.optimization.synthesis import SynthesisConfig, optimised
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.ranking.score import ScoreConfig, score_grasps
 from dro_grasp.simulation.protocols import Protocol
-from dro_grasp.simulation.trial import simulate
+from dro_grasp.simulation.trial import settle, simulate
+
+FARTHEST_DIRECTION = math.radians(20.0)
+"""Largest angle between the palm direction of an optimised grasp and the direction that was asked for [rad] (ours)."""
 
 
 def complete(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
@@ -80,6 +86,31 @@ def evaluate(
         OptionError: No protocol has the name.
     """
     return grasps.with_trial(simulate(problem.hand, problem.obj, grasps, protocol, workers=workers, progress=progress))
+
+
+def optimise(
+    problem: GraspProblem, num: int, seed: int, direction: Direction | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> GraspBatch:
+    """Candidates from synthesis, settled in simulation on a mesh; no network is asked, so any hand and object will do.
+
+    Args:
+        problem: Hand and object.
+        num: How many.
+        seed: The same seed gives the same candidates.
+        direction: Palm direction in the object's frame; any by default. Candidates that the descent turned away are left out.
+        progress: Called with (candidates optimised, candidates wanted).
+    """
+    config = SynthesisConfig(starts=StartConfig(direction=direction))
+    hand, obj = problem.hand, problem.obj
+    grasps = optimised(hand, obj, problem.energy(config.energy), num, seed, config, progress)
+    if hand.description is not None and not obj.is_cloud:
+        grasps = settle(hand, obj, grasps)
+    grasps = grasps.bare()
+    if direction is None:
+        return grasps
+    wanted = torch.nn.functional.normalize(torch.tensor(direction), dim=0)
+    return grasps[hand.palm_directions(grasps.T_object_wrist) @ wanted > math.cos(FARTHEST_DIRECTION)]
 
 
 def above_table(problem: GraspProblem, grasps: GraspBatch, table: float) -> Bool[Tensor, " n"]:

@@ -100,7 +100,8 @@ def motion_losses(
     with torch.no_grad():
         features = encoder(hand - hand.mean(1, keepdim=True))
     mean, log_variance = motion.encode(features, hand, goal)
-    distance = (motion(features, hand, sample_posterior(mean, log_variance, generator)) - goal).norm(dim=-1).mean()
+    z = sample_posterior(mean, log_variance, generator)
+    distance = (motion(features, hand, z[:, None])[:, 0] - goal).norm(dim=-1).mean()
     nats = divergence(mean, log_variance).sum(-1).mean()
     return {"total": distance + config.divergence * nats, "distance": distance, "nats": nats}
 

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import cast, get_args
 
 import torch
 import viser
@@ -26,7 +26,7 @@ from dro_grasp.objects.catalogue import load_object, object_names
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import evaluate
-from dro_grasp.predictor import GraspPredictor, GraspRequest
+from dro_grasp.predictor import GraspPredictor, GraspRequest, Method
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.trial import record
 from dro_grasp.viewer.app import POSTURES, Posture, describe, outcome, postures_of
@@ -101,7 +101,7 @@ class Studio(ServedPage):
 
     def generate(
         self, hand: str, obj: str, num: int = 16, direction: str = ANY, temperature: float | None = None,
-        protocol: str = "strict", candidates: int = 4,
+        protocol: str = "strict", candidates: int = 4, method: Method = "auto",
     ) -> ShownGrasps:
         """Predict, refine, rank and evaluate, then show the best.
 
@@ -113,13 +113,14 @@ class Studio(ServedPage):
             temperature: Of z; the weights' own by default.
             protocol: Trial; bare clouds get none.
             candidates: Candidates proposed for each grasp.
+            method: Their source, as in `GraspRequest`.
 
         Raises:
             DroGraspError: An argument cannot be used.
         """
         problem = GraspProblem(load_hand(hand), load_object(obj), self.predictor.device)
         along = None if direction == ANY else half_axis_direction(direction)
-        request = GraspRequest(num, direction=along, candidates=candidates, temperature=temperature)
+        request = GraspRequest(num, direction=along, candidates=candidates, temperature=temperature, method=method)
         found = self.predictor.run(problem, request)
         raw, refined = found.proposed, found.grasps
         if not problem.obj.is_cloud:
@@ -139,6 +140,8 @@ class Studio(ServedPage):
             object_file = gui.add_upload_button("Upload an object (STL, OBJ, PLY)", mime_type=kinds)
         with gui.add_folder("Generate"):
             self.num = gui.add_slider("Grasps", 1, LARGEST_CALL, 1, 16)
+            self.method = gui.add_dropdown(
+                "Method", get_args(Method), initial_value="auto", hint="auto: the optimiser helps where the network is unsure.")
             self.candidates = gui.add_slider(
                 "Candidates", 1, MOST_CANDIDATES, 1, 4, hint="Candidates proposed for each grasp; the best by score are kept.")
             self.direction = gui.add_dropdown(
@@ -205,7 +208,7 @@ class Studio(ServedPage):
         begin = time.perf_counter()
         made = self.generate(
             self.hand.value, self.object.value, int(self.num.value), self.direction.value, float(self.temperature.value),
-            self.protocol.value, int(self.candidates.value))
+            self.protocol.value, int(self.candidates.value), self.method.value)
         held = "" if made.obj.is_cloud else (
             f", **{int(made.refined.success.sum())}** held under *{self.protocol.value}*")
         self._say(f"{len(made.refined)} grasps{held}; {time.perf_counter() - begin:.1f} s")

@@ -1,0 +1,75 @@
+"""Choice of z: of several hands that z moves, the one whose points suit the object best.
+
+Differs from the paper, which decodes the one z that it draws. A draw is one of many grasps that fit the placement, and the
+motion of the hand tells before decoding which of them penetrate the object, cross their fingers or stay away from it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dro_grasp.geometry.distance_field import DistanceField
+from dro_grasp.hands.anatomy import PALM
+from dro_grasp.hands.hand import Hand
+
+CROWDING_POINTS = 64
+"""Hand points, spread evenly, between which the distance of fingers is measured (ours)."""
+
+
+@dataclass(frozen=True)
+class ChoiceConfig:
+    """How many z are drawn, and the penalties by which one is chosen; fitted to `strict` trials on training objects (ours)."""
+
+    draws: int = 32
+    """z drawn for each placement; 1 takes the first."""
+    finger_penetration: float = 435.0
+    """Penalty for the deepest point of a finger inside the object, mean over fingers [1/m]."""
+    palm_penetration: float = 288.0
+    """The same for the palm [1/m]."""
+    margin: float = 0.0
+    """Clearance below which a point counts as inside; decoding moves points by some millimetres [m]."""
+    gap: float = 68.0
+    """Penalty for the distance of a finger from the surface, mean over fingers [1/m]."""
+    unevenness: float = 0.0
+    """Penalty for fingers that would arrive one after the other: standard deviation of their distances [1/m]."""
+    crowding: float = 330.0
+    """Penalty for how much closer than `apart` two fingers come [1/m]."""
+    reach: float = 0.03
+    """Fingers farther from the surface than this are all alike [m]."""
+    apart: float = 0.012
+    """Distance between points of two fingers from which on they do not crowd each other [m]."""
+
+
+def choice_scores(
+    hand: Hand, field: DistanceField, points: Float[Tensor, "*b n_points 3"], config: ChoiceConfig
+) -> Float[Tensor, "*b"]:
+    """How well moved hands suit the object; higher is better, comparable among hands of one kind.
+
+    Args:
+        hand: The hand that was moved.
+        field: Signed distances of the object, from its mesh or from its cloud and normals.
+        points: The hand's surface points after the motion, in the object's frame [m].
+        config: Penalties.
+    """
+    distance, _ = field.distances(points)
+    finger = hand.finger_of_link[hand.link_index]
+
+    def nearest(part: int) -> Float[Tensor, "*b"]:
+        return distance[..., finger == part].amin(-1)
+
+    fingers = [i for i in range(len(hand.fingers)) if bool((finger == i).any())]
+    nearest_of = torch.stack([nearest(i) for i in fingers], -1)
+    score = -config.finger_penetration * (config.margin - nearest_of).clamp_min(0).mean(-1)
+    score = score - config.gap * nearest_of.clamp(0, config.reach).mean(-1)
+    score = score - config.unevenness * nearest_of.clamp(-config.reach, config.reach).std(-1, correction=0)
+    if bool((finger == PALM).any()):
+        score = score - config.palm_penetration * (config.margin - nearest(PALM)).clamp_min(0)
+    some = hand.spread_rank < CROWDING_POINTS
+    owner = finger[some]
+    rivals = (owner[:, None] != owner) & (owner[:, None] != PALM) & (owner != PALM)
+    apart = torch.cdist(points[..., some, :], points[..., some, :])
+    return score - config.crowding * (config.apart - torch.where(rivals, apart, torch.inf).amin((-1, -2))).clamp_min(0)
