@@ -2,9 +2,10 @@
 
     python scripts/train_ranking.py --folder FOLDER [--num N] [--objects N] [--collect-only]
 
-Grasps are drawn at several temperatures and evaluated raw, refined, shaken and opened; some features come from a depth
-image or half of a cloud. The folder keeps the trials of each hand, so a stopped script resumes. The network with the
-lowest loss on objects left out is written to the package. Needs the development assets.
+Grasps are drawn at several temperatures and evaluated raw, refined, shaken and opened, beside optimised ones; some features
+come from a depth image or half of a cloud. `--hands` also takes files, such as those of `dro-grasp hand make`. The folder
+keeps the trials of each hand, so a stopped script resumes. The network with the lowest loss on objects left out is written
+to the package. Needs the development assets.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.partial_views import View, partial_view
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.proposal import ProposalConfig, propose
-from dro_grasp.pipeline.stages import complete, refine
+from dro_grasp.pipeline.stages import complete, optimise, refine
 from dro_grasp.ranking.features import feature_names, grasp_features
 from dro_grasp.ranking.score import ScoreConfig
 from dro_grasp.ranking.score_network import SHIPPED, ScoreNetwork, save_score_network
@@ -101,14 +102,15 @@ def collect(
         # Proposed without ranking: the network in use must neither choose its successor's data nor know its features.
         proposal = propose(problem, network, num, torch.Generator().manual_seed(rng.randrange(10**6)), config=config)
         raw, refined = complete(problem, proposal.grasps), refine(problem, proposal.grasps)
+        best = refine(problem, optimise(problem, num, rng.randrange(10**6)))
         some = refined[slice(0, num // 8)]
         opened = hand.canonical_joints(1.0).expand_as(some.joints)
         groups = {
-            "raw": raw[slice(0, num // 4)], "refined": refined,
+            "raw": raw[slice(0, num // 4)], "refined": refined, "optimised": best,
             "shaken": shaken(hand, refined[slice(0, num // 2)], generator),
             "opened": some.moved_to(some.T_object_wrist, opened),
         }
-        parts += [{"hand": name, "object": label, "kind": kind, "view": view, **evaluated(hand, obj, grasps, known)}
+        parts += [{"hand": hand.name, "object": label, "kind": kind, "view": view, **evaluated(hand, obj, grasps, known)}
                   for kind, grasps in groups.items()]
     return parts
 
@@ -163,7 +165,7 @@ def fit(parts: list[dict[str, Any]], left_out: set[str], seed: int) -> tuple[Sco
             if now < best:
                 best, best_state = now, {k: v.clone() for k, v in network.state_dict().items()}
     network.load_state_dict(best_state)
-    return network.eval(), areas(network, [p for p in others if p["kind"] == "refined"]), best
+    return network.eval(), areas(network, [p for p in others if p["kind"] in ("refined", "optimised")]), best
 
 
 def main() -> None:
@@ -182,7 +184,8 @@ def main() -> None:
     torch.set_num_threads(1)
     options.folder.mkdir(exist_ok=True)
     for name in options.hands:
-        path = options.folder / f"{name.replace('/', '-')}-{options.seed}-{FEATURES}.pt"
+        stem = Path(name).stem if Path(name).suffix else name.replace("/", "-")
+        path = options.folder / f"{stem}-{options.seed}-{FEATURES}.pt"
         if not path.exists():
             found = collect(
                 load_weights(options.weights), name, options.objects, options.num, options.seed, options.views)

@@ -26,13 +26,13 @@ class ChoiceConfig:
 
     draws: int = 32
     """z drawn for each placement; 1 takes the first."""
-    finger_penetration: float = 435.0
+    finger_penetration: float = 800.0
     """Penalty for the deepest point of a finger inside the object, mean over fingers [1/m]."""
-    palm_penetration: float = 288.0
+    palm_penetration: float = 800.0
     """The same for the palm [1/m]."""
-    margin: float = 0.0
+    margin: float = 0.002
     """Clearance below which a point counts as inside; decoding moves points by some millimetres [m]."""
-    gap: float = 68.0
+    gap: float = 150.0
     """Penalty for the distance of a finger from the surface, mean over fingers [1/m]."""
     unevenness: float = 0.0
     """Penalty for fingers that would arrive one after the other: standard deviation of their distances [1/m]."""
