@@ -37,7 +37,7 @@ METHODS = (FIRST_Z, "network", "optimise", "auto")
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--hands", nargs="+", default=sorted(HELD_OUT_HANDS), help="hands; those left out of training by default")
+    parser.add_argument("--hands", nargs="+", default=sorted(HELD_OUT_HANDS), help="hands; all left out of training by default")
     parser.add_argument("--objects", nargs="+", default=["builtin:test"], help="objects")
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS), help="rows")
     parser.add_argument("--num", type=int, default=16, help="grasps of each hand on each object")

@@ -32,7 +32,7 @@ def names_of(command: Any) -> list[list[str]]:
 
 COMMANDS = [[], *names_of(cli.Command)]
 KEYS = {
-    "hand", "object", "num", "candidates", "seed", "weights", "protocol", "success", "success_rate", "seconds",
+    "hand", "object", "num", "candidates", "origin", "seed", "weights", "protocol", "success", "success_rate", "seconds",
     "output", "frame",
 }
 
@@ -151,7 +151,7 @@ def test_generate_reports_and_saves_what_it_counts(generate, tmp_path: Path) -> 
     path = tmp_path / "grasps.parquet"
     report = generate("--output", str(path))
     assert report.keys() >= KEYS
-    assert set(report["seconds"]) == {"load", "network", "decode", "refine", "rank", "trial"}
+    assert set(report["seconds"]) == {"load", "network", "decode", "optimise", "refine", "rank", "trial"}
     assert (report["num"], report["candidates"], report["protocol"]) == (3, 12, "dro")
     assert report["success_rate"] == pytest.approx(report["success"] / 3)
     grasps = GraspBatch.load(path)

@@ -31,7 +31,7 @@ class Off(DistanceNetwork):
         return NetworkOutput(self.true + 0.004, mean, zero, zero, zero, zero[:, 0], hand, torch.zeros(len(obj), TINY.width))
 
     def predict(self, hand: Tensor, obj: Tensor, noise: Tensor) -> Tensor:
-        assert noise.shape == (len(obj), TINY.latent)
+        assert noise.shape == (len(obj), 1, TINY.latent)
         return self.true - 0.009
 
 

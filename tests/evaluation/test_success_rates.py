@@ -71,7 +71,8 @@ def test_raw_and_ranked_rows_are_what_single_trials_say(rows: list[Row]) -> None
         passed, passed_best, passed_first, held = [], [], [], []
         for name in OBJECTS:
             obj = load_object(name)
-            grasps = predictor.predict(hand, obj, num=8, seed=pair_seed(0, hand, obj), candidates=1, refine=False)
+            seed = pair_seed(0, hand, obj)
+            grasps = predictor.predict(hand, obj, num=8, seed=seed, candidates=1, refine=False, method="network")
             if stage == REFINED:
                 grasps = refine(GraspProblem(hand, obj), grasps)
             passed.append(simulate(hand, obj, grasps, "strict").success)
