@@ -2,10 +2,10 @@
 
     python scripts/train_ranking.py --folder FOLDER [--num N] [--objects N] [--collect-only]
 
-Grasps are drawn at several temperatures and evaluated raw, refined, shaken and opened, beside optimised ones; some features
-come from a depth image or half of a cloud. `--hands` also takes files, such as those of `dro-grasp hand make`. The folder
-keeps the trials of each hand, so a stopped script resumes. The network with the lowest loss on objects left out is written
-to the package. Needs the development assets.
+Grasps are drawn at several temperatures and evaluated raw, refined, shaken, opened and moved away, beside optimised ones;
+some features come from a depth image or half of a cloud. `--hands` also takes files, such as those of `dro-grasp hand make`.
+The folder keeps the trials of each hand, so a stopped script resumes. The network with the lowest loss on objects left out
+is written to the package. Needs the development assets.
 """
 
 from __future__ import annotations
@@ -78,6 +78,14 @@ def shaken(hand: Hand, grasps: GraspBatch, generator: torch.Generator) -> GraspB
     return grasps.moved_to(T, q)
 
 
+def away(grasps: GraspBatch, generator: torch.Generator) -> GraspBatch:
+    """Grasps of air: the hand is 5 to 40 cm off in any direction."""
+    T = grasps.T_object_wrist.clone()
+    direction = functional.normalize(torch.randn(len(T), 3, generator=generator), dim=-1)
+    T[:, :3, 3] += direction * (0.05 + 0.35 * torch.rand(len(T), 1, generator=generator))
+    return grasps.moved_to(T, grasps.joints)
+
+
 @torch.no_grad()
 def evaluated(hand: Hand, obj: ObjectModel, grasps: GraspBatch, known: ObjectModel) -> dict[str, Tensor]:
     """Features of grasps from the known part of the object, and outcomes of their trials on the whole object."""
@@ -108,7 +116,7 @@ def collect(
         groups = {
             "raw": raw[slice(0, num // 4)], "refined": refined, "optimised": best,
             "shaken": shaken(hand, refined[slice(0, num // 2)], generator),
-            "opened": some.moved_to(some.T_object_wrist, opened),
+            "opened": some.moved_to(some.T_object_wrist, opened), "away": away(some, generator),
         }
         parts += [{"hand": hand.name, "object": label, "kind": kind, "view": view, **evaluated(hand, obj, grasps, known)}
                   for kind, grasps in groups.items()]

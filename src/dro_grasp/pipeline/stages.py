@@ -23,6 +23,10 @@ FARTHEST_DIRECTION = math.radians(20.0)
 """Largest angle between the palm direction of an optimised grasp and the direction that was asked for [rad] (ours)."""
 
 
+FARTHEST_SETTLED = 0.05
+"""How far the object may move in the hand while a grasp settles [m] (ours)."""
+
+
 def complete(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
     """Grasps that all state a pregrasp and a squeeze; the controller makes the missing ones.
 
@@ -105,7 +109,9 @@ def optimise(
     hand, obj = problem.hand, problem.obj
     grasps = optimised(hand, obj, problem.energy(config.energy), num, seed, config, progress)
     if hand.description is not None and not obj.is_cloud:
-        grasps = settle(hand, obj, grasps)
+        settled = settle(hand, obj, grasps)
+        moved = hand.grasp_centres(settled.T_object_wrist) - hand.grasp_centres(grasps.T_object_wrist)
+        grasps = settled[moved.norm(dim=-1) < FARTHEST_SETTLED]  # an object that flies away leaves no grasp behind
     grasps = grasps.bare()
     if direction is None:
         return grasps
