@@ -42,7 +42,7 @@ _NAMES = {
     "pipeline.stages": "complete evaluate rank refine",
     "predictor": "GraspPredictor GraspRequest Prediction PredictorConfig",
     "simulation.outcome": "Failure TrialResult",
-    "simulation.protocols": "Protocol",
+    "simulation.protocols": "Perturbations Protocol",
     "simulation.trial": "simulate",
     "training.config": "AugmentationConfig LossConfig MotionConfig PretrainConfig ScheduleConfig TrainConfig",
     "training.loop": "train",
@@ -91,7 +91,7 @@ if TYPE_CHECKING:
         PredictorConfig as PredictorConfig,
     )
     from dro_grasp.simulation.outcome import Failure as Failure, TrialResult as TrialResult
-    from dro_grasp.simulation.protocols import Protocol as Protocol
+    from dro_grasp.simulation.protocols import Perturbations as Perturbations, Protocol as Protocol
     from dro_grasp.simulation.trial import simulate as simulate
     from dro_grasp.training.config import (
         AugmentationConfig as AugmentationConfig,

@@ -264,7 +264,17 @@ def test_evaluate_and_view_take_the_file_that_generate_wrote(generate, tmp_path:
     report = json.loads(capsys.readouterr().out)
     assert report["num"] == 2
     assert report["interval_95"][0] <= report["success_rate"] <= report["interval_95"][1]
-    assert set(GraspBatch.load(tried).protocol) == {"strict/1"}
+    evaluated = GraspBatch.load(tried)
+    assert set(evaluated.protocol) == {"strict/1"}
+    fingers = evaluated.fingers_in_contact
+    assert report["fingers_in_contact"] == pytest.approx(float(fingers.mean()) / 3)
+    assert report["all_fingers_in_contact"] == pytest.approx(float((fingers == 3).float().mean()))
+    assert "trials_held" not in report
+    assert main(["evaluate", str(grasps), "--protocol", "robust", "--output", str(tried), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["trials_held"] == pytest.approx(float(GraspBatch.load(tried).robustness.mean()))
+    assert main(["evaluate", str(grasps), "--protocol", "robust"]) == 0
+    assert "held in" in capsys.readouterr().out
     assert main(["picture", str(tried), "--output", str(picture)]) == 0
     assert picture.read_bytes().startswith(b"\x89PNG")
 

@@ -12,7 +12,7 @@ from scipy.stats import mannwhitneyu
 
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.evaluation.controls import mean_grasp, mean_grasps, palm_facing_starts
-from dro_grasp.evaluation.metrics import diversity, roc_area, wilson_interval
+from dro_grasp.evaluation.metrics import diversity, finger_contact, mean_share, roc_area, wilson_interval
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.shape import ObjectModel
 from tests.helpers.tiny_bundle import SEMIAXES, ellipsoid, made_up_grasps, tiny_bundle
@@ -38,6 +38,26 @@ def test_wilson_interval_holds_the_rates_that_the_score_test_keeps(success: int,
     z, p = 1.959963985, success / total
     ends = np.roots([1 + z**2 / total, -2 * p - z**2 / total, p**2])
     assert wilson_interval(success, total) == pytest.approx((ends.min(), ends.max()), abs=1e-7)
+
+
+def test_mean_share_covers_the_mean_more_often_than_it_says() -> None:
+    """A thousand times 25 grasps, each with a rate of its own: the true mean is inside at least 95 % of the time."""
+    generator = np.random.default_rng(0)
+    rates = generator.beta(4, 1, size=(1000, 25))
+    shares = generator.binomial(8, rates) / 8
+    inside = 0
+    for row in shares:
+        mean, low, high = mean_share(torch.from_numpy(row).float())
+        assert low <= mean <= high
+        inside += low <= 0.8 <= high
+    assert inside >= 950
+    assert mean_share(torch.ones(25)) == (1.0, *wilson_interval(25, 25))
+    assert math.isnan(mean_share(torch.zeros(0))[0])
+
+
+def test_finger_contact_is_the_mean_share_and_the_share_of_full_hands() -> None:
+    assert finger_contact(torch.tensor([4, 2, 4, 0]), 4) == (10 / 16, 0.5)
+
 
 
 def test_without_trials_nothing_is_known() -> None:

@@ -36,7 +36,8 @@ def make(n: int, obj=BALL, seed: int = 0, **optional) -> GraspBatch:
 def evaluated(n: int, **optional) -> GraspBatch:
     trial = SimpleNamespace(
         success=torch.arange(n) % 2 == 0, displacement=torch.rand(n, 6), rotation=torch.rand(n, 6),
-        penetration=torch.rand(n), protocol="dro/1",
+        penetration=torch.rand(n), protocol="dro/1", robustness=torch.full((n,), torch.nan),
+        fingers_in_contact=torch.arange(n),
         reason=tuple("" if i % 2 == 0 else "slipped by 30 mm" for i in range(n)), contact_links=(("tip",),) * n,
         failure=tuple(None if i % 2 == 0 else Failure.SLIPPED for i in range(n)),
     )

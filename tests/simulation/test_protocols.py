@@ -44,5 +44,14 @@ def test_a_protocol_of_ones_own_passes_through():
 
 
 def test_unknown_name_lists_the_choices():
-    with pytest.raises(OptionError, match=r"'hard'.*dro, strict, dro_static"):
+    with pytest.raises(OptionError, match=r"'hard'.*dro, strict, robust, dro_static"):
         protocol("hard")
+
+
+def test_robust_is_strict_under_perturbations():
+    strict, robust = protocol("strict"), protocol("robust")
+    assert replace(robust, name="strict", perturbations=strict.perturbations) == strict
+    assert strict.perturbations.trials == 1
+    assert robust.label == "robust/1"
+    fewer = replace(robust, perturbations=replace(robust.perturbations, trials=7))
+    assert fewer.label == "robust+changed/1"

@@ -37,7 +37,7 @@ def same(a: TrialResult, b: TrialResult) -> None:
     assert (a.failure, a.reason) == (b.failure, b.reason)
 
 
-@pytest.mark.parametrize("name", ["dro", "strict", "dro_static", "dexgraspbench"])
+@pytest.mark.parametrize("name", ["dro", "strict", "robust", "dro_static", "dexgraspbench"])
 def test_power_grasp_holds_a_ball(hand, obj, name):
     grasps = power_grasp(hand, obj, 3)
     if name == "dro_static":

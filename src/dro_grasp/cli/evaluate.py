@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -14,6 +14,13 @@ from dro_grasp.cli.grasp_files import load_grasps
 from dro_grasp.cli.output import Flag, optional, print_json, print_table, progress_bar, say, say_aside
 from dro_grasp.cli.protocol_name import ProtocolName
 from dro_grasp.grasps.sources import hand_of, object_of
+
+if TYPE_CHECKING:
+    from dro_grasp.grasps.batch import GraspBatch
+    from dro_grasp.hands.hand import Hand
+
+SHARES = {"trials_held": "held", "fingers_in_contact": "fingers", "all_fingers_in_contact": "all fingers"}
+"""Shares beside the success rate, in the JSON object, and their columns in the table."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +50,7 @@ class Evaluate:
     def run(self) -> int:
         """Evaluate object by object, then report."""
         from dro_grasp.errors import OptionError
-        from dro_grasp.evaluation.metrics import wilson_interval
+        from dro_grasp.evaluation.metrics import mean_share, wilson_interval
         from dro_grasp.files import check_output
         from dro_grasp.grasps.batch import GraspBatch
         from dro_grasp.pipeline.problem import GraspProblem
@@ -72,16 +79,17 @@ class Evaluate:
                 evaluated.append(done)
                 reasons.update(Failure[name].value for name in done.extra["failure"] if name)
                 success = int(done.success.sum())
-                rows.append([name, len(done), success, success / max(1, len(done))])
+                rows.append([name, len(done), success, success / max(1, len(done)), *shares(done, hand).values()])
         done = GraspBatch.concatenate(evaluated)
         if self.output is not None:
             done.save(self.output)
         success = sum(row[2] for row in rows)
         low, high = wilson_interval(success, len(grasps))
+        beside = shares(done, hand)
         report = {
             "file": str(self.file), "hand": hand.name, "protocol": rules.label, "num": len(grasps), "success": success,
             "success_rate": success / max(1, len(grasps)), "interval_95": [low, high],
-            "objects": {row[0]: {"num": row[1], "success": row[2]} for row in rows},
+            **beside, "objects": {row[0]: {"num": row[1], "success": row[2]} for row in rows},
             "reasons": dict(reasons.most_common()), "seconds": round(time.perf_counter() - begin, 3),
             "output": None if self.output is None else str(self.output),
         }
@@ -90,7 +98,20 @@ class Evaluate:
             return 0
         rate = success / max(1, len(grasps))
         note = f"{success} of {len(grasps)} succeeded: {rate:.1%} (95 %: {low:.1%} to {high:.1%})"
-        print_table(f"{hand.name}, protocol {rules.label}", ["object", "grasps", "success", "rate"], rows, note=note)
+        if "trials_held" in beside:
+            mean, low, high = mean_share(done.robustness)
+            note += f", and held in {mean:.1%} of their trials (95 %: {low:.1%} to {high:.1%})"
+        columns = ["object", "grasps", "success", "rate", *(SHARES[name] for name in beside)]
+        print_table(f"{hand.name}, protocol {rules.label}", columns, rows, note=note)
         for reason, count in reasons.most_common():
             say(f"  {count} failed: {reason}")
         return 0
+
+
+def shares(grasps: GraspBatch, hand: Hand) -> dict[str, float]:
+    """Mean shares, as in SHARES: of its trials that a grasp holds in, if it has several, and of fingers in contact."""
+    from dro_grasp.evaluation.metrics import finger_contact
+
+    held = [float(grasps.robustness.mean())] if bool(grasps.robustness.isfinite().all()) else []
+    names = list(SHARES)[-2 - len(held):]
+    return dict(zip(names, [*held, *finger_contact(grasps.fingers_in_contact, len(hand.fingers))], strict=True))

@@ -6,7 +6,7 @@ import math
 
 import roma
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
@@ -19,6 +19,20 @@ def wilson_interval(success: int, total: int) -> tuple[float, float]:
         return 0.0, 1.0
     interval = binomtest(success, total).proportion_ci(confidence_level=0.95, method="wilson")
     return float(interval.low), float(interval.high)
+
+
+def mean_share(shares: Float[Tensor, " n"]) -> tuple[float, float, float]:
+    """Mean of a share that each grasp has, and its 95 % interval; NaN and [0, 1] without grasps.
+
+    The interval is Wilson's for as many successes: shares vary less than successes of the same mean, so it is cautious.
+    """
+    mean, total = float(shares.mean()), len(shares)
+    return mean, *wilson_interval(round(mean * total) if total else 0, total)
+
+
+def finger_contact(counts: Float[Tensor, " n"] | Int[Tensor, " n"], fingers: int) -> tuple[float, float]:
+    """Mean share of a hand's fingers in contact with the object, and share of grasps with all of them; NaN without grasps."""
+    return float(counts.float().mean()) / fingers, float((counts == fingers).float().mean())
 
 
 def diversity(T_object_wrist: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"]) -> dict[str, float]:

@@ -22,11 +22,13 @@ def csv_table(grasps: GraspBatch, frame: Frame) -> str:
     text.write(comment(grasps, frame))
     writer = csv.writer(text, lineterminator="\n")
     names = [f"{posture}:{joint}" for posture in joints for joint in grasps.joint_names]
-    writer.writerow(["object", "x", "y", "z", "qw", "qx", "qy", "qz", "score", "energy", "success", "protocol", *names])
+    writer.writerow(["object", "x", "y", "z", "qw", "qx", "qy", "qz", "score", "energy", "success", "protocol",
+                     "robustness", "fingers_in_contact", *names])
     for i in range(len(grasps)):
         writer.writerow([
             grasps.object[i], *plain(position[i]), *plain(quaternion[i]), _known(grasps.score[i]), _known(grasps.energy[i]),
             int(grasps.success[i]) if bool(grasps.evaluated[i]) else "", grasps.protocol[i],
+            _known(grasps.robustness[i]), _known(grasps.fingers_in_contact[i]),
             *(value for values in joints.values() for value in plain(values[i])),
         ])
     return text.getvalue()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -76,3 +78,11 @@ def nearer_half(points: Float[Tensor, "*b n 3"], direction: Float[Tensor, "*b 3"
     """Indices of the half of the points farthest along a direction, in ascending order."""
     along = (points @ direction[..., None])[..., 0]
     return along.topk(points.shape[-2] // 2, dim=-1).indices.sort(dim=-1).values
+
+
+def even_directions(count: int) -> Float[Tensor, "count 3"]:
+    """Unit vectors spread evenly over the sphere, from the top down (Fibonacci sphere)."""
+    i = torch.arange(count, dtype=torch.float64) + 0.5
+    z = 1 - 2 * i / count
+    angle, radius = math.pi * (1 + math.sqrt(5)) * i, (1 - z * z).sqrt()
+    return torch.stack([radius * angle.cos(), radius * angle.sin(), z], -1)

@@ -72,6 +72,10 @@ class GraspBatch:
     """Largest rotation of the object in the trial [rad]."""
     penetration: Float[Tensor, " n"]
     """Deepest penetration in the grasp pose [m]."""
+    robustness: Float[Tensor, " n"]
+    """Share of a grasp's trials in which it held, under a protocol that perturbs."""
+    fingers_in_contact: Float[Tensor, " n"]
+    """Number of fingers that touch the object after closing in the trial."""
     protocol: tuple[str, ...]
     """Protocol of each grasp's trial; the empty string where there was none."""
     extra: dict[str, Any] = field(default_factory=dict)
@@ -228,7 +232,8 @@ class GraspBatch:
         }
         return self.replace(
             success=trial.success, displacement=trial.displacement.amax(-1), rotation=trial.rotation.amax(-1),
-            penetration=trial.penetration, protocol=(trial.protocol,) * len(self), extra=self.extra | further)
+            penetration=trial.penetration, robustness=trial.robustness, fingers_in_contact=trial.fingers_in_contact.float(),
+            protocol=(trial.protocol,) * len(self), extra=self.extra | further)
 
     def without_trial(self) -> GraspBatch:
         """The batch as if no grasp had been evaluated."""

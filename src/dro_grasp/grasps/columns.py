@@ -9,8 +9,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-FLOATS = ("score", "energy", "displacement", "rotation", "penetration")
-"""Columns of one number per grasp; NaN is unknown."""
+TRIAL_FLOATS = ("displacement", "rotation", "penetration", "robustness", "fingers_in_contact")
+"""Columns of one number per grasp that a trial fills; NaN is unknown."""
+FLOATS = ("score", "energy", *TRIAL_FLOATS)
+"""All columns of one number per grasp."""
 POSTURES = ("pregrasp_joints", "squeeze_joints")
 """Columns of one number per joint; a row of NaN is not stated."""
 TEXTS = ("object", "object_sha256", "split", "provenance")
@@ -23,7 +25,7 @@ NOT_EVALUATED = ""
 """Protocol of a grasp without a trial."""
 UNKNOWN_PROTOCOL = "unknown"
 """Protocol of a grasp whose outcome is known without its protocol."""
-MEASURED = ("success", "protocol", "displacement", "rotation", "penetration")
+MEASURED = ("success", "protocol", *TRIAL_FLOATS)
 """Fields of a batch that a trial fills."""
 REASON = "reason"
 """Further column: why a grasp failed, in words; empty for a success."""

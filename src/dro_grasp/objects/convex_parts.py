@@ -39,8 +39,8 @@ Part = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
 def decompose(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"], key: str) -> tuple[Part, ...]:
     """Convex parts by CoACD, cached under the content hash `key`; a convex mesh is its own part."""
     settings = f"{THRESHOLD * 1000:.0f}-{MAX_PARTS}-{MAX_VERTICES}"
-    stored = cached_arrays(f"parts-{key[:24]}-{settings}", lambda: _pack(_run(vertices, faces)))
-    return _unpack(stored)
+    stored = cached_arrays(f"parts-{key[:24]}-{settings}", lambda: pack(_run(vertices, faces)))
+    return unpack(stored)
 
 
 def _run(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> list[Part]:
@@ -94,7 +94,7 @@ def closed_surface(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m
     return surface
 
 
-def _pack(parts: list[Part]) -> Arrays:
+def pack(parts: list[Part]) -> Arrays:
     """Parts as three arrays: all vertices, all faces, and the counts of each part."""
     return {
         "vertices": np.concatenate([v for v, _ in parts]), "faces": np.concatenate([f for _, f in parts]),
@@ -102,8 +102,8 @@ def _pack(parts: list[Part]) -> Arrays:
     }
 
 
-def _unpack(stored: Arrays) -> tuple[Part, ...]:
-    """The inverse of `_pack`."""
+def unpack(stored: Arrays) -> tuple[Part, ...]:
+    """The inverse of `pack`."""
     ends = np.cumsum(stored["counts"], axis=0)[:-1]
     vertices = np.split(stored["vertices"], ends[:, 0])
     faces = np.split(stored["faces"], ends[:, 1])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -14,6 +14,7 @@ from dro_grasp.errors import ObjectError
 from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.geometry.point_clouds import random_half
 from dro_grasp.objects.cache import cached_arrays
+from dro_grasp.objects.coarse_parts import coarse_parts
 from dro_grasp.objects.convex_parts import Part, decompose
 from dro_grasp.objects.surface_distances import GRID_SPACING, bake_grid, cloud_distances, signed_distances
 
@@ -74,6 +75,11 @@ class ObjectModel:
         if self.vertices is None or self.faces is None:
             raise ObjectError(f"object '{self.name}' is a bare point cloud and has no convex parts; give a mesh instead")
         return decompose(self.vertices, self.faces, self.sha256)
+
+    @cached_property
+    def coarse(self) -> ObjectModel:
+        """The same object with fewer and simpler convex parts, as another tool might cut it; its hash is another."""
+        return replace(self, exact_parts=coarse_parts(self.parts), sha256=f"{self.sha256}-coarse")
 
     @cached_property
     def distance_field(self) -> DistanceField:

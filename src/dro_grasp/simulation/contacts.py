@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from jaxtyping import Float, Int
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
 from dro_grasp.simulation.scene import PREFIX, Scene
 
 
@@ -21,6 +24,10 @@ class Penetration:
     """Deepest contact of hand and object [m]; zero without contact."""
     own: Float[np.ndarray, " n"]
     """Summed over pairs of hand links, the deepest contact of each pair [m]."""
+
+    def rows(self, index: Int[np.ndarray, " k"]) -> Penetration:
+        """The penetration in some of the grasps."""
+        return Penetration(self.object[index], self.own[index])
 
 
 def measure_penetration(scene: Scene, grasps: GraspBatch) -> Penetration:
@@ -45,6 +52,22 @@ def find_contact_links(scene: Scene, qpos: Float[np.ndarray, "n nq"]) -> tuple[t
         involved = bodies[(bodies == scene.object_body).any(1)]
         found.append(tuple(sorted({names[i] for i in involved[involved != scene.object_body]})))
     return tuple(found)
+
+
+def contact_mask(hand: Hand, contact_links: Sequence[Sequence[str]]) -> Bool[Tensor, "n n_links"]:
+    """Which links of the hand are among each grasp's contact links."""
+    names = {name: i for i, name in enumerate(hand.tree.link_names)}
+    mask = torch.zeros(len(contact_links), hand.tree.n_links, dtype=torch.bool)
+    for row, links in zip(mask, contact_links, strict=True):
+        row[[names[link] for link in links if link in names]] = True
+    return mask
+
+
+def count_fingers(hand: Hand, contact_links: Sequence[Sequence[str]]) -> Int[Tensor, " n"]:
+    """Number of fingers with at least one contact link, in each grasp."""
+    mask = contact_mask(hand, contact_links)
+    fingers = [mask[:, list(finger.links)].any(1) for finger in hand.fingers]
+    return torch.stack(fingers).sum(0) if fingers else mask.new_zeros(len(mask), dtype=torch.int64)
 
 
 def _contacts(

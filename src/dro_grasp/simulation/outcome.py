@@ -36,7 +36,11 @@ class Failure(Enum):
 
 @dataclass(frozen=True)
 class TrialResult:
-    """Outcome of the trials of n grasps. A quantity that a trial did not measure is NaN."""
+    """Outcome of the trials of n grasps. A quantity that a trial did not measure is NaN.
+
+    Under a protocol that perturbs, a grasp has several trials. Measurements and reason are then those of the first one
+    with the grasp's verdict.
+    """
 
     success: Bool[Tensor, " n"]
     displacement: Float[Tensor, "n 6"]
@@ -50,6 +54,8 @@ class TrialResult:
     """Rotation of the object while the hand closes [rad]."""
     contact_links: tuple[tuple[str, ...], ...]
     """Names of the links that touch the object after closing."""
+    fingers_in_contact: Int[Tensor, " n"]
+    """Number of the hand's fingers that touch the object after closing."""
     penetration: Float[Tensor, " n"]
     """Deepest penetration of hand and object in the labelled grasp [m]."""
     self_penetration: Float[Tensor, " n"]
@@ -58,6 +64,10 @@ class TrialResult:
     """Why each grasp fails; None for a success."""
     reason: tuple[str, ...]
     """The same in words, with the number or the direction; empty for a success."""
+    robustness: Float[Tensor, " n"]
+    """Share of its trials that a grasp holds in; NaN under a protocol that does not perturb."""
+    shown: Int[Tensor, " n"]
+    """The trial that was measured; 0 is the protocol's own, without perturbation."""
     protocol: str
     """Name and version."""
 
@@ -81,12 +91,33 @@ class TrialResult:
     @staticmethod
     def join(results: Sequence[TrialResult], label: str) -> TrialResult:
         """One result after the other, all of the same protocol."""
+        columns: dict[str, Any]
         if not results:
             none, six = torch.zeros(0), torch.zeros(0, len(DIRECTIONS))
-            return TrialResult(none > 0, six, six, none, none, (), none, none, (), (), label)
-        columns: dict[str, Any] = {name: torch.cat([getattr(r, name) for r in results]) for name in NUMBERS}
+            columns = dict.fromkeys(NUMBERS, none) | dict.fromkeys(TEXTS, ())
+            columns |= {"success": none > 0, "displacement": six, "rotation": six}
+            columns |= {"fingers_in_contact": none.long(), "shown": none.long()}
+            return TrialResult(**columns, protocol=label)
+        columns = {name: torch.cat([getattr(r, name) for r in results]) for name in NUMBERS}
         columns |= {name: tuple(x for r in results for x in getattr(r, name)) for name in TEXTS}
         return TrialResult(**columns, protocol=label)
+
+
+def verdict(trials: TrialResult, count: int, needed: int) -> TrialResult:
+    """The outcome of grasps from several trials of each.
+
+    Args:
+        trials: The first trial of every grasp, then the second of every grasp, and so on.
+        count: Trials of each grasp.
+        needed: Trials that a success holds in.
+    """
+    held = trials.success.reshape(count, -1)
+    total = held.sum(0)
+    shown = (held == (total >= needed)).int().argmax(0)
+    result = trials.rows(shown * held.shape[1] + torch.arange(held.shape[1]))
+    reason = tuple(f"{why}; held in {k} of {count} trials" if why else "" for why, k in zip(
+        result.reason, total.tolist(), strict=True))
+    return replace(result, robustness=total / count, shown=shown, reason=reason)
 
 
 TEXTS = ("contact_links", "failure", "reason")
@@ -103,6 +134,7 @@ class Measurements:
     shift: Float[np.ndarray, " n"]
     turn: Float[np.ndarray, " n"]
     contacts: tuple[tuple[str, ...], ...]
+    fingers: Int[Tensor, " n"]
     stable: Bool[np.ndarray, " n"]
     displacement: Float[np.ndarray, "n 6"]
     rotation: Float[np.ndarray, "n 6"]
@@ -119,9 +151,12 @@ class Measurements:
             success=torch.tensor([failure is None for failure, _ in verdicts], dtype=torch.bool),
             displacement=tensor(self.displacement, True), rotation=tensor(self.rotation, True),
             closing_shift=tensor(self.shift, True), closing_rotation=tensor(self.turn, True), contact_links=self.contacts,
+            fingers_in_contact=self.fingers,
             penetration=tensor(self.penetration.object), self_penetration=tensor(self.penetration.own),
             failure=tuple(failure for failure, _ in verdicts),
-            reason=tuple(failure.value + detail if failure else "" for failure, detail in verdicts), protocol=rules.label,
+            reason=tuple(failure.value + detail if failure else "" for failure, detail in verdicts),
+            robustness=torch.full((len(verdicts),), torch.nan), shown=torch.zeros(len(verdicts), dtype=torch.int64),
+            protocol=rules.label,
         )
 
     def _verdict(self, i: int, rules: Protocol) -> tuple[Failure | None, str]:

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.simulation.outcome import GIVE_UP
+from dro_grasp.simulation.perturbation import Conditions
 from dro_grasp.simulation.scene import Scene, object_mass
 
 FORCES = np.concatenate([np.eye(3), -np.eye(3)])
@@ -54,7 +55,9 @@ class ObjectState:
 class Rollout:
     """Trials of several grasps side by side; each hand waits at its start."""
 
-    def __init__(self, scene: Scene, grasps: GraspBatch, workers: int, stride: int | None = None) -> None:
+    def __init__(
+        self, scene: Scene, grasps: GraspBatch, workers: int, stride: int | None = None, conditions: Conditions | None = None
+    ) -> None:
         """Place hands and objects.
 
         Args:
@@ -62,6 +65,7 @@ class Rollout:
             grasps: At least one; each states its pregrasp and squeeze if the protocol closes the hand.
             workers: Threads.
             stride: Record a frame every so many time steps; None records nothing.
+            conditions: What differs from the protocol; None if nothing does.
         """
         rules = scene.protocol
         start, target = grasps.joints, grasps.joints
@@ -69,7 +73,12 @@ class Rollout:
             start, target = grasps.pregrasp_joints, grasps.squeeze_joints
         self.scene, self.stride = scene, stride
         self.size = len(grasps)
+        self.mass = np.full(self.size, object_mass(scene.obj, rules))
+        if conditions is not None:
+            grasps = conditions.displaced(grasps, scene.obj.centre_of_mass)
         self.batch = mujoco.batch.Batch(scene.model, nsim=self.size, nthread=min(workers, self.size))
+        if conditions is not None:
+            self._change(conditions)
         self.qpos, self.ctrl, self.force = (self.batch.bind(n) for n in ("qpos", "ctrl", "xfrc_applied"))
         self.qpos[:] = scene.qpos(grasps.T_object_wrist, start)
         postures = [start, grasps.joints, target] if rules.gradual else [target]
@@ -141,6 +150,16 @@ class Rollout:
         poses[:, :3, :3], poses[:, :3, 3] = _matrices(pose[:, 3:]), pose[:, :3]
         return joints, poses
 
+    def _change(self, conditions: Conditions) -> None:
+        """Give each trial its own friction, mass and servos; the scene is compiled once for all."""
+        self.mass *= conditions.mass
+        self.batch.expand("geom_friction")[:] *= conditions.friction[:, None, None]
+        for name in ("actuator_gainprm", "actuator_biasprm"):
+            self.batch.expand(name)[:] *= conditions.gain[:, None, None]
+        self.batch.expand("body_mass")[:, self.scene.object_body] *= conditions.mass
+        self.batch.expand("body_inertia")[:, self.scene.object_body] *= conditions.mass[:, None]
+        self.batch.set_const()
+
     def _steps(self, seconds: float) -> int:
         """Time steps of a duration."""
         return round(seconds / self.scene.protocol.timestep)
@@ -148,7 +167,7 @@ class Rollout:
     def _set_force(self, axis: Float[np.ndarray, "3"], rows: Int[np.ndarray, " k"]) -> None:
         """Apply the force along an axis of the object's frame, as the object was oriented at the start."""
         rules = self.scene.protocol
-        newtons = rules.force * object_mass(self.scene.obj, rules)
+        newtons = rules.force * self.mass[rows, None]
         self.force[rows, self.scene.object_body, :3] = newtons * (self.start.rotation[rows] @ axis)
 
     def _advance(self, rows: Int[np.ndarray, " k"], steps: int) -> None:

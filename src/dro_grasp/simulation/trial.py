@@ -6,6 +6,7 @@ Source: paper, evaluation metric details.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -17,8 +18,9 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import completed
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.simulation.contacts import find_contact_links, measure_penetration
-from dro_grasp.simulation.outcome import DIRECTIONS, GIVE_UP, Failure, Measurements, TrialResult
+from dro_grasp.simulation.contacts import Penetration, contact_mask, count_fingers, find_contact_links, measure_penetration
+from dro_grasp.simulation.outcome import DIRECTIONS, GIVE_UP, Failure, Measurements, TrialResult, verdict
+from dro_grasp.simulation.perturbation import draw
 from dro_grasp.simulation.protocols import Protocol, protocol as find_protocol
 from dro_grasp.simulation.rollout import Rollout
 from dro_grasp.simulation.scene import Scene, cached_scene
@@ -52,7 +54,11 @@ def simulate(
     scene = _scene(hand, obj, grasps, protocol)
     results, done = [], 0
     for part, rollout in _rollouts(scene, hand, grasps, workers):
-        results.append(_run(rollout, part))
+        penetration = measure_penetration(scene, part)
+        result = _run(rollout, penetration)
+        if scene.protocol.perturbations.trials > 1:
+            result = _repeated(scene, part, result, penetration, workers)
+        results.append(result)
         done += len(part)
         if progress is not None:
             progress(done, len(grasps))
@@ -94,6 +100,8 @@ def record(
 ) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames n_dof"]]:
     """Frames of one grasp's trial, as `simulate` runs it: it ends where the trial ends.
 
+    Of several trials under a protocol that perturbs, it is the one that `simulate` measures.
+
     Args:
         hand: The hand of the grasps.
         obj: Their object; it needs a mesh.
@@ -113,7 +121,11 @@ def record(
     """
     scene = _scene(hand, obj, grasps, protocol)
     (grasp, rollout), = _rollouts(scene, hand, grasps[index], workers=1, stride=stride)
-    _run(rollout, grasp)
+    penetration = measure_penetration(scene, grasp)
+    if shown := int(simulate(hand, obj, grasp, scene.protocol, workers=1).shown):
+        conditions = draw(scene.protocol.perturbations, grasp).rows(slice(shown - 1, shown))
+        rollout = Rollout(_scene_of_trial(scene, shown), grasp, workers=1, stride=stride, conditions=conditions)
+    _run(rollout, penetration)
     joints, poses = (
         torch.from_numpy(np.concatenate(part).astype(np.float32)) for part in zip(*rollout.frames, strict=True))
     return poses, joints
@@ -137,10 +149,9 @@ def _rollouts(
         yield part, Rollout(scene, part, workers or cores(), stride)
 
 
-def _run(rollout: Rollout, grasps: GraspBatch) -> TrialResult:
-    """Take a rollout through the whole protocol."""
+def _run(rollout: Rollout, penetration: Penetration) -> TrialResult:
+    """Take a rollout through the whole protocol; the labelled grasps' penetration is known."""
     scene, rules = rollout.scene, rollout.scene.protocol
-    penetration = measure_penetration(scene, grasps)
     closed = rollout.close()
     contacts = find_contact_links(scene, rollout.qpos)
     shift, turn = closed.shift(rollout.start), closed.turn(rollout.start)
@@ -148,13 +159,37 @@ def _run(rollout: Rollout, grasps: GraspBatch) -> TrialResult:
     failed = ((shift > min(rules.max_closing_shift, GIVE_UP)) | (turn > rules.max_closing_rotation)
               | (penetration.object > rules.max_penetration) | (penetration.own > rules.max_self_penetration))
     displacement, rotation, stable = rollout.push(closed, ~failed)
-    return Measurements(penetration, shift, turn, contacts, stable, displacement, rotation).judged(rules)
+    fingers = count_fingers(scene.hand, contacts)
+    return Measurements(penetration, shift, turn, contacts, fingers, stable, displacement, rotation).judged(rules)
+
+
+def _repeated(
+    scene: Scene, grasps: GraspBatch, first: TrialResult, penetration: Penetration, workers: int | None
+) -> TrialResult:
+    """The outcome with all trials of a protocol that perturbs, from the first; who penetrates too deep fails them all."""
+    rules = scene.protocol.perturbations
+    deep = torch.tensor([failure in {Failure.PENETRATION, Failure.SELF_PENETRATION} for failure in first.failure])
+    others, rows = deep.nonzero()[:, 0], (~deep).nonzero()[:, 0]
+    results = [replace(first.rows(others), robustness=torch.zeros(len(others)))]
+    if len(rows):
+        conditions, trials = draw(rules, grasps[rows]), [first.rows(rows)]
+        for begin, end in ((1, rules.trials - rules.coarse), (rules.trials - rules.coarse, rules.trials)):
+            if begin == end:
+                continue
+            index, own = rows.repeat(end - begin), conditions.rows(slice((begin - 1) * len(rows), (end - 1) * len(rows)))
+            rollout = Rollout(_scene_of_trial(scene, begin), grasps[index], workers or cores(), conditions=own)
+            trials.append(_run(rollout, penetration.rows(index.numpy())))
+        results.append(verdict(TrialResult.join(trials, first.protocol), rules.trials, rules.needed))
+    return TrialResult.join(results, first.protocol).rows(torch.cat([others, rows]).argsort())
+
+
+def _scene_of_trial(scene: Scene, trial: int) -> Scene:
+    """The scene of a trial: in the last ones the object has coarse parts."""
+    rules = scene.protocol.perturbations
+    fine = trial < rules.trials - rules.coarse
+    return scene if fine else cached_scene(scene.hand, scene.obj.coarse, scene.protocol)
 
 
 def _holding_joints(hand: Hand, contact_links: Sequence[Sequence[str]]) -> Bool[Tensor, "n n_dof"]:
     """Joints that move a contact link."""
-    names = {name: i for i, name in enumerate(hand.tree.link_names)}
-    in_contact = torch.zeros(len(contact_links), hand.tree.n_links)
-    for row, links in zip(in_contact, contact_links, strict=True):
-        row[[names[link] for link in links if link in names]] = 1
-    return in_contact @ hand.tree.moves.float() > 0
+    return contact_mask(hand, contact_links).float() @ hand.tree.moves.float() > 0

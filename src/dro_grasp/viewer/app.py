@@ -118,10 +118,12 @@ def describe(grasps: GraspBatch, index: int) -> str:
         lines.append("not evaluated")
     values = {"score": (grasps.score, 1.0, ""), "energy": (grasps.energy, 1.0, ""),
               "displacement": (grasps.displacement, 1e3, " mm"), "rotation": (grasps.rotation, 180 / np.pi, "°"),
-              "penetration": (grasps.penetration, 1e3, " mm")}
+              "penetration": (grasps.penetration, 1e3, " mm"), "robustness": (grasps.robustness, 100.0, " %")}
     for name, (column, factor, unit) in values.items():
         if bool(column[index].isfinite()):
             lines.append(f"{name} {float(column[index]) * factor:.2f}{unit}")
+    if bool(grasps.fingers_in_contact[index].isfinite()):
+        lines.append(f"fingers in contact {int(grasps.fingers_in_contact[index])}")
     return "  \n".join(lines)
 
 

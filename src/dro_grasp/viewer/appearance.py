@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from dro_grasp.geometry.point_clouds import even_directions
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
@@ -105,13 +106,9 @@ def best_camera(
 
 @lru_cache(maxsize=1)
 def _directions() -> tuple[tuple[float, float, float], ...]:
-    """Evenly spread viewpoints (Fibonacci sphere), without those from straight below or above."""
-    i = np.arange(2 * VIEWPOINTS) + 0.5
-    z = 1 - i / VIEWPOINTS
-    angle = np.pi * (1 + 5**0.5) * i
-    r = np.sqrt(1 - z**2)
-    rows = zip((r * np.cos(angle)).tolist(), (r * np.sin(angle)).tolist(), z.tolist(), strict=True)
-    return tuple(row for row in rows if LOWEST_VIEW < row[2] < HIGHEST_VIEW)
+    """Evenly spread viewpoints, without those from straight below or above."""
+    rows = even_directions(2 * VIEWPOINTS)
+    return tuple((x, y, z) for x, y, z in rows.tolist() if LOWEST_VIEW < z < HIGHEST_VIEW)
 
 
 def _clarity(points: Float[np.ndarray, "n 3"], owner: Int[np.ndarray, " n"], direction: tuple[float, float, float]) -> float:
