@@ -30,8 +30,8 @@ Method = Literal["auto", "network", "optimise"]
 """Where candidates come from."""
 TRUSTED_SCORE = 0.5
 """Log-odds of holding from which on a grasp needs no rival from the optimiser (ours)."""
-OPTIMISED_PER_GRASP = 32
-"""Candidates that the optimiser makes for each grasp below TRUSTED_SCORE; about 0.8 s on one core (ours)."""
+OPTIMISED_PER_GRASP = 8
+"""Candidates that the optimiser makes for each grasp below TRUSTED_SCORE (ours)."""
 
 
 @dataclass(frozen=True)

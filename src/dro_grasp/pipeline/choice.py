@@ -34,8 +34,6 @@ class ChoiceConfig:
     """Clearance below which a point counts as inside; decoding moves points by some millimetres [m]."""
     gap: float = 150.0
     """Penalty for the distance of a finger from the surface, mean over fingers [1/m]."""
-    unevenness: float = 0.0
-    """Penalty for fingers that would arrive one after the other: standard deviation of their distances [1/m]."""
     crowding: float = 330.0
     """Penalty for how much closer than `apart` two fingers come [1/m]."""
     reach: float = 0.03
@@ -65,7 +63,6 @@ def choice_scores(
     nearest_of = torch.stack([nearest(i) for i in fingers], -1)
     score = -config.finger_penetration * (config.margin - nearest_of).clamp_min(0).mean(-1)
     score = score - config.gap * nearest_of.clamp(0, config.reach).mean(-1)
-    score = score - config.unevenness * nearest_of.clamp(-config.reach, config.reach).std(-1, correction=0)
     if bool((finger == PALM).any()):
         score = score - config.palm_penetration * (config.margin - nearest(PALM)).clamp_min(0)
     some = hand.spread_rank < CROWDING_POINTS

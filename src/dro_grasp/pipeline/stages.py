@@ -23,6 +23,8 @@ FARTHEST_DIRECTION = math.radians(20.0)
 """Largest angle between the palm direction of an optimised grasp and the direction that was asked for [rad] (ours)."""
 
 
+STARTS_PER_CANDIDATE = 4
+"""Grasps that are optimised for each candidate; those of lowest energy are kept (ours)."""
 FARTHEST_SETTLED = 0.05
 """How far the object may move in the hand while a grasp settles [m] (ours)."""
 
@@ -100,23 +102,23 @@ def optimise(
 
     Args:
         problem: Hand and object.
-        num: How many.
+        num: How many, at most: those are left out that lose the object while they settle, or turn away from the direction.
         seed: The same seed gives the same candidates.
-        direction: Palm direction in the object's frame; any by default. Candidates that the descent turned away are left out.
-        progress: Called with (candidates optimised, candidates wanted).
+        direction: Palm direction in the object's frame; any by default.
+        progress: Called with (grasps optimised, grasps to optimise).
     """
-    config = SynthesisConfig(starts=StartConfig(direction=direction))
-    hand, obj = problem.hand, problem.obj
-    grasps = optimised(hand, obj, problem.energy(config.energy), num, seed, config, progress)
+    hand, obj, config = problem.hand, problem.obj, SynthesisConfig(starts=StartConfig(direction=direction))
+    energy = problem.energy(config.energy)
+    grasps = optimised(hand, obj, energy, STARTS_PER_CANDIDATE * num, seed, config, progress)
+    if direction is not None:
+        wanted = torch.nn.functional.normalize(torch.tensor(direction), dim=0)
+        grasps = grasps[hand.palm_directions(grasps.T_object_wrist) @ wanted > math.cos(FARTHEST_DIRECTION)]
+    grasps = grasps.sorted_by_energy()[:num]
     if hand.description is not None and not obj.is_cloud:
         settled = settle(hand, obj, grasps)
         moved = hand.grasp_centres(settled.T_object_wrist) - hand.grasp_centres(grasps.T_object_wrist)
         grasps = settled[moved.norm(dim=-1) < FARTHEST_SETTLED]  # an object that flies away leaves no grasp behind
-    grasps = grasps.bare()
-    if direction is None:
-        return grasps
-    wanted = torch.nn.functional.normalize(torch.tensor(direction), dim=0)
-    return grasps[hand.palm_directions(grasps.T_object_wrist) @ wanted > math.cos(FARTHEST_DIRECTION)]
+    return grasps.bare()
 
 
 def above_table(problem: GraspProblem, grasps: GraspBatch, table: float) -> Bool[Tensor, " n"]:
