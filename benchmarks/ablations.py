@@ -149,8 +149,7 @@ def trained(name: str, ablation: Ablation, folder: Path, steps: int) -> tuple[Di
 def measured(name: str, ablation: Ablation, folder: Path, steps: int, num: int, object_names: list[str]) -> dict[str, Any]:
     """Train and evaluate one row."""
     model, seconds = trained(name, ablation, folder, steps)
-    predictor = GraspPredictor()
-    predictor.network, predictor.weights_name = model, name
+    predictor = GraspPredictor(str(folder / f"{name.replace(' ', '_')}.safetensors"))
     objects = [load_object(o) for o in resolve_objects(object_names)]
     config = BenchmarkConfig(num, (RAW, REFINED), (protocol("dro"), protocol("strict")), controls=False, view=ablation.view)
     rows = benchmark([load_hand(h) for h in ablation.evaluated], objects, predictor, config)
