@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial import ConvexHull, QhullError, KDTree
 
 from dro_grasp.errors import HandError
 
@@ -65,13 +65,13 @@ def find_palm(
     planes = np.unique(hull.equations.round(6), axis=0)
     for plane in planes:
         grid = grid[grid @ plane[:3] < -plane[3]]
-    tree = cKDTree(palm_points)
-    to_palm, nearest = tree.query(grid)
+    tree = KDTree(palm_points)
+    to_palm, nearest = map(np.asarray, tree.query(grid))
     outside = ((grid - palm_points[nearest]) * palm_normals[nearest]).sum(1) > 0.7 * to_palm
     grid, to_palm, nearest = grid[outside], to_palm[outside], nearest[outside]
     if not len(grid):
         raise HandError(NOTHING_ENCLOSED)
-    to_fingers = np.stack([cKDTree(f).query(grid)[0] for f in fingers], 1)
+    to_fingers = np.stack([KDTree(f).query(grid)[0] for f in fingers], 1)
     radius = np.minimum(np.minimum(to_palm, to_fingers.min(1)), LARGEST_BALL)
     # A ball that touches everything around it scores its radius; gaps to palm and fingers count against it.
     gaps = (to_palm - radius + (to_fingers - radius[:, None]).mean(1)) / 2
