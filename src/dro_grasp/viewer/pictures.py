@@ -132,9 +132,9 @@ def caption(grasps: GraspBatch, index: int) -> tuple[str, bool | None]:
 
 def contact_sheet(
     tiles: list[UInt8[np.ndarray, "height width 3"]], captions: Sequence[tuple[str, bool | None]], title: str,
-    columns: int = COLUMNS,
+    columns: int = COLUMNS, outcomes: bool = True,
 ) -> Image.Image:
-    """A grid of captioned pictures under a title."""
+    """A grid of captioned pictures under a title; the captions tell the outcomes in colour, unless there are none."""
     height, width = tiles[0].shape[:2]
     columns = min(columns, len(tiles))
     rows = -(-len(tiles) // columns)
@@ -145,7 +145,9 @@ def contact_sheet(
     for i, (tile, (text, outcome)) in enumerate(zip(tiles, captions, strict=True)):
         x, y = (i % columns) * width, HEADER + (i // columns) * (height + CAPTION)
         sheet.paste(Image.fromarray(tile), (x, y))
-        red, green, blue = (int(255 * c) for c in success_colour(outcome))
-        pen.ellipse((x + 16, y + height + 5, x + 26, y + height + 15), fill=(red, green, blue))
-        pen.text((x + 34, y + height + 1), text, fill=INK if outcome is not None else FAINT, font=font)
+        if outcomes:
+            red, green, blue = (int(255 * c) for c in success_colour(outcome))
+            pen.ellipse((x + 16, y + height + 5, x + 26, y + height + 15), fill=(red, green, blue))
+        left = x + (34 if outcomes else 16)
+        pen.text((left, y + height + 1), text, fill=INK if outcome is not None else FAINT, font=font)
     return sheet

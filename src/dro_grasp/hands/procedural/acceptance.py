@@ -18,6 +18,8 @@ TOUCHING = 5e-4
 """Deepest penetration of the open hand's links [m] (ours)."""
 MEETING = 0.03
 """Largest distance to which each fingertip comes to one that closes against it, from middle to middle [m] (ours)."""
+FEWEST_WITH_SPARE = 4
+"""From this number of fingers on, one of them may meet no other, as little fingers do (ours)."""
 POSTURES = 1024
 """Random postures in which fingertips are looked for near each other (ours)."""
 SWEEP = (0.25, 0.75)
@@ -79,7 +81,8 @@ def _idle(hand: Hand) -> str:
     spread = _tips(hand, hand.random_joints(POSTURES, torch.Generator().manual_seed(0)), middles)
     nearest = torch.cdist(spread, spread).amin(0)
     nearest = torch.where(against & ~torch.eye(len(middles), dtype=torch.bool), nearest, torch.inf).amin(0)
-    return "a finger meets no other" if float(nearest.amax()) > MEETING else ""
+    lonely = int((nearest > MEETING).sum())
+    return "a finger meets no other" if lonely > (len(nearest) >= FEWEST_WITH_SPARE) else ""
 
 
 def _tips(

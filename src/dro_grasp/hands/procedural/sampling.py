@@ -11,9 +11,9 @@ from jaxtyping import Float
 from dro_grasp.hands.procedural.parts import Block, Mount, Style, Turn, finger_plan, lifted, plate, unit
 from dro_grasp.hands.procedural.plan import Coupling, Family, FingerPlan, FingerShape, HandPlan, PalmShape, Thumb
 
-FAMILIES: dict[Family, float] = {"row": 0.6, "ring": 0.2, "facing": 0.2}
+FAMILIES: dict[Family, float] = {"row": 0.74, "ring": 0.12, "facing": 0.14}
 """Share of each family among all hands drawn (ours)."""
-FINGERS_IN_ROW = {1: 0.08, 2: 0.22, 3: 0.35, 4: 0.35}
+FINGERS_IN_ROW = {1: 0.06, 2: 0.18, 3: 0.32, 4: 0.44}
 """Share of hands with this many fingers beside the thumb, in the family `row` (ours)."""
 FINGERS_IN_RING = {2: 0.15, 3: 0.40, 4: 0.25, 5: 0.20}
 """Share of hands with this many fingers, in the family `ring` (ours)."""
@@ -25,7 +25,7 @@ RING_PALMS: dict[PalmShape, float] = {"disc": 0.75, "two-part": 0.25}
 """The same, in the family `ring` (ours)."""
 FACING_PALMS: dict[PalmShape, float] = {"box": 0.4, "rounded": 0.3, "two-part": 0.3}
 """The same, in the family `facing` (ours)."""
-THUMBS: dict[Thumb, float] = {"lateral": 0.6, "opposed": 0.4}
+THUMBS: dict[Thumb, float] = {"lateral": 0.7, "opposed": 0.3}
 """Share of each mount of the thumb, in the family `row` (ours)."""
 FINGER_SHAPES: dict[FingerShape, float] = {"capsule": 0.6, "box": 0.4}
 """Share of each shape of fingers (ours)."""
