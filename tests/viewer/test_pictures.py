@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from dro_grasp.cli import picture
+from dro_grasp.cli import view
 from dro_grasp.cli.main import main
 from dro_grasp.errors import OutputError
 from dro_grasp.grasps.batch import GraspBatch
@@ -203,7 +203,7 @@ def test_the_command_names_the_option_that_is_wrong(
 def test_a_sheet_of_too_many_pixels_is_refused(
     file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(picture, "MAX_PIXELS", 3 * 64 * 48 - 1)
+    monkeypatch.setattr(view, "MAX_PIXELS", 3 * 64 * 48 - 1)
     given = ["picture", str(file), "--output", str(file.parent / "Sheet.PNG"), "--size", "64", "48"]
     assert main(given) == 2
     assert "3 pictures of 64 x 48 are" in capsys.readouterr().err

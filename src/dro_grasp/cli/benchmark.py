@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from dro_grasp.cli.output import Flag, optional, print_json, progress_bar, say
-from dro_grasp.cli.protocol_name import ProtocolName
+from dro_grasp.cli.inputs import Flag, ProtocolName, optional
+from dro_grasp.cli.output import print_json, progress_bar, say
 
 if TYPE_CHECKING:
     from dro_grasp.evaluation.success_rates import Row

@@ -2,18 +2,287 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from dro_grasp.cli.dataset_bundle import BundleCommand
-from dro_grasp.cli.dataset_check import Check
-from dro_grasp.cli.dataset_filter import Filter
-from dro_grasp.cli.dataset_import import Import
-from dro_grasp.cli.dataset_info import Info
-from dro_grasp.cli.dataset_merge import Merge
-from dro_grasp.cli.dataset_report import Report
+from dro_grasp.cli.inputs import Flag, ProtocolName, optional
+from dro_grasp.cli.output import print_result, progress_bar, records, say_aside
+
+if TYPE_CHECKING:
+    from dro_grasp.datasets.collections.collection import PairGrasps
+
+
+@dataclass(frozen=True)
+class Info:
+    """Count the grasps of a data set by hand and object."""
+
+    folder: tyro.conf.Positional[Path]
+    """An output folder of `dro-grasp synthesize`, a folder of grasp files, or a grasp file."""
+    json: Flag = False
+    """Print one JSON object instead of a table."""
+
+    def run(self) -> int:
+        """Count."""
+        from dro_grasp.datasets.collections.collection import count_collection
+
+        counts = count_collection(self.folder)
+        total = sum(sum(c.values()) for c in counts.values())
+        rows = [[hand, len(c), sum(c.values()), min(c.values())] for hand, c in counts.items()]
+        print_result(self.json, {"total": total, "hands": counts}, f"data set {self.folder}",
+                     ["hand", "objects", "grasps", "fewest"], rows, f"{total} grasps in all")
+        return 0
+
+
+@dataclass(frozen=True)
+class Import:
+    """Convert grasps of other data sets into grasp files, to evaluate, filter and train on.
+
+    Example: dro-grasp dataset import cmap_dataset.pt --format cmap --hands barrett=assets/barrett_multidex --output imported
+    """
+
+    inputs: tyro.conf.Positional[tuple[Path, ...]]
+    """`cmap_dataset.pt` of the official D(R,O) release, or npy files of DexGraspNet or DexGraspBench."""
+    format: Literal["cmap", "dexgraspnet", "dexgraspbench"]
+    """Format of the files."""
+    output: Path
+    """Folder for one grasp file per hand; created if missing, inside an existing folder."""
+    hands: tuple[str, ...] = ()
+    """Names or paths of the hands; NAME_IN_FILE=NAME renames one. Files that name no hand need exactly one."""
+    object: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
+    """Object of all grasps, if the file names another or none."""
+    json: Flag = False
+    """Print one JSON object instead of a table."""
+
+    def run(self) -> int:
+        """Read all files, find hands and objects, write grasp files."""
+        from dro_grasp.datasets.collections.importing import import_grasps
+        from dro_grasp.datasets.collections.merging import file_name
+        from dro_grasp.errors import GraspFileError
+        from dro_grasp.files import check_folder, make_folder
+
+        check_folder(self.output)
+        here = {theirs: ours for theirs, _, ours in (pair.rpartition("=") for pair in self.hands)}
+        by_hand, missing = import_grasps(self.inputs, self.format, here, self.object)
+        for obj, why in missing.items():
+            say_aside(f"grasps of {obj} are left out: {why}")
+        if not (by_hand or self.json):
+            raise GraspFileError(
+                "no grasp was imported; name the object of all grasps with --object, or set DRO_GRASP_ASSETS to the folder "
+                "with the data set's objects" if missing else
+                f"no grasp was imported: {', '.join(map(str, self.inputs))} holds none; name other files")
+        folder = make_folder(self.output) if by_hand else self.output
+        rows = []
+        for grasps in by_hand.values():
+            path = folder / file_name(grasps.hand)
+            grasps.save(path)
+            rows.append([grasps.hand, len(set(grasps.object)), len(grasps), str(path)])
+        columns = ["hand", "objects", "grasps", "file"]
+        print_result(self.json, {"files": records(columns, rows), "missing": missing}, "imported", columns, rows,
+                     "`dro-grasp dataset filter` keeps those that pass a trial")
+        return 0 if rows else 2
+
+
+@dataclass(frozen=True)
+class DataSets:
+    """The data sets that a command takes."""
+
+    inputs: tyro.conf.Positional[tuple[Path, ...]]
+    """Output folders of `dro-grasp synthesize`, folders of grasp files, or grasp files."""
+
+    def pairs(self, only_successful: bool) -> Iterator[PairGrasps]:
+        """The grasps of each pair in them."""
+        from dro_grasp.datasets.collections.collection import read_collection
+
+        return (pair for path in self.inputs for pair in read_collection(path, only_successful))
+
+
+@dataclass(frozen=True)
+class Report(DataSets):
+    """Report yields, failures and diversity of a data set: palm directions, wrist rolls, grasp sizes, joints.
+
+    Example: dro-grasp dataset report data --output report.html
+    """
+
+    output: Annotated[Path | None, optional("PATH", "no page")] = None
+    """Self-contained HTML page with charts and pictures."""
+    json: Flag = False
+    """Print one JSON object instead of a table."""
+
+    def run(self) -> int:
+        """Measure, print, write the page."""
+        from dro_grasp.evaluation.coverage import measure_coverage
+        from dro_grasp.files import check_output
+        from dro_grasp.viewer.dataset_pages import write_report
+
+        if self.output is not None:
+            check_output(self.output)
+        hands = measure_coverage(self.pairs(only_successful=True))
+        if self.output is not None:
+            with progress_bar("drawing", self.json) as progress:
+                write_report(hands, self.output, progress)
+        rows = [[h.grasps.hand, len(h.grasps), len(h.pairs), h.yields.per_cpu_hour, *h.diversity.values()] for h in hands]
+        values = {"hands": [h.to_dict() for h in hands], "output": None if self.output is None else str(self.output)}
+        columns = ["hand", "grasps", "objects", "per CPU-hour", "diversity", "of wrist", "of joints"]
+        print_result(self.json, values, "data set", columns, rows, "" if self.output is None else f"page: {self.output}")
+        for h in hands:
+            for pair in h.pairs:
+                if not (pair.grasps or self.json):
+                    say_aside(f"{h.grasps.hand} on {pair.object}: no grasp, {pair.reason}")
+        return 0
+
+
+@dataclass(frozen=True)
+class Merge(DataSets):
+    """Merge data sets into one file per hand, without near-duplicates and failed grasps.
+
+    Example: dro-grasp dataset merge data more --output grasps --per-pair 150
+    """
+
+    output: Path
+    """Folder for the files, one per hand; created if missing, inside an existing folder."""
+    per_pair: Annotated[int | None, optional("N", "all")] = None
+    """Limit of grasps of a hand on an object; those that cover palm directions best are kept."""
+    json: Flag = False
+    """Print one JSON object instead of a table."""
+
+    def run(self) -> int:
+        """Merge, and write one file per hand."""
+        from dro_grasp.datasets.collections.merging import file_name, merge
+        from dro_grasp.files import make_folder
+
+        folder = make_folder(self.output)
+        rows = []
+        for merged in merge(self.inputs, self.per_pair):
+            path = folder / file_name(merged.hand)
+            merged.save(path)
+            rows.append([merged.hand, len(merged.grasps), merged.duplicates, merged.surplus, path.stat().st_size])
+        columns = ["hand", "grasps", "duplicates", "surplus", "bytes"]
+        values = {"output": str(folder), "files": records(columns, rows)}
+        print_result(self.json, values, f"merged into {folder}", columns, rows, f"{sum(row[1] for row in rows)} grasps in all")
+        return 0
+
+
+@dataclass(frozen=True)
+class Check(DataSets):
+    """Evaluate a random sample of a data set again, and compare the results with the stored ones.
+
+    Example: dro-grasp dataset check data --sample 500
+    """
+
+    sample: int = 100
+    """Grasps to evaluate, drawn uniformly from all grasps."""
+    protocol: ProtocolName = "strict"
+    """Protocol of the trial."""
+    friction: Annotated[float | None, optional("MU", "the protocol's")] = None
+    """Friction coefficient between hand and object."""
+    mass_factor: float = 1.0
+    """Factor for the masses of the objects, and thereby for the forces."""
+    seed: int = 0
+    """Seed of the sample."""
+    json: Flag = False
+    """Print one JSON object instead of a table."""
+
+    def run(self) -> int:
+        """Draw, evaluate, compare."""
+        from dro_grasp.datasets.collections.checking import check
+        from dro_grasp.evaluation.metrics import wilson_interval
+        from dro_grasp.simulation.protocols import changed
+
+        rules = changed(self.protocol, friction=self.friction, mass_factor=self.mass_factor)
+        with progress_bar("evaluating", self.json) as progress:
+            found = check(self.pairs(only_successful=False), self.sample, rules, self.seed, progress)
+        low, high = wilson_interval(found.agreed, found.evaluated)
+        rows = [[hand, count, success, success / count] for hand, (count, success) in found.hands.items()]
+        share = found.agreed / found.evaluated
+        values = {
+            "protocol": found.protocol, "evaluated": found.evaluated, "agreed": found.agreed,
+            "agreement": share, "interval_95": [low, high], "succeeded": found.succeeded,
+            "reasons": dict(found.reasons.most_common()), "hands": found.hands,
+        }
+        notes = [f"{found.agreed} of {found.evaluated} results agree with the stored ones: {share:.1%} "
+                 f"(95 %: {low:.1%} to {high:.1%})"]
+        notes += [f"  {count} stored as successful now fail: {reason}" for reason, count in found.reasons.most_common(5)]
+        columns = ["hand", "grasps", "success", "rate"]
+        print_result(self.json, values, f"evaluated again, protocol {found.protocol}", columns, rows, *notes)
+        return 0
+
+
+@dataclass(frozen=True)
+class Filter(DataSets):
+    """Evaluate all grasps of a data set, and keep those that pass.
+
+    Example: dro-grasp dataset filter theirs.parquet --protocol strict --output kept
+    """
+
+    output: Path
+    """Folder for the files, one per hand; created if missing, inside an existing folder."""
+    protocol: ProtocolName = "strict"
+    """Protocol of the trial."""
+    friction: Annotated[float | None, optional("MU", "the protocol's")] = None
+    """Friction coefficient between hand and object."""
+    json: Flag = False
+    """Print one JSON object instead of a table."""
+
+    def run(self) -> int:
+        """Evaluate, and write one file per hand."""
+        from dro_grasp.datasets.collections.checking import keep_passing
+        from dro_grasp.datasets.collections.merging import file_name
+        from dro_grasp.files import make_folder
+        from dro_grasp.grasps.batch import GraspBatch
+        from dro_grasp.simulation.protocols import changed
+
+        rules = changed(self.protocol, friction=self.friction)
+        folder = make_folder(self.output)
+        pairs = list(self.pairs(only_successful=False))
+        with progress_bar("evaluating", self.json) as progress:
+            kept = keep_passing(pairs, rules, progress)
+        for hand in dict.fromkeys(passed.hand for _, passed in kept):
+            GraspBatch.concatenate([passed for _, passed in kept if passed.hand == hand]).save(folder / file_name(hand))
+        rows = [[pair.hand, pair.object, len(pair.grasps), len(passed)] for pair, passed in kept]
+        total, passed = sum(row[2] for row in rows), sum(row[3] for row in rows)
+        columns = ["hand", "object", "grasps", "kept"]
+        values = {"output": str(folder), "protocol": rules.label, "grasps": total, "kept": passed,
+                  "pairs": records(columns, rows)}
+        print_result(self.json, values, f"protocol {rules.label}", columns, rows, f"{passed} of {total} kept, in {folder}")
+        return 0
+
+
+@dataclass(frozen=True)
+class BundleCommand(DataSets):
+    """Pack grasps, hands and object clouds into one portable file for training.
+
+    Example: dro-grasp dataset bundle data --output bundle.safetensors
+    """
+
+    output: Path
+    """Bundle to write (.safetensors)."""
+    split: Literal["train", "few_shot", "validate"] = "train"
+    """Grasps to include. train: for training. few_shot: of held-out hands, for fine-tuning. validate: on objects that no
+    weights are trained on, for measuring."""
+    hands: tuple[str, ...] = ()
+    """Hands to include; by default all."""
+    per_pair: Annotated[int | None, optional("N", "all")] = None
+    """Limit of grasps of a hand on an object; those that cover palm directions best are kept."""
+    json: Flag = False
+    """Print one JSON object instead of a table."""
+
+    def run(self) -> int:
+        """Select the grasps of the split, find their hands and objects, write the bundle."""
+        from dro_grasp.datasets.collections.bundling import make_bundle
+        from dro_grasp.files import check_output
+
+        check_output(self.output)
+        bundle, left_out = make_bundle(self.inputs, self.output, self.split, self.hands, self.per_pair)
+        if left_out:
+            say_aside(f"{left_out} grasps outside split '{self.split}' are left out")
+        report = {"output": str(self.output), "bytes": self.output.stat().st_size, **bundle.summary()}
+        print_result(self.json, report, f"bundle {self.output}", ["hand", "grasps"], [*report["hands"].items()],
+                     f"{report['objects']} objects, {report['grasps']} grasps, {report['bytes'] / 1e6:.1f} MB")
+        return 0
 
 
 @dataclass(frozen=True)
@@ -29,7 +298,3 @@ class Dataset:
         | Annotated[Filter, tyro.conf.subcommand("filter")]
         | Annotated[BundleCommand, tyro.conf.subcommand("bundle")]
     )
-
-    def run(self) -> int:
-        """Run the subcommand."""
-        return self.command.run()

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from dro_grasp.cli.grasp_files import load_grasps
-from dro_grasp.cli.output import Flag, optional, print_json, print_table, progress_bar, say, say_aside
-from dro_grasp.cli.protocol_name import ProtocolName
+from dro_grasp.cli.inputs import Flag, ProtocolName, load_grasps, optional
+from dro_grasp.cli.output import print_result, progress_bar, say_aside
 from dro_grasp.grasps.sources import hand_of, object_of
 
 if TYPE_CHECKING:
@@ -85,26 +84,21 @@ class Evaluate:
             done.save(self.output)
         success = sum(row[2] for row in rows)
         low, high = wilson_interval(success, len(grasps))
-        beside = shares(done, hand)
+        rate, beside = success / max(1, len(grasps)), shares(done, hand)
         report = {
             "file": str(self.file), "hand": hand.name, "protocol": rules.label, "num": len(grasps), "success": success,
-            "success_rate": success / max(1, len(grasps)), "interval_95": [low, high],
+            "success_rate": rate, "interval_95": [low, high],
             **beside, "objects": {row[0]: {"num": row[1], "success": row[2]} for row in rows},
             "reasons": dict(reasons.most_common()), "seconds": round(time.perf_counter() - begin, 3),
             "output": None if self.output is None else str(self.output),
         }
-        if self.json:
-            print_json(report)
-            return 0
-        rate = success / max(1, len(grasps))
         note = f"{success} of {len(grasps)} succeeded: {rate:.1%} (95 %: {low:.1%} to {high:.1%})"
         if "trials_held" in beside:
             mean, low, high = mean_share(done.robustness)
             note += f", and held in {mean:.1%} of their trials (95 %: {low:.1%} to {high:.1%})"
+        failed = [f"  {count} failed: {reason}" for reason, count in reasons.most_common()]
         columns = ["object", "grasps", "success", "rate", *(SHARES[name] for name in beside)]
-        print_table(f"{hand.name}, protocol {rules.label}", columns, rows, note=note)
-        for reason, count in reasons.most_common():
-            say(f"  {count} failed: {reason}")
+        print_result(self.json, report, f"{hand.name}, protocol {rules.label}", columns, rows, note, *failed)
         return 0
 
 

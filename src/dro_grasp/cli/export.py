@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from dro_grasp.cli.grasp_files import load_grasps
-from dro_grasp.cli.output import Flag, optional, print_json, say
+from dro_grasp.cli.inputs import Flag, load_grasps, optional
+from dro_grasp.cli.output import print_json, say
 from dro_grasp.export.formats import FORMATS, ExportJob
 
 if TYPE_CHECKING:

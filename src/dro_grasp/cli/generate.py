@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from dro_grasp.cli.output import Flag, optional, print_json, print_table, progress_bar, say, say_aside
-from dro_grasp.cli.protocol_name import ProtocolName
+from dro_grasp.cli.inputs import Flag, ProtocolName, optional
+from dro_grasp.cli.output import print_json, print_table, progress_bar, say, say_aside
 from dro_grasp.grasps.sources import with_sources
 from dro_grasp.simulation.protocols import PROTOCOLS
 
@@ -185,7 +185,8 @@ class Generate:
             rows.append([i, origin[i], float(grasps.score[i]), *outcome])
         columns = ["grasp", "origin", "score", "success", "contacts", "penetration [mm]", "reason"]
         seconds = "  ".join(f"{k} {v:.2f} s" for k, v in report["seconds"].items())
-        print_table(f"{report['hand']} on {report['object']}", columns, rows, note=seconds)
+        print_table(f"{report['hand']} on {report['object']}", columns, rows)
+        say(seconds)
         if report["success"] is not None:
             say(f"{report['success']} of {report['num']} grasps succeeded under protocol {report['protocol']}")
         for what, key in (("grasps", "output"), ("picture", "picture")):

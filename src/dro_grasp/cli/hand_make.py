@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from dro_grasp.cli.output import Flag, optional, print_json, print_table, progress_bar, say
+from dro_grasp.cli.inputs import Flag, optional
+from dro_grasp.cli.output import print_json, print_table, progress_bar, say
 
 if TYPE_CHECKING:
     from dro_grasp.hands.procedural.making import MadeHand

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import tyro
 
-from dro_grasp.cli.output import Flag, print_json, say
+from dro_grasp.cli.inputs import Flag
+from dro_grasp.cli.output import print_json, say
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,17 @@
-"""`dro-grasp hands` and `objects`: names of hands and objects."""
+"""`dro-grasp hands`, `objects` and `hand`: names of hands and objects, and the check of a description."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
 
-from dro_grasp.cli.output import Flag, print_json, print_table
+import tyro
+
+from dro_grasp.cli.hand_make import Make
+from dro_grasp.cli.hand_vary import Vary
+from dro_grasp.cli.inputs import Flag, optional
+from dro_grasp.cli.output import print_json, print_result, say
 
 
 @dataclass(frozen=True)
@@ -19,11 +26,8 @@ class Hands:
         from dro_grasp.hands.library import hand_names
 
         names = hand_names()
-        if self.json:
-            print_json({"hands": names})
-        else:
-            print_table("hands", ["name", "from"], [[n, o] for n, o in names.items()],
-                        note="also: the path of a URDF or MJCF file, or a robot_descriptions name")
+        print_result(self.json, {"hands": names}, "hands", ["name", "from"], [*names.items()],
+                     "also: the path of a URDF or MJCF file, or a robot_descriptions name")
         return 0
 
 
@@ -39,9 +43,52 @@ class Objects:
         from dro_grasp.objects.catalogue import object_names
 
         names = object_names()
-        if self.json:
-            print_json({"objects": names})
-        else:
-            print_table("objects", ["name", "split"], [[n, s] for n, s in names.items()],
-                        note="also: the path of a mesh or point cloud")
+        print_result(self.json, {"objects": names}, "objects", ["name", "split"], [*names.items()],
+                     "also: the path of a mesh or point cloud")
         return 0
+
+
+@dataclass(frozen=True)
+class Check:
+    """Check a hand description: report what is derived from it and what is wrong with it, and draw it.
+
+    Example: dro-grasp hand check my_hand.urdf --picture my_hand.png
+    """
+
+    hand: tyro.conf.Positional[str]
+    """Name of a hand, or path of a URDF or MJCF file."""
+    picture: Annotated[Path | None, optional("PNG", "none")] = None
+    """PNG file with the hand open and closed, its palm direction and its contact links."""
+    json: Flag = False
+    """Print one JSON object instead of text."""
+
+    def run(self) -> int:
+        """Check, print, draw."""
+        from dro_grasp.files import check_output
+        from dro_grasp.hands.check import check_hand, picture
+
+        if self.picture is not None:
+            check_output(self.picture)
+        report = check_hand(self.hand)
+        if self.picture is not None:
+            picture(report.hand, self.picture)
+        if self.json:
+            print_json({**report.to_dict(), "picture": None if self.picture is None else str(self.picture)})
+            return 0
+        for line in report.lines():
+            say(line)
+        if self.picture is not None:
+            say(f"picture: {self.picture}")
+        return 0
+
+
+@dataclass(frozen=True)
+class HandCommand:
+    """Check, make, vary and list hands."""
+
+    command: (
+        Annotated[Check, tyro.conf.subcommand("check")]
+        | Annotated[Make, tyro.conf.subcommand("make")]
+        | Annotated[Vary, tyro.conf.subcommand("vary")]
+        | Annotated[Hands, tyro.conf.subcommand("list")]
+    )

@@ -15,13 +15,11 @@ from dro_grasp.cli.dataset import Dataset
 from dro_grasp.cli.evaluate import Evaluate
 from dro_grasp.cli.export import Export
 from dro_grasp.cli.generate import Generate
-from dro_grasp.cli.hand_check import HandCommand
-from dro_grasp.cli.listing import Hands, Objects
+from dro_grasp.cli.listing import HandCommand, Hands, Objects
 from dro_grasp.cli.onboard import Onboard
-from dro_grasp.cli.picture import Picture
 from dro_grasp.cli.synthesize import Synthesize
 from dro_grasp.cli.train import Pretrain, Train
-from dro_grasp.cli.view import View
+from dro_grasp.cli.view import Picture, View
 from dro_grasp.cli.weights import Weights
 from dro_grasp.errors import DroGraspError
 
@@ -56,12 +54,12 @@ Command = (
 
 
 def parse(arguments: Sequence[str]) -> Any:
-    """Parse the arguments into a command.
+    """Parse the arguments into a command; of a group such as `dataset`, the one in it.
 
     Raises:
         SystemExit: With code 2 after a message about invalid arguments, with code 0 after `--help`.
     """
-    return tyro.cli(
+    command = tyro.cli(
         Command,  # type: ignore[arg-type]
         prog="dro-grasp",
         description="Any robot hand description in, simulation-checked dexterous grasps out. "
@@ -69,6 +67,7 @@ def parse(arguments: Sequence[str]) -> Any:
         args=list(arguments),
         config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
     )
+    return getattr(command, "command", command)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

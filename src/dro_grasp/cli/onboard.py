@@ -8,7 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from dro_grasp.cli.output import Flag, optional, print_json, say, say_aside
+from dro_grasp.cli.inputs import Flag, optional
+from dro_grasp.cli.output import print_json, say, say_aside
 
 
 @dataclass(frozen=True)

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-import tyro
 from rich.console import Console
 from rich.table import Table
-
-Flag = tyro.conf.FlagCreatePairsOff[bool]
-"""A switch that is off by default and has no --no- form."""
 
 stdout = Console(highlight=False, markup=False)
 stderr = Console(stderr=True, highlight=False, markup=False)
@@ -27,11 +23,6 @@ def say(text: str) -> None:
 def say_aside(text: str) -> None:
     """Print one line to stderr without wrapping."""
     stderr.print(text, soft_wrap=True)
-
-
-def optional(metavar: str, default: str) -> Any:
-    """Help settings of an option without a default value: its metavar, and a description of the default."""
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})")
 
 
 def print_json(values: dict[str, Any]) -> None:
@@ -49,7 +40,24 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def print_table(title: str, columns: list[str], rows: list[list[Any]], note: str = "") -> None:
+def print_result(
+    as_json: bool, values: dict[str, Any], title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], *notes: str
+) -> None:
+    """Print the values as one JSON object for programs, or the rows as a table and the notes under it for people."""
+    if as_json:
+        print_json(values)
+        return
+    print_table(title, columns, rows)
+    for note in filter(None, notes):
+        say(note)
+
+
+def records(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[dict[str, Any]]:
+    """The rows of a table for JSON."""
+    return [dict(zip(columns, row, strict=True)) for row in rows]
+
+
+def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     """Print a table for people."""
     table = Table(title=title, title_justify="left")
     for column in columns:
@@ -57,8 +65,6 @@ def print_table(title: str, columns: list[str], rows: list[list[Any]], note: str
     for row in rows:
         table.add_row(*[_cell(value) for value in row])
     stdout.print(table)
-    if note:
-        say(note)
 
 
 def _cell(value: Any) -> str:

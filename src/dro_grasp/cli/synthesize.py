@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from dro_grasp.cli.output import Flag, optional, print_json, print_table, say_aside
-from dro_grasp.cli.protocol_name import ProtocolName
+from dro_grasp.cli.inputs import Flag, ProtocolName, optional
+from dro_grasp.cli.output import print_result, say_aside
 
 if TYPE_CHECKING:
     from dro_grasp.datasets.engine.pools import Pool
@@ -68,15 +68,13 @@ class Synthesize:
         values = {"output": str(self.output), "grasps": report.grasps, "added": report.added, "shards": report.shards,
                   "seconds": round(report.seconds, 2), "failures": failures}
         code = 2 if failures and not report.grasps else 0
-        if self.json:
-            print_json(values)
-            return code
-        print_table("synthesis", ["grasps", "added", "shards", "seconds"],
-                    [[report.grasps, report.added, report.shards, report.seconds]])
-        for failure in failures:
-            say_aside(f"{failure['hand']} on {failure['object']}: {failure['reason']}")
-        if code:
-            say_aside("error: no grasp was found, for the reasons above")
+        print_result(self.json, values, "synthesis", ["grasps", "added", "shards", "seconds"],
+                     [[report.grasps, report.added, report.shards, report.seconds]])
+        if not self.json:
+            for failure in failures:
+                say_aside(f"{failure['hand']} on {failure['object']}: {failure['reason']}")
+            if code:
+                say_aside("error: no grasp was found, for the reasons above")
         return code
 
     def _check_numbers(self) -> None:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from dro_grasp.cli.output import Flag, optional, print_json, print_table
+from dro_grasp.cli.inputs import Flag, optional
+from dro_grasp.cli.output import print_result, print_table
 
 if TYPE_CHECKING:
     from dro_grasp.models.network import DistanceNetwork
@@ -129,11 +130,8 @@ class Pretrain(Stage):
         source = SampleSource(bundle, network, AugmentationConfig())
         ranks = matching_rank(model.hand_encoder, source, torch.Generator().manual_seed(1))
         report = {"output": str(self.output), "steps": about["steps"], "mean_rank": ranks, "chance": network.n_hand / 2}
-        if self.json:
-            print_json(report)
-        else:
-            print_table("mean rank of each point's counterpart", ["hand", "rank"], [list(i) for i in ranks.items()],
-                        note=f"1 is perfect, {network.n_hand / 2:.0f} is chance; weights: {self.output}")
+        print_result(self.json, report, "mean rank of each point's counterpart", ["hand", "rank"], [*ranks.items()],
+                     f"1 is perfect, {network.n_hand / 2:.0f} is chance; weights: {self.output}")
         return 0
 
 
@@ -212,11 +210,10 @@ class Train(Stage):
         save_weights(model, self.output, about, [entry for name in given for entry in history_of(locate_weights(name))])
         errors = [] if validation is None else distance_errors(load_weights(self.output), validation, self.validation_samples)
         report = {"output": str(self.output), "steps": about["steps"], "log": str(self.run_folder / "log.jsonl")}
-        if self.json:
-            print_json(report | {"distance_errors": [dataclasses.asdict(e) for e in errors]})
-            return 0
-        print_table("training", ["steps", "weights", "log"], [[report["steps"], report["output"], report["log"]]])
-        if errors:
+        values = report | {"distance_errors": [dataclasses.asdict(e) for e in errors]}
+        print_result(self.json, values, "training", ["steps", "weights", "log"],
+                     [[report["steps"], report["output"], report["log"]]])
+        if errors and not self.json:
             rows = [[e.hand, 1e3 * e.posterior, 1e3 * e.prior, e.divergence] for e in errors]
             print_table("distance error", ["hand", "posterior z [mm]", "prior z [mm]", "divergence [nat]"], rows)
         return 0

@@ -1,15 +1,25 @@
-"""`dro-grasp view`: grasps in the browser."""
+"""`dro-grasp view` and `dro-grasp picture`: the grasps of a file in the browser, or on one sheet."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from dro_grasp.cli.grasp_files import load_grasps_of_one_object
-from dro_grasp.cli.output import optional
+from dro_grasp.cli.inputs import Flag, load_grasps, optional
+from dro_grasp.cli.output import say
+
+if TYPE_CHECKING:
+    from dro_grasp.grasps.batch import GraspBatch
+    from dro_grasp.hands.hand import Hand
+    from dro_grasp.objects.shape import ObjectModel
+
+MAX_SIDE = 4096
+"""Largest width and height of one picture [pixels]."""
+MAX_PIXELS = 100_000_000
+"""Most pixels of all pictures on a sheet together."""
 
 
 @dataclass(frozen=True)
@@ -45,3 +55,87 @@ class View:
 
         view_grasps(*load_grasps_of_one_object(self.file, self.hand, self.object, self.scale), port=self.port, host=self.host)
         return 0
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Draw the grasps of a file on one sheet, without a browser or OpenGL.
+
+    Example: dro-grasp picture grasps.parquet --output sheet.png --opacity 0.5 --contacts
+    """
+
+    file: tyro.conf.Positional[Path]
+    """Grasp file."""
+    output: Path
+    """PNG file to write."""
+    count: int = 16
+    """Limit of grasps drawn, from the first on."""
+    columns: int = 4
+    """Pictures side by side."""
+    size: tuple[int, int] = (320, 280)
+    """Width and height of one picture [pixels], at most 4096 each."""
+    opacity: float = 1.0
+    """Opacity of the object; below 1 the hand shows through it."""
+    contacts: Flag = False
+    """Mark contacts in red."""
+    only_successful: Flag = False
+    """Draw only grasps that passed their trial."""
+    hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
+    """Hand to use instead of the one named in the file."""
+    object: Annotated[str | None, optional("NAME|PATH", "the names in the file")] = None
+    """Object to draw: a name in the file, or a mesh to use for the file's only object."""
+    scale: float = 1.0
+    """Factor for the coordinates of the mesh given with --object."""
+
+    def run(self) -> int:
+        """Load the file and draw the grasps of one object."""
+        from dro_grasp.errors import GraspFileError, OptionError
+        from dro_grasp.files import check_output
+        from dro_grasp.viewer.pictures import PictureStyle, draw_grasps
+
+        self._check_options()
+        check_output(self.output)
+        hand, obj, grasps = load_grasps_of_one_object(self.file, self.hand, self.object, self.scale)
+        if self.only_successful:
+            if not bool(grasps.success.any()):
+                raise GraspFileError(f"no grasp in {self.file} has passed a trial; leave out --only-successful")
+            grasps = grasps[grasps.success]
+        shown = min(self.count, len(grasps))
+        if (pixels := shown * self.size[0] * self.size[1]) > MAX_PIXELS:
+            raise OptionError(f"{shown} pictures of {self.size[0]} x {self.size[1]} are {pixels / 1e6:.0f} million pixels; a "
+                              f"sheet has at most {MAX_PIXELS // 10**6} million: give a smaller --size or --count")
+        style = PictureStyle(self.size, self.opacity, self.contacts)
+        draw_grasps(hand, obj, grasps, self.output, self.count, self.columns, style)
+        say(f"picture: {self.output}")
+        return 0
+
+    def _check_options(self) -> None:
+        """Refuse invalid options by name."""
+        from dro_grasp.errors import OptionError, OutputError
+
+        if self.output.suffix.lower() != ".png":
+            raise OutputError(f"cannot write {self.output}: pictures are PNG; give a name that ends in .png")
+        for option, value in (("--count", self.count), ("--columns", self.columns)):
+            if value < 1:
+                raise OptionError(f"{option} is {value}; give at least 1")
+        if not (min(self.size) >= 1 and max(self.size) <= MAX_SIDE):
+            raise OptionError(f"--size is {self.size[0]} {self.size[1]}; give a width and a height of 1 to {MAX_SIDE} pixels")
+        if not 0 <= self.opacity <= 1:
+            raise OptionError(f"--opacity is {self.opacity}; give a number from 0 to 1")
+
+
+def load_grasps_of_one_object(
+    file: Path, hand_name: str | None, object_name: str | None, scale: float
+) -> tuple[Hand, ObjectModel, GraspBatch]:
+    """Read the grasps of one object in a file, with hand and object; by default those of the first object.
+
+    Raises:
+        DroGraspError: The file, its hand or its object cannot be loaded.
+    """
+    from dro_grasp.grasps.sources import hand_of, object_of
+
+    grasps = load_grasps(file)
+    hand = hand_of(grasps, hand_name)
+    name = object_name if object_name in grasps.object else grasps.object[0]
+    chosen = dict(grasps.by_object())[name]
+    return hand, object_of(chosen, None if object_name == name else object_name, scale), chosen

@@ -8,7 +8,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from dro_grasp.cli.output import Flag, print_json, print_table
+from dro_grasp.cli.inputs import Flag
+from dro_grasp.cli.output import print_json, print_result, print_table
 
 
 @dataclass(frozen=True)
@@ -23,12 +24,9 @@ class List:
         from dro_grasp.models.checkpoints import DEFAULT, describe_weights, weights_names
 
         found = [describe_weights(name) for name in weights_names()]
-        if self.json:
-            print_json({"weights": found})
-        else:
-            rows = [[w["name"], w["parameters"], w["bytes"] / 1e6, trained_on(w["about"]), w["sha256"][:16]] for w in found]
-            print_table("weights", ["name", "parameters", "MB", "trained on", "sha256"], rows,
-                        note=f"default: '{DEFAULT}'; `dro-grasp weights verify` checks the files")
+        rows = [[w["name"], w["parameters"], w["bytes"] / 1e6, trained_on(w["about"]), w["sha256"][:16]] for w in found]
+        print_result(self.json, {"weights": found}, "weights", ["name", "parameters", "MB", "trained on", "sha256"], rows,
+                     f"default: '{DEFAULT}'; `dro-grasp weights verify` checks the files")
         return 0
 
 
@@ -71,10 +69,6 @@ class Weights:
     """List and check trained weights."""
 
     command: Annotated[List, tyro.conf.subcommand("list")] | Annotated[Verify, tyro.conf.subcommand("verify")]
-
-    def run(self) -> int:
-        """Run the subcommand."""
-        return self.command.run()
 
 
 def trained_on(about: dict[str, Any]) -> str:
