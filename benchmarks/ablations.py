@@ -23,8 +23,7 @@ from report import ROOT, emit
 from synthesis import HANDS
 
 from dro_grasp.cli.main import main as command
-from dro_grasp.datasets.bundle.splits import HELD_OUT_HANDS
-from dro_grasp.datasets.bundle.training_file import Bundle, load_bundle
+from dro_grasp.datasets.bundle.training_file import HELD_OUT_HANDS, Bundle, load_bundle
 from dro_grasp.evaluation.distance_error import distance_errors
 from dro_grasp.evaluation.success_rates import ALL, RAW, REFINED, BenchmarkConfig, benchmark
 from dro_grasp.hands.library import load_hand

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from dro_grasp.cli.main import main
-from dro_grasp.datasets.collections.foreign_files import read_foreign
+from dro_grasp.datasets.collections.importing import read_foreign
 from dro_grasp.errors import GraspFileError
 from dro_grasp.grasps.batch import GraspBatch
 from tests.helpers.loaded_hands import loaded_hand

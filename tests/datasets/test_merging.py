@@ -13,8 +13,7 @@ import torch
 from dro_grasp.cli.main import main
 from dro_grasp.datasets.collections.collection import read_collection
 from dro_grasp.datasets.collections.merging import ANGLE_STEP, POSITION_STEP, compact, file_name, merge, spread
-from dro_grasp.datasets.engine.shards import Shard, notes_of
-from dro_grasp.datasets.engine.yields import Yield
+from dro_grasp.datasets.engine.shards import Shard, Yield, notes_of
 from dro_grasp.errors import GraspFileError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand

@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from dro_grasp.datasets.collections.collection import count_collection, read_collection
-from dro_grasp.datasets.engine.shards import Shard, find_shards, notes_of, read_yield, remove_leftovers
-from dro_grasp.datasets.engine.yields import Yield
+from dro_grasp.datasets.engine.shards import Shard, Yield, find_shards, notes_of, read_yield, remove_leftovers
 from dro_grasp.errors import GraspFileError, OutputError
 from dro_grasp.grasps.batch import GraspBatch
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from dro_grasp.datasets.bundle.splits import FEW_SHOT, HELD_OUT_HANDS
+from dro_grasp.datasets.bundle.training_file import FEW_SHOT, HELD_OUT_HANDS
 from dro_grasp.datasets.collections.checking import check
 from dro_grasp.datasets.collections.collection import YIELDS, read_collection
 from dro_grasp.datasets.collections.merging import file_name

@@ -16,8 +16,7 @@ from safetensors.torch import save_file
 
 from dro_grasp.cli.main import main
 from dro_grasp.datasets.bundle import training_file as bundle_module
-from dro_grasp.datasets.bundle.splits import SPLITS, split_of
-from dro_grasp.datasets.bundle.training_file import ObjectCloud, load_bundle, write_bundle
+from dro_grasp.datasets.bundle.training_file import SPLITS, ObjectCloud, load_bundle, split_of, write_bundle
 from dro_grasp.datasets.collections.bundling import sources
 from dro_grasp.datasets.engine.shards import Shard
 from dro_grasp.errors import BundleError, GraspFileError, OutputError

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from dro_grasp.cli.main import main
 from dro_grasp.datasets.collections.collection import PairGrasps
 from dro_grasp.datasets.collections.merging import Merged
-from dro_grasp.datasets.engine.yields import Yield
+from dro_grasp.datasets.engine.shards import Yield
 from dro_grasp.evaluation.coverage import grasp_sizes, measure_coverage, wrist_rolls
 from dro_grasp.evaluation.metrics import diversity
 from dro_grasp.grasps.batch import GraspBatch

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.datasets.collections.collection import PairGrasps
-from dro_grasp.datasets.engine.yields import Yield
+from dro_grasp.datasets.engine.shards import Yield
 from dro_grasp.evaluation.metrics import diversity
 from dro_grasp.geometry import se3
 from dro_grasp.geometry.half_axes import HALF_AXES, half_axis

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dro_grasp.datasets.bundle.splits import split_of
-from dro_grasp.datasets.bundle.training_file import load_bundle
+from dro_grasp.datasets.bundle.training_file import load_bundle, split_of
 from dro_grasp.datasets.collections.bundling import make_bundle
 from dro_grasp.datasets.collections.collection import count_collection
 from dro_grasp.datasets.engine.schedule import EngineConfig, require_known, synthesize_dataset

@@ -1,1 +1,1 @@
-"""The training bundle: its file and its splits."""
+"""The training bundle and its splits."""

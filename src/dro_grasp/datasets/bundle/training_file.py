@@ -1,4 +1,4 @@
-"""The training bundle: hands, object clouds and grasps in one portable file.
+"""The training bundle: hands, object clouds and the grasps that training may use in one portable file.
 
 The file is safetensors. Object points have 16 bits within the cloud's box, normals 8 bits. Reading it needs neither a
 simulator nor a mesh library.
@@ -19,7 +19,6 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from dro_grasp.datasets.bundle.splits import TRAINING
 from dro_grasp.devices import on_device
 from dro_grasp.errors import BundleError
 from dro_grasp.files import replacing
@@ -33,6 +32,19 @@ FORMAT_VERSION = 1
 """Version of the bundle file that this code writes and reads."""
 MAX_BYTES = 25_000_000
 """Largest bundle [bytes]. Ours: a repository takes it as it is."""
+HELD_OUT_HANDS = frozenset(f"assets/{name}" for name in ("inspire", "ability", "dclaw", "orca", "ezgripper"))
+"""Hands that no shipped weights were trained on, for zero-shot and few-shot results. Ours."""
+FEW_SHOT = "few_shot"
+"""Split of a held-out hand's grasps on training objects: for fine-tuning studies, never for shipped weights."""
+TRAINING = frozenset({"train", ""})
+"""Splits of a training bundle; the empty one stands for an object of the user's own."""
+SPLITS = {"train": TRAINING, "few_shot": frozenset({FEW_SHOT}), "validate": frozenset({"validate"})}
+"""Splits that a bundle may hold, by the bundle's own split."""
+
+
+def split_of(hand: str, object_split: str) -> str:
+    """The split of a hand's grasps on an object: that of the object, unless the hand is held out."""
+    return FEW_SHOT if hand in HELD_OUT_HANDS and object_split in TRAINING else object_split
 
 
 @dataclass(frozen=True)
@@ -92,14 +104,7 @@ def write_bundle(
     path: Path | str, hands: Sequence[Hand], objects: Mapping[str, ObjectCloud], grasps: Sequence[GraspBatch],
     splits: Set[str] = TRAINING,
 ) -> Bundle:
-    """Write a training bundle.
-
-    Args:
-        path: The file to write.
-        hands: The hands of the grasps.
-        objects: Clouds of the objects of the grasps, by name.
-        grasps: Batches of any of the hands on any of the objects.
-        splits: Splits that may enter.
+    """Write a training bundle of grasps of some splits, by these hands on objects with these clouds.
 
     Raises:
         BundleError: A grasp is of another split, its hand or object is missing, or the file grows too large.

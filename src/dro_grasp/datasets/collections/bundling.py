@@ -8,8 +8,7 @@ from pathlib import Path
 
 import torch
 
-from dro_grasp.datasets.bundle.splits import SPLITS
-from dro_grasp.datasets.bundle.training_file import Bundle, ObjectCloud, write_bundle
+from dro_grasp.datasets.bundle.training_file import SPLITS, Bundle, ObjectCloud, write_bundle
 from dro_grasp.datasets.collections.collection import read_collection
 from dro_grasp.datasets.collections.merging import spread
 from dro_grasp.errors import BundleError
@@ -25,11 +24,10 @@ def make_bundle(
     """Write the bundle of a split's grasps; returns it, and how many grasps of other splits were left out.
 
     Args:
-        inputs: Folders that the engine filled, folders of grasp files, or grasp files.
-        output: The bundle.
+        inputs: As in `read_collection`.
         split: One of SPLITS.
         hands: Only these; all when none is named.
-        per_pair: Most grasps of a pair; the choice spreads best over palm directions.
+        per_pair: As in `merge`.
 
     Raises:
         BundleError: It cannot be made of these grasps.
@@ -72,10 +70,7 @@ def _why_none(split: str, seen: Counter[str], hands: Sequence[str], hands_seen: 
 
 
 def sources(batches: list[GraspBatch]) -> tuple[list[Hand], dict[str, ObjectCloud]]:
-    """The hands and object clouds of grasps, each once; their hashes are checked.
-
-    Args:
-        batches: Each of one hand and one object.
+    """The hands and object clouds of batches of one hand and one object, each once; their hashes are checked.
 
     Raises:
         BundleError: Different files have one name.

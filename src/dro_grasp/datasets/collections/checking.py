@@ -18,6 +18,7 @@ from dro_grasp.simulation.protocols import Protocol
 from dro_grasp.simulation.trial import simulate
 
 Progress = Callable[[int, int], None]
+"""Called with (grasps evaluated, grasps in all)."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +58,6 @@ def check(
     Args:
         pairs: The data set, failures included if they are to be checked as well.
         sample: Number of grasps, drawn evenly; all of them if there are fewer.
-        rules: The protocol.
-        seed: Seed of the draw.
-        progress: Called with (grasps evaluated, grasps in all).
 
     Raises:
         OptionError: `sample` is not positive.

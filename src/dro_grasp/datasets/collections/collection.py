@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dro_grasp.datasets.engine.shards import find_shards, read_yield
-from dro_grasp.datasets.engine.yields import Yield
+from dro_grasp.datasets.engine.shards import Yield, find_shards, read_yield
 from dro_grasp.errors import GraspFileError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.table import read_footer
@@ -52,7 +52,7 @@ def read_collection(path: Path | str, only_successful: bool = True) -> Iterator[
         raise GraspFileError(f"no grasps at {path}: expected a .parquet file, a folder of them, or a folder that "
                              "`dro-grasp synthesize` filled")
     for pair in pairs:
-        yield replace(pair, grasps=successful(pair.grasps)) if only_successful else pair
+        yield replace(pair, grasps=pair.grasps[pair.grasps.success]) if only_successful else pair
 
 
 def count_collection(path: Path | str) -> dict[str, dict[str, int]]:
@@ -73,11 +73,6 @@ def count_collection(path: Path | str) -> dict[str, dict[str, int]]:
     return counts
 
 
-def successful(grasps: GraspBatch) -> GraspBatch:
-    """The grasps that passed their trial."""
-    return grasps[grasps.success]
-
-
 def _pairs_of_file(path: Path) -> Iterator[PairGrasps]:
     grasps = GraspBatch.load(path)
     yields = (read_footer(path)[1].get("notes") or {}).get(YIELDS) or {}
@@ -89,26 +84,12 @@ def _pairs_of_file(path: Path) -> Iterator[PairGrasps]:
 
 
 def _pairs_of_shards(folder: Path) -> Iterator[PairGrasps]:
-    pairs: dict[tuple[str, str], list[int]] = {}
-    shards = find_shards(folder)
-    for i, shard in enumerate(shards):
-        pairs.setdefault((shard.hand, shard.object), []).append(i)
-    for (hand, obj), indices in pairs.items():
-        own = [shards[i] for i in indices]
-        grasps = GraspBatch.concatenate(_of_one_hand([GraspBatch.load(s.path(folder)) for s in own], hand, obj))
-        yield PairGrasps(hand, obj, grasps, sum((read_yield(folder, s) for s in own), Yield()))
-
-
-def _of_one_hand(batches: Sequence[GraspBatch], hand: str, obj: str) -> Sequence[GraspBatch]:
-    """Refuse shards made with different versions of a hand or an object.
-
-    Raises:
-        GraspFileError: The versions differ.
-    """
-    hands = {b.hand_sha256 for b in batches}
-    objects = {sha for b in batches for sha in b.object_sha256}
-    if len(hands) > 1 or len(objects) > 1:
-        what = f"hand '{hand}'" if len(hands) > 1 else f"object '{obj}'"
-        raise GraspFileError(f"the shards of {hand} on {obj} were made with different versions of {what}, whose file has "
-                             "changed; synthesise the pair again into another folder")
-    return batches
+    for (hand, obj), shards in itertools.groupby(find_shards(folder), lambda shard: (shard.hand, shard.object)):
+        own = list(shards)
+        batches = [GraspBatch.load(shard.path(folder)) for shard in own]
+        hands = {batch.hand_sha256 for batch in batches}
+        if len(hands) > 1 or len({sha for batch in batches for sha in batch.object_sha256}) > 1:
+            what = f"hand '{hand}'" if len(hands) > 1 else f"object '{obj}'"
+            raise GraspFileError(f"the shards of {hand} on {obj} were made with different versions of {what}, whose file has "
+                                 "changed; synthesise the pair again into another folder")
+        yield PairGrasps(hand, obj, GraspBatch.concatenate(batches), sum((read_yield(folder, s) for s in own), Yield()))

@@ -1,34 +1,215 @@
-"""Import grasps of other projects: match their hands, objects and joints with ours."""
+"""Import grasps of other projects: the official CMapDataset, DexGraspNet and DexGraspBench.
+
+Their files are pickles, which can run code; these readers build numbers, names and arrays only. Sources: the loaders of
+the official D(R,O) release (roll, pitch and yaw about moving axes), DexGraspNet's description of its data (about fixed
+axes), the readme of DexGraspBench.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import pickle
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import torch
+from jaxtyping import Float, Shaped
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
-from dro_grasp.datasets.collections.foreign_files import ForeignGrasp, Format, in_order, read_foreign
-from dro_grasp.errors import ObjectError, OptionError
+from dro_grasp.errors import GraspFileError, ObjectError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import with_sources
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 
+Format = Literal["cmap", "dexgraspnet", "dexgraspbench"]
+WRIST = ("WRJTx", "WRJTy", "WRJTz", "WRJRx", "WRJRy", "WRJRz")
+"""Names of the wrist's six coordinates. Source: DexGraspNet."""
+HARMLESS = {
+    ("numpy.core.multiarray", "_reconstruct"), ("numpy._core.multiarray", "_reconstruct"), ("numpy", "ndarray"),
+    ("numpy", "dtype"), ("numpy.core.multiarray", "scalar"), ("numpy._core.multiarray", "scalar"),
+    ("collections", "OrderedDict"),
+}
+"""Classes that a pickle may name. Source: the pickles that NumPy writes."""
+EXPECTED = {
+    "cmap": "'metadata', a list of (wrist and joints, object, hand)",
+    "dexgraspnet": "a list of grasps, each with 'scale' and 'qpos', and in that WRJTx to WRJRz and the joints",
+    "dexgraspbench": "'grasp_qpos', and where it applies 'joint_names', 'obj_pose', 'obj_scale', 'obj_path' and 'hand'",
+}
+"""Entries of each format, for messages."""
+
+
+@dataclass(frozen=True)
+class ForeignGrasp:
+    """One grasp in a file's own terms."""
+
+    hand: str
+    """Name of the hand; empty if the format has none."""
+    object: str
+    """Name of the object; empty if the format has none."""
+    scale: float
+    """Scale of the object."""
+    T_object_wrist: Float[np.ndarray, "4 4"]
+    """Wrist pose [m]."""
+    joints: dict[str, float] | Float[np.ndarray, " n_joints"]
+    """By name, or in the order of the hand's moving joints [rad or m]."""
+
+
+def read_foreign(path: Path, kind: Format) -> list[ForeignGrasp]:
+    """All grasps of a project's file: `cmap_dataset.pt`, or an npy file.
+
+    Raises:
+        GraspFileError: The file is missing, holds something else, or could run code.
+    """
+    readers = {"cmap": _cmap, "dexgraspnet": _dexgraspnet, "dexgraspbench": _dexgraspbench}
+    if path.is_dir():
+        raise GraspFileError(f"{path} is a folder; name the {kind} files in it")
+    if not path.exists():
+        raise GraspFileError(f"no file {path}; give the path of a {kind} file")
+    try:
+        return list(readers[kind](path))
+    except _MoreThanData as error:
+        raise GraspFileError(f"{path} holds more than tensors ({error}) and is not opened, for safety: it could run code; take "
+                             "the file that the project publishes, or save its grasps again with tensors or arrays, numbers "
+                             "and names only") from error
+    except _NoEntry as error:
+        raise GraspFileError(f"{path} is no {kind} file: it has no entry '{error}'; expected {EXPECTED[kind]}") from error
+    except (OSError, pickle.UnpicklingError, EOFError, KeyError, ValueError, TypeError, IndexError, AttributeError,
+            RuntimeError) as error:
+        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        raise GraspFileError(f"{path} is no {kind} file that can be read ({reason}); expected {EXPECTED[kind]}; download it "
+                             "again if it is damaged") from error
+
+
+class _MoreThanData(Exception):
+    """A pickle would build something other than data; the text names it."""
+
+
+class _NoEntry(Exception):
+    """An entry is missing; the text is its name."""
+
+
+def _entry(entries: dict[str, Any], name: str) -> Any:
+    """One entry of a file's dictionary."""
+    if not isinstance(entries, dict):
+        raise TypeError(f"it holds a {type(entries).__name__} where named entries should be")
+    if name not in entries:
+        raise _NoEntry(name)
+    return entries[name]
+
+
+def _load_tensors(path: Path) -> Any:
+    """Read a torch file of tensors and containers only."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return torch.load(path, weights_only=True, map_location="cpu")
+    except pickle.UnpicklingError as error:
+        named = re.search(r"GLOBAL ([\w.]+)", str(error))
+        raise _MoreThanData(f"it names {named[1]}" if named else "it is a pickle that cannot be checked") from error
+    except KeyError as error:
+        raise ValueError("it is no file that torch.save wrote") from error
+
+
+def _pose(rotation: Rotation, position: ArrayLike) -> Float[np.ndarray, "4 4"]:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation.as_matrix(), position
+    return T
+
+
+def _cmap(path: Path) -> Iterator[ForeignGrasp]:
+    for q, obj, hand in _entry(_load_tensors(path), "metadata"):
+        values = np.asarray(q, np.float64)
+        T = _pose(Rotation.from_euler("XYZ", values[3:6]), values[:3])
+        yield ForeignGrasp(str(hand), str(obj), 1.0, T, values[6:])
+
+
+def _dexgraspnet(path: Path) -> Iterator[ForeignGrasp]:
+    for entry in _load_npy(path):
+        qpos = {str(name): float(value) for name, value in _entry(entry, "qpos").items()}
+        position = [_entry(qpos, name) for name in WRIST[:3]]
+        angles = [_entry(qpos, name) for name in WRIST[3:]]
+        joints = {name: value for name, value in qpos.items() if name not in WRIST}
+        T = _pose(Rotation.from_euler("xyz", angles), position)
+        yield ForeignGrasp("", path.stem, float(_entry(entry, "scale")), T, joints)
+
+
+def _dexgraspbench(path: Path) -> Iterator[ForeignGrasp]:
+    def pose(row: Float[np.ndarray, " k"]) -> Float[np.ndarray, "4 4"]:
+        return _pose(Rotation.from_quat(row[3:7], scalar_first=True), row[:3])
+
+    entry = _load_npy(path).item()
+    rows = np.atleast_2d(np.asarray(_entry(entry, "grasp_qpos"), np.float64))
+    obj = np.atleast_2d(np.asarray(entry.get("obj_pose", [0, 0, 0, 1, 0, 0, 0]), np.float64))
+    for row, place in zip(rows, np.broadcast_to(obj, (len(rows), 7)), strict=True):
+        T = np.linalg.inv(pose(place)) @ pose(row)
+        scale = float(np.ravel(entry.get("obj_scale", 1.0))[0])
+        names = entry.get("joint_names")
+        joints = row[7:] if names is None else dict(zip(map(str, names), row[7:].tolist(), strict=True))
+        yield ForeignGrasp(str(entry.get("hand", "")), Path(str(entry.get("obj_path", ""))).name, scale, T, joints)
+
+
+class _Harmless(pickle.Unpickler):
+    """Builds arrays, numbers, strings and containers, and refuses everything else."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) not in HARMLESS:
+            raise _MoreThanData(f"it names {module}.{name}")
+        return super().find_class(module, name)
+
+
+def _load_npy(path: Path) -> Shaped[np.ndarray, "..."]:
+    """An array of objects from a npy file."""
+    with path.open("rb") as file:
+        version = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(file)
+        if not dtype.hasobject:
+            raise ValueError(f"it is an array of {dtype}, not of grasps")
+        loaded = _Harmless(file).load()
+    return np.asarray(loaded, dtype=object).reshape(shape)
+
+
+def in_order(grasp: ForeignGrasp, moving: Sequence[str], independent: Sequence[str]) -> list[float]:
+    """A grasp's independent joints.
+
+    Args:
+        grasp: Of any format.
+        moving: Names of all the hand's moving joints, followers included, in the order of the description.
+        independent: Names of the joints that others follow.
+
+    Raises:
+        GraspFileError: The grasp has other joints.
+    """
+    give = "give the description that the data was made with (--hands)"
+    if isinstance(grasp.joints, dict):
+        # Names of MuJoCo's Shadow hand begin with the robot's.
+        values = {**grasp.joints, **{name.rpartition(":")[2]: value for name, value in grasp.joints.items()}}
+        if missing := [name for name in independent if name not in values]:
+            raise GraspFileError(
+                f"the grasp has no joint {', '.join(missing[:4])} among {', '.join(list(grasp.joints)[:6])}; {give}")
+        return [values[name] for name in independent]
+    names = moving if len(grasp.joints) == len(moving) else independent
+    if len(grasp.joints) != len(names):
+        raise GraspFileError(f"the grasp has {len(grasp.joints)} joints, the hand {len(moving)} that move, {len(independent)} "
+                             f"of them independent; {give}")
+    by_name = dict(zip(names, grasp.joints.tolist(), strict=True))
+    return [by_name[name] for name in independent]
+
 
 def import_grasps(
     paths: Sequence[Path], kind: Format, hands: Mapping[str, str], obj: str | None = None
 ) -> tuple[dict[str, GraspBatch], dict[str, str]]:
-    """Read other projects' files.
+    """Read a project's files: grasps by hand, and why objects are missing, by their names.
 
     Args:
-        paths: The files.
-        kind: Their project.
         hands: Our names or paths of hands, by the names in the files; the entry '' stands for all others.
         obj: Object of all grasps, for files that name it otherwise or not at all.
-
-    Returns:
-        Grasps by hand, and why objects are missing, by their names.
 
     Raises:
         OptionError: No file is given, or neither a file nor the arguments name its hand or object.

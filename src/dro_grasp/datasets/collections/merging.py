@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dro_grasp._version import __version__
 from dro_grasp.datasets.collections.collection import YIELDS, PairGrasps, read_collection
-from dro_grasp.datasets.engine.yields import Yield
+from dro_grasp.datasets.engine.shards import Yield
 from dro_grasp.errors import GraspFileError
 from dro_grasp.geometry.se3 import compose
 from dro_grasp.grasps.batch import GraspBatch

@@ -33,12 +33,10 @@ class RayPool:
         """Join a cluster, or start one on this machine.
 
         Args:
-            job: Settings that all shards share.
             workers: Processes of a cluster that has to be started; a running cluster is used whole.
             limit: A shard that takes longer is stopped [s].
             address: Address `host:port` of the cluster's head, or `auto` for the one that runs here; None takes
                 RAY_ADDRESS, and without it starts a cluster on this machine.
-            work: Makes a shard.
 
         Raises:
             OptionError: Ray is not installed, or there is no cluster at the address.
@@ -95,11 +93,7 @@ class RayPool:
 
 
 def _connect(address: str | None, workers: int) -> None:
-    """Join the cluster at the address, or start one on this machine where there is no address.
-
-    Raises:
-        OptionError: There is no cluster at the address.
-    """
+    """Join the cluster at the address, or start one on this machine where there is no address."""
     import ray
 
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
@@ -115,11 +109,7 @@ def _connect(address: str | None, workers: int) -> None:
 
 
 def _knock(address: str) -> None:
-    """Check in seconds that something listens at `host:port`; Ray itself waits for minutes.
-
-    Raises:
-        OSError: Nothing does.
-    """
+    """Check in seconds that something listens at `host:port`; Ray itself waits for minutes."""
     host, _, port = address.rpartition(":")
     if host and port.isdecimal():
         socket.create_connection((host, int(port)), CONNECT_TIME).close()

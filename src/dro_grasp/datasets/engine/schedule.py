@@ -13,11 +13,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from dro_grasp.datasets.engine.local_pool import LocalPool
-from dro_grasp.datasets.engine.pools import Failed, Outcome, Pool
-from dro_grasp.datasets.engine.shards import Shard, find_shards, read_yield, remove_leftovers, sole_run
+from dro_grasp.datasets.engine.pools import Failed, LocalPool, Outcome, Pool
+from dro_grasp.datasets.engine.shards import Shard, Yield, find_shards, read_yield, remove_leftovers, sole_run
 from dro_grasp.datasets.engine.worker import EngineConfig, Job, Task
-from dro_grasp.datasets.engine.yields import Yield
 from dro_grasp.devices import require_device
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.files import make_folder
@@ -104,18 +102,15 @@ def synthesize_dataset(
     workers: int | Callable[[Job], Pool] = 2, seed: int = 0, config: EngineConfig | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> DatasetReport:
-    """Fill a folder with valid grasps of every hand on every object.
+    """Fill a folder with valid grasps of every hand on every object, which are given by names or paths.
 
     All pairs get their first shard before any gets its second, so a run that is stopped early is useful.
 
     Args:
-        hands: Names or paths of hands.
-        objects: Names or paths of objects.
         grasps_per_pair: A pair is finished when it has this many valid grasps.
         output_dir: The folder; made when missing (its parent must exist).
         workers: Processes, of one thread each; or a function that makes another pool for a job.
         seed: Determines every shard, together with hand, object, round and number of candidates.
-        config: Protocol, scale, time limit and other settings.
         progress: Called with a line of text now and then; None prints to stderr.
 
     Raises:
@@ -144,11 +139,7 @@ def synthesize_dataset(
 
 
 def require_known(hands: Sequence[str], objects: Sequence[str]) -> None:
-    """Refuse unknown names and missing files, without reading any file that exists.
-
-    Args:
-        hands: Names or paths of hands.
-        objects: Names or paths of objects, without folders and groups.
+    """Refuse unknown names and missing files, without reading any file that exists; folders and groups are no objects.
 
     Raises:
         HandError: A hand's name or file is missing.
@@ -235,11 +226,7 @@ class Production:
         return bool(self.busy)
 
     def _collect(self, outcome: Outcome) -> None:
-        """Store a shard, or note why there is none.
-
-        Raises:
-            OutputError: It cannot be stored; then no other could be.
-        """
+        """Store a shard, or note why there is none; one that cannot be stored ends the run, as no other could be."""
         task, result = outcome
         pair = (task.shard.hand, task.shard.object)
         state = self.states[pair]

@@ -10,9 +10,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 from functools import lru_cache
 
-from dro_grasp.datasets.bundle.splits import split_of
-from dro_grasp.datasets.engine.shards import Shard, notes_of
-from dro_grasp.datasets.engine.yields import Yield
+from dro_grasp.datasets.bundle.training_file import split_of
+from dro_grasp.datasets.engine.shards import Shard, Yield, notes_of
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.duplicates import distinct
 from dro_grasp.grasps.sources import with_sources
@@ -136,10 +135,7 @@ def valid_grasps(
     """Candidates of one seed that pass the protocol, near-duplicates once, best energy first.
 
     Args:
-        hand: The hand.
-        obj: The object, with a mesh.
-        seed: The same seed gives the same grasps.
-        config: Protocol, sizes and thresholds.
+        obj: An object with a mesh.
         candidates: Grasps to synthesise; the config's number by default.
         earlier: Grasps that the pair has already.
     """

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from dro_grasp.datasets.engine.local_pool import LocalPool
+from dro_grasp.datasets.engine.pools import LocalPool
 from dro_grasp.datasets.engine.schedule import EngineConfig, synthesize_dataset
 from dro_grasp.datasets.engine.shards import Shard, find_shards, read_yield, sole_run
 from dro_grasp.datasets.engine.worker import FinishedShard, Job, Task
@@ -26,7 +26,7 @@ ROOT = Path(__file__).parents[2]
 PARENT = """
 import signal, sys
 from dro_grasp.datasets.engine.schedule import EngineConfig, synthesize_dataset
-from dro_grasp.datasets.engine.local_pool import LocalPool
+from dro_grasp.datasets.engine.pools import LocalPool
 from tests.helpers.engine_work import {work}
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where tests run in the background
