@@ -27,10 +27,9 @@ from dro_grasp.datasets.bundle.training_file import HELD_OUT_HANDS, Bundle, load
 from dro_grasp.evaluation.distance_error import distance_errors
 from dro_grasp.evaluation.success_rates import ALL, RAW, REFINED, BenchmarkConfig, benchmark
 from dro_grasp.hands.library import load_hand
-from dro_grasp.models.checkpoints import load_weights, locate_weights, save_weights
+from dro_grasp.models.checkpoints import history_of, load_weights, locate_weights, save_weights
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.models.presets import NetworkConfig
-from dro_grasp.models.small_networks import history_of
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.perception.partial_views import View
 from dro_grasp.predictor import GraspPredictor

@@ -23,8 +23,8 @@ from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from dro_grasp.errors import ObjectError
+from dro_grasp.models.checkpoints import save_weights
 from dro_grasp.models.completion_network import SHIPPED, SurfaceNetwork
-from dro_grasp.models.small_networks import save_small
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.loading import mesh_object
 from dro_grasp.objects.shape import ObjectModel
@@ -210,7 +210,7 @@ def main() -> None:
     SHIPPED.parent.mkdir(exist_ok=True)
     about = {"stage": "completion", "script": Path(__file__).name, "steps": options.steps, "seed": options.seed,
              "data": {"objects": len(parts), "views": sum(len(part.kind) for part in parts)}}
-    save_small(fit(joined(parts), options.steps, options.seed), SHIPPED, about)
+    save_weights(fit(joined(parts), options.steps, options.seed), SHIPPED, about)
 
 
 if __name__ == "__main__":

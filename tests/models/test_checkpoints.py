@@ -20,6 +20,7 @@ from dro_grasp.models.checkpoints import (
     SHIPPED_FOLDER,
     SMALL,
     describe_weights,
+    history_of,
     load_weights,
     locate_weights,
     save_weights,
@@ -28,7 +29,6 @@ from dro_grasp.models.checkpoints import (
 )
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.models.presets import NetworkConfig
-from dro_grasp.models.small_networks import history_of, save_small
 from tests.helpers.tiny_bundle import TINY
 
 HALF_ROUNDING = 2.0**-11
@@ -172,7 +172,7 @@ def test_weights_remember_every_training_before(path: Path, network: DistanceNet
     save_weights(network, later, {"stage": "second"}, history_of(path))
     assert describe_weights(later)["about"] == {"stage": "second"}
     assert describe_weights(later)["history"] == [{"stage": "test"}]
-    save_small(torch.nn.Linear(2, 1), tmp_path / "small.safetensors", {"stage": "third"}, history_of(later))
+    save_weights(torch.nn.Linear(2, 1), tmp_path / "small.safetensors", {"stage": "third"}, history_of(later))
     stages = [entry["stage"] for entry in history_of(tmp_path / "small.safetensors")]
     assert stages == ["test", "second", "third"]
     assert [entry["initial"] for entry in history_of(locate_weights("multi"))] == ["multi"]

@@ -10,10 +10,9 @@ import torch
 from safetensors import safe_open
 
 from dro_grasp.errors import OptionError
-from dro_grasp.models.checkpoints import load_weights, locate_weights
+from dro_grasp.models.checkpoints import KEY, load_weights, locate_weights
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.models.presets import PRESETS, NetworkConfig
-from dro_grasp.models.small_networks import KEY
 
 
 def test_paper_preset_is_the_papers_network() -> None:

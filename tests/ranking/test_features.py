@@ -13,7 +13,7 @@ from dro_grasp.energy.grasp_energy import GraspEnergy
 from dro_grasp.errors import WeightsError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
-from dro_grasp.models.small_networks import save_small
+from dro_grasp.models.checkpoints import save_weights
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.ranking.features import FARTHEST, LENGTH, LINK_FEATURES, MOTION, NEAR, Feature, GraspFeatures, grasp_features
@@ -113,7 +113,7 @@ def test_a_network_comes_back_as_it_was_saved(tmp_path: Path) -> None:
 
 def test_a_network_of_other_features_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A feature more than the weights know: both lists are named. A file without a list is refused as well."""
-    save_small(ScoreNetwork(2), tmp_path / "unnamed.safetensors")
+    save_weights(ScoreNetwork(2), tmp_path / "unnamed.safetensors")
     with pytest.raises(WeightsError, match=r"unnamed.safetensors states the features None"):
         load_score_network(tmp_path / "unnamed.safetensors")
     save_score_network(ScoreNetwork(2), tmp_path / "old.safetensors")

@@ -180,8 +180,7 @@ class Train(Stage):
         from dro_grasp.datasets.bundle.training_file import load_bundle
         from dro_grasp.evaluation.distance_error import distance_errors
         from dro_grasp.files import check_output
-        from dro_grasp.models.checkpoints import load_weights, locate_weights, save_weights
-        from dro_grasp.models.small_networks import history_of
+        from dro_grasp.models.checkpoints import history_of, load_weights, locate_weights, save_weights
         from dro_grasp.training.config import AugmentationConfig, LossConfig, TrainConfig
         from dro_grasp.training.loop import train
         from dro_grasp.training.processes import is_first

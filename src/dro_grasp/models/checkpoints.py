@@ -9,17 +9,22 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxtyping import Num
+from jaxtyping import Float, Num
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
-from torch import Tensor
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
 
 from dro_grasp.errors import OptionError, WeightsError
 from dro_grasp.files import replacing
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.models.presets import NetworkConfig
-from dro_grasp.models.small_networks import FORMAT_VERSION, KEY, SHIPPED_FOLDER, header
 
+SHIPPED_FOLDER = Path(__file__).parent.parent / "weights"
+"""Folder of the shipped weights."""
+KEY = "dro_grasp_weights"
+"""Metadata entry that marks a safetensors file as weights of this package; JSON."""
+FORMAT_VERSION = 1
+"""Version of that entry."""
 PICKLES = (b"PK", b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")
 """First two bytes of zipped and of bare pickles."""
 CHECKSUMS = "SHA256SUMS"
@@ -31,14 +36,14 @@ DEFAULT = "multi"
 
 
 def save_weights(
-    network: DistanceNetwork, path: Path | str, about: dict[str, Any] | None = None, history: Sequence[dict[str, Any]] = ()
+    network: nn.Module, path: Path | str, about: dict[str, Any] | None = None, history: Sequence[dict[str, Any]] = ()
 ) -> None:
     """Write weights in half precision; counters and statistics of BatchNorm stay in single precision.
 
     Args:
-        network: The network; its configuration goes along.
+        network: A network that predicts grasps, whose configuration goes along, or a small one that ships beside it.
         about: How the weights were made, and on what data.
-        history: The same of the weights that training began with, oldest first (`small_networks.history_of`).
+        history: The same of the weights that training began with, oldest first (`history_of`).
 
     Raises:
         OutputError: The file cannot be written.
@@ -48,8 +53,10 @@ def save_weights(
         name: value.half().contiguous() if value.is_floating_point() and "running" not in name else value.contiguous()
         for name, value in network.state_dict().items()
     }
+    config = {"config": dataclasses.asdict(network.config)} if isinstance(network, DistanceNetwork) else {}
+    entry = {"format_version": FORMAT_VERSION, **config, "about": about or {}, "history": list(history)}
     with replacing(path, "weights") as temporary:
-        save_file(tensors, temporary, metadata=header(about, history, config=dataclasses.asdict(network.config)))
+        save_file(tensors, temporary, metadata={KEY: json.dumps(entry)})
 
 
 def load_weights(name: str | Path | None = None) -> DistanceNetwork:
@@ -70,6 +77,18 @@ def load_weights(name: str | Path | None = None) -> DistanceNetwork:
         raise WeightsError(f"{path} does not fit this version of the network ({str(error).splitlines()[0]}); use weights "
                            "made with this version") from error
     return network.eval()
+
+
+def load_small(path: Path) -> dict[str, Float[Tensor, "..."]]:
+    """The tensors of a small network's file in single precision."""
+    return {name: value.to(torch.float32) for name, value in load_file(path).items()}
+
+
+def history_of(path: Path) -> list[dict[str, Any]]:
+    """How the weights of a file were made: one entry a training, oldest first; empty where the file does not say."""
+    with safe_open(path, "pt") as file:
+        entry = json.loads((file.metadata() or {}).get(KEY, "{}"))
+    return [*entry.get("history", []), *([entry["about"]] if entry.get("about") else [])]
 
 
 def locate_weights(name: str | Path | None = None) -> Path:

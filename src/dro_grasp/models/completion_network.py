@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from dro_grasp.models.small_networks import SHIPPED_FOLDER, load_small
+from dro_grasp.models.checkpoints import SHIPPED_FOLDER, load_small
 
 SHIPPED = SHIPPED_FOLDER / "completion" / "surface.safetensors"
 """The shipped network, which completes objects seen in part."""

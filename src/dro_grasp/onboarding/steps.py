@@ -20,8 +20,7 @@ from dro_grasp.evaluation.success_rates import BEST, RAW, REFINED, BenchmarkConf
 from dro_grasp.files import check_folder, make_folder, replacing
 from dro_grasp.hands.check import check_hand, picture
 from dro_grasp.hands.library import load_hand
-from dro_grasp.models.checkpoints import load_weights, locate_weights, save_weights
-from dro_grasp.models.small_networks import history_of
+from dro_grasp.models.checkpoints import history_of, load_weights, locate_weights, save_weights
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.predictor import GraspPredictor
 from dro_grasp.simulation.protocols import protocol

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from dro_grasp.errors import WeightsError
-from dro_grasp.models.small_networks import SHIPPED_FOLDER, history_of, load_small, save_small
+from dro_grasp.models.checkpoints import SHIPPED_FOLDER, history_of, load_small, save_weights
 from dro_grasp.ranking.features import GRASP_FEATURES, LINK_FEATURES, feature_names
 
 SHIPPED = SHIPPED_FOLDER / "ranking" / "quality.safetensors"
@@ -59,7 +59,7 @@ def save_score_network(network: ScoreNetwork, path: Path, about: dict[str, Any] 
     Raises:
         OutputError: The file cannot be written.
     """
-    save_small(network, path, {FEATURES_KEY: feature_names()} | (about or {}))
+    save_weights(network, path, {FEATURES_KEY: feature_names()} | (about or {}))
 
 
 def load_score_network(path: Path) -> ScoreNetwork:
