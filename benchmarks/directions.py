@@ -16,7 +16,7 @@ from report import emit
 from synthesis import HANDS
 from torch import Tensor
 
-from dro_grasp.geometry.half_axes import HALF_AXES, half_axis, half_axis_direction
+from dro_grasp.frames import HALF_AXES, half_axis, half_axis_direction
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand

@@ -30,8 +30,7 @@ from dro_grasp.objects.loading import mesh_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.objects.surface_distances import signed_distances
 from dro_grasp.perception.completion import GUESSES, THINNEST, surface_features, to_view_axes
-from dro_grasp.perception.depth_camera import DepthCamera
-from dro_grasp.perception.partial_views import visible_side
+from dro_grasp.perception.partial_views import DepthCamera, visible_side
 
 Kind = Literal["half", "depth"]
 KINDS: tuple[Kind, ...] = ("half", "depth")

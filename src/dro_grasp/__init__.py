@@ -21,7 +21,7 @@ _NAMES = {
     "evaluation.metrics": "wilson_interval",
     "export.csv_table": "csv_table",
     "export.dexgraspbench": "dexgraspbench",
-    "export.frame": "Frame",
+    "export.contents": "Frame",
     "export.isaac_grasp": "isaac_grasp",
     "export.moveit": "moveit_grasps",
     "grasps.batch": "GraspBatch",
@@ -36,7 +36,7 @@ _NAMES = {
     "objects.shape": "ObjectModel",
     "optimization.refinement": "RefineConfig",
     "optimization.synthesis": "SynthesisConfig synthesize",
-    "perception.depth_camera": "DepthCamera visible_points",
+    "perception.partial_views": "DepthCamera visible_points",
     "perception.scan": "depth_points scanned_object",
     "pipeline.problem": "GraspProblem",
     "pipeline.stages": "complete evaluate rank refine",
@@ -63,9 +63,9 @@ if TYPE_CHECKING:
     from dro_grasp.errors import DroGraspError as DroGraspError
     from dro_grasp.evaluation.controls import palm_facing_starts as palm_facing_starts
     from dro_grasp.evaluation.metrics import wilson_interval as wilson_interval
+    from dro_grasp.export.contents import Frame as Frame
     from dro_grasp.export.csv_table import csv_table as csv_table
     from dro_grasp.export.dexgraspbench import dexgraspbench as dexgraspbench
-    from dro_grasp.export.frame import Frame as Frame
     from dro_grasp.export.isaac_grasp import isaac_grasp as isaac_grasp
     from dro_grasp.export.moveit import moveit_grasps as moveit_grasps
     from dro_grasp.grasps.batch import GraspBatch as GraspBatch
@@ -80,7 +80,7 @@ if TYPE_CHECKING:
     from dro_grasp.objects.shape import ObjectModel as ObjectModel
     from dro_grasp.optimization.refinement import RefineConfig as RefineConfig
     from dro_grasp.optimization.synthesis import SynthesisConfig as SynthesisConfig, synthesize as synthesize
-    from dro_grasp.perception.depth_camera import DepthCamera as DepthCamera, visible_points as visible_points
+    from dro_grasp.perception.partial_views import DepthCamera as DepthCamera, visible_points as visible_points
     from dro_grasp.perception.scan import depth_points as depth_points, scanned_object as scanned_object
     from dro_grasp.pipeline.problem import GraspProblem as GraspProblem
     from dro_grasp.pipeline.stages import complete as complete, evaluate as evaluate, rank as rank, refine as refine

@@ -1,4 +1,4 @@
-"""Poses of frames in JSON files."""
+"""Frames: their six half-axes as names, directions and bins of directions, and their poses in JSON files."""
 
 from __future__ import annotations
 
@@ -7,13 +7,28 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
 
+HALF_AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
+"""Names of the half-axes, in the order of the indices of `half_axis`."""
 LONGEST = 100.0
 """A longer translation must be in another unit [m] (ours)."""
+
+
+def half_axis(directions: Float[Tensor, "n 3"]) -> Int[Tensor, " n"]:
+    """Index into HALF_AXES of the half-axis nearest to each direction."""
+    axis = directions.abs().argmax(-1)
+    return 2 * axis + (directions.gather(1, axis[:, None])[:, 0] < 0)
+
+
+def half_axis_direction(name: str) -> tuple[float, float, float]:
+    """The unit vector along one of HALF_AXES."""
+    sign = 1.0 if name[0] == "+" else -1.0
+    x, y, z = (sign if letter == name[1] else 0.0 for letter in "xyz")
+    return x, y, z
 
 
 class NamedMotion(NamedTuple):

@@ -13,7 +13,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from dro_grasp.cli.main import main
-from dro_grasp.export.frame import Frame
+from dro_grasp.export.contents import Frame
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
 from dro_grasp.objects.catalogue import load_object

@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
+import trimesh
 
-from dro_grasp.geometry.point_clouds import farthest_points, random_half, sample_surface
+from dro_grasp.geometry.point_clouds import enclosed_volume, farthest_points, random_half, sample_surface
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -81,3 +84,14 @@ def test_a_random_half_is_a_half_space_of_its_draw():
 def test_a_small_cloud_has_no_random_half():
     with pytest.raises(ValueError, match="needs a cloud of 20 points, got 19"):
         random_half(torch.randn(19, 3), 10, seeded())
+
+
+@pytest.mark.parametrize(("mesh", "volume"), [
+    (trimesh.creation.box((0.1, 0.2, 0.3)), 0.006),
+    (trimesh.creation.icosphere(5, 0.05), 4 / 3 * math.pi * 0.05**3),
+    (trimesh.creation.torus(0.1, 0.02, 256, 128), 2 * math.pi**2 * 0.1 * 0.02**2),
+], ids=["box", "sphere", "torus"])
+def test_volumes_are_those_of_formulas_wherever_the_surface_is(mesh: trimesh.Trimesh, volume: float) -> None:
+    triangles = np.asarray(mesh.triangles) + np.array([0.3, -2.0, 0.7])
+    assert enclosed_volume(triangles) == pytest.approx(volume, rel=2e-3)
+    assert enclosed_volume(triangles[:, ::-1]) == pytest.approx(-volume, rel=2e-3)

@@ -16,8 +16,7 @@ from scipy.spatial.transform import Rotation
 from dro_grasp.models.completion_network import SurfaceNetwork, shipped_surface
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.perception.completion import GUESSES, complete_cloud, surface_features, to_view_axes
-from dro_grasp.perception.depth_camera import DepthCamera, visible_points
-from dro_grasp.perception.partial_views import visible_side
+from dro_grasp.perception.partial_views import DepthCamera, visible_points, visible_side
 from dro_grasp.perception.symmetry import Guess, VisibleSide
 
 Shape = tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]

@@ -17,7 +17,7 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.viewer.app import GraspViewer, describe
 from dro_grasp.viewer.appearance import success_colour
-from dro_grasp.viewer.serving import HOST, ServedPage
+from dro_grasp.viewer.stage import HOST, ServedPage
 from tests.helpers.browser import free_port, page_of
 
 pytestmark = pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")

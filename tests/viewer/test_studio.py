@@ -14,7 +14,7 @@ import viser
 import yaml
 
 from dro_grasp.errors import OptionError
-from dro_grasp.geometry.half_axes import HALF_AXES, half_axis_direction
+from dro_grasp.frames import HALF_AXES, half_axis_direction
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import BUILTIN_FOLDER
 from dro_grasp.objects.catalogue import load_object

@@ -14,8 +14,8 @@ from torch import Tensor
 from dro_grasp.datasets.collections.collection import PairGrasps
 from dro_grasp.datasets.engine.shards import Yield
 from dro_grasp.evaluation.metrics import diversity
+from dro_grasp.frames import HALF_AXES, half_axis
 from dro_grasp.geometry import se3
-from dro_grasp.geometry.half_axes import HALF_AXES, half_axis
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import hand_of
 from dro_grasp.hands.hand import Hand

@@ -8,9 +8,8 @@ import io
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.export.contents import comment, plain, postures
+from dro_grasp.export.contents import Frame, comment, plain, postures
 from dro_grasp.export.formats import ExportJob
-from dro_grasp.export.frame import Frame
 from dro_grasp.grasps.batch import GraspBatch
 
 

@@ -9,9 +9,8 @@ import numpy as np
 import roma
 import torch
 
-from dro_grasp.export.contents import postures
+from dro_grasp.export.contents import Frame, postures
 from dro_grasp.export.formats import ExportJob
-from dro_grasp.export.frame import Frame
 from dro_grasp.grasps.batch import GraspBatch
 
 

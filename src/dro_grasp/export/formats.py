@@ -7,7 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from dro_grasp.export.frame import Frame
+    from dro_grasp.export.contents import Frame
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.hands.hand import Hand
 

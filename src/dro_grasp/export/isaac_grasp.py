@@ -5,9 +5,8 @@ Source: documentation of isaac_grasp files in Isaac Sim (grasp editor) and Isaac
 
 from __future__ import annotations
 
-from dro_grasp.export.contents import by_joint, comment, confidence, plain, postures, yaml_text
+from dro_grasp.export.contents import Frame, by_joint, comment, confidence, plain, postures, yaml_text
 from dro_grasp.export.formats import ExportJob
-from dro_grasp.export.frame import Frame
 from dro_grasp.grasps.batch import GraspBatch
 
 NO_CONFIDENCE = 0.5

@@ -9,9 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
-from dro_grasp.export.contents import comment, confidence, plain, postures, yaml_text
+from dro_grasp.export.contents import Frame, comment, confidence, plain, postures, yaml_text
 from dro_grasp.export.formats import ExportJob
-from dro_grasp.export.frame import Frame
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 

@@ -1,12 +1,19 @@
-"""Sampling of surfaces and selection of points."""
+"""Volume and samples of surfaces, and selection of points."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+
+
+def enclosed_volume(triangles: Float[np.ndarray, "n 3 3"]) -> float:
+    """Signed volume inside a closed surface [m^3], by the divergence theorem; positive if corners run counter-clockwise."""
+    a, b, c = triangles.transpose(1, 0, 2)
+    return float(np.einsum("ni,ni->", a, np.cross(b, c)) / 6)
 
 
 def sample_surface(

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from dro_grasp.descriptions.loader import Description
 from dro_grasp.descriptions.notes import Note
 from dro_grasp.geometry import se3
-from dro_grasp.geometry.triangles import enclosed_volume
+from dro_grasp.geometry.point_clouds import enclosed_volume
 from dro_grasp.hands.anatomy import Finger
 from dro_grasp.hands.build import build_hand
 from dro_grasp.hands.hand import Hand

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dro_grasp.errors import ObjectError
-from dro_grasp.geometry.triangles import enclosed_volume
+from dro_grasp.geometry.point_clouds import enclosed_volume
 
 if TYPE_CHECKING:
     import trimesh

@@ -15,8 +15,7 @@ from dro_grasp.grasps.controller import completed
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.viewer.appearance import PREDICTED_COLOUR
-from dro_grasp.viewer.serving import HOST, ServedPage, serve
-from dro_grasp.viewer.stage import Stage
+from dro_grasp.viewer.stage import HOST, ServedPage, serve
 
 Posture = Literal["open", "pregrasp", "grasp", "squeeze"]
 """Stages of closing the hand that the viewer shows."""
@@ -58,7 +57,6 @@ class GraspViewer(ServedPage):
         self.posture: Posture = "grasp"
         self._joints = postures_of(hand, obj, grasps)
         super().__init__(port, host)
-        self.stage = Stage(self.server)
         self.stage.set_pair(hand, obj, self._joints["grasp"][0], grasps.T_object_wrist[0].float())
         self._predicted = None
         if predicted_points is not None:

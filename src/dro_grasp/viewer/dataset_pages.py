@@ -13,7 +13,7 @@ import torch
 
 from dro_grasp.evaluation.coverage import ROLL_BINS, HandCoverage, PairCoverage, grasp_sizes, wrist_rolls
 from dro_grasp.files import check_output
-from dro_grasp.geometry.half_axes import HALF_AXES
+from dro_grasp.frames import HALF_AXES
 from dro_grasp.grasps.sources import object_of
 from dro_grasp.viewer.page import ShadedCount, image, png_bytes, table, write_page
 from dro_grasp.viewer.pictures import caption, contact_sheet, draw_grasp

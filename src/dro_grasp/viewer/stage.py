@@ -1,6 +1,10 @@
-"""The 3D scene in the browser: one hand, one object, their poses."""
+"""The 3D scene in the browser, one hand and one object in their poses; and pages with their own server that show it."""
 
 from __future__ import annotations
+
+import contextlib
+import socket
+import sys
 
 import numpy as np
 import torch
@@ -9,6 +13,7 @@ import viser.transforms
 from jaxtyping import Float
 from torch import Tensor
 
+from dro_grasp.errors import OptionError
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.rendering.meshes import Colour
@@ -22,6 +27,10 @@ from dro_grasp.viewer.appearance import (
     success_colour,
 )
 
+HOST = "127.0.0.1"
+"""Default address: only this machine can connect."""
+PORTS = range(1, 65536)
+"""Valid TCP ports."""
 POINT_SIZE = 0.0022
 """Size of a drawn point [m]."""
 CAMERA_DISTANCE = 1.15
@@ -112,3 +121,50 @@ def rgb(colour: Colour) -> tuple[int, int, int]:
     """Red, green and blue as whole numbers to 255."""
     red, green, blue = (round(255 * c) for c in colour)
     return red, green, blue
+
+
+class ServedPage:
+    """A page with a stage that is being served; `stop()` ends it."""
+
+    def __init__(self, port: int, host: str) -> None:
+        """Start serving.
+
+        Args:
+            port: Port to serve on; if it is taken, the next free one.
+            host: Address to serve at; 0.0.0.0 serves the whole network.
+
+        Raises:
+            OptionError: The port is invalid, or the host is no address of this machine.
+        """
+        if port not in PORTS:
+            raise OptionError(f"port is {port}; give a number from {PORTS[0]} to {PORTS[-1]}, for example --port 8080")
+        try:
+            # viser would search for a free port forever.
+            socket.create_server((host, 0)).close()
+        except OSError as error:
+            raise OptionError(f"this machine cannot serve at '{host}' ({error}); give --host {HOST} for this machine only, or "
+                              "0.0.0.0 for the whole network") from error
+        # viser prints a banner to stdout, which is reserved for tables and JSON.
+        with contextlib.redirect_stdout(sys.stderr):
+            self.server = viser.ViserServer(host=host, port=port, verbose=False)
+        self.stage = Stage(self.server)
+
+    @property
+    def url(self) -> str:
+        """Address of the page for a browser."""
+        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+
+    def stop(self) -> None:
+        """Stop serving and free the port."""
+        self.server.stop()
+
+
+def serve(page: ServedPage) -> None:
+    """Print the address of the page, and serve it until Ctrl-C."""
+    print(f"viewer: {page.url} (Ctrl-C stops it)", file=sys.stderr, flush=True)
+    try:
+        page.server.sleep_forever()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        page.stop()

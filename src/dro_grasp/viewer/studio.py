@@ -16,9 +16,9 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from dro_grasp.errors import DroGraspError
+from dro_grasp.export.contents import Frame
 from dro_grasp.export.formats import FORMATS, ExportJob
-from dro_grasp.export.frame import Frame
-from dro_grasp.geometry.half_axes import HALF_AXES, half_axis, half_axis_direction
+from dro_grasp.frames import HALF_AXES, half_axis, half_axis_direction
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import hand_names, load_hand
@@ -30,8 +30,7 @@ from dro_grasp.predictor import GraspPredictor, GraspRequest, Method
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.trial import record
 from dro_grasp.viewer.app import POSTURES, Posture, describe, outcome, postures_of
-from dro_grasp.viewer.serving import HOST, ServedPage, serve
-from dro_grasp.viewer.stage import Stage
+from dro_grasp.viewer.stage import HOST, ServedPage, serve
 from dro_grasp.viewer.uploads import store_upload
 
 FRAME_TIME = 0.04
@@ -89,7 +88,6 @@ class Studio(ServedPage):
         self._busy = threading.Lock()
         self._uploads = 0
         super().__init__(port, host)
-        self.stage = Stage(self.server)
         self._add_choices(hand, obj)
         self._add_display()
         self._say("Pick a hand and an object, or upload your own, and press *Generate*.")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from dro_grasp.geometry.half_axes import HALF_AXES, half_axis, half_axis_direction
+from dro_grasp.frames import HALF_AXES, half_axis, half_axis_direction
 
 
 def test_half_axes_are_in_order() -> None:
