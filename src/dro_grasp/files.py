@@ -63,11 +63,7 @@ def make_folder(path: Path | str) -> Path:
 
 @contextmanager
 def replacing(path: Path, what: str = "") -> Iterator[Path]:
-    """A temporary path that replaces `path` when the block ends; a failure leaves `path` as it was.
-
-    Args:
-        path: File to write or replace.
-        what: Name of the content, for the error.
+    """A temporary path that replaces `path` when the block ends; a failure leaves `path` as it was, its error names `what`.
 
     Raises:
         OutputError: The file cannot be written.

@@ -40,11 +40,7 @@ class NamedMotion(NamedTuple):
 
 
 def read_motion(path: Path, key: str) -> NamedMotion:
-    """A frame's name and a matrix from a JSON file `{"frame": NAME, key: 4x4}`.
-
-    Args:
-        path: The file.
-        key: Name of the matrix, such as `T_frame_object`.
+    """A frame's name and a matrix from a JSON file `{"frame": NAME, key: 4x4}`, with a key such as `T_frame_object`.
 
     Raises:
         OptionError: No such file, no such content, or no rigid motion.

@@ -45,9 +45,6 @@ def sample_surface(
 def farthest_points(points: Float[Tensor, "*batch n 3"], count: int, start: int = 0) -> Int[Tensor, "*batch count"]:
     """Farthest point sampling: each next point is the one farthest from all before it; the first of several wins.
 
-    Args:
-        points: Clouds to choose from [m].
-
     Raises:
         ValueError: `count` exceeds the number of points.
     """

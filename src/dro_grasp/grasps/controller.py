@@ -16,13 +16,10 @@ from dro_grasp.hands.hand import Hand
 
 
 def completed(hand: Hand, grasps: GraspBatch, centre: Float[Tensor, "3"], config: ControllerConfig | None = None) -> GraspBatch:
-    """The same grasps, each with pregrasp and squeeze; rows that are stated stay.
+    """The same grasps of one object, each with pregrasp and squeeze; rows that are stated stay.
 
     Args:
-        hand: The grasps' hand.
-        grasps: Grasps of one object.
         centre: The object's centre of mass, in the object's frame [m].
-        config: Amounts.
     """
     open_rows = ~grasps.states_closing
     if not bool(open_rows.any()):
@@ -48,11 +45,8 @@ def pregrasp_and_squeeze(
     joints above the palm and the wrist stay.
 
     Args:
-        hand: The hand.
-        T_object_wrist: Wrist poses.
         joints: The grasps' independent joints [rad or m].
         centre: The object's centre of mass, in the object's frame [m].
-        config: Amounts.
     """
     config = config or ControllerConfig()
     slope = distance_slope(hand, T_object_wrist, joints, centre)

@@ -21,8 +21,6 @@ def distinct(
     """Grasps that are not near-duplicates of an earlier grasp of the same object.
 
     Args:
-        hand: The grasps' hand.
-        grasps: Any grasps of it.
         near: Mean distance between corresponding surface points below which two grasps are duplicates [m].
         earlier: Grasps that come before these; none by default.
     """

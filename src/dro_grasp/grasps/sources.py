@@ -32,7 +32,6 @@ def with_sources(grasps: GraspBatch, hand: str, obj: str, scale: float, camera: 
         grasps: Grasps of one object.
         hand: Name or path.
         obj: Name or path.
-        scale: Scale of the object's file.
         camera: Pose of the camera that saw the object, in the frame of the grasps.
     """
     import torch
@@ -109,12 +108,7 @@ def frame_of(grasps: GraspBatch) -> str | None:
 
 
 def require_same(grasps: GraspBatch, hand: Hand, obj: ObjectModel) -> None:
-    """Refuse a hand or an object that has changed since the grasps were made.
-
-    Args:
-        grasps: Grasps of one object.
-        hand: Their hand, as found.
-        obj: Their object, as found.
+    """Refuse a hand or an object that has changed since grasps of one object were made.
 
     Raises:
         GraspFileError: A hash differs.

@@ -26,12 +26,7 @@ METADATA_KEY = b"dro_grasp"
 
 
 def table_bytes(columns: dict[str, pa.Array], header: dict[str, Any]) -> bytes:
-    """A grasp file of the given columns.
-
-    Args:
-        columns: Arrow arrays of equal length by name.
-        header: JSON-able metadata; the format version is added.
-    """
+    """A grasp file of Arrow arrays of equal length by name; the format version is added to the header."""
     metadata = {METADATA_KEY: json.dumps({"format_version": FORMAT_VERSION, **header}).encode()}
     table, file = pa.table(columns).replace_schema_metadata(metadata), io.BytesIO()
     # Byte-stream split puts bytes of equal weight side by side: rounded floats then take half the space.

@@ -168,7 +168,6 @@ def solve_joints(
 
     Args:
         tree: The hand's kinematic tree; its couplings hold exactly.
-        targets: Points on links and their wanted positions.
         T_world_wrist: Initial pose of the root link.
         q: Initial independent joints; clamped to the limits [rad or m].
         movable: False for joints that keep their initial value, inside the limits or not; all move by default.

@@ -43,12 +43,7 @@ class SurfaceNetwork(nn.Module):
             self.leave.bias[0] = 1.0
 
     def forward(self, guessed: Float[Tensor, "*n guesses"], features: Float[Tensor, "*n features"]) -> Float[Tensor, "*n"]:
-        """Signed distances to the surface [m].
-
-        Args:
-            guessed: Signed distances to the guesses [m].
-            features: Other features of each point.
-        """
+        """Signed distances to the surface [m], from those to the guesses [m] and other features of each point."""
         x = self.enter(features)
         for layer in self.layers:
             x = x + layer(x)

@@ -42,8 +42,7 @@ class DistanceHead(nn.Module):
         """Distances [m].
 
         Args:
-            hand: Features of the hand's points, latent included.
-            obj: Features of the object's points, latent included.
+            hand: Features of the hand's points, latent included; `obj` likewise.
             base: Distances [m] that the kernel corrects, before the softplus; None in the paper's form.
         """
         left, right = self.first.weight.chunk(2, 1)

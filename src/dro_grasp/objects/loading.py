@@ -108,7 +108,6 @@ def mesh_object(
     """Check and repair a mesh, and derive mass properties and the stored cloud.
 
     Args:
-        mesh: Its mesh, in metres after scaling.
         origin: Source of the mesh, for messages.
         scale: Multiplies all coordinates, including those of the parts.
         split: `train`, `validate`, `test`, or None for a user's object.

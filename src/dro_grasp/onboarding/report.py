@@ -25,11 +25,7 @@ CANDIDATES = 4
 
 
 def write_report(done: Onboarded, held_out: list[str]) -> Path:
-    """Write the page into the folder of the hand, and return its path.
-
-    Args:
-        done: Results of all steps.
-        held_out: Objects that the weights were evaluated on; some are drawn.
+    """Write the page into the folder of the hand, and return its path; grasps on some held-out objects are drawn.
 
     Raises:
         OutputError: The page cannot be written.

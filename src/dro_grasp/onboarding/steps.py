@@ -98,7 +98,6 @@ def onboard(
     Args:
         hand: Name or path of the description.
         folder: Folder of all results; made if its parent exists.
-        config: Time and objects.
         say: Called with a line about each step.
 
     Raises:

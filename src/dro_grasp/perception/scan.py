@@ -54,7 +54,6 @@ def load_scan(path: Path, T_frame_camera: Float[np.ndarray, "4 4"], scale: float
 
     Args:
         path: PLY, NPY or PCD; outliers and the NaN points of organised clouds are dropped.
-        T_frame_camera: The camera's pose in the wanted frame.
         scale: Multiplies the points; 0.001 for millimetres.
 
     Raises:

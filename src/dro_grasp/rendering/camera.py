@@ -34,10 +34,7 @@ class Camera:
         """The nearest camera in a direction that has all points in its picture.
 
         Args:
-            points: What must be in the picture [m].
-            direction: From the points towards the camera.
-            up: Direction that points up in the picture.
-            field_of_view: Angle between the upper and lower edges [rad].
+            direction: From the points [m] towards the camera.
             aspect: Width of the picture over its height.
             margin: Share of the picture that stays free at each edge.
         """
@@ -65,10 +62,7 @@ class Camera:
     ) -> tuple[Float[np.ndarray, "f 3 3"], Bool[np.ndarray, " f"]]:
         """Pixel coordinates and inverse depth [1/m] of triangle corners, and which triangles lie before the camera.
 
-        Args:
-            corners: In the camera's axes [m].
-            width: Of the picture [pixels].
-            height: Of the picture [pixels].
+        Corners are in the camera's axes [m], width and height those of the picture [pixels].
         """
         depth = -corners[..., 2]
         visible = np.asarray((depth > NEAR).all(1))

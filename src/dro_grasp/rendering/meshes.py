@@ -60,8 +60,6 @@ def corner_normals(
     """Unit normals at the corners of each face: smooth, but flat where the surface folds.
 
     Args:
-        vertices: Positions [m].
-        faces: Vertex indices.
         crease: Cosine between face normal and vertex normal below which the corner takes the face normal.
     """
     triangle = vertices[faces]

@@ -75,11 +75,9 @@ def render(
     meshes: Sequence[Mesh], camera: Camera, width: int = 640, height: int = 480, *, background: Colour = WHITE,
     oversampling: int = 2, style: Style | None = None,
 ) -> UInt8[np.ndarray, "{height} {width} 3"]:
-    """Draw meshes with perspective, smooth shading and soft outlines.
+    """Draw meshes with perspective, smooth shading and soft outlines, on a picture of `width` times `height` pixels.
 
     Args:
-        width: Of the picture [pixels].
-        height: Of the picture [pixels].
         oversampling: Samples per pixel and axis; 2 smooths the edges.
     """
     style = style or Style()
@@ -160,12 +158,7 @@ def _barycentric(
 def shade(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], colours: Float[np.ndarray, "n 3"], style: Style
 ) -> Float[np.ndarray, "n 3"]:
-    """Blinn-Phong shading from both sides, because files disagree about which side is out.
-
-    Args:
-        points: In the camera's axes [m].
-        normals: Likewise, of any length.
-    """
+    """Blinn-Phong shading from both sides, because files disagree about which side is out, in the camera's axes [m]."""
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     view = -points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-12)
     normals = np.where((normals * view).sum(1, keepdims=True) < 0, -normals, normals)

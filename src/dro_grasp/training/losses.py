@@ -69,7 +69,6 @@ def divergence_loss(
     """Loss of the divergences of a batch.
 
     Args:
-        divergence: Per grasp and latent dimension [nat].
         form: `batch_mean` sums over latents and takes the mean over the batch; `official` is the release's, summed over
             the whole batch, then sqrt(1 + x^2) - 1.
         free_bits: Nats of each dimension that cost nothing, on average over the batch. Source: Kingma et al. 2016.

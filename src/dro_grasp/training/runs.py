@@ -40,7 +40,6 @@ class TrainingRun:
         """Prepare optimiser and averaged weights; nothing is read or written before `train`.
 
         Args:
-            folder: For log and checkpoint.
             model: What is trained, on its device; parameters that require no gradient stay as they are.
             generator: Source of all random numbers of the losses, on the model's device.
             processes: Those that train together; this one alone by default.

@@ -48,11 +48,7 @@ class SampleSource:
     def __init__(
         self, bundle: Bundle, network: NetworkConfig, augmentation: AugmentationConfig, device: torch.device | str = "cpu"
     ) -> None:
-        """Put hands, grasps and objects on the device on which samples are drawn.
-
-        Args:
-            network: Numbers of points, and the frame.
-            device: Device of the samples, and of the generators that draw them.
+        """Put hands, grasps and objects on the device of the samples, and of the generators that draw them.
 
         Raises:
             BundleError: The bundle holds no grasps.

@@ -38,12 +38,8 @@ class GraspViewer(ServedPage):
         """Start serving.
 
         Args:
-            hand: Hand of the grasps.
-            obj: Object of the grasps.
-            grasps: At least one grasp, with or without a trial.
             predicted_points: Hand points multilaterated from D(R,O), before the solver [m].
-            port: Port to serve on; if it is taken, the next free one.
-            host: Address to serve at; 0.0.0.0 serves the whole network.
+            port: As `ServedPage` takes it; `host` likewise.
 
         Raises:
             OptionError: There is no grasp, or the port or host is invalid.

@@ -66,7 +66,6 @@ def hand_meshes(
     """The posed hand in the object's frame; without a description, its surface points.
 
     Args:
-        hand: The hand.
         joints: Independent joints [rad or m].
         T_object_wrist: Wrist pose; by default the hand is drawn in its wrist frame.
         above_palm: Whether to draw links above the palm (a forearm, a stand).
@@ -115,7 +114,6 @@ def _clarity(points: Float[np.ndarray, "n 3"], owner: Int[np.ndarray, " n"], dir
     """Number of cells of a coarse picture that show the object or the fingers; the scarcer of the two counts more.
 
     Args:
-        points: Points of hand and object [m].
         owner: 1 for points of fingers, 2 for points of the object, 0 for all others.
         direction: From the points towards the camera.
     """

@@ -30,12 +30,7 @@ ACCENT = "#d1713b"
 
 
 def write_report(hands: Sequence[HandCoverage], path: Path, progress: Callable[[int, int], None] | None = None) -> None:
-    """Write the page.
-
-    Args:
-        hands: Coverage of each hand.
-        path: HTML file.
-        progress: Called with (hands done, all hands).
+    """Write the page; `progress` is called with (hands done, all hands).
 
     Raises:
         OutputError: The file cannot be written.

@@ -26,12 +26,7 @@ td.cell { min-width: 2.2em } img { max-width: 100% } p.note { color: #666 }
 
 
 def write_page(path: Path, title: str, body: str) -> None:
-    """Write the page.
-
-    Args:
-        path: HTML file.
-        title: Title of the window.
-        body: HTML.
+    """Write a page of an HTML body, whose window has the title.
 
     Raises:
         OutputError: The file cannot be written.

@@ -59,16 +59,9 @@ def draw_grasps(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, path: Path | str, count: int = MAX_PICTURES, columns: int = COLUMNS,
     style: PictureStyle | None = None,
 ) -> None:
-    """Write a PNG with pictures of the first `count` grasps, captioned with score and trial outcome.
+    """Write a PNG with pictures of the first `count` grasps, captioned with score and trial outcome, in some columns.
 
-    Args:
-        hand: Hand of the grasps; links above its palm are not drawn.
-        obj: Object of the grasps.
-        grasps: At least one grasp.
-        path: PNG to write.
-        count: Limit of grasps drawn, from the first on.
-        columns: Pictures side by side.
-        style: Size, opacity and contact marks.
+    Links above the hand's palm are not drawn.
 
     Raises:
         OutputError: The file cannot be written, or there is no grasp.

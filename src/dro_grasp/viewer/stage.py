@@ -53,8 +53,6 @@ class Stage:
         """Replace hand and object, and move the camera to the best viewpoint.
 
         Args:
-            hand: Hand with its description, which holds the shapes.
-            obj: Object with a mesh or a cloud.
             joints: Initial joints [rad or m].
             T: Initial wrist pose in the object's frame [m].
         """

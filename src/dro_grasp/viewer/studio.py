@@ -72,15 +72,7 @@ class Studio(ServedPage):
     def __init__(
         self, hand: str = "allegro", obj: str = "rubber_duck", weights: str | None = None, port: int = 8080, host: str = HOST
     ) -> None:
-        """Start serving.
-
-        Args:
-            hand: Hand chosen at first.
-            obj: Object chosen at first.
-            weights: Name or path of weights.
-            port: Port to serve on; if it is taken, the next free one.
-            host: Address to serve at; 0.0.0.0 serves the whole network.
-        """
+        """Start serving with a hand and an object chosen; weights by name or path, port and host as `ServedPage` takes them."""
         self.predictor = GraspPredictor(weights)
         self.made: ShownGrasps | None = None
         self.shown: list[int] = []
@@ -101,16 +93,12 @@ class Studio(ServedPage):
         self, hand: str, obj: str, num: int = 16, direction: str = ANY, temperature: float | None = None,
         protocol: str = "strict", candidates: int = 4, method: Method = "auto",
     ) -> ShownGrasps:
-        """Predict, refine, rank and evaluate, then show the best.
+        """Predict, refine, rank and evaluate, then show the best; bare clouds get no trial.
 
         Args:
-            hand: Name or path.
-            obj: Name or path.
-            num: How many.
             direction: One of HALF_AXES, or `any`.
             temperature: Of z; the weights' own by default.
-            protocol: Trial; bare clouds get none.
-            candidates: Candidates proposed for each grasp.
+            candidates: Proposed for each grasp.
             method: Their source, as in `GraspRequest`.
 
         Raises:

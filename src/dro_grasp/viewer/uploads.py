@@ -19,12 +19,10 @@ DESCRIPTIONS = (".urdf", ".xml", ".mjcf")
 
 
 def store_upload(name: str, content: bytes, folder: Path) -> Path:
-    """Write an upload into a folder, and return its path or, for a ZIP file, that of the hand description in it.
+    """Write an upload into an empty folder, and return its path or, for a ZIP file, that of the hand description in it.
 
     Args:
         name: File name from the browser; folders in it are ignored.
-        content: Bytes of the file.
-        folder: An empty folder.
 
     Raises:
         OptionError: The file is too large, its name is invalid, or a ZIP file holds no description or paths outside itself.
