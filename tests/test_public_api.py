@@ -28,19 +28,16 @@ def test_every_public_name_has_a_docstring_of_its_own(name: str) -> None:
     assert not own.startswith(f"{name}("), name
 
 
-def test_the_names_for_type_checkers_are_those_of_the_lazy_table() -> None:
-    tree = ast.parse(inspect.getsource(dro))
-    (block,) = (node for node in tree.body if isinstance(node, ast.If))
-    stated = {alias.asname: node.module for node in block.body if isinstance(node, ast.ImportFrom) for alias in node.names
-              if alias.asname == alias.name}  # a type checker takes only an import with an alias for public
-    assert stated == {name: f"dro_grasp.{module}" for name, module in dro._EXPORTS.items()}
-    assert len(" ".join(dro._NAMES.values()).split()) == len(dro._EXPORTS), "a name is stated twice"
-    assert set(stated) == set(NAMES)
+def test_the_list_of_names_states_each_once_and_for_type_checkers() -> None:
+    aliases = [alias for node in ast.parse((Path(dro.__file__).with_suffix(".pyi")).read_text()).body
+               if isinstance(node, ast.ImportFrom) for alias in node.names]
+    assert all(alias.asname == alias.name for alias in aliases), "a type checker takes only an import with an alias for public"
+    assert sorted(alias.name for alias in aliases) == sorted(dro.__all__) == dir(dro), "a name is stated twice"
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_lazy_table_names_the_module_that_defines_it(name: str) -> None:
-    assert getattr(dro, name).__module__ == f"dro_grasp.{dro._EXPORTS[name]}"
+def test_the_list_names_the_module_that_defines_it(name: str) -> None:
+    assert getattr(dro, name).__module__ == dro._EXPORTS[name]
 
 
 def test_the_python_page_documents_every_public_name_and_no_other() -> None:

@@ -1,119 +1,29 @@
 """D(R,O) Grasp: any robot hand description in, simulation-checked dexterous grasps out.
 
-Public names are loaded on first use, so that importing the package costs nothing and training needs no simulator.
+Public names are loaded on first use, so that importing the package costs nothing and training needs no simulator. They are
+listed once, in `__init__.pyi`, which type checkers read as well.
 """
 
 from __future__ import annotations
 
+import ast
+import pkgutil
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from dro_grasp._version import __version__ as __version__
 
-_NAMES = {
-    "datasets.bundle.training_file": "load_bundle",
-    "datasets.collections.bundling": "make_bundle",
-    "datasets.collections.collection": "read_collection",
-    "datasets.engine.schedule": "synthesize_dataset",
-    "datasets.engine.worker": "EngineConfig",
-    "errors": "DroGraspError",
-    "evaluation.controls": "palm_facing_starts",
-    "evaluation.metrics": "wilson_interval",
-    "export.csv_table": "csv_table",
-    "export.dexgraspbench": "dexgraspbench",
-    "export.contents": "Frame",
-    "export.isaac_grasp": "isaac_grasp",
-    "export.moveit": "moveit_grasps",
-    "grasps.batch": "GraspBatch",
-    "hands.check": "HandReport check_hand",
-    "hands.hand": "Hand",
-    "hands.library": "hand_names load_hand",
-    "hands.procedural.making": "MadeHand make_hand",
-    "hands.variants": "vary_hand",
-    "models.checkpoints": "load_weights save_weights",
-    "models.presets": "NetworkConfig",
-    "objects.catalogue": "load_object object_names",
-    "objects.shape": "ObjectModel",
-    "optimization.refinement": "RefineConfig",
-    "optimization.synthesis": "SynthesisConfig synthesize",
-    "perception.partial_views": "DepthCamera visible_points",
-    "perception.scan": "depth_points scanned_object",
-    "pipeline.problem": "GraspProblem",
-    "pipeline.stages": "complete evaluate rank refine",
-    "predictor": "GraspPredictor GraspRequest Prediction PredictorConfig",
-    "simulation.outcome": "Failure TrialResult",
-    "simulation.protocols": "Perturbations Protocol",
-    "simulation.trial": "simulate",
-    "training.config": "AugmentationConfig LossConfig MotionConfig PretrainConfig ScheduleConfig TrainConfig",
-    "training.loop": "train",
-    "training.pretraining": "pretrain pretrain_motion",
-    "viewer.app": "view_grasps",
-    "viewer.pictures": "draw_grasps",
-}
-"""Public names by the module below this package that defines them."""
-_EXPORTS = {name: module for module, names in _NAMES.items() for name in names.split()}
+_LIST = ast.parse(pkgutil.get_data(__name__, "__init__.pyi") or b"")
+_EXPORTS = {alias.name: str(node.module) for node in _LIST.body if isinstance(node, ast.ImportFrom) for alias in node.names}
 """Module of each public name."""
-
-if TYPE_CHECKING:
-    from dro_grasp.datasets.bundle.training_file import load_bundle as load_bundle
-    from dro_grasp.datasets.collections.bundling import make_bundle as make_bundle
-    from dro_grasp.datasets.collections.collection import read_collection as read_collection
-    from dro_grasp.datasets.engine.schedule import synthesize_dataset as synthesize_dataset
-    from dro_grasp.datasets.engine.worker import EngineConfig as EngineConfig
-    from dro_grasp.errors import DroGraspError as DroGraspError
-    from dro_grasp.evaluation.controls import palm_facing_starts as palm_facing_starts
-    from dro_grasp.evaluation.metrics import wilson_interval as wilson_interval
-    from dro_grasp.export.contents import Frame as Frame
-    from dro_grasp.export.csv_table import csv_table as csv_table
-    from dro_grasp.export.dexgraspbench import dexgraspbench as dexgraspbench
-    from dro_grasp.export.isaac_grasp import isaac_grasp as isaac_grasp
-    from dro_grasp.export.moveit import moveit_grasps as moveit_grasps
-    from dro_grasp.grasps.batch import GraspBatch as GraspBatch
-    from dro_grasp.hands.check import HandReport as HandReport, check_hand as check_hand
-    from dro_grasp.hands.hand import Hand as Hand
-    from dro_grasp.hands.library import hand_names as hand_names, load_hand as load_hand
-    from dro_grasp.hands.procedural.making import MadeHand as MadeHand, make_hand as make_hand
-    from dro_grasp.hands.variants import vary_hand as vary_hand
-    from dro_grasp.models.checkpoints import load_weights as load_weights, save_weights as save_weights
-    from dro_grasp.models.presets import NetworkConfig as NetworkConfig
-    from dro_grasp.objects.catalogue import load_object as load_object, object_names as object_names
-    from dro_grasp.objects.shape import ObjectModel as ObjectModel
-    from dro_grasp.optimization.refinement import RefineConfig as RefineConfig
-    from dro_grasp.optimization.synthesis import SynthesisConfig as SynthesisConfig, synthesize as synthesize
-    from dro_grasp.perception.partial_views import DepthCamera as DepthCamera, visible_points as visible_points
-    from dro_grasp.perception.scan import depth_points as depth_points, scanned_object as scanned_object
-    from dro_grasp.pipeline.problem import GraspProblem as GraspProblem
-    from dro_grasp.pipeline.stages import complete as complete, evaluate as evaluate, rank as rank, refine as refine
-    from dro_grasp.predictor import (
-        GraspPredictor as GraspPredictor,
-        GraspRequest as GraspRequest,
-        Prediction as Prediction,
-        PredictorConfig as PredictorConfig,
-    )
-    from dro_grasp.simulation.outcome import Failure as Failure, TrialResult as TrialResult
-    from dro_grasp.simulation.protocols import Perturbations as Perturbations, Protocol as Protocol
-    from dro_grasp.simulation.trial import simulate as simulate
-    from dro_grasp.training.config import (
-        AugmentationConfig as AugmentationConfig,
-        LossConfig as LossConfig,
-        MotionConfig as MotionConfig,
-        PretrainConfig as PretrainConfig,
-        ScheduleConfig as ScheduleConfig,
-        TrainConfig as TrainConfig,
-    )
-    from dro_grasp.training.loop import train as train
-    from dro_grasp.training.pretraining import pretrain as pretrain, pretrain_motion as pretrain_motion
-    from dro_grasp.viewer.app import view_grasps as view_grasps
-    from dro_grasp.viewer.pictures import draw_grasps as draw_grasps
-else:
-    __all__ = ["__version__", *_EXPORTS]
+__all__ = list(_EXPORTS)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
     if name not in _EXPORTS:
         raise AttributeError(f"module 'dro_grasp' has no attribute '{name}'")
-    return getattr(import_module(f"dro_grasp.{_EXPORTS[name]}"), name)
+    return getattr(import_module(_EXPORTS[name]), name)
 
 
 def __dir__() -> list[str]:
-    return sorted(["__version__", *_EXPORTS])
+    return sorted(__all__)

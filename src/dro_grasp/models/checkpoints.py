@@ -81,7 +81,7 @@ def load_weights(name: str | Path | None = None) -> DistanceNetwork:
 
 def load_small(path: Path) -> dict[str, Float[Tensor, "..."]]:
     """The tensors of a small network's file in single precision."""
-    return {name: value.to(torch.float32) for name, value in load_file(path).items()}
+    return {name: value.float() for name, value in load_file(path).items()}
 
 
 def history_of(path: Path) -> list[dict[str, Any]]:

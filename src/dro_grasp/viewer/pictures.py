@@ -59,7 +59,7 @@ def draw_grasps(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, path: Path | str, count: int = MAX_PICTURES, columns: int = COLUMNS,
     style: PictureStyle | None = None,
 ) -> None:
-    """Write a PNG with pictures of the first `count` grasps, captioned with score and trial outcome, in some columns.
+    """Write a PNG with pictures of the first `count` grasps, `columns` side by side, captioned with score and trial outcome.
 
     Links above the hand's palm are not drawn.
 
