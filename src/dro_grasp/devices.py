@@ -18,15 +18,8 @@ Record = TypeVar("Record")
 
 
 def choose_device(name: str) -> str:
-    """The named device; `auto` stands for CUDA if there is a GPU, and for the CPU otherwise.
-
-    Raises:
-        OptionError: This machine has no such device.
-    """
-    if name == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    require_device(name)
-    return name
+    """The named device; `auto` stands for CUDA if there is a GPU, and for the CPU otherwise."""
+    return name if name != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
 
 
 def require_device(name: str) -> None:

@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from dro_grasp.datasets.engine.pools import LocalPool
-from dro_grasp.datasets.engine.schedule import EngineConfig, synthesize_dataset
+from dro_grasp.datasets.engine.schedule import synthesize_dataset
 from dro_grasp.datasets.engine.shards import Shard, find_shards, read_yield, sole_run
-from dro_grasp.datasets.engine.worker import FinishedShard, Job, Task
+from dro_grasp.datasets.engine.worker import EngineConfig, FinishedShard, Job, Task
 from dro_grasp.errors import OutputError
 from dro_grasp.grasps.batch import GraspBatch
 from tests.helpers import engine_work
@@ -25,7 +25,7 @@ from tests.helpers.engine_work import GRASPS
 ROOT = Path(__file__).parents[2]
 PARENT = """
 import signal, sys
-from dro_grasp.datasets.engine.schedule import EngineConfig, synthesize_dataset
+from dro_grasp.datasets.engine.schedule import synthesize_dataset
 from dro_grasp.datasets.engine.pools import LocalPool
 from tests.helpers.engine_work import {work}
 if __name__ == "__main__":

@@ -13,9 +13,9 @@ from dro_grasp.cli.main import main
 from dro_grasp.datasets.collections.collection import read_collection
 from dro_grasp.datasets.engine import schedule as engine, worker
 from dro_grasp.datasets.engine.pools import Outcome, Work, failure_of
-from dro_grasp.datasets.engine.schedule import EngineConfig, PairState, next_pair, synthesize_dataset
+from dro_grasp.datasets.engine.schedule import PairState, next_pair, synthesize_dataset
 from dro_grasp.datasets.engine.shards import Shard, Yield, find_shards
-from dro_grasp.datasets.engine.worker import Job, Task, make_shard, shard_seed, valid_grasps
+from dro_grasp.datasets.engine.worker import EngineConfig, Job, Task, make_shard, shard_seed, valid_grasps
 from dro_grasp.errors import OptionError, OutputError
 from dro_grasp.grasps import table
 from dro_grasp.grasps.batch import GraspBatch

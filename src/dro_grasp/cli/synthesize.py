@@ -51,7 +51,8 @@ class Synthesize:
 
     def run(self) -> int:
         """Check numbers and names, then fill the folder; the exit code is 2 if every pair fails and there is no grasp."""
-        from dro_grasp.datasets.engine.schedule import EngineConfig, require_known, synthesize_dataset
+        from dro_grasp.datasets.engine.schedule import require_known, synthesize_dataset
+        from dro_grasp.datasets.engine.worker import EngineConfig
         from dro_grasp.objects.catalogue import resolve_objects
         from dro_grasp.optimization.synthesis import SynthesisConfig
 

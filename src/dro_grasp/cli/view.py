@@ -47,9 +47,10 @@ class View:
     def run(self) -> int:
         """Serve the grasps of one object, or the page that generates grasps."""
         if self.file is None:
-            from dro_grasp.viewer.studio import serve_studio
+            from dro_grasp.viewer.stage import serve
+            from dro_grasp.viewer.studio import Studio
 
-            serve_studio(self.weights, self.port, self.host)
+            serve(Studio(weights=self.weights, port=self.port, host=self.host))
             return 0
         from dro_grasp.viewer.app import view_grasps
 

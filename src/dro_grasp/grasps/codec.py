@@ -15,25 +15,14 @@ from torch import Tensor
 
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.geometry import se3
-from dro_grasp.grasps.columns import (
-    COLUMNS,
-    CONTACT_LINKS,
-    ENERGY_TERM,
-    FAILURE,
-    FLOATS,
-    NOT_EVALUATED,
-    POSTURES,
-    REASON,
-    TEXTS,
-    UNKNOWN_PROTOCOL,
-)
+from dro_grasp.grasps import columns
 from dro_grasp.grasps.table import fixed_column, float_column, floats
 
 REQUIRED = ("object", "wrist_position", "wrist_quaternion_wxyz", "joints")
 """Columns without which a file holds no grasps."""
 HEADER = ("hand", "hand_sha256", "wrist_link", "joint_names")
 """Entries of the file's header."""
-TEXT_TYPES = {REASON: pa.string(), FAILURE: pa.string(), CONTACT_LINKS: pa.list_(pa.string())}
+TEXT_TYPES = {columns.REASON: pa.string(), columns.FAILURE: pa.string(), columns.CONTACT_LINKS: pa.list_(pa.string())}
 """Types of the trial's further columns, which their values do not tell when all are unknown."""
 SYNTHESISED = re.compile(r"\bsynthesis \d+\b")
 """Provenance of synthesised grasps, whose `score` is minus the energy in files without a column `energy`."""
@@ -42,22 +31,22 @@ SYNTHESISED = re.compile(r"\bsynthesis \d+\b")
 def encode(batch: Any) -> tuple[dict[str, pa.Array], dict[str, Any]]:
     """Columns and header of a GraspBatch's file."""
     xyzw = roma.rotmat_to_unitquat(batch.T_object_wrist[:, :3, :3].to(torch.float64))
-    columns: dict[str, pa.Array] = {
+    stored: dict[str, pa.Array] = {
         "object": pa.array(list(batch.object), pa.string()),
         "wrist_position": fixed_column(batch.T_object_wrist[:, :3, 3]),
         "wrist_quaternion_wxyz": fixed_column(roma.quat_xyzw_to_wxyz(xyzw)),
         "joints": float_column(batch.joints),
     }
-    columns |= {name: float_column(getattr(batch, name)) for name in (*POSTURES, *FLOATS)}
-    columns["success"] = pa.array(batch.success.cpu().numpy(), mask=(~batch.evaluated).cpu().numpy())
-    columns["protocol"] = pa.array([p or None for p in batch.protocol], pa.string())
-    for name in TEXTS[1:]:
-        columns[name] = pa.array(list(getattr(batch, name)), pa.string())
-    columns["seed"] = pa.array(batch.seed.cpu().numpy())
-    columns |= {name: _further_column(name, value) for name, value in batch.extra.items()}
+    stored |= {name: float_column(getattr(batch, name)) for name in (*columns.POSTURES, *columns.FLOATS)}
+    stored["success"] = pa.array(batch.success.cpu().numpy(), mask=(~batch.evaluated).cpu().numpy())
+    stored["protocol"] = pa.array([p or None for p in batch.protocol], pa.string())
+    for name in columns.TEXTS[1:]:
+        stored[name] = pa.array(list(getattr(batch, name)), pa.string())
+    stored["seed"] = pa.array(batch.seed.cpu().numpy())
+    stored |= {name: _further_column(name, value) for name, value in batch.extra.items()}
     header = {"hand": batch.hand, "hand_sha256": batch.hand_sha256, "wrist_link": batch.wrist_link,
               "joint_names": list(batch.joint_names)}
-    return columns, header
+    return stored, header
 
 
 def _further_column(name: str, value: Any) -> pa.Array:
@@ -91,14 +80,13 @@ def decode(table: pa.Table, header: dict[str, Any], path: str) -> dict[str, Any]
     if not (T.isfinite().all() and joints.isfinite().all()):
         raise GraspFileError(f"{path} has grasps with missing or non-finite poses; write it without them")
     success = table["success"].to_pylist() if "success" in table.column_names else [None] * n
-    protocol = tuple(
-        (p or UNKNOWN_PROTOCOL) if s is not None else NOT_EVALUATED for p, s in zip(text("protocol"), success, strict=True)
-    )
-    fields: dict[str, Any] = {name: text(name) for name in TEXTS} | {name: numbers(name, n_dof) for name in POSTURES}
-    fields |= {name: numbers(name, None) for name in FLOATS}
+    protocol = tuple(columns.NOT_EVALUATED if s is None else p or columns.UNKNOWN_PROTOCOL
+                     for p, s in zip(text("protocol"), success, strict=True))
+    fields: dict[str, Any] = {name: text(name) for name in columns.TEXTS}
+    fields |= {name: numbers(name, n_dof) for name in columns.POSTURES} | {name: numbers(name, None) for name in columns.FLOATS}
     if "energy" not in table.column_names:
         fields |= _energy_apart(fields["score"], fields["provenance"], table)
-    known = {*COLUMNS, *REQUIRED}
+    known = {*columns.COLUMNS, *REQUIRED}
     seed = [s or 0 for s in table["seed"].to_pylist()] if "seed" in table.column_names else [0] * n
     return {
         "T_object_wrist": T, "joints": joints,
@@ -118,7 +106,7 @@ def _poses(position: Float[Tensor, "n 3"], quaternion: Float[Tensor, "n 4"]) -> 
 
 def _energy_apart(score: Float[Tensor, " n"], provenance: tuple[str, ...], table: pa.Table) -> dict[str, Float[Tensor, " n"]]:
     """Energy and score in a file without a column `energy`: the score of its synthesised grasps is minus the energy."""
-    terms = [name for name in table.column_names if name.startswith(ENERGY_TERM)]
+    terms = [name for name in table.column_names if name.startswith(columns.ENERGY_TERM)]
     has_terms = ~torch.from_numpy(np.array(table[terms[0]].is_null())) if terms else torch.zeros(len(score), dtype=torch.bool)
     synthesised = has_terms & torch.tensor([SYNTHESISED.search(p) is not None for p in provenance], dtype=torch.bool)
     nothing = torch.full_like(score, torch.nan)

@@ -15,13 +15,10 @@ HAND_POINTS = 64
 """Surface points that are compared (ours)."""
 
 
-def distinct(
-    hand: Hand, grasps: GraspBatch, near: float = DUPLICATE_DISTANCE, earlier: GraspBatch | None = None
-) -> Bool[Tensor, " n"]:
+def distinct(hand: Hand, grasps: GraspBatch, earlier: GraspBatch | None = None) -> Bool[Tensor, " n"]:
     """Grasps that are not near-duplicates of an earlier grasp of the same object.
 
     Args:
-        near: Mean distance between corresponding surface points below which two grasps are duplicates [m].
         earlier: Grasps that come before these; none by default.
     """
     n_earlier = 0 if earlier is None else len(earlier)
@@ -35,5 +32,5 @@ def distinct(
         before = (keep[:i] & (owner[:i] == owner[i])).nonzero()[:, 0]
         if len(before):
             apart = (points[before] - points[i]).norm(dim=-1).mean(-1)
-            keep[i] = bool(apart.min() >= near)
+            keep[i] = bool(apart.min() >= DUPLICATE_DISTANCE)
     return keep[n_earlier:]

@@ -222,8 +222,9 @@ def _advance(problem: _Problem, state: _State, config: JointSolverConfig) -> tup
     weight = smoothed_norms(state.residual, config.step.norm_floor).reciprocal().mean(-1)
     damping = state.damping * (weight * config.damping_length**2)
     step = best_step(state.jacobian, state.residual, low, high, damping, state.sharpness, config.step)
-    T, q = _move(state, step)
-    q = torch.minimum(torch.maximum(q, problem.lower), problem.upper)
+    # The wrist moves in its own frame.
+    T = state.T @ compose(roma.rotvec_to_rotmat(step[:, 3:6]), step[:, :3])
+    q = torch.minimum(torch.maximum(state.q + step[:, 6:], problem.lower), problem.upper)
     proposed = _state(problem, T, q, config)
     better = proposed.cost <= state.cost
     change = step.abs().amax(-1)
@@ -233,12 +234,6 @@ def _advance(problem: _Problem, state: _State, config: JointSolverConfig) -> tup
     little = proposed.cost > state.cost * (1 - config.objective_tolerance)
     stalled = torch.where(little, state.stalled + 1 + better.long(), 0)
     return replace(proposed.where(better, state), damping=damping, sharpness=sharpness, stalled=stalled), change
-
-
-def _move(state: _State, step: Float[Tensor, "b p"]) -> tuple[Float[Tensor, "b 4 4"], Float[Tensor, "b n_dof"]]:
-    """Apply a step: the wrist moves in its own frame."""
-    local = compose(roma.rotvec_to_rotmat(step[:, 3:6]), step[:, :3])
-    return state.T @ local, state.q + step[:, 6:]
 
 
 def _problem(

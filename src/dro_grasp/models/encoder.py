@@ -19,12 +19,6 @@ def nearest_neighbours(points: Float[Tensor, "b n 3"], k: int) -> Int[Tensor, "b
     return torch.cdist(points, points).topk(min(k, points.shape[1]), largest=False).indices
 
 
-def rows_of(index: Int[Tensor, "b n k"]) -> Int[Tensor, "bn k"]:
-    """Neighbours as rows of the clouds laid end to end."""
-    start = torch.arange(len(index), device=index.device)[:, None, None] * index.shape[1]
-    return (index + start).flatten(0, 1)
-
-
 class EdgeLayer(nn.Module):
     """Graph convolution: max over neighbours of LeakyReLU(BatchNorm(W [x_j - x_i, x_i])).
 
@@ -56,7 +50,9 @@ class EdgeLayer(nn.Module):
     def _highest(self, neighbour: Float[Tensor, "b n d"], index: Int[Tensor, "b n k"]) -> Float[Tensor, "b n d"]:
         """The value, among each point's neighbours, that a positive or negative scale makes the highest."""
         sign = torch.where(self.norm.weight < 0, -1.0, 1.0).to(neighbour.dtype)
-        rows, needs_source = rows_of(index), neighbour.requires_grad
+        # Neighbours as rows of the clouds laid end to end.
+        start = torch.arange(len(index), device=index.device)[:, None, None] * index.shape[1]
+        rows, needs_source = (index + start).flatten(0, 1), neighbour.requires_grad
         with torch.no_grad():
             signed = (neighbour * sign).flatten(0, 1)
             best = signed.index_select(0, rows[:, 0])

@@ -10,18 +10,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from dro_grasp.models import latent
 from dro_grasp.models.attention import CrossTransformer
 from dro_grasp.models.distance_head import DistanceHead
 from dro_grasp.models.encoder import StaticGraphEncoder
-from dro_grasp.models.latent import (
-    Condition,
-    FlowPrior,
-    GaussianPrior,
-    HandMotion,
-    LatentEncoder,
-    sample_posterior,
-    with_latent,
-)
 from dro_grasp.models.placement import PlacementPrior
 from dro_grasp.models.precision import fast_products
 from dro_grasp.models.presets import NetworkConfig
@@ -72,13 +64,13 @@ class DistanceNetwork(nn.Module):
         self.hand_transformer = CrossTransformer(c.width, c.heads, c.attention_hidden)
         self.object_transformer = CrossTransformer(c.width, c.heads, c.attention_hidden)
         latent_width = c.latent_head[0]
-        self.motion = HandMotion(c.width, c.latent, latent_width) if c.latent_form == "motion" else None
-        self.latent_encoder = None if self.motion is not None else LatentEncoder(
+        self.motion = latent.HandMotion(c.width, c.latent, latent_width) if c.latent_form == "motion" else None
+        self.latent_encoder = None if self.motion is not None else latent.LatentEncoder(
             c.width, c.latent, c.latent_widths, c.latent_head, c.latent_neighbours)
-        self.condition = None if c.prior == "standard" else Condition(c.width, latent_width)
+        self.condition = None if c.prior == "standard" else latent.Condition(c.width, latent_width)
         self.prior = (
-            FlowPrior(c.latent, latent_width) if c.prior == "flow"
-            else GaussianPrior(c.latent, latent_width) if c.prior == "learned" else None)
+            latent.FlowPrior(c.latent, latent_width) if c.prior == "flow"
+            else latent.GaussianPrior(c.latent, latent_width) if c.prior == "learned" else None)
         self.head = DistanceHead(c.width + c.latent, c.kernel_hidden, c.initial_distance)
         self.place = nn.Linear(3, c.width) if c.placed else None
         self.placement = PlacementPrior(c.width, c.placement_width, c.placement_components)
@@ -121,7 +113,7 @@ class DistanceNetwork(nn.Module):
         phi_hand, phi_object = self.encode(hand, obj)
         if self.motion is not None:
             mean, log_variance = self.motion.encode(phi_hand, hand, grasp)
-            z = sample_posterior(mean, log_variance, generator)
+            z = latent.sample_posterior(mean, log_variance, generator)
             moved = self.motion(phi_hand, hand, z[:, None])[:, 0]
             psi_hand, psi_object = self.relate(phi_hand, phi_object, moved)
         else:
@@ -131,12 +123,12 @@ class DistanceNetwork(nn.Module):
                 mean, log_variance = self.latent_encoder(
                     torch.cat([grasp, obj], 1), torch.cat([psi_hand, psi_object], 1))
             mean, log_variance = mean.float(), log_variance.float()
-            z, moved = sample_posterior(mean, log_variance, generator), hand
+            z, moved = latent.sample_posterior(mean, log_variance, generator), hand
         distances = self._distances(psi_hand, psi_object[:, :columns], z, moved, obj[:, :columns])
         prior_mean, prior_log_variance, flow_error = torch.zeros_like(z), torch.zeros_like(z), z.new_zeros(len(z))
         if self.condition is not None:
             condition = self.condition(phi_hand, phi_object, hand, obj)
-            if isinstance(self.prior, FlowPrior):
+            if isinstance(self.prior, latent.FlowPrior):
                 flow_error = self.prior.loss(z, condition, generator)
             elif self.prior is not None:
                 prior_mean, prior_log_variance = self.prior.moments(condition)
@@ -175,7 +167,7 @@ class DistanceNetwork(nn.Module):
         hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"],
     ) -> Float[Tensor, "b n m"]:
         base = torch.cdist(hand, obj, compute_mode=EXACT) if self.config.placed else None
-        return self.head(with_latent(psi_hand, z), with_latent(psi_object, z), base)
+        return self.head(latent.with_latent(psi_hand, z), latent.with_latent(psi_object, z), base)
 
     def to_frame(
         self, points: Float[Tensor, "b n 3"], centre: Float[Tensor, "b 3"], rotation: Float[Tensor, "b 3 3"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cache
 
 import torch
@@ -22,9 +22,12 @@ def fast_products() -> Iterator[None]:
     accuracy. On others it rounds to half precision: a test product decides, once. It is never used where CUDA is
     present, whose products it would round. The caller's setting comes back at the end.
     """
-    if torch.cuda.is_available() or not quick_path_is_accurate():
+    with nullcontext() if torch.cuda.is_available() or not quick_path_is_accurate() else _quick_path():
         yield
-        return
+
+
+@contextmanager
+def _quick_path() -> Iterator[None]:
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("medium")
     try:
@@ -38,11 +41,7 @@ def quick_path_is_accurate() -> bool:
     """Whether a product on the quick path agrees with double precision."""
     generator = torch.Generator().manual_seed(0)
     a, b = torch.randn(2, PROBE_SIZE, PROBE_SIZE, generator=generator)
-    before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("medium")
-    try:
+    with _quick_path():
         product = a @ b
-    finally:
-        torch.set_float32_matmul_precision(before)
     exact = a.double() @ b.double()
     return bool((product - exact).abs().max() <= LARGEST_DEVIATION * exact.abs().max())

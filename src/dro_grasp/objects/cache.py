@@ -40,7 +40,9 @@ def cached_arrays(key: str, make: Callable[[], Arrays]) -> Arrays:
     except DAMAGED:
         made = make()
     with contextlib.suppress(OSError, OutputError):
-        _store(path, made)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as temporary, temporary.open("wb") as file:
+            np.savez(file, **made)  # type: ignore[arg-type]
     return made
 
 
@@ -50,10 +52,3 @@ def content_hash(*arrays: Num[np.ndarray, "..."]) -> str:
     for array in arrays:
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
-
-
-def _store(path: Path, arrays: Arrays) -> None:
-    """Write under a temporary name and rename, so that no reader sees half a file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, **arrays)  # type: ignore[arg-type]

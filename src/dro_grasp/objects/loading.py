@@ -47,8 +47,6 @@ def load_file(path: Path, *, scale: float = 1.0) -> ObjectModel:
     if not path.is_file():
         raise ObjectError(f"no object file at {path}; give an existing mesh or point cloud, or a name that "
                           "`dro-grasp objects` lists")
-    if path.suffix.lower() in CLOUD_SUFFIXES:
-        return cloud_object(path.stem, read_cloud(path), origin=str(path), scale=scale)
     geometry, unit = read_geometry(path)
     if isinstance(geometry, np.ndarray):
         return cloud_object(path.stem, geometry * unit, origin=str(path), scale=scale)
@@ -62,21 +60,20 @@ def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
     if not path.is_file():
         raise ObjectError(f"no file at {path}; with --camera give a cloud file (PLY, NPY, PCD), because named objects "
                           "are meshes, not camera clouds")
-    if path.suffix.lower() in CLOUD_SUFFIXES:
-        points = read_cloud(path)
-        if points.ndim != 2 or points.shape[1] < 3:
-            raise ObjectError(f"{path} holds an array of shape {points.shape}; expected (n, 3) points")
-        return points[:, :3]
     geometry, unit = read_geometry(path)
     if not isinstance(geometry, np.ndarray):
         raise ObjectError(f"{path} is a mesh, not a camera cloud; leave out --camera, or give a cloud (PLY, NPY, PCD)")
-    return geometry * unit
+    if geometry.ndim != 2 or geometry.shape[1] < 3:
+        raise ObjectError(f"{path} holds an array of shape {geometry.shape}; expected (n, 3) points")
+    return geometry[:, :3] * unit
 
 
-def read_geometry(path: Path) -> tuple[trimesh.Trimesh | Float[np.ndarray, "n 3"], float]:
+def read_geometry(path: Path) -> tuple[trimesh.Trimesh | Float[np.ndarray, "..."], float]:
     """One mesh, scenes merged, or the points of a file without faces; and the file's unit [m], 1 if it states none."""
     import trimesh
 
+    if path.suffix.lower() in CLOUD_SUFFIXES:
+        return read_cloud(path), 1.0
     try:
         loaded = trimesh.load(path, process=False)
         unit = trimesh.units.unit_conversion(loaded.units, "meters") if loaded.units else 1.0

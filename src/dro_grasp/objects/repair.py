@@ -64,7 +64,8 @@ def mass_properties(mesh: trimesh.Trimesh, origin: str, notes: list[str]) -> Mas
                           "give a closed solid, or a point cloud if only its surface is known")
     if _is_solid(mesh) and LEAST_FILL * hull.volume < _volume(mesh) <= (1 + OVERLAP) * hull.volume:
         return _of_solid(mesh)
-    inside, cell = _inside(mesh)
+    winding, points, cell = _winding(mesh)
+    inside = points[np.abs(winding) > 0.5]
     if len(inside) * cell > max(OPEN_FILL * hull.volume, 100 * cell):
         return _of_points(inside, cell)
     notes.append("volume and mass are those of the convex hull, because the mesh encloses none")
@@ -142,12 +143,6 @@ def _winding(mesh: trimesh.Trimesh) -> tuple[Float[np.ndarray, " n"], Float[np.n
     winding = igl.fast_winding_number(
         np.ascontiguousarray(mesh.vertices, np.float64), np.ascontiguousarray(mesh.faces, np.int64), points)
     return np.asarray(winding), points, spacing**3
-
-
-def _inside(mesh: trimesh.Trimesh) -> tuple[Float[np.ndarray, "n 3"], float]:
-    """Grid points inside the mesh [m], and the volume of a cell [m^3]."""
-    winding, points, cell = _winding(mesh)
-    return points[np.abs(winding) > 0.5], cell
 
 
 def _of_solid(body: trimesh.Trimesh) -> MassProperties:

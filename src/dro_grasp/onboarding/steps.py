@@ -14,7 +14,8 @@ from typing import Any
 from dro_grasp.datasets.bundle.training_file import load_bundle, split_of
 from dro_grasp.datasets.collections.bundling import make_bundle
 from dro_grasp.datasets.collections.collection import count_collection
-from dro_grasp.datasets.engine.schedule import EngineConfig, require_known, synthesize_dataset
+from dro_grasp.datasets.engine.schedule import require_known, synthesize_dataset
+from dro_grasp.datasets.engine.worker import EngineConfig
 from dro_grasp.errors import BundleError, OptionError
 from dro_grasp.evaluation.success_rates import BEST, RAW, REFINED, BenchmarkConfig, benchmark
 from dro_grasp.files import check_folder, make_folder, replacing

@@ -64,11 +64,6 @@ TURNS_AWAY = 0.35
 """Cosine between normal and ray below which the surface at the rim turns away; above, it ends at an edge (ours)."""
 
 
-def _lean(linear: Float[np.ndarray, "3 3"], up: Float[np.ndarray, "3"] | None) -> float:
-    """Cost of a motion that does not keep the vertical."""
-    return 0.0 if up is None or np.allclose(linear @ up, up, atol=1e-6) else LEANING
-
-
 def nearest_points(points: Float[np.ndarray, "n d"]) -> KDTree:
     """A search tree for nearest points; SciPy is loaded when needed."""
     from scipy.spatial import KDTree
@@ -152,7 +147,8 @@ class VisibleSide:
         Symmetries that preserve `up` [view axes] are preferred.
         """
         motions = self.symmetries(up)
-        costs = np.array([self.cost(*motion) + _lean(motion[0], up) for motion in motions])
+        leaning = [up is not None and not np.allclose(linear @ up, up, atol=1e-6) for linear, _ in motions]
+        costs = np.array([self.cost(*motion) for motion in motions]) + LEANING * np.array(leaning)
         found: list[Guess] = []
         sampled: list[KDTree] = []
         for k in costs.argsort():

@@ -14,15 +14,8 @@ from dro_grasp.errors import WeightsError
 from dro_grasp.geometry.se3 import apply
 from dro_grasp.models.network import DistanceNetwork, NetworkOutput, untrained_network
 from dro_grasp.models.presets import NetworkConfig
+from dro_grasp.training import losses
 from dro_grasp.training.config import TrainConfig
-from dro_grasp.training.losses import (
-    distance_loss,
-    divergence,
-    divergence_loss,
-    penetration_loss,
-    placement_loss,
-    pose_loss,
-)
 from dro_grasp.training.reports import Report, console_report
 from dro_grasp.training.runs import Losses, TrainingRun, begin, recalibrate
 from dro_grasp.training.samples import HandSamples, SampleSource
@@ -139,20 +132,21 @@ def step_losses(
     placed, obj, grasp = _clouds(groups)
     output = model(placed, obj, grasp, generator, columns=config.columns)
     anchors = obj[:, : config.columns]
-    parts = {"distance": distance_loss(output.distances, distance_matrix.build(grasp, anchors))}
+    parts = {"distance": losses.distance_loss(output.distances, distance_matrix.build(grasp, anchors))}
     poses, penetrations = [], []
     start = 0
     for group in groups:
         rows = slice(start, start + len(group.placed))
         decoded = distance_matrix.decode(group.hand, output.distances[rows], anchors[rows])
-        poses.append(pose_loss(decoded.T_world_link, group.T_frame_link, decoded.valid))
-        posed = _posed_points(group, decoded)
-        penetrations.append(penetration_loss(posed, group.obj, group.normals))
+        poses.append(losses.pose_loss(decoded.T_world_link, group.T_frame_link, decoded.valid))
+        kept = decoded.valid[group.hand.link_index]
+        posed = apply(decoded.T_world_link[:, group.hand.link_index[kept]], group.hand.link_points[kept])
+        penetrations.append(losses.penetration_loss(posed, group.obj, group.normals))
         start = rows.stop
     parts["pose"] = torch.cat(poses).mean()
     parts["penetration"] = torch.cat(penetrations).mean()
-    nats = divergence(output.mean, output.log_variance, output.prior_mean, output.prior_log_variance)
-    parts["divergence"] = divergence_loss(nats, config.losses.divergence_form, config.losses.free_bits)
+    nats = losses.divergence(output.mean, output.log_variance, output.prior_mean, output.prior_log_variance)
+    parts["divergence"] = losses.divergence_loss(nats, config.losses.divergence_form, config.losses.free_bits)
     if model.motion is not None:
         parts["motion"] = (output.moved - grasp).norm(dim=-1).mean()
     parts["flow"] = output.flow_error.mean()
@@ -170,12 +164,6 @@ def _clouds(groups: list[HandSamples]) -> tuple[Float[Tensor, "b n 3"], Float[Te
     return placed, obj, grasp
 
 
-def _posed_points(group: HandSamples, decoded: distance_matrix.LinkPoses) -> Float[Tensor, "b k 3"]:
-    """Hand points under the decoded link poses [m], of the links that have one."""
-    kept = decoded.valid[group.hand.link_index]
-    return apply(decoded.T_world_link[:, group.hand.link_index[kept]], group.hand.link_points[kept])
-
-
 def _placement(model: DistanceNetwork, groups: list[HandSamples], output: NetworkOutput) -> Float[Tensor, ""]:
     feature = output.hand_feature.detach()
     obj, other, position = (
@@ -183,4 +171,4 @@ def _placement(model: DistanceNetwork, groups: list[HandSamples], output: Networ
     )
     density, score = model.placement.log_density(obj, feature, position)
     other_score = model.placement(other, feature)[3]
-    return placement_loss(density, score, other_score)
+    return losses.placement_loss(density, score, other_score)

@@ -17,15 +17,7 @@ from dro_grasp.errors import OptionError
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.rendering.meshes import Colour
-from dro_grasp.viewer.appearance import (
-    OBJECT_COLOUR,
-    SOLVED_COLOUR,
-    best_camera,
-    link_colours,
-    link_shapes,
-    object_meshes,
-    success_colour,
-)
+from dro_grasp.viewer import appearance
 
 HOST = "127.0.0.1"
 """Default address: only this machine can connect."""
@@ -63,17 +55,17 @@ class Stage:
             name = f"/pair{self._root}"
         self.hand = hand
         self._object = scene.add_frame(f"{name}/object", show_axes=False)
-        for i, mesh in enumerate(object_meshes(obj)):
-            colour = rgb(OBJECT_COLOUR)
+        for i, mesh in enumerate(appearance.object_meshes(obj)):
+            colour = rgb(appearance.OBJECT_COLOUR)
             scene.add_mesh_simple(f"{name}/object/{i}", mesh.vertices, mesh.faces, color=colour, side="double")
-        colours = link_colours(hand)
+        colours = appearance.link_colours(hand)
         self.links = [scene.add_frame(f"{name}/hand/{i}", show_axes=False) for i in range(hand.tree.n_links)]
-        for k, (link, vertices, faces) in enumerate(link_shapes(hand)):
+        for k, (link, vertices, faces) in enumerate(appearance.link_shapes(hand)):
             scene.add_mesh_simple(f"{name}/hand/{link}/{k}", vertices, faces, color=rgb(colours[link]), side="double")
-        self.solved = self.cloud("solved", np.zeros((1, 3)), SOLVED_COLOUR)
+        self.solved = self.cloud("solved", np.zeros((1, 3)), appearance.SOLVED_COLOUR)
         position = (*obj.cloud.mean(0)[:2].tolist(), float(obj.cloud.min(0)[2]) - GRID_DEPTH)
         self._grid = scene.add_grid(f"{name}/grid", width=0.4, height=0.4, cell_size=0.05, section_size=0.1, position=position)
-        camera = best_camera(hand, joints, T, obj)
+        camera = appearance.best_camera(hand, joints, T, obj)
         start, target = np.asarray(camera.position), np.asarray(camera.target)
         position = tuple((target + CAMERA_DISTANCE * (start - target)).tolist())
         initial = self.server.initial_camera
@@ -106,7 +98,7 @@ class Stage:
 
     def colour_grid(self, success: bool | None) -> None:
         """Show the trial outcome by the colour of the grid."""
-        self._grid.cell_color = self._grid.section_color = rgb(success_colour(success))
+        self._grid.cell_color = self._grid.section_color = rgb(appearance.success_colour(success))
 
     def show_shapes(self, visible: bool) -> None:
         """Show or hide the hand's shapes."""

@@ -30,7 +30,7 @@ from dro_grasp.predictor import GraspPredictor, GraspRequest, Method
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.trial import record
 from dro_grasp.viewer.app import POSTURES, Posture, describe, outcome, postures_of
-from dro_grasp.viewer.stage import HOST, ServedPage, serve
+from dro_grasp.viewer.stage import HOST, ServedPage
 from dro_grasp.viewer.uploads import store_upload
 
 FRAME_TIME = 0.04
@@ -271,8 +271,3 @@ def chosen(hand: Hand, grasps: GraspBatch, success: str, palm: str) -> Bool[Tens
     if palm != ANY:
         keep &= half_axis(hand.palm_directions(grasps.T_object_wrist)) == HALF_AXES.index(palm)
     return keep
-
-
-def serve_studio(weights: str | None, port: int, host: str) -> None:
-    """Serve the page until Ctrl-C."""
-    serve(Studio(weights=weights, port=port, host=host))

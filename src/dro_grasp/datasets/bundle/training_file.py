@@ -124,7 +124,12 @@ def write_bundle(
     for i, hand in enumerate(hands):
         header["hands"].append(_pack_hand(f"hand.{i}", hand, tensors))
         tensors |= _pack_grasps(f"grasps.{i}", hand, [b for b in grasps if b.hand_sha256 == hand.sha256], names, splits)
-    _save(Path(path), tensors, header)
+    size = sum(t.numel() * t.element_size() for t in tensors.values())
+    if size > MAX_BYTES:
+        raise BundleError(f"the bundle would have {size / 1e6:.1f} MB, at most {MAX_BYTES / 1e6:.0f} MB are allowed; take "
+                          "fewer objects or fewer grasps a pair (--per-pair)")
+    with replacing(Path(path)) as temporary:
+        save_file(tensors, temporary, metadata={"dro_grasp_bundle": json.dumps(header)})
     return load_bundle(path)
 
 
@@ -158,7 +163,8 @@ def _unpack(header: dict[str, Any], tensors: Tensors) -> Bundle:
     objects = {name: _unpack_cloud(f"object.{i}", tensors) for i, name in enumerate(header["objects"])}
     hands, grasps = {}, {}
     for i, plain in enumerate(header["hands"]):
-        hand = _unpack_hand(f"hand.{i}", plain, tensors)
+        prefix = f"hand.{i}."
+        hand = Hand.from_tensors(plain | {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
         hands[hand.name] = hand
         grasps[hand.name] = _unpack_grasps(f"grasps.{i}", tensors)
     return Bundle(hands, objects, grasps)
@@ -193,12 +199,6 @@ def _pack_hand(key: str, hand: Hand, tensors: Tensors) -> dict[str, Any]:
     return plain
 
 
-def _unpack_hand(key: str, plain: dict[str, Any], tensors: Tensors) -> Hand:
-    prefix = f"{key}."
-    own = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
-    return Hand.from_tensors(plain | own)
-
-
 def _pack_grasps(key: str, hand: Hand, batches: list[GraspBatch], names: list[str], splits: Set[str]) -> Tensors:
     if not batches:
         raise BundleError(f"no grasps of hand '{hand.name}'; synthesise some or leave the hand out")
@@ -224,12 +224,3 @@ def _unpack_grasps(key: str, tensors: Tensors) -> HandGrasps:
     quaternion = roma.quat_wxyz_to_xyzw(tensors[f"{key}.quaternion_wxyz"])
     rotation = roma.unitquat_to_rotmat(torch.nn.functional.normalize(quaternion, dim=-1))
     return HandGrasps(compose(rotation, tensors[f"{key}.position"]), tensors[f"{key}.joints"], tensors[f"{key}.object"].long())
-
-
-def _save(path: Path, tensors: Tensors, header: dict[str, Any]) -> None:
-    size = sum(t.numel() * t.element_size() for t in tensors.values())
-    if size > MAX_BYTES:
-        raise BundleError(f"the bundle would have {size / 1e6:.1f} MB, at most {MAX_BYTES / 1e6:.0f} MB are allowed; take "
-                          "fewer objects or fewer grasps a pair (--per-pair)")
-    with replacing(path) as temporary:
-        save_file(tensors, temporary, metadata={"dro_grasp_bundle": json.dumps(header)})

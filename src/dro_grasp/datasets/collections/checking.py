@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -72,12 +72,10 @@ def check(
     order = torch.randperm(sum(sizes), generator=torch.Generator().manual_seed(seed))
     chosen = torch.zeros(sum(sizes), dtype=torch.bool)
     chosen[order[:sample]] = True
-    result, hands = Agreement(rules.label), {}
-    for grasps, mask in zip(parts, chosen.split(sizes), strict=True):
-        if mask.any():
-            result = result.extended(grasps[mask], _evaluate(grasps[mask], rules, hands))
-            if progress is not None:
-                progress(result.evaluated, int(chosen.sum()))
+    drawn = [grasps[mask] for grasps, mask in zip(parts, chosen.split(sizes), strict=True) if mask.any()]
+    result = Agreement(rules.label)
+    for grasps, trial in zip(drawn, _trials(drawn, rules, progress), strict=True):
+        result = result.extended(grasps, trial)
     return result
 
 
@@ -90,20 +88,20 @@ def keep_passing(
         GraspFileError: A hand or an object is not the one the grasps were made for.
     """
     parts = [pair for pair in pairs if len(pair.grasps)]
-    total, done, kept, hands = sum(len(pair.grasps) for pair in parts), 0, [], {}
-    for pair in parts:
-        trial = _evaluate(pair.grasps, rules, hands)
-        kept.append((pair, pair.grasps.with_trial(trial)[trial.success]))
-        done += len(pair.grasps)
+    trials = _trials([pair.grasps for pair in parts], rules, progress)
+    return [(pair, pair.grasps.with_trial(trial)[trial.success]) for pair, trial in zip(parts, trials, strict=True)]
+
+
+def _trials(parts: Sequence[GraspBatch], rules: Protocol, progress: Progress | None) -> Iterator[TrialResult]:
+    """New trials of the grasps of one pair after the other; each hand is loaded once."""
+    total, done = sum(map(len, parts)), 0
+    hands: dict[str, Hand] = {}
+    for grasps in parts:
+        if grasps.hand_sha256 not in hands:
+            hands[grasps.hand_sha256] = hand_of(grasps, None)
+        hand, obj = hands[grasps.hand_sha256], object_of(grasps, None, 1.0)
+        require_same(grasps, hand, obj)
+        done += len(grasps)
+        yield simulate(hand, obj, grasps, rules)
         if progress is not None:
             progress(done, total)
-    return kept
-
-
-def _evaluate(grasps: GraspBatch, rules: Protocol, hands: dict[str, Hand]) -> TrialResult:
-    """New trials of one pair's grasps; `hands` keeps the hands loaded so far, by hash."""
-    if grasps.hand_sha256 not in hands:
-        hands[grasps.hand_sha256] = hand_of(grasps, None)
-    hand, obj = hands[grasps.hand_sha256], object_of(grasps, None, 1.0)
-    require_same(grasps, hand, obj)
-    return simulate(hand, obj, grasps, rules)

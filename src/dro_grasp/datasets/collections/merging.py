@@ -70,18 +70,15 @@ def merge(paths: Sequence[Path | str], per_pair: int | None = None) -> list[Merg
     by_hand: dict[str, dict[str, list[PairGrasps]]] = {}
     for path in paths:
         for pair in read_collection(path):
-            by_hand.setdefault(pair.grasps.hand, {}).setdefault(_name(pair), []).append(pair)
+            # The pair may have been requested by path.
+            name = pair.grasps.object[0] if len(pair.grasps) else pair.object
+            by_hand.setdefault(pair.grasps.hand, {}).setdefault(name, []).append(pair)
     return [_merge_hand(hand, pairs, per_pair) for hand, pairs in sorted(by_hand.items())]
 
 
 def file_name(hand: str) -> str:
     """Name of a merged file: the hand's with its source, as hands of two sources may share a name."""
     return f"{hand.replace('/', '-')}.parquet"
-
-
-def _name(pair: PairGrasps) -> str:
-    """The object's name in its grasps; the pair may have been requested by path."""
-    return pair.grasps.object[0] if len(pair.grasps) else pair.object
 
 
 def _merge_hand(name: str, pairs: dict[str, list[PairGrasps]], per_pair: int | None) -> Merged:

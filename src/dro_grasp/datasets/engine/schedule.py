@@ -22,8 +22,6 @@ from dro_grasp.files import make_folder
 from dro_grasp.hands.library import load_hand, locate_hand
 from dro_grasp.objects.catalogue import ASSET_PREFIX, load_object, object_names
 
-__all__ = ["DatasetReport", "EngineConfig", "require_known", "synthesize_dataset"]
-
 REPORT_EVERY = 10.0
 """Time between lines of progress [s]. Ours."""
 CANDIDATE_STEP = 64
@@ -50,11 +48,6 @@ class PairState:
     def grasps(self) -> int:
         """Stored so far."""
         return self.total.valid
-
-    @property
-    def next_round(self) -> int:
-        """The first round that is missing."""
-        return next(i for i in itertools.count() if i not in self.done)
 
     def note(self, shard: Shard, made: Yield) -> None:
         """Record a finished shard."""
@@ -221,7 +214,8 @@ class Production:
                 break
             state = self.states[pair]
             earlier = tuple(Shard(*pair, i).path(self.folder).read_bytes() for i in sorted(state.done))
-            self.pool.submit(Task(Shard(*pair, state.next_round), state.next_candidates(self.goal, self.config), earlier))
+            missing = next(i for i in itertools.count() if i not in state.done)
+            self.pool.submit(Task(Shard(*pair, missing), state.next_candidates(self.goal, self.config), earlier))
             self.busy.add(pair)
         return bool(self.busy)
 

@@ -99,20 +99,13 @@ def shard_seed(seed: int, shard: Shard) -> int:
     return int.from_bytes(hashlib.sha256(text).digest()[:6], "big")
 
 
-@lru_cache(maxsize=16)
-def _hand(name: str) -> Hand:
-    return load_hand(name)
-
-
-@lru_cache(maxsize=16)
-def _object(name: str, scale: float) -> ObjectModel:
-    return load_object(name, scale=scale)
+_hand, _object = lru_cache(maxsize=16)(load_hand), lru_cache(maxsize=16)(load_object)
 
 
 def make_shard(job: Job, task: Task) -> FinishedShard:
     """Make one shard. Files come and go as bytes, so that it runs on machines without the folder."""
     started = time.process_time()
-    hand, obj = _hand(task.shard.hand), _object(task.shard.object, job.config.scale)
+    hand, obj = _hand(task.shard.hand), _object(task.shard.object, scale=job.config.scale)
     _ = obj.distance_field, obj.parts
     prepared = time.process_time()
     earlier = [GraspBatch.load(io.BytesIO(payload)) for payload in task.earlier]
