@@ -24,8 +24,8 @@ from report import emit
 from torch import Tensor
 from torch.nn import functional
 
+from dro_grasp.devices import fast_products
 from dro_grasp.models.distance_head import DistanceHead
-from dro_grasp.models.precision import fast_products
 from dro_grasp.models.presets import NetworkConfig
 
 BLOCKS = 4

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dro_grasp.devices import fast_products
 from dro_grasp.errors import OptionError
 from dro_grasp.models import precision
 from dro_grasp.models.attention import Attention
 from dro_grasp.models.encoder import SLOPE, EdgeLayer, StaticGraphEncoder, nearest_neighbours
 from dro_grasp.models.latent import FlowPrior
 from dro_grasp.models.network import DistanceNetwork, untrained_network
-from dro_grasp.models.precision import fast_products
 from dro_grasp.models.presets import NetworkConfig
 
 SMALL = NetworkConfig(

@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from dro_grasp.devices import fast_products
 from dro_grasp.models import latent
 from dro_grasp.models.attention import CrossTransformer
 from dro_grasp.models.distance_head import DistanceHead
 from dro_grasp.models.encoder import StaticGraphEncoder
 from dro_grasp.models.placement import PlacementPrior
-from dro_grasp.models.precision import fast_products
 from dro_grasp.models.presets import NetworkConfig
 
 EXACT = "donot_use_mm_for_euclid_dist"

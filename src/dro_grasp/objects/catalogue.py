@@ -9,18 +9,16 @@ import os
 import re
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import trimesh
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.objects.builtin import BUILTIN, make_builtin
 from dro_grasp.objects.convex_parts import Part
 from dro_grasp.objects.loading import load_file, mesh_object, read_geometry
 from dro_grasp.objects.shape import ObjectModel
-
-if TYPE_CHECKING:
-    import trimesh
 
 ASSET_PREFIX = "assets/"
 """Prefix of a name that forces the asset."""

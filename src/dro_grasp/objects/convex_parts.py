@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+import trimesh
 from jaxtyping import Float, Int
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.objects.cache import Arrays, cached_arrays
 from dro_grasp.objects.repair import OPEN_FILL
 from dro_grasp.objects.surface_distances import signed_distances
-
-if TYPE_CHECKING:
-    import trimesh
 
 THRESHOLD = 0.08
 """CoACD's concavity threshold [1] (ours)."""
@@ -45,8 +41,6 @@ def decompose(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"],
 
 def _run(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> list[Part]:
     """Close the mesh if necessary, and cut it unless it is convex."""
-    import trimesh
-
     hull = trimesh.convex.convex_hull(vertices)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     if not mesh.is_volume:
@@ -74,7 +68,6 @@ def _run(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> l
 def closed_surface(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> trimesh.Trimesh | None:
     """A watertight mesh around the points that are inside by their winding number; None if there are none."""
     import igl
-    import trimesh
 
     low, high = vertices.min(0), vertices.max(0)
     spacing = float((high - low).max()) / CLOSING

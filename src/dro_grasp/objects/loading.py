@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import trimesh
 from jaxtyping import Float, Int, Num
+from scipy.spatial import KDTree
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.objects.cache import content_hash
 from dro_grasp.objects.convex_parts import Part
 from dro_grasp.objects.repair import mass_properties, repair
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
-
-if TYPE_CHECKING:
-    import trimesh
 
 LARGEST = 1.0
 """Largest extent of an object that counts as metres [m] (ours)."""
@@ -70,8 +68,6 @@ def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
 
 def read_geometry(path: Path) -> tuple[trimesh.Trimesh | Float[np.ndarray, "..."], float]:
     """One mesh, scenes merged, or the points of a file without faces; and the file's unit [m], 1 if it states none."""
-    import trimesh
-
     if path.suffix.lower() in CLOUD_SUFFIXES:
         return read_cloud(path), 1.0
     try:
@@ -91,8 +87,6 @@ def read_geometry(path: Path) -> tuple[trimesh.Trimesh | Float[np.ndarray, "..."
 
 def _merge(scene: trimesh.Scene) -> trimesh.Trimesh | trimesh.PointCloud:
     """All meshes of a scene in its frame, or its point clouds if it has no mesh."""
-    import trimesh
-
     mesh = scene.to_mesh()
     clouds = [part.vertices for part in scene.dump() if isinstance(part, trimesh.PointCloud)]
     return trimesh.PointCloud(np.concatenate(clouds)) if clouds and len(mesh.faces) == 0 else mesh
@@ -112,8 +106,6 @@ def mesh_object(
     Raises:
         ObjectError: NaN vertices, no faces, no volume, or an implausible size in metres.
     """
-    import trimesh
-
     notes: list[str] = []
     vertices, faces = np.asarray(mesh.vertices, np.float64) * scale, np.asarray(mesh.faces, np.int64)
     _check_numbers(vertices, faces, origin)
@@ -175,8 +167,6 @@ def estimate_normals(
     points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None = None
 ) -> Float[np.ndarray, "n 3"]:
     """Unit normals of a cloud by local principal axes, turned to the camera, or away from the cloud's mean without one."""
-    from scipy.spatial import KDTree
-
     neighbours = KDTree(points).query(points, k=min(NEIGHBOURS, len(points)))[1]
     local = points[neighbours] - points[neighbours].mean(1, keepdims=True)
     normals = np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))[1][:, :, 0]

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+import trimesh
 from jaxtyping import Float
+from scipy.spatial import QhullError
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.geometry.point_clouds import enclosed_volume
-
-if TYPE_CHECKING:
-    import trimesh
 
 MANY_FACES = 100_000
 """Meshes with more faces are decimated (ours)."""
@@ -73,8 +70,6 @@ def mass_properties(mesh: trimesh.Trimesh, origin: str, notes: list[str]) -> Mas
 
 
 def _close(mesh: trimesh.Trimesh, notes: list[str]) -> None:
-    import trimesh
-
     mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
     mesh.remove_unreferenced_vertices()
     trimesh.repair.fill_holes(mesh)
@@ -84,8 +79,6 @@ def _close(mesh: trimesh.Trimesh, notes: list[str]) -> None:
 
 def _turn_outward(mesh: trimesh.Trimesh) -> bool:
     """Make all faces counter-clockwise from outside; returns whether any was turned."""
-    import trimesh
-
     before = np.array(mesh.faces)
     if not mesh.is_winding_consistent or (mesh.is_watertight and _volume(mesh) < 0):
         with np.errstate(invalid="ignore", divide="ignore"):  # flat bodies have no centre of mass
@@ -98,8 +91,6 @@ def _turn_outward(mesh: trimesh.Trimesh) -> bool:
 
 def _join(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
     """The union of overlapping bodies; without it, overlaps count twice in the mass and hide surface inside."""
-    import trimesh
-
     if not mesh.is_watertight or mesh.body_count == 1:
         return mesh
     bodies = list(mesh.split(only_watertight=False))
@@ -123,9 +114,6 @@ def _is_solid(mesh: trimesh.Trimesh) -> bool:
 
 
 def _hull(mesh: trimesh.Trimesh) -> trimesh.Trimesh | None:
-    import trimesh
-    from scipy.spatial import QhullError
-
     try:
         with np.errstate(invalid="ignore", divide="ignore"):  # a flat one has no centre of mass
             return trimesh.convex.convex_hull(mesh)

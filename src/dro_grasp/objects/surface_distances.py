@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial import KDTree
 
 from dro_grasp.objects.cache import Arrays
 
@@ -38,8 +39,6 @@ def cloud_distances(
 
     Discs are perpendicular to the normals and extend to the neighbours: they close the surface and leave its rims open.
     """
-    from scipy.spatial import KDTree
-
     tree = KDTree(cloud)
     some = cloud[:: max(1, len(cloud) // 256)]
     reach = float(np.median(tree.query(some, k=min(DISC_NEIGHBOURS, len(cloud)))[0][:, -1]))

@@ -11,11 +11,13 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.interpolate import RegularGridInterpolator
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from dro_grasp.models.completion_network import SurfaceNetwork, shipped_surface
 from dro_grasp.objects.surface_distances import cloud_distances
-from dro_grasp.perception.symmetry import Guess, VisibleSide, nearest_points, project
+from dro_grasp.perception.symmetry import Guess, VisibleSide, project
 
 GUESSES = 5
 """Symmetries that the network chooses between (ours)."""
@@ -89,7 +91,7 @@ def complete_cloud(
     surface, outward = extract_surface(side, guesses, network or shipped_surface())
     apart = max(side.width / THINNING, min(FINEST, side.width / COARSEST))
     seen, seen_normals = _thinned(side.points, side.normals, apart)
-    between = 2 * float(np.median(nearest_points(seen).query(seen, k=2)[0][:, 1]))
+    between = 2 * float(np.median(KDTree(seen).query(seen, k=2)[0][:, 1]))
     near = side.tree.query(surface)[0] < 1.5 * max(apart, between)
     # Extracted points near the visible side cover the same area as the thinned visible points: the ratio of the two
     # counts is the share of extracted points that gives the other side the same density.
@@ -137,8 +139,6 @@ def extract_surface(
     side: VisibleSide, guesses: list[Guess], network: SurfaceNetwork
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
     """Points on the network's zero level and their unit normals, in view axes; those of the best guess if there is none."""
-    from scipy.interpolate import RegularGridInterpolator
-
     everything = np.concatenate([g.points for g in guesses])
     low, high = everything.min(0) - MARGIN, everything.max(0) + MARGIN
     spacing = float((np.prod(high - low) / CELLS) ** (1 / 3))

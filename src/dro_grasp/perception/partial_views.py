@@ -7,7 +7,9 @@ from typing import Literal
 
 import numpy as np
 import torch
+import trimesh
 from jaxtyping import Float
+from scipy.spatial import ConvexHull
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
@@ -137,8 +139,6 @@ def _depth_of_mesh(
     obj: ObjectModel, T_object_camera: Float[np.ndarray, "4 4"], radius: float, camera: DepthCamera
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     """Ray directions with z = 1 in the camera's frame, and the depth along z of their first hits [m]."""
-    import trimesh
-
     mesh = trimesh.Trimesh(obj.vertices, obj.faces, process=False)
     # At the distance of its middle, a sphere's silhouette is wider than the sphere.
     reach = camera.distance * radius / np.sqrt(camera.distance**2 - radius**2)
@@ -162,8 +162,6 @@ def _depth_of_cloud(
 
     Source: Katz, Tal and Basri, Direct visibility of point sets, 2007.
     """
-    from scipy.spatial import ConvexHull
-
     local = (obj.cloud.astype(np.float64) - T_object_camera[:3, 3]) @ T_object_camera[:3, :3]
     away = np.linalg.norm(local, axis=1, keepdims=True)
     flipped = local + 2 * (FLIP * away.max() - away) * local / away

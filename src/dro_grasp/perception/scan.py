@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Num
+from scipy.spatial import KDTree
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.objects.loading import cloud_object, estimate_normals, read_points
@@ -99,7 +100,5 @@ def scanned_object(
 
 def without_outliers(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
     """Remove points whose mean distance to their neighbours is unusually large. Source: Rusu et al. 2008."""
-    from scipy.spatial import KDTree
-
     distance = KDTree(points).query(points, k=min(NEIGHBOURS, len(points) - 1) + 1)[0][:, 1:].mean(1)
     return points[distance <= distance.mean() + TOLERANCE * distance.std()]

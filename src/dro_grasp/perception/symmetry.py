@@ -14,13 +14,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Int
-
-if TYPE_CHECKING:
-    from scipy.spatial import KDTree
+from scipy.spatial import KDTree
 
 SAMPLE = 300
 """Visible points that judge a symmetry (ours)."""
@@ -62,13 +59,6 @@ FEWEST_RIM = 8
 """Fewest rim points (ours)."""
 TURNS_AWAY = 0.35
 """Cosine between normal and ray below which the surface at the rim turns away; above, it ends at an edge (ours)."""
-
-
-def nearest_points(points: Float[np.ndarray, "n d"]) -> KDTree:
-    """A search tree for nearest points; SciPy is loaded when needed."""
-    from scipy.spatial import KDTree
-
-    return KDTree(points)
 
 
 def project(points: Float[np.ndarray, "n 3"], camera_distance: float | None) -> Float[np.ndarray, "n 2"]:
@@ -128,7 +118,7 @@ class VisibleSide:
             rays, flat = np.array([[0.0, 0.0, 1.0]]), 0.0
         else:
             some = shuffled[:RIM_SAMPLE]
-            near = nearest_points(image).query_ball_point(image[some], RIM_RADIUS * width)
+            near = KDTree(image).query_ball_point(image[some], RIM_RADIUS * width)
             aside = np.array([np.linalg.norm(image[i].mean(0) - image[k]) for i, k in zip(near, some, strict=True)])
             rim = some[aside >= min(LOPSIDED * RIM_RADIUS * width, np.sort(aside)[-min(FEWEST_RIM, len(aside))])]
             rays, flat = np.array([0.0, 0.0, camera_distance]) - points[rim], max(0.0, width - float(top - end))
@@ -156,7 +146,7 @@ class VisibleSide:
             some = (self.points[self.sample] - centre) @ linear.T + centre
             if any(tree.query(some)[0].mean() < SAME_GUESS * self.width for tree in sampled):
                 continue
-            sampled.append(nearest_points(some))
+            sampled.append(KDTree(some))
             behind = (self.points - centre) @ linear.T + centre
             found.append(Guess(np.concatenate([self.points, behind]),
                                np.concatenate([self.normals, self.normals @ linear.T]), float(costs[k])))
@@ -211,12 +201,12 @@ class VisibleSide:
     @cached_property
     def tree(self) -> KDTree:
         """Search tree of the visible points."""
-        return nearest_points(self.points)
+        return KDTree(self.points)
 
     @cached_property
     def image_tree(self) -> KDTree:
         """Search tree of the visible points in the image."""
-        return nearest_points(project(self.points, self.camera_distance))
+        return KDTree(project(self.points, self.camera_distance))
 
     def _exposure(self, moved: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
         """Distance of points from where they would be hidden from the camera [m]: inside the image, behind the surface."""

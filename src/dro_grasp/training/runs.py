@@ -13,10 +13,9 @@ from torch import Tensor, nn
 from torch.optim import Adam
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from dro_grasp.devices import require_device
+from dro_grasp.devices import fast_products, require_device
 from dro_grasp.errors import OptionError, TrainingError
 from dro_grasp.files import make_folder
-from dro_grasp.models.precision import fast_products
 from dro_grasp.training.config import ScheduleConfig
 from dro_grasp.training.processes import Processes, join, process_count
 from dro_grasp.training.reports import Report, RunProgress, require_tensorboard, tensorboard_report

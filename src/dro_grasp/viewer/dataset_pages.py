@@ -7,19 +7,17 @@ import io
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from dro_grasp.evaluation.coverage import ROLL_BINS, HandCoverage, PairCoverage, grasp_sizes, wrist_rolls
 from dro_grasp.files import check_output
 from dro_grasp.frames import HALF_AXES
 from dro_grasp.grasps.sources import object_of
-from dro_grasp.viewer.page import ShadedCount, image, png_bytes, table, write_page
+from dro_grasp.viewer.page import ShadedCount, image, table, write_page
 from dro_grasp.viewer.pictures import caption, contact_sheet, draw_grasp
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 MAX_PICTURES = 8
 """Grasps drawn for each hand, each on another object."""
@@ -68,8 +66,6 @@ def _section(hand: HandCoverage) -> str:
 
 def charts(hand: HandCoverage) -> bytes:
     """Palm directions, rolls, sizes, energies and joints of a hand's grasps, as one PNG."""
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(12, 6.2), layout="constrained")
     grid = figure.add_gridspec(2, 3)
     _directions(figure.add_subplot(grid[0, 0], projection="mollweide"), hand)
@@ -81,7 +77,9 @@ def charts(hand: HandCoverage) -> bytes:
     sizes.set(title="grasp size: widest fingertip distance", xlabel="[cm]")
     _energies(figure.add_subplot(grid[1, 0]), hand)
     _joints(figure.add_subplot(grid[1, 1:]), hand)
-    return png_bytes(figure)
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=100)
+    return file.getvalue()
 
 
 def _directions(axes: Axes, hand: HandCoverage) -> None:

@@ -4,16 +4,11 @@ from __future__ import annotations
 
 import base64
 import html
-import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from dro_grasp._version import __version__
 from dro_grasp.files import replacing
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #282c34; max-width: 1180px; margin: 2em auto; padding: 0 1em }
@@ -63,9 +58,3 @@ def image(png: bytes, description: str) -> str:
     """A picture embedded in the page."""
     return f'<p><img alt="{html.escape(description)}" src="data:image/png;base64,{base64.b64encode(png).decode()}"></p>'
 
-
-def png_bytes(figure: Figure) -> bytes:
-    """A chart as PNG."""
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=100)
-    return file.getvalue()
