@@ -64,13 +64,11 @@ class Evaluate:
         grasps = load_grasps(self.file)
         hand = hand_of(grasps, self.hand)
         rows, evaluated, reasons = [], [], Counter()
-        names = list(dict.fromkeys(grasps.object))
-        if self.object is not None and len(names) > 1:
-            raise OptionError(f"{self.file} holds grasps of {len(names)} objects; --object fits a file with one")
+        parts = dict(grasps.by_object())
+        if self.object is not None and len(parts) > 1:
+            raise OptionError(f"{self.file} holds grasps of {len(parts)} objects; --object fits a file with one")
         with progress_bar("evaluating", self.json) as progress:
-            for name in names:
-                index = [i for i, o in enumerate(grasps.object) if o == name]
-                part = grasps[index]
+            for name, part in parts.items():
                 obj = object_of(part, self.object, self.scale)
                 if part.object_sha256[0] not in {"", obj.sha256}:
                     say_aside(f"the grasps were made for another '{name}' than the given {obj.name}")

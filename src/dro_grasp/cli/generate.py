@@ -81,13 +81,14 @@ class Generate:
 
     def run(self) -> int:
         """Check everything that can be checked before the work, then do it."""
-        from dro_grasp.errors import DroGraspError
+        from dro_grasp.errors import DroGraspError, OptionError
         from dro_grasp.frames import read_motion
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.catalogue import resolve_objects
         from dro_grasp.predictor import GraspPredictor, GraspRequest
 
-        check_seed(self.seed)
+        if not 0 <= self.seed < 2**63:
+            raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^63 - 1")
         request = GraspRequest(
             self.num, self.seed, self.direction, self.table, self.candidates, self.refine, self.temperature, self.method)
         names = resolve_objects([self.object])
@@ -217,14 +218,6 @@ class ObjectResult:
     """The grasps that were kept."""
     predicted_points: Float[Tensor, "n n_points 3"]
     """Their hand points as the network placed them [m]."""
-
-
-def check_seed(seed: int) -> None:
-    """Refuse seeds that the random generators cannot take."""
-    from dro_grasp.errors import OptionError
-
-    if not 0 <= seed < 2**63:
-        raise OptionError(f"seed is {seed}; give an integer from 0 to 2^63 - 1")
 
 
 def paths_per_object(path: Path | None, names: list[str], several: bool, suffix: str) -> list[Path | None]:

@@ -47,7 +47,7 @@ class _Cloud:
 def multilaterate(
     distances: Float[Tensor, "*b n m"], anchors: Float[Tensor, "*b m 3"], config: MultilaterationConfig | None = None
 ) -> tuple[Float[Tensor, "*b 2 n 3"], Bool[Tensor, "*b"]]:
-    """Points whose distances to the anchors are closest to the given ones: both candidates where the anchors are flat.
+    """Points whose distances to the anchors are closest to the given ones [m]: both candidates where the anchors are flat.
 
     The closed form is the minimiser of the linear least-squares problem that is left when the anchors' mean is
     subtracted from the squared distances. If the anchors are thin, a point and its mirror image fit alike: both are
@@ -55,10 +55,6 @@ def multilaterate(
 
     Differs from the paper: its argmin of squared distances to the fourth power is replaced by the linear problem,
     which has one minimum, and on thin clouds by unsquared distances, which weigh noise evenly.
-
-    Args:
-        distances: Distance of each point to each anchor [m].
-        anchors: Known positions [m].
 
     Returns:
         The candidates on the two sides of the anchors' plane [m], equal where the cloud is not thin; and the mask of

@@ -19,10 +19,7 @@ def enclosed_volume(triangles: Float[np.ndarray, "n 3 3"]) -> float:
 def sample_surface(
     vertices: Float[Tensor, "n_vertices 3"], faces: Int[Tensor, "n_faces 3"], count: int, generator: torch.Generator
 ) -> tuple[Float[Tensor, "count 3"], Float[Tensor, "count 3"], Int[Tensor, " count"]]:
-    """Points uniform on a triangle mesh.
-
-    Returns:
-        Points [m], unit normals (outward for counter-clockwise faces), and the face of each point.
+    """Points uniform on a triangle mesh [m], their unit normals (outward for counter-clockwise faces), and their faces.
 
     Raises:
         ValueError: The mesh has no area.

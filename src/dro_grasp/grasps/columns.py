@@ -42,12 +42,7 @@ ENERGY_TERM = "energy_"
 
 
 def unknown(name: str, joints: Float[Tensor, "n n_dof"]) -> Any:
-    """A column that says nothing about any grasp.
-
-    Args:
-        name: One of COLUMNS, except pose and joints, which are always known.
-        joints: The batch's joints, for size and device.
-    """
+    """A column, not the pose or the joints, that says nothing about any grasp of a batch with these joints."""
     n = len(joints)
     if name in FLOATS:
         return torch.full((n,), torch.nan, device=joints.device)

@@ -69,10 +69,9 @@ def hand_of(grasps: GraspBatch, given: str | None) -> Hand:
 
 
 def object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectModel:
-    """The object of some grasps, or the given one instead.
+    """The object of grasps of one object, or the given one instead.
 
     Args:
-        grasps: Grasps of one object.
         given: Name or path that replaces the one in the file.
         scale: Scale of the object, unless the grasps record one.
 

@@ -121,10 +121,7 @@ def describe_weights(name: str | Path | None = None) -> dict[str, Any]:
 
 
 def verify_weights(name: str | Path | None = None) -> str:
-    """SHA-256 of a weights file that loads and, if it ships, is unchanged.
-
-    Args:
-        name: As in `load_weights`, or one of `SMALL`.
+    """SHA-256 of a weights file, or of one of `SMALL`, that loads and, if it ships, is unchanged.
 
     Raises:
         WeightsError: As in `load_weights`; or shipped weights are missing or changed.

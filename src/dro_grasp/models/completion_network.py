@@ -23,13 +23,7 @@ class SurfaceNetwork(nn.Module):
     """
 
     def __init__(self, guesses: int, features: int, width: int = 128, depth: int = 2) -> None:
-        """Untrained, it returns nearly the first guess.
-
-        Args:
-            guesses: Number of guessed distances, best guess first.
-            features: Number of other features of a point.
-            depth: Residual blocks.
-        """
+        """Untrained, it returns nearly the first of the guesses, which is the best one."""
         super().__init__()
         self.guesses = guesses
         self.enter = nn.Linear(features, width)

@@ -51,11 +51,7 @@ def depth_points(
 
 
 def load_scan(path: Path, T_frame_camera: Float[np.ndarray, "4 4"], scale: float = 1.0) -> ObjectModel:
-    """The object in a cloud file in the camera's frame; see `scanned_object`.
-
-    Args:
-        path: PLY, NPY or PCD; outliers and the NaN points of organised clouds are dropped.
-        scale: Multiplies the points; 0.001 for millimetres.
+    """The object in a cloud file (PLY, NPY, PCD) in the camera's frame, times `scale`; see `scanned_object`.
 
     Raises:
         ObjectError: The file holds no cloud, or none of an object's size.

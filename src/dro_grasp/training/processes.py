@@ -61,10 +61,8 @@ def process_count() -> int:
 def join(device: str) -> tuple[Processes, str]:
     """Join the processes that torchrun started, if any, and take a device of one's own.
 
-    Processes stay joined until they end, so a second stage of training finds them joined.
-
-    Args:
-        device: `cpu`, or `cuda` for the GPU with this process's number on its machine.
+    Processes stay joined until they end, so a second stage of training finds them joined. Device `cuda` stands for the GPU
+    with this process's number on its machine.
 
     Raises:
         OptionError: torchrun started more processes on this machine than it has GPUs.

@@ -62,11 +62,7 @@ class TrainingRun:
         return steps if limit is None else max(steps, self.seconds / (60 * limit))
 
     def train(self, losses: Callable[[], Losses], report: Report) -> None:
-        """Make the folder or resume from its checkpoint, then step until the schedule ends.
-
-        Args:
-            losses: Makes the next batch and returns its losses.
-            report: Called every `log_every` steps.
+        """Make the folder or resume from its checkpoint, then step until the schedule ends; it reports every few steps.
 
         Raises:
             TrainingError: A loss or the gradient is not finite, or the folder holds the checkpoint of another run.
@@ -219,11 +215,8 @@ def recalibrate(model: nn.Module, forward: Callable[[], object], batches: int = 
     """Measure the statistics of BatchNorm for the averaged weights.
 
     The averages kept during training belong to other weights: with them the distance error in evaluation mode is
-    twice that in training mode. Layers in evaluation mode, as in a frozen encoder, keep their statistics.
-
-    Args:
-        model: A model in training mode, with the averaged weights.
-        forward: Passes the next batch of training data through it.
+    twice that in training mode. Layers in evaluation mode, as in a frozen encoder, keep their statistics. `forward` passes
+    the next batch of training data through the model.
     """
     layers = [layer for layer in model.modules() if isinstance(layer, nn.BatchNorm1d) and layer.training]
     momenta = [layer.momentum for layer in layers]

@@ -15,6 +15,7 @@ from dro_grasp.grasps.controller import completed
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.viewer.appearance import PREDICTED_COLOUR
+from dro_grasp.viewer.pictures import outcome
 from dro_grasp.viewer.stage import HOST, ServedPage, serve
 
 Posture = Literal["open", "pregrasp", "grasp", "squeeze"]
@@ -96,11 +97,6 @@ def view_grasps(
 ) -> None:
     """Serve the viewer until Ctrl-C; arguments as for `GraspViewer`."""
     serve(GraspViewer(hand, obj, grasps, predicted_points, port, host))
-
-
-def outcome(grasps: GraspBatch, index: int) -> bool | None:
-    """Whether a grasp passed its trial; None if it was not evaluated."""
-    return bool(grasps.success[index]) if bool(grasps.evaluated[index]) else None
 
 
 def describe(grasps: GraspBatch, index: int) -> str:

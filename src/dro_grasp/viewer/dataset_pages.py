@@ -61,7 +61,9 @@ def _section(hand: HandCoverage) -> str:
     parts = [f"<h2>{name}</h2>"]
     if len(hand.grasps):
         parts += [image(charts(hand), f"charts of {name}"), image(grasps_drawn(hand), f"grasps of {name}")]
-    return "".join([*parts, _failures(hand), _pair_table(hand)])
+    head = ["object", "grasps", "candidates", "per CPU-hour", *HALF_AXES, f"rolls of {ROLL_BINS}", "size [cm]",
+            "contact links", "why no grasp"]
+    return "".join([*parts, _failures(hand), table(head, [_pair_row(pair) for pair in hand.pairs])])
 
 
 def charts(hand: HandCoverage) -> bytes:
@@ -144,12 +146,6 @@ def _failures(hand: HandCoverage) -> str:
     return table(["outcome of candidates", "number", "share"], [
         [name, n, share or _percent(n, yields.candidates)] for name, n, share in rows
     ])
-
-
-def _pair_table(hand: HandCoverage) -> str:
-    head = ["object", "grasps", "candidates", "per CPU-hour", *HALF_AXES, f"rolls of {ROLL_BINS}", "size [cm]",
-            "contact links", "why no grasp"]
-    return table(head, [_pair_row(pair) for pair in hand.pairs])
 
 
 def _pair_row(pair: PairCoverage) -> list[object]:

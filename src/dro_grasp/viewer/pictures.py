@@ -114,13 +114,17 @@ def heading(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> str:
     return f"{text}, {int(grasps.success.sum())} of {int(grasps.evaluated.sum())} succeeded ({', '.join(protocols)})"
 
 
+def outcome(grasps: GraspBatch, index: int) -> bool | None:
+    """Whether a grasp passed its trial; None if it was not evaluated."""
+    return bool(grasps.success[index]) if bool(grasps.evaluated[index]) else None
+
+
 def caption(grasps: GraspBatch, index: int) -> tuple[str, bool | None]:
     """The caption of a picture, and the trial outcome that gives its colour."""
-    outcome = bool(grasps.success[index]) if bool(grasps.evaluated[index]) else None
-    words = {True: "success", False: "failed", None: "not evaluated"}[outcome]
+    words = {True: "success", False: "failed", None: "not evaluated"}[outcome(grasps, index)]
     values = {name: float(getattr(grasps, name)[index]) for name in ("score", "energy")}
     numbers = "".join(f"   {name} {value:.2f}" for name, value in values.items() if math.isfinite(value))
-    return f"{index}   {words}{numbers}", outcome
+    return f"{index}   {words}{numbers}", outcome(grasps, index)
 
 
 def contact_sheet(
@@ -135,12 +139,12 @@ def contact_sheet(
     pen = ImageDraw.Draw(sheet)
     pen.text((16, 12), title, fill=INK, font=ImageFont.load_default(18))
     font = ImageFont.load_default(14)
-    for i, (tile, (text, outcome)) in enumerate(zip(tiles, captions, strict=True)):
+    for i, (tile, (text, passed)) in enumerate(zip(tiles, captions, strict=True)):
         x, y = (i % columns) * width, HEADER + (i // columns) * (height + CAPTION)
         sheet.paste(Image.fromarray(tile), (x, y))
         if outcomes:
-            red, green, blue = (int(255 * c) for c in success_colour(outcome))
+            red, green, blue = (int(255 * c) for c in success_colour(passed))
             pen.ellipse((x + 16, y + height + 5, x + 26, y + height + 15), fill=(red, green, blue))
         left = x + (34 if outcomes else 16)
-        pen.text((left, y + height + 1), text, fill=INK if outcome is not None else FAINT, font=font)
+        pen.text((left, y + height + 1), text, fill=INK if passed is not None else FAINT, font=font)
     return sheet

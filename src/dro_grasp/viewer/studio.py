@@ -29,7 +29,8 @@ from dro_grasp.pipeline.stages import evaluate
 from dro_grasp.predictor import GraspPredictor, GraspRequest, Method
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.trial import record
-from dro_grasp.viewer.app import POSTURES, Posture, describe, outcome, postures_of
+from dro_grasp.viewer.app import POSTURES, Posture, describe, postures_of
+from dro_grasp.viewer.pictures import outcome
 from dro_grasp.viewer.stage import HOST, ServedPage
 from dro_grasp.viewer.uploads import store_upload
 
