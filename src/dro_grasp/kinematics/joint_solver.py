@@ -134,28 +134,6 @@ class _State:
         return _State(*(torch.where(mask.view(-1, *[1] * (a.ndim - 1)), a, b) for a, b in pairs))
 
 
-@dataclass(frozen=True)
-class _Result:
-    """Results, filled in as grasps finish."""
-
-    T: Float[Tensor, "b 4 4"]
-    q: Float[Tensor, "b n_dof"]
-    residual: Float[Tensor, "b k"]
-    converged: Bool[Tensor, " b"]
-    iterations: Int[Tensor, " b"]
-
-    @staticmethod
-    def empty(state: _State) -> _Result:
-        """Results that equal the state, with no iteration."""
-        none = torch.zeros_like(state.stalled)
-        return _Result(state.T.clone(), state.q.clone(), state.residual.clone(), none.bool(), none)
-
-    def put(self, rows: Int[Tensor, " r"], state: _State, converged: Bool[Tensor, " r"], iterations: int) -> None:
-        """Store finished grasps."""
-        self.T[rows], self.q[rows], self.residual[rows] = state.T, state.q, state.residual
-        self.converged[rows], self.iterations[rows] = converged, iterations
-
-
 @torch.no_grad()
 def solve_joints(
     tree: KinematicTree, targets: Targets, T_world_wrist: Float[Tensor, "*b 4 4"], q: Float[Tensor, "*b n_dof"],
@@ -186,19 +164,19 @@ def solve_joints(
     T = T_world_wrist.reshape(-1, 4, 4).double()
     final = _iterate(problem, _state(problem, T, torch.minimum(torch.maximum(q, low), high), config), config)
     # Rounding to single precision may step over a limit by half a unit: clamp once more.
-    joints = torch.minimum(torch.maximum(final.q.to(dtype), low.to(dtype)), high.to(dtype))
+    joints = torch.minimum(torch.maximum(final.joints.to(dtype), low.to(dtype)), high.to(dtype))
     # Repeated products leave rounding errors in the rotation: make it orthonormal again.
-    T = compose(roma.special_gramschmidt(final.T[:, :3, :2]), final.T[:, :3, 3])
+    T = compose(roma.special_gramschmidt(final.T_world_wrist[:, :3, :2]), final.T_world_wrist[:, :3, 3])
     return JointSolution(
-        T.to(dtype).reshape(*batch, 4, 4), joints.reshape(*batch, tree.n_dof),
-        point_norms(final.residual).mean(-1).to(dtype).reshape(batch), final.converged.reshape(batch),
-        final.iterations.reshape(batch),
+        T.to(dtype).reshape(*batch, 4, 4), joints.reshape(*batch, tree.n_dof), final.residual.to(dtype).reshape(batch),
+        final.converged.reshape(batch), final.iterations.reshape(batch),
     )
 
 
-def _iterate(problem: _Problem, state: _State, config: JointSolverConfig) -> _Result:
-    """Iterate until every grasp is done; finished grasps leave the batch."""
-    result = _Result.empty(state)
+def _iterate(problem: _Problem, state: _State, config: JointSolverConfig) -> JointSolution:
+    """Iterate until every grasp is done; finished grasps leave the batch for the solution, which is in double precision."""
+    none = torch.zeros_like(state.stalled)
+    result = JointSolution(state.T.clone(), state.q.clone(), torch.zeros_like(state.cost), none.bool(), none)
     rows = torch.arange(len(state.q), device=state.q.device)
     for iteration in range(1, config.max_iterations + 1):
         state, change = _advance(problem, state, config)
@@ -206,7 +184,10 @@ def _iterate(problem: _Problem, state: _State, config: JointSolverConfig) -> _Re
         last = iteration == config.max_iterations
         if last or bool(done.any()):
             leaving = torch.ones_like(done) if last else done
-            result.put(rows[leaving], state.rows(leaving), done[leaving], iteration)
+            gone, final = rows[leaving], state.rows(leaving)
+            result.T_world_wrist[gone], result.joints[gone] = final.T, final.q
+            result.residual[gone] = point_norms(final.residual).mean(-1)
+            result.converged[gone], result.iterations[gone] = done[leaving], iteration
             problem, state, rows = problem.rows(~leaving), state.rows(~leaving), rows[~leaving]
         if len(rows) == 0:
             break
@@ -222,9 +203,8 @@ def _advance(problem: _Problem, state: _State, config: JointSolverConfig) -> tup
     weight = smoothed_norms(state.residual, config.step.norm_floor).reciprocal().mean(-1)
     damping = state.damping * (weight * config.damping_length**2)
     step = best_step(state.jacobian, state.residual, low, high, damping, state.sharpness, config.step)
-    # The wrist moves in its own frame.
-    T = state.T @ compose(roma.rotvec_to_rotmat(step[:, 3:6]), step[:, :3])
-    q = torch.minimum(torch.maximum(state.q + step[:, 6:], problem.lower), problem.upper)
+    T, q = _move(state, step)
+    q = torch.minimum(torch.maximum(q, problem.lower), problem.upper)
     proposed = _state(problem, T, q, config)
     better = proposed.cost <= state.cost
     change = step.abs().amax(-1)
@@ -234,6 +214,12 @@ def _advance(problem: _Problem, state: _State, config: JointSolverConfig) -> tup
     little = proposed.cost > state.cost * (1 - config.objective_tolerance)
     stalled = torch.where(little, state.stalled + 1 + better.long(), 0)
     return replace(proposed.where(better, state), damping=damping, sharpness=sharpness, stalled=stalled), change
+
+
+def _move(state: _State, step: Float[Tensor, "b p"]) -> tuple[Float[Tensor, "b 4 4"], Float[Tensor, "b n_dof"]]:
+    """Apply a step: the wrist moves in its own frame."""
+    local = compose(roma.rotvec_to_rotmat(step[:, 3:6]), step[:, :3])
+    return state.T @ local, state.q + step[:, 6:]
 
 
 def _problem(

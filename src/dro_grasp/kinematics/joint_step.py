@@ -1,7 +1,7 @@
 """One step of the joint solver: a convex problem per grasp, solved for a whole batch at once.
 
-Minimise over d the sum of un-squared norms |r_i + J_i d|, with d inside a box. Iteratively reweighted least squares
-(IRLS) handles the norms, an active set handles the box, and each pass is one batched Cholesky factorisation.
+Minimise over d the sum of un-squared norms |r_i + J_i d|, with d inside a box. One reweighting of iteratively reweighted
+least squares (IRLS) handles the norms, an active set the box, and each of its passes is one batched Cholesky factorisation.
 Source: paper section III-D, joint configurations.
 
 A norm |r| has the curvature (I - u u^T) / |r| with u = r / |r|. IRLS takes I / |r| instead: it never overshoots, but it
@@ -25,10 +25,8 @@ from torch import Tensor
 class StepConfig:
     """How precisely one step is solved. Values are ours."""
 
-    reweightings: int = 1
-    """IRLS passes."""
     active_set_passes: int = 3
-    """Most solves with a corrected active set per reweighting; they end when the set no longer changes."""
+    """Most solves with a corrected active set; they end when the set no longer changes."""
     norm_floor: float = 3e-4
     """Below this, norms are replaced by parabolas [m]: the weights stay finite and the optimum moves by less than this."""
 
@@ -62,36 +60,28 @@ def best_step(
         sharpness: Between IRLS (0, the default) and Newton's method (1).
     """
     config = config or StepConfig()
-    step = torch.zeros_like(lower)
-    held: tuple[Bool[Tensor, "b p"], Bool[Tensor, "b p"]] | None = None
-    for i in range(config.reweightings):
-        left = residual + (step[:, None] @ jacobian)[:, 0] if i else residual
-        matrix, gradient = _model(jacobian, left, sharpness, config)
-        # The model is expanded about `step`: its slope at d = 0 is gradient - H step.
-        constant = gradient - (matrix @ step[..., None])[..., 0] if i else gradient
-        matrix.diagonal(dim1=-2, dim2=-1).add_(damping[:, None])
-        quadratic = _Quadratic(matrix, constant, lower, upper)
-        step, held = _minimum_in_box(quadratic, held, config.active_set_passes)
-    return step
+    matrix, gradient = _model(jacobian, residual, sharpness, config)
+    matrix.diagonal(dim1=-2, dim2=-1).add_(damping[:, None])
+    return _minimum_in_box(_Quadratic(matrix, gradient, lower, upper), config.active_set_passes)
 
 
 def _model(
-    jacobian: Float[Tensor, "b p k"], left: Float[Tensor, "b k"], sharpness: Float[Tensor, " b"] | None, config: StepConfig
+    jacobian: Float[Tensor, "b p k"], residual: Float[Tensor, "b k"], sharpness: Float[Tensor, " b"] | None, config: StepConfig
 ) -> tuple[Float[Tensor, "b p p"], Float[Tensor, "b p"]]:
-    """Curvature H and slope g of the sum of norms at the residuals `left`.
+    """Curvature H and slope g of the sum of norms.
 
     With weights w_i = 1 / |r_i|, IRLS has H = sum w_i J_i^T J_i. The correction -s w_i (J_i^T u_i)(J_i^T u_i)^T is of rank
     one per target, so it joins the same matrix product as one more column per target.
     """
-    norms = point_norms(left)
+    norms = point_norms(residual)
     floored = norms.clamp(min=config.norm_floor)
     scale = floored.reciprocal()
     weighted, plain = jacobian * scale.repeat(1, 3)[:, None], jacobian
-    gradient = (weighted @ left[..., None])[..., 0]
+    gradient = (weighted @ residual[..., None])[..., 0]
     if sharpness is not None:
         # Below the floor the function is a parabola, and IRLS has its exact curvature.
         share = torch.where(norms > config.norm_floor, sharpness[:, None] * scale, 0.0)
-        directions = left / floored.repeat(1, 3)
+        directions = residual / floored.repeat(1, 3)
         x, y, z = (jacobian * directions[:, None]).chunk(3, -1)
         along = x + y + z
         weighted, plain = torch.cat([weighted, -along * share[:, None]], -1), torch.cat([jacobian, along], -1)
@@ -110,28 +100,18 @@ def smoothed_norms(residual: Float[Tensor, "*b k"], floor: float) -> Float[Tenso
     return torch.where(norms > floor, norms, (norms.square() + floor**2) / (2 * floor))
 
 
-def _minimum_in_box(
-    quadratic: _Quadratic, held: tuple[Bool[Tensor, "b p"], Bool[Tensor, "b p"]] | None, passes: int
-) -> tuple[Float[Tensor, "b p"], tuple[Bool[Tensor, "b p"], Bool[Tensor, "b p"]]]:
+def _minimum_in_box(quadratic: _Quadratic, passes: int) -> Float[Tensor, "b p"]:
     """Minimum of the quadratic in its box, by a primal-dual active set.
 
     Each unknown is free, held at its lower bound or held at its upper bound. A pass minimises over the free unknowns. Then
     a free unknown beyond a bound is held there, and a held unknown is released if the slope pulls it back inside. Most
     sets settle in two or three passes; passes after the first one see only the rows whose set has changed.
-
-    Args:
-        held: Unknowns held at their lower and upper bounds by the previous reweighting.
-
-    Returns:
-        The minimum, clamped to the box, and the unknowns held at either bound.
     """
     lower, upper, gradient = quadratic.lower, quadratic.upper, quadratic.gradient
     # Joints that cannot move have equal bounds: they stay at the lower one whatever the slope.
     frozen = lower >= upper
-    if held is None:
-        # First guess: a bound already reached, with the steepest descent pointing out of the box.
-        held = (lower >= 0) & (gradient > 0), (upper <= 0) & (gradient < 0)
-    at_lower, at_upper = held[0] | frozen, held[1] & ~frozen
+    # First guess: a bound already reached, with the steepest descent pointing out of the box.
+    at_lower, at_upper = (lower >= 0) & (gradient > 0) | frozen, (upper <= 0) & (gradient < 0) & ~frozen
     step, at_lower, at_upper, changed = _pass(quadratic, at_lower, at_upper)
     for _ in range(passes - 1):
         rows = changed.nonzero()[:, 0]
@@ -139,7 +119,7 @@ def _minimum_in_box(
             break
         again = _pass(quadratic.rows(rows), at_lower[rows], at_upper[rows])
         step[rows], at_lower[rows], at_upper[rows], changed[rows] = again
-    return torch.minimum(torch.maximum(step, lower), upper), (at_lower, at_upper)
+    return torch.minimum(torch.maximum(step, lower), upper)
 
 
 def _pass(
