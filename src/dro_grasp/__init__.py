@@ -13,8 +13,8 @@ from typing import Any
 
 from dro_grasp._version import __version__ as __version__
 
-_LIST = ast.parse(pkgutil.get_data(__name__, "__init__.pyi") or b"")
-_EXPORTS = {alias.name: str(node.module) for node in _LIST.body if isinstance(node, ast.ImportFrom) for alias in node.names}
+_EXPORTS = {alias.name: str(node.module) for node in ast.parse(pkgutil.get_data(__name__, "__init__.pyi") or b"").body
+            if isinstance(node, ast.ImportFrom) for alias in node.names}
 """Module of each public name."""
 __all__ = list(_EXPORTS)  # pyright: ignore[reportUnsupportedDunderAll]
 

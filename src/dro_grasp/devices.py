@@ -1,4 +1,4 @@
-"""Devices and cores of this machine, quick products and time spent on them; records of tensors: moved to a device, cached."""
+"""Devices and cores of this machine, and time spent on them. Records of tensors: moved to a device, cached."""
 
 from __future__ import annotations
 

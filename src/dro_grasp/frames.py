@@ -1,4 +1,4 @@
-"""Frames: their six half-axes as names, directions and bins of directions, and their poses in JSON files."""
+"""Frames: the names of their half-axes, and their poses in JSON files."""
 
 from __future__ import annotations
 

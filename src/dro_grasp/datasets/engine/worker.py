@@ -99,7 +99,8 @@ def shard_seed(seed: int, shard: Shard) -> int:
     return int.from_bytes(hashlib.sha256(text).digest()[:6], "big")
 
 
-_hand, _object = lru_cache(maxsize=16)(load_hand), lru_cache(maxsize=16)(load_object)
+_hand = lru_cache(maxsize=16)(load_hand)
+_object = lru_cache(maxsize=16)(load_object)
 
 
 def make_shard(job: Job, task: Task) -> FinishedShard:
