@@ -226,7 +226,7 @@ def test_real_shards_hold_valid_grasps_repeat_and_add_up(tmp_path):
     points = load_hand("barrett").with_points(64).points(found.joints, found.T_object_wrist)
     apart = (points[:, None] - points).norm(dim=-1).mean(-1) + torch.eye(len(found))
     assert apart.min() >= DUPLICATE_DISTANCE  # also across shards
-    hand, can = worker._hand("barrett"), worker._object("can", 1.0)
+    hand, can = worker._hand("barrett"), worker._object("can", scale=1.0)
     again, _ = valid_grasps(hand, can, shard_seed(0, Shard("barrett", "can", 0)), TINY)
     assert torch.equal(again.joints, GraspBatch.load(Shard("barrett", "can", 0).path(tmp_path)).joints)
 

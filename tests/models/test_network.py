@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dro_grasp import devices
 from dro_grasp.devices import fast_products
 from dro_grasp.errors import OptionError
-from dro_grasp.models import precision
 from dro_grasp.models.attention import Attention
 from dro_grasp.models.encoder import SLOPE, EdgeLayer, StaticGraphEncoder, nearest_neighbours
 from dro_grasp.models.latent import FlowPrior
@@ -240,7 +240,7 @@ def test_wrist_frame_turns_with_the_wrist() -> None:
 
 
 def test_caller_keeps_the_precision_setting(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(precision, "quick_path_is_accurate", lambda: True)
+    monkeypatch.setattr(devices, "quick_path_is_accurate", lambda: True)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     before = torch.get_float32_matmul_precision()
     inside = []
@@ -256,7 +256,7 @@ def test_caller_keeps_the_precision_setting(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_inaccurate_processors_keep_full_precision(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(precision, "quick_path_is_accurate", lambda: False)
+    monkeypatch.setattr(devices, "quick_path_is_accurate", lambda: False)
     before = torch.get_float32_matmul_precision()
     with fast_products():
         assert torch.get_float32_matmul_precision() == before

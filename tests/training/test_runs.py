@@ -20,7 +20,7 @@ from dro_grasp.cli.main import main
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.errors import OptionError, OutputError, TrainingError
 from dro_grasp.models.network import DistanceNetwork
-from dro_grasp.training import loop, pretraining
+from dro_grasp.training import loop, losses, pretraining
 from dro_grasp.training.config import ScheduleConfig
 from dro_grasp.training.run_folder import CHECKPOINT, LOG
 from dro_grasp.training.runs import TrainingRun, check_schedule, learning_rate_share
@@ -93,14 +93,14 @@ def test_a_run_killed_before_its_first_checkpoint_begins_a_new_log(bundle: Bundl
 def test_a_loss_that_is_not_finite_stops_and_leaves_a_sound_checkpoint(
     bundle: Bundle, finished: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    calls, honest = [], loop.placement_loss
+    calls, honest = [], losses.placement_loss
 
     def poisoned(*values: torch.Tensor) -> torch.Tensor:
         calls.append(1)
         return honest(*values) * (math.nan if len(calls) == 6 else 1)
 
     with monkeypatch.context() as patch:
-        patch.setattr(loop, "placement_loss", poisoned)
+        patch.setattr(losses, "placement_loss", poisoned)
         with pytest.raises(TrainingError, match=r"^placement is not finite at step 5"):
             run_stage("train", bundle, tmp_path / "run")
     state = torch.load(tmp_path / "run" / CHECKPOINT, weights_only=True)
