@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from report import emit
 
-from dro_grasp.datasets.bundle.splits import HELD_OUT_HANDS
+from dro_grasp.datasets.bundle.training_file import HELD_OUT_HANDS
 from dro_grasp.evaluation.metrics import wilson_interval
 from dro_grasp.evaluation.success_rates import pair_seed
 from dro_grasp.hands.library import load_hand

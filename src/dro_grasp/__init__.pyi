@@ -19,6 +19,7 @@ from dro_grasp.hands.check import HandReport as HandReport, check_hand as check_
 from dro_grasp.hands.hand import Hand as Hand
 from dro_grasp.hands.library import hand_names as hand_names, load_hand as load_hand
 from dro_grasp.hands.procedural.making import MadeHand as MadeHand, make_hand as make_hand
+from dro_grasp.hands.variants import vary_hand as vary_hand
 from dro_grasp.models.checkpoints import load_weights as load_weights, save_weights as save_weights
 from dro_grasp.models.presets import NetworkConfig as NetworkConfig
 from dro_grasp.objects.catalogue import load_object as load_object, object_names as object_names
