@@ -9,8 +9,7 @@ import argparse
 from collections import Counter
 from pathlib import Path
 
-from dro_grasp.datasets.engine.shards import find_shards, read_yield
-from dro_grasp.datasets.engine.yields import Yield
+from dro_grasp.datasets.engine.shards import Yield, find_shards, read_yield
 from dro_grasp.evaluation.metrics import wilson_interval
 from dro_grasp.hands.procedural.making import make_hand
 
