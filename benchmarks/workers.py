@@ -12,7 +12,8 @@ from pathlib import Path
 from report import emit
 from synthesis import HANDS
 
-from dro_grasp.datasets.engine.schedule import DatasetReport, EngineConfig, synthesize_dataset
+from dro_grasp.datasets.engine.schedule import DatasetReport, synthesize_dataset
+from dro_grasp.datasets.engine.worker import EngineConfig
 
 OBJECTS = ("sphere", "can", "bottle", "mug")
 """Built-in objects, one shard for each hand; their geometry is in the cache after the first run."""
