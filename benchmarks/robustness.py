@@ -96,13 +96,13 @@ def measure(samples: list[Sample], rules: Protocol) -> list[Outcome]:
     return outcomes
 
 
-def row(what: str, samples: list[Sample], rules: Protocol) -> list[object]:
-    """A line of the table."""
-    single, several = measure(samples, protocol("strict")), measure(samples, rules)
+def row(what: str, single: list[Outcome], several: list[Outcome]) -> list[object]:
+    """A line of the table, from the outcomes under `strict` and under a protocol with several trials of each grasp."""
     strict, success = (torch.cat([o.result.success for o in outcomes]) for outcomes in (single, several))
     held = torch.cat([o.result.robustness for o in several])
     reasons = Counter(f.value for o in several for f in o.result.failure if f).most_common(2)
-    fingers, everyone = finger_contact(torch.cat([o.result.fingers_in_contact for o in single]), single[0].fingers)
+    shares = torch.cat([o.result.fingers_in_contact / o.fingers for o in single])
+    fingers, everyone = finger_contact(shares, 1)
     return [
         what, len(success), percent(*rate(strict)), percent(*rate(success)), percent(*mean_share(held)),
         *(f"{100 * float(((held >= low) & (held < high)).float().mean()):.0f}" for low, high in BANDS),
@@ -129,15 +129,20 @@ def main() -> None:
     parser.add_argument("--causes", action="store_true", help="also measure each condition alone")
     options = parser.parse_args()
     robust = protocol("robust")
-    samples = {name: list(stored(name, options.num)) for name in STORED}
-    rows = [row(f"{name}, stored", found, robust) for name, found in samples.items()]
-    rows.append(row("all, stored", [s for found in samples.values() for s in found], robust))
-    rows += [row(f"{name}, predicted", list(predicted(name)), robust) for name in PREDICTED]
+    samples = {f"{name}, stored": list(stored(name, options.num)) for name in STORED}
+    samples |= {f"{name}, predicted": list(predicted(name)) for name in PREDICTED}
+    single = {name: measure(found, protocol("strict")) for name, found in samples.items()}
+    several = {name: measure(found, robust) for name, found in samples.items()}
+    rows = [row(name, single[name], several[name]) for name in samples]
+    of_all = [[o for name in STORED for o in outcomes[f"{name}, stored"]] for outcomes in (single, several)]
+    rows.insert(len(STORED), row("all, stored", *of_all))
     if options.causes:
+        name = f"{STORED[1]}, stored"
         everything, none = robust.perturbations, Perturbations(trials=8, needed=6)
         for cause, fields in CAUSES.items():
-            alone = replace(none, **{name: getattr(everything, name) for name in fields})
-            rows.append(row(f"{STORED[1]}, {cause} alone", samples[STORED[1]], replace(robust, perturbations=alone)))
+            alone = replace(none, **{field: getattr(everything, field) for field in fields})
+            measured = measure(samples[name], replace(robust, perturbations=alone))
+            rows.append(row(f"{name}, {cause} alone", single[name], measured))
     columns = ["grasps", "n", "`strict` [%]", "`robust` [%]", "trials held [%]", "8 of 8 [%]", "6 or 7", "4 or 5", "fewer",
                "fingers (all) [%]", "cost", "failures"]
     emit("Grasps under `robust`, beside `strict`", rows, columns, {"rows": [dict(zip(columns, r, strict=True)) for r in rows]},

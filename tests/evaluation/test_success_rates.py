@@ -36,7 +36,7 @@ from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import refine, scored
 from dro_grasp.predictor import GraspPredictor, GraspRequest, Prediction
 from dro_grasp.simulation.outcome import TrialResult
-from dro_grasp.simulation.protocols import protocol
+from dro_grasp.simulation.protocols import Perturbations, protocol
 from dro_grasp.simulation.trial import simulate
 
 HANDS = ("gripper3", "barrett")
@@ -68,14 +68,16 @@ def test_every_source_has_its_stages_for_every_hand_and_on_average(rows: list[Ro
 def test_raw_and_ranked_rows_are_what_single_trials_say(rows: list[Row]) -> None:
     hand, predictor = load_hand("barrett"), GraspPredictor()
     for stage, best in ((RAW, RANKED), (REFINED, BEST)):
-        passed, passed_best, passed_first, held = [], [], [], []
+        passed, passed_best, passed_first, held, fingers = [], [], [], [], []
         for name in OBJECTS:
             obj = load_object(name)
             seed = pair_seed(0, hand, obj)
             grasps = predictor.predict(hand, obj, num=8, seed=seed, candidates=1, refine=False, method="network")
             if stage == REFINED:
                 grasps = refine(GraspProblem(hand, obj), grasps)
-            passed.append(simulate(hand, obj, grasps, "strict").success)
+            strict = simulate(hand, obj, grasps, "strict")
+            passed.append(strict.success)
+            fingers.append(strict.fingers_in_contact)
             order = scored(GraspProblem(hand, obj), grasps).score.argsort(descending=True)[:2]
             passed_best.append(simulate(hand, obj, grasps[order], "strict").success)
             passed_first.append(simulate(hand, obj, grasps[order[:1]], "strict").success)
@@ -83,6 +85,9 @@ def test_raw_and_ranked_rows_are_what_single_trials_say(rows: list[Row]) -> None
             held.append(first.displacement[first.success, -1])
         assert find(rows, NETWORK, stage, "barrett").success["strict/1"][0] == float(torch.cat(passed).float().mean())
         assert find(rows, NETWORK, best, "barrett").success["strict/1"][0] == float(torch.cat(passed_best).float().mean())
+        counts = torch.cat(fingers)
+        assert find(rows, NETWORK, stage, "barrett").fingers["strict/1"] == pytest.approx(
+            (float(counts.float().mean()) / 3, float((counts == 3).float().mean())))
         if stage == REFINED:
             alone = find(rows, NETWORK, "refined, top 1", "barrett").success["strict/1"][0]
             assert alone == float(torch.cat(passed_first).float().mean())
@@ -127,6 +132,9 @@ def test_the_average_is_over_hands(rows: list[Row]) -> None:
         mean, low, high = whole.success["dro/1"]
         assert mean == pytest.approx(sum(p.success["dro/1"][0] for p in parts) / 2)
         assert low <= mean <= high
+        for i in range(2):
+            assert whole.fingers["dro/1"][i] == pytest.approx(sum(p.fingers["dro/1"][i] for p in parts) / 2)
+        assert whole.trials_held == {}
         assert whole.num == sum(p.num for p in parts)
         assert whole.diversity == pytest.approx(sum(p.diversity for p in parts) / 2)
         assert whole.seconds["network"] > 0
@@ -153,6 +161,23 @@ def test_grasps_that_all_fail_have_no_means(monkeypatch: pytest.MonkeyPatch) -> 
     assert row.success["dro/1"][0] == 0
     assert math.isnan(row.displacement)
     assert row.diversity == 0
+
+
+def test_trials_held_stand_beside_the_success_of_a_protocol_that_perturbs() -> None:
+    hands, obj = [load_hand(n) for n in HANDS], load_object("can")
+    few = dataclasses.replace(protocol("robust"), perturbations=Perturbations(trials=3, needed=2, shift=0.01))
+    config = dataclasses.replace(CONFIG, num=6, stages=(RAW,), controls=False, protocols=(protocol("dro"), few))
+    first, second, whole = benchmark(hands, [obj], GraspPredictor(), config)
+    for hand, row in zip(hands, (first, second), strict=True):
+        grasps = GraspPredictor().predict(
+            hand, obj, num=6, seed=pair_seed(0, hand, obj), candidates=1, refine=False, method="network")
+        alone = simulate(hand, obj, grasps, few)
+        assert row.success[few.label][0] == pytest.approx(float(alone.success.float().mean()))
+        assert set(row.trials_held) == {few.label}
+        mean, low, high = row.trials_held[few.label]
+        assert mean == pytest.approx(float(alone.robustness.mean()))
+        assert low <= mean <= high
+    assert whole.trials_held[few.label][0] == pytest.approx((first.trials_held[few.label][0] + mean) / 2)
 
 
 @pytest.mark.parametrize("view", ["cloud", "half", "depth"])
@@ -190,8 +215,11 @@ def test_the_command_prints_rows_and_json(capsys: pytest.CaptureFixture[str]) ->
     (row,) = json.loads(capsys.readouterr().out)["rows"]
     assert row["stage"] == RAW
     assert row["num"] == 4
+    fingers, everyone = row["fingers"]["dro/1"]
+    assert 0 < fingers <= 1
     assert main(command) == 0
     line = next(x for x in capsys.readouterr().out.splitlines() if x.startswith("| network"))
     assert f"| {100 * row['success']['dro/1'][0]:.1f} [" in line
+    assert f" | {100 * fingers:.0f} ({100 * everyone:.0f}) | " in line
     assert main(["benchmark", "--hands", "gripper3", "--objects", "can", "--num", "0"]) == 2
     assert "ask for at least one grasp" in capsys.readouterr().err

@@ -97,7 +97,11 @@ def test_text_says_what_is_known(grasps: GraspBatch) -> None:
     assert describe(grasps, 0).splitlines()[1].startswith("**success** under dro/1")
     assert "failed" in describe(grasps, 1)
     assert "displacement 4.00 mm" in describe(grasps, 0)
+    assert "robustness" not in describe(grasps, 0)
     assert "not evaluated" in describe(grasps.without_trial(), 0)
+    n = len(grasps)
+    several = grasps.replace(robustness=torch.full((n,), 0.75), fingers_in_contact=torch.full((n,), 3.0))
+    assert describe(several, 0).endswith("robustness 75.00 %  \nfingers in contact 3")
 
 
 def test_nothing_to_show_and_foreign_hands_are_refused(grasps: GraspBatch) -> None:

@@ -95,9 +95,10 @@ class Benchmark:
             title += f", view '{self.view}'"
         if self.views > 1:
             title += f", {self.views} views"
-        columns = ["grasps", "stage", "hand", "n", *rows[0].success, "shift [mm]", "turn [deg]", "diversity", "ROC area",
-                   "ms a grasp"]
-        say(title + "; success in % with 95 % intervals; ROC area of the score for each protocol\n")
+        columns = ["grasps", "stage", "hand", "n", *rows[0].success, *(f"{label} trials" for label in rows[0].trials_held),
+                   "fingers", "shift [mm]", "turn [deg]", "diversity", "ROC area", "ms a grasp"]
+        say(title + "; success, and trials held where a grasp has several, in % with 95 % intervals; for each protocol fingers "
+            "in contact (grasps with all of them) in %, and ROC area of the score\n")
         for line in [columns, ["---"] * len(columns), *map(cells, rows)]:
             say("| " + " | ".join(map(str, line)) + " |")
         say(f"\n{seconds:.0f} s")
@@ -106,10 +107,12 @@ class Benchmark:
 
 def cells(row: Row) -> list[object]:
     """A row's cells for people."""
-    rates = [f"{100 * p:.1f} [{100 * low:.0f}-{100 * high:.0f}]" for p, low, high in row.success.values()]
+    shares = (*row.success.values(), *row.trials_held.values())
+    rates = [f"{100 * p:.1f} [{100 * low:.0f}-{100 * high:.0f}]" for p, low, high in shares]
+    fingers = " / ".join(f"{100 * share:.0f} ({100 * everyone:.0f})" for share, everyone in row.fingers.values())
     areas = " / ".join("-" if math.isnan(area) else f"{area:.2f}" for area in row.ranking.values())
     parts = " + ".join(f"{1e3 * seconds:.0f} {name}" for name, seconds in row.seconds.items())
     return [
-        row.grasps, row.stage, row.hand, row.num, *rates, f"{1e3 * row.displacement:.1f}",
+        row.grasps, row.stage, row.hand, row.num, *rates, fingers, f"{1e3 * row.displacement:.1f}",
         f"{math.degrees(row.rotation):.1f}", f"{row.diversity:.3f}", areas, parts,
     ]

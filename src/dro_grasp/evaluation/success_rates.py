@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.evaluation.controls import mean_grasp, mean_grasps, palm_facing_starts
-from dro_grasp.evaluation.metrics import diversity, roc_area, wilson_interval
+from dro_grasp.evaluation.metrics import diversity, finger_contact, mean_share, roc_area, wilson_interval
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
@@ -89,10 +89,12 @@ class EvaluatedGrasps:
     """One for each protocol."""
     seconds: dict[str, float]
     """Time to make one grasp, by part [s]."""
+    fingers: int
+    """Fingers of the hand."""
 
     def rows(self, index: Int[Tensor, " k"]) -> EvaluatedGrasps:
         """Some of the grasps; the outcome of a trial depends on nothing but the grasp."""
-        return EvaluatedGrasps(self.grasps[index], tuple(r.rows(index) for r in self.results), self.seconds)
+        return EvaluatedGrasps(self.grasps[index], tuple(r.rows(index) for r in self.results), self.seconds, self.fingers)
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,11 @@ class Row:
     """Mean rotation of the object, likewise [rad]."""
     diversity: float
     """The paper's measure over successes of the first protocol, mixing m and rad as the paper does."""
+    trials_held: dict[str, tuple[float, float, float]]
+    """Mean share of its trials that a grasp holds in, likewise, per protocol with several trials of each grasp."""
+    fingers: dict[str, tuple[float, float]]
+    """Per protocol the mean share of the hand's fingers that touch the object after closing, and the share of grasps with
+    all of them."""
     ranking: dict[str, float]
     """Per protocol the area under the ROC curve of score against success, within each pair."""
     seconds: dict[str, float]
@@ -212,7 +219,7 @@ def _stages(source: _Source, obj: ObjectModel, config: BenchmarkConfig) -> Itera
         if grasps.score.isnan().any():
             grasps = scored(problem, grasps)
         results = tuple(simulate(problem.hand, obj, grasps, rules, workers=config.workers) for rules in config.protocols)
-        evaluated = EvaluatedGrasps(grasps, results, seconds)
+        evaluated = EvaluatedGrasps(grasps, results, seconds, len(problem.hand.fingers))
         if whole in wanted:
             yield whole, evaluated
         for stage, count in best.items():
@@ -223,10 +230,13 @@ def _stages(source: _Source, obj: ObjectModel, config: BenchmarkConfig) -> Itera
 def _row(source: str, stage: str, parts: list[EvaluatedGrasps], protocols: Sequence[Protocol]) -> Row:
     """One hand's line."""
     success = [torch.cat([t.results[i].success for t in parts]) for i in range(len(protocols))]
-    rates = {}
-    for rules, passed in zip(protocols, success, strict=True):
-        k, n = int(passed.sum()), len(passed)
+    rates, held_in, fingers = {}, {}, {}
+    for i, rules in enumerate(protocols):
+        k, n = int(success[i].sum()), len(success[i])
         rates[rules.label] = (k / n, *wilson_interval(k, n))
+        if rules.perturbations.trials > 1:
+            held_in[rules.label] = mean_share(torch.cat([t.results[i].robustness for t in parts]))
+        fingers[rules.label] = finger_contact(torch.cat([t.results[i].fingers_in_contact for t in parts]), parts[0].fingers)
     held = GraspBatch.concatenate([t.grasps.replace(extra={}) for t in parts])[success[0]]
     first = [t.results[0] for t in parts]
     areas = {
@@ -238,24 +248,32 @@ def _row(source: str, stage: str, parts: list[EvaluatedGrasps], protocols: Seque
         source, stage, parts[0].grasps.hand, len(success[0]), rates,
         displacement=float(torch.cat([r.displacement[r.success, -1] for r in first]).mean()),
         rotation=float(torch.cat([r.rotation[r.success, -1] for r in first]).mean()),
-        diversity=diversity(held.T_object_wrist, held.joints)["all"], ranking=areas, seconds=seconds,
+        diversity=diversity(held.T_object_wrist, held.joints)["all"], trials_held=held_in, fingers=fingers, ranking=areas,
+        seconds=seconds,
     )
 
 
 def _average(rows: list[Row]) -> Row:
     """The mean over hands; its interval is that of all grasps, of which every hand has the same number."""
     total = sum(r.num for r in rows)
-    success = {}
-    for label in rows[0].success:
-        mean = _mean([r.success[label][0] for r in rows])
-        success[label] = (mean, *wilson_interval(round(mean * total), total))
     return replace(
-        rows[0], hand=ALL, num=total, success=success,
+        rows[0], hand=ALL, num=total, success=_average_rates([r.success for r in rows], total),
+        trials_held=_average_rates([r.trials_held for r in rows], total),
+        fingers={
+            label: (_mean([r.fingers[label][0] for r in rows]), _mean([r.fingers[label][1] for r in rows]))
+            for label in rows[0].fingers
+        },
         displacement=_mean([r.displacement for r in rows]), rotation=_mean([r.rotation for r in rows]),
         diversity=_mean([r.diversity for r in rows]),
         ranking={label: _mean([r.ranking[label] for r in rows]) for label in rows[0].ranking},
         seconds={name: _mean([r.seconds[name] for r in rows]) for name in rows[0].seconds},
     )
+
+
+def _average_rates(rates: list[dict[str, tuple[float, float, float]]], total: int) -> dict[str, tuple[float, float, float]]:
+    """Per protocol the mean over hands, with the interval of as many grasps."""
+    means = {label: _mean([rate[label][0] for rate in rates]) for label in rates[0]}
+    return {label: (mean, *wilson_interval(round(mean * total), total)) for label, mean in means.items()}
 
 
 def _mean(values: Sequence[float]) -> float:

@@ -18,6 +18,9 @@ from dro_grasp.simulation.protocols import Perturbations
 FACTORS = ("friction", "mass", "gain")
 """Conditions that are factors, as in Perturbations."""
 
+RESOLUTION = 1e-4
+"""Grasps that agree to this have the same draws [m or rad]. Ours: another machine rounds otherwise."""
+
 
 @dataclass(frozen=True)
 class Conditions:
@@ -60,8 +63,7 @@ def draw(config: Perturbations, grasps: GraspBatch) -> Conditions:
 
 def _generator(position: Float[Tensor, "3"], joints: Float[Tensor, " n_dof"]) -> np.random.Generator:
     """The random numbers of a grasp."""
-    # Adding zero turns -0 into 0, which is the same grasp.
-    content = torch.cat([position, joints]).to(torch.float32).add(0.0).numpy().tobytes()
+    content = (torch.cat([position, joints]).double() / RESOLUTION).round().long().numpy().tobytes()
     return np.random.default_rng(int.from_bytes(hashlib.sha256(content).digest()[:16], "big"))
 
 
