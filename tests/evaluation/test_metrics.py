@@ -11,10 +11,12 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import mannwhitneyu
 
 from dro_grasp.datasets.bundle.training_file import Bundle
-from dro_grasp.evaluation.controls import mean_grasp, mean_grasps, palm_facing_starts
+from dro_grasp.evaluation.controls import CHOICE_POINTS, mean_grasp, mean_grasps, palm_facing_starts
 from dro_grasp.evaluation.metrics import diversity, finger_contact, mean_share, roc_area, wilson_interval
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.pipeline.choice import ChoiceConfig, choice_scores
+from dro_grasp.pipeline.problem import GraspProblem
 from tests.helpers.tiny_bundle import SEMIAXES, ellipsoid, made_up_grasps, tiny_bundle
 from tests.helpers.toy_hand import toy_hand
 
@@ -100,8 +102,8 @@ def test_mean_grasp_is_the_mean_in_the_wrist_frame(bundle: Bundle) -> None:
 
 
 def test_mean_grasps_ignore_the_shape(bundle: Bundle) -> None:
-    mean = mean_grasp(bundle, "toy")
-    ball, egg = (mean_grasps(HAND, obj, mean, 12, 3) for obj in (bare("ball"), bare("egg", 0.5)))
+    mean, first = mean_grasp(bundle, "toy"), ChoiceConfig(draws=1)
+    ball, egg = (mean_grasps(GraspProblem(HAND, obj), mean, 12, 3, first) for obj in (bare("ball"), bare("egg", 0.5)))
     assert torch.equal(ball.joints, egg.joints)
     assert torch.equal(ball.joints, mean.joints.expand(12, -1))
     assert torch.equal(ball.T_object_wrist[:, :3, :3], egg.T_object_wrist[:, :3, :3])
@@ -109,6 +111,17 @@ def test_mean_grasps_ignore_the_shape(bundle: Bundle) -> None:
         T = torch.linalg.inv(grasps.T_object_wrist)
         seen = T[:, :3, :3] @ torch.from_numpy(obj.cloud.mean(0)) + T[:, :3, 3]
         torch.testing.assert_close(seen, mean.object_centre.expand(12, 3), atol=1e-5, rtol=0)
+
+
+def test_the_chosen_rotation_of_a_mean_grasp_is_the_best_of_its_draws(bundle: Bundle) -> None:
+    problem, mean, config = GraspProblem(HAND, bare("egg", 0.5)), mean_grasp(bundle, "toy"), ChoiceConfig(draws=6)
+    every = mean_grasps(problem, mean, 4 * config.draws, 3, ChoiceConfig(draws=1))
+    thin = problem.thinned(min(CHOICE_POINTS, HAND.n_points))
+    scores = choice_scores(thin, problem.field, thin.points(every.joints, every.T_object_wrist), config)
+    best = scores.unflatten(0, (4, config.draws)).argmax(-1) + config.draws * torch.arange(4)
+    chosen = mean_grasps(problem, mean, 4, 3, config)
+    torch.testing.assert_close(chosen.T_object_wrist, every.T_object_wrist[best])
+    assert scores.unflatten(0, (4, config.draws)).std(-1).min() > 0
 
 
 @pytest.mark.parametrize("name", list(SEMIAXES))
@@ -135,4 +148,4 @@ def test_controls_know_no_network(bundle: Bundle, monkeypatch: pytest.MonkeyPatc
     again = palm_facing_starts(HAND, obj, 8, 1)
     assert torch.equal(before.T_object_wrist, again.T_object_wrist)
     assert not torch.equal(before.T_object_wrist, palm_facing_starts(HAND, obj, 8, 2).T_object_wrist)
-    mean_grasps(HAND, obj, mean_grasp(bundle, "toy"), 8, 1)
+    mean_grasps(GraspProblem(HAND, obj), mean_grasp(bundle, "toy"), 8, 1, ChoiceConfig(draws=1))

@@ -57,12 +57,14 @@ def find(rows: list[Row], grasps: str, stage: str, hand: str) -> Row:
 
 def test_every_source_has_its_stages_for_every_hand_and_on_average(rows: list[Row]) -> None:
     names = {(r.grasps, r.stage) for r in rows}
-    assert names == {*((NETWORK, stage) for stage in STAGES), (START, RAW), (SYNTHESISED, RAW)}
+    assert names == {(source, stage) for source in (NETWORK, START, SYNTHESISED) for stage in STAGES}
     assert len(rows) == len(names) * 3
-    assert {r.num for r in rows if r.stage in {RAW, REFINED} and r.hand != ALL} == {16}
-    assert {r.num for r in rows if r.stage in {RANKED, BEST} and r.hand != ALL} == {4}
-    assert {(r.stage, r.num) for r in rows if r.stage in TOP and r.hand != ALL} == {
+    full = [r for r in rows if r.grasps != SYNTHESISED]  # the optimiser drops candidates that lose the object
+    assert {r.num for r in full if r.stage in {RAW, REFINED} and r.hand != ALL} == {16}
+    assert {r.num for r in full if r.stage in {RANKED, BEST} and r.hand != ALL} == {4}
+    assert {(r.stage, r.num) for r in full if r.stage in TOP and r.hand != ALL} == {
         ("refined, top 5", 10), ("refined, top 1", 2)}
+    assert all(12 <= r.num <= 16 for r in rows if (r.grasps, r.stage) == (SYNTHESISED, RAW) and r.hand != ALL)
 
 
 def test_raw_and_ranked_rows_are_what_single_trials_say(rows: list[Row]) -> None:

@@ -9,10 +9,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.datasets.bundle.training_file import Bundle
-from dro_grasp.geometry.se3 import apply, compose, random_rotations
+from dro_grasp.geometry.se3 import apply, apply_to_cloud, compose, random_rotations
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.pipeline.choice import ChoiceConfig, choice_scores
+from dro_grasp.pipeline.problem import GraspProblem
+
+CHOICE_POINTS = 160
+"""Hand points by which a rotation of the mean grasp is chosen; as many as the shipped weights see (ours)."""
 
 
 @dataclass(frozen=True)
@@ -37,12 +42,22 @@ def mean_grasp(bundle: Bundle, hand_name: str) -> MeanGrasp:
     return MeanGrasp(grasps.joints.mean(0), apply(T_wrist_object, centres).mean(0))
 
 
-def mean_grasps(hand: Hand, obj: ObjectModel, mean: MeanGrasp, num: int, seed: int) -> GraspBatch:
-    """The mean grasp at random wrist rotations about the object's centre."""
+def mean_grasps(
+    problem: GraspProblem, mean: MeanGrasp, num: int, seed: int, config: ChoiceConfig
+) -> GraspBatch:
+    """The mean grasp at random wrist rotations about the object's centre, each the best of `config.draws` as z is chosen.
+
+    With one draw, nothing looks at the object's shape.
+    """
+    hand, obj = problem.hand, problem.obj
     generator = torch.Generator().manual_seed(seed)
-    rotation = random_rotations(num, generator)
+    rotation = random_rotations(num * config.draws, generator)
     centre = torch.from_numpy(obj.cloud).mean(0)
     T = compose(rotation, centre - rotation @ mean.object_centre)
+    thin = problem.thinned(min(CHOICE_POINTS, hand.n_points))
+    points = apply_to_cloud(T.to(problem.device), thin.points(mean.joints.to(problem.device)).expand(len(T), -1, -1))
+    best = choice_scores(thin, problem.field, points, config).unflatten(0, (num, config.draws)).argmax(-1).cpu()
+    T = T.unflatten(0, (num, config.draws))[torch.arange(num), best]
     joints = mean.joints.expand(num, -1).contiguous()
     return GraspBatch.create(hand, obj, T, joints, seed=seed, provenance="control: mean grasp")
 

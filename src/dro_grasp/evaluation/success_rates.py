@@ -21,14 +21,14 @@ from dro_grasp.evaluation.metrics import diversity, finger_contact, mean_share, 
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimization.synthesis import synthesize
 from dro_grasp.perception.partial_views import View, partial_view
+from dro_grasp.pipeline.choice import ChoiceConfig
 from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.stages import refine, scored
+from dro_grasp.pipeline.stages import optimise, refine, scored
 from dro_grasp.predictor import GraspPredictor, GraspRequest
 from dro_grasp.simulation.outcome import TrialResult
 from dro_grasp.simulation.protocols import Protocol
-from dro_grasp.simulation.trial import settle, simulate
+from dro_grasp.simulation.trial import simulate
 
 RAW = "raw"
 """Stage: grasps as they come."""
@@ -46,16 +46,16 @@ NETWORK = "network"
 """Source: the network under test."""
 MEAN = "mean grasp"
 """Source: the mean of the training grasps at random rotations."""
+MEAN_CHOSEN = "mean grasp, chosen"
+"""Source: the same, each rotation chosen by geometry as z is."""
 START = "unoptimised start"
 """Source: half-closed hands that face the object."""
 SYNTHESISED = "synthesised"
-"""Source: synthesised and settled grasps."""
+"""Source: grasps that the optimiser makes without a network, settled."""
 ALL = "average"
 """Name of the row over all hands."""
 KEPT = 0.25
 """Share of the grasps of a pair that ranking keeps, before any trial."""
-CANDIDATES = 4
-"""Candidates that synthesis makes for each grasp it is asked for; the paper's baseline keeps its best as well."""
 
 
 @dataclass(frozen=True)
@@ -196,16 +196,17 @@ def _sources(
     if not config.controls:
         return
     if bundle is not None and hand.name in bundle.grasps:
-        yield _Source(MEAN, problem, mean_grasps(hand, obj, mean_grasp(bundle, hand.name), num, seed), {})
+        mean = mean_grasp(bundle, hand.name)
+        for name, choice in ((MEAN, ChoiceConfig(draws=1)), (MEAN_CHOSEN, ChoiceConfig())):
+            yield _Source(name, problem, mean_grasps(problem, mean, num, seed, choice), {})
     yield _Source(START, problem, palm_facing_starts(hand, obj, num, seed), {})
     begin = time.perf_counter()
-    settled = settle(hand, obj, synthesize(hand, obj, CANDIDATES * num, seed)[:num], workers=config.workers)
-    yield _Source(SYNTHESISED, problem, settled, {"synthesis": (time.perf_counter() - begin) / num})
+    yield _Source(SYNTHESISED, problem, optimise(problem, num, seed), {"synthesis": (time.perf_counter() - begin) / num})
 
 
 def _stages(source: _Source, obj: ObjectModel, config: BenchmarkConfig) -> Iterator[tuple[str, EvaluatedGrasps]]:
     """The stages asked for; what several of them share is made once. Trials see the whole object."""
-    asked = {RAW} if source.name in {START, SYNTHESISED} else set(config.stages)
+    asked = set(config.stages)
     problem, grasps, seconds = source.problem, source.grasps, source.seconds
     quarter = max(1, round(KEPT * len(grasps)))
     for whole, best in ((RAW, {RANKED: quarter}), (REFINED, {BEST: quarter, **TOP})):
