@@ -73,7 +73,7 @@ def toy_hand(dtype: torch.dtype = torch.float32) -> Hand:
         rigid_group=rigid_groups(tree), tip_offsets=torch.tensor([[0.0, 0.0, 0.04]] * 3).to(dtype),
         palm=0, palm_centre=torch.tensor([0.0, 0.0, 0.01]).to(dtype),
         palm_direction=torch.tensor([0.0, 0.0, 1.0]).to(dtype), grasp_centre=torch.tensor([0.0, 0.0, 0.045]).to(dtype),
-        opening_signs=torch.full((dof,), -1.0).to(dtype), movable=torch.ones(dof, dtype=torch.bool),
+        opening_signs=torch.full((dof,), -1.0).to(dtype), open_ends=tree.lower, movable=torch.ones(dof, dtype=torch.bool),
         rest=torch.zeros(dof).to(dtype), abduction=torch.zeros(dof, dtype=torch.bool),
         contact_links=tuple(range(tree.n_links)), sha256="toy",
     )

@@ -6,7 +6,6 @@ Source: paper section III-B and appendix, dataset preprocessing.
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -17,19 +16,9 @@ from torch import Tensor
 from dro_grasp.descriptions.loader import Description
 from dro_grasp.errors import HandError
 from dro_grasp.geometry.point_clouds import farthest_points
-from dro_grasp.hands.anatomy import (
-    Finger,
-    axes_along,
-    closing_gains,
-    find_fingers,
-    find_palm_link,
-    find_tips,
-    fixed_below,
-    path_to,
-    rigid_groups,
-)
+from dro_grasp.hands.anatomy import Finger, find_fingers, find_palm_link, find_tips, fixed_below, path_to, rigid_groups
+from dro_grasp.hands.closing import Closing, ClosingFinder
 from dro_grasp.hands.hand import Hand
-from dro_grasp.hands.palm import CLOSINGS, Palm, find_palm
 from dro_grasp.hands.surface import LinkSurface, sample_links
 from dro_grasp.kinematics.tree import FIXED
 
@@ -39,8 +28,6 @@ LARGEST_HAND = 1.5
 """Largest extent, from the palm on, that a hand in metres has [m] (ours)."""
 SMALLEST_HAND = 0.02
 """Smallest extent, from the palm on, that a hand in metres has [m] (ours)."""
-REFINEMENTS = 3
-"""Rounds in which opening signs and palm are derived from each other (ours)."""
 
 
 def build_hand(description: Description, *, name: str | None = None, seed: int = 0, n_points: int = 512) -> Hand:
@@ -58,18 +45,6 @@ def build_hand(description: Description, *, name: str | None = None, seed: int =
     keep = farthest_points(hand.points(hand.canonical_joints()), n_points).sort().values
     return dataclasses.replace(hand, link_points=hand.link_points[keep], link_normals=hand.link_normals[keep],
                                link_index=hand.link_index[keep])
-
-
-@dataclass(frozen=True)
-class Closing:
-    """The closing of a hand: direction of each joint, and the palm."""
-
-    opening_signs: Float[Tensor, " n_dof"]
-    """As in `Hand`."""
-    abduction: Bool[Tensor, " n_dof"]
-    """As in `Hand`."""
-    palm: Palm
-    """In the root link's frame."""
 
 
 class HandBuilder:
@@ -90,8 +65,8 @@ class HandBuilder:
             fingers=self.fingers, rigid_group=rigid_groups(tree), tip_offsets=self.tip_offsets(), palm=self.palm,
             palm_centre=to_palm(closing.palm.centre),
             palm_direction=T[:3, :3] @ torch.tensor(closing.palm.direction, dtype=torch.float32),
-            grasp_centre=to_palm(closing.palm.grasp_centre), opening_signs=closing.opening_signs, movable=self.movable,
-            rest=self.rest, abduction=closing.abduction, contact_links=tuple(i for i in self.links if i in collides),
+            grasp_centre=to_palm(closing.palm.grasp_centre), opening_signs=closing.opening_signs,
+            open_ends=closing.open_ends, movable=self.movable, rest=self.rest, abduction=closing.abduction, contact_links=tuple(i for i in self.links if i in collides),
             sha256=self.description.sha256, description=self.description,
         ).with_thumb()
 
@@ -163,53 +138,17 @@ class HandBuilder:
 
     @cached_property
     def closing(self) -> Closing:
-        """Opening signs, abduction joints and palm, refined together.
+        """From where and to where the joints close, and the palm."""
+        finder = ClosingFinder(self.tree, self.fingers, self.coarse, self.on_palm, self.rest, self.movable, self.stated)
+        try:
+            return finder.find()
+        except HandError as error:
+            raise self._error(str(error)) from error
 
-        A joint opens towards the limit at which its fingertips are farther from the grasp centre and from the palm, while
-        all other joints are at rest or half closed. The distance to the grasp centre tells closing from spreading; curled
-        fingers pass it, but come nearer to the palm all the way. A joint whose axis points out of the palm, at rest and with
-        bent fingers alike, only spreads the fingers.
-        """
-        tree, n_dof = self.tree, self.tree.n_dof
-        posed = self.coarse.posed(tree, self.rest)[0]
-        palm_middle = torch.tensor(posed[self.on_palm].mean(0))
-        centre = torch.tensor(self.coarse.posed(tree, (tree.lower + tree.upper) / 2)[0].mean(0))
-        tip_points = torch.stack([self.coarse.middle(tip) for tip in self.tips])
-        signs, abduction = -torch.ones(n_dof), torch.zeros(n_dof, dtype=torch.bool)
-        out_of_palm, found = abduction, None
-        for _ in range(REFINEMENTS):
-            bases = (self.rest, self.closed(signs, abduction, 0.5))
-            gains = torch.stack([closing_gains(tree, q, self.tips, tip_points, (centre, palm_middle)) for q in bases]).sum(0)
-            before = torch.cat([signs, abduction])
-            signs, abduction = torch.where((gains >= 0) | out_of_palm, -1.0, 1.0), out_of_palm
-            if found is None or not torch.equal(before, torch.cat([signs, abduction])):
-                found = self.examine(signs, abduction)
-            centre = torch.tensor(found.grasp_centre, dtype=torch.float32)
-            direction = torch.tensor(found.direction, dtype=torch.float32)
-            bent = self.closed(signs, torch.zeros_like(abduction), 0.5)
-            out_of_palm = axes_along(tree, self.rest, direction) & axes_along(tree, bent, direction)
-        assert found is not None
-        return Closing(signs, abduction & self.movable, found)
-
-    def closed(
-        self, signs: Float[Tensor, " n_dof"], abduction: Bool[Tensor, " n_dof"], share: float
-    ) -> Float[Tensor, " n_dof"]:
-        """Joints this share of the way from open to closed; those that are held or only spread fingers at rest."""
-        opened = torch.where(signs > 0, self.tree.upper, self.tree.lower)
-        closed = torch.where(signs > 0, self.tree.lower, self.tree.upper)
-        return torch.where(self.movable & ~abduction, opened + share * (closed - opened), self.rest)
-
-    def examine(self, signs: Float[Tensor, " n_dof"], abduction: Bool[Tensor, " n_dof"]) -> Palm:
-        """The palm at the closing where palm and fingers enclose a ball best."""
-        on_finger = [np.isin(self.coarse.link.numpy(), finger.chain) for finger in self.fingers]
-        palms = []
-        for share in CLOSINGS:
-            points, normals = self.coarse.posed(self.tree, self.closed(signs, abduction, share))
-            try:
-                palms.append(find_palm(points[self.on_palm], normals[self.on_palm], [points[mask] for mask in on_finger]))
-            except HandError as error:
-                raise self._error(str(error)) from error
-        return max(palms, key=lambda palm: palm.score)
+    @cached_property
+    def stated(self) -> Float[Tensor, " n_dof"]:
+        """The open posture that the file states [rad or m]; NaN where it states none."""
+        return torch.full_like(self.tree.lower, torch.nan)
 
     def tip_offsets(self) -> Float[Tensor, "n_tips 3"]:
         """Points beyond the fingertips, in the direction from the last joint through the middle of the tip's surface [m]."""

@@ -61,6 +61,8 @@ class Hand:
     """Centre of the volume that the half-closed hand encloses, in the palm frame [m]."""
     opening_signs: Float[Tensor, " n_dof"]
     """+1 for joints that open towards their upper limit, -1 for those that open towards their lower limit."""
+    open_ends: Float[Tensor, " n_dof"]
+    """Where each joint is open [rad or m]: at a limit, or at the widest span of a finger that folds back beyond it."""
     movable: Bool[Tensor, " n_dof"]
     """False for joints above the palm, which are held at rest."""
     rest: Float[Tensor, " n_dof"]
@@ -92,12 +94,27 @@ class Hand:
     @cached_tensor
     def thumb_opposition(self) -> Float[Tensor, " n_tips"]:
         """How much each finger closes against the others: -1 if all close alike, 1 if the others all close the opposite way."""
-        rate = -self.opening_signs * (self.tree.upper - self.tree.lower) * (self.movable & ~self.abduction)
+        rate = (self.closed_ends - self.open_ends) * (self.movable & ~self.abduction)
         return measure_opposition(self.tree, self.canonical_joints(1 - THUMB_CLOSING), rate, self.tips, self.tip_offsets)
 
     def with_thumb(self) -> Hand:
         """The same hand with its thumb found."""
         return dataclasses.replace(self, thumb=find_thumb(self.thumb_opposition))
+
+    @cached_tensor
+    def closed_ends(self) -> Float[Tensor, " n_dof"]:
+        """The limit towards which each joint closes [rad or m]."""
+        return torch.where(self.opening_signs > 0, self.tree.lower, self.tree.upper)
+
+    @cached_tensor
+    def lower(self) -> Float[Tensor, " n_dof"]:
+        """Least value of each joint in use [rad or m]: its lower limit, or its open end."""
+        return torch.minimum(self.open_ends, self.closed_ends)
+
+    @cached_tensor
+    def upper(self) -> Float[Tensor, " n_dof"]:
+        """Greatest value of each joint in use [rad or m]: its upper limit, or its open end."""
+        return torch.maximum(self.open_ends, self.closed_ends)
 
     @property
     def n_points(self) -> int:
@@ -130,9 +147,9 @@ class Hand:
         return self._spread_evenly(self._between(share.expand(n, self.tree.n_dof)))
 
     def random_joints(self, n: int, generator: torch.Generator) -> Float[Tensor, "n n_dof"]:
-        """Joints uniform within their limits [rad or m]; held joints at rest."""
+        """Joints uniform between their open and closed ends [rad or m]; held joints at rest."""
         share = torch.rand(n, self.tree.n_dof, generator=generator, device=generator.device).to(self.rest)
-        return torch.where(self.movable, self.tree.lower + share * (self.tree.upper - self.tree.lower), self.rest)
+        return torch.where(self.movable, self.lower + share * (self.upper - self.lower), self.rest)
 
     def _spread_evenly(self, q: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_dof"]:
         """Put joints that only spread the fingers at zero, or a quarter of their range inside their limits."""
@@ -142,10 +159,7 @@ class Hand:
 
     def _between(self, share: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_dof"]:
         """Joints this share of the way from closed to open; held joints at rest."""
-        lower, upper = self.tree.lower, self.tree.upper
-        opened = torch.where(self.opening_signs > 0, upper, lower)
-        closed = torch.where(self.opening_signs > 0, lower, upper)
-        return torch.where(self.movable, opened * share + closed * (1 - share), self.rest)
+        return torch.where(self.movable, self.open_ends * share + self.closed_ends * (1 - share), self.rest)
 
     def points(
         self, q: Float[Tensor, "*batch n_dof"], T_world_wrist: Float[Tensor, "*batch 4 4"] | None = None
@@ -271,4 +285,6 @@ class Hand:
         fingers = find_fingers(tree, plain.pop("tips"), plain["palm"])
         named = {stored: name for name, stored in STORED_AS.items()}
         own = {named.get(k, k): v for k, v in plain.items()}
+        # Bundles made before hands had open ends hold hands that open as far as they go.
+        own.setdefault("open_ends", torch.where(own["opening_signs"] > 0, tree.upper, tree.lower))
         return Hand(tree=tree, fingers=fingers, rigid_group=rigid_groups(tree), **own).with_thumb()

@@ -1,0 +1,233 @@
+"""How a hand closes: from which end of each joint's range to which, and on what side of the palm.
+
+The limits of most hands say it: fingers open as far as they go. A finger whose limits let it fold back behind the palm is
+open where it spans the most.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from dro_grasp.hands.anatomy import Finger, axes_along, closing_gains
+from dro_grasp.hands.opening import FingerMotion, Line, main_axis
+from dro_grasp.hands.palm import CLOSINGS, Palm, find_palm
+from dro_grasp.hands.surface import LinkSurface
+from dro_grasp.kinematics.tree import KinematicTree
+
+REFINEMENTS = 3
+"""Rounds in which opening signs and palm are derived from each other (ours)."""
+AT_LIMIT = 0.1
+"""Distance to a limit, as a share of the range, within which a joint is at this limit (ours)."""
+PATH = 65
+"""Postures on the way from closed to open at which a hand is examined (ours)."""
+
+
+@dataclass(frozen=True)
+class Closing:
+    """The closing of a hand: ends of each joint, and the palm."""
+
+    opening_signs: Float[Tensor, " n_dof"]
+    """As in `Hand`."""
+    open_ends: Float[Tensor, " n_dof"]
+    """As in `Hand` [rad or m]."""
+    abduction: Bool[Tensor, " n_dof"]
+    """As in `Hand`."""
+    palm: Palm
+    """In the root link's frame."""
+
+
+@dataclass(frozen=True)
+class ClosingFinder:
+    """What the closing of a hand is derived from."""
+
+    tree: KinematicTree
+    """Links and joints."""
+    fingers: tuple[Finger, ...]
+    """The fingers."""
+    coarse: LinkSurface
+    """Some samples of every link from the palm on."""
+    on_palm: Bool[np.ndarray, " n"]
+    """The samples on the palm."""
+    rest: Float[Tensor, " n_dof"]
+    """As in `Hand`."""
+    movable: Bool[Tensor, " n_dof"]
+    """As in `Hand`."""
+    stated: Float[Tensor, " n_dof"]
+    """The open posture that the hand's file states [rad or m]; NaN for joints of which it says nothing."""
+
+    def find(self) -> Closing:
+        """The closing between the limits, or from the widest posture of fingers that fold back beyond it."""
+        found = self.between_limits()
+        return self.from_widest() if bool(self.folded(found).any()) else found
+
+    def between_limits(self) -> Closing:
+        """Opening signs, abduction joints and palm, refined together.
+
+        A joint opens towards the limit at which its fingertips are farther from the grasp centre and from the palm, while
+        all other joints are at rest or half closed. The distance to the grasp centre tells closing from spreading; curled
+        fingers pass it, but come nearer to the palm all the way. A joint whose axis points out of the palm, at rest and with
+        bent fingers alike, only spreads the fingers.
+        """
+        tree, n_dof = self.tree, self.tree.n_dof
+        centre = _tensor(self.coarse.posed(tree, (tree.lower + tree.upper) / 2)[0].mean(0))
+        signs, abduction = -torch.ones(n_dof), torch.zeros(n_dof, dtype=torch.bool)
+        out_of_palm, palm = abduction, None
+        for _ in range(REFINEMENTS):
+            before = torch.cat([signs, abduction])
+            signs, abduction = self.signs_at_limits(signs, abduction, out_of_palm, centre), out_of_palm
+            if palm is None or not torch.equal(before, torch.cat([signs, abduction])):
+                palm = self.examine(self.opened(signs), signs, abduction)
+            centre = _tensor(palm.grasp_centre)
+            out_of_palm = self.out_of_palm(self.opened(signs), signs, palm)
+        assert palm is not None
+        return Closing(signs, self.opened(signs), abduction & self.movable, palm)
+
+    def from_widest(self) -> Closing:
+        """The closing of fingers that start from their widest span.
+
+        Where fingers fold as far to one side of the palm as to the other, limits do not tell the sides apart. So the hand is
+        spread as far from the palm's middle as it goes and closed to both sides; on the better one palm and fingers enclose
+        a ball best.
+        """
+        tree, start = self.tree, torch.where(self.stated.isnan(), self.rest, self.stated)
+        spread = self.motion.widest(self._from_middle, start, self.movable & self.stated.isnan())
+        velocity = self.motion.velocities(spread)
+        normal = main_axis(velocity.mT.reshape(-1, 3))
+        sides = []
+        for side in (normal, -normal):
+            signs = self.away_from_limits(spread, torch.where((velocity * side[:, None]).sum((0, 1)) >= 0, -1.0, 1.0))
+            sides.append((self.examine(spread, signs, torch.zeros_like(self.movable)), signs))
+        palm, signs = max(sides, key=lambda pair: pair[0].score)
+        abduction = self.out_of_palm(spread, signs, palm) & self.movable
+        axis = Line(_tensor(palm.centre), _tensor(palm.direction))
+        widest = self.motion.widest(axis.distance, start, self.movable & ~abduction & self.stated.isnan())
+        centre = _tensor(palm.grasp_centre)
+        for _ in range(REFINEMENTS):
+            signs = self.signs_at_limits(signs, abduction, abduction, centre)
+        at_limits = Closing(signs, self.opened(signs), abduction, palm)
+        folded = tree.moves[self.motion.links][self.folded(at_limits)].any(0) & ~abduction
+        signs = torch.where(folded, self.signs_from(widest, signs, abduction, centre), signs)
+        lower = torch.where(folded & (signs < 0), widest, tree.lower)
+        upper = torch.where(folded & (signs > 0), widest, tree.upper)
+        narrowed = dataclasses.replace(tree, lower=lower, upper=upper)
+        stated = torch.where(folded, widest, self.stated)
+        return dataclasses.replace(self, tree=narrowed, stated=stated).between_limits()
+
+    def signs_at_limits(
+        self, signs: Float[Tensor, " n_dof"], abduction: Bool[Tensor, " n_dof"], spreads: Bool[Tensor, " n_dof"],
+        centre: Float[Tensor, "3"],
+    ) -> Float[Tensor, " n_dof"]:
+        """Opening signs by what each joint does from limit to limit, with the others at rest or, by these signs, half closed.
+
+        Args:
+            signs: Opening signs so far.
+            abduction: The joints that are at rest when the hand is half closed.
+            spreads: Joints that do not close anything.
+            centre: The grasp centre [m].
+        """
+        bases = (self.rest, self.posture(self.opened(signs), signs, abduction, 0.5))
+        gains = torch.stack([self.gains(self.tree, q, centre) for q in bases]).sum(0)
+        return self.as_stated(torch.where((gains >= 0) | spreads, -1.0, 1.0))
+
+    def signs_from(
+        self, widest: Float[Tensor, " n_dof"], signs: Float[Tensor, " n_dof"], abduction: Bool[Tensor, " n_dof"],
+        centre: Float[Tensor, "3"],
+    ) -> Float[Tensor, " n_dof"]:
+        """Opening signs of joints that start from the widest posture: those that close each fingertip on the grasp centre.
+
+        The joints of a finger are decided together, because a thumb closes on the other fingers only as a whole.
+        """
+        for finger in self.fingers:
+            joints = (self.tree.moves[finger.tip] & self.movable & ~abduction).nonzero()[:, 0]
+            choices = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * len(joints)).reshape(-1, len(joints))
+            tried = signs.repeat(len(choices), 1)
+            tried[:, joints] = choices
+            tried = self.away_from_limits(widest, tried)
+            postures = torch.cat([self.posture(widest, tried, abduction, share) for share in CLOSINGS])
+            distance = (self.motion.tips(postures) - centre).norm(dim=-1).sum(-1).unflatten(0, (len(CLOSINGS), -1)).sum(0)
+            signs = tried[int(distance.argmin())]
+        return signs
+
+    def folded(self, closing: Closing) -> Bool[Tensor, " n_tips"]:
+        """Fingers that fold back before the joints are at their open ends."""
+        shares = torch.linspace(1, 0, PATH).tolist()
+        path = torch.stack([self.posture(closing.open_ends, closing.opening_signs, closing.abduction, s) for s in shares])
+        axis = Line(_tensor(closing.palm.centre), _tensor(closing.palm.direction))
+        return self.motion.folded(path, self.movable & ~closing.abduction, axis)
+
+    @cached_property
+    def motion(self) -> FingerMotion:
+        """How the joints move the middles of the fingertips."""
+        middles = torch.stack([self.coarse.middle(finger.tip) for finger in self.fingers])
+        return FingerMotion(self.tree, self.fingers, middles)
+
+    @cached_property
+    def palm_middle(self) -> Float[Tensor, "3"]:
+        """Mean of the palm's samples [m]."""
+        return _tensor(self.coarse.posed(self.tree, self.rest)[0][self.on_palm].mean(0))
+
+    def _from_middle(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, " *batch"]:
+        return (points - self.palm_middle).norm(dim=-1)
+
+    def gains(self, tree: KinematicTree, q: Float[Tensor, " n_dof"], centre: Float[Tensor, "3"]) -> Float[Tensor, " n_dof"]:
+        """How much each joint, from end to end, brings its fingertips nearer to the grasp centre and to the palm [m]."""
+        return closing_gains(tree, q, self.motion.links, self.motion.tip_points, (centre, self.palm_middle))
+
+    def opened(self, signs: Float[Tensor, " n_dof"]) -> Float[Tensor, " n_dof"]:
+        """The stated open posture; for other joints the limits towards which they open."""
+        limits = torch.where(signs > 0, self.tree.upper, self.tree.lower)
+        return torch.where(self.stated.isnan(), limits, self.stated)
+
+    def as_stated(self, signs: Float[Tensor, " n_dof"]) -> Float[Tensor, " n_dof"]:
+        """The signs, but a joint whose stated open posture is a limit opens towards it."""
+        return torch.where(self.stated.isnan(), signs, self.away_from_limits(self.stated, signs))
+
+    def away_from_limits(
+        self, opened: Float[Tensor, " n_dof"], signs: Float[Tensor, "*batch n_dof"]
+    ) -> Float[Tensor, "*batch n_dof"]:
+        """The signs, but joints that are open at one of their limits close towards the other one."""
+        room = AT_LIMIT * (self.tree.upper - self.tree.lower)
+        at_lower, at_upper = opened - self.tree.lower < room, self.tree.upper - opened < room
+        return torch.where(at_lower, -1.0, torch.where(at_upper, 1.0, signs))
+
+    def posture(
+        self, opened: Float[Tensor, " n_dof"], signs: Float[Tensor, "*batch n_dof"], abduction: Bool[Tensor, " n_dof"],
+        share: float,
+    ) -> Float[Tensor, "*batch n_dof"]:
+        """Joints this share of the way from open to closed; those that are held or only spread fingers at rest."""
+        closed = torch.where(signs > 0, self.tree.lower, self.tree.upper)
+        return torch.where(self.movable & ~abduction, opened + share * (closed - opened), self.rest)
+
+    def out_of_palm(
+        self, opened: Float[Tensor, " n_dof"], signs: Float[Tensor, " n_dof"], palm: Palm
+    ) -> Bool[Tensor, " n_dof"]:
+        """Joints whose axes point out of the palm, at rest and with bent fingers alike."""
+        bent = self.posture(opened, signs, torch.zeros_like(self.movable), 0.5)
+        direction = _tensor(palm.direction)
+        return axes_along(self.tree, self.rest, direction) & axes_along(self.tree, bent, direction)
+
+    def examine(
+        self, opened: Float[Tensor, " n_dof"], signs: Float[Tensor, " n_dof"], abduction: Bool[Tensor, " n_dof"]
+    ) -> Palm:
+        """The palm at the closing where palm and fingers enclose a ball best.
+
+        Raises:
+            HandError: They enclose nothing.
+        """
+        on_finger = [np.isin(self.coarse.link.numpy(), finger.chain) for finger in self.fingers]
+        palms = []
+        for share in CLOSINGS:
+            points, normals = self.coarse.posed(self.tree, self.posture(opened, signs, abduction, share))
+            palms.append(find_palm(points[self.on_palm], normals[self.on_palm], [points[mask] for mask in on_finger]))
+        return max(palms, key=lambda palm: palm.score)
+
+
+def _tensor(values: Float[np.ndarray, "3"]) -> Float[Tensor, "3"]:
+    return torch.tensor(values, dtype=torch.float32)

@@ -1,0 +1,125 @@
+"""How far a hand opens: the widest posture of its fingers, and fingers that fold back behind the palm beyond it.
+
+A joint's limits say how far it can move, not how far it is of use. A finger is open where it spans the most; one whose limits
+let it fold back closes on nothing on the way from there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from dro_grasp.geometry import se3
+from dro_grasp.hands.anatomy import Finger
+from dro_grasp.kinematics.tree import KinematicTree
+
+STEPS = 64
+"""Steps in which a joint's range, or the way from closed to open, is searched (ours)."""
+SWEEPS = 24
+"""Most rounds of the search over all joints (ours); hands need 1 to 10."""
+SAME_SPAN = 1e-4
+"""Spans that differ by less are the same [m] (ours)."""
+KNUCKLE = 0.5
+"""Range of a finger's knuckle, as a share of the widest range of its joints (ours); a metacarpal has less."""
+LEAST_REACH = 0.35
+"""Share of its widest reach below which a finger that opens farther folds back (ours). At the limits of their ranges, 16 hands
+that open as they should keep 0.44 to 1; a finger that points straight back behind its knuckle keeps 0 or less."""
+@dataclass(frozen=True)
+class Line:
+    """A straight line: the palm's axis."""
+
+    point: Float[Tensor, "3"]
+    """A point on it [m]."""
+    direction: Float[Tensor, "3"]
+    """Unit vector along it."""
+
+    def distance(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, " *batch"]:
+        """Distances of points to the line [m]."""
+        offset = points - self.point
+        return (offset - (offset @ self.direction)[..., None] * self.direction).norm(dim=-1)
+
+
+@dataclass(frozen=True)
+class FingerMotion:
+    """Fingertips as functions of joints, in the root link's frame."""
+
+    tree: KinematicTree
+    """Links and joints."""
+    fingers: tuple[Finger, ...]
+    """The fingers."""
+    tip_points: Float[Tensor, "n_tips 3"]
+    """A point on each fingertip, in its link's frame [m]."""
+
+    @property
+    def links(self) -> list[int]:
+        """The fingertips' links."""
+        return [finger.tip for finger in self.fingers]
+
+    def tips(self, q: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_tips 3"]:
+        """Positions of the fingertips [m]."""
+        return se3.apply(self.tree.forward(q)[..., self.links, :, :], self.tip_points)
+
+    def velocities(self, q: Float[Tensor, " n_dof"]) -> Float[Tensor, "n_tips 3 n_dof"]:
+        """Motion of each fingertip per motion of each joint [m/rad or m/m]."""
+        poses = self.tree.forward(q)
+        return self.tree.point_jacobian(poses, self.tips(q), torch.tensor(self.links))
+
+    def reaches(self, q: Float[Tensor, "*batch n_dof"], bends: Bool[Tensor, " n_dof"]) -> Float[Tensor, "*batch n_tips 3"]:
+        """From the knuckle of each finger to its tip [m]."""
+        poses = self.tree.forward(q)
+        knuckles = [self._knuckle(f, bends) for f in self.fingers]
+        return self.tips(q) - se3.apply(poses[..., knuckles, :, :], self.tree.anchor[knuckles])
+
+    def _knuckle(self, finger: Finger, bends: Bool[Tensor, " n_dof"]) -> int:
+        """The first link that bends far; a metacarpal, which bends a little, is no knuckle."""
+        chain = list(finger.chain)
+        ranges = (self.tree.upper - self.tree.lower) / self.tree.joint_unit * bends
+        far = ((self.tree.link_coupling[chain] != 0) * ranges).amax(-1)
+        return chain[int((far >= KNUCKLE * far.max()).nonzero()[0, 0])]
+
+    def widest(
+        self, span: Callable[[Float[Tensor, "*batch n_tips 3"]], Float[Tensor, "*batch n_tips"]],
+        start: Float[Tensor, " n_dof"], bends: Bool[Tensor, " n_dof"],
+    ) -> Float[Tensor, " n_dof"]:
+        """The posture whose fingertips span the most, found joint by joint [rad or m].
+
+        Args:
+            span: Of fingertips [m].
+            start: Where the search begins; joints that do not bend stay there, and of equal spans the nearest wins.
+            bends: The joints that are searched.
+        """
+        q, tree = start, self.tree
+        for _ in range(SWEEPS):
+            before = q
+            for joint in bends.nonzero()[:, 0].tolist():
+                values = torch.linspace(float(tree.lower[joint]), float(tree.upper[joint]), STEPS + 1)
+                values = torch.cat([start[joint, None], values])
+                values = values[(values - start[joint]).abs().argsort(stable=True)]
+                tried = q.repeat(len(values), 1)
+                tried[:, joint] = values
+                total = span(self.tips(tried)).sum(-1)
+                q = tried[int((total > total.max() - SAME_SPAN).nonzero()[0, 0])]
+            if torch.equal(q, before):
+                break
+        return q
+
+    def folded(
+        self, path: Float[Tensor, "steps n_dof"], bends: Bool[Tensor, " n_dof"], axis: Line
+    ) -> Bool[Tensor, " n_tips"]:
+        """Fingers that fold back on a path from closed to open: beyond their widest span they lose most of their reach."""
+        reach = self.reaches(path, bends)
+        at = axis.distance(self.tips(path)).argmax(0)
+        widest = reach[at, torch.arange(len(self.fingers))]
+        kept = (reach * widest).sum(-1) / widest.square().sum(-1).clamp_min(1e-12)
+        beyond = torch.arange(len(path))[:, None] >= at
+        return (beyond & (kept < LEAST_REACH)).any(0)
+
+
+def main_axis(vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
+    """Unit vector along which most of the vectors lie, forth or back."""
+    return torch.linalg.svd(vectors, full_matrices=False)[2][0]
+
