@@ -143,9 +143,9 @@ class GraspEnergy:
         hand = self.hand
         thin = self.source.with_points(min(config.hand_points, hand.n_points)).to(hand.link_points.device)
         self.config, self.body = config, LinkPoints.of(thin.link_points, thin.link_index, hand.tree.n_links)
-        room = config.closing_room * (hand.tree.upper - hand.tree.lower) * ~hand.abduction
-        self.lower = torch.where(hand.opening_signs > 0, hand.tree.lower + room, hand.tree.lower)
-        self.upper = torch.where(hand.opening_signs > 0, hand.tree.upper, hand.tree.upper - room)
+        room = config.closing_room * (hand.upper - hand.lower) * ~hand.abduction
+        self.lower = torch.where(hand.opening_signs > 0, hand.lower + room, hand.lower)
+        self.upper = torch.where(hand.opening_signs > 0, hand.upper, hand.upper - room)
 
     def __call__(
         self, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], contacts: Int[Tensor, "n c"] | None = None

@@ -51,7 +51,9 @@ def pregrasp_and_squeeze(
     config = config or ControllerConfig()
     slope = distance_slope(hand, T_object_wrist, joints, centre)
     moves = hand.movable & ~hand.abduction & (slope.abs() > config.dead_zone)
-    lower, upper = hand.tree.lower, hand.tree.upper
+    # The pregrasp opens as far as the hand opens; a grasp that is beyond already opens no farther.
+    lower = torch.maximum(torch.minimum(hand.lower, joints), hand.tree.lower)
+    upper = torch.minimum(torch.maximum(hand.upper, joints), hand.tree.upper)
     away = torch.where(slope > 0, upper, lower)
     towards = torch.where(slope > 0, lower, upper)
     outer = torch.where(moves, joints + config.outer * (away - joints), joints)

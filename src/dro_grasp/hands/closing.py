@@ -6,6 +6,7 @@ open where it spans the most.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,9 +16,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from dro_grasp.errors import HandError
 from dro_grasp.hands.anatomy import Finger, axes_along, closing_gains
 from dro_grasp.hands.opening import FingerMotion, Line, main_axis
-from dro_grasp.hands.palm import CLOSINGS, Palm, find_palm
+from dro_grasp.hands.palm import CLOSINGS, NOTHING_ENCLOSED, Palm, find_palm
 from dro_grasp.hands.surface import LinkSurface
 from dro_grasp.kinematics.tree import KinematicTree
 
@@ -98,13 +100,7 @@ class ClosingFinder:
         """
         tree, start = self.tree, torch.where(self.stated.isnan(), self.rest, self.stated)
         spread = self.motion.widest(self._from_middle, start, self.movable & self.stated.isnan())
-        velocity = self.motion.velocities(spread)
-        normal = main_axis(velocity.mT.reshape(-1, 3))
-        sides = []
-        for side in (normal, -normal):
-            signs = self.away_from_limits(spread, torch.where((velocity * side[:, None]).sum((0, 1)) >= 0, -1.0, 1.0))
-            sides.append((self.examine(spread, signs, torch.zeros_like(self.movable)), signs))
-        palm, signs = max(sides, key=lambda pair: pair[0].score)
+        signs, palm = self.better_side(spread)
         abduction = self.out_of_palm(spread, signs, palm) & self.movable
         axis = Line(_tensor(palm.centre), _tensor(palm.direction))
         widest = self.motion.widest(axis.distance, start, self.movable & ~abduction & self.stated.isnan())
@@ -119,6 +115,22 @@ class ClosingFinder:
         narrowed = dataclasses.replace(tree, lower=lower, upper=upper)
         stated = torch.where(folded, widest, self.stated)
         return dataclasses.replace(self, tree=narrowed, stated=stated).between_limits()
+
+    def better_side(self, spread: Float[Tensor, " n_dof"]) -> tuple[Float[Tensor, " n_dof"], Palm]:
+        """Opening signs of a hand that closes from here to the better side, and the palm there.
+
+        Raises:
+            HandError: Palm and fingers enclose nothing on either side.
+        """
+        velocity, still = self.motion.velocities(spread), torch.zeros_like(self.movable)
+        normal, sides = main_axis(velocity.mT.reshape(-1, 3)), []
+        for side in (normal, -normal):
+            signs = self.away_from_limits(spread, torch.where((velocity * side[:, None]).sum((0, 1)) >= 0, -1.0, 1.0))
+            with contextlib.suppress(HandError):
+                sides.append((signs, self.examine(spread, signs, still)))
+        if not sides:
+            raise HandError(NOTHING_ENCLOSED)
+        return max(sides, key=lambda pair: pair[1].score)
 
     def signs_at_limits(
         self, signs: Float[Tensor, " n_dof"], abduction: Bool[Tensor, " n_dof"], spreads: Bool[Tensor, " n_dof"],

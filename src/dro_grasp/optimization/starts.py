@@ -42,14 +42,14 @@ class StartConfig:
 
 
 def start_joints(hand: Hand, n: int, config: StartConfig, generator: torch.Generator) -> Float[Tensor, "n n_dof"]:
-    """Partly closed hands with some noise on every joint, within limits [rad or m]."""
+    """Partly closed hands with some noise on every joint, no farther open than the hand opens [rad or m]."""
     low, high = config.openness
     share = low + (high - low) * torch.rand(n, 1, generator=generator)
     opened, closed = hand.canonical_joints(1.0), hand.canonical_joints(0.0)
     q = opened * share + closed * (1 - share)
-    span = hand.tree.upper - hand.tree.lower
+    span = hand.upper - hand.lower
     q = q + config.joint_noise * span * torch.randn(n, hand.tree.n_dof, generator=generator)
-    q = torch.minimum(torch.maximum(q, hand.tree.lower), hand.tree.upper)
+    q = torch.minimum(torch.maximum(q, hand.lower), hand.upper)
     return torch.where(hand.movable, q, hand.rest)
 
 

@@ -193,9 +193,9 @@ def propose(
     move, turn = (-pace * state.result.by_pose * scale[:, :6]).split(3, -1)
     bend = -pace * state.result.by_joint * scale[:, 6:]
     T = turned_about(state.T, energy.pivot(state.T), config.translation_step * move, config.rotation_step * turn)
-    tree = energy.hand.tree
-    step = config.joint_step * tree.joint_unit
-    q = torch.minimum(torch.maximum(state.q + step * bend, tree.lower), tree.upper)
+    hand = energy.hand
+    step = config.joint_step * hand.tree.joint_unit
+    q = torch.minimum(torch.maximum(state.q + step * bend, hand.lower), hand.upper)
     contacts = switched(energy, state, config.switch, generator)
     return State(T, q, contacts, state.slots, energy(T, q, contacts))
 
