@@ -27,6 +27,9 @@ REFINEMENTS = 3
 """Rounds in which opening signs and palm are derived from each other (ours)."""
 AT_LIMIT = 0.1
 """Distance to a limit, as a share of the range, within which a joint is at this limit (ours)."""
+ROLLED_UP = 0.15
+"""Share of its reach at the widest spread below which a finger that opens farther is rolled up (ours). 15 hands keep 0.34 to 1
+at the limits of their ranges; D'Claw, whose fingers bend as far back as forth, keeps 0.19."""
 PATH = 65
 """Postures on the way from closed to open at which a hand is examined (ours)."""
 
@@ -67,7 +70,21 @@ class ClosingFinder:
     def find(self) -> Closing:
         """The closing between the limits, or from the widest posture of fingers that fold back beyond it."""
         found = self.between_limits()
-        return self.from_widest() if bool(self.folded(found).any()) else found
+        # The palm itself may have been found on the wrong side, so the second test takes none.
+        ends = torch.where(self.movable & ~found.abduction, found.open_ends, self.spread)
+        beyond = torch.stack([self.spread + share * (ends - self.spread) for share in torch.linspace(0, 1, PATH)])
+        rolled_up = self.motion.kept(beyond, self.movable).amin(0) < ROLLED_UP
+        return self.from_widest() if bool((self.folded(found) | rolled_up).any()) else found
+
+    @cached_property
+    def spread(self) -> Float[Tensor, " n_dof"]:
+        """The posture whose fingertips are farthest from the palm's middle [rad or m]."""
+        return self.motion.widest(self._from_middle, self.start, self.movable & self.stated.isnan())
+
+    @cached_property
+    def start(self) -> Float[Tensor, " n_dof"]:
+        """Joints at rest, or as the file states them [rad or m]."""
+        return torch.where(self.stated.isnan(), self.rest, self.stated)
 
     def between_limits(self) -> Closing:
         """Opening signs, abduction joints and palm, refined together.
@@ -98,12 +115,11 @@ class ClosingFinder:
         spread as far from the palm's middle as it goes and closed to both sides; on the better one palm and fingers enclose
         a ball best.
         """
-        tree, start = self.tree, torch.where(self.stated.isnan(), self.rest, self.stated)
-        spread = self.motion.widest(self._from_middle, start, self.movable & self.stated.isnan())
-        signs, palm = self.better_side(spread)
-        abduction = self.out_of_palm(spread, signs, palm) & self.movable
+        tree = self.tree
+        signs, palm = self.better_side(self.spread)
+        abduction = self.out_of_palm(self.spread, signs, palm) & self.movable
         axis = Line(_tensor(palm.centre), _tensor(palm.direction))
-        widest = self.motion.widest(axis.distance, start, self.movable & ~abduction & self.stated.isnan())
+        widest = self.motion.widest(axis.distance, self.start, self.movable & ~abduction & self.stated.isnan())
         centre = _tensor(palm.grasp_centre)
         for _ in range(REFINEMENTS):
             signs = self.signs_at_limits(signs, abduction, abduction, centre)

@@ -6,11 +6,12 @@ let it fold back closes on nothing on the way from there.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.geometry import se3
@@ -25,6 +26,9 @@ SAME_SPAN = 1e-4
 """Spans that differ by less are the same [m] (ours)."""
 KNUCKLE = 0.5
 """Range of a finger's knuckle, as a share of the widest range of its joints (ours); a metacarpal has less."""
+BEHIND = 0.9
+"""Angle by which an opened finger that folds back points behind the plane of its palm [rad] (ours). At the limits of their
+ranges, 16 hands that open as they should have 0.82 at most, and most of them 0.3."""
 LEAST_REACH = 0.35
 """Share of its widest reach below which a finger that opens farther folds back (ours). At the limits of their ranges, 16 hands
 that open as they should keep 0.44 to 1; a finger that points straight back behind its knuckle keeps 0 or less."""
@@ -110,13 +114,22 @@ class FingerMotion:
     def folded(
         self, path: Float[Tensor, "steps n_dof"], bends: Bool[Tensor, " n_dof"], axis: Line
     ) -> Bool[Tensor, " n_tips"]:
-        """Fingers that fold back on a path from closed to open: beyond their widest span they lose most of their reach."""
-        reach = self.reaches(path, bends)
+        """Fingers that fold back on a path from closed to open: beyond their widest span they point behind the palm, or lose
+        most of their reach.
+        """
         at = axis.distance(self.tips(path)).argmax(0)
-        widest = reach[at, torch.arange(len(self.fingers))]
-        kept = (reach * widest).sum(-1) / widest.square().sum(-1).clamp_min(1e-12)
+        reach = self.reaches(path, bends)
+        behind = -(reach @ axis.direction) / reach.norm(dim=-1).clamp_min(1e-6)
         beyond = torch.arange(len(path))[:, None] >= at
-        return (beyond & (kept < LEAST_REACH)).any(0)
+        return (beyond & ((self.kept(path, bends, at) < LEAST_REACH) | (behind > math.sin(BEHIND)))).any(0)
+
+    def kept(
+        self, path: Float[Tensor, "steps n_dof"], bends: Bool[Tensor, " n_dof"], at: Int[Tensor, " n_tips"] | int = 0
+    ) -> Float[Tensor, "steps n_tips"]:
+        """Share of each finger's reach at one step of a path that it keeps at every step, measured along that reach."""
+        reach = self.reaches(path, bends)
+        then = reach[at, torch.arange(len(self.fingers))]
+        return (reach * then).sum(-1) / then.square().sum(-1).clamp_min(1e-12)
 
 
 def main_axis(vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
