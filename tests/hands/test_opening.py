@@ -9,20 +9,20 @@ import pytest
 import torch
 
 import dro_grasp as dro
+from dro_grasp.errors import HandError
+from dro_grasp.grasps.controller import pregrasp_and_squeeze
+from dro_grasp.hands.check import check_hand, picture
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import hand_names
+from dro_grasp.optimization.starts import StartConfig, start_joints
 from tests.helpers.bracket_hand import bracket_urdf
-from tests.helpers.claw_urdf import written
+from tests.helpers.claw_urdf import joint, link, written
 from tests.helpers.folding_hands import folding_bracket, folding_claw
 from tests.helpers.loaded_hands import loaded_hand
 
 
 def load(folder: Path, text: str) -> Hand:
     return dro.load_hand(written(folder, text, "hand.urdf"))
-
-
-def limits(hand: Hand) -> torch.Tensor:
-    return torch.where(hand.opening_signs > 0, hand.tree.upper, hand.tree.lower)
 
 
 @pytest.mark.parametrize("back", [math.pi, 1.5 * math.pi - 0.1])
@@ -36,11 +36,10 @@ def test_fingers_that_fold_by_90_and_by_180_degrees_are_open_when_flat(tmp_path:
 
 def test_fingers_that_lie_flat_at_their_limits_are_open_there(tmp_path: Path) -> None:
     hand = load(tmp_path, folding_claw(math.pi / 2))
-    assert torch.equal(hand.open_ends, limits(hand))
+    assert torch.equal(hand.open_ends, hand.open_limits)
 
 
-@pytest.mark.parametrize("side", [1.0, -1.0])
-@pytest.mark.parametrize("back", [1.0, 1.5, 2.2])
+@pytest.mark.parametrize(("back", "side"), [(1.0, 1.0), (1.5, -1.0), (2.2, 1.0)])
 def test_straight_fingers_that_roll_up_on_both_sides_open_straight(tmp_path: Path, side: float, back: float) -> None:
     """With limits of 1.5 rad both ways, nothing but the thumb tells the palm's side."""
     straight, hand = load(tmp_path, bracket_urdf(side)), load(tmp_path, folding_bracket(back, side))
@@ -58,21 +57,21 @@ def test_one_joint_that_folds_its_finger_back_is_cut(tmp_path: Path) -> None:
 def test_a_little_more_than_straight_is_kept(tmp_path: Path) -> None:
     """As many hands have it: 0.2 rad in each joint."""
     hand = load(tmp_path, folding_bracket(0.2))
-    assert torch.equal(hand.open_ends, limits(hand))
+    assert torch.equal(hand.open_ends, hand.open_limits)
     assert sorted(set(hand.open_ends.tolist())) == pytest.approx([-0.2, 0.0])
 
 
 @pytest.mark.parametrize("name", [n for n, source in hand_names().items() if source == "builtin"])
 def test_built_in_hands_open_to_their_limits(name: str) -> None:
     hand = loaded_hand(name)
-    assert torch.equal(hand.open_ends, limits(hand))
+    assert torch.equal(hand.open_ends, hand.open_limits)
 
 
 @pytest.mark.assets
 @pytest.mark.parametrize("name", ["allegro_left", "shadowhand", "leaphand", "inspire", "ability", "dclaw", "orca", "ezgripper"])
 def test_real_hands_open_to_their_limits(assets_folder: Path, name: str) -> None:
     hand = loaded_hand(f"assets/{name}")
-    assert torch.equal(hand.open_ends, limits(hand))
+    assert torch.equal(hand.open_ends, hand.open_limits)
 
 
 def test_open_closed_and_random_joints_stay_in_front_of_the_palm(tmp_path: Path) -> None:
@@ -80,7 +79,8 @@ def test_open_closed_and_random_joints_stay_in_front_of_the_palm(tmp_path: Path)
     assert torch.equal(hand.canonical_joints(1.0), hand.open_ends)
     assert torch.equal(hand.canonical_joints(0.0), hand.closed_ends)
     generator = torch.Generator().manual_seed(0)
-    for joints in (hand.random_joints(50, generator), hand.random_open_joints(50, generator)):
+    starts = start_joints(hand, 50, StartConfig(), generator)
+    for joints in (hand.random_joints(50, generator), hand.random_open_joints(50, generator), starts):
         tips = hand.tree.forward(joints)[:, list(hand.tips), :3] @ torch.tensor([0.0, 0.0, 0.06, 1.0])
         assert float(tips[..., 2].min()) > 0.0
 
@@ -91,3 +91,86 @@ def test_a_bundle_without_open_ends_opens_to_the_limits(tmp_path: Path) -> None:
     assert torch.equal(Hand.from_tensors(dict(values)).open_ends, hand.open_ends)
     del values["open_ends"]
     assert Hand.from_tensors(values).open_ends.tolist() == pytest.approx([-math.pi] * 2)
+
+
+def test_a_pregrasp_opens_no_farther_than_the_hand(tmp_path: Path) -> None:
+    hand = load(tmp_path, folding_claw(math.pi))
+    T, centre = torch.eye(4)[None].repeat(2, 1, 1), torch.tensor([0.0, 0.0, 0.03])
+    joints = torch.stack([0.9 * hand.open_ends, hand.open_ends - 0.5])
+    within, beyond = pregrasp_and_squeeze(hand, T, joints, centre)[0]
+    assert within.tolist() == pytest.approx((0.925 * hand.open_ends).tolist(), abs=1e-5)
+    assert torch.equal(beyond, joints[1]), "a grasp that is beyond already opens no farther"
+
+
+def test_check_says_and_draws_what_is_left_out(tmp_path: Path) -> None:
+    from PIL import Image
+
+    report = check_hand(written(tmp_path, folding_claw(math.pi), "hand.urdf"))
+    assert report.facts["open_posture"]["a"] == pytest.approx(-math.pi / 2, abs=0.1)
+    told = {note.subject: note.text for note in report.notes}
+    assert set(told) == {"left", "right"}
+    assert "leaves out 3" in told["left"], "a third of the range"
+    assert "of a (-1.5" in told["left"]
+    picture(report.hand, tmp_path / "hand.png")
+    with Image.open(tmp_path / "hand.png") as sheet:
+        colours = {colour for _, colour in sheet.convert("RGB").getcolors(1 << 24)}
+    assert any(r > 100 and g < 90 and b > 140 and r < b for r, g, b in colours), "no purple track"
+
+
+SRDF = '<robot name="claw"><group_state name="{name}" group="fingers">{joints}</group_state></robot>'
+
+
+def test_an_srdf_beside_the_urdf_may_state_the_open_posture(tmp_path: Path) -> None:
+    path = written(tmp_path, folding_claw(math.pi), "hand.urdf")
+    plain = dro.load_hand(path)
+    joints = '<joint name="a" value="-1.0"/><joint name="of_the_arm" value="3"/>'
+    written(tmp_path, SRDF.format(name="closed", joints=joints), "hand.srdf")
+    assert dro.load_hand(path).sha256 == plain.sha256, "another state says nothing"
+    written(tmp_path, SRDF.format(name="open", joints=joints), "hand.srdf")
+    hand = dro.load_hand(path)
+    assert hand.sha256 != plain.sha256
+    assert hand.open_ends.tolist() == pytest.approx([-1.0, float(plain.open_ends[1])], abs=0.05)
+    assert torch.equal(hand.opening_signs, plain.opening_signs)
+
+
+def test_an_open_posture_behind_the_palm_is_warned_of(tmp_path: Path) -> None:
+    path = written(tmp_path, folding_claw(math.pi), "hand.urdf")
+    written(tmp_path, SRDF.format(name="open", joints='<joint name="a" value="-2.9"/>'), "hand.srdf")
+    warned = {note.subject: note.text for note in check_hand(path).notes if note.level == "warning"}
+    assert set(warned) == {"left"}
+    assert "degrees behind the palm" in warned["left"]
+
+
+def test_a_stated_posture_that_is_no_number_is_refused(tmp_path: Path) -> None:
+    path = written(tmp_path, folding_claw(1.5), "hand.urdf")
+    written(tmp_path, SRDF.format(name="open", joints='<joint name="a" value="wide"/>'), "hand.srdf")
+    with pytest.raises(HandError, match=r"joint 'a'; expected one number"):
+        dro.load_hand(path)
+
+
+def test_a_keyframe_of_an_mjcf_may_state_the_open_posture(tmp_path: Path) -> None:
+    """Its values follow the joints, and begin with the seven of the free base."""
+    finger = """<body name="{name}" pos="{x} 0 0.01"><joint name="{name}" axis="0 {side} 0" range="-180 86"/>
+      <geom type="box" size="0.006 0.006 0.03" pos="0 0 0.03"/></body>"""
+    fingers = finger.format(name="a", x=-0.035, side=1) + finger.format(name="b", x=0.035, side=-1)
+    key = '<keyframe><key name="{name}" qpos="0 0 0 1 0 0 0 -1.1 -1.2"/></keyframe>'
+    text = """<mujoco><compiler autolimits="true"/><worldbody><body name="palm"><freejoint/>
+      <geom type="box" size="0.04 0.04 0.01"/>{fingers}</body></worldbody>{key}</mujoco>"""
+    ends = {}
+    for name in ("open", "home"):
+        hand = dro.load_hand(written(tmp_path, text.format(fingers=fingers, key=key.format(name=name)), f"{name}.xml"))
+        ends[name] = hand.open_ends.tolist()
+    assert ends["open"] == pytest.approx([-1.1, -1.2])
+    assert ends["home"] == pytest.approx([-math.pi / 2] * 2, abs=0.1)
+
+
+def test_a_tiny_fingertip_keeps_points(tmp_path: Path) -> None:
+    """Inside a large finger, farthest point sampling leaves it out."""
+    nails = link("nail_a", '<sphere radius="0.001"/>') + link("nail_b", '<sphere radius="0.001"/>')
+    glue = "".join(joint(f"glue_{n}", parent, f"nail_{n}", "0 0 0", kind="fixed", more="")
+                   for n, parent in (("a", "left"), ("b", "right")))
+    hand = load(tmp_path, folding_claw(1.5).replace("</robot>", nails + glue + "</robot>"))
+    assert [hand.tree.link_names[tip] for tip in hand.tips] == ["nail_a", "nail_b"]
+    assert all(int((hand.link_index == tip).sum()) > 0 for tip in hand.tips)
+    assert hand.n_points == 512
+    assert bool((hand.link_index.diff() >= 0).all())

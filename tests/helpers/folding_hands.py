@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from tests.helpers.bracket_hand import bracket_urdf
-from tests.helpers.claw_urdf import claw, joint, link
+from tests.helpers.claw_urdf import claw, joint
 
 
 def limit(lower: float, upper: float) -> str:
@@ -13,11 +13,11 @@ def limit(lower: float, upper: float) -> str:
     return f'<limit lower="{lower}" upper="{upper}" effort="1" velocity="1"/>'
 
 
-def folding_claw(back: float, offset: float = 0.0) -> str:
+def folding_claw(back: float) -> str:
     """Two facing fingers that stand upright at zero, close by 1.5 rad and open by this angle [rad]; pi/2 lays them flat."""
-    ends = limit(-back + offset, 1.5 + offset)
-    joints = joint("a", "palm", "left", "-0.035 0 0.01", more=ends) + joint("b", "palm", "right", "0.035 0 0.01", "0 -1 0", ends)
-    return claw(links=link("left") + link("right"), joints=joints)
+    ends = limit(-back, 1.5)
+    left = joint("a", "palm", "left", "-0.035 0 0.01", more=ends)
+    return claw(joints=left + joint("b", "palm", "right", "0.035 0 0.01", "0 -1 0", ends))
 
 
 def folding_bracket(back: float, side: float = 1.0, pattern: str = "base|knuckle") -> str:

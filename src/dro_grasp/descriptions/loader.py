@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import os
 import xml.etree.ElementTree as ET
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +21,7 @@ from dro_grasp.descriptions.compiling import compile_hand, mujoco_speaks_to
 from dro_grasp.descriptions.couplings import Coupling
 from dro_grasp.descriptions.link_geometry import LinkGeometry, read_geometry
 from dro_grasp.descriptions.notes import Note
+from dro_grasp.descriptions.open_posture import open_key, open_state
 from dro_grasp.descriptions.reduction import keep_hand_only
 from dro_grasp.descriptions.tree_reading import read_couplings, read_tree
 from dro_grasp.descriptions.urdf import prepare_urdf
@@ -40,13 +42,18 @@ def load_description(path: Path | str) -> Description:
     notes: list[Note] = []
     if root.tag == "robot":
         spec, files = _read_urdf(root, path, notes)
+        srdf = path.with_suffix(".srdf")
+        stated = open_state(srdf) if srdf.is_file() else {}
+        files = (*files, srdf) if stated else files
     elif root.tag == "mujoco":
         spec, files = _read_mjcf(root, path, notes)
+        with mujoco_speaks_to(notes, path):
+            stated = open_key(spec)
     else:
         raise HandError(f"{path} starts with <{root.tag}>; expected a URDF (<robot>) or MJCF (<mujoco>) file")
     notes.extend(keep_hand_only(spec, path))
     model = compile_hand(spec, path, notes)
-    description = Description(path.resolve(), spec, model, _digest(path, files), tuple(notes))
+    description = Description(path.resolve(), spec, model, _digest(path, files), tuple(notes), stated)
     _ = description.tree  # raises the errors of the tree now
     return description
 
@@ -64,6 +71,8 @@ class Description:
     """Hash of the file and of the files it uses."""
     notes: tuple[Note, ...]
     """Findings and repairs."""
+    open_posture: Mapping[str, float]
+    """The open posture that the file, or the SRDF beside it, states, by joint [rad or m]; empty if it states none."""
 
     @property
     def name(self) -> str:

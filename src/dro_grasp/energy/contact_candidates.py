@@ -84,8 +84,10 @@ def contact_candidates(hand: Hand, config: ContactConfig | None = None) -> Conta
     cosine = (normals * towards).sum(-1) / towards.norm(dim=-1).clamp_min(1e-9)
     finger = hand.finger_of_link[hand.link_index]
     inner = (cosine > config.inner_cosine) & torch.isin(hand.link_index, torch.tensor(hand.contact_links))
-    weight = _level_weights(hand, config)[hand.link_index] * cosine.clamp_min(0)
-    inner = _never_empty(inner, weight, finger, len(hand.fingers)) & (weight > 0)
+    by_level = _level_weights(hand, config)[hand.link_index]
+    weight = by_level * cosine.clamp_min(0)
+    weight = torch.where(_without_any(weight > 0, finger), by_level, weight)
+    inner = (inner | _without_any(inner & (weight > 0), finger)) & (weight > 0)
     keep = inner.nonzero()[:, 0]
     slots = _slots(finger[keep], weight[keep].clamp_min(1e-6), len(hand.fingers), config)
     return ContactCandidates(
@@ -103,28 +105,20 @@ def _level_weights(hand: Hand, config: ContactConfig) -> Float[Tensor, " n_links
     return weights
 
 
-def _never_empty(
-    inner: Bool[Tensor, " n"], weight: Float[Tensor, " n"], finger: Int[Tensor, " n"], n_fingers: int
-) -> Bool[Tensor, " n"]:
-    """Give a finger without inner points all of its points."""
-    result = inner.clone()
-    for i in range(n_fingers):
-        if not (inner & (finger == i) & (weight > 0)).any():
-            result |= finger == i
-    return result
+def _without_any(chosen: Bool[Tensor, " n"], finger: Int[Tensor, " n"]) -> Bool[Tensor, " n"]:
+    """The points of fingers of which no point is chosen."""
+    return (finger != PALM) & ~torch.isin(finger, finger[chosen])
 
 
 def _slots(
     finger: Int[Tensor, " k"], weight: Float[Tensor, " k"], n_fingers: int, config: ContactConfig
 ) -> tuple[Float[Tensor, "n_slots k"], tuple[int, ...]]:
-    rows = []
-    for i in range(n_fingers):
-        row = weight * (finger == i)
-        rows.append(row / row.sum())
+    """The slots' weights and their fingers; the slot of a finger without candidates is a free one."""
+    rows = [_normalised(weight * (finger == i)) for i in range(n_fingers)]
     free = torch.stack(rows).sum(0) + config.palm_weight * _normalised(weight * (finger == PALM))
     extra = max(0, config.min_contacts - n_fingers)
-    rows += [free / free.sum()] * extra
-    return torch.stack(rows), (*range(n_fingers), *(PALM,) * extra)
+    owners = [i if bool(row.any()) else PALM for i, row in enumerate(rows)] + [PALM] * extra
+    return torch.stack([free / free.sum() if i == PALM else rows[i] for i in owners]), tuple(owners)
 
 
 def _normalised(row: Float[Tensor, " k"]) -> Float[Tensor, " k"]:

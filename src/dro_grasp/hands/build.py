@@ -18,7 +18,7 @@ from dro_grasp.errors import HandError
 from dro_grasp.geometry.point_clouds import farthest_points
 from dro_grasp.hands.anatomy import Finger, find_fingers, find_palm_link, find_tips, fixed_below, path_to, rigid_groups
 from dro_grasp.hands.closing import Closing, ClosingFinder
-from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.hand import POINTS_PER_LINK, Hand
 from dro_grasp.hands.surface import LinkSurface, sample_links
 from dro_grasp.kinematics.tree import FIXED
 
@@ -41,8 +41,11 @@ def build_hand(description: Description, *, name: str | None = None, seed: int =
         HandError: The description has no finger, no link with a surface, or a size that no hand has.
     """
     hand = HandBuilder(description, seed).build(name or description.name)
-    # Farthest point sampling over the open hand keeps the points grouped by link.
-    keep = farthest_points(hand.points(hand.canonical_joints()), n_points).sort().values
+    keep = farthest_points(hand.points(hand.canonical_joints()), n_points)
+    # A fingertip that is small beside the rest may have been left out.
+    missing = [tip for tip in hand.tips if not bool((hand.link_index[keep] == tip).any())]
+    own = [(hand.link_index == tip).nonzero()[:POINTS_PER_LINK, 0] for tip in missing]
+    keep = torch.cat([*own, keep])[:len(keep)].sort().values  # grouped by link
     return dataclasses.replace(hand, link_points=hand.link_points[keep], link_normals=hand.link_normals[keep],
                                link_index=hand.link_index[keep])
 
@@ -66,7 +69,8 @@ class HandBuilder:
             palm_centre=to_palm(closing.palm.centre),
             palm_direction=T[:3, :3] @ torch.tensor(closing.palm.direction, dtype=torch.float32),
             grasp_centre=to_palm(closing.palm.grasp_centre), opening_signs=closing.opening_signs,
-            open_ends=closing.open_ends, movable=self.movable, rest=self.rest, abduction=closing.abduction, contact_links=tuple(i for i in self.links if i in collides),
+            open_ends=closing.open_ends, movable=self.movable, rest=self.rest, abduction=closing.abduction,
+            contact_links=tuple(i for i in self.links if i in collides),
             sha256=self.description.sha256, description=self.description,
         ).with_thumb()
 
@@ -148,7 +152,9 @@ class HandBuilder:
     @cached_property
     def stated(self) -> Float[Tensor, " n_dof"]:
         """The open posture that the file states [rad or m]; NaN where it states none."""
-        return torch.full_like(self.tree.lower, torch.nan)
+        values = [self.description.open_posture.get(name, float("nan")) for name in self.tree.joint_names]
+        stated = torch.tensor(values).clamp(self.tree.lower, self.tree.upper)
+        return torch.where(self.movable, stated, torch.nan)
 
     def tip_offsets(self) -> Float[Tensor, "n_tips 3"]:
         """Points beyond the fingertips, in the direction from the last joint through the middle of the tip's surface [m]."""

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from dro_grasp.descriptions.loader import Description
 from dro_grasp.descriptions.notes import Note
@@ -19,6 +20,7 @@ from dro_grasp.hands.anatomy import Finger
 from dro_grasp.hands.build import build_hand
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand_description
+from dro_grasp.hands.opening_notes import opening_notes
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.rendering.meshes import Mesh, arrow
 from dro_grasp.rendering.rasterizer import render
@@ -35,6 +37,8 @@ DIRECTION = (0.85, 0.15, 0.15)
 """Colour of the palm direction."""
 TRACK = (0.15, 0.39, 0.92)
 """Colour of the fingertips' tracks."""
+LEFT_OUT = (0.62, 0.30, 0.75)
+"""Colour of the tracks that the open posture leaves out."""
 SIDEWAYS = 0.15
 """Cosine below which a thumb is on neither side of the other fingers (ours); hands with a side have 0.34 to 0.96."""
 END = {1: "upper", -1: "lower"}
@@ -79,8 +83,8 @@ def check_hand(name: str | Path) -> HandReport:
     """
     description, label = load_hand_description(name)
     hand = build_hand(description, name=label)
-    notes = (*description.notes, *_finger_notes(hand), *_shape_notes(hand, description), *_point_notes(hand))
-    return HandReport(hand, _facts(hand, description), notes)
+    found = (*_finger_notes(hand), *opening_notes(hand), *_shape_notes(hand, description), *_point_notes(hand))
+    return HandReport(hand, _facts(hand, description), (*description.notes, *found))
 
 
 def _facts(hand: Hand, description: Description) -> dict[str, Any]:
@@ -106,6 +110,7 @@ def _facts(hand: Hand, description: Description) -> dict[str, Any]:
         "held_joints": [n for n, m in zip(joints, movable, strict=True) if not m],
         "coupled_joints": couplings,
         "opening_signs": {n: int(sign) for n, sign in zip(joints, hand.opening_signs.tolist(), strict=True)},
+        "open_posture": {n: round(x, 3) for n, x, m in zip(joints, hand.open_ends.tolist(), movable, strict=True) if m},
         "spreading_joints": [n for n, a in zip(joints, hand.abduction.tolist(), strict=True) if a],
         "contact_links": [names[i] for i in hand.contact_links],
         "points": hand.n_points,
@@ -198,6 +203,8 @@ def picture(hand: Hand, path: Path | str) -> None:
         sheet.paste(Image.fromarray(render(_meshes(hand, openness), camera, width, height)), (column * width, TEXT))
         pen.text((column * width + 12, 6), f"{hand.name}, {title}", fill=(20, 20, 20), font=font)
     legend = "orange: contact links   grey: others   red: palm direction   blue: fingertips from open to closed"
+    if not torch.equal(hand.open_ends, hand.open_limits):
+        legend += "   purple: left out"
     pen.text((12, height + TEXT + 6), legend, fill=(90, 90, 90), font=font)
     sheet.save(path, format="PNG")
 
@@ -226,14 +233,17 @@ def _meshes(hand: Hand, openness: float) -> list[Mesh]:
     ]
     start = hand.palm_centre_wrist.numpy()
     meshes.append(arrow(start, start + 0.1 * hand.palm_direction_wrist.numpy(), DIRECTION, radius=0.003))
-    for track in _tracks(hand):
-        meshes.extend(arrow(a, b, TRACK, radius=0.0012) for a, b in pairwise(track))
+    used = torch.stack([hand.canonical_joints(float(x)) for x in torch.linspace(1, 0.25, 8)])
+    farthest = torch.where(hand.open_ends == hand.open_limits, used[0], hand.open_limits)
+    beyond = torch.stack([torch.lerp(used[0], farthest, float(x)) for x in torch.linspace(0, 1, 12)])
+    for colour, joints in ((TRACK, used), (LEFT_OUT, beyond))[: 1 + (not torch.equal(farthest, used[0]))]:
+        for track in _tracks(hand, joints):
+            meshes.extend(arrow(a, b, colour, radius=0.0012) for a, b in pairwise(track))
     return meshes
 
 
-def _tracks(hand: Hand, steps: int = 8) -> Float[np.ndarray, "n_tips steps 3"]:
-    """Positions of the fingertips from open to closed [m]."""
-    joints = torch.stack([hand.canonical_joints(float(x)) for x in torch.linspace(1, 0.25, steps)])
+def _tracks(hand: Hand, joints: Float[Tensor, "steps n_dof"]) -> Float[np.ndarray, "n_tips steps 3"]:
+    """Positions of the fingertips on a way of the joints [m]."""
     poses = hand.tree.forward(joints)[:, list(hand.tips)]
     middles = torch.stack([hand.link_points[hand.link_index == t].mean(0) for t in hand.tips])
     return se3.apply(poses, middles).transpose(0, 1).numpy()

@@ -107,6 +107,11 @@ class Hand:
         return torch.where(self.opening_signs > 0, self.tree.lower, self.tree.upper)
 
     @cached_tensor
+    def open_limits(self) -> Float[Tensor, " n_dof"]:
+        """The limit towards which each joint opens [rad or m]; it opens that far unless its finger folds back."""
+        return torch.where(self.opening_signs > 0, self.tree.upper, self.tree.lower)
+
+    @cached_tensor
     def lower(self) -> Float[Tensor, " n_dof"]:
         """Least value of each joint in use [rad or m]: its lower limit, or its open end."""
         return torch.minimum(self.open_ends, self.closed_ends)

@@ -114,8 +114,9 @@ class FingerMotion:
     def folded(
         self, path: Float[Tensor, "steps n_dof"], bends: Bool[Tensor, " n_dof"], axis: Line
     ) -> Bool[Tensor, " n_tips"]:
-        """Fingers that fold back on a path from closed to open: beyond their widest span they point behind the palm, or lose
-        most of their reach.
+        """Fingers that fold back on a path from closed to open.
+
+        Beyond their widest span they point behind the palm, or lose most of their reach.
         """
         at = axis.distance(self.tips(path)).argmax(0)
         reach = self.reaches(path, bends)
