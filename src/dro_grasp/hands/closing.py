@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dro_grasp.errors import HandError
 from dro_grasp.hands.anatomy import Finger, axes_along, closing_gains
-from dro_grasp.hands.opening import FingerMotion, Line, main_axis
+from dro_grasp.hands.opening import FingerMotion, Line, main_axis, span
 from dro_grasp.hands.palm import CLOSINGS, NOTHING_ENCLOSED, Palm, find_palm
 from dro_grasp.hands.surface import LinkSurface
 from dro_grasp.kinematics.tree import KinematicTree
@@ -119,7 +119,7 @@ class ClosingFinder:
         signs, palm = self.better_side(self.spread)
         abduction = self.out_of_palm(self.spread, signs, palm) & self.movable
         axis = Line(_tensor(palm.centre), _tensor(palm.direction))
-        widest = self.motion.widest(axis.distance, self.start, self.movable & ~abduction & self.stated.isnan())
+        widest = self.motion.widest(axis.span, self.start, self.movable & ~abduction & self.stated.isnan())
         centre = _tensor(palm.grasp_centre)
         for _ in range(REFINEMENTS):
             signs = self.signs_at_limits(signs, abduction, abduction, centre)
@@ -201,8 +201,8 @@ class ClosingFinder:
         """Mean of the palm's samples [m]."""
         return _tensor(self.coarse.posed(self.tree, self.rest)[0][self.on_palm].mean(0))
 
-    def _from_middle(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, " *batch"]:
-        return (points - self.palm_middle).norm(dim=-1)
+    def _from_middle(self, tips: Float[Tensor, "*batch 3"], knuckles: Float[Tensor, "*batch 3"]) -> Float[Tensor, " *batch"]:
+        return span(tips - self.palm_middle, knuckles - self.palm_middle)
 
     def gains(self, tree: KinematicTree, q: Float[Tensor, " n_dof"], centre: Float[Tensor, "3"]) -> Float[Tensor, " n_dof"]:
         """How much each joint, from end to end, brings its fingertips nearer to the grasp centre and to the palm [m]."""

@@ -41,10 +41,18 @@ class Line:
     direction: Float[Tensor, "3"]
     """Unit vector along it."""
 
-    def distance(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, " *batch"]:
-        """Distances of points to the line [m]."""
+    def span(self, tips: Float[Tensor, "*batch 3"], knuckles: Float[Tensor, "*batch 3"]) -> Float[Tensor, " *batch"]:
+        """Distances of fingertips to the line [m]; negative for those on the other side of it than their knuckles."""
+        return span(self._across(tips), self._across(knuckles))
+
+    def _across(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         offset = points - self.point
-        return (offset - (offset @ self.direction)[..., None] * self.direction).norm(dim=-1)
+        return offset - (offset @ self.direction)[..., None] * self.direction
+
+
+def span(tips: Float[Tensor, "*batch 3"], knuckles: Float[Tensor, "*batch 3"]) -> Float[Tensor, " *batch"]:
+    """Distances of fingertips to the origin [m]; negative for those on the other side of it than their knuckles."""
+    return torch.where((tips * knuckles).sum(-1) >= 0, 1.0, -1.0) * tips.norm(dim=-1)
 
 
 @dataclass(frozen=True)
@@ -74,9 +82,12 @@ class FingerMotion:
 
     def reaches(self, q: Float[Tensor, "*batch n_dof"], bends: Bool[Tensor, " n_dof"]) -> Float[Tensor, "*batch n_tips 3"]:
         """From the knuckle of each finger to its tip [m]."""
-        poses = self.tree.forward(q)
-        knuckles = [self._knuckle(f, bends) for f in self.fingers]
-        return self.tips(q) - se3.apply(poses[..., knuckles, :, :], self.tree.anchor[knuckles])
+        return self.tips(q) - self.knuckles(q, bends)
+
+    def knuckles(self, q: Float[Tensor, "*batch n_dof"], bends: Bool[Tensor, " n_dof"]) -> Float[Tensor, "*batch n_tips 3"]:
+        """Positions of the knuckles [m]."""
+        links = [self._knuckle(finger, bends) for finger in self.fingers]
+        return se3.apply(self.tree.forward(q)[..., links, :, :], self.tree.anchor[links])
 
     def _knuckle(self, finger: Finger, bends: Bool[Tensor, " n_dof"]) -> int:
         """The first link that bends far; a metacarpal, which bends a little, is no knuckle."""
@@ -86,13 +97,13 @@ class FingerMotion:
         return chain[int((far >= KNUCKLE * far.max()).nonzero()[0, 0])]
 
     def widest(
-        self, span: Callable[[Float[Tensor, "*batch n_tips 3"]], Float[Tensor, "*batch n_tips"]],
+        self, measure: Callable[[Float[Tensor, "n n_tips 3"], Float[Tensor, "n n_tips 3"]], Float[Tensor, "n n_tips"]],
         start: Float[Tensor, " n_dof"], bends: Bool[Tensor, " n_dof"],
     ) -> Float[Tensor, " n_dof"]:
         """The posture whose fingertips span the most, found joint by joint [rad or m].
 
         Args:
-            span: Of fingertips [m].
+            measure: The span of fingertips with these knuckles [m].
             start: Where the search begins; joints that do not bend stay there, and of equal spans the nearest wins.
             bends: The joints that are searched.
         """
@@ -105,7 +116,7 @@ class FingerMotion:
                 values = values[(values - start[joint]).abs().argsort(stable=True)]
                 tried = q.repeat(len(values), 1)
                 tried[:, joint] = values
-                total = span(self.tips(tried)).sum(-1)
+                total = measure(self.tips(tried), self.knuckles(tried, bends)).sum(-1)
                 q = tried[int((total > total.max() - SAME_SPAN).nonzero()[0, 0])]
             if torch.equal(q, before):
                 break
@@ -118,7 +129,7 @@ class FingerMotion:
 
         Beyond their widest span they point behind the palm, or lose most of their reach.
         """
-        at = axis.distance(self.tips(path)).argmax(0)
+        at = axis.span(self.tips(path), self.knuckles(path, bends)).argmax(0)
         reach = self.reaches(path, bends)
         behind = -(reach @ axis.direction) / reach.norm(dim=-1).clamp_min(1e-6)
         beyond = torch.arange(len(path))[:, None] >= at
