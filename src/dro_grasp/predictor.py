@@ -25,7 +25,7 @@ from dro_grasp.pipeline.stages import above_table, complete, optimise, refine, s
 LARGEST_CALL = 100_000
 """Most candidates of one call; more do not fit memory."""
 Progress = Callable[[int, int], None]
-"""Called with (candidates decoded, candidates wanted)."""
+"""Called with (candidates made so far, candidates wanted), by the network and then by the optimiser."""
 Method = Literal["auto", "network", "optimise"]
 """Where candidates come from."""
 TRUSTED_SCORE = 0.5
@@ -163,10 +163,10 @@ class GraspPredictor:
         Args:
             problem: Hand and object, on the predictor's device.
             request: What is asked for.
-            progress: Called with (candidates decoded, candidates wanted).
+            progress: See `Progress`.
 
         Raises:
-            OptionError: Too few grasps stay above the table.
+            OptionError: Too few grasps stay above the table, or near the direction.
         """
         _check_table(problem.obj, request)
         watch = Stopwatch("network", "decode", "optimise", "refine", "rank")
@@ -252,7 +252,9 @@ def _check_table(obj: ObjectModel, request: GraspRequest) -> None:
 
 def _too_few(obj: ObjectModel, request: GraspRequest, found: int, made: int) -> OptionError:
     low, high = float(obj.cloud[:, 2].min()), float(obj.cloud[:, 2].max())
-    kept = f"palm near direction {request.direction}" if request.table is None else f"hand above table {request.table} m"
+    if request.table is None:
+        return OptionError(f"the optimiser kept only {found} grasps on object '{obj.name}', {request.num} were asked for; "
+                           "ask for another --direction or none, or for --method auto")
     return OptionError(
-        f"only {found} of {made} grasps keep the {kept}, {request.num} were asked for; lower --table (the object spans z = "
-        f"{low:.3f} to {high:.3f} m), or ask for a --direction from above (0 0 -1)")
+        f"only {found} of {made} grasps keep the hand above table {request.table} m, {request.num} were asked for; lower "
+        f"--table (the object spans z = {low:.3f} to {high:.3f} m), or ask for a --direction from above (0 0 -1)")

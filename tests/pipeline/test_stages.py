@@ -15,7 +15,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimization.synthesis import SynthesisConfig, optimised, synthesize
+from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize, synthesize_with
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import complete, evaluate, optimise, rank, refine, scored
 from tests.helpers.toy_hand import toy_hand
@@ -76,7 +76,7 @@ def test_an_object_that_flies_away_while_it_settles_leaves_no_grasp(monkeypatch:
 
     monkeypatch.setattr("dro_grasp.pipeline.stages.settle", settled)
     monkeypatch.setattr("dro_grasp.pipeline.stages.STARTS_PER_CANDIDATE", 2)
-    free = optimised(HAND, CAN, GraspProblem(HAND, CAN).energy(EnergyConfig()), 6, 0, SynthesisConfig()).sorted_by_energy()
+    free = synthesize_with(GraspProblem(HAND, CAN).energy(EnergyConfig()), CAN, 6, 0, SynthesisConfig())
     kept = optimise(GraspProblem(HAND, CAN), 3, seed=0)
     moved = kept.T_object_wrist[:, 2, 3] - free.T_object_wrist[1:3, 2, 3]
     torch.testing.assert_close(moved, torch.tensor([0.01, 0.0]))

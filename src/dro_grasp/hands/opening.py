@@ -6,7 +6,6 @@ let it fold back closes on nothing on the way from there.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -16,6 +15,7 @@ from torch import Tensor
 
 from dro_grasp.geometry import se3
 from dro_grasp.hands.anatomy import Finger
+from dro_grasp.hands.hand import Hand
 from dro_grasp.kinematics.tree import KinematicTree
 
 STEPS = 64
@@ -32,6 +32,8 @@ ranges, 16 hands that open as they should have 0.82 at most, and most of them 0.
 LEAST_REACH = 0.35
 """Share of its widest reach below which a finger that opens farther folds back (ours). At the limits of their ranges, 16 hands
 that open as they should keep 0.44 to 1; a finger that points straight back behind its knuckle keeps 0 or less."""
+
+
 @dataclass(frozen=True)
 class Line:
     """A straight line: the palm's axis."""
@@ -65,6 +67,12 @@ class FingerMotion:
     """The fingers."""
     tip_points: Float[Tensor, "n_tips 3"]
     """A point on each fingertip, in its link's frame [m]."""
+
+    @staticmethod
+    def of(hand: Hand) -> FingerMotion:
+        """The motion of the middles of a hand's fingertips."""
+        middles = torch.stack([hand.link_points[hand.link_index == tip].mean(0) for tip in hand.tips])
+        return FingerMotion(hand.tree, hand.fingers, middles)
 
     @property
     def links(self) -> list[int]:
@@ -130,10 +138,16 @@ class FingerMotion:
         Beyond their widest span they point behind the palm, or lose most of their reach.
         """
         at = axis.span(self.tips(path), self.knuckles(path, bends)).argmax(0)
-        reach = self.reaches(path, bends)
-        behind = -(reach @ axis.direction) / reach.norm(dim=-1).clamp_min(1e-6)
         beyond = torch.arange(len(path))[:, None] >= at
-        return (beyond & ((self.kept(path, bends, at) < LEAST_REACH) | (behind > math.sin(BEHIND)))).any(0)
+        behind = self.behind(path, bends, axis.direction) > BEHIND
+        return (beyond & ((self.kept(path, bends, at) < LEAST_REACH) | behind)).any(0)
+
+    def behind(
+        self, q: Float[Tensor, "*batch n_dof"], bends: Bool[Tensor, " n_dof"], palm_direction: Float[Tensor, "3"]
+    ) -> Float[Tensor, "*batch n_tips"]:
+        """Angle by which each finger points behind the plane of the palm [rad]; negative in front of it."""
+        reach = self.reaches(q, bends)
+        return torch.asin((-(reach @ palm_direction) / reach.norm(dim=-1).clamp_min(1e-6)).clamp(-1, 1))
 
     def kept(
         self, path: Float[Tensor, "steps n_dof"], bends: Bool[Tensor, " n_dof"], at: Int[Tensor, " n_tips"] | int = 0
@@ -147,4 +161,3 @@ class FingerMotion:
 def main_axis(vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
     """Unit vector along which most of the vectors lie, forth or back."""
     return torch.linalg.svd(vectors, full_matrices=False)[2][0]
-

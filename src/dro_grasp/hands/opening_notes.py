@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-import torch
-
 from dro_grasp.descriptions.notes import Note
 from dro_grasp.hands.anatomy import Finger
 from dro_grasp.hands.hand import Hand
@@ -14,10 +12,8 @@ from dro_grasp.hands.opening import BEHIND, FingerMotion
 
 def opening_notes(hand: Hand) -> list[Note]:
     """What the open posture leaves out, finger by finger, and the fingers that point behind the palm in it."""
-    middles = torch.stack([hand.link_points[hand.link_index == tip].mean(0) for tip in hand.tips])
-    motion = FingerMotion(hand.tree, hand.fingers, middles)
-    reach = motion.reaches(hand.canonical_joints(1.0), hand.movable & ~hand.abduction)
-    behind = torch.asin((-(reach @ hand.palm_direction_wrist) / reach.norm(dim=-1).clamp_min(1e-6)).clamp(-1, 1)).tolist()
+    bends = hand.movable & ~hand.abduction
+    behind = FingerMotion.of(hand).behind(hand.canonical_joints(1.0), bends, hand.palm_direction_wrist).tolist()
     notes = []
     for finger, angle in zip(hand.fingers, behind, strict=True):
         tip, left_out = hand.tree.link_names[finger.tip], _left_out(hand, finger)

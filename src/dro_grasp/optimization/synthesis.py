@@ -14,7 +14,6 @@ from dro_grasp._version import __version__
 from dro_grasp.energy.contact_candidates import ContactConfig
 from dro_grasp.energy.grasp_energy import TERMS, EnergyConfig, Evaluation, GraspEnergy
 from dro_grasp.errors import ObjectError, OptionError
-from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.geometry.se3 import turned_about
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
@@ -82,17 +81,6 @@ class State:
         return State(T, q, torch.where(row, other.contacts, self.contacts), self.slots, result)
 
 
-def field_of(obj: ObjectModel) -> DistanceField:
-    """The signed distances of an object.
-
-    Raises:
-        ObjectError: The object is a bare cloud.
-    """
-    if obj.is_cloud:
-        raise ObjectError(f"object '{obj.name}' is a bare point cloud; synthesis needs a mesh")
-    return obj.distance_field
-
-
 def synthesize(hand: Hand, obj: ObjectModel, num: int, seed: int = 0, config: SynthesisConfig | None = None) -> GraspBatch:
     """Synthesise grasps of an object by a hand, lowest energy first, not evaluated.
 
@@ -110,28 +98,28 @@ def synthesize(hand: Hand, obj: ObjectModel, num: int, seed: int = 0, config: Sy
     if num < 1:
         raise OptionError(f"num is {num}; ask for at least one grasp")
     config = config or SynthesisConfig()
-    field_of(obj)
+    if obj.is_cloud:
+        raise ObjectError(f"object '{obj.name}' is a bare point cloud; synthesis needs a mesh")
     energy = GraspEnergy.of_object(hand, obj, config.energy, config.contacts, config.device)
-    return optimised(hand, obj, energy, num, seed, config).sorted_by_energy()
+    return synthesize_with(energy, obj, num, seed, config)
 
 
 @torch.no_grad()
-def optimised(
-    hand: Hand, obj: ObjectModel, energy: GraspEnergy, num: int, seed: int, config: SynthesisConfig,
+def synthesize_with(
+    energy: GraspEnergy, obj: ObjectModel, num: int, seed: int, config: SynthesisConfig,
     progress: Callable[[int, int], None] | None = None,
 ) -> GraspBatch:
-    """Grasps at the end of the annealing, in the order of their starts; a bare cloud will do.
+    """The same with an energy that is there already, on its device; a bare cloud will do.
 
     Args:
-        hand: The hand, on the CPU.
+        energy: Of the hand on the object.
         obj: The object.
-        energy: Of the two.
         num: How many grasps.
         seed: The same seed gives the same grasps.
         config: The optimiser.
         progress: Called with (grasps optimised, grasps wanted).
     """
-    generator = torch.Generator().manual_seed(seed)
+    hand, generator = energy.source, torch.Generator().manual_seed(seed)
     surface, centre = torch.as_tensor(obj.cloud, dtype=torch.float32), energy.centre.cpu()
     parts = []
     for begin in range(0, num, config.batch_size):
@@ -144,7 +132,8 @@ def optimised(
     T, q, terms, depths = (torch.cat(part) for part in zip(*parts, strict=True))
     T[:, :3, :3] = torch.as_tensor(roma.special_procrustes(T[:, :3, :3]))
     columns = {"depth": depths} | {f"energy_{name}": terms[:, i] for i, name in enumerate(TERMS)}
-    return GraspBatch.create(hand, obj, T, q, energy=terms.sum(-1), seed=seed, provenance=PROVENANCE, extra=columns)
+    batch = GraspBatch.create(hand, obj, T, q, energy=terms.sum(-1), seed=seed, provenance=PROVENANCE, extra=columns)
+    return batch.sorted_by_energy()
 
 
 def depth(energy: GraspEnergy, state: State) -> Float[Tensor, " n"]:

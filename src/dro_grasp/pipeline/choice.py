@@ -22,7 +22,7 @@ CROWDING_POINTS = 64
 
 @dataclass(frozen=True)
 class ChoiceConfig:
-    """How many z are drawn, and the penalties by which one is chosen; fitted to `strict` trials on training objects (ours)."""
+    """How many z are drawn, and the penalties by which one is chosen; set by trials on training objects (ours)."""
 
     draws: int = 32
     """z drawn for each placement; 1 takes the first."""

@@ -13,7 +13,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import completed
 from dro_grasp.optimization.refinement import RefineConfig, refine_grasps
 from dro_grasp.optimization.starts import Direction, StartConfig
-from dro_grasp.optimization.synthesis import SynthesisConfig, optimised
+from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize_with
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.ranking.score import ScoreConfig, score_grasps
 from dro_grasp.simulation.protocols import Protocol
@@ -109,11 +109,11 @@ def optimise(
     """
     hand, obj, config = problem.hand, problem.obj, SynthesisConfig(starts=StartConfig(direction=direction))
     energy = problem.energy(config.energy)
-    grasps = optimised(hand, obj, energy, STARTS_PER_CANDIDATE * num, seed, config, progress)
+    grasps = synthesize_with(energy, obj, STARTS_PER_CANDIDATE * num, seed, config, progress)
     if direction is not None:
         wanted = torch.nn.functional.normalize(torch.tensor(direction), dim=0)
         grasps = grasps[hand.palm_directions(grasps.T_object_wrist) @ wanted > math.cos(FARTHEST_DIRECTION)]
-    grasps = grasps.sorted_by_energy()[:num]
+    grasps = grasps[:num]
     if hand.description is not None and not obj.is_cloud:
         settled = settle(hand, obj, grasps)
         moved = hand.grasp_centres(settled.T_object_wrist) - hand.grasp_centres(grasps.T_object_wrist)

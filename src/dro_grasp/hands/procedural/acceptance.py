@@ -7,9 +7,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.descriptions.self_contact import self_penetration
-from dro_grasp.geometry import se3
 from dro_grasp.hands.check import HandReport, hand_side
 from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.opening import FingerMotion
 from dro_grasp.hands.procedural.plan import HandPlan
 
 PALM_COSINE = 0.8
@@ -70,23 +70,16 @@ def _overlap(plan: HandPlan, hand: Hand) -> str:
 
 def _idle(hand: Hand) -> str:
     """Whether a fingertip meets none that closes against it, or does not sweep the space in front of the palm."""
-    middles = torch.stack([hand.link_points[hand.link_index == tip].mean(0) for tip in hand.tips])
+    fingertips = FingerMotion.of(hand)
     shares = torch.linspace(*SWEEP, 5)
-    tips = _tips(hand, torch.stack([hand.canonical_joints(float(share)) for share in shares]), middles)
+    tips = fingertips.tips(torch.stack([hand.canonical_joints(float(share)) for share in shares]))
     height = (tips - hand.palm_centre_wrist) @ hand.palm_direction_wrist
     if not bool((height.amax(0) > 0).all()):
         return "a finger closes beside the palm or behind it"
     closing = torch.nn.functional.normalize(tips[0] - tips[-1], dim=-1)
     against = closing @ closing.T < 0.5
-    spread = _tips(hand, hand.random_joints(POSTURES, torch.Generator().manual_seed(0)), middles)
+    spread = fingertips.tips(hand.random_joints(POSTURES, torch.Generator().manual_seed(0)))
     nearest = torch.cdist(spread, spread).amin(0)
-    nearest = torch.where(against & ~torch.eye(len(middles), dtype=torch.bool), nearest, torch.inf).amin(0)
+    nearest = torch.where(against & ~torch.eye(len(hand.tips), dtype=torch.bool), nearest, torch.inf).amin(0)
     lonely = int((nearest > MEETING).sum())
     return "a finger meets no other" if lonely > (len(nearest) >= FEWEST_WITH_SPARE) else ""
-
-
-def _tips(
-    hand: Hand, joints: Float[Tensor, "n n_dof"], middles: Float[Tensor, "n_tips 3"]
-) -> Float[Tensor, "n n_tips 3"]:
-    """Middles of the fingertips in the wrist frame [m]."""
-    return se3.apply(hand.tree.forward(joints)[:, list(hand.tips)], middles)
