@@ -59,7 +59,6 @@ HELD_OUT_HANDS := assets/inspire assets/ability assets/dclaw assets/ezgripper as
 PAPER_OBJECTS := assets:train assets:validate
 
 data: setup  # hours; needs DRO_GRASP_ASSETS; can be stopped and started again
-	mkdir -p out
 	$(BIN)/dro-grasp synthesize --hand $(PAPER_HANDS) --object $(PAPER_OBJECTS) --grasps 150 --output out/data
 	$(BIN)/dro-grasp synthesize --hand $(OTHER_HANDS) --object $(PAPER_OBJECTS) --grasps 75 --output out/other
 	$(BIN)/dro-grasp synthesize --hand $(HELD_OUT_HANDS) --object $(PAPER_OBJECTS) --grasps 50 --output out/held_out

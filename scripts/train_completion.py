@@ -194,7 +194,7 @@ def main() -> None:
     parser.add_argument("--collect-only", action="store_true", help="do not fit")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    options.folder.mkdir(exist_ok=True)
+    options.folder.mkdir(parents=True, exist_ok=True)
     labels = resolve_objects(["assets:train", "builtin:train"])
     for k, label in list(enumerate(labels))[options.part[0]::options.part[1]]:
         path = options.folder / f"{label.replace('/', '-')}-{options.seed}.pt"

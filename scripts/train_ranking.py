@@ -190,7 +190,7 @@ def main() -> None:
     parser.add_argument("--collect-only", action="store_true", help="do not fit")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    options.folder.mkdir(exist_ok=True)
+    options.folder.mkdir(parents=True, exist_ok=True)
     for name in options.hands:
         stem = Path(name).stem if Path(name).suffix else name.replace("/", "-")
         path = options.folder / f"{stem}-{options.seed}-{FEATURES}.pt"

@@ -31,31 +31,29 @@ def check_output(path: Path | str) -> Path:
 
 
 def check_folder(path: Path | str) -> Path:
-    """Refuse a folder that cannot be created or written to, without creating it.
+    """Refuse a folder that cannot be created or written to, without creating it; its parents may be missing too.
 
     Raises:
-        OutputError: Its parent is missing, it is a file, or permission is missing.
+        OutputError: It or a folder above it is a file, or permission is missing.
     """
     path = Path(path)
-    if path.exists() and not path.is_dir():
-        raise OutputError(f"cannot write into {path}: it is a file; give a folder")
-    parent = path.absolute().parent
-    if not parent.is_dir():
-        raise OutputError(f"cannot create {path}: no folder {parent}; create it first")
-    if not os.access(path if path.exists() else parent, os.W_OK):
-        raise OutputError(f"cannot write into {path if path.exists() else parent}: no permission; choose another folder")
+    there = next(place for place in (path.absolute(), *path.absolute().parents) if place.exists())
+    if not there.is_dir():
+        raise OutputError(f"cannot write into {path}: {there} is a file; give a folder")
+    if not os.access(there, os.W_OK):
+        raise OutputError(f"cannot write into {there}: no permission; choose another folder")
     return path
 
 
 def make_folder(path: Path | str) -> Path:
-    """Create a folder to write to, unless it exists; its parent must exist.
+    """Create a folder to write to, with its parents, unless it exists.
 
     Raises:
-        OutputError: Its parent is missing, it is a file, or permission is missing.
+        OutputError: It or a folder above it is a file, or permission is missing.
     """
     path = check_folder(path)
     try:
-        path.mkdir(exist_ok=True)
+        path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"cannot create {path}: {error.strerror}; choose another folder") from error
     return path

@@ -49,7 +49,7 @@ class Import:
     format: Literal["cmap", "dexgraspnet", "dexgraspbench"]
     """Format of the files."""
     output: Path
-    """Folder for one grasp file per hand; created if missing, inside an existing folder."""
+    """Folder for one grasp file per hand; created if missing."""
     hands: tuple[str, ...] = ()
     """Names or paths of the hands; NAME_IN_FILE=NAME renames one. Files that name no hand need exactly one."""
     object: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
@@ -143,7 +143,7 @@ class Merge(DataSets):
     """
 
     output: Path
-    """Folder for the files, one per hand; created if missing, inside an existing folder."""
+    """Folder for the files, one per hand; created if missing."""
     per_pair: Annotated[int | None, optional("N", "all")] = None
     """Limit of grasps of a hand on an object; those that cover palm directions best are kept."""
     json: Flag = False
@@ -219,7 +219,7 @@ class Filter(DataSets):
     """
 
     output: Path
-    """Folder for the files, one per hand; created if missing, inside an existing folder."""
+    """Folder for the files, one per hand; created if missing."""
     protocol: ProtocolName = "strict"
     """Protocol of the trial."""
     friction: Annotated[float | None, optional("MU", "the protocol's")] = None

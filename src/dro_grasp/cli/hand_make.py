@@ -30,8 +30,7 @@ class Make:
     """
 
     output: Path
-    """Folder for hand_00000.urdf and so on, numbered by seed, and the listing hands.csv; created if missing, inside an existing
-    folder."""
+    """Folder for hand_00000.urdf and so on, numbered by seed, and the listing hands.csv; created if missing."""
     seed: int = 0
     """Seed of the first hand; each following hand has the next one. A seed always gives the same hand."""
     num: int = 24

@@ -27,7 +27,7 @@ class Synthesize:
     object: tuple[str, ...]
     """Names, meshes, folders of meshes, or groups such as builtin:train and assets:validate."""
     output: Path
-    """Folder for the grasp files; created if missing, inside an existing folder."""
+    """Folder for the grasp files; created if missing."""
     grasps: int = 150
     """Valid grasps of each hand on each object. A rerun with a larger number adds the difference."""
     minutes: Annotated[float | None, optional("MINUTES", "no limit")] = None

@@ -24,7 +24,7 @@ class Stage:
     bundle: Path
     """Bundle from `dro-grasp dataset bundle`."""
     run_folder: Path
-    """Folder for log and checkpoints; a run in it is resumed. Its parent must exist."""
+    """Folder for log and checkpoints; created if missing. A run in it is resumed."""
     output: Path
     """Weights file to write."""
     preset: Annotated[

@@ -98,7 +98,7 @@ def onboard(
 
     Args:
         hand: Name or path of the description.
-        folder: Folder of all results; made if its parent exists.
+        folder: Folder of all results; made when missing.
         say: Called with a line about each step.
 
     Raises:

@@ -101,7 +101,7 @@ def synthesize_dataset(
 
     Args:
         grasps_per_pair: A pair is finished when it has this many valid grasps.
-        output_dir: The folder; made when missing (its parent must exist).
+        output_dir: The folder; made when missing.
         workers: Processes, of one thread each; or a function that makes another pool for a job.
         seed: Determines every shard, together with hand, object, round and number of candidates.
         progress: Called with a line of text now and then; None prints to stderr.
