@@ -48,6 +48,17 @@ def cores() -> int:
 
 
 @contextmanager
+def one_thread() -> Iterator[None]:
+    """Within the block, PyTorch computes in one thread: several add to the CPU time of a task, and wait for each other."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextmanager
 def fast_products() -> Iterator[None]:
     """Within the block, single-precision products on the CPU take the quick path if it is accurate here.
 

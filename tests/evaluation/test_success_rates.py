@@ -11,19 +11,20 @@ import torch
 
 from dro_grasp.cli.main import main
 from dro_grasp.evaluation import success_rates as evaluated
+from dro_grasp.evaluation.controls import START, SYNTHESISED
+from dro_grasp.evaluation.rows import ALL, Row
 from dro_grasp.evaluation.success_rates import (
-    ALL,
     BEST,
+    BOTH,
+    EQUAL_TIME,
     NETWORK,
     RANKED,
     RAW,
     REFINED,
+    RETURNED,
     STAGES,
-    START,
-    SYNTHESISED,
     TOP,
     BenchmarkConfig,
-    Row,
     benchmark,
     pair_seed,
 )
@@ -146,8 +147,38 @@ def test_the_average_is_over_hands(rows: list[Row]) -> None:
 def test_refined_grasps_cost_time_and_controls_say_what_they_are(rows: list[Row]) -> None:
     assert "refine" not in find(rows, NETWORK, RAW, ALL).seconds
     assert find(rows, NETWORK, REFINED, ALL).seconds["refine"] > 0
-    assert find(rows, SYNTHESISED, RAW, ALL).seconds["synthesis"] > 0
+    assert find(rows, SYNTHESISED, RAW, ALL).seconds["make"] > 0
     assert find(rows, START, RAW, ALL).success["strict/1"][0] < find(rows, NETWORK, REFINED, ALL).success["strict/1"][0]
+
+
+def test_what_generate_returns_and_what_controls_return_in_the_networks_time() -> None:
+    hand, obj, predictor = load_hand("gripper3"), load_object("can"), GraspPredictor()
+    config = dataclasses.replace(CONFIG, num=8, stages=(BEST, RETURNED, EQUAL_TIME))
+    rows = benchmark([hand], [obj], predictor, config)
+    best, alone = (find(rows, NETWORK, stage, "gripper3") for stage in (BEST, EQUAL_TIME))
+    assert (alone.success, alone.diversity, alone.candidates) == (best.success, best.diversity, 8)
+    returned = find(rows, BOTH, RETURNED, "gripper3")
+    made = predictor.run(GraspProblem(hand, obj), GraspRequest(2, pair_seed(0, hand, obj)))
+    assert returned.success["strict/1"][0] == float(simulate(hand, obj, made.grasps, "strict").success.float().mean())
+    assert returned.candidates == made.candidates
+    assert returned.optimised == made.origin.count("optimiser") / 2
+    start, synthesised = (find(rows, name, EQUAL_TIME, "gripper3") for name in (START, SYNTHESISED))
+    assert start.candidates > 8, "a start costs no network"
+    assert (start.num, start.optimised) == (2, 0)
+    assert 1 <= synthesised.num <= 2
+    assert synthesised.optimised == 1
+    assert {name for row in (alone, start, synthesised) for name in row.seconds} == {"CPU"}
+    assert 0.5 < start.seconds["CPU"] / alone.seconds["CPU"] < 2
+
+
+def test_no_grasp_at_all_has_a_row_without_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The optimiser may lose every grasp of an object while it settles."""
+    hand, obj = load_hand("gripper3"), load_object("can")
+    none = GraspPredictor().predict(hand, obj, num=1, method="network")[:0]
+    monkeypatch.setattr(evaluated, "controls", lambda *_: {SYNTHESISED: lambda num, seed: none.without("score")})
+    for row in benchmark([hand], [obj], GraspPredictor(), dataclasses.replace(CONFIG, num=2)):
+        assert row.num == 0 or row.grasps == NETWORK
+        assert math.isnan(row.success["strict/1"][0]) == (row.num == 0)
 
 
 def test_grasps_that_all_fail_have_no_means(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -212,12 +243,12 @@ def test_a_view_hides_the_object_from_the_network_alone(view: str, monkeypatch: 
 
 
 def test_the_command_prints_rows_and_json(capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["benchmark", "--hands", "gripper3", "--objects", "can", "--num", "4", "--stages", "raw", "--protocols", "dro",
-               "--no-controls"]
+    command = ["benchmark", "--hands", "gripper3", "--objects", "can", "--num", "4", "--stages", "raw", "equal-time",
+               "--protocols", "dro", "--no-controls"]
     assert main([*command, "--json"]) == 0
-    (row,) = json.loads(capsys.readouterr().out)["rows"]
-    assert row["stage"] == RAW
-    assert row["num"] == 4
+    row, best = json.loads(capsys.readouterr().out)["rows"]
+    assert (row["stage"], best["stage"]) == (RAW, EQUAL_TIME)
+    assert (row["num"], best["num"], best["candidates"]) == (4, 1, 4)
     fingers, everyone = row["fingers"]["dro/1"]
     assert 0 < fingers <= 1
     assert main(command) == 0

@@ -15,7 +15,7 @@ from dro_grasp.cli.inputs import Flag, ProtocolName, optional
 from dro_grasp.cli.output import print_json, progress_bar, say
 
 if TYPE_CHECKING:
-    from dro_grasp.evaluation.success_rates import Row
+    from dro_grasp.evaluation.rows import Row
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,9 @@ class Benchmark:
     """Objects with meshes: names, paths, folders, or groups such as assets:validate."""
     num: int = 100
     """Grasps of each hand on each object, of which ranking keeps the best quarter."""
-    stages: tuple[Literal["raw", "ranked", "refined"], ...] = ("raw", "ranked", "refined")
-    """What is done to the grasps before the trials; of refined grasps, all and the best by score are reported."""
+    stages: tuple[Literal["raw", "ranked", "refined", "returned", "equal-time"], ...] = ("raw", "ranked", "refined")
+    """What is done to the grasps before the trials; of refined grasps, all and the best by score are reported. returned: what
+    `generate` returns, with the optimiser's share. equal-time: controls with as much CPU time for each grasp as the network."""
     protocols: tuple[ProtocolName, ...] = ("dro", "strict", "dexgraspbench")
     """Trials; displacement, rotation and diversity are means over successes of the first."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
@@ -96,9 +97,9 @@ class Benchmark:
         if self.views > 1:
             title += f", {self.views} views"
         columns = ["grasps", "stage", "hand", "n", *rows[0].success, *(f"{label} trials" for label in rows[0].trials_held),
-                   "fingers", "shift [mm]", "turn [deg]", "diversity", "ROC area", "ms a grasp"]
+                   "fingers", "shift [mm]", "turn [deg]", "diversity", "ROC area", "candidates", "optimiser [%]", "ms a grasp"]
         say(title + "; success, and trials held where a grasp has several, in % with 95 % intervals; for each protocol fingers "
-            "in contact (grasps with all of them) in %, and ROC area of the score\n")
+            "in contact (grasps with all of them) in %, and ROC area of the score; candidates made for each pair\n")
         for line in [columns, ["---"] * len(columns), *map(cells, rows)]:
             say("| " + " | ".join(map(str, line)) + " |")
         say(f"\n{seconds:.0f} s")
@@ -114,5 +115,6 @@ def cells(row: Row) -> list[object]:
     parts = " + ".join(f"{1e3 * seconds:.0f} {name}" for name, seconds in row.seconds.items())
     return [
         row.grasps, row.stage, row.hand, row.num, *rates, fingers, f"{1e3 * row.displacement:.1f}",
-        f"{math.degrees(row.rotation):.1f}", f"{row.diversity:.3f}", areas, parts,
+        f"{math.degrees(row.rotation):.1f}", f"{row.diversity:.3f}", areas, f"{row.candidates:.0f}",
+        f"{100 * row.optimised:.0f}", parts,
     ]

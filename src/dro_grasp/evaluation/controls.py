@@ -1,8 +1,10 @@
-"""Controls: baselines that ignore the object's shape, yet often pass lenient trials."""
+"""Controls: grasps without a network, from those that ignore the object's shape to the optimiser's."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -15,7 +17,18 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pipeline.choice import ChoiceConfig, choice_scores
 from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.pipeline.stages import optimise
 
+MEAN = "mean grasp"
+"""The mean of the training grasps at random rotations."""
+MEAN_CHOSEN = "mean grasp, chosen"
+"""The same, each rotation chosen by geometry as z is."""
+START = "unoptimised start"
+"""Half-closed hands that face the object."""
+SYNTHESISED = "synthesised"
+"""Grasps that the optimiser makes without a network, settled."""
+Maker = Callable[[int, int], GraspBatch]
+"""Makes a number of grasps from a seed."""
 CHOICE_POINTS = 160
 """Hand points by which a rotation of the mean grasp is chosen; as many as the shipped weights see (ours)."""
 
@@ -28,6 +41,16 @@ class MeanGrasp:
     """[rad or m]"""
     object_centre: Float[Tensor, "3"]
     """Position of the object's centre in the wrist frame [m]."""
+
+
+def controls(problem: GraspProblem, bundle: Bundle | None) -> dict[str, Maker]:
+    """Every control by name; the mean grasp needs a bundle with grasps of the hand."""
+    hand, found = problem.hand, dict[str, Maker]()
+    if bundle is not None and hand.name in bundle.grasps:
+        mean = mean_grasp(bundle, hand.name)
+        for name, choice in ((MEAN, ChoiceConfig(draws=1)), (MEAN_CHOSEN, ChoiceConfig())):
+            found[name] = partial(mean_grasps, problem, mean, config=choice)
+    return found | {START: partial(palm_facing_starts, hand, problem.obj), SYNTHESISED: partial(optimise, problem)}
 
 
 def mean_grasp(bundle: Bundle, hand_name: str) -> MeanGrasp:

@@ -1,0 +1,136 @@
+"""Rows of the benchmark's table: grasps of pairs after their trials, and what is told of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from dro_grasp.evaluation.metrics import diversity, finger_contact, mean_share, roc_area, wilson_interval
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.optimization.synthesis import PROVENANCE
+from dro_grasp.simulation.outcome import TrialResult
+from dro_grasp.simulation.protocols import Protocol
+
+ALL = "average"
+"""Name of the row over all hands."""
+
+
+@dataclass(frozen=True)
+class EvaluatedGrasps:
+    """Grasps of one hand on one object, after all trials."""
+
+    grasps: GraspBatch
+    results: tuple[TrialResult, ...]
+    """One for each protocol."""
+    seconds: dict[str, float]
+    """Time to make one grasp, by part [s]."""
+    fingers: int
+    """Fingers of the hand."""
+    candidates: int
+    """Grasps that were made, of which these are the best by score."""
+
+    def rows(self, index: Int[Tensor, " k"]) -> EvaluatedGrasps:
+        """Some of the grasps; the outcome of a trial depends on nothing but the grasp."""
+        return replace(self, grasps=self.grasps[index], results=tuple(r.rows(index) for r in self.results))
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table."""
+
+    grasps: str
+    """Their source."""
+    stage: str
+    hand: str
+    num: int
+    """Grasps evaluated."""
+    success: dict[str, tuple[float, float, float]]
+    """Per protocol the share of successes and its 95 % interval (Wilson); the mean over hands in the row of all."""
+    displacement: float
+    """Mean displacement of the object over successes of the first protocol [m]."""
+    rotation: float
+    """Mean rotation of the object, likewise [rad]."""
+    diversity: float
+    """The paper's measure over successes of the first protocol, mixing m and rad as the paper does."""
+    trials_held: dict[str, tuple[float, float, float]]
+    """Mean share of its trials that a grasp holds in, likewise, per protocol with several trials of each grasp."""
+    fingers: dict[str, tuple[float, float]]
+    """Per protocol the mean share of the hand's fingers that touch the object after closing, and the share of grasps with
+    all of them."""
+    ranking: dict[str, float]
+    """Per protocol the area under the ROC curve of score against success, within each pair."""
+    seconds: dict[str, float]
+    """Time of one grasp by part [s]."""
+    candidates: float
+    """Grasps made for each pair, of which these are the best by score."""
+    optimised: float
+    """Share of the grasps that the optimiser made."""
+
+
+def hand_row(source: str, stage: str, parts: Sequence[EvaluatedGrasps], protocols: Sequence[Protocol]) -> Row:
+    """One hand's line.
+
+    Args:
+        source: Where the grasps come from.
+        stage: What was done to them.
+        parts: The hand's grasps, one entry for each view of each object.
+        protocols: Of the results, in their order.
+    """
+    success = [torch.cat([t.results[i].success for t in parts]) for i in range(len(protocols))]
+    rates, held_in, fingers = {}, {}, {}
+    for i, rules in enumerate(protocols):
+        k, n = int(success[i].sum()), len(success[i])
+        rates[rules.label] = (k / n if n else math.nan, *wilson_interval(k, n))
+        if rules.perturbations.trials > 1:
+            held_in[rules.label] = mean_share(torch.cat([t.results[i].robustness for t in parts]))
+        fingers[rules.label] = finger_contact(torch.cat([t.results[i].fingers_in_contact for t in parts]), parts[0].fingers)
+    held = GraspBatch.concatenate([t.grasps.replace(extra={}) for t in parts])[success[0]]
+    first = [t.results[0] for t in parts]
+    areas = {
+        rules.label: _mean([roc_area(t.grasps.score, t.results[i].success) for t in parts])
+        for i, rules in enumerate(protocols)
+    }
+    seconds = {name: _mean([t.seconds[name] for t in parts]) for name in parts[0].seconds}
+    return Row(
+        source, stage, parts[0].grasps.hand, len(success[0]), rates,
+        displacement=float(torch.cat([r.displacement[r.success, -1] for r in first]).mean()),
+        rotation=float(torch.cat([r.rotation[r.success, -1] for r in first]).mean()),
+        diversity=diversity(held.T_object_wrist, held.joints)["all"], trials_held=held_in, fingers=fingers, ranking=areas,
+        seconds=seconds, candidates=_mean([t.candidates for t in parts]),
+        optimised=_mean([float(maker == PROVENANCE) for t in parts for maker in t.grasps.provenance]),
+    )
+
+
+def average(rows: Sequence[Row]) -> Row:
+    """The mean over hands; its interval is that of all grasps, of which every hand has the same number."""
+    total = sum(r.num for r in rows)
+    return replace(
+        rows[0], hand=ALL, num=total, success=_average_rates([r.success for r in rows], total),
+        trials_held=_average_rates([r.trials_held for r in rows], total),
+        fingers={
+            label: (_mean([r.fingers[label][0] for r in rows]), _mean([r.fingers[label][1] for r in rows]))
+            for label in rows[0].fingers
+        },
+        displacement=_mean([r.displacement for r in rows]), rotation=_mean([r.rotation for r in rows]),
+        diversity=_mean([r.diversity for r in rows]),
+        ranking={label: _mean([r.ranking[label] for r in rows]) for label in rows[0].ranking},
+        seconds={name: _mean([r.seconds[name] for r in rows]) for name in rows[0].seconds},
+        candidates=_mean([r.candidates for r in rows]), optimised=_mean([r.optimised for r in rows]),
+    )
+
+
+def _average_rates(rates: list[dict[str, tuple[float, float, float]]], total: int) -> dict[str, tuple[float, float, float]]:
+    """Per protocol the mean over hands, with the interval of as many grasps."""
+    means = {label: _mean([rate[label][0] for rate in rates]) for label in rates[0]}
+    return {label: (mean, *wilson_interval(round(mean * total), total)) for label, mean in means.items()}
+
+
+def _mean(values: Sequence[float]) -> float:
+    """The mean of the numbers among them; NaN without any."""
+    numbers = [v for v in values if math.isfinite(v)]
+    return sum(numbers) / len(numbers) if numbers else math.nan
