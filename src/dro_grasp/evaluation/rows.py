@@ -28,7 +28,7 @@ class EvaluatedGrasps:
     results: tuple[TrialResult, ...]
     """One for each protocol."""
     seconds: dict[str, float]
-    """Time to make one grasp, by part [s]."""
+    """Time to make one grasp, by part [s]; of grasps that a source returns, with all their candidates."""
     fingers: int
     """Fingers of the hand."""
     candidates: int
@@ -65,7 +65,7 @@ class Row:
     ranking: dict[str, float]
     """Per protocol the area under the ROC curve of score against success, within each pair."""
     seconds: dict[str, float]
-    """Time of one grasp by part [s]."""
+    """Time of one grasp, by part [s]; where a source returns its best, with all their candidates."""
     candidates: float
     """Grasps made for each pair, of which these are the best by score."""
     optimised: float
