@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from importlib import import_module
 from pathlib import Path
@@ -11,9 +12,13 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from scipy.stats import ttest_rel
 
+from dro_grasp.datasets.bundle.training_file import write_bundle
+from dro_grasp.models.presets import PRESETS
+from dro_grasp.training import loop, pretraining
 from tests.helpers.loaded_hands import loaded_hand
-from tests.helpers.tiny_bundle import made_up_grasps
+from tests.helpers.tiny_bundle import SEMIAXES, TINY, ellipsoid, made_up_grasps
 from tests.helpers.toy_hand import toy_hand
 
 
@@ -42,3 +47,42 @@ def test_palm_angles_are_scipys() -> None:
     twice = dataclasses.replace(grasps[[0]], T_object_wrist=torch.eye(4)[None])
     opposite = tuple((-hand.palm_direction_wrist).tolist())
     assert float(palm_angles(hand, twice, opposite)) == pytest.approx(math.pi, abs=1e-5)
+
+
+def test_the_gain_by_pretraining_is_scipys_paired_interval() -> None:
+    paper_form = import_module("paper_form")
+    rates = torch.rand(2, 3, generator=torch.Generator().manual_seed(0)).tolist()
+    pretrained, plain = (
+        [{"seed": seed, "rows": [{"stage": "raw", "success": {"dro/1": (other, 0, 1)}} for other in (0.5, rate)]}
+         for seed, rate in enumerate(row)] for row in rates)
+    interval = ttest_rel(*rates).confidence_interval()
+    expected = 50 * (interval.low + interval.high), 50 * (interval.high - interval.low)
+    (told,) = paper_form.gains(list(reversed(pretrained)), plain)
+    assert f"under dro/1, raw: {expected[0]:+.1f} +- {expected[1]:.1f} points" in told
+    (alone,) = paper_form.gains(pretrained[:1], plain)
+    assert f"{100 * (rates[0][0] - rates[1][0]):+.1f} +- nan" in alone
+    assert paper_form.gains([], plain) == paper_form.gains(pretrained[:1], plain[1:]) == []
+
+
+def test_the_papers_form_is_trained_and_measured_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    paper_form, hand = import_module("paper_form"), loaded_hand("gripper3")
+    monkeypatch.setitem(PRESETS, "paper-slim", dataclasses.replace(TINY, frame="object"))
+    grasps = [made_up_grasps(hand, name) for name in SEMIAXES]
+    write_bundle(tmp_path / "bundle.safetensors", [hand], {k: ellipsoid(v) for k, v in SEMIAXES.items()}, grasps)
+    command = ["--bundle", str(tmp_path / "bundle.safetensors"), "--validation", str(tmp_path / "bundle.safetensors"),
+               "--output", str(tmp_path / "out"), "--hands", "gripper3", "--objects", "sphere", "--num", "1", "--steps", "2",
+               "--pretraining-steps", "2", "--seeds", "0"]
+    for stage in (loop, pretraining):
+        monkeypatch.setattr(stage, "recalibrate", lambda *_: None)
+    paper_form.main(command)
+    told = capsys.readouterr().out
+    assert "pretraining adds under strict/1, refined, ranked:" in told
+    assert "z carries" in told
+    monkeypatch.setattr(paper_form, "train", None)
+    monkeypatch.setattr(paper_form, "benchmark", None)
+    paper_form.main([*command, "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert [(r["row"], r["seed"], len(r["rows"])) for name in ("pretrained", "not pretrained") for r in found[name]] == [
+        ("pretrained", 0, 3), ("not pretrained", 0, 3)]

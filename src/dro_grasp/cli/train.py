@@ -28,10 +28,11 @@ class Stage:
     output: Path
     """Weights file to write."""
     preset: Annotated[
-        Literal["slim", "paper", "multi"] | None,
-        tyro.conf.arg(aliases=["--size"], metavar="{slim,paper,multi}", help_behavior_hint="(default: slim)"),
+        Literal["slim", "paper", "paper-slim", "multi"] | None,
+        tyro.conf.arg(aliases=["--size"], metavar="{slim,paper,paper-slim,multi}", help_behavior_hint="(default: slim)"),
     ] = None
-    """Network: slim (narrow, the paper's latent), paper, or multi (that of the shipped weights)."""
+    """Network: slim (narrow, the paper's latent, told the placement), paper, paper-slim (the same as narrow as slim), or
+    multi (that of the shipped weights)."""
     latent: Annotated[int | None, optional("N", "the preset's")] = None
     """Numbers in z."""
     latent_form: Annotated[Literal["kernel", "motion"] | None, optional("{kernel,motion}", "the preset's")] = None
@@ -154,7 +155,9 @@ class Train(Stage):
     prior: Annotated[
         Literal["standard", "learned", "flow"] | None, optional("{standard,learned,flow}", "the preset's")] = None
     """Distribution of z: standard (N(0, I), the paper's form), or a Gaussian or a flow learned from hand and object."""
-    divergence: float = 0.01
+    losses: Literal["ours", "release"] = "ours"
+    """Weights of the losses and form of the KL divergence: ours, or those of the official release."""
+    divergence: Annotated[float | None, optional("WEIGHT", "0.01")] = None
     """KL weight; a lower value lets z carry more information."""
     divergence_warmup: float = 0.0
     """Share of the schedule over which the KL weight grows from zero."""
@@ -181,7 +184,7 @@ class Train(Stage):
         from dro_grasp.evaluation.distance_error import distance_errors
         from dro_grasp.files import check_output
         from dro_grasp.models.checkpoints import history_of, load_weights, locate_weights, save_weights
-        from dro_grasp.training.config import AugmentationConfig, LossConfig, TrainConfig
+        from dro_grasp.training.config import LOSSES, AugmentationConfig, TrainConfig
         from dro_grasp.training.loop import train
         from dro_grasp.training.processes import is_first
 
@@ -190,11 +193,12 @@ class Train(Stage):
         pretrained, initial = (None if name is None else load_weights(name) for name in (self.pretrained, self.initial))
         network = network_config(
             self.preset, initial, latent=self.latent, prior=self.prior, latent_form=self.latent_form)
+        losses = dataclasses.replace(LOSSES[self.losses], divergence_warmup=self.divergence_warmup, free_bits=self.free_bits)
+        if self.divergence is not None:
+            losses = dataclasses.replace(losses, divergence=self.divergence)
         config = TrainConfig(
             schedule=self.schedule(steps=self.steps, learning_rate=self.learning_rate, mixed=self.mixed),
-            samples_per_hand=self.samples_per_hand, columns=self.columns,
-            losses=LossConfig(
-                divergence=self.divergence, divergence_warmup=self.divergence_warmup, free_bits=self.free_bits),
+            samples_per_hand=self.samples_per_hand, columns=self.columns, losses=losses,
             augmentation=AugmentationConfig(partial=self.partial),
         )
         bundle = load_bundle(self.bundle)

@@ -73,7 +73,7 @@ class DistanceNetwork(nn.Module):
             else latent.GaussianPrior(c.latent, latent_width) if c.prior == "learned" else None)
         self.head = DistanceHead(c.width + c.latent, c.kernel_hidden, c.initial_distance)
         self.place = nn.Linear(3, c.width) if c.placed else None
-        self.placement = PlacementPrior(c.width, c.placement_width, c.placement_components)
+        self.placement = PlacementPrior(c.width, c.placement_width, c.placement_components) if c.placed else None
 
     def encode(
         self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"]
@@ -198,11 +198,16 @@ class DistanceNetwork(nn.Module):
     ) -> tuple[Float[Tensor, "num 3 3"], Float[Tensor, "num 3"]]:
         """Rotations of the hand's axes, and positions of the grasp centre in them about the object's centre [m].
 
+        A network that knows the placement chooses the rotations by its prior. The paper's takes the first, centred on the
+        object: it has no prior, and does not see the position.
+
         Args:
             hand: The open hand in its axes (`NetworkConfig.axes`) [m].
             obj: The object's cloud in its own frame [m].
-            rotations: Candidate rotations of these axes.
+            rotations: Candidate rotations of these axes, in random order.
         """
+        if self.placement is None:
+            return rotations[:num], rotations.new_zeros(num, 3)
         feature = self.hand_encoder((hand - hand.mean(0))[None]).mean(1)[0]
         return self.placement.sample(
             obj - obj.mean(0), feature, rotations, num, generator, self.config.placement_temperature

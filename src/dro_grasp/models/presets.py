@@ -40,9 +40,10 @@ class NetworkConfig:
     latent_neighbours: int = 20
     """K of the latent encoder's graph."""
     frame: Literal["object", "wrist", "palm"] = "object"
-    """Axes of both clouds. With `object`, the paper's form, the hand is zero-centred and its placement discarded. With `wrist`
-    or `palm` the network knows the placement, and adds the kernel to the distances of the placed open hand. The wrist's axes
-    are those that each description chooses; the palm's mean the same for every hand."""
+    """Axes of both clouds. With `object`, the paper's form, the hand is zero-centred: the network sees which way it is turned,
+    not where it is, and any wrist rotation is as good as another. With `wrist` or `palm` the network knows the placement, adds
+    the kernel to the distances of the placed open hand, and has a learned prior of placements. The wrist's axes are those
+    that each description chooses; the palm's mean the same for every hand."""
     latent_form: Literal["kernel", "motion"] = "kernel"
     """z enters the kernel alone (the paper's form), or also moves the placed open hand."""
     prior: Literal["standard", "learned", "flow"] = "standard"
@@ -80,7 +81,11 @@ class NetworkConfig:
 
     @staticmethod
     def preset(name: str) -> NetworkConfig:
-        """A named configuration: `paper` (about 14 M parameters), `slim`, or `multi`, that of the shipped weights (1.5 M).
+        """A named configuration.
+
+        Args:
+            name: `paper` (14 M parameters), `paper-slim`, the same form as narrow as `slim`, `slim`, or `multi`, that of the
+                shipped weights (1.5 M).
 
         Raises:
             OptionError: No configuration has the name.
@@ -114,6 +119,7 @@ SLIM = NetworkConfig(
 """A network narrow enough to train on a CPU, with the paper's latent; it knows the placement. Source: ours."""
 PRESETS = {
     "paper": NetworkConfig(),
+    "paper-slim": dataclasses.replace(SLIM, frame="object"),
     "slim": SLIM,
     "multi": dataclasses.replace(SLIM, latent=32, latent_form="motion", prior="flow"),
 }

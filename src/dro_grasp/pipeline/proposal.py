@@ -1,7 +1,8 @@
 """Candidates from the network: placements of the open hand, D(R,O), link poses, joints.
 
 Source: paper section III, figure 2. Differs from the paper: a placement of the open hand is chosen first, by the caller's
-direction or by the learned placement prior.
+direction or by the learned placement prior. Networks of the paper's form have no such prior: their wrists are turned at
+random, or face the caller's direction at a random roll.
 """
 
 from __future__ import annotations

@@ -14,16 +14,21 @@ class AugmentationConfig:
     object_noise: float = 0.002
     """Standard deviation of the noise on object points [m]. Source: appendix, object point cloud sampling."""
     placement_rotation: float = math.radians(4)
-    """Largest rotation between the open hand's placement and the grasp's wrist pose [rad]. Source: ours."""
+    """Largest rotation between the open hand's placement and the grasp's wrist pose, for networks that know the placement
+    [rad]. Source: ours."""
     placement_shift: float = 0.004
     """Standard deviation of the shift between them, along each axis [m]. Source: ours."""
+    tilt: float = math.radians(30)
+    """For networks that do not know the placement, the largest angle by which the open hand is turned from the grasp's wrist
+    rotation, about an axis perpendicular to the direction from the wrist to the object [rad]. Source: the official
+    release."""
     partial: float = 0.0
     """Share of samples in which half of the object is seen. Source: appendix."""
 
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights of the four terms. Source: the official release; the KL weight is swept."""
+    """Weights of the four terms, and of those that are ours. Source: the official release, where nothing else is said."""
 
     distance: float = 1.0
     pose: float = 0.01
@@ -42,6 +47,10 @@ class LossConfig:
     """Weight of the flow's loss; for prior `flow`."""
     placement: float = 0.01
     """Weight of the placement prior's loss; it shares no parameter with the rest."""
+
+
+LOSSES = {"ours": LossConfig(), "release": LossConfig(penetration=1.0, divergence_form="official")}
+"""Losses by name; `release` has the weights of the official release and its form of the divergence."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +114,8 @@ class PretrainConfig:
     sharpness: float = 10.0
     """lambda of the tanh weights [1/m]. Source: paper section III-B."""
     rotation: float = math.radians(15)
-    """Largest rotation between the two clouds' wrists [rad]."""
+    """Largest rotation between the two clouds' wrists, for networks that know the placement [rad]; others are pretrained with
+    the tilt of their training. Source: ours."""
 
 
 @dataclass(frozen=True)

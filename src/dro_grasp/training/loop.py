@@ -13,6 +13,7 @@ from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.errors import WeightsError
 from dro_grasp.geometry.se3 import apply
 from dro_grasp.models.network import DistanceNetwork, NetworkOutput, untrained_network
+from dro_grasp.models.placement import PlacementPrior
 from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.training import losses
 from dro_grasp.training.config import TrainConfig
@@ -150,7 +151,8 @@ def step_losses(
     if model.motion is not None:
         parts["motion"] = (output.moved - grasp).norm(dim=-1).mean()
     parts["flow"] = output.flow_error.mean()
-    parts["placement"] = _placement(model, groups, output)
+    if model.placement is not None:
+        parts["placement"] = _placement(model.placement, groups, output)
     weights = {name: getattr(config.losses, name) for name in parts}
     if progress < config.losses.divergence_warmup:
         weights["divergence"] *= progress / config.losses.divergence_warmup
@@ -164,11 +166,11 @@ def _clouds(groups: list[HandSamples]) -> tuple[Float[Tensor, "b n 3"], Float[Te
     return placed, obj, grasp
 
 
-def _placement(model: DistanceNetwork, groups: list[HandSamples], output: NetworkOutput) -> Float[Tensor, ""]:
+def _placement(prior: PlacementPrior, groups: list[HandSamples], output: NetworkOutput) -> Float[Tensor, ""]:
     feature = output.hand_feature.detach()
     obj, other, position = (
         torch.cat([getattr(g, n) for g in groups]) for n in ("obj_hand", "obj_random", "position")
     )
-    density, score = model.placement.log_density(obj, feature, position)
-    other_score = model.placement(other, feature)[3]
+    density, score = prior.log_density(obj, feature, position)
+    other_score = prior(other, feature)[3]
     return losses.placement_loss(density, score, other_score)

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.errors import TrainingError
-from dro_grasp.geometry.se3 import random_rotations
 from dro_grasp.models.encoder import StaticGraphEncoder
 from dro_grasp.models.latent import HandMotion, sample_posterior
 from dro_grasp.models.network import DistanceNetwork, untrained_network
@@ -109,18 +108,22 @@ def motion_losses(
 def contrastive_step(
     encoder: StaticGraphEncoder, source: SampleSource, config: PretrainConfig, generator: torch.Generator
 ) -> Float[Tensor, ""]:
-    """Loss of one batch: grasps (cloud A) against the open hand (cloud B) with a similar wrist rotation."""
+    """Loss of one batch: grasps (cloud A) against the open hand (cloud B) with a similar wrist rotation.
+
+    A network that does not know the placement gets both as in its training: the grasp as it is stored, the open hand tilted.
+    """
     grasp_clouds, open_clouds = [], []
     for name in source.draw_hands(config.hands_per_step, generator):
         hand, grasps = source.hands[name], source.grasps[name]
         chosen = torch.randint(len(grasps.joints), (config.samples_per_hand,), generator=generator, device=generator.device)
-        if source.network.frame == "object":
-            wrist = random_rotations(len(chosen), generator)
+        if source.network.placed:
+            opened = source.network.axes(hand.palm_axes_wrist).mT.expand(len(chosen), 3, 3)
+            grasping = opened @ random_turns(len(chosen), config.rotation, generator)
         else:
-            wrist = source.network.axes(hand.palm_axes_wrist).mT.expand(len(chosen), 3, 3)
-        turn = wrist @ random_turns(len(chosen), config.rotation, generator)
-        grasp_clouds.append(hand.points(grasps.joints[chosen]) @ turn.mT)
-        open_clouds.append(hand.points(hand.random_open_joints(len(chosen), generator)) @ wrist.mT)
+            T = grasps.T_object_wrist[chosen]
+            opened, grasping = source.tilted(T, source.centres[grasps.object_index[chosen]], generator), T[:, :3, :3]
+        grasp_clouds.append(hand.points(grasps.joints[chosen]) @ grasping.mT)
+        open_clouds.append(hand.points(hand.random_open_joints(len(chosen), generator)) @ opened.mT)
     a, b = (torch.cat(c) for c in (grasp_clouds, open_clouds))
     features = encoder(torch.cat([c - c.mean(1, keepdim=True) for c in (a, b)]))
     features_a, features_b = features.chunk(2)

@@ -25,7 +25,7 @@ class HandSamples:
     hand: Hand
     """Thinned to the network's number of points."""
     placed: Float[Tensor, "b n 3"]
-    """The open hand near the grasp [m]."""
+    """The open hand near the grasp [m]; centred on the object where the network does not know the placement."""
     grasp: Float[Tensor, "b n 3"]
     """The hand in the grasp [m]."""
     obj: Float[Tensor, "b m 3"]
@@ -61,6 +61,7 @@ class SampleSource:
         self.names = [name for name, grasps in bundle.grasps.items() if len(grasps.joints)]
         self.points = torch.stack([cloud.points for cloud in bundle.objects.values()]).to(device)
         self.normals = torch.stack([cloud.normals for cloud in bundle.objects.values()]).to(device)
+        self.centres = self.points.mean(1)
 
     def draw_hands(self, count: int, generator: torch.Generator) -> list[str]:
         """Names of the hands of one step, each as often as any other in the long run."""
@@ -74,10 +75,10 @@ class SampleSource:
         T, q = grasps.T_object_wrist[chosen], grasps.joints[chosen]
         points, normals = self._objects(grasps.object_index[chosen], generator)
         centre = points.mean(1)
-        T_placed = self._placements(hand, T, generator)
+        T_placed = self._placements(hand, T, generator) if self.network.placed else self._centred(hand, T, centre, generator)
         own = self.network.axes(hand.palm_axes_wrist)
         world = torch.eye(3, device=T.device).expand(count, 3, 3)
-        axes = world if self.network.frame == "object" else T_placed[:, :3, :3] @ own
+        axes = T_placed[:, :3, :3] @ own if self.network.placed else world
         T_frame_object = invert(compose(axes, centre))
         opened = hand.random_open_joints(count, generator)
         T_frame_wrist = T_frame_object @ T
@@ -96,22 +97,39 @@ class SampleSource:
     ) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b n 3"]]:
         """Placed open hands, and the same hands with other joint values and a wrist pose as far off as placements are [m].
 
-        Half of the joint values are those of grasps, the others are uniform within the limits. Axes are the network's; they
-        are random where these are the object's.
+        Half of the joint values are those of grasps, the others are uniform within the limits. Axes are the network's, which
+        knows the placement.
         """
         hand, grasps = self.hands[name], self.grasps[name]
         chosen = torch.randint(len(grasps.joints), (count,), generator=generator, device=generator.device)
         drawn = hand.random_joints(count, generator)
         known = torch.rand(count, 1, generator=generator, device=generator.device) < 0.5
         q = torch.where(known, grasps.joints[chosen], drawn)
-        if self.network.frame == "object":
-            turn = random_rotations(count, generator)
-        else:
-            turn = self.network.axes(hand.palm_axes_wrist).mT.expand(count, 3, 3)
+        turn = self.network.axes(hand.palm_axes_wrist).mT.expand(count, 3, 3)
         wrist = compose(turn, turn.new_zeros(3))
         near = self._placements(hand, torch.eye(4, device=generator.device).repeat(count, 1, 1), generator)
         opened = hand.random_open_joints(count, generator)
         return hand.points(opened, wrist), hand.points(q, wrist @ invert(near))
+
+    def tilted(
+        self, T: Float[Tensor, "b 4 4"], centre: Float[Tensor, "b 3"], generator: torch.Generator
+    ) -> Float[Tensor, "b 3 3"]:
+        """Wrist rotations of open hands near those of grasps, for a network that does not know the placement.
+
+        Args:
+            T: Wrist poses of grasps.
+            centre: Centres of their objects, in the same frame [m].
+            generator: Source of randomness.
+        """
+        toward = torch.nn.functional.normalize(centre - T[:, :3, 3], dim=-1)
+        return random_turns(len(T), self.augmentation.tilt, generator, toward) @ T[:, :3, :3]
+
+    def _centred(
+        self, hand: Hand, T: Float[Tensor, "b 4 4"], centre: Float[Tensor, "b 3"], generator: torch.Generator
+    ) -> Float[Tensor, "b 4 4"]:
+        """Tilted wrists with the grasp centre in the object's, as at inference: a position that tells nothing of the grasp."""
+        rotation = self.tilted(T, centre, generator)
+        return compose(rotation, centre - rotation @ hand.grasp_centre_wrist)
 
     def _objects(
         self, index: Int[Tensor, " b"], generator: torch.Generator
@@ -136,8 +154,13 @@ class SampleSource:
         return compose(T[:, :3, :3] @ turn, T[:, :3, 3] + moved)
 
 
-def random_turns(count: int, largest: float, generator: torch.Generator) -> Float[Tensor, "count 3 3"]:
-    """Rotations about random axes by angles uniform up to the largest [rad]."""
-    axis = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, device=generator.device), dim=-1)
+def random_turns(
+    count: int, largest: float, generator: torch.Generator, across: Float[Tensor, "count 3"] | None = None
+) -> Float[Tensor, "count 3 3"]:
+    """Rotations about random axes, perpendicular to unit vectors if given, by angles uniform up to the largest [rad]."""
+    axis = torch.randn(count, 3, generator=generator, device=generator.device)
+    if across is not None:
+        axis = axis - (axis * across).sum(-1, keepdim=True) * across
+    axis = torch.nn.functional.normalize(axis, dim=-1)
     angle = torch.rand(count, 1, generator=generator, device=generator.device) * largest
     return roma.rotvec_to_rotmat(axis * angle)
