@@ -184,7 +184,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(argv)
     torch.set_num_threads(1)
-    options.output.mkdir(exist_ok=True)
+    options.output.mkdir(parents=True, exist_ok=True)
     bundle = part(load_bundle(options.bundle), options.hands)
     found: dict[str, list[dict[str, Any]]] = {}
     for seed in options.seeds:
