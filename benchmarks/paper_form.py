@@ -28,6 +28,7 @@ from dro_grasp.datasets.bundle.training_file import Bundle, load_bundle
 from dro_grasp.evaluation.distance_error import distance_errors
 from dro_grasp.evaluation.metrics import wilson_interval
 from dro_grasp.evaluation.success_rates import ALL, BEST, RAW, REFINED, BenchmarkConfig, benchmark
+from dro_grasp.files import replacing
 from dro_grasp.hands.library import load_hand
 from dro_grasp.models.checkpoints import describe_weights, load_weights, save_weights
 from dro_grasp.models.presets import NetworkConfig
@@ -100,15 +101,17 @@ def measured(options: argparse.Namespace, row: str, seed: int, bundle: Bundle) -
     stored = weights.with_name(f"{weights.stem}_on_{where}_{options.num}.json")
     if not stored.exists():
         objects = [load_object(name) for name in resolve_objects(options.objects)]
-        config = BenchmarkConfig(options.num, STAGES, tuple(protocol(p) for p in PROTOCOLS), controls=False)
+        config = BenchmarkConfig(options.num, STAGES, tuple(map(protocol, PROTOCOLS)), controls=False, seed=seed)
         rows = benchmark([load_hand(h) for h in options.hands], objects, GraspPredictor(str(weights)), config)
         errors = []
         if options.validation is not None:
             errors = distance_errors(load_weights(weights), part(load_bundle(options.validation), options.hands))
-        stored.write_text(json.dumps({
+        values = {
             "row": row, "seed": seed, "seconds": describe_weights(weights)["about"]["seconds"],
             "rows": [dataclasses.asdict(r) for r in rows], "errors": [dataclasses.asdict(e) for e in errors],
-        }))
+        }
+        with replacing(stored) as temporary:
+            temporary.write_text(json.dumps(values))
     return json.loads(stored.read_text())
 
 
