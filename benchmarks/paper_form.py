@@ -27,7 +27,8 @@ from synthesis import HANDS
 from dro_grasp.datasets.bundle.training_file import Bundle, load_bundle
 from dro_grasp.evaluation.distance_error import distance_errors
 from dro_grasp.evaluation.metrics import wilson_interval
-from dro_grasp.evaluation.success_rates import ALL, BEST, RAW, REFINED, BenchmarkConfig, benchmark
+from dro_grasp.evaluation.rows import ALL
+from dro_grasp.evaluation.success_rates import BEST, RAW, REFINED, BenchmarkConfig, benchmark
 from dro_grasp.files import replacing
 from dro_grasp.hands.library import load_hand
 from dro_grasp.models.checkpoints import describe_weights, load_weights, save_weights
@@ -101,7 +102,7 @@ def measured(options: argparse.Namespace, row: str, seed: int, bundle: Bundle) -
     stored = weights.with_name(f"{weights.stem}_on_{where}_{options.num}.json")
     if not stored.exists():
         objects = [load_object(name) for name in resolve_objects(options.objects)]
-        config = BenchmarkConfig(options.num, STAGES, tuple(map(protocol, PROTOCOLS)), controls=False, seed=seed)
+        config = BenchmarkConfig(options.num, STAGES, tuple(map(protocol, PROTOCOLS)), controls=False, seed=seed, workers=1)
         rows = benchmark([load_hand(h) for h in options.hands], objects, GraspPredictor(str(weights)), config)
         errors = []
         if options.validation is not None:
