@@ -38,6 +38,10 @@ def test_a_file_becomes_weights_and_a_report(home: Path, capsys: pytest.CaptureF
     assert page.count("data:image/png;base64,") == 2, "the hand, and grasps of the one held-out object"
     assert "http" not in page.replace("http-equiv", ""), "nothing is fetched"
     assert f"{told['after']['refined']['dro/1']:.0%} after" in page
+    for step in ("before", "after"):
+        share = f"{told[step]['returned']['dro/1']:.0%} {step} ({told['optimised'][step]:.0%} of them made by the optimiser)"
+        assert share in page
+    assert " of 8 made by the optimiser" in page
     assert str(home / "out" / "weights.safetensors") in page
 
 
@@ -62,6 +66,18 @@ def test_a_run_that_stopped_goes_on(home: Path, monkeypatch: pytest.MonkeyPatch,
     monkeypatch.setattr(steps, "synthesize_dataset", None)
     assert main(command(home)) == 0
     assert capsys.readouterr().err.count("finished before") == 3
+
+
+def test_a_benchmark_without_what_generate_returns_is_made_again(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As folders of an earlier version have it."""
+    state = json.loads((home / "out" / steps.STATE).read_text())
+    whole = state["steps"]["after"]
+    state["steps"]["after"] = whole | {"rows": [row for row in whole["rows"] if row["stage"] != steps.RETURNED]}
+    (home / "out" / steps.STATE).write_text(json.dumps(state))
+    assert main(command(home)) == 0
+    assert capsys.readouterr().err.count("finished before") == 4
+    rows = json.loads((home / "out" / steps.STATE).read_text())["steps"]["after"]["rows"]
+    assert [row["stage"] for row in rows] == [row["stage"] for row in whole["rows"]]
 
 
 def test_the_folder_of_another_hand_is_refused(home: Path, capsys: pytest.CaptureFixture[str]) -> None:

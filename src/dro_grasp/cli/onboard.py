@@ -30,7 +30,7 @@ class Onboard:
     minutes: float = 30.0
     """Total time for data, training and trials [min]."""
     num: int = 20
-    """Grasps to evaluate on each held-out object."""
+    """Grasps of the network to evaluate on each held-out object, and a quarter as many that `generate` returns."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Weights to fine-tune."""
     workers: int = 2
@@ -54,6 +54,7 @@ class Onboard:
                  for step in ("before", "after")}
         if self.json:
             print_json({"hand": self.hand, "weights": str(self.output / WEIGHTS), "report": str(report), **rates,
+                        "optimised": {step: done.optimised(step) for step in ("before", "after")},
                         "grasps": done.steps["training"]["grasps"],
                         "seconds": {name: round(step["seconds"], 1) for name, step in done.steps.items()}})
             return 0

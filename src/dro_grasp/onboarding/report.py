@@ -6,7 +6,7 @@ import html
 from pathlib import Path
 from typing import Any
 
-from dro_grasp.evaluation.success_rates import BEST, RAW, REFINED
+from dro_grasp.evaluation.success_rates import BEST, RAW, REFINED, RETURNED
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.onboarding.steps import DATA, PICTURE, REPORT, WEIGHTS, Onboarded
@@ -20,8 +20,8 @@ GRASPS = 8
 """Grasps drawn on each object."""
 OBJECTS = 3
 """Held-out objects drawn."""
-CANDIDATES = 4
-"""Candidates for each grasp drawn."""
+STAGES = {RAW: "network alone", REFINED: "network, refined", BEST: "network, refined, best quarter", RETURNED: "generate"}
+"""What the grasps of each stage are called."""
 
 
 def write_report(done: Onboarded, held_out: list[str]) -> Path:
@@ -32,7 +32,8 @@ def write_report(done: Onboarded, held_out: list[str]) -> Path:
     """
     path, name = done.folder / REPORT, html.escape(Path(done.hand).stem)
     parts = [
-        f"<h1>{name}</h1>", _summary(done), _rates(done), "<h2>Grasps after fine-tuning</h2>", _drawn(done, held_out),
+        f"<h1>{name}</h1>", _summary(done), _rates(done),
+        "<h2>What generate returns after fine-tuning</h2>", _drawn(done, held_out),
         f"<h2>The description</h2><p class=note>{html.escape(done.hand)}</p>",
         image((done.folder / PICTURE).read_bytes(), f"{name}, open and closed"),
         f"<pre>{html.escape(chr(10).join(done.steps['check']['lines']))}</pre>", "<h2>Training grasps</h2>",
@@ -45,10 +46,14 @@ def write_report(done: Onboarded, held_out: list[str]) -> Path:
 def _summary(done: Onboarded) -> str:
     before, after = (done.rate(step, REFINED, "dro/1") for step in ("before", "after"))
     best = done.rate("after", BEST, "dro/1")
+    returned = " and ".join(
+        f"{done.rate(step, RETURNED, 'dro/1'):.0%} {step} ({done.optimised(step):.0%} of them made by the optimiser)"
+        for step in ("before", "after"))
     minutes = sum(step["seconds"] for step in done.steps.values()) / 60
     return (f"<p>On held-out objects, {before:.0%} of the refined grasps pass protocol <i>dro</i> before fine-tuning, and "
             f"{after:.0%} after fine-tuning on {done.steps['training']['grasps']:,} grasps of this hand; of the best quarter "
-            f"by score, {best:.0%} pass. All steps took {minutes:.0f} minutes.</p>")
+            f"by score, {best:.0%} pass. Of the grasps that <i>generate</i> returns, {returned} pass. All steps took "
+            f"{minutes:.0f} minutes.</p>")
 
 
 def _rates(done: Onboarded) -> str:
@@ -56,13 +61,15 @@ def _rates(done: Onboarded) -> str:
     for step in ("before", "after"):
         for row in done.steps[step]["rows"]:
             rates = [f"{100 * p:.0f} % [{100 * low:.0f}-{100 * high:.0f}]" for p, low, high in row["success"].values()]
-            rows.append([step, "network alone" if row["stage"] == RAW else row["stage"], row["num"], *rates,
+            rows.append([step, STAGES[row["stage"]], row["num"], *rates, f"{100 * row['optimised']:.0f} %",
                          f"{row['diversity']:.2f}"])
     labels = list(done.steps["after"]["rows"][0]["success"])
-    return table(["weights", "grasps", "trials", *labels, "diversity"], rows) + (
+    return table(["weights", "grasps", "trials", *labels, "by the optimiser", "diversity"], rows) + (
         "<p class=note>Success rates with 95 % intervals. dro is the paper's protocol and lenient; strict also limits "
-        "penetration and how far closing may push the object. <i>generate</i> keeps the best of four candidates by score: "
-        "the rows <i>refined, ranked</i>.</p>")
+        "penetration and how far closing may push the object. The network's rows are what fine-tuning improves. "
+        "<i>generate</i> keeps the best of four of the network's candidates by score, as the row <i>best quarter</i> does, and "
+        "asks the optimiser for others where the score does not trust these: slower, and less needed the better the network "
+        "is. <i>generate --method network</i> does without.</p>")
 
 
 def _drawn(done: Onboarded, held_out: list[str]) -> str:
@@ -72,9 +79,11 @@ def _drawn(done: Onboarded, held_out: list[str]) -> str:
         obj = load_object(name)
         path = done.folder / f"{Path(name).stem}.png"
         problem = GraspProblem(hand, obj)
-        grasps = predictor.run(problem, GraspRequest(GRASPS, candidates=CANDIDATES, method="network")).grasps
-        draw_grasps(hand, obj, evaluate(problem, grasps, "strict"), path)
-        parts.append(image(path.read_bytes(), f"grasps of {name}"))
+        made = predictor.run(problem, GraspRequest(GRASPS))
+        draw_grasps(hand, obj, evaluate(problem, made.grasps, "strict"), path)
+        by_optimiser = made.origin.count("optimiser")
+        parts.append(image(path.read_bytes(), f"grasps of {name}")
+                     + f"<p class=note>{html.escape(name)}: {by_optimiser} of {GRASPS} made by the optimiser</p>")
     return "".join(parts)
 
 
