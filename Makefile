@@ -21,7 +21,7 @@ demo: setup
 		--output out/demo.parquet --picture out/demo.png
 
 test: setup
-	$(BIN)/python -m pytest -n 2 --dist loadgroup -q
+	$(BIN)/python -m pytest -n 2 --dist loadfile -q
 
 test-slow: setup  # what takes a minute each, such as a Ray cluster that loses a node
 	$(BIN)/python -m pytest -q -m slow

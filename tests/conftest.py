@@ -41,20 +41,20 @@ def device(request: pytest.FixtureRequest) -> Iterator[str]:
         yield request.param
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the tiny bundle and the runs on it lie."""
     return tmp_path_factory.mktemp("training")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def bundle(home: Path):
     from tests.helpers.tiny_bundle import tiny_bundle
 
     return tiny_bundle(home / "bundle.safetensors")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def results(home: Path, bundle) -> dict:
     """What uninterrupted runs of both stages of training return, by stage."""
     from tests.helpers.training_stages import STAGES, run_stage
@@ -62,7 +62,16 @@ def results(home: Path, bundle) -> dict:
     return {stage: run_stage(stage, bundle, home / stage) for stage in STAGES}
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def finished(home: Path, results: dict) -> dict[str, Path]:
     """The folders of these runs."""
     return {stage: home / stage for stage in results}
+
+
+@pytest.fixture
+def quick_statistics(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands that train measure the statistics of BatchNorm over two batches, which takes most of so short a run."""
+    from dro_grasp.training import loop
+    from dro_grasp.training.runs import recalibrate
+
+    monkeypatch.setattr(loop, "recalibrate", lambda model, forward, _: recalibrate(model, forward, 2))

@@ -3,27 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from pathlib import Path
 
 import pytest
 import torch
 
-from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.devices import choose_device, on_device, require_device
 from dro_grasp.energy.grasp_energy import link_spheres
 from dro_grasp.errors import OptionError
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predictor import GraspPredictor
-from dro_grasp.training import loop, pretraining
-from dro_grasp.training.runs import recalibrate
 from tests.helpers.claw import ball
 from tests.helpers.toy_hand import toy_hand
-from tests.helpers.training_stages import SCHEDULE, STAGES, curve, run_stage
 from tests.helpers.weights import untrained_weights
 
-SHORT = dataclasses.replace(SCHEDULE, steps=2, log_every=1)
 NEARLY = {"atol": 1e-5, "rtol": 1e-4}
 
 
@@ -79,19 +73,3 @@ def test_prediction_on_a_device_gives_the_grasps_of_the_cpu(
     assert there.joints.device.type == "cpu"
     for name in ("joints", "T_object_wrist", "pregrasp_joints", "squeeze_joints", "score"):
         torch.testing.assert_close(getattr(there, name), getattr(here, name), atol=1e-3, rtol=1e-3)
-
-
-@pytest.mark.parametrize("stage", STAGES)
-def test_training_on_a_device_gives_the_losses_of_the_cpu(
-    device: str, stage: str, bundle: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for module in (loop, pretraining):
-        monkeypatch.setattr(module, "recalibrate", functools.partial(recalibrate, batches=1))
-    run_stage(stage, bundle, tmp_path / "here", SHORT)
-    model = run_stage(stage, bundle, tmp_path / "there", dataclasses.replace(SHORT, device=device))
-    assert {x.device.type for x in model.state_dict().values()} == {"cpu"}
-    losses = [[torch.tensor(list(line.values())) for line in curve(tmp_path / where)] for where in ("here", "there")]
-    for here, there in zip(*losses, strict=True):
-        assert there.isfinite().all()
-        if device != "cuda":  # it draws other samples
-            torch.testing.assert_close(there, here, **NEARLY)

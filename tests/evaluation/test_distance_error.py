@@ -43,6 +43,7 @@ def test_errors_are_those_of_the_network(bundle: Bundle) -> None:
     assert found.divergence == pytest.approx(2.0), "half of the squared mean"
 
 
+@pytest.mark.usefixtures("quick_statistics")
 def test_training_reports_them_of_grasps_it_has_not_seen(
     bundle: Bundle, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -43,7 +43,6 @@ from dro_grasp.simulation.trial import simulate
 HANDS = ("gripper3", "barrett")
 OBJECTS = ("sphere", "can")
 CONFIG = BenchmarkConfig(num=8, protocols=(protocol("dro"), protocol("strict")))
-pytestmark = pytest.mark.xdist_group("success rates")  # one process makes the rows that the tests share
 
 
 @pytest.fixture(scope="module")

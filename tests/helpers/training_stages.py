@@ -17,7 +17,7 @@ from dro_grasp.training.run_folder import LOG
 from tests.helpers.tiny_bundle import TINY
 
 SCHEDULE = ScheduleConfig(
-    steps=10, warmup_steps=3, learning_rate=3e-3, average_decay=0.9, checkpoint_seconds=0, log_every=2
+    steps=10, warmup_steps=3, learning_rate=3e-3, average_decay=0.9, checkpoint_seconds=0, log_every=2, recalibration=4,
 )
 SHARDED = dataclasses.replace(SCHEDULE, shards=2)
 STAGES = ["train", "pretrain"]

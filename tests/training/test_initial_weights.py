@@ -24,7 +24,7 @@ MOVING = dataclasses.replace(TINY, latent_form="motion", prior="flow")
 
 
 @pytest.fixture
-def command(home: Path, bundle: Bundle, tmp_path: Path) -> list[str]:
+def command(home: Path, bundle: Bundle, tmp_path: Path, quick_statistics: None) -> list[str]:
     """Train one step from weights in the form of the shipped ones."""
     save_weights(untrained_network(MOVING, seed=0), tmp_path / "initial.safetensors")
     return ["train", "--bundle", str(home / "bundle.safetensors"), "--run-folder", str(tmp_path / "run"), "--output",

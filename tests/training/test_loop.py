@@ -82,7 +82,7 @@ def test_recalibration_measures_what_the_weights_make_of_the_data(bundle: Bundle
 
 @pytest.mark.parametrize("stage", STAGES)
 def test_statistics_returned_belong_to_the_weights_returned(bundle: Bundle, tmp_path: Path, stage: str) -> None:
-    model = run_stage(stage, bundle, tmp_path / "run")
+    model = run_stage(stage, bundle, tmp_path / "run", dataclasses.replace(SCHEDULE, recalibration=64))
     assert not any(m.training for m in model.modules())
     norm = model.hand_encoder.final.norm
     inputs: list[torch.Tensor] = []

@@ -75,6 +75,8 @@ class ScheduleConfig:
     """Independent parts of a step's batch, each as large as the configuration says; processes share them."""
     log_every: int = 20
     """Steps between lines of the log."""
+    recalibration: int = 64
+    """Batches that measure the statistics of BatchNorm for the averaged weights, after the last step."""
     tensorboard: bool = False
     """Also write the log for TensorBoard, which must be installed."""
     mixed: bool = False

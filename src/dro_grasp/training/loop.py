@@ -70,7 +70,7 @@ def train(
     run.train(lambda: step_losses(model, draw(), config, generator, run.progress), report or console_report("training"))
     model.load_state_dict(run.average.module.state_dict())
     run.seed_shard()
-    recalibrate(model, lambda: model(*_clouds(draw()), generator, columns=1))
+    recalibrate(model, lambda: model(*_clouds(draw()), generator, columns=1), config.schedule.recalibration)
     model.mixed = False
     return model.cpu().eval()
 

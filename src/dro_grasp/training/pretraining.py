@@ -51,7 +51,7 @@ def pretrain(
     run.train(losses, report or console_report("pretraining"))
     encoder.load_state_dict(run.average.module.state_dict())
     run.seed_shard()
-    recalibrate(encoder, losses)
+    recalibrate(encoder, losses, config.schedule.recalibration)
     return whole.cpu().eval()
 
 

@@ -199,7 +199,7 @@ def check_schedule(schedule: ScheduleConfig) -> None:
             installed, or the processes would get different numbers of shards.
     """
     require_device(schedule.device)
-    for name in ("steps", "minutes", "learning_rate", "log_every", "shards"):
+    for name in ("steps", "minutes", "learning_rate", "log_every", "recalibration", "shards"):
         value = getattr(schedule, name)
         if value is not None and not 0 < value < math.inf:
             raise OptionError(f"{name} is {value}; give a positive number")
@@ -211,7 +211,7 @@ def check_schedule(schedule: ScheduleConfig) -> None:
 
 
 @torch.no_grad()
-def recalibrate(model: nn.Module, forward: Callable[[], object], batches: int = 64) -> None:
+def recalibrate(model: nn.Module, forward: Callable[[], object], batches: int) -> None:
     """Measure the statistics of BatchNorm for the averaged weights.
 
     The averages kept during training belong to other weights: with them the distance error in evaluation mode is
