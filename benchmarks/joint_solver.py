@@ -19,13 +19,13 @@ from pathlib import Path
 
 import cvxpy as cp
 import numpy as np
-import roma
 import torch
 from jaxtyping import Float
 from report import emit
 from torch import Tensor
 
 from dro_grasp import distance_matrix
+from dro_grasp.geometry.rotations import roma
 from dro_grasp.geometry.se3 import compose
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand

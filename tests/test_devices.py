@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from pathlib import Path
 
 import pytest
@@ -61,14 +62,15 @@ def test_synthesis_on_a_device_gives_the_grasps_of_the_cpu(device: str) -> None:
     torch.testing.assert_close(there.T_object_wrist, here.T_object_wrist, **NEARLY)
 
 
-@pytest.mark.parametrize("refine", [False, True])
-def test_prediction_on_a_device_gives_the_grasps_of_the_cpu(
-    device: str, refine: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_the_optimiser_s_predictions_on_a_device_are_those_of_the_cpu(
+    device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Those of the network: `test_predictor.py`."""
     monkeypatch.setattr("dro_grasp.predictor.OPTIMISED_PER_GRASP", 2)
+    monkeypatch.setattr("dro_grasp.pipeline.stages.SynthesisConfig", functools.partial(SynthesisConfig, steps=10))
     weights, obj = str(untrained_weights(tmp_path)), load_object("sphere")
     here, there = (
-        GraspPredictor(weights, device=place).predict(toy_hand(), obj, 2, seed=3, candidates=2, refine=refine)
+        GraspPredictor(weights, device=place).predict(toy_hand(), obj, 2, seed=3, method="optimise")
         for place in ("cpu", device))
     assert there.joints.device.type == "cpu"
     for name in ("joints", "T_object_wrist", "pregrasp_joints", "squeeze_joints", "score"):

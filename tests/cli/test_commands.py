@@ -44,9 +44,9 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.fixture
 def generate(weights: str, capsys: pytest.CaptureFixture[str]):
-    def run(*arguments: str, num: int = 3, name: str = "sphere") -> dict:
+    def run(*arguments: str, num: int = 3, name: str = "sphere", method: str = "network") -> dict:
         base = ["generate", "--hand", "gripper3", "--object", name, "--weights", weights, "--num", str(num), "--json"]
-        assert main([*base, *arguments]) == 0
+        assert main([*base, "--method", method, *arguments]) == 0
         return json.loads(capsys.readouterr().out)
 
     return run
@@ -149,7 +149,7 @@ def test_outputs_are_checked_before_the_work(monkeypatch: pytest.MonkeyPatch, ca
 
 def test_generate_reports_and_saves_what_it_counts(generate, tmp_path: Path) -> None:
     path = tmp_path / "grasps.parquet"
-    report = generate("--output", str(path))
+    report = generate("--output", str(path), method="auto")
     assert report.keys() >= KEYS
     assert set(report["seconds"]) == {"load", "network", "decode", "optimise", "refine", "rank", "trial"}
     assert (report["num"], report["candidates"], report["protocol"]) == (3, 12, "dro")
@@ -208,7 +208,7 @@ def test_a_bad_object_in_a_folder_costs_only_its_own_grasps(
     trimesh.creation.icosphere(radius=30.0).export(objects / "huge.stl")
     trimesh.creation.box((0.05, 0.05, 0.05)).export(objects / "z.stl")
     base = ["generate", "--hand", "gripper3", "--object", str(objects), "--weights", weights, "--num", "2"]
-    assert main([*base, "--protocol", "none", "--output", str(results), "--json"]) == 2
+    assert main([*base, "--method", "network", "--protocol", "none", "--output", str(results), "--json"]) == 2
     said = capsys.readouterr()
     report = json.loads(said.out)
     assert [r["object"] for r in report["results"]] == ["a", "z"]
@@ -365,7 +365,7 @@ def test_own_files_are_found_again(
     (tmp_path / "below").mkdir()
     monkeypatch.chdir(tmp_path)
     assert main(["generate", "--hand", "mine.urdf", "--object", "box.stl", "--scale", "0.001", "--num", "2", "--weights",
-                 weights, "--output", "grasps.parquet", "--json"]) == 0
+                 weights, "--method", "network", "--output", "grasps.parquet", "--json"]) == 0
     made = json.loads(capsys.readouterr().out)
     monkeypatch.chdir(tmp_path / "below")
     assert main(["evaluate", "../grasps.parquet", "--json"]) == 0

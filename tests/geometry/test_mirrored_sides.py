@@ -1,9 +1,9 @@
 from __future__ import annotations
 
-import roma
 import torch
 
 from dro_grasp.geometry.mirrored_sides import choose_sides
+from dro_grasp.geometry.rotations import roma
 
 
 def bodies(height: float, noise: float = 0.0) -> tuple[torch.Tensor, ...]:

@@ -2,11 +2,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import roma
 import torch
 from scipy.spatial.transform import Rotation
 
 from dro_grasp.geometry.registration import register
+from dro_grasp.geometry.rotations import roma
 
 
 def pair(batch: tuple[int, ...] = (), n: int = 20, noise: float = 0.0, dtype=torch.float64):

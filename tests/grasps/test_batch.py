@@ -8,11 +8,11 @@ from types import SimpleNamespace
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-import roma
 import torch
 
 from dro_grasp.errors import GraspFileError, OptionError, OutputError
 from dro_grasp.files import check_output
+from dro_grasp.geometry.rotations import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.simulation.outcome import Failure
 

@@ -6,10 +6,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import roma
 import torch
 
 from dro_grasp.datasets.bundle.training_file import Bundle, ObjectCloud, write_bundle
+from dro_grasp.geometry.rotations import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.models.presets import NetworkConfig

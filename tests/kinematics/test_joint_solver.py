@@ -5,10 +5,10 @@ from dataclasses import replace
 import cvxpy as cp
 import numpy as np
 import pytest
-import roma
 import torch
 
 from dro_grasp.errors import OptionError
+from dro_grasp.geometry.rotations import roma
 from dro_grasp.kinematics.joint_reading import read_joints
 from dro_grasp.kinematics.joint_solver import JointSolverConfig, Targets, solve_joints
 from dro_grasp.kinematics.joint_step import StepConfig, best_step

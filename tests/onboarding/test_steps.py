@@ -25,7 +25,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def command(home: Path, *more: str, hand: str = "mine.urdf") -> list[str]:
     return ["onboard", str(home / hand), "--output", str(home / "out"), "--objects", "sphere", "--held-out", "can",
-            "--num", "2", "--minutes", "0.1", "--workers", "1", "--weights", str(home / "untrained.safetensors"), *more]
+            "--num", "2", "--minutes", "0.05", "--workers", "1", "--weights", str(home / "untrained.safetensors"), *more]
 
 
 def test_a_file_becomes_weights_and_a_report(home: Path, capsys: pytest.CaptureFixture[str]) -> None:

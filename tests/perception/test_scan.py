@@ -126,7 +126,7 @@ def test_grasps_of_a_cloud_are_in_the_frame_of_the_camera_file(
     (tmp_path / "camera.json").write_text(json.dumps({"frame": "base", "T_frame_camera": T_object_camera.tolist()}))
     base = ["generate", "--hand", "gripper3", "--object", str(tmp_path / "scan.npy"), "--num", "3", "--weights",
             str(untrained_weights(tmp_path)), "--camera", str(tmp_path / "camera.json"), "--direction", "0", "0", "-1",
-            "--no-refine", "--json"]
+            "--no-refine", "--method", "network", "--json"]
     assert main([*base, "--output", str(tmp_path / "g.parquet")]) == 0
     from tests.helpers.loaded_hands import loaded_hand
 
@@ -149,7 +149,8 @@ def test_a_file_remembers_the_frame_and_where_the_camera_stood(
     np.save(tmp_path / "scan.npy", points)
     (tmp_path / "camera.json").write_text(json.dumps({"frame": "base", "T_frame_camera": T_object_camera.tolist()}))
     made = ["generate", "--hand", "gripper3", "--object", str(tmp_path / "scan.npy"), "--num", "2", "--weights",
-            str(untrained_weights(tmp_path)), "--camera", str(tmp_path / "camera.json"), "--output", str(file), "--json"]
+            str(untrained_weights(tmp_path)), "--camera", str(tmp_path / "camera.json"), "--output", str(file),
+            "--method", "network", "--json"]
     assert main(made) == 0
     assert json.loads(capsys.readouterr().out)["frame"] == "base"
     grasps = GraspBatch.load(file)

@@ -47,7 +47,7 @@ def viewer(grasps: GraspBatch):
 
 
 def test_links_stand_where_kinematics_puts_them(viewer: GraspViewer, grasps: GraspBatch) -> None:
-    import roma
+    from dro_grasp.geometry.rotations import roma
 
     for posture in ("open", "pregrasp", "grasp", "squeeze"):
         viewer.show(1, posture)

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import math
 
-import roma
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dro_grasp.geometry.rotations import roma
+
+NORMAL_95 = 1.959963984540054
+"""Standard deviations of a normal distribution within which 95 % of it lie."""
+
 
 def wilson_interval(success: int, total: int) -> tuple[float, float]:
     """Wilson's 95 % confidence interval of a success rate; [0, 1] without trials."""
-    # scipy.stats takes half a second to import, which only those who ask for intervals should pay.
-    from scipy.stats import binomtest
-
     if total == 0:
         return 0.0, 1.0
-    interval = binomtest(success, total).proportion_ci(confidence_level=0.95, method="wilson")
-    return float(interval.low), float(interval.high)
+    rate, weight = success / total, NORMAL_95**2 / total
+    middle = rate + weight / 2
+    spread = math.sqrt(weight * rate * (1 - rate) + weight**2 / 4)
+    return max(0.0, (middle - spread) / (1 + weight)), min(1.0, (middle + spread) / (1 + weight))
 
 
 def mean_share(shares: Float[Tensor, " n"]) -> tuple[float, float, float]:
@@ -52,12 +55,10 @@ def diversity(T_object_wrist: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n
 def roc_area(score: Float[Tensor, " n"], success: Bool[Tensor, " n"]) -> float:
     """Probability that a success scores higher than a failure; ties count half, NaN if all grasps have one outcome.
 
-    This is the Mann-Whitney U statistic, from rank sums, as a share of all pairs.
+    This is the Mann-Whitney U statistic as a share of all pairs.
     """
-    from scipy.stats import rankdata
-
-    good, bad = int(success.sum()), int((~success).sum())
-    if not good or not bad:
+    good, bad = score[success], score[~success].sort().values
+    if not len(good) or not len(bad):
         return math.nan
-    ranks = rankdata(score.cpu().numpy())[success.cpu().numpy()]
-    return float((ranks.mean() - (good + 1) / 2) / bad)
+    below, not_above = (torch.searchsorted(bad, good, right=right) for right in (False, True))
+    return float((below + not_above).double().mean()) / (2 * len(bad))

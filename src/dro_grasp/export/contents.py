@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import roma
 import torch
 import yaml
 from jaxtyping import Float
@@ -15,6 +14,7 @@ from torch import Tensor
 
 from dro_grasp.errors import OptionError
 from dro_grasp.frames import read_motion
+from dro_grasp.geometry.rotations import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import frame_of
 

@@ -6,11 +6,11 @@ import io
 from typing import Any
 
 import numpy as np
-import roma
 import torch
 
 from dro_grasp.export.contents import Frame, postures
 from dro_grasp.export.formats import ExportJob
+from dro_grasp.geometry.rotations import roma
 from dro_grasp.grasps.batch import GraspBatch
 
 

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dro_grasp.geometry.rotations import roma
 from dro_grasp.geometry.se3 import compose
 
 

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.geometry import se3
+from dro_grasp.geometry.rotations import roma
 from dro_grasp.grasps import columns
 from dro_grasp.grasps.table import fixed_column, float_column, floats
 

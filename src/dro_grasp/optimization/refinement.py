@@ -8,12 +8,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
+from dro_grasp.geometry.rotations import roma
 from dro_grasp.geometry.se3 import turned_about
 from dro_grasp.grasps.batch import GraspBatch
 

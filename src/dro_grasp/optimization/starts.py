@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.geometry.distance_field import DistanceField
+from dro_grasp.geometry.rotations import roma
 from dro_grasp.geometry.se3 import compose, random_rotations, rotate, rotation_between
 from dro_grasp.hands.hand import Hand
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-import roma
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -14,6 +13,7 @@ from dro_grasp._version import __version__
 from dro_grasp.energy.contact_candidates import ContactConfig
 from dro_grasp.energy.grasp_energy import TERMS, EnergyConfig, Evaluation, GraspEnergy
 from dro_grasp.errors import ObjectError, OptionError
+from dro_grasp.geometry.rotations import roma
 from dro_grasp.geometry.se3 import turned_about
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand

@@ -6,12 +6,12 @@ import hashlib
 from dataclasses import dataclass, fields
 
 import numpy as np
-import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.geometry import se3
+from dro_grasp.geometry.rotations import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.simulation.protocols import Perturbations
 

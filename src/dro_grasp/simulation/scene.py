@@ -11,12 +11,12 @@ from functools import cached_property, lru_cache
 
 import mujoco
 import numpy as np
-import roma
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from dro_grasp.errors import HandError, ObjectError
+from dro_grasp.geometry.rotations import roma
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.protocols import Protocol

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import roma
 import torch
 from jaxtyping import Float, Int, Shaped
 from safetensors import SafetensorError, safe_open
@@ -22,6 +21,7 @@ from torch import Tensor
 from dro_grasp.devices import on_device
 from dro_grasp.errors import BundleError
 from dro_grasp.files import replacing
+from dro_grasp.geometry.rotations import roma
 from dro_grasp.geometry.se3 import compose
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand

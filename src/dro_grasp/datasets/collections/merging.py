@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import roma
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -15,6 +14,7 @@ from dro_grasp._version import __version__
 from dro_grasp.datasets.collections.collection import YIELDS, PairGrasps, read_collection
 from dro_grasp.datasets.engine.shards import Yield
 from dro_grasp.errors import GraspFileError
+from dro_grasp.geometry.rotations import roma
 from dro_grasp.geometry.se3 import compose
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.duplicates import distinct
