@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import shutil
 from pathlib import Path
@@ -9,9 +10,10 @@ from pathlib import Path
 import pytest
 
 from dro_grasp.cli.main import main
+from dro_grasp.datasets.engine.worker import EngineConfig
 from dro_grasp.hands.library import BUILTIN_FOLDER
 from dro_grasp.models.checkpoints import describe_weights
-from dro_grasp.onboarding import steps
+from dro_grasp.onboarding import report, steps
 from tests.helpers.weights import untrained_weights
 
 
@@ -21,6 +23,13 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copy(BUILTIN_FOLDER / "gripper3.urdf", folder / "mine.urdf")
     untrained_weights(folder)
     return folder
+
+
+@pytest.fixture(autouse=True)
+def small_steps(monkeypatch: pytest.MonkeyPatch, quick_statistics: None) -> None:
+    """Small shards, and few grasps in the report."""
+    monkeypatch.setattr(steps, "EngineConfig", functools.partial(EngineConfig, candidates=64, min_candidates=64))
+    monkeypatch.setattr(report, "GRASPS", 3)
 
 
 def command(home: Path, *more: str, hand: str = "mine.urdf") -> list[str]:
@@ -100,8 +109,8 @@ def test_a_hand_that_grasps_nothing_is_told(
 ) -> None:
     from dro_grasp.datasets.engine.schedule import DatasetReport
 
-    report = DatasetReport(0, 0, 1, 1.0, {("mine", "sphere"): "0 grasps: every candidate penetrates"})
-    monkeypatch.setattr(steps, "synthesize_dataset", lambda *_, **__: report)
+    nothing = DatasetReport(0, 0, 1, 1.0, {("mine", "sphere"): "0 grasps: every candidate penetrates"})
+    monkeypatch.setattr(steps, "synthesize_dataset", lambda *_, **__: nothing)
     monkeypatch.setattr(steps, "count_collection", lambda _: {})
     assert main([*command(home), "--output", str(home / "empty")]) == 2
     assert "every candidate penetrates" in capsys.readouterr().err
