@@ -194,7 +194,7 @@ def test_shards_have_seeds_of_their_own():
 
 def test_impossible_requests_are_refused_before_the_work(tmp_path):
     for goal, folder, error in (
-        (0, tmp_path, OptionError), (1, tmp_path / "no" / "folder", OutputError), (1, tmp_path / "file", OutputError)
+        (0, tmp_path, OptionError), (1, tmp_path / "file" / "folder", OutputError), (1, tmp_path / "file", OutputError)
     ):
         (tmp_path / "file").write_text("")
         with pytest.raises(error):

@@ -27,9 +27,10 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def small_steps(monkeypatch: pytest.MonkeyPatch, quick_statistics: None) -> None:
-    """Small shards, and few grasps in the report."""
+    """Small shards, few grasps in the report, and few candidates of the optimiser."""
     monkeypatch.setattr(steps, "EngineConfig", functools.partial(EngineConfig, candidates=64, min_candidates=64))
     monkeypatch.setattr(report, "GRASPS", 3)
+    monkeypatch.setattr("dro_grasp.predictor.OPTIMISED_PER_GRASP", 2)
 
 
 def command(home: Path, *more: str, hand: str = "mine.urdf") -> list[str]:
@@ -50,7 +51,7 @@ def test_a_file_becomes_weights_and_a_report(home: Path, capsys: pytest.CaptureF
     for step in ("before", "after"):
         share = f"{told[step]['returned']['dro/1']:.0%} {step} ({told['optimised'][step]:.0%} of them made by the optimiser)"
         assert share in page
-    assert " of 8 made by the optimiser" in page
+    assert " of 3 made by the optimiser" in page
     assert str(home / "out" / "weights.safetensors") in page
 
 

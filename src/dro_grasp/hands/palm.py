@@ -6,6 +6,7 @@ centre is the grasp centre, and the palm direction points from the palm's surfac
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,8 @@ from dro_grasp.errors import HandError
 
 GRID_SPACING = 0.008
 """Spacing of candidate ball centres [m] (ours)."""
+PLANES = 32
+"""Planes of the hull that the centres are compared with at once; most centres fall to the first (ours)."""
 CLOSINGS = (0.35, 0.5, 0.65)
 """Shares of the way from open to closed at which the hand is examined (ours)."""
 FACE_POINTS = 16
@@ -63,8 +66,8 @@ def find_palm(
     axes = [np.arange(a, b, GRID_SPACING) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     planes = np.unique(hull.equations.round(6), axis=0)
-    for plane in planes:
-        grid = grid[grid @ plane[:3] < -plane[3]]
+    for some in np.array_split(planes, math.ceil(len(planes) / PLANES)):
+        grid = grid[(grid @ some[:, :3].T < -some[:, 3]).all(1)]
     tree = KDTree(palm_points)
     to_palm, nearest = map(np.asarray, tree.query(grid))
     outside = ((grid - palm_points[nearest]) * palm_normals[nearest]).sum(1) > 0.7 * to_palm
