@@ -38,7 +38,7 @@ def hand_of(name: str) -> Hand:
 @cache
 def energy_of(name: str, part: str = "all") -> GraspEnergy:
     """The energy with all its terms, or with one."""
-    config = EnergyConfig(closing_room=0.3)
+    config = EnergyConfig(closing_room=0.3, filled=True)
     if part != "all":
         config = dataclasses.replace(config, **{term: 0.0 for term in TERMS if term != part})
     return GraspEnergy(hand_of(name), rounded_box(), torch.tensor(CENTRE, dtype=torch.float64), 0.03, config)

@@ -85,12 +85,14 @@ def branches(energy: GraspEnergy, samples: Samples) -> Tensor:
     """What every choice in the energy comes to, (n k): the energy is smooth as long as no number of a row changes."""
     field, (contacts, body) = energy.field, place(energy, samples)
     inside = field.distances(body)[0] < energy.config.margin
-    voxels = [((p - field.origin) / field.spacing).round() for p in (contacts, body)]
+    spheres = energy.ball.place(samples.T[:, None] @ energy.hand.tree.forward(samples.q))
+    pierced = field.distances(spheres)[0] < energy.spheres.radii
+    voxels = [((p - field.origin) / field.spacing).round() for p in (contacts, body, spheres)]
     rows = [
-        field.normals(contacts).distance > 0, inside, overlaps(energy, samples.q) > 0,
+        field.normals(contacts).distance > 0, inside, pierced, overlaps(energy, samples.q) > 0,
         samples.q > energy.upper, samples.q < energy.lower,
         # Points outside say nothing, whichever voxel they are in.
-        voxels[0].flatten(1), (voxels[1] * inside[..., None]).flatten(1),
+        voxels[0].flatten(1), (voxels[1] * inside[..., None]).flatten(1), (voxels[2] * pierced[..., None]).flatten(1),
     ]
     return torch.cat([row.double() for row in rows], -1)
 

@@ -33,6 +33,9 @@ class EnergyConfig:
     """Weight of the contacts' distance to the surface [1/m]."""
     penetration: float = 100.0
     """Weight of the hand points' penetration into the object [1/m]."""
+    filled: bool = False
+    """Whether penetration is also measured at the spheres that fill the links, with the same weight (ours): a thin object
+    finds its way between the hand points."""
     self_penetration: float = 50.0
     """Weight of self-penetration [1/m] (DexGraspNet: 10; its spheres are finer)."""
     alignment: float = 1.0
@@ -170,16 +173,19 @@ class GraspEnergy:
         )
         spheres = self.ball.place(poses)
         own = energies.self_penetration(spheres, self.spheres.radii, self.spheres.pairs)
-        wrenches = wrenches + energies.link_wrenches(
-            spheres, config.self_penetration * own.by_point, self.ball.members
-        )
+        depth, by_sphere = inside.value.sum(-1), config.self_penetration * own.by_point
+        if config.filled:
+            distance, gradient = self.field.distances(spheres)
+            pierced = energies.penetration(distance - self.spheres.radii, gradient)
+            depth, by_sphere = depth + pierced.value.sum(-1), by_sphere + config.penetration * pierced.by_point
+        wrenches = wrenches + energies.link_wrenches(spheres, by_sphere, self.ball.members)
         beyond, slope = energies.joint_margin(q, self.lower, self.upper)
         by_pose, by_joint = energies.joint_gradient(tree, poses, wrenches, self.pivot(T_object_wrist))
         closure, apart, alignment = contact_terms
         terms = torch.stack([
             config.force_closure * closure,
             config.distance * apart,
-            config.penetration * inside.value.sum(-1),
+            config.penetration * depth,
             config.self_penetration * own.value.sum(-1),
             config.alignment * alignment,
             config.joints * beyond.sum(-1),

@@ -16,6 +16,8 @@ from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.geometry.se3 import turned_about
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.optimization.finger_closing import ClosingConfig
+from dro_grasp.optimization.grip import GripConfig
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,7 @@ class RefineConfig:
     largest_bend: float = 0.5
     """Largest change of a joint [rad; for sliding joints in their tree's unit]."""
     reach: float = 0.03
-    """A finger farther than this from the surface is idle; the descent does not draw it in [m]."""
+    """The descent does not draw in a finger farther than this from the surface [m]."""
     translation_step: float = 0.002
     """First step of the translation [m]."""
     rotation_step: float = 0.02
@@ -42,8 +44,13 @@ class RefineConfig:
     """Factor on a grasp's step lengths after a step that lowered its energy."""
     shrinkage: float = 0.5
     """The same after a step that did not, which is undone."""
-    energy: EnergyConfig = field(default_factory=lambda: EnergyConfig(penetration=500.0, hand_points=400))
+    energy: EnergyConfig = field(default_factory=lambda: EnergyConfig(
+        penetration=500.0, self_penetration=500.0, hand_points=400, filled=True))
     """Weights; no simulation settles these grasps, so penetration weighs more than in synthesis."""
+    closing: ClosingConfig = field(default_factory=ClosingConfig)
+    """How idle fingers close before the descent."""
+    grip: GripConfig = field(default_factory=GripConfig)
+    """How the refined grasps squeeze."""
     batch_size: int = 64
     """Grasps refined at once."""
 

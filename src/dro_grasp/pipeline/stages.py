@@ -11,6 +11,8 @@ from torch import Tensor
 
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import completed
+from dro_grasp.optimization.finger_closing import close_idle_fingers
+from dro_grasp.optimization.grip import gripping
 from dro_grasp.optimization.refinement import RefineConfig, refine_grasps
 from dro_grasp.optimization.starts import Direction, StartConfig
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize_with
@@ -44,16 +46,18 @@ def complete(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
 
 
 def refine(problem: GraspProblem, grasps: GraspBatch, config: RefineConfig | None = None) -> GraspBatch:
-    """Grasps after a short descent of the grasp energy near each of them, with new pregrasps and squeezes.
+    """Grasps near the given ones: idle fingers close, the grasp energy descends, and the squeeze balances the contacts' forces.
 
     Args:
         problem: Hand and object.
-        grasps: Any grasps of the two; outcomes, scores and energies are dropped, since they belong to the grasps before.
-        config: Steps and bounds.
+        grasps: Any grasps of the two; outcomes, scores, energies and what they state of pregrasp and squeeze are dropped.
+        config: Steps, bounds and forces.
     """
     config = config or RefineConfig()
     grasps.require_hand(problem.hand)
-    return complete(problem, refine_grasps(problem.energy(config.energy), grasps, config))
+    energy = problem.energy(config.energy)
+    closed = close_idle_fingers(energy, grasps, config.closing)
+    return gripping(energy, refine_grasps(energy, closed, config), config.grip)
 
 
 def rank(problem: GraspProblem, grasps: GraspBatch, config: ScoreConfig | None = None) -> GraspBatch:

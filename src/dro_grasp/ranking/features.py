@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.energy.grasp_energy import TERMS, GraspEnergy
+from dro_grasp.energy.nearest_points import NearestPoints
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import completed
 
@@ -135,22 +136,12 @@ def grasp_state(energy: GraspEnergy, grasps: GraspBatch, terms: Float[Tensor, "n
     grasps = completed(energy.source, grasps, energy.centre.cpu())
     T, q, pregrasp, squeeze = (
         x.to(device) for x in (grasps.T_object_wrist, grasps.joints, grasps.pregrasp_joints, grasps.squeeze_joints))
-    points, normals = hand.points_and_normals(q, T)
-    before, after = hand.points(pregrasp, T), hand.points(squeeze, T)
-    distance, gradient = energy.field.distances(points)
-    links = hand.link_index.unique()
-    # Index of each link's nearest point (n l): points of other links are infinitely far away.
-    nearest = torch.stack([
-        torch.where(hand.link_index == link, distance, torch.inf).argmin(1) for link in links.tolist()], 1)
-
-    def pick(values: Float[Tensor, "n p 3"]) -> Float[Tensor, "n l 3"]:
-        return values.gather(1, nearest[..., None].expand(-1, -1, 3))
-
-    gap = distance.gather(1, nearest)
+    near = NearestPoints.of(energy, T, q)
+    before, after = (near.pick(hand.points(joints, T)) for joints in (pregrasp, squeeze))
     offset = (hand.grasp_centres(T) - energy.centre).norm(dim=-1)
     return GraspState(
-        gap=gap, object_normal=pick(torch.nn.functional.normalize(gradient, dim=-1)), link_normal=pick(normals),
-        position=pick(points) - energy.centre, arriving=pick(points - before), closing=pick(after - points),
-        is_palm=(links == hand.palm).to(gap).expand_as(gap), palm_axes=T[:, :3, :3] @ hand.palm_axes_wrist,
+        gap=near.gap, object_normal=near.object_normals, link_normal=near.link_normals, position=near.points - energy.centre,
+        arriving=near.points - before, closing=after - near.points,
+        is_palm=(near.links == hand.palm).to(near.gap).expand_as(near.gap), palm_axes=T[:, :3, :3] @ hand.palm_axes_wrist,
         terms=terms, size=torch.full_like(offset, energy.length), offset=offset,
     )

@@ -1,0 +1,138 @@
+"""Idle fingers close: each finger of a grasp that touches nothing moves alone until it meets the object.
+
+A person holds with all fingers that reach. Neither the network nor the descent of the energy sees to that: the energy's few
+contacts choose the fingers that are near anyway. Differs from the paper, which leaves idle fingers where the network puts them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from dro_grasp.energy import terms as energies
+from dro_grasp.energy.grasp_energy import GraspEnergy
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
+
+
+@dataclass(frozen=True)
+class ClosingConfig:
+    """When a finger is idle, and how far it closes (ours)."""
+
+    idle: float = 0.003
+    """A finger farther than this from the object is idle [m]."""
+    contact: float = 0.001
+    """Distance at which a closing finger stops [m]: the clearance that refined grasps keep."""
+    steps: int = 24
+    """Samples of a path from open to closed."""
+    halvings: int = 5
+    """Halvings of the interval between two samples that holds the contact."""
+    openness: float = 0.9
+    """Openness from which a finger closes that is bent too far to meet the object [share of its range]."""
+    overlap: float = 0.001
+    """Most that the self-penetration of a grasp may grow [m]."""
+    batch_size: int = 64
+    """Grasps treated at once."""
+
+
+@torch.no_grad()
+def close_idle_fingers(energy: GraspEnergy, grasps: GraspBatch, config: ClosingConfig | None = None) -> GraspBatch:
+    """The grasps with their idle fingers on the object, where they reach it without meeting others.
+
+    A finger bends from where it is; if it meets nothing, from its open posture, with all joints and then with the first alone.
+    Whatever belongs to the grasps before (pregrasp, squeeze, scores, energies, outcomes) is dropped.
+
+    Args:
+        energy: Of the grasps' hand on their object.
+        grasps: Any grasps of the two.
+        config: Distances and steps.
+    """
+    config = config or ClosingConfig()
+    if not len(grasps):
+        return grasps
+    device = energy.centre.device
+    parts = zip(grasps.T_object_wrist.split(config.batch_size), grasps.joints.split(config.batch_size), strict=True)
+    ends = [_Closer(energy, T.to(device), config).close(q.to(device)) for T, q in parts]
+    return grasps.moved_to(grasps.T_object_wrist, torch.cat(ends).cpu())
+
+
+@dataclass(frozen=True)
+class _Closer:
+    """Hands that stay where they are while fingers move."""
+
+    energy: GraspEnergy
+    T: Float[Tensor, "n 4 4"]
+    config: ClosingConfig
+
+    def close(self, q: Float[Tensor, "n n_dof"]) -> Float[Tensor, "n n_dof"]:
+        """Joints with idle fingers closed."""
+        hand, config = self.energy.hand, self.config
+        bends = _bending(hand)
+        idle = self.distances(q) > config.idle
+        opened = torch.where(bends.any(0), hand.canonical_joints(config.openness), q)
+        for start, moving in ((q, bends), (opened, bends), (opened, _first(hand, bends))):
+            if not bool(idle.any()):
+                break
+            share, meets = self.first_contact(start, moving)
+            for finger in (meets & idle).any(0).nonzero()[:, 0].tolist():
+                own = bends[finger]
+                new = torch.where(own, self.along(start, moving[finger], share[:, finger, None]), q)
+                kept = meets[:, finger] & idle[:, finger] & (self.overlap(new) < self.overlap(q) + config.overlap)
+                q = torch.where(kept[:, None], new, q)
+                idle[:, finger] &= ~kept
+        return q
+
+    def along(
+        self, start: Float[Tensor, "n n_dof"], moving: Bool[Tensor, " n_dof"], share: Float[Tensor, "n #n_dof"]
+    ) -> Float[Tensor, "n n_dof"]:
+        """Moving joints this share of the way from `start` to closed."""
+        return torch.where(moving, start + share * (self.energy.hand.closed_ends - start), start)
+
+    def first_contact(
+        self, start: Float[Tensor, "n n_dof"], moving: Bool[Tensor, "n_tips n_dof"]
+    ) -> tuple[Float[Tensor, "n n_tips"], Bool[Tensor, "n n_tips"]]:
+        """The share of the way at which each finger meets the object, and whether it does; all close at once."""
+        config, every = self.config, moving.any(0)
+        shares = torch.linspace(0, 1, config.steps, device=start.device)
+        path = [self.along(start, every, share.expand(len(start), 1)) for share in shares]
+        near = torch.stack([self.distances(q) <= config.contact for q in path])
+        first = near.float().argmax(0)
+        meets = near.any(0) & (first > 0)  # a path that begins in the object meets nothing
+        low, high = shares[(first - 1).clamp_min(0)], shares[first]
+        owner = moving.float().argmax(0).expand(len(start), -1)  # the finger that each joint moves
+        for _ in range(config.halvings):
+            middle = (low + high) / 2
+            inside = self.distances(self.along(start, every, middle.gather(1, owner))) <= config.contact
+            high, low = torch.where(inside, middle, high), torch.where(inside, low, middle)
+        return low, meets
+
+    def distances(self, q: Float[Tensor, "n n_dof"]) -> Float[Tensor, "n n_tips"]:
+        """Distance of each finger's nearest point to the object [m]."""
+        energy, hand = self.energy, self.energy.hand
+        points = energy.body.place(self.T[:, None] @ hand.tree.forward(q))
+        distance = energy.field.distances(points)[0]
+        finger = hand.finger_of_link[energy.body.members.argmax(-1)]
+        return torch.stack([
+            torch.where(finger == index, distance, torch.inf).amin(-1) for index in range(len(hand.fingers))], -1)
+
+    def overlap(self, q: Float[Tensor, "n n_dof"]) -> Float[Tensor, " n"]:
+        """Self-penetration [m]."""
+        energy = self.energy
+        centres = energy.ball.place(self.T[:, None] @ energy.hand.tree.forward(q))
+        return energies.self_penetration(centres, energy.spheres.radii, energy.spheres.pairs).value.sum(-1)
+
+
+def _bending(hand: Hand) -> Bool[Tensor, "n_tips n_dof"]:
+    """The joints that bend each finger and no other."""
+    moves = torch.stack([hand.tree.moves[list(finger.links)].any(0) for finger in hand.fingers])
+    return moves & (moves.sum(0) == 1) & hand.movable & ~hand.abduction
+
+
+def _first(hand: Hand, bends: Bool[Tensor, "n_tips n_dof"]) -> Bool[Tensor, "n_tips n_dof"]:
+    """The joint of each finger that is nearest to the palm."""
+    moved = torch.where(bends, hand.tree.moves.sum(0), 0)
+    first = torch.zeros_like(bends)
+    return first.scatter(1, moved.argmax(1, keepdim=True), True) & bends
