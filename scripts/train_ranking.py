@@ -119,7 +119,7 @@ def collect(
             "opened": some.moved_to(some.T_object_wrist, opened), "away": away(some, generator),
         }
         parts += [{"hand": hand.name, "object": label, "kind": kind, "view": view, **evaluated(hand, obj, grasps, known)}
-                  for kind, grasps in groups.items()]
+                  for kind, grasps in groups.items() if len(grasps)]  # all optimised ones may have lost the object
     return parts
 
 

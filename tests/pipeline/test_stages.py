@@ -76,7 +76,7 @@ def test_an_object_that_flies_away_while_it_settles_leaves_no_grasp(monkeypatch:
 
     monkeypatch.setattr("dro_grasp.pipeline.stages.settle", settled)
     monkeypatch.setattr("dro_grasp.pipeline.stages.STARTS_PER_CANDIDATE", 2)
-    free = synthesize_with(GraspProblem(HAND, CAN).energy(EnergyConfig()), CAN, 6, 0, SynthesisConfig())
+    free = synthesize_with(GraspProblem(HAND, CAN).energy(SynthesisConfig().energy), CAN, 6, 0, SynthesisConfig())
     kept = optimise(GraspProblem(HAND, CAN), 3, seed=0)
     moved = kept.T_object_wrist[:, 2, 3] - free.T_object_wrist[1:3, 2, 3]
     torch.testing.assert_close(moved, torch.tensor([0.01, 0.0]))

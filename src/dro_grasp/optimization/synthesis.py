@@ -50,7 +50,7 @@ class SynthesisConfig:
     """The same at the end."""
     device: str = "cpu"
     """Where energies are computed. Random numbers are drawn on the CPU, so that a seed means the same everywhere."""
-    energy: EnergyConfig = field(default_factory=EnergyConfig)
+    energy: EnergyConfig = field(default_factory=lambda: EnergyConfig(filled=True))
     """Weights of the terms."""
     starts: StartConfig = field(default_factory=StartConfig)
     """Distribution of the starts."""
