@@ -80,6 +80,30 @@ def test_filter_keeps_what_passes_with_its_new_numbers(stored):
     assert 0 < sum(len(passed) for _, passed in kept) < 48
 
 
+def test_fingers_are_closed_where_the_grasp_holds_and_touches_with_more(stored, tmp_path):
+    hand, grasps = load_hand("barrett"), GraspBatch.load(stored)
+    joints = grasps.joints.clone()
+    bends = hand.tree.moves[list(hand.fingers[0].links)].any(0) & ~hand.abduction
+    joints[:, bends] = hand.open_ends[bends]
+    joints = torch.where(grasps.success[:, None], joints, grasps.joints)
+    lazy = grasps.moved_to(grasps.T_object_wrist, joints)
+    lazy.save(tmp_path / "lazy.parquet")
+    pairs = list(read_collection(tmp_path / "lazy.parquet", only_successful=False))
+    plain, closed = (keep_passing(pairs, changed("dro"), close_fingers=close) for close in (False, True))
+    gained = 0
+    for (pair, before), (_, after) in zip(plain, closed, strict=True):
+        again = simulate(hand, load_object(pair.object), after, "dro")
+        assert bool(again.success.all())
+        assert torch.equal(again.fingers_in_contact.float(), after.fingers_in_contact)
+        # The wrist stays, so it tells which grasp is which.
+        had, has = (dict(zip(g.T_object_wrist[:, 0, 3].tolist(), g.fingers_in_contact.tolist(), strict=True))
+                    for g in (before, after))
+        assert had.keys() <= has.keys()
+        assert all(has[key] >= count for key, count in had.items())
+        gained += sum(count > had.get(key, 0) for key, count in has.items())
+    assert gained > 3
+
+
 def test_commands(stored, tmp_path, capsys):
     assert main(["dataset", "check", str(stored), "--sample", "12", "--protocol", "dro", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)

@@ -224,6 +224,8 @@ class Filter(DataSets):
     """Protocol of the trial."""
     friction: Annotated[float | None, optional("MU", "the protocol's")] = None
     """Friction coefficient between hand and object."""
+    close_fingers: Flag = False
+    """Close idle fingers onto the object, and keep the new grasp where it passes and no fewer fingers touch."""
     json: Flag = False
     """Print one JSON object instead of a table."""
 
@@ -239,7 +241,7 @@ class Filter(DataSets):
         folder = make_folder(self.output)
         pairs = list(self.pairs(only_successful=False))
         with progress_bar("evaluating", self.json) as progress:
-            kept = keep_passing(pairs, rules, progress)
+            kept = keep_passing(pairs, rules, progress, self.close_fingers)
         for hand in dict.fromkeys(passed.hand for _, passed in kept):
             GraspBatch.concatenate([passed for _, passed in kept if passed.hand == hand]).save(folder / file_name(hand))
         rows = [[pair.hand, pair.object, len(pair.grasps), len(passed)] for pair, passed in kept]

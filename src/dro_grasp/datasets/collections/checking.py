@@ -9,10 +9,13 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from dro_grasp.datasets.collections.collection import PairGrasps
+from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import hand_of, object_of, require_same
 from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.optimization.finger_closing import close_idle_fingers
 from dro_grasp.simulation.outcome import TrialResult
 from dro_grasp.simulation.protocols import Protocol
 from dro_grasp.simulation.trial import simulate
@@ -74,26 +77,51 @@ def check(
     chosen[order[:sample]] = True
     drawn = [grasps[mask] for grasps, mask in zip(parts, chosen.split(sizes), strict=True) if mask.any()]
     result = Agreement(rules.label)
-    for grasps, trial in zip(drawn, _trials(drawn, rules, progress), strict=True):
-        result = result.extended(grasps, trial)
+    for grasps, (hand, obj) in zip(drawn, _loaded(drawn, progress), strict=True):
+        result = result.extended(grasps, simulate(hand, obj, grasps, rules))
     return result
 
 
 def keep_passing(
-    pairs: Iterable[PairGrasps], rules: Protocol, progress: Progress | None = None
+    pairs: Iterable[PairGrasps], rules: Protocol, progress: Progress | None = None, close_fingers: bool = False
 ) -> list[tuple[PairGrasps, GraspBatch]]:
     """Evaluate all grasps and keep those that pass, with their new results: each pair and the grasps left of it.
+
+    Args:
+        pairs: The data set.
+        rules: The trial.
+        progress: Called with (grasps evaluated, grasps in all).
+        close_fingers: Also evaluate grasps with their idle fingers closed, and keep these instead where they pass and no
+            fewer fingers touch.
 
     Raises:
         GraspFileError: A hand or an object is not the one the grasps were made for.
     """
     parts = [pair for pair in pairs if len(pair.grasps)]
-    trials = _trials([pair.grasps for pair in parts], rules, progress)
-    return [(pair, pair.grasps.with_trial(trial)[trial.success]) for pair, trial in zip(parts, trials, strict=True)]
+    kept = []
+    for pair, (hand, obj) in zip(parts, _loaded([pair.grasps for pair in parts], progress), strict=True):
+        grasps = pair.grasps.with_trial(simulate(hand, obj, pair.grasps, rules))
+        if close_fingers:
+            grasps = _closed_where_it_holds(hand, obj, grasps, rules)
+        kept.append((pair, grasps[grasps.success.nonzero()[:, 0]]))
+    return kept
 
 
-def _trials(parts: Sequence[GraspBatch], rules: Protocol, progress: Progress | None) -> Iterator[TrialResult]:
-    """New trials of the grasps of one pair after the other; each hand is loaded once."""
+def _closed_where_it_holds(hand: Hand, obj: ObjectModel, evaluated: GraspBatch, rules: Protocol) -> GraspBatch:
+    """Evaluated grasps; those with closed fingers instead, where these pass and no fewer fingers touch."""
+    closed = close_idle_fingers(GraspEnergy.of_object(hand, obj, EnergyConfig(hand_points=hand.n_points)), evaluated)
+    rows = (closed.joints != evaluated.joints).any(1).nonzero()[:, 0]
+    if not len(rows):
+        return evaluated
+    tried = closed[rows].with_trial(simulate(hand, obj, closed[rows], rules))
+    better = tried.success & (tried.fingers_in_contact >= evaluated.fingers_in_contact[rows])
+    order = torch.arange(len(evaluated))
+    order[rows[better]] = len(evaluated) + better.nonzero()[:, 0]
+    return GraspBatch.concatenate([evaluated, tried])[order]
+
+
+def _loaded(parts: Sequence[GraspBatch], progress: Progress | None) -> Iterator[tuple[Hand, ObjectModel]]:
+    """Hand and object of the grasps of one pair after the other; each hand is loaded once."""
     total, done = sum(map(len, parts)), 0
     hands: dict[str, Hand] = {}
     for grasps in parts:
@@ -101,7 +129,7 @@ def _trials(parts: Sequence[GraspBatch], rules: Protocol, progress: Progress | N
             hands[grasps.hand_sha256] = hand_of(grasps, None)
         hand, obj = hands[grasps.hand_sha256], object_of(grasps, None, 1.0)
         require_same(grasps, hand, obj)
+        yield hand, obj
         done += len(grasps)
-        yield simulate(hand, obj, grasps, rules)
         if progress is not None:
             progress(done, total)
