@@ -26,7 +26,8 @@ def apply_to_cloud(T: Float[Tensor, "*#b 4 4"], cloud: Float[Tensor, "*#b n 3"])
 
 def compose(rotation: Float[Tensor, "*#b 3 3"], translation: Float[Tensor, "*#b 3"]) -> Float[Tensor, "*b 4 4"]:
     """The pose with this rotation and this translation."""
-    batch = torch.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    # torch.broadcast_shapes would import sympy, and takes longer.
+    batch = torch.broadcast_tensors(rotation[..., 0], translation)[0].shape[:-1]
     top = torch.cat([rotation.expand(*batch, 3, 3), translation.expand(*batch, 3)[..., None]], -1)
     bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*batch, 1, 4)
     return torch.cat([top, bottom], -2)
