@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -66,6 +67,14 @@ def results(home: Path, bundle) -> dict:
 def finished(home: Path, results: dict) -> dict[str, Path]:
     """The folders of these runs."""
     return {stage: home / stage for stage in results}
+
+
+@pytest.fixture
+def quick_synthesis(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The optimiser beside the network takes a quarter of its steps: its grasps are worse, and made in the same way."""
+    from dro_grasp.pipeline import stages
+
+    monkeypatch.setattr(stages, "SynthesisConfig", functools.partial(stages.SynthesisConfig, steps=30))
 
 
 @pytest.fixture

@@ -144,7 +144,7 @@ def test_the_temperature_scales_what_z_is_made_of(weights: str, ball: ObjectMode
             return honest(hand, points, noise, choose)
 
         monkeypatch.setattr(predictor.network, "predict", predict)
-        predictor.predict(HAND, obj, num=3, seed=5, candidates=1, method="network")
+        predictor.predict(HAND, obj, num=3, seed=5, candidates=1, refine=False, method="network")
     assert float(drawn[0.0, ball].abs().max()) == 0
     torch.testing.assert_close(drawn[0.5, ball], 0.5 * drawn[None, ball])
     torch.testing.assert_close(drawn[None, cloud], drawn[0.5, ball], msg="bare clouds get surer grasps")
@@ -168,23 +168,23 @@ def test_placements_face_the_direction_at_any_roll(
 
 
 def test_a_table_drops_what_goes_below_it(predictor: GraspPredictor, ball: ObjectModel) -> None:
-    free = predictor.predict(HAND, ball, num=12, candidates=1, method="network")
+    free = predictor.predict(HAND, ball, num=8, candidates=1, method="network")
     heights = sorted(
         min(lowest_point(q, T), lowest_point(p, T))
         for q, p, T in zip(free.joints, free.pregrasp_joints, free.T_object_wrist, strict=True)
     )
-    table = (heights[5] + heights[6]) / 2
-    run = predictor.run(GraspProblem(HAND, ball), GraspRequest(num=12, table=table, candidates=1, method="network"))
+    table = (heights[3] + heights[4]) / 2
+    run = predictor.run(GraspProblem(HAND, ball), GraspRequest(num=8, table=table, candidates=1, method="network"))
     kept = run.grasps
-    assert len(kept) == len(run.proposed) == len(run.points) == 12
-    assert run.candidates >= 24
-    assert run.candidates % 12 == 0
+    assert len(kept) == len(run.proposed) == len(run.points) == 8
+    assert run.candidates >= 16
+    assert run.candidates % 8 == 0
     for q, p, T in zip(kept.joints, kept.pregrasp_joints, kept.T_object_wrist, strict=True):
         assert min(lowest_point(q, T), lowest_point(p, T)) > table - 1e-6
-    low = GraspRequest(num=12, table=heights[0] - 0.01, candidates=1, method="network")
+    low = GraspRequest(num=8, table=heights[0] - 0.01, candidates=1, method="network")
     below = predictor.run(GraspProblem(HAND, ball), low)
     assert torch.equal(below.grasps.joints, free.joints)
-    assert below.candidates == 12
+    assert below.candidates == 8
 
 
 def test_an_impossible_table_is_told(weights: str, ball: ObjectModel) -> None:
@@ -229,7 +229,7 @@ def test_prediction_runs_wholly_on_the_device_it_is_told(
 
 
 def test_auto_lets_the_optimiser_help_only_where_the_score_distrusts_the_network(
-    predictor: GraspPredictor, ball: ObjectModel, monkeypatch: pytest.MonkeyPatch
+    predictor: GraspPredictor, ball: ObjectModel, quick_synthesis: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("dro_grasp.predictor.OPTIMISED_PER_GRASP", 3)
     problem, alone = GraspProblem(HAND, ball), GraspRequest(4, seed=1, candidates=2, method="network")
@@ -245,7 +245,7 @@ def test_auto_lets_the_optimiser_help_only_where_the_score_distrusts_the_network
 
 
 def test_the_optimiser_alone_asks_no_network(
-    predictor: GraspPredictor, ball: ObjectModel, monkeypatch: pytest.MonkeyPatch
+    predictor: GraspPredictor, ball: ObjectModel, quick_synthesis: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("dro_grasp.predictor.OPTIMISED_PER_GRASP", 4)
     monkeypatch.setattr(predictor.network, "predict", None)

@@ -17,13 +17,13 @@ from dro_grasp.datasets.engine.shards import Shard, Yield, notes_of
 from dro_grasp.errors import GraspFileError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
-from dro_grasp.hands.library import load_hand
+from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.tiny_bundle import made_up_grasps
 
 
 @pytest.fixture(scope="module")
 def hand() -> Hand:
-    return load_hand("gripper3")
+    return loaded_hand("gripper3")
 
 
 def tried(hand: Hand, obj: str, count: int, seed: int, failed: int = 0) -> GraspBatch:

@@ -20,10 +20,10 @@ from dro_grasp.errors import OptionError, OutputError
 from dro_grasp.grasps import table
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.duplicates import DUPLICATE_DISTANCE
-from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import SynthesisConfig
 from tests.helpers.engine_work import GRASPS, easy
+from tests.helpers.loaded_hands import loaded_hand
 
 TINY = EngineConfig(
     candidates=64, min_candidates=64, trial_share=0.5, synthesis=SynthesisConfig(steps=80, batch_size=64))
@@ -224,7 +224,7 @@ def test_real_shards_hold_valid_grasps_repeat_and_add_up(tmp_path):
     assert made.candidates == sum(t.candidates for t in tasks)
     assert made.candidates == made.ranked_out + made.deep + made.moved + made.evaluated
     assert made.cpu_seconds > 0
-    points = load_hand("barrett").with_points(64).points(found.joints, found.T_object_wrist)
+    points = loaded_hand("barrett").with_points(64).points(found.joints, found.T_object_wrist)
     apart = (points[:, None] - points).norm(dim=-1).mean(-1) + torch.eye(len(found))
     assert apart.min() >= DUPLICATE_DISTANCE  # also across shards
     hand, can = worker._hand("barrett"), worker._object("can", scale=1.0)
@@ -237,7 +237,7 @@ def test_the_same_command_makes_the_same_grasps_however_many_work(tmp_path):
     found = []
     for name, workers in (("here", lambda job: HerePool(job, make_shard)), ("there", 2)):
         folder = tmp_path / name
-        synthesize_dataset(["barrett"], ["can", "sphere"], 2, folder, workers, config=SMALL, progress=lambda _: None)
+        synthesize_dataset(["gripper3"], ["can", "sphere"], 2, folder, workers, config=SMALL, progress=lambda _: None)
         found.append([GraspBatch.load(shard.path(folder)) for shard in find_shards(folder)])
     assert len(found[0]) >= 2
     assert min(map(len, found[0])) > 0
@@ -247,7 +247,7 @@ def test_the_same_command_makes_the_same_grasps_however_many_work(tmp_path):
 
 
 def test_a_success_that_hardly_anything_touches_is_not_kept():
-    hand, can = load_hand("barrett"), load_object("can")
+    hand, can = loaded_hand("barrett"), load_object("can")
     kept, made = valid_grasps(hand, can, 3, TINY)
     strict, fewer = valid_grasps(hand, can, 3, replace(TINY, min_contact_links=5))
     held = [len(links) for links in kept.extra["contact_links"]]
@@ -260,7 +260,7 @@ def test_a_success_that_hardly_anything_touches_is_not_kept():
 def test_settled_labels_move_only_joints_that_hold(tmp_path):
     from dro_grasp.simulation.trial import settle, simulate
 
-    hand, can = load_hand("allegro"), load_object("can")
+    hand, can = loaded_hand("allegro"), load_object("can")
     grasps = valid_grasps(hand, can, 1, EngineConfig(
         candidates=48, trial_share=0.5, settle=False, synthesis=SynthesisConfig(steps=80, batch_size=48)))[0]
     settled = settle(hand, can, grasps, "strict")
@@ -277,7 +277,7 @@ def test_a_hand_that_cannot_hold_the_object_is_told_why(tmp_path):
     trimesh.creation.box((0.3, 0.3, 0.3)).export(tmp_path / "house.stl")
     config = replace(SMALL, max_barren_rounds=1)
     (tmp_path / "data").mkdir()
-    report, _, _ = run(tmp_path / "data", ["barrett"], [str(tmp_path / "house.stl"), "can"], 1, make_shard, config=config)
+    report, _, _ = run(tmp_path / "data", ["gripper3"], [str(tmp_path / "house.stl"), "can"], 1, make_shard, config=config)
     (why,) = report.failures.values()
     assert why.startswith("0 grasps, none in the last 1 rounds: ")
     assert "%" in why
@@ -303,7 +303,7 @@ def test_an_object_that_coacd_cannot_cut_is_told_in_one_line(tmp_path, monkeypat
 def test_grasps_of_files_remember_them(tmp_path):
     trimesh.creation.icosphere(radius=0.03).export(tmp_path / "ball.stl")
     (tmp_path / "data").mkdir()
-    run(tmp_path / "data", ["barrett"], [str(tmp_path / "ball.stl")], 1, make_shard, config=replace(SMALL, scale=1.2))
+    run(tmp_path / "data", ["gripper3"], [str(tmp_path / "ball.stl")], 1, make_shard, config=replace(SMALL, scale=1.2))
     (pair,) = read_collection(tmp_path / "data")
     assert set(pair.grasps.extra["object_file"]) == {str(tmp_path / "ball.stl")}
     assert pair.grasps.extra["object_scale"].unique().tolist() == [pytest.approx(1.2)]

@@ -19,14 +19,14 @@ from dro_grasp.evaluation.coverage import grasp_sizes, measure_coverage, wrist_r
 from dro_grasp.evaluation.metrics import diversity
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
-from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
+from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.tiny_bundle import made_up_grasps
 
 
 @pytest.fixture(scope="module")
 def hand() -> Hand:
-    return load_hand("barrett")
+    return loaded_hand("barrett")
 
 
 def turned(hand: Hand, rotations: Rotation) -> GraspBatch:

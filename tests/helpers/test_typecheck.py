@@ -29,14 +29,14 @@ def test_fitting_arguments_and_results_pass() -> None:
 @pytest.mark.parametrize(
     "arguments", [(torch.zeros(4, 1), 2), (torch.zeros(4, dtype=torch.int), 2), ([0.0], 2), (torch.zeros(4), 2.0)])
 def test_arguments_are_refused(arguments: tuple) -> None:
-    with pytest.raises(TypeCheckError, match="parameters of .*repeated"):
+    with pytest.raises(TypeCheckError, match=r"parameters of .*repeated"):
         repeated(*arguments)
-    with pytest.raises(TypeCheckError, match="parameters of .*shown"):
+    with pytest.raises(TypeCheckError, match=r"parameters of .*shown"):
         shown(*arguments)
 
 
 def test_results_are_refused_also_for_sizes_that_only_the_arguments_tell() -> None:
-    with pytest.raises(TypeCheckError, match="return value of .*repeated"):
+    with pytest.raises(TypeCheckError, match=r"return value of .*repeated"):
         repeated(torch.zeros(4), 2, wrong=1)
-    with pytest.raises(TypeCheckError, match="return value of .*shown"):
+    with pytest.raises(TypeCheckError, match=r"return value of .*shown"):
         shown(torch.zeros(3), "done")

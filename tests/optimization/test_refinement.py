@@ -9,7 +9,6 @@ import torch
 
 from dro_grasp.energy.grasp_energy import GraspEnergy
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.refinement import RefineConfig, refine_grasps
@@ -17,8 +16,9 @@ from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import refine
 from dro_grasp.simulation.trial import simulate
+from tests.helpers.loaded_hands import loaded_hand
 
-HAND = load_hand("gripper3")
+HAND = loaded_hand("gripper3")
 CONFIG = RefineConfig()
 
 

@@ -10,7 +10,6 @@ import torch
 from dro_grasp.geometry.se3 import random_rotations
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.hand import Hand
-from dro_grasp.hands.library import load_hand
 from dro_grasp.models.network import DistanceNetwork, untrained_network
 from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.objects.catalogue import load_object
@@ -18,8 +17,9 @@ from dro_grasp.pipeline import proposal
 from dro_grasp.pipeline.choice import CROWDING_POINTS, ChoiceConfig, choice_scores
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.proposal import ProposalConfig, propose
+from tests.helpers.loaded_hands import loaded_hand
 
-HAND = load_hand("allegro").with_points(160)
+HAND = loaded_hand("allegro").with_points(160)
 SPHERE = load_object("sphere")
 CONFIG = ChoiceConfig()
 
@@ -99,7 +99,7 @@ def test_the_moved_hands_are_judged_in_the_object_s_frame_and_the_best_is_taken(
     with torch.no_grad():
         for draws in (1, 8):
             config = ProposalConfig(choice=ChoiceConfig(draws=draws))
-            propose(GraspProblem(load_hand("allegro"), SPHERE), network, 6, torch.Generator().manual_seed(0), None, config)
+            propose(GraspProblem(loaded_hand("allegro"), SPHERE), network, 6, torch.Generator().manual_seed(0), None, config)
     points = torch.cat(judged)
     assert points.shape[:2] == (6, 8)  # nothing is judged where there is one draw
     expected = HAND.points(joints, T)[:, None].expand_as(points)

@@ -12,15 +12,15 @@ from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.errors import GraspFileError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
-from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize, synthesize_with
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import complete, evaluate, optimise, rank, refine, scored
+from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.toy_hand import toy_hand
 
-HAND, CAN = load_hand("gripper3"), load_object("can")
+HAND, CAN = loaded_hand("gripper3"), load_object("can")
 PROBLEM = GraspProblem(HAND, CAN)
 
 

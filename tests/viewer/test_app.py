@@ -13,19 +13,19 @@ import torch
 
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.viewer.app import GraspViewer, describe
 from dro_grasp.viewer.appearance import success_colour
 from dro_grasp.viewer.stage import HOST, ServedPage
 from tests.helpers.browser import free_port, page_of
+from tests.helpers.loaded_hands import loaded_hand
 
 pytestmark = pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")
 
 
 @pytest.fixture(scope="module")
 def grasps() -> GraspBatch:
-    hand, obj = load_hand("gripper3"), load_object("sphere")
+    hand, obj = loaded_hand("gripper3"), load_object("sphere")
     T = torch.eye(4).repeat(2, 1, 1)
     T[:, :3, 3] = -hand.grasp_centre_wrist
     return GraspBatch.create(
@@ -36,7 +36,7 @@ def grasps() -> GraspBatch:
 
 @pytest.fixture(scope="module")
 def viewer(grasps: GraspBatch):
-    hand, obj = load_hand("gripper3"), load_object("sphere")
+    hand, obj = loaded_hand("gripper3"), load_object("sphere")
     points = hand.points(grasps.joints, grasps.T_object_wrist)
     said = io.StringIO()
     with contextlib.redirect_stdout(said):
@@ -105,7 +105,7 @@ def test_text_says_what_is_known(grasps: GraspBatch) -> None:
 
 
 def test_nothing_to_show_and_foreign_hands_are_refused(grasps: GraspBatch) -> None:
-    hand, obj = load_hand("gripper3"), load_object("sphere")
+    hand, obj = loaded_hand("gripper3"), load_object("sphere")
     with pytest.raises(OptionError, match="no grasp"):
         GraspViewer(hand, obj, grasps[slice(0, 0)])
     with pytest.raises(GraspFileError, match="gripper3"):

@@ -15,7 +15,6 @@ from dro_grasp.cli.main import main
 from dro_grasp.errors import OutputError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
-from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.rendering.camera import Camera
@@ -41,11 +40,12 @@ from dro_grasp.viewer.pictures import (
     draw_grasps,
     heading,
 )
+from tests.helpers.loaded_hands import loaded_hand
 
 
 @pytest.fixture(scope="module")
 def hand() -> Hand:
-    return load_hand("gripper3")
+    return loaded_hand("gripper3")
 
 
 @pytest.fixture(scope="module")
