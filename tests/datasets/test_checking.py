@@ -13,17 +13,17 @@ from dro_grasp.datasets.collections.checking import check, keep_passing
 from dro_grasp.datasets.collections.collection import read_collection
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
 from dro_grasp.simulation.protocols import changed
 from dro_grasp.simulation.trial import simulate
-from tests.helpers.loaded_hands import loaded_hand
 
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A file of evaluated grasps of two objects, successes and failures."""
-    hand, batches = loaded_hand("barrett"), []
+    hand, batches = load_hand("barrett"), []
     for name in ("can", "sphere"):
         obj = load_object(name)
         grasps = synthesize(hand, obj, 24, 0, SynthesisConfig(steps=80, batch_size=24))
@@ -74,7 +74,7 @@ def test_filter_keeps_what_passes_with_its_new_numbers(stored):
     pairs = list(read_collection(stored, only_successful=False))
     kept = keep_passing(pairs, changed("strict"))
     for pair, passed in kept:
-        again = simulate(loaded_hand("barrett"), load_object(pair.object), pair.grasps, "strict")
+        again = simulate(load_hand("barrett"), load_object(pair.object), pair.grasps, "strict")
         assert torch.equal(passed.joints, pair.grasps.joints[again.success])
         assert set(passed.protocol or ()) <= {"strict/1"}
     assert 0 < sum(len(passed) for _, passed in kept) < 48

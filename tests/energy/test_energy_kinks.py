@@ -19,8 +19,8 @@ from dro_grasp.energy.grasp_energy import TERMS, EnergyConfig, Evaluation, Grasp
 from dro_grasp.energy.terms import force_closure
 from dro_grasp.geometry.se3 import turned_about
 from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.library import load_hand
 from tests.helpers.energy_samples import GROUPS, PER_GROUP, Samples, branches, near_kinks, place, precise, rounded_box
-from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.toy_hand import toy_hand
 
 HANDS = ("toy", "barrett")  # the second has joints that follow others
@@ -32,7 +32,7 @@ CENTRE = (0.004, -0.006, 0.003)  # not the box's middle, so that normals have ar
 
 @cache
 def hand_of(name: str) -> Hand:
-    return precise(toy_hand() if name == "toy" else loaded_hand(name))
+    return precise(toy_hand() if name == "toy" else load_hand(name))
 
 
 @cache
