@@ -196,14 +196,12 @@ class Check(DataSets):
         with progress_bar("evaluating", self.json) as progress:
             found = check(self.pairs(only_successful=False), self.sample, rules, self.seed, progress)
         low, high = wilson_interval(found.agreed, found.evaluated)
-        rows = [[hand, count, success, success / count] for hand, (count, success) in found.hands.items()]
-        share = found.agreed / found.evaluated
+        rows = [[hand, n, success, success / n] for hand, (n, success) in found.hands.items()]
         values = {
-            "protocol": found.protocol, "evaluated": found.evaluated, "agreed": found.agreed,
-            "agreement": share, "interval_95": [low, high], "succeeded": found.succeeded,
-            "reasons": dict(found.reasons.most_common()), "hands": found.hands,
-        }
-        notes = [f"{found.agreed} of {found.evaluated} results agree with the stored ones: {share:.1%} "
+            "protocol": found.protocol, "evaluated": found.evaluated, "agreed": found.agreed, "agreement": found.share,
+            "interval_95": [low, high], "succeeded": found.succeeded, "hands": found.hands,
+            "reasons": dict(found.reasons.most_common())}
+        notes = [f"{found.agreed} of {found.evaluated} results agree with the stored ones: {found.share:.1%} "
                  f"(95 %: {low:.1%} to {high:.1%})"]
         notes += [f"  {count} stored as successful now fail: {reason}" for reason, count in found.reasons.most_common(5)]
         columns = ["hand", "grasps", "success", "rate"]
@@ -225,7 +223,7 @@ class Filter(DataSets):
     friction: Annotated[float | None, optional("MU", "the protocol's")] = None
     """Friction coefficient between hand and object."""
     close_fingers: Flag = False
-    """Close idle fingers onto the object, and keep the new grasp where it passes and no fewer fingers touch."""
+    """Close idle fingers onto the object where the grasp still passes."""
     json: Flag = False
     """Print one JSON object instead of a table."""
 
@@ -242,13 +240,13 @@ class Filter(DataSets):
         pairs = list(self.pairs(only_successful=False))
         with progress_bar("evaluating", self.json) as progress:
             kept = keep_passing(pairs, rules, progress, self.close_fingers)
-        for hand in dict.fromkeys(passed.hand for _, passed in kept):
-            GraspBatch.concatenate([passed for _, passed in kept if passed.hand == hand]).save(folder / file_name(hand))
+        for hand in dict.fromkeys(g.hand for _, g in kept):
+            GraspBatch.concatenate([g for _, g in kept if g.hand == hand]).save(folder / file_name(hand))
         rows = [[pair.hand, pair.object, len(pair.grasps), len(passed)] for pair, passed in kept]
         total, passed = sum(row[2] for row in rows), sum(row[3] for row in rows)
         columns = ["hand", "object", "grasps", "kept"]
-        values = {"output": str(folder), "protocol": rules.label, "grasps": total, "kept": passed,
-                  "pairs": records(columns, rows)}
+        values = {
+            "output": str(folder), "protocol": rules.label, "grasps": total, "kept": passed, "pairs": records(columns, rows)}
         print_result(self.json, values, f"protocol {rules.label}", columns, rows, f"{passed} of {total} kept, in {folder}")
         return 0
 

@@ -41,6 +41,11 @@ class Agreement:
     hands: dict[str, tuple[int, int]] = field(default_factory=dict)
     """Trials and successes by hand."""
 
+    @property
+    def share(self) -> float:
+        """Share of the new trials with the stored verdict."""
+        return self.agreed / self.evaluated
+
     def extended(self, grasps: GraspBatch, trial: TrialResult) -> Agreement:
         """With the new trials of more grasps."""
         failed = Counter(f.value for f, held in zip(trial.failure, grasps.success.tolist(), strict=True) if f and held)
