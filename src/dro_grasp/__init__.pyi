@@ -24,10 +24,13 @@ from dro_grasp.models.checkpoints import load_weights as load_weights, save_weig
 from dro_grasp.models.presets import NetworkConfig as NetworkConfig
 from dro_grasp.objects.catalogue import load_object as load_object, object_names as object_names
 from dro_grasp.objects.shape import ObjectModel as ObjectModel
+from dro_grasp.optimization.finger_closing import ClosingConfig as ClosingConfig
+from dro_grasp.optimization.grip import GripConfig as GripConfig
 from dro_grasp.optimization.refinement import RefineConfig as RefineConfig
 from dro_grasp.optimization.synthesis import SynthesisConfig as SynthesisConfig, synthesize as synthesize
 from dro_grasp.perception.partial_views import DepthCamera as DepthCamera, visible_points as visible_points
 from dro_grasp.perception.scan import depth_points as depth_points, scanned_object as scanned_object
+from dro_grasp.pipeline.choice import ChoiceConfig as ChoiceConfig
 from dro_grasp.pipeline.problem import GraspProblem as GraspProblem
 from dro_grasp.pipeline.stages import complete as complete, evaluate as evaluate, rank as rank, refine as refine
 from dro_grasp.predictor import (
