@@ -33,6 +33,8 @@ from dro_grasp.perception.scan import depth_points as depth_points, scanned_obje
 from dro_grasp.pipeline.choice import ChoiceConfig as ChoiceConfig
 from dro_grasp.pipeline.problem import GraspProblem as GraspProblem
 from dro_grasp.pipeline.stages import complete as complete, evaluate as evaluate, rank as rank, refine as refine
+from dro_grasp.planning.robot import Robot as Robot, load_robot as load_robot
+from dro_grasp.planning.robot_check import RobotReport as RobotReport, check_robot as check_robot
 from dro_grasp.predictor import (
     GraspPredictor as GraspPredictor,
     GraspRequest as GraspRequest,

@@ -15,6 +15,14 @@ class HandError(DroGraspError):
     """A hand description cannot be used."""
 
 
+class RobotError(DroGraspError):
+    """The description of a robot, of arm and hand together, cannot be used."""
+
+
+class PlanError(DroGraspError):
+    """No motion of the robot grasps the object, or a plan file cannot be used."""
+
+
 class ObjectError(DroGraspError):
     """A mesh or point cloud of an object cannot be used."""
 

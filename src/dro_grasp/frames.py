@@ -55,11 +55,18 @@ def read_motion(path: Path, key: str) -> NamedMotion:
         raise OptionError(f"{wanted}; it does not ({error})") from error
     if not isinstance(name, str) or not name:
         raise OptionError(f"{wanted}; its frame is {name!r}, which is not a name")
+    if (fault := motion_fault(T)) is not None:
+        raise OptionError(f"{wanted}; {fault}")
+    return NamedMotion(name, T.float())
+
+
+def motion_fault(T: Float[Tensor, "*any"]) -> str | None:
+    """Why a matrix is no rigid motion in metres, in words; None if it is one."""
     if T.shape != (4, 4) or not bool(T.isfinite().all()) or T[3].tolist() != [0, 0, 0, 1]:
-        raise OptionError(f"{wanted}; its matrix has shape {tuple(T.shape)} or a last row other than 0 0 0 1")
+        return f"its matrix has shape {tuple(T.shape)} or a last row other than 0 0 0 1"
     R = T[:3, :3]
     if float((R @ R.T - torch.eye(3)).abs().max()) > 1e-3 or float(torch.linalg.det(R)) < 0:
-        raise OptionError(f"{wanted}; the upper left 3x3 of its matrix is not a rotation (scaled, or mirrored)")
+        return "the upper left 3x3 of its matrix is not a rotation (scaled, or mirrored)"
     if float(T[:3, 3].norm()) > LONGEST:
-        raise OptionError(f"{wanted}; its translation is {float(T[:3, 3].norm()):g} m long; divide millimetres by 1000")
-    return NamedMotion(name, T.float())
+        return f"its translation is {float(T[:3, 3].norm()):g} m long; divide millimetres by 1000"
+    return None

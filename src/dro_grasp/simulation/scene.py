@@ -60,7 +60,7 @@ class Scene:
     @cached_property
     def hand_qpos(self) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
         """Addresses in qpos, and indices into the tree's moving joints, of the simulated joints."""
-        return _joint_addresses(self.model, self.hand)
+        return joint_addresses(self.model, self.hand)
 
     @cached_property
     def actuated(self) -> Int[np.ndarray, " n_servos"]:
@@ -120,9 +120,9 @@ def build_scene(hand: Hand, obj: ObjectModel, protocol: Protocol) -> Scene:
     if hand.description is None:
         raise HandError(f"hand '{hand.name}' carries no description; load it by name or file to simulate it")
     scene = _empty_scene(protocol)
-    _attach(scene, _hand_spec(hand, protocol))
-    _add_servos(scene, hand, protocol)
-    _add_object(scene, obj, protocol)
+    attach(scene, hand_spec(hand, protocol), scene.worldbody.add_frame())
+    add_servos(scene, hand, protocol)
+    add_object(scene, obj, protocol)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         _exclude_resting_contacts(scene, hand)
@@ -141,7 +141,7 @@ def _empty_scene(protocol: Protocol) -> mujoco.MjSpec:
     return scene
 
 
-def _hand_spec(hand: Hand, protocol: Protocol) -> mujoco.MjSpec:
+def hand_spec(hand: Hand, protocol: Protocol) -> mujoco.MjSpec:
     """The hand with the protocol's contacts, without a description's damping, springs and limits of effort."""
     assert hand.description is not None
     spec = hand.description.spec()
@@ -164,16 +164,16 @@ def _hand_spec(hand: Hand, protocol: Protocol) -> mujoco.MjSpec:
     return spec
 
 
-def _attach(scene: mujoco.MjSpec, hand: mujoco.MjSpec) -> None:
-    """Put the hand's root at the origin, fixed."""
+def attach(scene: mujoco.MjSpec, part: mujoco.MjSpec, frame: mujoco.MjsFrame, prefix: str = PREFIX) -> None:
+    """Fix the root of a hand, or of an arm, to a frame of the scene."""
     # Where some meshes live in memory, MuJoCo 4.0.0 puts the prefix into the file names of the others as well.
-    on_disk = {PREFIX + mesh.name: mesh.file for mesh in hand.meshes if mesh.file and mesh.file not in hand.assets}
-    scene.attach(hand, prefix=PREFIX, frame=scene.worldbody.add_frame())
+    on_disk = {prefix + mesh.name: mesh.file for mesh in part.meshes if mesh.file and mesh.file not in part.assets}
+    scene.attach(part, prefix=prefix, frame=frame)
     for mesh in scene.meshes:
         mesh.file = on_disk.get(mesh.name, mesh.file)
 
 
-def _add_servos(scene: mujoco.MjSpec, hand: Hand, protocol: Protocol) -> None:
+def add_servos(scene: mujoco.MjSpec, hand: Hand, protocol: Protocol) -> None:
     """Position servos on the independent joints, all hands alike.
 
     They are added to the scene, not to the hand, whose description may set defaults for actuators.
@@ -214,22 +214,23 @@ def _hold_joints(spec: mujoco.MjSpec, hand: Hand) -> None:
             tie.data[0] = offset
 
 
-def _add_object(scene: mujoco.MjSpec, obj: ObjectModel, protocol: Protocol) -> None:
-    """The object as its convex parts, with the mass and inertia of its mesh."""
-    body = scene.worldbody.add_body(name="object", pos=FAR_AWAY)
-    body.add_freejoint(name="object")
+def add_object(scene: mujoco.MjSpec, obj: ObjectModel, protocol: Protocol, name: str = "object") -> mujoco.MjsBody:
+    """The object as its convex parts, with the mass and inertia of its mesh; body and free joint have the name."""
+    body = scene.worldbody.add_body(name=name, pos=FAR_AWAY)
+    body.add_freejoint(name=name)
     for i, (vertices, faces) in enumerate(obj.parts):
-        mesh = scene.add_mesh(name=f"part{i}", uservert=np.asarray(vertices, float).ravel(),
+        mesh = scene.add_mesh(name=f"{name}{i}", uservert=np.asarray(vertices, float).ravel(),
                               userface=np.asarray(faces, np.int32).ravel())
         mesh.maxhullvert = HULL_VERTICES
         # A part's own inertia plays no role, and thin parts would be refused for it.
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"part{i}", condim=4, mass=0.0,
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, condim=4, mass=0.0,
                       friction=[protocol.friction, protocol.torsional_friction, 1e-4])
     mass = object_mass(obj, protocol)
     inertia = obj.inertia / obj.volume * mass
     body.explicitinertial, body.mass, body.ipos = True, mass, obj.centre_of_mass
     body.fullinertia = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
+    return body
 
 
 def object_mass(obj: ObjectModel, protocol: Protocol) -> float:
@@ -244,7 +245,7 @@ def _exclude_resting_contacts(scene: mujoco.MjSpec, hand: Hand) -> None:
     """
     model = scene.compile()
     data = mujoco.MjData(model)
-    addresses, moving = _joint_addresses(model, hand)
+    addresses, moving = joint_addresses(model, hand)
     pairs: set[tuple[str, str]] = set()
     for openness in (0.75, 1.0):
         q = hand.canonical_joints(openness)
@@ -261,7 +262,8 @@ def _exclude_resting_contacts(scene: mujoco.MjSpec, hand: Hand) -> None:
         scene.add_exclude(bodyname1=first, bodyname2=second)
 
 
-def _joint_addresses(model: mujoco.MjModel, hand: Hand) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+def joint_addresses(model: mujoco.MjModel, hand: Hand) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """Addresses in qpos, and indices into the tree's moving joints, of the hand's joints in a scene."""
     names = {model.joint(j).name: int(model.jnt_qposadr[j]) for j in range(model.njnt)}
     pairs = [(names[PREFIX + n], i) for i, n in enumerate(hand.tree.moving_names) if PREFIX + n in names]
     return np.array([a for a, _ in pairs], int), np.array([i for _, i in pairs], int)

@@ -1,0 +1,182 @@
+"""A robot: an arm that carries a hand, compared with its file and ready for planning."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from dro_grasp.descriptions.loader import Description, load_description
+from dro_grasp.descriptions.xml_files import parse_xml
+from dro_grasp.errors import HandError, RobotError
+from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.library import load_hand
+from dro_grasp.planning.robot_file import CameraMount, RobotFile, Table, locate_robot, read_robot_file
+
+LONGEST_ARM = 5.0
+"""A farther link must be in another unit [m] (ours)."""
+NO_LIMITS = "states no limits"
+"""Beginning of the note of a joint whose limits had to be assumed."""
+DEFAULT_EFFORT = 50.0
+"""Largest torque of an arm's joint that states none [Nm]; only simulated servos use it (ours)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """An arm with a hand. The world's z axis points up."""
+
+    name: str
+    arm: Description
+    hand: Hand
+    mount_link: str
+    """The arm's link that carries the hand."""
+    T_link_wrist: Float[np.ndarray, "4 4"]
+    """Pose of the hand's root link in the mount link [m]."""
+    T_world_base: Float[np.ndarray, "4 4"]
+    """Pose of the arm's root link in the world [m]."""
+    home: Float[np.ndarray, " n_arm"]
+    """Where the arm starts [rad or m]."""
+    lower: Float[np.ndarray, " n_arm"]
+    """[rad or m]"""
+    upper: Float[np.ndarray, " n_arm"]
+    """[rad or m]"""
+    velocity: Float[np.ndarray, " n_arm"]
+    """Largest speed [rad/s or m/s]."""
+    acceleration: Float[np.ndarray, " n_arm"]
+    """Largest acceleration [rad/s^2 or m/s^2]."""
+    effort: Float[np.ndarray, " n_arm"]
+    """Largest torque or force [Nm or N]."""
+    hand_velocity: float
+    """Largest speed of the hand's joints [rad/s or m/s]."""
+    hand_acceleration: float
+    """Largest acceleration of the hand's joints [rad/s^2 or m/s^2]."""
+    camera: CameraMount | None
+    table: Table | None
+
+    @property
+    def arm_joints(self) -> tuple[str, ...]:
+        """Names of the arm's joints, from the base to the hand."""
+        return tuple(self.arm.tree.joint_names)
+
+    @property
+    def hand_joints(self) -> tuple[str, ...]:
+        """Names of the hand's independent joints."""
+        return tuple(self.hand.tree.joint_names)
+
+    def T_world_wrist(self, arm: Float[np.ndarray, "*batch n_arm"]) -> Float[np.ndarray, "*batch 4 4"]:
+        """Pose of the hand's root link [m]."""
+        tree = self.arm.tree.double
+        mount = tree.forward(torch.from_numpy(np.asarray(arm, np.float64)))[..., tree.link_names.index(self.mount_link), :, :]
+        return self.T_world_base @ mount.numpy() @ self.T_link_wrist
+
+
+def load_robot(name: str | Path) -> Robot:
+    """A built-in robot, or one from a robot file.
+
+    Raises:
+        RobotError: The file, its arm, or how the two fit; the message names the entry and a remedy.
+        HandError: The hand cannot be used.
+    """
+    file = read_robot_file(locate_robot(name))
+    try:
+        arm = load_description(file.arm)
+    except HandError as error:
+        raise RobotError(f"{file.path}: the arm cannot be used: {str(error).replace('hand', 'robot')}") from error
+    fit = _Fit(file, arm)
+    fit.check_tree()
+    lower, upper = fit.positions()
+    return Robot(
+        file.name, arm, load_hand(file.hand), file.mount_link, file.T_link_wrist, file.T_world_base,
+        fit.home(lower, upper), lower, upper, fit.limit("velocity"), fit.limit("acceleration"),
+        fit.limit("effort", DEFAULT_EFFORT), file.hand_velocity, file.hand_acceleration, file.camera, file.table)
+
+
+class _Fit:
+    """Compares a robot file with its arm."""
+
+    def __init__(self, file: RobotFile, arm: Description) -> None:
+        self.file, self.arm, self.tree = file, arm, arm.tree
+        self.joints = list(self.tree.joint_names)
+
+    def error(self, text: str) -> RobotError:
+        return RobotError(f"{self.file.path}: {text}")
+
+    def check_tree(self) -> None:
+        """The mount link exists, and every joint of the arm moves it."""
+        tree, link = self.tree, self.file.mount_link
+        if link not in tree.link_names:
+            raise self.error(f"the hand is mounted at link '{link}', which the arm does not have; its links are "
+                             f"{', '.join(tree.link_names)}")
+        if tree.joint_names != tree.moving_names:
+            follower = next(n for n in tree.moving_names if n not in tree.joint_names)
+            raise self.error(f"joint '{follower}' of the arm follows another; expected an arm of independent joints")
+        if idle := [n for n, m in zip(self.joints, tree.moves[tree.link_names.index(link)].tolist(), strict=True) if not m]:
+            raise self.error(f"joints {', '.join(idle)} of the arm do not move link '{link}'; remove what they move (a "
+                             "gripper?) from the arm's file, or mount the hand farther out")
+        reach = float(tree.forward(torch.zeros(tree.n_dof))[:, :3, 3].norm(dim=-1).max())
+        if reach > LONGEST_ARM:
+            raise self.error(f"a link of the arm is {reach:.3g} m from its base, which looks like millimetres; expected metres")
+
+    def positions(self) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """Limits of the joints: the file's, or else the arm's."""
+        stated = self._by_joint("position", self.file.limits.get("position", {}))
+        unlimited = {note.subject for note in self.arm.notes if note.text.startswith(NO_LIMITS)}
+        lower, upper = (t.double().numpy().copy() for t in (self.tree.lower, self.tree.upper))
+        for i, name in enumerate(self.joints):
+            if name in stated:
+                ends = stated[name]
+                if not isinstance(ends, list) or len(ends) != 2 or not ends[0] < ends[1]:
+                    raise self.error(f"limits: position of joint '{name}' is {ends!r}; expected [lower, upper]")
+                lower[i], upper[i] = ends
+            elif name in unlimited:
+                raise self.error(f"joint '{name}' of the arm has no position limits; state them in the arm's file, or here: "
+                                 f"limits: {{position: {{{name}: [-3.1, 3.1]}}}}")
+        return lower, upper
+
+    def limit(self, kind: str, default: float | None = None) -> Float[np.ndarray, " n"]:
+        """One limit of each joint: the file's, or else the URDF's."""
+        given, stated = self.file.limits.get(kind), _urdf_limits(self.arm.path, kind)
+        if given is not None and not isinstance(given, dict):
+            given = dict.fromkeys(self.joints, given)
+        values = {**stated, **self._by_joint(kind, given or {})}
+        for name in self.joints:
+            value = values.get(name, default)
+            if value is None:
+                raise self.error(f"joint '{name}' of the arm has no {kind} limit; state it in {self.file.path.name}, for "
+                                 f"example limits: {{{kind}: 1.5}}, in rad/s or rad/s^2")
+            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < np.inf:
+                raise self.error(f"limits: {kind} of joint '{name}' is {value!r}; expected a number above 0")
+        return np.array([float(values.get(name, default)) for name in self.joints])
+
+    def home(self, lower: Float[np.ndarray, " n"], upper: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """The home configuration, within the limits."""
+        home = self._by_joint("home", self.file.home)
+        if missing := [n for n in self.joints if n not in home]:
+            raise self.error(f"home lacks joint '{missing[0]}'; the arm's joints are {', '.join(self.joints)}")
+        q = np.array([home[n] for n in self.joints])
+        if len(out := np.flatnonzero((q < lower) | (q > upper))):
+            i = int(out[0])
+            raise self.error(f"home of joint '{self.joints[i]}' is {q[i]:g}, outside its limits {lower[i]:g} to {upper[i]:g}")
+        return q
+
+    def _by_joint(self, what: str, values: Any) -> Mapping[str, Any]:
+        if not isinstance(values, Mapping):
+            raise self.error(f"{what} is {values!r}; expected values by joint")
+        if unknown := [n for n in values if n not in self.joints]:
+            raise self.error(f"{what} names joint '{unknown[0]}', which the arm does not have; its joints are "
+                             f"{', '.join(self.joints)}")
+        return values
+
+
+def _urdf_limits(path: Path, kind: str) -> dict[str, float]:
+    """What a URDF states of its joints; MuJoCo does not keep velocities. Zero means that nothing is known."""
+    root = parse_xml(path)
+    if root.tag != "robot" or kind not in {"velocity", "effort"}:
+        return {}
+    found = {j.get("name", ""): float(limit.get(kind, 0)) for j in root.findall("joint") for limit in j.findall("limit")}
+    return {name: value for name, value in found.items() if value > 0}

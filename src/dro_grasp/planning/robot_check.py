@@ -1,0 +1,154 @@
+"""Check a robot: what is derived from its file, what collides, how far the palm reaches; and a picture of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image
+
+from dro_grasp.files import check_output, replacing
+from dro_grasp.planning.collisions import CollisionChecker, open_hand
+from dro_grasp.planning.robot import Robot, load_robot
+from dro_grasp.planning.robot_file import Table
+from dro_grasp.rendering.camera import Camera
+from dro_grasp.rendering.meshes import Colour, Mesh, arrow
+from dro_grasp.rendering.rasterizer import render
+from dro_grasp.simulation.scene import PREFIX
+
+SIZE = (900, 660)
+"""Width and height of the picture [pixels]."""
+VIEW = (1.0, -1.3, 0.75)
+"""Direction from the robot towards the camera of pictures, in the world."""
+ARM_COLOUR: Colour = (0.84, 0.85, 0.87)
+"""Light grey of the arm."""
+MOUNT_COLOUR: Colour = (0.35, 0.38, 0.43)
+"""Dark grey of the arm's base."""
+HAND_COLOUR: Colour = (0.25, 0.47, 0.75)
+"""Blue of the hand."""
+TABLE_COLOUR: Colour = (0.90, 0.87, 0.82)
+"""Sand of the table."""
+CAMERA_COLOUR: Colour = (0.85, 0.2, 0.2)
+"""Red of the camera's direction."""
+REACH_SAMPLES = 2000
+"""Random configurations among which reach is measured (ours)."""
+
+
+@dataclass(frozen=True, eq=False)
+class RobotReport:
+    """What a check found."""
+
+    robot: Robot
+    excluded: tuple[tuple[str, str], ...]
+    """Pairs of links whose contacts are not checked, since they always touch."""
+    home_contacts: tuple[str, ...]
+    """What collides at home, in words; nothing should."""
+    reach: tuple[float, float]
+    """Horizontal distances from the base at which the grasp centre gets to within 10 cm above the table [m]."""
+    free_share: float
+    """Share of random configurations that do not collide."""
+
+    @property
+    def usable(self) -> bool:
+        """Whether plans can start: nothing collides at home."""
+        return not self.home_contacts
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        r = self.robot
+        columns = ("home", "lower", "upper", "velocity", "acceleration", "effort")
+        joints = {n: {c: float(getattr(r, c)[i]) for c in columns} for i, n in enumerate(r.arm_joints)}
+        return {"robot": r.name, "joints": joints, "hand": r.hand.name, "hand_joints": list(r.hand_joints),
+                "mount_link": r.mount_link, "wrist_at_home": r.T_world_wrist(r.home).tolist(), "camera": r.camera is not None,
+                "table": None if r.table is None else r.table.height, "reach": list(self.reach), "free_share": self.free_share,
+                "excluded": [list(p) for p in self.excluded], "home_contacts": list(self.home_contacts), "usable": self.usable}
+
+    def lines(self) -> list[str]:
+        """In words."""
+        r = self.robot
+        place = r.T_world_wrist(r.home)[:3, 3]
+        of_arm = [pair for pair in self.excluded if not all(name.startswith(PREFIX) for name in pair)]
+        between = [" and ".join(name.partition("/")[2] for name in pair) for pair in of_arm]
+        table = "no table" if r.table is None else (
+            f"table at z = {r.table.height:g} m, {r.table.size[0]:g} x {r.table.size[1]:g} m")
+        camera = "no camera" if r.camera is None else (
+            "camera at ({:.2f}, {:.2f}, {:.2f}) m".format(*r.camera.T_world_camera[:3, 3]))
+        return [
+            f"robot {r.name}: {len(r.arm_joints)} arm joints, hand {r.hand.name} with {len(r.hand_joints)}, mounted at "
+            f"link {r.mount_link}",
+            *(f"  {n}: home {h:.2f}, {lo:.2f} to {up:.2f}, at most {v:g} /s and {a:g} /s^2" for n, h, lo, up, v, a in zip(
+                r.arm_joints, r.home, r.lower, r.upper, r.velocity, r.acceleration, strict=True)),
+            f"wrist at home: ({place[0]:.3f}, {place[1]:.3f}, {place[2]:.3f}) m; {table}; {camera}",
+            f"reach: the grasp centre gets close above the table {self.reach[0]:.2f} to {self.reach[1]:.2f} m from the base"
+            if np.isfinite(self.reach).all() else "reach: the grasp centre was never found close above the table",
+            f"{self.free_share:.0%} of random configurations are free of collisions",
+            f"not checked, since they always touch: {', '.join(between) or 'nothing'}",
+            *(f"COLLISION at home: {text}" for text in self.home_contacts),
+            "usable" if self.usable else "not usable: change `home` or the mount until nothing collides at home",
+        ]
+
+
+def check_robot(name: str | Path) -> RobotReport:
+    """Load a robot and look at it.
+
+    Raises:
+        RobotError: The robot cannot be loaded.
+    """
+    robot = load_robot(name)
+    checker, opened = CollisionChecker(robot, robot.table), open_hand(robot)
+    contacts = [f"{c.first} and {c.second} ({-1e3 * c.distance:.1f} mm)" for c in checker.contacts(robot.home, opened)]
+    draws = np.random.default_rng(0).uniform(robot.lower, robot.upper, (REACH_SAMPLES, len(robot.home)))
+    free = np.array([checker.free(q, opened) for q in draws])
+    centre = robot.hand.grasp_centres(torch.from_numpy(robot.T_world_wrist(draws)).float()).double().numpy()
+    height = centre[:, 2] - (robot.table or Table()).height
+    distance = np.linalg.norm(centre[:, :2] - robot.T_world_base[:2, 3], axis=1)[free & (height > 0) & (height < 0.1)]
+    reach = (float(distance.min()), float(distance.max())) if len(distance) else (float("nan"), float("nan"))
+    return RobotReport(robot, checker.excluded, tuple(contacts), reach, float(free.mean()))
+
+
+def draw_robot(robot: Robot, path: Path) -> None:
+    """Write a PNG of the robot at home, its table, and where its camera looks.
+
+    Raises:
+        OutputError: The path cannot be written.
+    """
+    meshes = [*robot_meshes(robot, robot.home, open_hand(robot)), *table_meshes(robot.table)]
+    if robot.camera is not None:
+        T = robot.camera.T_world_camera
+        meshes.append(arrow(T[:3, 3], T[:3, 3] + 0.15 * T[:3, 2], CAMERA_COLOUR, radius=0.008))
+    points = np.concatenate([m.vertices for m in meshes])
+    picture = render(meshes, Camera.around(points, VIEW, aspect=SIZE[0] / SIZE[1]), *SIZE)
+    with replacing(check_output(path), "picture") as temporary:
+        Image.fromarray(picture).save(temporary, format="PNG")
+
+
+def robot_meshes(robot: Robot, arm: Float[np.ndarray, " n_arm"], hand: Float[np.ndarray, " n_dof"]) -> list[Mesh]:
+    """The visual shapes of arm and hand in the world."""
+    found = []
+    parts = (robot.arm, arm, robot.T_world_base), (robot.hand.description, hand, robot.T_world_wrist(arm))
+    for description, q, root in parts:
+        if description is None:
+            continue
+        poses = root @ description.tree.double.forward(torch.from_numpy(np.asarray(q, np.float64))).numpy()
+        for shape in description.geometry:
+            if shape.visual:
+                T = poses[shape.link]
+                colour = HAND_COLOUR if description is not robot.arm else MOUNT_COLOUR if shape.link == 0 else ARM_COLOUR
+                found.append(Mesh(shape.vertices @ T[:3, :3].T + T[:3, 3], shape.faces, colour))
+    return found
+
+
+def table_meshes(table: Table | None, thickness: float = 0.02) -> list[Mesh]:
+    """The table as a board."""
+    if table is None:
+        return []
+    import trimesh
+
+    board = trimesh.creation.box(extents=[*table.size, thickness])
+    board.apply_translation([*table.centre, table.height - thickness / 2])
+    return [Mesh(np.asarray(board.vertices), np.asarray(board.faces), TABLE_COLOUR)]
+

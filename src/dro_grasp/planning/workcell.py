@@ -1,0 +1,78 @@
+"""The robot and what stands around it, as one MuJoCo specification: for collision checks, and for lifts with physics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from dro_grasp.geometry.rotations import roma
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.planning.robot import Robot
+from dro_grasp.planning.robot_file import Table
+from dro_grasp.simulation.protocols import Protocol
+from dro_grasp.simulation.scene import HULL_VERTICES, attach, hand_spec
+
+ARM = "arm/"
+"""Prefix of the arm's names."""
+TABLE = "table"
+"""Name of the table."""
+TABLE_THICKNESS = 0.05
+"""[m] (ours)"""
+VOXEL = 0.015
+"""Edge of the boxes that stand for a cloud of obstacles [m] (ours)."""
+
+
+def robot_spec(robot: Robot, protocol: Protocol, table: Table | None) -> mujoco.MjSpec:
+    """Arm, hand and table; nothing drives them yet."""
+    scene = mujoco.MjSpec()
+    option = scene.option
+    option.timestep, option.impratio = protocol.timestep, protocol.impratio
+    option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # the sparse Newton solver of MuJoCo 4.0.0 can be wrong
+    arm = robot.arm.spec()
+    for mesh in arm.meshes:
+        mesh.maxhullvert = HULL_VERTICES
+    for geom in arm.geoms:
+        geom.condim, geom.margin, geom.gap = 1, 0.0, 0.0
+    attach(scene, arm, placed_frame(scene.worldbody, robot.T_world_base), ARM)
+    attach(scene, hand_spec(robot.hand, protocol), placed_frame(scene.body(ARM + robot.mount_link), robot.T_link_wrist))
+    if table is not None:
+        half = [table.size[0] / 2, table.size[1] / 2, TABLE_THICKNESS / 2]
+        scene.worldbody.add_geom(
+            name=TABLE, type=mujoco.mjtGeom.mjGEOM_BOX, size=half, rgba=[0.82, 0.80, 0.76, 1],
+            pos=[*table.centre, table.height - TABLE_THICKNESS / 2], friction=[protocol.friction, 0.005, 1e-4])
+    return scene
+
+
+def placed_frame(body: mujoco.MjsBody, T: Float[np.ndarray, "4 4"]) -> mujoco.MjsFrame:
+    """A frame of a body at a pose [m]."""
+    return body.add_frame(pos=T[:3, 3], quat=wxyz(T[:3, :3]))
+
+
+def wxyz(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
+    """Unit quaternion WXYZ of a rotation."""
+    rotation = roma.special_procrustes(torch.from_numpy(np.asarray(R, np.float64)))
+    return roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(rotation)).numpy()
+
+
+def add_solids(scene: mujoco.MjSpec, body: mujoco.MjsBody, things: Sequence[ObjectModel], hull: bool = False) -> None:
+    """Shapes of things in a body's frame: convex parts of meshes; of clouds, small boxes, or with `hull` the convex hull."""
+    for i, thing in enumerate(things):
+        if thing.is_cloud and not hull:
+            for centre in occupied(thing.cloud.astype(np.float64)):
+                body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[VOXEL / 2] * 3, pos=centre)
+            continue
+        corners = [thing.cloud] if thing.is_cloud else [vertices for vertices, _ in thing.parts]
+        for j, vertices in enumerate(corners):
+            mesh = scene.add_mesh(name=f"{body.name}-solid{i}.{j}", uservert=np.asarray(vertices, np.float64).ravel())
+            mesh.maxhullvert = HULL_VERTICES
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name)
+
+
+def occupied(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
+    """Centres of the cells of size VOXEL that hold a point [m]."""
+    return (np.unique(np.floor(points / VOXEL).astype(int), axis=0) + 0.5) * VOXEL

@@ -1,0 +1,170 @@
+"""Robots: their files, the arms that ship, what collides, and how bad files are refused."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+
+from dro_grasp.cli.main import main
+from dro_grasp.errors import RobotError
+from dro_grasp.planning.collisions import CollisionChecker, open_hand
+from dro_grasp.planning.robot import load_robot
+from dro_grasp.planning.robot_file import BUILTIN_ROBOTS, robot_names
+
+
+@pytest.fixture
+def values() -> dict[str, Any]:
+    """The built-in xArm 7, with absolute paths."""
+    values = yaml.safe_load((BUILTIN_ROBOTS / "xarm7_leaphand.yaml").read_text())
+    return values | {"arm": str(BUILTIN_ROBOTS / "xarm7.urdf"), "hand": "gripper3"}
+
+
+def written(values: dict[str, Any], folder: Path) -> Path:
+    path = folder / "robot.yaml"
+    path.write_text(yaml.safe_dump(values))
+    return path
+
+
+@pytest.mark.parametrize("name", robot_names())
+def test_a_built_in_robot_is_free_at_home_and_its_wrist_is_where_mujoco_has_it(name: str) -> None:
+    robot = load_robot(name)
+    checker = CollisionChecker(robot, robot.table)
+    assert not checker.contacts(robot.home, open_hand(robot))
+    q = np.random.default_rng(0).uniform(robot.lower, robot.upper)
+    checker.contacts(q, open_hand(robot))
+    body = checker.data.body(f"hand/{robot.hand.wrist_link}")
+    T = robot.T_world_wrist(q)
+    assert np.allclose(T[:3, 3], body.xpos, atol=1e-6)
+    assert np.allclose(T[:3, :3], body.xmat.reshape(3, 3), atol=1e-6)
+
+
+def dh(a: float, d: float, alpha: float, theta: float) -> np.ndarray:
+    c, s, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha), np.sin(alpha)
+    return np.array([[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1.0]])
+
+
+def test_the_ur5e_has_the_kinematics_that_its_maker_publishes() -> None:
+    robot = load_robot("ur5e_allegro")
+    table = [(0, 0.163, np.pi / 2), (-0.425, 0, 0), (-0.392, 0, 0), (0, 0.134, np.pi / 2), (0, 0.1, -np.pi / 2), (0, 0.1, 0)]
+    turned = np.diag([-1.0, -1.0, 1.0, 1.0])  # the maker's base looks the other way
+    for q in np.random.default_rng(1).uniform(-3, 3, (5, 6)):
+        expected = turned
+        for (a, d, alpha), theta in zip(table, q, strict=True):
+            expected = expected @ dh(a, d, alpha, theta)
+        flange = robot.T_world_wrist(q) @ np.linalg.inv(robot.T_link_wrist)
+        assert np.allclose(flange[:3, 3], expected[:3, 3], atol=1e-5)
+        assert np.allclose(flange[:3, 2], expected[:3, 2], atol=1e-5)
+
+
+@pytest.mark.assets
+def test_the_xarm7_has_the_kinematics_of_another_model_of_it(assets_folder: Path) -> None:
+    robot = load_robot("xarm7_leaphand")
+    other = mujoco.MjModel.from_xml_path(str(assets_folder / "arms" / "xarm7" / "xarm7.xml"))
+    data = mujoco.MjData(other)
+    assert np.allclose(other.jnt_range, np.stack([robot.lower, robot.upper], 1), atol=1e-4)
+    for q in np.random.default_rng(2).uniform(robot.lower, robot.upper, (5, 7)):
+        data.qpos[:] = q
+        mujoco.mj_kinematics(other, data)
+        flange = robot.T_world_wrist(q) @ np.linalg.inv(robot.T_link_wrist)
+        assert np.allclose(flange[:3, 3], data.body("link7").xpos, atol=1e-5)
+        assert np.allclose(flange[:3, :3], data.body("link7").xmat.reshape(3, 3), atol=1e-5)
+
+
+@pytest.mark.assets
+@pytest.mark.parametrize(("arm", "link", "hand"), [
+    ("lite6/lite6.xml", "link6", "assets/inspire"), ("xarm7/xarm7.xml", "link7", "gripper3")])
+def test_any_arm_and_any_hand_are_one_file(
+    arm: str, link: str, hand: str, tmp_path: Path, assets_folder: Path, values: dict[str, Any]
+) -> None:
+    count = 6 if "lite6" in arm else 7
+    values |= {"arm": str(assets_folder / "arms" / arm), "hand": hand, "mount": {"link": link, "position": [0, 0, 0.02]},
+               "home": {f"joint{i + 1}": 0.5 for i in range(count)}}
+    robot = load_robot(written(values, tmp_path))
+    assert len(robot.arm_joints) == count
+    assert CollisionChecker(robot, robot.table).excluded
+
+
+def test_an_arm_that_dips_into_the_table_collides_with_it_and_with_nothing_else(values: dict[str, Any], tmp_path: Path) -> None:
+    robot = load_robot(written(values, tmp_path))
+    down = robot.home.copy()
+    down[[1, 3]] = 1.2, 1.6
+    found = CollisionChecker(robot, robot.table).contacts(down, open_hand(robot))
+    assert found
+    assert {"table"} == {name for c in found for name in (c.first, c.second) if "/" not in name}
+    assert not CollisionChecker(robot).contacts(down, open_hand(robot))
+
+
+def change(path: str, value: Any) -> Any:
+    def apply(values: dict[str, Any]) -> None:
+        *above, last = path.split("/")
+        for key in above:
+            values = values[key]
+        if value is None:
+            del values[last]
+        else:
+            values[last] = value
+    return apply
+
+
+SQUASHED = [[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+
+
+@pytest.mark.parametrize(("fault", "said"), [
+    (change("mount/link", "link9"), "link 'link9', which the arm does not have"),
+    (change("mount/link", "link5"), "joints joint6, joint7 of the arm do not move link 'link5'"),
+    (change("limits/acceleration", None), "has no acceleration limit"),
+    (change("limits/velocity", -1), "expected a number above 0"),
+    (change("home/joint2", 5.0), "outside its limits"),
+    (change("home/joint2", None), "home lacks joint 'joint2'"),
+    (change("home/elbow", 0.1), "joint 'elbow', which the arm does not have"),
+    (change("camera/T_world_camera", SQUASHED), "no rigid motion"),
+    (change("camera/focal", 0), "camera: focal is 0"),
+    (change("mount/quaternion_wxyz", [1, 1, 0, 0]), "has length 1.41421"),
+    (change("tabel", {}), "has an entry 'tabel'"),
+    (change("arm", "nowhere.urdf"), "nowhere.urdf"),
+    (change("table/size", [0, 1]), "expected metres above 0"),
+    (change("hand", "no_such_hand"), "no_such_hand"),
+])
+def test_a_bad_robot_file_is_refused_in_words(
+    fault: Any, said: str, values: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    values = copy.deepcopy(values)
+    fault(values)
+    picture = tmp_path / "robot.png"
+    assert main(["robot", "check", str(written(values, tmp_path)), "--picture", str(picture)]) == 2
+    assert said in capsys.readouterr().err
+    assert not picture.exists()
+
+
+def test_an_arm_without_position_limits_needs_them_in_the_file(values: dict[str, Any], tmp_path: Path) -> None:
+    arm = tmp_path / "arm.urdf"
+    text = (BUILTIN_ROBOTS / "xarm7.urdf").read_text().replace('lower="-6.28319" upper="6.28319" ', "", 1)
+    arm.write_text(text.replace('type="revolute"', 'type="continuous"', 1))
+    values["arm"] = str(arm)
+    with pytest.raises(RobotError, match="joint 'joint1' of the arm has no position limits"):
+        load_robot(written(values, tmp_path))
+    values["limits"]["position"] = {"joint1": [-3.0, 3.0]}
+    assert load_robot(written(values, tmp_path)).lower[0] == -3.0
+
+
+def test_the_check_says_what_it_found_and_draws_the_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = tmp_path / "robot.png"
+    assert main(["robot", "check", "xarm7_leaphand", "--picture", str(picture)]) == 0
+    said = capsys.readouterr().out
+    assert "7 arm joints, hand leaphand with 16" in said
+    assert "reach" in said
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_robot_that_collides_at_home_is_not_usable(
+    values: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    values["home"]["joint2"] = 1.6
+    assert main(["robot", "check", str(written(values, tmp_path))]) == 2
+    assert "COLLISION at home: " in capsys.readouterr().out
