@@ -17,7 +17,7 @@ from dro_grasp.cli.export import Export
 from dro_grasp.cli.generate import Generate
 from dro_grasp.cli.listing import HandCommand, Hands, Objects
 from dro_grasp.cli.onboard import Onboard
-from dro_grasp.cli.robot import RobotCommand
+from dro_grasp.cli.robots import RobotCommand
 from dro_grasp.cli.synthesize import Synthesize
 from dro_grasp.cli.train import Pretrain, Train
 from dro_grasp.cli.view import Picture, View
