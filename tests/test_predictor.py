@@ -14,6 +14,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.starts import wrist_rotations
+from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import scored
 from dro_grasp.predictor import GraspPredictor, GraspRequest, PredictorConfig
@@ -167,30 +168,36 @@ def test_placements_face_the_direction_at_any_roll(
     assert bool((torch.histc(roll, 4, -math.pi, math.pi) > 70).all())
 
 
-def test_a_table_drops_what_goes_below_it(predictor: GraspPredictor, ball: ObjectModel) -> None:
-    free = predictor.predict(HAND, ball, num=8, candidates=1, method="network")
-    heights = sorted(
-        min(lowest_point(q, T), lowest_point(p, T))
-        for q, p, T in zip(free.joints, free.pregrasp_joints, free.T_object_wrist, strict=True)
-    )
-    table = (heights[3] + heights[4]) / 2
-    run = predictor.run(GraspProblem(HAND, ball), GraspRequest(num=8, table=table, candidates=1, method="network"))
+def test_hands_stay_above_the_table(predictor: GraspPredictor, ball: ObjectModel) -> None:
+    table = -0.06
+    problem = GraspProblem(HAND, ball, constraints=Constraints(table=table))
+    run = predictor.run(problem, GraspRequest(num=8, candidates=1, method="network"))
     kept = run.grasps
-    assert len(kept) == len(run.proposed) == len(run.points) == 8
-    assert run.candidates >= 16
-    assert run.candidates % 8 == 0
-    for q, p, T in zip(kept.joints, kept.pregrasp_joints, kept.T_object_wrist, strict=True):
-        assert min(lowest_point(q, T), lowest_point(p, T)) > table - 1e-6
-    low = GraspRequest(num=8, table=heights[0] - 0.01, candidates=1, method="network")
-    below = predictor.run(GraspProblem(HAND, ball), low)
-    assert torch.equal(below.grasps.joints, free.joints)
-    assert below.candidates == 8
+    assert 0 < len(kept) == len(run.proposed) == len(run.points) <= 8
+    assert (run.shortage is None) == (len(kept) == 8)
+    for q, p, s, T in zip(kept.joints, kept.pregrasp_joints, kept.squeeze_joints, kept.T_object_wrist, strict=True):
+        assert min(lowest_point(joints, T) for joints in (q, p, s)) > table - 1e-6
 
 
-def test_an_impossible_table_is_told(weights: str, ball: ObjectModel) -> None:
-    predictor = GraspPredictor(weights, config=PredictorConfig(table_rounds=2))
-    with pytest.raises(OptionError, match=r"only 0 of 6 grasps .* 3 were asked for; lower --table \(the object spans"):
-        predictor.predict(HAND, ball, num=3, table=float(ball.cloud[:, 2].max()) - 1e-4, candidates=1, method="network")
+def test_what_was_found_is_returned_with_a_warning(
+    predictor: GraspPredictor, ball: ObjectModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def first_of_each_batch(problem: GraspProblem, grasps: GraspBatch) -> Tensor:
+        return torch.arange(len(grasps)) == 0
+
+    monkeypatch.setattr("dro_grasp.predictor.permitted", first_of_each_batch)
+    with pytest.warns(UserWarning, match=r"only 1 of 6 candidates on object 'sphere' .* 6 were .* lower table \(now -0.1 m"):
+        found = predictor.predict(HAND, ball, num=6, table=-0.1, candidates=1, method="network")
+    assert len(found) == 1
+
+
+def test_an_impossible_table_is_told(predictor: GraspPredictor, ball: ObjectModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dro_grasp.predictor.permitted", lambda problem, grasps: torch.zeros(len(grasps), dtype=torch.bool))
+    with pytest.raises(OptionError, match=r"only 0 of 3 .* 3 were asked for.* lower table .* use the method 'auto'"):
+        predictor.predict(
+            HAND, ball, num=3, direction=(0.0, 0.0, -1.0), table=-0.04, candidates=1, method="network")
+    with pytest.raises(OptionError, match="leaves nothing of the object"):
+        predictor.predict(HAND, ball, num=3, table=0.05)
 
 
 def test_a_bare_cloud_is_grasped(weights: str, ball: ObjectModel) -> None:
@@ -252,8 +259,9 @@ def test_the_optimiser_alone_asks_no_network(
     cloud = dataclasses.replace(ball, vertices=None, faces=None)
     direction = torch.tensor([0.0, 0.6, -0.8])
     for obj in (ball, cloud):
-        request = GraspRequest(2, seed=1, direction=tuple(direction.tolist()), method="optimise")
-        made = predictor.run(GraspProblem(HAND, obj), request)
+        constraints = Constraints(direction=tuple(direction.tolist()))
+        problem = GraspProblem(HAND, obj, constraints=constraints)
+        made = predictor.run(problem, GraspRequest(2, seed=1, method="optimise"))
         assert made.origin == ["optimiser"] * 2
         assert 2 <= made.candidates <= 8  # the descent turned some away from the direction
         assert made.seconds["optimise"] > 0 == made.seconds["network"]

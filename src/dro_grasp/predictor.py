@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
+import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, get_args
 
 import torch
@@ -18,9 +18,10 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.models.checkpoints import load_weights
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.proposal import Direction, Proposal, ProposalConfig, check_temperature, propose
-from dro_grasp.pipeline.stages import above_table, complete, optimise, refine, scored
+from dro_grasp.pipeline.proposal import Proposal, ProposalConfig, check_temperature, propose
+from dro_grasp.pipeline.stages import complete, optimise, permitted, refine, scored
 
 LARGEST_CALL = 100_000
 """Most candidates of one call; more do not fit memory."""
@@ -42,11 +43,6 @@ class GraspRequest:
     """Grasps to return."""
     seed: int = 0
     """The same seed gives the same grasps."""
-    direction: Direction | None = None
-    """Palm direction in the object's frame; any by default."""
-    table: float | None = None
-    """Height of a plane in the object's frame [m]. Candidates whose hand goes below it, in the pregrasp or in the grasp, are
-    dropped, and sampling continues."""
     candidates: int = 4
     """Candidates proposed for each grasp returned; the best by score are returned."""
     refine: bool = True
@@ -61,7 +57,7 @@ class GraspRequest:
         """Refuse what cannot be done, before any work.
 
         Raises:
-            OptionError: `num` or `candidates` is not positive, `direction` is zero, or another value is out of range.
+            OptionError: `num` or `candidates` is not positive, or another value is out of range.
         """
         if self.num < 1:
             raise OptionError(f"num is {self.num}; ask for at least one grasp (--num 16)")
@@ -70,22 +66,19 @@ class GraspRequest:
         if self.num * self.candidates > LARGEST_CALL:
             raise OptionError(f"{self.num} grasps of {self.candidates} candidates each do not fit memory; predict at most "
                               f"{LARGEST_CALL} at once, with another --seed for more")
-        if self.direction is not None and not 1e-9 <= math.hypot(*self.direction) < math.inf:
-            raise OptionError(f"direction {self.direction} has no direction; give the palm direction in the object's frame, "
-                              "for example --direction 0 0 -1 to grasp from above")
         check_temperature(self.temperature)
         if self.method not in get_args(Method):
             raise OptionError(f"method is '{self.method}'; choose {', '.join(get_args(Method))}")
-        if self.table is not None and not math.isfinite(self.table):
-            raise OptionError(f"table is {self.table}; give the height in metres, for example --table 0")
 
 
 @dataclass(frozen=True)
 class PredictorConfig(ProposalConfig):
     """How grasps are sampled and decoded."""
 
-    table_rounds: int = 20
-    """How often sampling is repeated when a table plane rejects candidates."""
+    rounds: int = 4
+    """How often at most the network is asked again when constraints reject candidates."""
+    least_yield: float = 0.2
+    """Share of the candidates below which it is not asked again."""
 
 
 @dataclass(frozen=True)
@@ -99,9 +92,11 @@ class Prediction:
     points: Float[Tensor, "n n_points 3"]
     """Hand points of the proposed grasps [m]; the network's are multilaterated, and the solved hand differs from them."""
     candidates: int
-    """Candidates made, those that a table rejected included."""
+    """Candidates made, those that constraints rejected included."""
     seconds: dict[str, float]
     """Time by part: network, decode, optimise, refine, rank [s]."""
+    shortage: str | None = None
+    """Why there are fewer grasps than were asked for, and what to do; None if there are as many."""
 
     @property
     def origin(self) -> list[str]:
@@ -139,21 +134,30 @@ class GraspPredictor:
         """Name of the weights."""
         return self.network.name
 
-    def predict(self, hand: Hand, obj: ObjectModel, num: int = 16, seed: int = 0, **options: Any) -> GraspBatch:
-        """Grasps with pregrasp, squeeze and score, the best score first.
+    def predict(
+        self, hand: Hand, obj: ObjectModel, num: int = 16, seed: int = 0, constraints: Constraints | None = None, **options: Any
+    ) -> GraspBatch:
+        """Grasps with pregrasp, squeeze and score, the best score first; fewer, with a warning, if no more can be found.
 
         Args:
             hand: Any hand.
             obj: A mesh or a bare point cloud.
             num: Grasps to return.
             seed: The same seed gives the same grasps.
-            options: Other fields of `GraspRequest`: direction, table, candidates, refine, temperature, method.
+            constraints: What grasps have to respect.
+            options: Fields of `Constraints`, such as direction and table, and other fields of `GraspRequest`: candidates,
+                refine, temperature, method.
 
         Raises:
-            OptionError: An argument is out of range, or too few grasps stay above the table.
+            OptionError: An argument is out of range, or no grasp was found.
         """
-        problem = GraspProblem(hand, obj, self.device)
-        return self.run(problem, GraspRequest(num, seed, **options)).grasps
+        names = {f.name for f in fields(Constraints)} & set(options)
+        constraints = replace(constraints or Constraints(), **{name: options.pop(name) for name in names})
+        problem = GraspProblem(hand, obj, self.device, constraints)
+        made = self.run(problem, GraspRequest(num, seed, **options))
+        if made.shortage is not None:
+            warnings.warn(made.shortage, stacklevel=2)
+        return made.grasps
 
     # no_grad, not inference_mode: roma caches a tensor at first use, which training could then not use.
     @torch.no_grad()
@@ -161,21 +165,20 @@ class GraspPredictor:
         """Propose, refine and rank, and keep the best; results do not depend on batch sizes.
 
         Args:
-            problem: Hand and object, on the predictor's device.
+            problem: Hand, object and constraints, on the predictor's device.
             request: What is asked for.
             progress: See `Progress`.
 
         Raises:
-            OptionError: Too few grasps stay above the table, or near the direction.
+            OptionError: The table is above the object, or no grasp was found.
         """
-        _check_table(problem.obj, request)
         watch = Stopwatch("network", "decode", "optimise", "refine", "rank")
         pool = _Pool(problem, request, watch)
         if request.method != "optimise":
             self._ask_network(pool, progress)
         if count := pool.to_optimise():
             with watch("optimise"):
-                grasps = optimise(problem, count, request.seed, request.direction, progress)
+                grasps = optimise(problem, count, request.seed, progress)
                 hand = problem.thinned(self.network.config.n_hand).to("cpu")
                 proposal = Proposal(grasps, hand.points(grasps.joints, grasps.T_object_wrist))
             pool.add(proposal)
@@ -186,20 +189,19 @@ class GraspPredictor:
         request = pool.request
         wanted, generator = request.num * request.candidates, torch.Generator().manual_seed(request.seed)
         config = self.config if request.temperature is None else replace(self.config, temperature=request.temperature)
-        for _ in range(1 if request.table is None else config.table_rounds):
-            pool.add(propose(
-                pool.problem, self.network, wanted, generator, request.direction, config, pool.watch, progress), wanted)
-            if len(pool) >= wanted:
+        for _ in range(config.rounds):
+            pool.add(propose(pool.problem, self.network, wanted, generator, config, pool.watch, progress), wanted)
+            if len(pool) >= wanted or len(pool) < config.least_yield * pool.made:
                 break
 
 
 class _Pool:
-    """Candidates of all sources, refined, scored and above the table, beside what was proposed."""
+    """Candidates of all sources, refined, scored and as the constraints want them, beside what was proposed."""
 
     def __init__(self, problem: GraspProblem, request: GraspRequest, watch: Stopwatch) -> None:
         self.problem, self.request, self.watch = problem, request, watch
         self.made = 0
-        """Candidates made, those that the table rejected included."""
+        """Candidates made, those that constraints rejected included."""
         self.proposals: list[Proposal] = []
         self.grasps: list[GraspBatch] = []
 
@@ -212,10 +214,7 @@ class _Pool:
         self.made += len(proposal.grasps)
         with self.watch("refine"):
             grasps = refine(problem, proposal.grasps) if request.refine else complete(problem, proposal.grasps)
-        keep = torch.ones(len(grasps), dtype=torch.bool)
-        if request.table is not None:
-            keep = above_table(problem, grasps, request.table)
-        kept = keep.nonzero()[:, 0][: None if most is None else most - len(self)]
+        kept = permitted(problem, grasps).nonzero()[:, 0][: None if most is None else most - len(self)]
         with self.watch("rank"):
             self.grasps.append(scored(problem, grasps[kept]))
         self.proposals.append(proposal[kept])
@@ -232,29 +231,29 @@ class _Pool:
         """The best grasps by score.
 
         Raises:
-            OptionError: There are fewer than were asked for.
+            OptionError: There is none.
         """
+        shortage = None
         if len(self) < self.request.num:
-            raise _too_few(self.problem.obj, self.request, len(self), self.made)
+            shortage = _shortage(self.problem, self.request, len(self), self.made)
+        if not len(self):
+            raise OptionError(str(shortage))
         grasps = GraspBatch.concatenate(self.grasps)
         best = (-grasps.score).argsort(stable=True)[: self.request.num]
         chosen = Proposal.concatenate(self.proposals)[best]
-        return Prediction(grasps[best], complete(self.problem, chosen.grasps), chosen.points, self.made, self.watch.seconds)
+        proposed = complete(self.problem, chosen.grasps)
+        return Prediction(grasps[best], proposed, chosen.points, self.made, self.watch.seconds, shortage)
 
 
-def _check_table(obj: ObjectModel, request: GraspRequest) -> None:
-    """Refuse a table above the object."""
-    top = float(obj.cloud[:, 2].max())
-    if request.table is not None and not request.table < top:
-        raise OptionError(f"a table at {request.table} m leaves nothing of the object, which ends at z = {top:.3f} m; give "
-                          "--table in metres in the frame of the grasps")
-
-
-def _too_few(obj: ObjectModel, request: GraspRequest, found: int, made: int) -> OptionError:
-    low, high = float(obj.cloud[:, 2].min()), float(obj.cloud[:, 2].max())
-    if request.table is None:
-        return OptionError(f"the optimiser kept only {found} grasps on object '{obj.name}', {request.num} were asked for; "
-                           "ask for another --direction or none, or for --method auto")
-    return OptionError(
-        f"only {found} of {made} grasps keep the hand above table {request.table} m, {request.num} were asked for; lower "
-        f"--table (the object spans z = {low:.3f} to {high:.3f} m), or ask for a --direction from above (0 0 -1)")
+def _shortage(problem: GraspProblem, request: GraspRequest, found: int, made: int) -> str:
+    """What to say where there are fewer grasps than were asked for."""
+    constraints, low, high = problem.constraints, *problem.height_range
+    advice = []
+    if constraints.table is not None:
+        advice.append(f"lower table (now {constraints.table:g} m; the object spans z = {low:.3f} to {high:.3f} m)")
+    if constraints.direction is not None:
+        advice.append("leave out direction, or give another one")
+    if request.method != "auto":
+        advice.append("use the method 'auto'")
+    return (f"only {found} of {made} candidates on object '{problem.obj.name}' meet what was asked of them; {request.num} were "
+            f"asked for. {'; or '.join(['Try another seed', *advice])}")

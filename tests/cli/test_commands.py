@@ -242,14 +242,16 @@ def test_folder_of_objects_needs_a_folder_for_results(weights: str, tmp_path: Pa
 def test_table_keeps_hands_above_it(generate, tmp_path: Path) -> None:
     from dro_grasp.hands.library import load_hand
     from dro_grasp.objects.catalogue import load_object
+    from dro_grasp.pipeline.constraints import Constraints
     from dro_grasp.pipeline.problem import GraspProblem
-    from dro_grasp.pipeline.stages import above_table
+    from dro_grasp.pipeline.stages import permitted
 
     path = tmp_path / "grasps.parquet"
     report = generate("--table", "-0.15", "--protocol", "none", "--output", str(path))
-    assert report["candidates"] >= report["num"] == 3
-    problem = GraspProblem(load_hand("gripper3"), load_object("sphere"))
-    assert above_table(problem, GraspBatch.load(path), -0.15).all()
+    assert report["candidates"] >= report["num"] == report["asked"] == 3
+    assert report["shortage"] is None
+    problem = GraspProblem(load_hand("gripper3"), load_object("sphere"), constraints=Constraints(table=-0.15))
+    assert permitted(problem, GraspBatch.load(path)).all()
 
 
 def test_impossible_table_says_so(weights: str, capsys: pytest.CaptureFixture[str]) -> None:

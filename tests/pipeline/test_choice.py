@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from dro_grasp.energy.surroundings import Surroundings
 from dro_grasp.geometry.se3 import random_rotations
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.hand import Hand
@@ -73,6 +74,15 @@ def test_a_hand_at_the_surface_is_preferred_to_one_inside_and_to_one_far_away() 
     assert bool((worse.diff() < 0).all())
 
 
+def test_a_hand_under_a_plane_is_worse_by_its_depth(clouds: torch.Tensor) -> None:
+    free = choice_scores(HAND, SPHERE.distance_field, clouds, CONFIG)
+    plane = Surroundings(torch.tensor([0.0, 0.0, 1.0, -0.09]))
+    above = choice_scores(HAND, SPHERE.distance_field, clouds, CONFIG, plane)
+    depth = (CONFIG.margin - (clouds[..., 2].amin(-1) + 0.09)).clamp_min(0)
+    torch.testing.assert_close(free - above, CONFIG.clearance * depth)
+    assert 0 < int((depth > 0).sum()) < depth.numel()
+
+
 def test_the_moved_hands_are_judged_in_the_object_s_frame_and_the_best_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     network = untrained_network(NetworkConfig.preset("multi"), seed=0).eval()
     with torch.no_grad():
@@ -85,7 +95,7 @@ def test_the_moved_hands_are_judged_in_the_object_s_frame_and_the_best_is_taken(
     monkeypatch.setattr(type(HAND), "random_open_joints", lambda *_: joints)
     judged, kept = [], []
 
-    def scores(hand: Hand, field: object, points: torch.Tensor, config: ChoiceConfig) -> torch.Tensor:
+    def scores(hand: Hand, field: object, points: torch.Tensor, config: ChoiceConfig, surroundings: object) -> torch.Tensor:
         judged.append(points)
         return torch.arange(points.shape[1]).remainder(6).float().expand(points.shape[:2])  # the fifth is the best
 
@@ -99,7 +109,7 @@ def test_the_moved_hands_are_judged_in_the_object_s_frame_and_the_best_is_taken(
     with torch.no_grad():
         for draws in (1, 8):
             config = ProposalConfig(choice=ChoiceConfig(draws=draws))
-            propose(GraspProblem(loaded_hand("allegro"), SPHERE), network, 6, torch.Generator().manual_seed(0), None, config)
+            propose(GraspProblem(loaded_hand("allegro"), SPHERE), network, 6, torch.Generator().manual_seed(0), config)
     points = torch.cat(judged)
     assert points.shape[:2] == (6, 8)  # nothing is judged where there is one draw
     expected = HAND.points(joints, T)[:, None].expand_as(points)

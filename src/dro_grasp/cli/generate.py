@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.hands.hand import Hand
     from dro_grasp.objects.shape import ObjectModel
+    from dro_grasp.pipeline.constraints import Constraints
     from dro_grasp.pipeline.problem import GraspProblem
     from dro_grasp.predictor import GraspPredictor, GraspRequest
 
@@ -46,9 +47,10 @@ class Generate:
     seed: int = 0
     """The same seed gives the same grasps."""
     direction: Annotated[tuple[float, float, float] | None, optional("X Y Z", "any direction")] = None
-    """Palm direction in the object's frame: 0 0 -1 grasps from above."""
+    """Palm direction in the object's frame: 0 0 -1 grasps from above. Over a table, palms tilt towards it as far as the hand
+    needs room."""
     table: Annotated[float | None, optional("Z", "no table")] = None
-    """Height [m] of a table in the object's frame; the hand stays above it."""
+    """Height [m] of a table in the object's frame; the hand stays above it, in pregrasp, grasp and squeeze."""
     camera: Annotated[Path | None, optional("JSON", "the object's own frame")] = None
     """File with {"frame": "base", "T_frame_camera": 4x4}: the object is a cloud in that camera's frame; it is cleaned. Grasps,
     direction and table are in the named frame."""
@@ -85,12 +87,14 @@ class Generate:
         from dro_grasp.frames import read_motion
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.catalogue import resolve_objects
+        from dro_grasp.pipeline.constraints import Constraints
         from dro_grasp.predictor import GraspPredictor, GraspRequest
 
         if not 0 <= self.seed < 2**63:
             raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^63 - 1")
         request = GraspRequest(
-            self.num, self.seed, self.direction, self.table, self.candidates, self.refine, self.temperature, self.method)
+            self.num, self.seed, self.candidates, self.refine, self.temperature, self.method)
+        constraints = Constraints(self.direction, self.table)
         names = resolve_objects([self.object])
         several = names != [self.object]
         outputs = paths_per_object(self.output, names, several, ".parquet")
@@ -98,7 +102,7 @@ class Generate:
         camera = None if self.camera is None else read_motion(self.camera, "T_frame_camera")
         begin = time.perf_counter()
         hand = load_hand(self.hand)
-        job = Job(hand, GraspPredictor(self.weights), request, camera, time.perf_counter() - begin)
+        job = Job(hand, GraspPredictor(self.weights), request, constraints, camera, time.perf_counter() - begin)
         done, failed = [], []
         for name, output, picture in zip(names, outputs, pictures, strict=True):
             try:
@@ -126,15 +130,18 @@ class Generate:
         load = job.load_seconds + time.perf_counter() - begin
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
-        problem = GraspProblem(job.hand, obj)
+        problem = GraspProblem(job.hand, obj, constraints=job.constraints)
         with progress_bar("predicting", self.json) as progress:
             made = job.predictor.run(problem, job.request, progress)
+        if made.shortage is not None:
+            say_aside(f"warning: {obj.name}: {made.shortage}")
         begin = time.perf_counter()
         grasps = self._evaluate(problem, made.grasps)
         simulated = bool(grasps.evaluated.any())
         seconds = {"load": load, **made.seconds, "trial": time.perf_counter() - begin if simulated else 0.0}
         report = {
-            "hand": job.hand.name, "object": obj.name, "num": len(grasps), "candidates": made.candidates,
+            "hand": job.hand.name, "object": obj.name, "num": len(grasps), "asked": self.num, "shortage": made.shortage,
+            "candidates": made.candidates,
             "origin": dict(Counter(made.origin)),
             "seed": self.seed, "weights": job.predictor.weights_name, "protocol": self._protocol(obj),
             "success": int(grasps.success.sum()) if simulated else None,
@@ -202,6 +209,7 @@ class Job:
     hand: Hand
     predictor: GraspPredictor
     request: GraspRequest
+    constraints: Constraints
     camera: NamedMotion | None
     load_seconds: float
     """Time to load hand and weights [s]."""

@@ -12,8 +12,11 @@ from torch import Tensor
 
 from dro_grasp.devices import on_device
 from dro_grasp.energy import terms as energies
+from dro_grasp.energy.clearance import Clearance
 from dro_grasp.energy.contact_candidates import ContactCandidates, ContactConfig, contact_candidates
+from dro_grasp.energy.link_points import LinkPoints
 from dro_grasp.energy.link_spheres import link_spheres
+from dro_grasp.energy.surroundings import Surroundings
 from dro_grasp.geometry import se3
 from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.hands.hand import Hand
@@ -48,6 +51,12 @@ class EnergyConfig:
     """Number of hand points at which penetration is measured."""
     margin: float = 0.001
     """Clearance that hand points keep from the object before they count as penetrating [m] (ours)."""
+    clearance: float = 100.0
+    """Weight of the hand's penetration into its surroundings, in pregrasp, grasp and squeeze [1/m] (ours)."""
+    clearance_points: int = 120
+    """Number of hand points at which that is measured (ours)."""
+    clear: float = 0.003
+    """Distance that the hand keeps from its surroundings [m] (ours)."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +65,8 @@ class Evaluation:
 
     terms: Float[Tensor, "n 6"]
     """Weighted terms in the order of TERMS."""
+    clearance: Float[Tensor, "n 1"]
+    """Weighted penetration into the surroundings. It says nothing about the grasp itself, so it is not among the terms."""
     by_pose: Float[Tensor, "n 6"]
     """Derivative by the hand's translation [1/m] and rotation about its grasp centre [1/rad]."""
     by_joint: Float[Tensor, "n n_dof"]
@@ -63,40 +74,14 @@ class Evaluation:
 
     @property
     def total(self) -> Float[Tensor, " n"]:
-        """Sum of the terms."""
-        return self.terms.sum(-1)
+        """Sum of the terms, the clearance included."""
+        return self.terms.sum(-1) + self.clearance[:, 0]
 
     def where(self, keep: Bool[Tensor, " n"], other: Evaluation) -> Evaluation:
         """The other's rows where `keep` is true, these elsewhere."""
         return Evaluation(*(
-            torch.where(keep[:, None], getattr(other, name), getattr(self, name)) for name in ("terms", "by_pose", "by_joint")))
-
-
-@dataclass(frozen=True)
-class LinkPoints:
-    """Points fixed to links, laid out so that one matrix product places them all.
-
-    The poses of a grasp, as one row of 4 n_links entries for each of x, y and z, times the layout give the coordinates of all
-    points: each point's column holds its homogeneous coordinates in the four rows of its own link, and zeros elsewhere.
-    """
-
-    layout: Float[Tensor, "rows p"]
-    """The columns; rows is 4 n_links [m]."""
-    members: Float[Tensor, "p n_links"]
-    """One-hot link of each point."""
-
-    @staticmethod
-    def of(local: Float[Tensor, "p 3"], links: Int[Tensor, " p"], n_links: int) -> LinkPoints:
-        """Lay out points given in their links' frames."""
-        members = torch.eye(n_links, dtype=local.dtype, device=local.device)[links]
-        homogeneous = torch.cat([local, torch.ones_like(local[:, :1])], -1)
-        layout = (members[:, :, None] * homogeneous[:, None, :]).flatten(1).T.contiguous()
-        return LinkPoints(layout, members)
-
-    def place(self, poses: Float[Tensor, "n n_links 4 4"]) -> Float[Tensor, "n p 3"]:
-        """The points in the world [m]."""
-        rows = poses[:, :, :3].transpose(1, 2).reshape(3 * len(poses), -1)
-        return (rows @ self.layout).unflatten(0, (-1, 3)).mT
+            torch.where(keep[:, None], getattr(other, name), getattr(self, name))
+            for name in ("terms", "clearance", "by_pose", "by_joint")))
 
 
 class GraspEnergy:
@@ -104,7 +89,7 @@ class GraspEnergy:
 
     def __init__(
         self, hand: Hand, field: DistanceField, centre: Float[Tensor, 3], length: float, config: EnergyConfig | None = None,
-        contacts: ContactConfig | None = None, device: torch.device | str = "cpu",
+        contacts: ContactConfig | None = None, device: torch.device | str = "cpu", surroundings: Surroundings | None = None,
     ) -> None:
         """Prepare everything that stays the same from step to step.
 
@@ -113,8 +98,10 @@ class GraspEnergy:
             centre: The object's centre of mass [m].
             length: Typical distance of its surface from there [m].
             device: Device of the evaluations; hand, field and centre are on the CPU.
+            surroundings: What the hand stays clear of, on the CPU.
         """
         self.length = length
+        self.surroundings = None if surroundings is None else surroundings.to(device)
         self.candidates: ContactCandidates = on_device(contact_candidates(hand, contacts), device)
         self.spheres = on_device(link_spheres(hand), device)
         self.source, hand = hand, hand.to(device)
@@ -127,13 +114,13 @@ class GraspEnergy:
     @staticmethod
     def of_object(
         hand: Hand, obj: ObjectModel, config: EnergyConfig | None = None, contacts: ContactConfig | None = None,
-        device: torch.device | str = "cpu",
+        device: torch.device | str = "cpu", surroundings: Surroundings | None = None,
     ) -> GraspEnergy:
         """The energy on the object's grid of signed distances."""
         surface = torch.as_tensor(obj.cloud, dtype=torch.float32)
         centre = torch.as_tensor(obj.centre_of_mass, dtype=torch.float32)
         length = float((surface - centre).norm(dim=-1).mean())
-        return GraspEnergy(hand, obj.distance_field, centre, length, config, contacts, device)
+        return GraspEnergy(hand, obj.distance_field, centre, length, config, contacts, device, surroundings)
 
     def weighted(self, config: EnergyConfig) -> GraspEnergy:
         """This energy under other weights; it shares contacts, link spheres and distance field."""
@@ -147,6 +134,12 @@ class GraspEnergy:
         thin = self.source.with_points(min(config.hand_points, hand.n_points)).to(hand.link_points.device)
         self.config, self.body = config, LinkPoints.of(thin.link_points, thin.link_index, hand.tree.n_links)
         room = config.closing_room * (hand.upper - hand.lower) * ~hand.abduction
+        self.clearance = None
+        if self.surroundings is not None:
+            few = self.source.with_points(min(config.clearance_points, hand.n_points)).to(hand.link_points.device)
+            body = LinkPoints.of(few.link_points, few.link_index, hand.tree.n_links)
+            self.clearance = Clearance(
+                hand, self.surroundings, body, self.ball, self.spheres.radii, config.clear, config.clearance)
         self.lower = torch.where(hand.opening_signs > 0, hand.lower + room, hand.lower)
         self.upper = torch.where(hand.opening_signs > 0, hand.upper, hand.upper - room)
 
@@ -190,8 +183,11 @@ class GraspEnergy:
             config.alignment * alignment,
             config.joints * beyond.sum(-1),
         ], -1)
-        movable = self.hand.movable.to(q.dtype)
-        return Evaluation(terms, by_pose, (by_joint + config.joints * slope) * movable)
+        by_joint, blocked = by_joint + config.joints * slope, torch.zeros_like(terms[:, :1])
+        if self.clearance is not None:
+            near = self.clearance(T_object_wrist, q, poses, self.pivot(T_object_wrist))
+            blocked, by_pose, by_joint = near.value, by_pose + near.by_pose, by_joint + near.by_joint
+        return Evaluation(terms, blocked, by_pose, by_joint * self.hand.movable.to(q.dtype))
 
     def nearest_contacts(
         self, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], reach: float = math.inf

@@ -45,7 +45,7 @@ class RefineConfig:
     shrinkage: float = 0.5
     """The same after a step that did not, which is undone."""
     energy: EnergyConfig = field(default_factory=lambda: EnergyConfig(
-        penetration=500.0, self_penetration=500.0, hand_points=400, filled=True))
+        penetration=500.0, self_penetration=500.0, hand_points=400, filled=True, clearance=500.0, clearance_points=512))
     """Weights; no simulation settles these grasps, so penetration weighs more than in synthesis."""
     closing: ClosingConfig = field(default_factory=ClosingConfig)
     """How idle fingers close before the descent."""

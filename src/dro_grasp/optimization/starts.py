@@ -9,13 +9,24 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dro_grasp.energy.surroundings import Surroundings
 from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.geometry.rotations import roma
-from dro_grasp.geometry.se3 import compose, random_rotations, rotate, rotation_between
+from dro_grasp.geometry.se3 import apply_to_cloud, compose, random_rotations, rotate, rotation_between
 from dro_grasp.hands.hand import Hand
 
 Direction = tuple[float, float, float]
 """A vector in the object's frame, of any length but zero."""
+CLEAR = 0.003
+"""Distance from its surroundings at which a hand starts [m] (ours)."""
+LARGEST_TILT = math.radians(60.0)
+"""How far palms tilt from the wanted direction towards a plane, where the hand needs room [rad] (ours)."""
+TILT_COST = 0.03
+"""Depth in the surroundings that a tilt of one radian is worth [m/rad] (ours)."""
+CHOICES = 8
+"""Wrist rotations among which each hand takes the one with most room (ours)."""
+ROOM_POINTS = 96
+"""Hand points, spread evenly, at which room is measured (ours)."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +66,7 @@ def start_joints(hand: Hand, n: int, config: StartConfig, generator: torch.Gener
 
 def starts(
     hand: Hand, field: DistanceField, surface: Float[Tensor, "k 3"], centre: Float[Tensor, 3], n: int, config: StartConfig,
-    generator: torch.Generator,
+    generator: torch.Generator, surroundings: Surroundings | None = None,
 ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n n_dof"]]:
     """Wrist poses and joints to start from.
 
@@ -70,12 +81,14 @@ def starts(
         n: How many.
         config: Their distribution.
         generator: Source of randomness.
+        surroundings: What the hands stay clear of: more palms are turned than are needed, those with most room start, and
+            those that would start under a plane are lifted.
     """
     q = start_joints(hand, n, config, generator)
     points = hand.points(q)
-    rotation = wrist_rotations(hand, n, config.direction, config.direction_spread, generator)
     pick = torch.randint(len(surface), (n,), generator=generator)
     aim = centre + config.aim * torch.rand(n, 1, generator=generator) * (surface[pick] - centre)
+    rotation = roomy_rotations(hand, points, aim, config, generator, surroundings)
     direction = rotation @ hand.palm_direction_wrist
     offset = aim - rotation @ hand.grasp_centre_wrist
     reach = float((surface - centre).norm(dim=-1).max())
@@ -87,11 +100,71 @@ def starts(
     for _ in range(config.approach_steps):
         distance = field.distances(body - (back[:, None] * direction)[:, None])[0].amin(-1)
         back = (back - (distance - gap).clamp_min(0)).clamp_min(0)
-    return compose(rotation, offset - back[:, None] * direction), q
+    offset = offset - back[:, None] * direction
+    if surroundings is not None:
+        offset = offset + surroundings.lift(rotate(rotation[:, None], points) + offset[:, None], CLEAR)
+    return compose(rotation, offset), q
+
+
+def roomy_rotations(
+    hand: Hand, points: Float[Tensor, "n p 3"], aim: Float[Tensor, "n 3"], config: StartConfig, generator: torch.Generator,
+    surroundings: Surroundings | None,
+) -> Float[Tensor, "n 3 3"]:
+    """Wrist rotations of hands that aim at points; of several for each, the one that has most room in the surroundings."""
+    n, up = len(aim), None if surroundings is None else surroundings.up
+    if surroundings is None:
+        return wrist_rotations(hand, n, config.direction, config.direction_spread, generator)
+    rotations = wrist_rotations(hand, n * CHOICES, config.direction, config.direction_spread, generator, up)
+    rotations = rotations.unflatten(0, (n, CHOICES))
+    placed = compose(rotations, aim[:, None] - rotations @ hand.grasp_centre_wrist)
+    lack = lack_of_room(hand, placed, points[:, None], config.direction, surroundings)
+    return rotations[torch.arange(n), lack.argmin(1)]
+
+
+def lack_of_room(
+    hand: Hand, T: Float[Tensor, "*b 4 4"], points: Float[Tensor, "*n p 3"], direction: Direction | None,
+    surroundings: Surroundings,
+) -> Float[Tensor, "*b"]:
+    """How deep hands are in their surroundings [m], and for how much of a tilt from the direction that was wanted.
+
+    Args:
+        hand: The hand.
+        T: Wrist poses [m].
+        points: The hand's surface points in the wrist frame [m].
+        direction: The palm direction that was wanted.
+        surroundings: What the hand stays clear of.
+    """
+    placed = apply_to_cloud(T, points[..., hand.spread_rank < ROOM_POINTS, :])
+    lack = (CLEAR - surroundings.distances(placed)[0].amin(-1)).clamp_min(0)
+    if direction is None:
+        return lack
+    wanted = torch.nn.functional.normalize(torch.tensor(direction).to(T), dim=0)
+    return lack + TILT_COST * torch.acos((hand.palm_directions(T) @ wanted).clamp(-1, 1))
+
+
+def angle_to_arc(
+    palm: Float[Tensor, "n 3"], wanted: Float[Tensor, "3"], up: Float[Tensor, "3"] | None
+) -> Float[Tensor, " n"]:
+    """Angles between palm directions and the nearest that is allowed [rad]: the wanted one, or tilted from there to a plane."""
+    nearest = wanted.expand_as(palm)
+    if up is not None:
+        axis, most = _tilt(wanted, up)
+        beside = torch.linalg.cross(axis, wanted)
+        tilt = torch.atan2(palm @ beside, palm @ wanted).clamp_min(0).clamp_max(most)[:, None]
+        nearest = tilt.cos() * wanted + tilt.sin() * beside
+    return torch.atan2(torch.linalg.cross(palm, nearest).norm(dim=-1), (palm * nearest).sum(-1))
+
+
+def _tilt(wanted: Float[Tensor, "3"], up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, ""]]:
+    """The axis about which a palm direction tilts towards a plane, and the largest angle [rad]."""
+    across = torch.linalg.cross(wanted, -up)
+    most = torch.atan2(across.norm(), -wanted @ up).clamp_max(LARGEST_TILT)
+    return torch.nn.functional.normalize(across, dim=0), most
 
 
 def wrist_rotations(
-    hand: Hand, count: int, direction: Direction | None, spread: float, generator: torch.Generator
+    hand: Hand, count: int, direction: Direction | None, spread: float, generator: torch.Generator,
+    up: Float[Tensor, "3"] | None = None,
 ) -> Float[Tensor, "count 3 3"]:
     """Random wrist rotations: uniform, or with the palm near a direction and any roll.
 
@@ -101,6 +174,7 @@ def wrist_rotations(
         direction: Palm direction in the object's frame.
         spread: Standard deviation of the palm direction around it [rad].
         generator: Source of randomness, on the CPU.
+        up: Normal of a plane towards which palms also tilt, by up to LARGEST_TILT.
     """
     palm = hand.palm_direction_wrist
     if direction is None:
@@ -111,4 +185,7 @@ def wrist_rotations(
     tilt = torch.randn(count, 3, generator=generator) * spread
     tilt = tilt - (tilt @ wanted)[:, None] * wanted
     align = rotation_between(palm.cpu(), wanted)
+    if up is not None:
+        axis, most = _tilt(wanted, up.cpu())
+        tilt = tilt + torch.rand(count, 1, generator=generator) * most * axis
     return (roma.rotvec_to_rotmat(tilt) @ roma.rotvec_to_rotmat(roll[:, None] * wanted) @ align).to(palm)

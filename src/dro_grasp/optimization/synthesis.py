@@ -121,18 +121,19 @@ def synthesize_with(
     """
     hand, generator = energy.source, torch.Generator().manual_seed(seed)
     surface, centre = torch.as_tensor(obj.cloud, dtype=torch.float32), energy.centre.cpu()
+    surroundings = None if energy.surroundings is None else energy.surroundings.to("cpu")
     parts = []
     for begin in range(0, num, config.batch_size):
         size = min(config.batch_size, num - begin)
-        start = starts(hand, obj.distance_field, surface, centre, size, config.starts, generator)
+        start = starts(hand, obj.distance_field, surface, centre, size, config.starts, generator, surroundings)
         end = optimise(energy, *start, config, generator)
-        parts.append([x.cpu() for x in (end.T, end.q, end.result.terms, depth(energy, end))])
+        parts.append([x.cpu() for x in (end.T, end.q, end.result.terms, end.result.total, depth(energy, end))])
         if progress is not None:
             progress(begin + size, num)
-    T, q, terms, depths = (torch.cat(part) for part in zip(*parts, strict=True))
+    T, q, terms, totals, depths = (torch.cat(part) for part in zip(*parts, strict=True))
     T[:, :3, :3] = torch.as_tensor(roma.special_procrustes(T[:, :3, :3]))
     columns = {"depth": depths} | {f"energy_{name}": terms[:, i] for i, name in enumerate(TERMS)}
-    batch = GraspBatch.create(hand, obj, T, q, energy=terms.sum(-1), seed=seed, provenance=PROVENANCE, extra=columns)
+    batch = GraspBatch.create(hand, obj, T, q, energy=totals, seed=seed, provenance=PROVENANCE, extra=columns)
     return batch.sorted_by_energy()
 
 

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dro_grasp.energy.surroundings import Surroundings
 from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.hand import Hand
@@ -32,6 +33,8 @@ class ChoiceConfig:
     """The same for the palm [1/m]."""
     margin: float = 0.002
     """Clearance below which a point counts as inside; decoding moves points by some millimetres [m]."""
+    clearance: float = 400.0
+    """Penalty for the deepest point of the hand in its surroundings [1/m]."""
     gap: float = 150.0
     """Penalty for the distance of a finger from the surface, mean over fingers [1/m]."""
     crowding: float = 330.0
@@ -43,7 +46,8 @@ class ChoiceConfig:
 
 
 def choice_scores(
-    hand: Hand, field: DistanceField, points: Float[Tensor, "*b n_points 3"], config: ChoiceConfig
+    hand: Hand, field: DistanceField, points: Float[Tensor, "*b n_points 3"], config: ChoiceConfig,
+    surroundings: Surroundings | None = None,
 ) -> Float[Tensor, "*b"]:
     """How well moved hands suit the object; higher is better, comparable among hands of one kind.
 
@@ -52,6 +56,7 @@ def choice_scores(
         field: Signed distances of the object, from its mesh or from its cloud and normals.
         points: The hand's surface points after the motion, in the object's frame [m].
         config: Penalties.
+        surroundings: What the hand stays clear of.
     """
     distance, _ = field.distances(points)
     finger = hand.finger_of_link[hand.link_index]
@@ -65,6 +70,8 @@ def choice_scores(
     score = score - config.gap * nearest_of.clamp(0, config.reach).mean(-1)
     if bool((finger == PALM).any()):
         score = score - config.palm_penetration * (config.margin - nearest(PALM)).clamp_min(0)
+    if surroundings is not None:
+        score = score - config.clearance * (config.margin - surroundings.distances(points)[0].amin(-1)).clamp_min(0)
     some = hand.spread_rank < CROWDING_POINTS
     owner = finger[some]
     rivals = (owner[:, None] != owner) & (owner[:, None] != PALM) & (owner != PALM)

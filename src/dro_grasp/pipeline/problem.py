@@ -10,10 +10,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.devices import require_device
+from dro_grasp.energy.clearance import Clearance
 from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
+from dro_grasp.energy.surroundings import Surroundings
+from dro_grasp.errors import OptionError
 from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.pipeline.constraints import Constraints
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,16 +35,27 @@ class GraspProblem:
     """A mesh or a bare point cloud."""
     device: torch.device | str = "cpu"
     """Where the network and the grasp energy run."""
+    constraints: Constraints = field(default_factory=Constraints)
+    """What grasps have to respect."""
     _energies: dict[EnergyConfig, GraspEnergy] = field(default_factory=dict, init=False, repr=False)
     _thinned: dict[int, Hand] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Refuse an absent device.
+        """Refuse an absent device, and a table above the object.
 
         Raises:
-            OptionError: This machine has no such device.
+            OptionError: This machine has no such device, or the table leaves nothing of the object.
         """
         require_device(str(self.device))
+        table, top = self.constraints.table, self.height_range[1]
+        if table is not None and not table < top:
+            raise OptionError(f"a table at {table} m leaves nothing of the object, which ends at z = {top:.3f} m; give the "
+                              "table's height in metres in the frame of the grasps")
+
+    @property
+    def height_range(self) -> tuple[float, float]:
+        """Least and greatest z of the object [m]."""
+        return float(self.obj.cloud[:, 2].min()), float(self.obj.cloud[:, 2].max())
 
     @cached_property
     def centre(self) -> Float[Tensor, "3"]:
@@ -52,6 +67,16 @@ class GraspProblem:
         """Signed distances of the object, on the device."""
         return self._default_energy.field
 
+    @property
+    def surroundings(self) -> Surroundings | None:
+        """What the hand stays clear of, on the device; None for nothing."""
+        return self._default_energy.surroundings
+
+    @property
+    def clearance(self) -> Clearance | None:
+        """Distance of the hand, with all its surface points, to the surroundings."""
+        return self.energy(EnergyConfig(clearance_points=self.hand.n_points)).clearance
+
     def energy(self, config: EnergyConfig) -> GraspEnergy:
         """The grasp energy under these weights; contacts, link spheres and distance field are shared among all weights."""
         if config not in self._energies:
@@ -60,7 +85,8 @@ class GraspProblem:
 
     @cached_property
     def _default_energy(self) -> GraspEnergy:
-        return GraspEnergy.of_object(self.hand, self.obj, device=self.device)
+        return GraspEnergy.of_object(
+            self.hand, self.obj, device=self.device, surroundings=self.constraints.surroundings())
 
     def thinned(self, count: int) -> Hand:
         """The hand with `count` surface points, on the device.

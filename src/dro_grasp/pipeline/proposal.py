@@ -18,11 +18,11 @@ from torch import Tensor
 from dro_grasp import distance_matrix
 from dro_grasp.devices import Stopwatch
 from dro_grasp.errors import OptionError
-from dro_grasp.geometry.se3 import compose, rotate
+from dro_grasp.geometry.se3 import apply_to_cloud, compose, rotate
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.models.network import DistanceNetwork
-from dro_grasp.optimization.starts import Direction, wrist_rotations
+from dro_grasp.optimization.starts import CHOICES, CLEAR, lack_of_room, wrist_rotations
 from dro_grasp.pipeline.choice import ChoiceConfig, choice_scores
 from dro_grasp.pipeline.problem import GraspProblem
 
@@ -77,17 +77,16 @@ class Proposal:
 
 
 def propose(
-    problem: GraspProblem, network: DistanceNetwork, num: int, generator: torch.Generator, direction: Direction | None = None,
+    problem: GraspProblem, network: DistanceNetwork, num: int, generator: torch.Generator,
     config: ProposalConfig | None = None, watch: Stopwatch | None = None, progress: Callable[[int, int], None] | None = None,
 ) -> Proposal:
     """Candidates from the network.
 
     Args:
-        problem: Hand and object.
+        problem: Hand, object and constraints.
         network: In evaluation mode, on the problem's device.
         num: How many.
         generator: Source of randomness, on the CPU; its seed is recorded with the grasps.
-        direction: Palm direction in the object's frame; any by default.
         config: Sampling and batches.
         watch: Counts the seconds of `network` and `decode`.
         progress: Called with (candidates decoded, candidates wanted).
@@ -97,7 +96,7 @@ def propose(
     hand = problem.thinned(network.config.n_hand)
     cloud = problem.cloud(network.config.n_object, generator)
     with watch("network"):
-        placement = _placements(hand, network, cloud, num, direction, config, generator)
+        placement = _placements(problem, hand, network, cloud, num, config, generator)
         joints = hand.random_open_joints(num, generator)
         noise = network.sample_latent(num, generator, _temperature(problem, config), config.choice.draws).to(problem.device)
     found: list[tuple[Tensor, Tensor, Tensor]] = []
@@ -135,17 +134,24 @@ def _temperature(problem: GraspProblem, config: ProposalConfig) -> float:
 
 
 def _placements(
-    hand: Hand, network: DistanceNetwork, cloud: Float[Tensor, "m 3"], num: int, direction: Direction | None,
+    problem: GraspProblem, hand: Hand, network: DistanceNetwork, cloud: Float[Tensor, "m 3"], num: int,
     config: ProposalConfig, generator: torch.Generator,
 ) -> Float[Tensor, "num 4 4"]:
     """Wrist poses of the open hand near which the network is asked for grasps, in the object's frame."""
-    axes = network.config.axes(hand.palm_axes_wrist)
+    axes, surroundings = network.config.axes(hand.palm_axes_wrist), problem.surroundings
+    direction, up = problem.constraints.direction, None if surroundings is None else surroundings.up
+    offered = num if surroundings is None else CHOICES * num
     count = num * (config.rotations_per_grasp if direction is None else config.rolls_per_grasp)
-    rotations = wrist_rotations(hand, count, direction, config.direction_spread, generator)
-    opened = hand.points(hand.canonical_joints()) @ axes
-    rotation, position = network.sample_placements(opened, cloud, rotations @ axes, num, generator)
-    offset = rotate(rotation, position - hand.grasp_centre_wrist @ axes)
-    return compose(rotation @ axes.mT, cloud.mean(0) + offset)
+    rotations = wrist_rotations(hand, max(count, offered), direction, config.direction_spread, generator, up)
+    opened = hand.points(hand.canonical_joints())
+    rotation, position = network.sample_placements(opened @ axes, cloud, rotations @ axes, offered, generator)
+    offset = cloud.mean(0) + rotate(rotation, position - hand.grasp_centre_wrist @ axes)
+    placed = compose(rotation @ axes.mT, offset)
+    if surroundings is None:
+        return placed
+    best = lack_of_room(hand, placed, opened, direction, surroundings).topk(num, largest=False).indices
+    rotation, offset = rotation[best] @ axes.mT, offset[best]
+    return compose(rotation, offset + surroundings.lift(apply_to_cloud(placed[best], opened), CLEAR))
 
 
 def _distances(
@@ -165,7 +171,7 @@ def _distances(
 
         def choose(moves: Float[Tensor, "b k n 3"], axes: Float[Tensor, "b 3 3"] = axes) -> Int[Tensor, " b"]:
             points = moves @ axes[:, None].mT + centre
-            return choice_scores(hand, problem.field, points, config.choice).argmax(-1)
+            return choice_scores(hand, problem.field, points, config.choice, problem.surroundings).argmax(-1)
 
         found.append(network.predict(opened, obj, z, choose).float())
     return torch.cat(found)

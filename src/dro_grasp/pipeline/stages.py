@@ -14,7 +14,7 @@ from dro_grasp.grasps.controller import completed
 from dro_grasp.optimization.finger_closing import close_idle_fingers
 from dro_grasp.optimization.grip import gripping
 from dro_grasp.optimization.refinement import RefineConfig, refine_grasps
-from dro_grasp.optimization.starts import Direction, StartConfig
+from dro_grasp.optimization.starts import StartConfig, angle_to_arc
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize_with
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.ranking.score import ScoreConfig, score_grasps
@@ -99,7 +99,7 @@ def evaluate(
 
 
 def optimise(
-    problem: GraspProblem, num: int, seed: int, direction: Direction | None = None,
+    problem: GraspProblem, num: int, seed: int,
     progress: Callable[[int, int], None] | None = None,
 ) -> GraspBatch:
     """Candidates from synthesis, settled in simulation on a mesh; no network is asked, so any hand and object will do.
@@ -108,16 +108,13 @@ def optimise(
         problem: Hand and object.
         num: How many, at most: those are left out that lose the object while they settle, or turn away from the direction.
         seed: The same seed gives the same candidates.
-        direction: Palm direction in the object's frame; any by default.
         progress: Called with (grasps optimised, grasps to optimise).
     """
-    hand, obj, config = problem.hand, problem.obj, SynthesisConfig(starts=StartConfig(direction=direction))
+    hand, obj, direction = problem.hand, problem.obj, problem.constraints.direction
+    config = SynthesisConfig(starts=StartConfig(direction=direction))
     energy = problem.energy(config.energy)
     grasps = synthesize_with(energy, obj, STARTS_PER_CANDIDATE * num, seed, config, progress)
-    if direction is not None:
-        wanted = torch.nn.functional.normalize(torch.tensor(direction), dim=0)
-        grasps = grasps[hand.palm_directions(grasps.T_object_wrist) @ wanted > math.cos(FARTHEST_DIRECTION)]
-    grasps = grasps[:num]
+    grasps = grasps[facing(problem, grasps)][:num]
     if hand.description is not None and not obj.is_cloud:
         settled = settle(hand, obj, grasps)
         moved = hand.grasp_centres(settled.T_object_wrist) - hand.grasp_centres(grasps.T_object_wrist)
@@ -125,7 +122,27 @@ def optimise(
     return grasps.bare()
 
 
-def above_table(problem: GraspProblem, grasps: GraspBatch, table: float) -> Bool[Tensor, " n"]:
-    """Which complete grasps keep the hand above the plane z = `table` [m], in the grasp and in the pregrasp."""
-    hand, T = problem.hand, grasps.T_object_wrist
-    return torch.minimum(*(hand.points(q, T)[..., 2].amin(-1) for q in (grasps.joints, grasps.pregrasp_joints))) > table
+def facing(problem: GraspProblem, grasps: GraspBatch) -> Bool[Tensor, " n"]:
+    """Which grasps have palms near the wanted direction; over a plane, those too that tilt from there towards it."""
+    direction, surroundings = problem.constraints.direction, problem.surroundings
+    if direction is None:
+        return torch.ones(len(grasps), dtype=torch.bool)
+    palm = problem.hand.palm_directions(grasps.T_object_wrist)
+    wanted = torch.nn.functional.normalize(torch.tensor(direction), dim=0)
+    up = None if surroundings is None else surroundings.up
+    return angle_to_arc(palm, wanted, up) < FARTHEST_DIRECTION
+
+
+def permitted(problem: GraspProblem, grasps: GraspBatch) -> Bool[Tensor, " n"]:
+    """Which complete grasps respect the problem's constraints."""
+    return clear(problem, grasps)
+
+
+def clear(problem: GraspProblem, grasps: GraspBatch) -> Bool[Tensor, " n"]:
+    """Which complete grasps keep the hand out of its surroundings, in pregrasp, grasp and squeeze."""
+    near = problem.clearance
+    if near is None or not len(grasps):
+        return torch.ones(len(grasps), dtype=torch.bool)
+    T = grasps.T_object_wrist.to(problem.device)
+    postures = (grasps.pregrasp_joints, grasps.joints, grasps.squeeze_joints)
+    return torch.stack([near.distance(T, q.to(problem.device)) for q in postures]).amin(0).cpu() > 0

@@ -24,6 +24,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import hand_names, load_hand
 from dro_grasp.objects.catalogue import load_object, object_names
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import evaluate
 from dro_grasp.predictor import GraspPredictor, GraspRequest, Method
@@ -105,9 +106,9 @@ class Studio(ServedPage):
         Raises:
             DroGraspError: An argument cannot be used.
         """
-        problem = GraspProblem(load_hand(hand), load_object(obj), self.predictor.device)
         along = None if direction == ANY else half_axis_direction(direction)
-        request = GraspRequest(num, direction=along, candidates=candidates, temperature=temperature, method=method)
+        problem = GraspProblem(load_hand(hand), load_object(obj), self.predictor.device, Constraints(along))
+        request = GraspRequest(num, candidates=candidates, temperature=temperature, method=method)
         found = self.predictor.run(problem, request)
         raw, refined = found.proposed, found.grasps
         if not problem.obj.is_cloud:

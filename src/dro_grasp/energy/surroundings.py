@@ -1,0 +1,52 @@
+"""What a hand must stay clear of beside the object: all below a plane, and obstacles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dro_grasp.devices import on_device
+from dro_grasp.geometry.distance_field import DistanceField
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """Signed distances to whatever is nearest, negative inside."""
+
+    plane: Float[Tensor, "4"] | None = None
+    """Upward unit normal of a plane, and its height along the normal [m]."""
+    obstacles: DistanceField | None = None
+    """Signed distances of everything else."""
+
+    @property
+    def up(self) -> Float[Tensor, "3"] | None:
+        """Normal of the plane."""
+        return None if self.plane is None else self.plane[:3]
+
+    def distances(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
+        """Signed distance [m] and its gradient, as of a `DistanceField`."""
+        if self.plane is None:
+            if self.obstacles is None:
+                return torch.full_like(points[..., 0], torch.inf), torch.zeros_like(points)
+            return self.obstacles.distances(points)
+        distance, gradient = points @ self.plane[:3] - self.plane[3], self.plane[:3].expand_as(points)
+        if self.obstacles is None:
+            return distance, gradient
+        other, slope = self.obstacles.distances(points)
+        nearer = other < distance
+        return torch.where(nearer, other, distance), torch.where(nearer[..., None], slope, gradient)
+
+    def lift(self, points: Float[Tensor, "*b p 3"], clear: float) -> Float[Tensor, "*b 3"]:
+        """The shift up the plane's normal that brings points this far above it [m]; none where they are already."""
+        if self.plane is None:
+            return torch.zeros_like(points[..., 0, :])
+        lowest = (points @ self.plane[:3]).amin(-1) - self.plane[3]
+        return (clear - lowest).clamp_min(0)[..., None] * self.plane[:3]
+
+    def to(self, device: torch.device | str) -> Surroundings:
+        """The same on another device."""
+        obstacles = None if self.obstacles is None else on_device(self.obstacles, device)
+        return Surroundings(None if self.plane is None else self.plane.to(device), obstacles)

@@ -1,0 +1,77 @@
+"""Constraints through the whole chain, checked by the collision shapes of the hand, which no stage reads."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dro_grasp.errors import OptionError
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.optimization.starts import LARGEST_TILT, angle_to_arc
+from dro_grasp.pipeline.constraints import Constraints
+from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.pipeline.stages import optimise, permitted, refine
+from tests.helpers.loaded_hands import loaded_hand
+
+SOAP = load_object("soap")
+"""4 cm high: no hand reaches around it on a table."""
+TABLE = float(SOAP.cloud[:, 2].min())
+
+
+def shapes(hand: Hand, T: Tensor, q: Tensor) -> Float[np.ndarray, "n 3"]:
+    """Vertices of all colliding shapes of one posed hand [m]."""
+    assert hand.description is not None
+    poses = (T @ hand.tree.forward(q)).double().numpy()
+    return np.concatenate([
+        shape.vertices @ poses[shape.link, :3, :3].T + poses[shape.link, :3, 3]
+        for shape in hand.description.geometry if shape.collides])
+
+
+def postures(grasps: GraspBatch, row: int) -> list[Tensor]:
+    """Pregrasp, grasp and squeeze of one grasp."""
+    return [joints[row].float() for joints in (grasps.pregrasp_joints, grasps.joints, grasps.squeeze_joints)]
+
+
+@pytest.mark.parametrize("direction", [(0.0, 0.0, -1.0), (1.0, 0.0, 0.0)])
+@pytest.mark.parametrize("name", ["gripper3", "allegro"])
+def test_a_low_object_on_a_table_is_grasped(name: str, direction: tuple[float, float, float]) -> None:
+    hand = loaded_hand(name)
+    problem = GraspProblem(hand, SOAP, constraints=Constraints(direction, TABLE))
+    found = refine(problem, optimise(problem, 8, seed=0))
+    kept = found[permitted(problem, found)]
+    assert len(kept) >= 3
+    off = angle_to_arc(hand.palm_directions(kept.T_object_wrist), torch.tensor(direction), torch.tensor([0.0, 0.0, 1.0]))
+    assert float(torch.rad2deg(off).median()) < 30, "near the direction, or tilted from there to the table"
+    for row in range(len(kept)):
+        lowest = min(shapes(hand, kept.T_object_wrist[row].float(), q)[:, 2].min() for q in postures(kept, row))
+        assert lowest > TABLE - 0.002, "surface points are sparse, but not that sparse [m]"
+    free = GraspProblem(hand, SOAP, constraints=Constraints(direction))
+    below = refine(free, optimise(free, 8, seed=0))
+    assert float(permitted(problem, below).float().mean()) < 0.2
+
+
+def test_palms_tilt_only_towards_the_plane() -> None:
+    up, side = torch.tensor([0.0, 0.0, 1.0]), torch.tensor([1.0, 0.0, 0.0])
+
+    def tilted(angle: float) -> Tensor:
+        return torch.tensor([math.cos(angle), 0.0, -math.sin(angle)])
+
+    palms = torch.stack([side, tilted(0.5), tilted(LARGEST_TILT + 0.2), tilted(-0.3), torch.tensor([0.0, 1.0, 0.0])])
+    expected = torch.tensor([0.0, 0.0, 0.2, 0.3, math.pi / 2])
+    torch.testing.assert_close(angle_to_arc(palms, side, up), expected, atol=1e-3, rtol=0)
+    torch.testing.assert_close(angle_to_arc(palms[:2], side, None), torch.tensor([0.0, 0.5]), atol=1e-3, rtol=0)
+    torch.testing.assert_close(angle_to_arc(palms[:1], -up, up), torch.tensor([math.pi / 2]), atol=1e-3, rtol=0)
+
+
+def test_a_table_above_the_object_is_refused() -> None:
+    with pytest.raises(OptionError, match="leaves nothing of the object, which ends at z"):
+        GraspProblem(loaded_hand("gripper3"), SOAP, constraints=Constraints(table=0.1))
+    with pytest.raises(OptionError, match="table is nan"):
+        Constraints(table=math.nan)
