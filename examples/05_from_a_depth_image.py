@@ -21,7 +21,7 @@ in_base = dro.visible_points(duck, direction, torch.Generator().manual_seed(0), 
 points = (in_base - T_base_camera[:3, 3]) @ T_base_camera[:3, :3]
 obj = dro.scanned_object("seen", points, T_base_camera)
 
-table = float(obj.cloud[:, 2].min()) 
+table = float(obj.cloud[:, 2].min())
 grasps = dro.GraspPredictor().predict(dro.load_hand("allegro"), obj, num=8, direction=(0.0, 0.0, -1.0), table=table)
 print(f"{obj.notes[0]}")
 for i in range(3):
