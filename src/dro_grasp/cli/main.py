@@ -17,6 +17,7 @@ from dro_grasp.cli.export import Export
 from dro_grasp.cli.generate import Generate
 from dro_grasp.cli.listing import HandCommand, Hands, Objects
 from dro_grasp.cli.onboard import Onboard
+from dro_grasp.cli.plan_lift import Plan
 from dro_grasp.cli.robots import RobotCommand
 from dro_grasp.cli.synthesize import Synthesize
 from dro_grasp.cli.train import Pretrain, Train
@@ -49,6 +50,7 @@ Command = (
     | Annotated[HandCommand, named("hand")]
     | Annotated[Hands, named("hands")]
     | Annotated[Objects, named("objects")]
+    | Annotated[Plan, named("plan")]
     | Annotated[RobotCommand, named("robot")]
     | Annotated[Weights, named("weights")]
 )

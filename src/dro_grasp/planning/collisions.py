@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -13,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.robot_file import Table
-from dro_grasp.planning.workcell import ARM, add_solids, robot_spec, wxyz
+from dro_grasp.planning.workcell import ARM, add_solids, arm_addresses, robot_spec, wxyz
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.scene import PREFIX, joint_addresses
 
@@ -31,8 +32,12 @@ CLEARANCE = 0.005
 """Distance that the robot keeps from everything else while it travels [m] (ours)."""
 SAMPLES = 100
 """Random configurations in which links that always collide are looked for (ours)."""
+SINK = 0.002
+"""How much deeper than at the start a carried object may be in what it stood on or against [m]; clouds are not exact (ours)."""
 ALWAYS = 0.95
 """Share of these in which they collide (ours)."""
+TARGET = "target"
+"""Name of the object that is grasped."""
 OBSTACLE = "obstacle"
 """What obstacles are called in contacts."""
 
@@ -51,7 +56,8 @@ class CollisionChecker:
     """One MuJoCo model of robot, table, obstacles and object, asked about one configuration after the other."""
 
     def __init__(
-        self, robot: Robot, table: Table | None = None, obstacles: Sequence[ObjectModel] = (), target: ObjectModel | None = None
+        self, robot: Robot, table: Table | None = None, obstacles: Sequence[ObjectModel] = (),
+        target: ObjectModel | None = None, T_world_target: Float[np.ndarray, "4 4"] | None = None,
     ) -> None:
         """Build the model.
 
@@ -59,13 +65,16 @@ class CollisionChecker:
             robot: Arm and hand; contacts that they always have are excluded.
             table: Where it stands; None for no table.
             obstacles: Things in the world's frame; clouds count as small boxes.
-            target: The object, in the world's frame; a bare cloud counts as its convex hull.
+            target: The object; a bare cloud counts as its convex hull.
+            T_world_target: Where it stands [m]; its frame is the world's by default.
         """
-        self.robot = robot
+        self.robot, self.T_world_target = robot, np.eye(4) if T_world_target is None else T_world_target
         scene = robot_spec(robot, PROTOCOLS["dro"], table)
         add_solids(scene, scene.worldbody, obstacles)
-        body = scene.worldbody.add_body(name="target", mocap=True)
-        add_solids(scene, body, [] if target is None else [target], hull=True)
+        if target is not None:
+            body = scene.worldbody.add_body(name=TARGET)
+            body.add_freejoint(name=TARGET)  # MuJoCo lets no fixed body collide with another
+            add_solids(scene, body, [target], hull=True)
         self._set_bits(scene)
         self.excluded = exclude_constant_contacts(scene, robot)
         """Pairs of links that collide at home or nearly everywhere; they are not checked."""
@@ -76,8 +85,9 @@ class CollisionChecker:
         self.part = np.array([part_of(self.model, g) for g in range(self.model.ngeom)])
         tree = robot.hand.tree
         self._coupling, self._offset = (t.double().numpy()[self.hand_moving] for t in (tree.coupling, tree.offset))
-        self.checks = 0
-        """Configurations asked about so far."""
+        start = None if target is None else int(self.model.jnt_qposadr[self.model.joint(TARGET).id])
+        self._target_qpos = slice(0) if start is None else slice(start, start + 7)
+        self._standing = np.concatenate([self.T_world_target[:3, 3], wxyz(self.T_world_target[:3, :3])])
 
     def _set_bits(self, scene: mujoco.MjSpec) -> None:
         for geom in scene.geoms:
@@ -89,7 +99,7 @@ class CollisionChecker:
 
     def contacts(
         self, arm: Float[np.ndarray, " n_arm"], hand: Float[np.ndarray, " n_dof"], clearance: float = 0.0,
-        T_world_target: Float[np.ndarray, "4 4"] | None = None, touch: bool = False,
+        moved: Float[np.ndarray, "4 4"] | None = None, touch: bool = False,
     ) -> list[Contact]:
         """What collides.
 
@@ -97,53 +107,55 @@ class CollisionChecker:
             arm: Joints of the arm [rad or m].
             hand: Independent joints of the hand [rad or m].
             clearance: Distance below which robot and surroundings count as colliding [m], at most CLEARANCE.
-            T_world_target: Motion of the object from where it stood, if the hand carries it; see also `touch`.
-            touch: The hand may touch the object, and the object the surroundings it stands on.
+            moved: Motion of the object from where it stands, in the world, if the hand carries it.
+            touch: The hand may touch the object.
         """
-        pairs, distance = self._detect(arm, hand, T_world_target)
-        bad = self._bad(pairs, distance, clearance, touch)
+        pairs, distance = self._detect(arm, hand, moved)
+        bad = self._bad(pairs, distance, clearance, moved is not None, touch)
         return [Contact(self._name(a), self._name(b), d)
                 for (a, b), d in zip(pairs[bad].tolist(), distance[bad].tolist(), strict=True)]
 
     def free(
         self, arm: Float[np.ndarray, " n_arm"], hand: Float[np.ndarray, " n_dof"], clearance: float = CLEARANCE,
-        T_world_target: Float[np.ndarray, "4 4"] | None = None, touch: bool = False,
+        moved: Float[np.ndarray, "4 4"] | None = None, touch: bool = False,
     ) -> bool:
         """Whether nothing collides; arguments as for `contacts`."""
-        return not self._bad(*self._detect(arm, hand, T_world_target), clearance, touch).any()
+        return not self._bad(*self._detect(arm, hand, moved), clearance, moved is not None, touch).any()
 
     def _name(self, geom: int) -> str:
         body = int(self.model.geom_bodyid[geom])
         return self.model.body(body).name if body else self.model.geom(geom).name or OBSTACLE
 
     def _detect(
-        self, arm: Float[np.ndarray, " n_arm"], hand: Float[np.ndarray, " n_dof"], T_target: Float[np.ndarray, "4 4"] | None
+        self, arm: Float[np.ndarray, " n_arm"], hand: Float[np.ndarray, " n_dof"], moved: Float[np.ndarray, "4 4"] | None
     ) -> tuple[Int[np.ndarray, "k 2"], Float[np.ndarray, " k"]]:
-        self.checks += 1
         model, data = self.model, self.data
         data.qpos[self.arm_qpos] = arm
         data.qpos[self.hand_qpos] = self._coupling @ hand + self._offset
-        T = np.eye(4) if T_target is None else T_target
-        data.mocap_pos[0], data.mocap_quat[0] = T[:3, 3], wxyz(T[:3, :3]) if T_target is not None else (1, 0, 0, 0)
+        if self._target_qpos.stop:
+            T = self.T_world_target if moved is None else moved @ self.T_world_target
+            data.qpos[self._target_qpos] = self._standing if moved is None else [*T[:3, 3], *wxyz(T[:3, :3])]
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_collision(model, data)
         return data.contact.geom.copy(), data.contact.dist.copy()
 
     def _bad(
-        self, pairs: Int[np.ndarray, "k 2"], distance: Float[np.ndarray, " k"], clearance: float, touch: bool
+        self, pairs: Int[np.ndarray, "k 2"], distance: Float[np.ndarray, " k"], clearance: float, moved: bool, touch: bool
     ) -> Bool[np.ndarray, " k"]:
         low, high = np.sort(self.part[pairs], axis=1).reshape(-1, 2).T
-        least = np.where(high <= HAND_PART, 0.0, clearance)
-        bad = distance < least
+        bad = distance < np.where(high <= HAND_PART, 0.0, clearance)
         if touch:
-            bad &= (high != OBJECT) | (low == ARM_PART)
-        return bad & ~((high == OBJECT) & (low == SURROUNDINGS))
+            bad &= (high != OBJECT) | (low != HAND_PART)
+        beside = (high == OBJECT) & (low == SURROUNDINGS)
+        return np.where(beside, moved & (distance < self._resting - SINK), bad)
 
-
-def arm_addresses(model: mujoco.MjModel, robot: Robot) -> Int[np.ndarray, " n_arm"]:
-    """Addresses in qpos of the arm's joints in a scene."""
-    return np.array([model.jnt_qposadr[model.joint(ARM + name).id] for name in robot.arm_joints])
+    @cached_property
+    def _resting(self) -> float:
+        """Signed distance of the object, where it stands, to the nearest of table and obstacles, at most zero [m]."""
+        pairs, distance = self._detect(self.robot.home, open_hand(self.robot), None)
+        beside = (np.sort(self.part[pairs], axis=1).reshape(-1, 2) == (SURROUNDINGS, OBJECT)).all(1)
+        return min(0.0, float(distance[beside].min(initial=0.0)))
 
 
 def part_of(model: mujoco.MjModel, geom: int) -> int:
@@ -154,7 +166,7 @@ def part_of(model: mujoco.MjModel, geom: int) -> int:
 def _part(body: str) -> int:
     if body.startswith(ARM):
         return ARM_PART
-    return HAND_PART if body.startswith(PREFIX) else OBJECT if body == "target" else SURROUNDINGS
+    return HAND_PART if body.startswith(PREFIX) else OBJECT if body == TARGET else SURROUNDINGS
 
 
 def exclude_constant_contacts(scene: mujoco.MjSpec, robot: Robot) -> tuple[tuple[str, str], ...]:

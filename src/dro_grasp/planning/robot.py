@@ -20,6 +20,8 @@ from dro_grasp.planning.robot_file import CameraMount, RobotFile, Table, locate_
 
 LONGEST_ARM = 5.0
 """A farther link must be in another unit [m] (ours)."""
+TURN = np.pi
+"""Planned motions stay this near home, so that configurations a whole turn apart count once [rad] (ours)."""
 NO_LIMITS = "states no limits"
 """Beginning of the note of a joint whose limits had to be assumed."""
 DEFAULT_EFFORT = 50.0
@@ -67,6 +69,17 @@ class Robot:
     def hand_joints(self) -> tuple[str, ...]:
         """Names of the hand's independent joints."""
         return tuple(self.hand.tree.joint_names)
+
+    @property
+    def working_range(self) -> tuple[Float[np.ndarray, " n_arm"], Float[np.ndarray, " n_arm"]]:
+        """The joints' limits, and at most TURN from home."""
+        return np.maximum(self.lower, self.home - TURN), np.minimum(self.upper, self.home + TURN)
+
+    @property
+    def longest_reach(self) -> float:
+        """No grasp centre gets farther from the base than this [m]: the sum of all distances between joints."""
+        links = float(self.arm.tree.origin[1:, :3, 3].norm(dim=-1).sum())
+        return links + float(np.linalg.norm(self.T_link_wrist[:3, 3])) + float(self.hand.grasp_centre_wrist.norm())
 
     def T_world_wrist(self, arm: Float[np.ndarray, "*batch n_arm"]) -> Float[np.ndarray, "*batch 4 4"]:
         """Pose of the hand's root link [m]."""

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.objects.shape import ObjectModel
@@ -46,6 +46,11 @@ def robot_spec(robot: Robot, protocol: Protocol, table: Table | None) -> mujoco.
             name=TABLE, type=mujoco.mjtGeom.mjGEOM_BOX, size=half, rgba=[0.82, 0.80, 0.76, 1],
             pos=[*table.centre, table.height - TABLE_THICKNESS / 2], friction=[protocol.friction, 0.005, 1e-4])
     return scene
+
+
+def arm_addresses(model: mujoco.MjModel, robot: Robot) -> Int[np.ndarray, " n_arm"]:
+    """Addresses in qpos of the arm's joints in a scene."""
+    return np.array([model.jnt_qposadr[model.joint(ARM + name).id] for name in robot.arm_joints])
 
 
 def placed_frame(body: mujoco.MjsBody, T: Float[np.ndarray, "4 4"]) -> mujoco.MjsFrame:

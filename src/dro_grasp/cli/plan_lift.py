@@ -1,0 +1,128 @@
+"""`dro-grasp plan`: a timed, collision-free motion of arm and hand that grasps an object and lifts it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from dro_grasp.cli.inputs import Flag, optional
+from dro_grasp.cli.output import print_json, say, say_aside
+
+if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Float
+
+    from dro_grasp.objects.shape import ObjectModel
+    from dro_grasp.planning.robot import Robot
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Plan how a robot grasps an object and lifts it: what a robot's computer runs. Needs the extra `[arm]`.
+
+    Example: dro-grasp plan --robot xarm7_leaphand --object mug --at 0.5 0.1 --output plan.npz --trajectory plan.yaml
+    """
+
+    robot: str
+    """A robot file, or the name of a built-in robot (see `dro-grasp robot list`)."""
+    object: str
+    """A cloud (PLY, NPY, PCD), a mesh, or an object's name (see `dro-grasp objects`), in the robot's world frame."""
+    camera: Annotated[str | None, optional("JSON|robot", "the object is in the world frame")] = None
+    """The object is a cloud in this camera's frame; it is cleaned and completed. A file with {"frame": "world",
+    "T_frame_camera": 4x4}, or `robot` for the camera of the robot file."""
+    pose: Annotated[Path | None, optional("JSON", "the object's frame is the world frame")] = None
+    """File with {"frame": "world", "T_frame_object": 4x4}: where the object stands."""
+    at: Annotated[tuple[float, float] | None, optional("X Y", "as --pose says")] = None
+    """Stand the object, upright in its own frame, on the table at this place [m]."""
+    obstacles: tuple[str, ...] = ()
+    """Clouds and meshes, in the world frame, that nothing may touch."""
+    num: int = 64
+    """Grasps to choose from."""
+    top: int = 5
+    """Reachable grasps of best score that are given to the planner at once."""
+    directions: Literal["paper", "all"] = "all"
+    """Palm directions: `paper`, from above to the right side, or `all` that a table leaves room for."""
+    planner_seconds: float = 3.0
+    """Longest time for one path [s]."""
+    seed: int = 0
+    """Of grasps, inverse kinematics and planner."""
+    weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
+    """Name of shipped weights (see `dro-grasp weights list`) or the path of a weights file."""
+    output: Annotated[Path | None, optional("NPZ", "not saved")] = None
+    """Plan file: arm and hand over time, by stage, and what was dropped."""
+    trajectory: Annotated[Path | None, optional("YAML", "not written")] = None
+    """The motion as trajectory_msgs/JointTrajectory, one for the arm and one for the hand."""
+    csv: Annotated[Path | None, optional("CSV", "not written")] = None
+    """The motion as a table."""
+    json: Flag = False
+    """Print one JSON object instead of text."""
+
+    def run(self) -> int:
+        """Check everything that can be checked before the work, then plan and write."""
+        from dataclasses import asdict
+
+        from dro_grasp.errors import OptionError
+        from dro_grasp.files import check_output, replacing
+        from dro_grasp.objects.catalogue import load_object
+        from dro_grasp.planning.extra import require_arm_extra
+
+        require_arm_extra()
+        from dro_grasp.planning.planner import PlanConfig, plan
+        from dro_grasp.planning.robot import load_robot
+        from dro_grasp.planning.trajectory_files import trajectory_csv, trajectory_yaml
+        from dro_grasp.predictor import GraspPredictor
+
+        if not 0 <= self.seed < 2**31:
+            raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^31 - 1")
+        config = PlanConfig(self.num, self.top, self.directions, planner_seconds=self.planner_seconds)
+        for path in (self.output, self.trajectory, self.csv):
+            if path is not None:
+                check_output(path)
+        robot = load_robot(self.robot)
+        obj, T_world_object = self._place(robot)
+        obstacles = [load_object(name) for name in self.obstacles]
+        for note in obj.notes:
+            say_aside(f"{obj.name}: {note}")
+        made = plan(robot, obj, T_world_object, obstacles, GraspPredictor(self.weights), config, self.seed)
+        if self.output is not None:
+            made.save(self.output)
+        for path, text in ((self.trajectory, trajectory_yaml), (self.csv, trajectory_csv)):
+            if path is not None:
+                with replacing(path, "trajectory") as temporary:
+                    temporary.write_text(text(made))
+        written = {k: str(p) for k, p in (("plan", self.output), ("trajectory", self.trajectory), ("csv", self.csv)) if p}
+        if self.json:
+            print_json({**asdict(made.notes), "motion_seconds": made.seconds, **written})
+            return 0
+        for line in [*made.lines(), *(f"{what}: {path}" for what, path in written.items())]:
+            say(line)
+        return 0
+
+    def _place(self, robot: Robot) -> tuple[ObjectModel, Float[np.ndarray, "4 4"]]:
+        """The object, and where it stands in the world."""
+        import numpy as np
+
+        from dro_grasp.errors import OptionError
+        from dro_grasp.frames import read_motion
+        from dro_grasp.objects.catalogue import load_object
+        from dro_grasp.perception.scan import load_scan
+
+        if sum(given is not None for given in (self.camera, self.pose, self.at)) > 1:
+            raise OptionError("--camera, --pose and --at each say where the object is; give one of them")
+        T = np.eye(4)
+        if self.camera is not None:
+            if self.camera != "robot":
+                camera = read_motion(Path(self.camera), "T_frame_camera").T.double().numpy()
+            elif robot.camera is None:
+                raise OptionError(f"robot '{robot.name}' has no camera; state it in the robot file, or give --camera JSON")
+            else:
+                camera = robot.camera.T_world_camera
+            return load_scan(Path(self.object).expanduser(), camera), T
+        obj = load_object(self.object)
+        if self.pose is not None:
+            T = read_motion(self.pose, "T_frame_object").T.double().numpy()
+        elif self.at is not None:
+            height = 0.0 if robot.table is None else robot.table.height
+            T[:3, 3] = *self.at, height - float(obj.cloud[:, 2].min())
+        return obj, T

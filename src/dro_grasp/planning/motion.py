@@ -1,0 +1,145 @@
+"""A motion of arm and hand, from home to the lifted object, as it is planned, stored and consumed by drivers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from dro_grasp.errors import PlanError
+from dro_grasp.files import check_output, replacing
+from dro_grasp.planning.timing import Trajectory
+
+STAGES = ("reach", "shape", "approach", "close", "lift")
+"""The arm travels with the hand open; the hand takes the pregrasp; straight to the grasp; the hand closes; straight up."""
+FORMAT = 1
+"""Version of plan files."""
+COLUMNS = ("time", "stage", "arm", "arm_velocity", "arm_acceleration", "hand", "hand_velocity", "hand_acceleration")
+"""Arrays of a plan file."""
+
+
+@dataclass(frozen=True)
+class MotionPoint:
+    """Where arm and hand should be at one time."""
+
+    time: float
+    """Since the start [s]."""
+    stage: str
+    """One of STAGES."""
+    arm: Float[np.ndarray, " n_arm"]
+    """[rad or m]"""
+    hand: Float[np.ndarray, " n_dof"]
+    """[rad or m]"""
+
+
+@dataclass(frozen=True)
+class PlanNotes:
+    """What a plan is for and how it came about; plain values."""
+
+    robot: str
+    object: str
+    arm_joints: tuple[str, ...]
+    hand_joints: tuple[str, ...]
+    frame: str
+    """The frame that wrist poses are in: that of the robot's world."""
+    table: float | None
+    """Height of the table that was planned for [m]."""
+    grasps: int
+    """Grasps that there were to choose from."""
+    dropped: dict[str, int]
+    """How many of them were dropped, by reason."""
+    goals: int
+    """Grasps that were given to the planner at once."""
+    chosen: int
+    """Index of the grasp in the batch, best score first."""
+    score: float
+    """Its score."""
+    T_world_wrist: list[list[float]]
+    """The wrist pose of the grasp [m]."""
+    seed: int
+    seconds: dict[str, float]
+    """Time spent on planning, by part [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPlan:
+    """Arm and hand over time, from home to the lifted object."""
+
+    notes: PlanNotes
+    stage: Int[np.ndarray, " k"]
+    """Index into STAGES of each sample."""
+    arm: Trajectory
+    hand: Trajectory
+
+    @property
+    def seconds(self) -> float:
+        """Duration [s]."""
+        return self.arm.seconds
+
+    def part(self, stage: str) -> slice:
+        """Rows of a stage, with the last row of the one before."""
+        rows = np.flatnonzero(self.stage == STAGES.index(stage))
+        return slice(max(0, int(rows[0]) - 1), int(rows[-1]) + 1)
+
+    def points(self, rate: float = 100.0) -> Iterator[MotionPoint]:
+        """Targets at a rate [1/s], the last one included, for a loop that sends them to a robot."""
+        count = int(np.ceil(self.seconds * rate - 1e-9))
+        for time in [*(i / rate for i in range(count)), self.seconds]:
+            row = min(int(np.searchsorted(self.arm.time, time, side="left")), len(self.stage) - 1)
+            yield MotionPoint(float(time), STAGES[int(self.stage[row])], *(
+                np.array([np.interp(time, t.time, column) for column in t.position.T]) for t in (self.arm, self.hand)))
+
+    def lines(self) -> list[str]:
+        """In words: what was dropped, what is done, how long it takes."""
+        n = self.notes
+        spans = ", ".join(f"{s} {np.ptp(self.arm.time[self.part(s)]):.1f} s" for s in STAGES)
+        x, y, z = (row[3] for row in n.T_world_wrist[:3])
+        return [
+            dropped_in_words(n.grasps, n.dropped) + f"; {n.goals} given to the planner",
+            f"grasp {n.chosen}, score {n.score:.2f}: wrist at ({x:.3f}, {y:.3f}, {z:.3f}) m in frame '{n.frame}'",
+            f"motion of {self.seconds:.1f} s: {spans}",
+            "planned in " + f"{sum(n.seconds.values()):.2f} s: " + ", ".join(f"{k} {v:.2f} s" for k, v in n.seconds.items()),
+        ]
+
+    def save(self, path: Path | str) -> None:
+        """Write a plan file (NPZ); it appears whole or not at all.
+
+        Raises:
+            OutputError: The path cannot be written.
+        """
+        header = json.dumps({"format_version": FORMAT, "stages": STAGES, **asdict(self.notes)})
+        arrays = {"time": self.arm.time, "stage": self.stage}
+        for name, part in (("arm", self.arm), ("hand", self.hand)):
+            arrays |= {name: part.position, f"{name}_velocity": part.velocity, f"{name}_acceleration": part.acceleration}
+        with replacing(check_output(path), "plan") as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, header=np.array(header), allow_pickle=False, **arrays)
+
+    @staticmethod
+    def load(path: Path | str) -> MotionPlan:
+        """Read a plan file.
+
+        Raises:
+            PlanError: No such file, or a truncated or foreign one, or one of another version.
+        """
+        try:
+            with Path(path).open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+                header: dict[str, Any] = json.loads(str(file["header"]))
+                time, stage, *rows = (file[name] for name in COLUMNS)
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+            raise PlanError(f"{path} is no plan file ({error}); `dro-grasp plan` writes them") from error
+        if header.pop("format_version", None) != FORMAT or tuple(header.pop("stages", ())) != STAGES:
+            raise PlanError(f"{path} is a plan file of another version; plan again")
+        names = {key: tuple(header[key]) for key in ("arm_joints", "hand_joints")}
+        return MotionPlan(PlanNotes(**(header | names)), stage, Trajectory(time, *rows[:3]), Trajectory(time, *rows[3:]))
+
+
+def dropped_in_words(grasps: int, dropped: dict[str, int]) -> str:
+    """How many grasps were dropped, and why."""
+    reasons = ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count)
+    return f"{grasps} grasps: {reasons or 'none dropped'}"

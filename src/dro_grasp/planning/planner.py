@@ -1,0 +1,237 @@
+"""From a robot and an object to a timed motion that grasps and lifts it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from dro_grasp.devices import Stopwatch
+from dro_grasp.errors import OptionError, PlanError, RobotError
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.planning.candidates import Directions, grasps_in_world
+from dro_grasp.planning.collisions import TARGET, CollisionChecker, open_hand
+from dro_grasp.planning.extra import require_arm_extra
+from dro_grasp.planning.motion import STAGES, MotionPlan, PlanNotes, dropped_in_words
+from dro_grasp.planning.reachability import Feasible, Postures, Reachability, ReachConfig, carried
+from dro_grasp.planning.robot import Robot
+from dro_grasp.planning.timing import Trajectory, cornered, joined, smooth, standing
+from dro_grasp.predictor import GraspPredictor
+
+NO_PATH = "without a path"
+"""The planner connects none of the goals, or a timed motion would touch something."""
+TRAVEL_CLEARANCE = 0.001
+"""Distance that the timed motion keeps while it travels, off the straight edges that were planned [m] (ours)."""
+
+
+@dataclass(frozen=True)
+class PlanConfig:
+    """How a motion is planned. Values without a source are ours."""
+
+    num: int = 64
+    """Grasps to choose from."""
+    top: int = 5
+    """Reachable grasps of best score that are given to the planner at once. Source: paper, real-robot experiment."""
+    directions: Directions = "all"
+    """Palm directions: `paper`, from above to the right side, or `all` that a table leaves room for."""
+    order: Literal["score", "random"] = "score"
+    """Which reachable grasps are taken: the best by score, or any, as a control."""
+    rounds: int = 3
+    """How often the planner is asked, each time with the next `top` grasps."""
+    planner_seconds: float = 3.0
+    """Longest time for one path [s]."""
+    closing_seconds: float = 1.0
+    """Least time in which the hand closes [s]. Source: as in trials."""
+    reach: ReachConfig = field(default_factory=ReachConfig)
+    """Approach and lift."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be done.
+
+        Raises:
+            OptionError: A number is not positive.
+        """
+        for name in ("num", "top", "rounds", "planner_seconds"):
+            if getattr(self, name) <= 0:
+                raise OptionError(f"{name} is {getattr(self, name)}; give a number above 0")
+
+
+def plan(
+    robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"] | None = None,
+    obstacles: Sequence[ObjectModel] = (), predictor: GraspPredictor | None = None, config: PlanConfig | None = None,
+    seed: int = 0, grasps: GraspBatch | None = None,
+) -> MotionPlan:
+    """A motion that grasps the object and lifts it.
+
+    Args:
+        robot: Arm, hand and table.
+        obj: A mesh, or a camera's cloud.
+        T_world_object: Where it stands [m]; its frame is the world's by default.
+        obstacles: Further things, in the world's frame.
+        predictor: Proposes grasps; the default weights if omitted.
+        config: How to plan.
+        seed: Of grasps, inverse kinematics and planner; where the planner's time suffices, the same seed gives the same plan.
+        grasps: Complete grasps with scores, in the world's frame, instead of predicted ones.
+
+    Raises:
+        PlanError: The object collides with the robot, lies below the table, or no grasp can be carried out; the message
+            counts what was dropped where.
+        RobotError: The robot collides at home.
+        OptionError: The extra `[arm]` is not installed.
+    """
+    require_arm_extra()
+    task = _Task(robot, obj, np.eye(4) if T_world_object is None else T_world_object, obstacles, config or PlanConfig(), seed)
+    task.check_start()
+    if grasps is None:
+        with task.watch("grasps"):
+            grasps = grasps_in_world(predictor or GraspPredictor(), GraspProblem(robot.hand, obj), task.T_world_object,
+                                     task.config.num, task.config.directions, task.height, seed)
+    return task.run(grasps)
+
+
+class _Task:
+    """One object to lift."""
+
+    def __init__(
+        self, robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"], obstacles: Sequence[ObjectModel],
+        config: PlanConfig, seed: int,
+    ) -> None:
+        self.robot, self.obj, self.T_world_object, self.config, self.seed = robot, obj, T_world_object, config, seed
+        self.watch = Stopwatch("grasps", "reach", "path", "timing")
+        self.checker = CollisionChecker(robot, robot.table, obstacles, obj, T_world_object)
+        self.height = None if robot.table is None else robot.table.height
+        self.reach = Reachability(robot, self.checker, obj, self.height, config.reach, seed)
+        self.opened = open_hand(robot)
+
+    @property
+    def dropped(self) -> Counter[str]:
+        """Grasps that were dropped, by reason."""
+        return self.reach.dropped
+
+    def check_start(self) -> None:
+        """Refuse a robot or an object that stands in the way of each other from the start."""
+        top = float((self.obj.cloud @ self.T_world_object[2, :3]).max() + self.T_world_object[2, 3])
+        if self.height is not None and top <= self.height:
+            raise PlanError(f"object '{self.obj.name}' ends at z = {top:.3f} m, below the table at {self.height:.3f} m; give "
+                            "the object in the robot's world frame (--camera, --pose), or correct `table` in the robot file")
+        if self._distance() > self.robot.longest_reach:
+            raise PlanError(f"object '{self.obj.name}' stands {self._distance():.2f} m from the base, farther than the arm and "
+                            f"hand are long ({self.robot.longest_reach:.2f} m); give its place in the robot's world frame [m]")
+        for contact in self.checker.contacts(self.robot.home, self.opened):
+            if TARGET in (contact.first, contact.second):
+                other = contact.first if contact.second == TARGET else contact.second
+                raise PlanError(f"object '{self.obj.name}' collides with {other} while the robot is at home; give its place in "
+                                "the robot's world frame, or another home")
+            raise RobotError(f"robot '{self.robot.name}' collides at home: {contact.first} and {contact.second}, by "
+                             f"{-1e3 * contact.distance:.1f} mm; `dro-grasp robot check` shows it")
+
+    def run(self, grasps: GraspBatch) -> MotionPlan:
+        """The plan for the best grasps that work."""
+        with self.watch("reach"):
+            waiting = self._in_order(self.reach.promising(grasps).nonzero()[:, 0])
+        for attempt in range(self.config.rounds):
+            goals: list[Feasible] = []
+            with self.watch("reach"):
+                while waiting and len(goals) < self.config.top:
+                    if (found := self.reach.feasible(grasps, waiting.pop(0))) is not None:
+                        goals.append(found)
+            if not goals:
+                break
+            if (made := self._move(grasps, goals, attempt)) is not None:
+                return made
+        raise PlanError(f"{dropped_in_words(len(grasps), dict(self.dropped))}, and none is left for '{self.obj.name}'; "
+                        f"{self._advice()}")
+
+    def _in_order(self, rows: Int[Tensor, " k"]) -> list[int]:
+        if self.config.order == "random":
+            rows = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(self.seed))]
+        return rows.tolist()
+
+    def _move(self, grasps: GraspBatch, goals: list[Feasible], attempt: int) -> MotionPlan | None:
+        """The motion to the first goal that a path leads to; None, and counted, if there is no path."""
+        from dro_grasp.planning.paths import find_path
+
+        lower, upper = self.robot.working_range
+        count = len(goals)
+        while goals:
+            with self.watch("path"):
+                path = find_path(self.robot.home, np.stack([g.approach[0] for g in goals]),
+                                 lambda q: self.checker.free(q, self.opened), lower, upper, self.config.planner_seconds,
+                                 self.seed + attempt)
+            if path is None:
+                break
+            chosen = goals.pop(path.goal)
+            with self.watch("timing"):
+                made = self._timed(path.waypoints, chosen, Postures.of(self.robot, grasps, chosen.index))
+            if made is not None:
+                notes = self._notes(grasps, chosen.index, count)
+                return MotionPlan(notes, *made)
+            self.dropped[NO_PATH] += 1
+        self.dropped[NO_PATH] += len(goals)
+        return None
+
+    def _timed(
+        self, waypoints: Float[np.ndarray, "k n_arm"], goal: Feasible, hand: Postures
+    ) -> tuple[Int[np.ndarray, " m"], Trajectory, Trajectory] | None:
+        """Stage of each sample, arm and hand; None if the timed motion touches something."""
+        robot = self.robot
+        limits = robot.velocity, robot.acceleration
+        n = len(hand.grasp)
+        fingers = np.full(n, robot.hand_velocity), np.full(n, robot.hand_acceleration)
+        reach = smooth(waypoints, *limits)
+        if not self._free(reach.position, hand.opened):
+            reach = cornered(waypoints, *limits)
+        standoff, grasp = goal.approach[0], goal.approach[-1]
+        shape = smooth(_between(hand.opened, hand.pregrasp), *fingers)
+        close = smooth(np.concatenate([_between(hand.pregrasp, hand.grasp), _between(hand.grasp, hand.squeeze)]), *fingers,
+                       self.config.closing_seconds)
+        approach, lift = smooth(goal.approach, *limits), smooth(goal.lift, *limits)
+        start = robot.T_world_wrist(grasp)
+        free = self._free(reach.position, hand.opened) and all(
+            self.checker.free(q, hand.pregrasp, 0.0, touch=True) for q in approach.position) and all(
+            self.checker.free(q, hand.squeeze, 0.0, carried(robot.T_world_wrist(q), start), touch=True) for q in lift.position)
+        if not free:
+            return None
+        arms = [reach, _still(standoff, shape), approach, _still(grasp, close), lift]
+        hands = [_still(hand.opened, reach), shape, _still(hand.pregrasp, approach), close, _still(hand.squeeze, lift)]
+        lengths = [len(part.time) - (i > 0) for i, part in enumerate(arms)]
+        return np.repeat(np.arange(len(STAGES)), lengths), joined(arms), joined(hands)
+
+    def _free(self, positions: Float[np.ndarray, "k n_arm"], hand: Float[np.ndarray, " n_dof"]) -> bool:
+        return all(self.checker.free(q, hand, TRAVEL_CLEARANCE) for q in positions)
+
+    def _notes(self, grasps: GraspBatch, index: int, goals: int) -> PlanNotes:
+        return PlanNotes(
+            self.robot.name, self.obj.name, self.robot.arm_joints, self.robot.hand_joints, "world", self.height, len(grasps),
+            dict(self.dropped), goals, index, float(grasps.score[index]), grasps.T_object_wrist[index].double().tolist(),
+            self.seed, self.watch.seconds)
+
+    def _distance(self) -> float:
+        """From the arm's base to the object's middle, along the ground [m]."""
+        middle = self.T_world_object[:2, :3] @ self.obj.cloud.mean(0) + self.T_world_object[:2, 3]
+        return float(np.linalg.norm(middle - self.robot.T_world_base[:2, 3]))
+
+    def _advice(self) -> str:
+        reason = max(self.dropped, key=lambda r: self.dropped[r], default="")
+        return (f"the object stands {self._distance():.2f} m from the base, and most grasps are {reason}; move the object, ask "
+                "for more grasps (--num), or for other palm directions (--directions)")
+
+
+def _between(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"], count: int = 8) -> Float[np.ndarray, "k n"]:
+    """Evenly spaced postures from one to another."""
+    return a + np.linspace(0, 1, count)[:, None] * (b - a)
+
+
+def _still(q: Float[np.ndarray, " n"], other: Trajectory) -> Trajectory:
+    """No motion at the times of another trajectory."""
+    return replace(standing(q, 0.0), time=other.time, **{
+        name: np.tile(row, (len(other.time), 1))
+        for name, row in (("position", q), ("velocity", np.zeros_like(q)), ("acceleration", np.zeros_like(q)))})

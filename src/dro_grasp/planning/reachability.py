@@ -1,0 +1,161 @@
+"""Which grasps the arm can carry out: wrist poses and configurations from the standoff to the end of the lift."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.planning.candidates import lowest_points
+from dro_grasp.planning.collisions import CollisionChecker, open_hand
+from dro_grasp.planning.robot import Robot
+
+BELOW_TABLE = "below the table"
+"""A finger, or the palm, would be in the table."""
+HITS_OBJECT = "through the object on the way to it"
+"""The opened fingers would push the object away."""
+OUT_OF_REACH = "out of reach"
+"""Inverse kinematics finds no configuration."""
+COLLIDES = "with the robot in collision"
+"""The configurations found collide with table, obstacles or the robot itself."""
+NO_LINE = "without a straight approach"
+"""Between standoff and grasp."""
+NO_LIFT = "without a straight lift"
+"""The arm cannot raise the object so far, or hits something with it."""
+
+
+@dataclass(frozen=True)
+class ReachConfig:
+    """How grasps are approached and lifted. Values are ours."""
+
+    standoff: float = 0.10
+    """Length of the straight approach, along the palm direction [m]."""
+    lift: float = 0.20
+    """Height of the straight lift [m]."""
+    step: float = 0.01
+    """Distance between the poses that are solved on both [m]."""
+    deepest: float = 0.008
+    """How far opened fingers may pass through the object's estimated surface on the approach [m]."""
+    table_margin: float = 0.002
+    """Distance that the hand's points keep from the table [m]."""
+    clearance: float = 0.001
+    """Distance that the robot keeps from table and obstacles on approach and lift [m]."""
+    seeds: int = 6
+    """Starts of inverse kinematics: home, and random ones."""
+
+
+@dataclass(frozen=True)
+class Feasible:
+    """A grasp with the arm's configurations for it."""
+
+    index: int
+    """Of the grasp in its batch."""
+    approach: Float[np.ndarray, "k n_arm"]
+    """From the standoff to the grasp [rad or m]."""
+    lift: Float[np.ndarray, "m n_arm"]
+    """From the grasp upwards [rad or m]."""
+
+
+@dataclass(frozen=True)
+class Postures:
+    """Independent joints of the hand in one grasp [rad or m]."""
+
+    opened: Float[np.ndarray, " n_dof"]
+    """While the arm travels."""
+    pregrasp: Float[np.ndarray, " n_dof"]
+    grasp: Float[np.ndarray, " n_dof"]
+    squeeze: Float[np.ndarray, " n_dof"]
+
+    @staticmethod
+    def of(robot: Robot, grasps: GraspBatch, index: int) -> Postures:
+        """Those of one grasp of a complete batch."""
+        rows = (grasps.pregrasp_joints, grasps.joints, grasps.squeeze_joints)
+        return Postures(open_hand(robot), *(r[index].double().numpy() for r in rows))
+
+
+class Reachability:
+    """Goes through grasps of one object, and counts why it drops them."""
+
+    def __init__(
+        self, robot: Robot, checker: CollisionChecker, obj: ObjectModel, table: float | None, config: ReachConfig, seed: int
+    ) -> None:
+        """Prepare the solver; `table` is the height of the table [m], the object stands where the checker has it."""
+        from dro_grasp.planning.inverse_kinematics import WristSolver
+
+        self.robot, self.checker, self.obj, self.table, self.config = robot, checker, obj, table, config
+        self.solver, self.random = WristSolver(robot), np.random.default_rng(seed)
+        self.dropped: Counter[str] = Counter()
+
+    def promising(self, grasps: GraspBatch) -> Bool[Tensor, " n"]:
+        """Which grasps are worth inverse kinematics: geometry of the hand alone decides."""
+        hand, T = self.robot.hand, grasps.T_object_wrist
+        keep = torch.ones(len(grasps), dtype=torch.bool)
+        if self.table is not None:
+            keep = lowest_points(hand, grasps) > self.table + self.config.table_margin
+            self.dropped[BELOW_TABLE] += int((~keep).sum())
+        ahead = hand.palm_directions(T)
+        way = torch.linspace(0, self.config.standoff, 5)
+        line = T[:, None].repeat(1, len(way), 1, 1)
+        line[..., :3, 3] -= way[:, None] * ahead[:, None]
+        T_object_world = torch.from_numpy(np.linalg.inv(self.checker.T_world_target)).to(T)
+        points = hand.points(grasps.pregrasp_joints[:, None].expand(-1, len(way), -1), T_object_world @ line)
+        depth = -self.obj.distance_field.distances(points.flatten(1, 2))[0].amin(-1)
+        self.dropped[HITS_OBJECT] += int((keep & (depth > self.config.deepest)).sum())
+        return keep & (depth <= self.config.deepest)
+
+    def feasible(self, grasps: GraspBatch, index: int) -> Feasible | None:
+        """One grasp with configurations from standoff to lift; None, and counted, if there are none."""
+        postures = Postures.of(self.robot, grasps, index)
+        T = grasps.T_object_wrist[index].double().numpy()
+        ahead = self.robot.hand.palm_directions(grasps.T_object_wrist[index:index + 1])[0].double().numpy()
+        back, up = self._line(T, -self.config.standoff * ahead), self._line(T, np.array([0, 0, self.config.lift]))
+        reasons = [OUT_OF_REACH]
+        lower, upper = self.solver.lower, self.solver.upper
+        for seed in [self.robot.home, *self.random.uniform(lower, upper, (self.config.seeds - 1, len(lower)))]:
+            q = self.solver.solve(T, [seed])
+            if q is None:
+                continue
+            outcome = self._ways(q, back, up, postures)
+            if not isinstance(outcome, str):
+                return Feasible(index, *outcome)
+            reasons.append(outcome)
+        order = (OUT_OF_REACH, COLLIDES, NO_LINE, NO_LIFT)
+        self.dropped[max(reasons, key=order.index)] += 1
+        return None
+
+    def _ways(
+        self, q: Float[np.ndarray, " n_arm"], back: Float[np.ndarray, "k 4 4"], up: Float[np.ndarray, "m 4 4"], hand: Postures
+    ) -> tuple[Float[np.ndarray, "k n_arm"], Float[np.ndarray, "m n_arm"]] | str:
+        """Approach and lift through one configuration of the grasp, or why there are none."""
+        free, clearance = self.checker.free, self.config.clearance
+        if not all(free(q, posture, clearance, touch=True) for posture in (hand.pregrasp, hand.grasp, hand.squeeze)):
+            return COLLIDES
+        retreat = self.solver.follow(back, q)
+        if retreat is None or not all(free(x, hand.pregrasp, clearance, touch=True) for x in retreat):
+            return NO_LINE
+        shapes = np.linspace(0, 1, 5)[:, None] * (hand.pregrasp - hand.opened) + hand.opened
+        if not free(retreat[-1], hand.opened) or not all(free(retreat[-1], shape, clearance) for shape in shapes):
+            return NO_LINE
+        raised = self.solver.follow(up, q)
+        if raised is None or not all(
+                free(x, hand.squeeze, clearance, carried(up[i], up[0]), touch=True) for i, x in enumerate(raised)):
+            return NO_LIFT
+        return retreat[::-1].copy(), raised
+
+    def _line(self, T: Float[np.ndarray, "4 4"], motion: Float[np.ndarray, "3"]) -> Float[np.ndarray, "k 4 4"]:
+        count = max(2, round(float(np.linalg.norm(motion)) / self.config.step) + 1)
+        poses = np.tile(T, (count, 1, 1))
+        poses[:, :3, 3] += np.linspace(0, 1, count)[:, None] * motion
+        return poses
+
+
+def carried(T_world_wrist: Float[np.ndarray, "4 4"], T_at_grasp: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """Motion of an object that the hand took hold of at one pose, and has at another."""
+    return T_world_wrist @ np.linalg.inv(T_at_grasp)
+

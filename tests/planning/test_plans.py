@@ -1,0 +1,287 @@
+"""Plans: collision-free at ten times their resolution, within limits, straight where they should be, and refused in words."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import trimesh
+import yaml
+
+import dro_grasp as dro
+from dro_grasp.cli.main import main
+from dro_grasp.planning import extra
+from dro_grasp.planning.collisions import CollisionChecker
+from dro_grasp.planning.inverse_kinematics import WristSolver
+from dro_grasp.planning.motion import STAGES, MotionPlan
+from dro_grasp.planning.paths import find_path
+from dro_grasp.planning.planner import PlanConfig, plan
+from dro_grasp.planning.timing import USED, cornered, smooth
+from dro_grasp.planning.workcell import arm_addresses, robot_spec
+from dro_grasp.simulation.protocols import PROTOCOLS
+from dro_grasp.simulation.scene import joint_addresses
+
+FINER = 10
+PLACE = (0.5, 0.1)
+
+
+@pytest.fixture(scope="module")
+def robot() -> dro.Robot:
+    return dro.load_robot("xarm7_leaphand")
+
+
+@pytest.fixture(scope="module")
+def wall(tmp_path_factory: pytest.TempPathFactory) -> dro.ObjectModel:
+    """A board between the home position and the object."""
+    board = trimesh.creation.box(extents=(0.02, 0.2, 0.3))
+    board.apply_translation((0.33, 0.1, 0.16))
+    path = tmp_path_factory.mktemp("wall") / "wall.obj"
+    board.export(path)
+    return dro.load_object(str(path))
+
+
+@pytest.fixture(scope="module")
+def standing() -> tuple[dro.ObjectModel, np.ndarray]:
+    obj, T = dro.load_object("can"), np.eye(4)
+    T[:3, 3] = *PLACE, -float(obj.cloud[:, 2].min())
+    return obj, T
+
+
+@pytest.fixture(scope="module")
+def planned(robot: dro.Robot, wall: dro.ObjectModel, standing: tuple[dro.ObjectModel, np.ndarray]) -> MotionPlan:
+    return plan(robot, *standing, obstacles=[wall], config=PlanConfig(num=24), seed=0)
+
+
+def finer(made: MotionPlan) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Time, stage, arm and hand at ten times the resolution."""
+    time = np.linspace(0, made.seconds, FINER * len(made.arm.time))
+    stage = made.stage[np.searchsorted(made.arm.time, time).clip(max=len(made.stage) - 1)]
+    arm, hand = (np.stack([np.interp(time, made.arm.time, c) for c in t.position.T], 1) for t in (made.arm, made.hand))
+    return time, stage, arm, hand
+
+
+def test_a_plan_touches_nothing_at_ten_times_its_resolution(
+    planned: MotionPlan, robot: dro.Robot, wall: dro.ObjectModel, standing: tuple[dro.ObjectModel, np.ndarray]
+) -> None:
+    """The robot and the table as plain MuJoCo has them; wall and object by signed distances of the hand's surface points."""
+    scene = robot_spec(robot, PROTOCOLS["dro"], robot.table)
+    for a, b in CollisionChecker(robot, robot.table).excluded:
+        scene.add_exclude(bodyname1=a, bodyname2=b)
+    model = scene.compile()
+    data = mujoco.MjData(model)
+    (fingers, moving), tree = joint_addresses(model, robot.hand), robot.hand.tree
+    _, stage, arm, hand = finer(planned)
+    full = hand @ tree.coupling.double().numpy().T + tree.offset.double().numpy()
+    for q, joints in zip(arm, full[:, moving], strict=True):
+        data.qpos[arm_addresses(model, robot)], data.qpos[fingers] = q, joints
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_collision(model, data)
+        pairs = [sorted(model.body(model.geom_bodyid[g]).name for g in c.geom) for c in data.contact if c.dist < 0]
+        assert all(a.startswith("hand/") and b.startswith("hand/") for a, b in pairs), pairs
+    wrist = torch.from_numpy(robot.T_world_wrist(arm)).float()
+    points = robot.hand.points(torch.from_numpy(hand).float(), wrist)
+    assert float(wall.distance_field.distances(points)[0].min()) > 0
+    obj, T = standing
+    travelling = points[torch.from_numpy(stage <= STAGES.index("shape"))]
+    in_object = travelling @ torch.from_numpy(T[:3, :3]).float() - torch.from_numpy(T[:3, 3]).float()
+    assert float(obj.distance_field.distances(in_object)[0].min()) > 0
+
+
+def test_the_check_above_sees_a_plan_that_goes_through_the_wall(
+    robot: dro.Robot, wall: dro.ObjectModel, standing: tuple[dro.ObjectModel, np.ndarray], planned: MotionPlan
+) -> None:
+    goal = planned.arm.position[planned.part("shape")][0]
+    straight = np.linspace(robot.home, goal, 200)
+    opened = torch.from_numpy(planned.hand.position[0]).float().expand(200, -1)
+    points = robot.hand.points(opened, torch.from_numpy(robot.T_world_wrist(straight)).float())
+    checker = CollisionChecker(robot, robot.table, [wall], *standing)
+    free = [checker.free(q, planned.hand.position[0], 0.0) for q in straight]
+    inside = wall.distance_field.distances(points)[0].amin(-1) < -0.003
+    assert not any(f and bool(i) for f, i in zip(free, inside, strict=True))
+
+
+def test_a_carried_object_hits_obstacles_and_leaves_the_table_in_peace(robot: dro.Robot, wall: dro.ObjectModel) -> None:
+    can, T = dro.load_object("can"), np.eye(4)
+    T[:3, 3] = 0.5, 0.1, -float(can.cloud[:, 2].min()) - 0.001
+    checker, up = CollisionChecker(robot, robot.table, [wall], can, T), np.eye(4)
+    fingers = robot.hand.canonical_joints().double().numpy()
+    assert checker.free(robot.home, fingers, moved=up, touch=True)
+    up[:3, 3] = -0.17, 0.0, 0.05
+    assert {(c.first, c.second) for c in checker.contacts(robot.home, fingers, 0.0, up, touch=True)} <= {
+        ("obstacle", "target"), ("target", "obstacle")}
+    assert not checker.free(robot.home, fingers, moved=up, touch=True)
+    up[:3, 3] = 0, 0, -0.02
+    assert not checker.free(robot.home, fingers, moved=up, touch=True)
+
+
+def test_limits_hold_by_finite_differences(planned: MotionPlan, robot: dro.Robot) -> None:
+    n = len(planned.notes.hand_joints)
+    limits = [(planned.arm, robot.velocity, robot.acceleration),
+              (planned.hand, np.full(n, robot.hand_velocity), np.full(n, robot.hand_acceleration))]
+    assert (planned.arm.position >= robot.lower).all()
+    assert (planned.arm.position <= robot.upper).all()
+    for part, velocity, acceleration in limits:
+        step = np.diff(part.time)[:, None]
+        assert (step > 0).all()
+        speed = np.diff(part.position, axis=0) / step
+        assert (np.abs(speed) <= velocity * 1.001).all()
+        assert (np.abs(part.velocity) <= velocity * 1.001).all()
+        assert (np.abs(part.acceleration) <= acceleration * 1.001).all()
+        change = np.diff(speed, axis=0) / ((step[1:] + step[:-1]) / 2)
+        assert (np.abs(change) <= acceleration * 1.1).all()
+
+
+def test_approach_and_lift_are_straight_and_stages_follow_each_other(planned: MotionPlan, robot: dro.Robot) -> None:
+    assert sorted(set(planned.stage.tolist())) == list(range(len(STAGES)))
+    assert (np.diff(planned.stage) >= 0).all()
+    assert np.allclose(planned.arm.position[0], robot.home)
+    wrist = robot.T_world_wrist(planned.arm.position)
+    grasp = np.array(planned.notes.T_world_wrist)
+    ahead = robot.hand.palm_directions(torch.from_numpy(grasp)[None].float())[0].double().numpy()
+    for stage, direction, length in (("approach", ahead, 0.1), ("lift", np.array([0, 0, 1.0]), 0.2)):
+        poses = wrist[planned.part(stage)]
+        way = poses[:, :3, 3] - poses[0, :3, 3]
+        assert np.allclose(way[-1], length * direction, atol=2e-3)
+        assert np.abs(way - (way @ direction)[:, None] * direction).max() < 2e-3
+        turned = np.einsum("nij,ij->n", poses[:, :3, :3], grasp[:3, :3])
+        assert (np.arccos(np.clip((turned - 1) / 2, -1, 1)) < 0.01).all()
+    assert np.allclose(wrist[planned.part("close")], grasp, atol=5e-3)
+
+
+def test_what_was_dropped_adds_up(planned: MotionPlan) -> None:
+    notes = planned.notes
+    assert notes.goals >= 1
+    assert sum(notes.dropped.values()) + notes.goals <= notes.grasps == 24
+    assert planned.lines()[0].startswith("24 grasps: ")
+
+
+def test_a_plan_file_gives_the_plan_back_and_other_files_are_refused(planned: MotionPlan, tmp_path: Path) -> None:
+    path = tmp_path / "plan.npz"
+    planned.save(path)
+    again = MotionPlan.load(path)
+    assert again.notes == planned.notes
+    assert (again.hand.velocity == planned.hand.velocity).all()
+    assert again.lines() == planned.lines()
+    (tmp_path / "half.npz").write_bytes(path.read_bytes()[:5000])
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    for name in ("half.npz", "other.npz", "none.npz"):
+        with pytest.raises(dro.DroGraspError, match=f"{name} is no plan file"):
+            MotionPlan.load(tmp_path / name)
+
+
+def test_drivers_get_every_target_and_controllers_the_same_motion(planned: MotionPlan) -> None:
+    points = list(planned.points(rate=50))
+    assert len(points) == int(np.ceil(planned.seconds * 50)) + 1
+    assert [p.stage for p in points][0::len(points) - 1] == ["reach", "lift"]
+    assert np.allclose(points[-1].arm, planned.arm.position[-1])
+    messages = yaml.safe_load(dro.trajectory_yaml(planned))
+    assert messages["arm"]["joint_names"] == list(planned.notes.arm_joints)
+    last = messages["hand"]["points"][-1]
+    assert np.allclose(last["positions"], planned.hand.position[-1], atol=1e-6)
+    end = last["time_from_start"]
+    assert end["sec"] + 1e-9 * end["nanosec"] == pytest.approx(planned.seconds, abs=1e-6)
+    rows = list(csv.DictReader(io.StringIO(dro.trajectory_csv(planned))))
+    assert len(rows) == len(planned.stage)
+    assert float(rows[-1]["arm/joint1"]) == pytest.approx(planned.arm.position[-1, 0], abs=1e-6)
+
+
+def test_inverse_kinematics_reaches_what_forward_kinematics_reached_and_nothing_beyond(robot: dro.Robot) -> None:
+    solver, (lower, upper) = WristSolver(robot), robot.working_range
+    generator = np.random.default_rng(3)
+    seeds = [robot.home, *generator.uniform(lower, upper, (8, 7))]
+    wanted = robot.T_world_wrist(generator.uniform(lower, upper, (10, 7)))
+    found = [solver.solve(T, seeds) for T in wanted]
+    assert sum(q is not None for q in found) >= 8
+    for q, T in zip(found, wanted, strict=True):
+        if q is not None:
+            assert np.abs(robot.T_world_wrist(q) - T)[:3, 3].max() < 1e-3
+            assert ((q >= lower) & (q <= upper)).all()
+    far = np.eye(4)
+    far[0, 3] = robot.longest_reach
+    assert solver.solve(far, seeds[:2]) is None
+
+
+def test_a_path_goes_round_a_wall_to_the_goal_that_can_be_reached() -> None:
+    def free(q: np.ndarray) -> bool:
+        return not (abs(q[0]) < 0.2 and q[1] < 0.6) and not (0.9 < np.abs(q - [0.7, -0.7]).max() * 5 < 1.1)
+
+    low, high = np.array([-1.0, -1.0]), np.array([1.0, 1.0])
+    start, goals = np.array([-0.8, -0.8]), np.array([[0.7, -0.7], [0.8, 0.2]])
+    found = find_path(start, goals, free, low, high, 2.0, 0)
+    assert found is not None
+    assert found.goal == 1  # the other one is walled in
+    assert np.allclose(found.waypoints[[0, -1]], [start, goals[1]])
+    assert all(free(q) for q in found.waypoints)
+    assert found.waypoints[:, 1].max() > 0.6
+    again = find_path(start, goals, free, low, high, 2.0, 0)
+    assert again is not None
+    assert np.array_equal(again.waypoints, found.waypoints)
+    assert find_path(start, goals[:1], free, low, high, 0.3, 0) is None
+
+
+def test_one_joint_takes_the_time_that_a_trapezoid_takes() -> None:
+    velocity, acceleration, way = 1.5, 4.0, 2.0
+    v, a = USED * velocity, USED * acceleration
+    for timed in (smooth, cornered):
+        made = timed(np.linspace(0, way, 9)[:, None], np.array([velocity]), np.array([acceleration]))
+        assert made.seconds == pytest.approx(way / v + v / a, rel=0.02)
+        assert np.allclose(made.velocity[[0, -1]], 0, atol=1e-6)
+
+
+def test_corners_are_stops_and_nothing_leaves_the_lines() -> None:
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
+    made = cornered(corners, np.ones(2), np.ones(2))
+    assert np.abs(made.position - made.position.clip(0, 1)).max() < 1e-9
+    assert np.minimum(np.abs(made.position[:, 1]), np.abs(made.position[:, 0] - 1)).max() < 1e-9
+
+
+BAD = {
+    "far away": (["--at", "3", "0"], "farther than the arm and hand are long"),
+    "in the robot": (["--at", "0.0", "0.0"], "while the robot is at home"),
+    "under the table": (["--pose", "low.json"], "below the table"),
+    "no rigid camera": (["--camera", "squashed.json"], "is not a rotation"),
+    "two places": (["--at", "0.5", "0", "--pose", "low.json"], "give one of them"),
+    "no grasps": (["--num", "0"], "num is 0"),
+    "no folder": (["--csv", "nowhere/plan.csv"], "no folder"),
+}
+
+
+@pytest.mark.parametrize(("options", "said"), BAD.values(), ids=BAD)
+def test_bad_input_is_refused_in_words_and_nothing_is_written(
+    options: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    low, squashed = np.eye(4), np.diag([1.0, 2.0, 1.0, 1.0])
+    low[:3, 3] = 0.5, 0.0, -1.0
+    Path("low.json").write_text(json.dumps({"frame": "world", "T_frame_object": low.tolist()}))
+    Path("squashed.json").write_text(json.dumps({"frame": "world", "T_frame_camera": squashed.tolist()}))
+    before = sorted(tmp_path.iterdir())
+    assert main(["plan", "--robot", "xarm7_leaphand", "--object", "can", "--output", "plan.npz", *options]) == 2
+    assert said in capsys.readouterr().err
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_without_the_extra_planning_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(extra, "find_spec", lambda name: None if name == "ompl" else object())
+    assert main(["plan", "--robot", "xarm7_leaphand", "--object", "can"]) == 2
+    assert "ompl; run pip install 'dro-grasp[arm]'" in capsys.readouterr().err
+
+
+def test_every_other_command_works_without_the_extra() -> None:
+    import subprocess
+    import sys
+
+    blocked = "".join(f"sys.modules[{name!r}] = None; " for name in extra.PACKAGES)
+    code = (f"import sys; {blocked}import dro_grasp as dro; from dro_grasp.cli.main import main; "
+            "dro.PlanConfig, dro.MotionPlan.load; sys.exit(main(['robot', 'check', 'xarm7_leaphand']))")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
