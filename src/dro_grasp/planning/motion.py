@@ -135,8 +135,9 @@ class MotionPlan:
             raise PlanError(f"{path} is no plan file ({error}); `dro-grasp plan` writes them") from error
         if header.pop("format_version", None) != FORMAT or tuple(header.pop("stages", ())) != STAGES:
             raise PlanError(f"{path} is a plan file of another version; plan again")
-        names = {key: tuple(header[key]) for key in ("arm_joints", "hand_joints")}
-        return MotionPlan(PlanNotes(**(header | names)), stage, Trajectory(time, *rows[:3]), Trajectory(time, *rows[3:]))
+        for key in ("arm_joints", "hand_joints"):
+            header[key] = tuple(header[key])
+        return MotionPlan(PlanNotes(**header), stage, Trajectory(time, *rows[:3]), Trajectory(time, *rows[3:]))
 
 
 def dropped_in_words(grasps: int, dropped: dict[str, int]) -> str:

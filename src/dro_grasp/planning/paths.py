@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -87,12 +88,12 @@ def densified(corners: Float[np.ndarray, "k n"], spacing: float) -> Float[np.nda
     return np.concatenate([*pieces, corners[-1:]])
 
 
-def _state(space: ob.RealVectorStateSpace, q: Float[np.ndarray, " n"]) -> ob.State:
-    state = space.allocState()
+def _state(space: ob.RealVectorStateSpace, q: Float[np.ndarray, " n"]) -> Any:
+    state: Any = space.allocState()
     for i, value in enumerate(q.tolist()):
         state[i] = value
     return state
 
 
-def _array(state: ob.State, n: int) -> Float[np.ndarray, " n"]:
+def _array(state: Any, n: int) -> Float[np.ndarray, " n"]:
     return np.array([state[i] for i in range(n)])
