@@ -16,13 +16,13 @@ from dro_grasp.devices import Stopwatch
 from dro_grasp.errors import OptionError, PlanError, RobotError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.planning.candidates import Directions, grasps_in_world
 from dro_grasp.planning.collisions import TARGET, CollisionChecker, open_hand
 from dro_grasp.planning.extra import require_arm_extra
 from dro_grasp.planning.motion import STAGES, MotionPlan, PlanNotes, dropped_in_words
 from dro_grasp.planning.reachability import Feasible, Postures, Reachability, ReachConfig, carried
 from dro_grasp.planning.robot import Robot
+from dro_grasp.planning.standing import upright
 from dro_grasp.planning.timing import Trajectory, cornered, joined, smooth, standing
 from dro_grasp.predictor import GraspPredictor
 
@@ -92,7 +92,7 @@ def plan(
     task.check_start()
     if grasps is None:
         with task.watch("grasps"):
-            grasps = grasps_in_world(predictor or GraspPredictor(), GraspProblem(robot.hand, obj), task.T_world_object,
+            grasps = grasps_in_world(predictor or GraspPredictor(), robot.hand, task.obj, task.T_world_object,
                                      task.config.num, task.config.directions, task.height, seed)
     return task.run(grasps)
 
@@ -104,11 +104,12 @@ class _Task:
         self, robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"], obstacles: Sequence[ObjectModel],
         config: PlanConfig, seed: int,
     ) -> None:
-        self.robot, self.obj, self.T_world_object, self.config, self.seed = robot, obj, T_world_object, config, seed
+        self.robot, self.config, self.seed = robot, config, seed
+        self.obj, self.T_world_object = upright(obj, T_world_object)
         self.watch = Stopwatch("grasps", "reach", "path", "timing")
-        self.checker = CollisionChecker(robot, robot.table, obstacles, obj, T_world_object)
+        self.checker = CollisionChecker(robot, robot.table, obstacles, self.obj, self.T_world_object)
         self.height = None if robot.table is None else robot.table.height
-        self.reach = Reachability(robot, self.checker, obj, self.height, config.reach, seed)
+        self.reach = Reachability(robot, self.checker, self.obj, self.height, config.reach, seed)
         self.opened = open_hand(robot)
 
     @property

@@ -1,0 +1,37 @@
+"""Objects as they stand in the world: turned until their z axis points up, as constraints on grasps want them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from dro_grasp.objects.cache import content_hash
+from dro_grasp.objects.shape import ObjectModel
+
+UPRIGHT = 1e-6
+"""Largest deviation of an upright object's z axis from the world's (ours)."""
+
+
+def upright(
+    obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"]
+) -> tuple[ObjectModel, Float[np.ndarray, "4 4"]]:
+    """The same object in the same place, with a frame whose z axis points up."""
+    if np.abs(T_world_object[2, :3] - (0, 0, 1)).max() < UPRIGHT:
+        return obj, T_world_object
+    placed = np.eye(4)
+    placed[:3, 3] = T_world_object[:3, 3]
+    return turned(obj, T_world_object[:3, :3]), placed
+
+
+def turned(obj: ObjectModel, R: Float[np.ndarray, "3 3"]) -> ObjectModel:
+    """An object turned about the origin of its frame."""
+    cloud, normals = ((v.astype(np.float64) @ R.T).astype(np.float32) for v in (obj.cloud, obj.cloud_normals))
+    vertices = None if obj.vertices is None else obj.vertices @ R.T
+    faces = np.zeros((0, 3), np.int32) if obj.faces is None else obj.faces
+    shape = cloud if vertices is None else vertices
+    return replace(
+        obj, cloud=cloud, cloud_normals=normals, vertices=vertices, centre_of_mass=R @ obj.centre_of_mass,
+        inertia=R @ obj.inertia @ R.T, sha256=content_hash(shape.astype(np.float32), faces.astype(np.int32)),
+        exact_parts=None if obj.is_cloud else tuple((v @ R.T, f) for v, f in obj.parts))
