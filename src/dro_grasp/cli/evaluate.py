@@ -13,6 +13,7 @@ import tyro
 from dro_grasp.cli.inputs import Flag, ProtocolName, load_grasps, optional
 from dro_grasp.cli.output import print_result, progress_bar, say_aside
 from dro_grasp.grasps.sources import hand_of, object_of
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL
 
 if TYPE_CHECKING:
     from dro_grasp.grasps.batch import GraspBatch
@@ -31,7 +32,7 @@ class Evaluate:
 
     file: tyro.conf.Positional[Path]
     """Grasp file."""
-    protocol: ProtocolName = "dro"
+    protocol: ProtocolName = DEFAULT_PROTOCOL
     """The trial."""
     friction: Annotated[float | None, optional("MU", "the protocol's")] = None
     """Friction coefficient between hand and object; the official release has 3."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from dro_grasp.cli.inputs import Flag, ProtocolName, optional
 from dro_grasp.cli.output import print_json, print_table, progress_bar, say, say_aside
 from dro_grasp.grasps.sources import with_sources
-from dro_grasp.simulation.protocols import PROTOCOLS
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -67,7 +67,7 @@ class Generate:
     """Name of shipped weights (see `dro-grasp weights list`) or the path of a weights file."""
     protocol: Annotated[
         ProtocolName | Literal["none"] | None,
-        optional(f"{{{','.join(PROTOCOLS)},none}}", "dro for a mesh, none for a bare point cloud"),
+        optional(f"{{{','.join(PROTOCOLS)},none}}", f"{DEFAULT_PROTOCOL} for a mesh, none for a bare point cloud"),
     ] = None
     """Trial of each grasp."""
     only_successful: Flag = False
@@ -172,7 +172,7 @@ class Generate:
         return load_scan(Path(name).expanduser(), camera.T.double().numpy(), self.scale)
 
     def _protocol(self, obj: ObjectModel) -> str:
-        return self.protocol or ("none" if obj.is_cloud else "dro")
+        return self.protocol or ("none" if obj.is_cloud else DEFAULT_PROTOCOL)
 
     def _evaluate(self, problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
         from dro_grasp.pipeline.stages import evaluate

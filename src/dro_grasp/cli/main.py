@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import traceback
 from collections.abc import Sequence
@@ -33,6 +34,10 @@ BAD_INPUT = 2
 """Exit code after invalid input."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C: 128 plus the number of SIGINT, as shells have it."""
+
+PATIENCE = ("OMP_WAIT_POLICY", "PASSIVE")
+"""Environment variable that lets PyTorch's threads sleep while they wait, which they otherwise spend spinning: beside other
+programs at work that takes several times as long. It counts if it is set before PyTorch is loaded."""
 
 named = tyro.conf.subcommand
 Command = (
@@ -83,6 +88,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     verbose = "--verbose" in arguments
     arguments = [a for a in arguments if a != "--verbose"] or ["--help"]
     command = parse(arguments)
+    os.environ.setdefault(*PATIENCE)
     try:
         return command.run()
     except DroGraspError as error:

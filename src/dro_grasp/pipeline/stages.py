@@ -18,7 +18,7 @@ from dro_grasp.optimization.starts import StartConfig, angle_to_arc
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize_with
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.ranking.score import ScoreConfig, score_grasps
-from dro_grasp.simulation.protocols import Protocol
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
 from dro_grasp.simulation.trial import settle, simulate
 
 FARTHEST_DIRECTION = math.radians(20.0)
@@ -79,7 +79,7 @@ def scored(problem: GraspProblem, grasps: GraspBatch, config: ScoreConfig | None
 
 
 def evaluate(
-    problem: GraspProblem, grasps: GraspBatch, protocol: str | Protocol = "dro",
+    problem: GraspProblem, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL,
     progress: Callable[[int, int], None] | None = None, workers: int | None = None,
 ) -> GraspBatch:
     """Grasps with the outcome of a trial each.

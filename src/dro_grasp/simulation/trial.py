@@ -21,7 +21,7 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.contacts import Penetration, contact_mask, count_fingers, find_contact_links, measure_penetration
 from dro_grasp.simulation.outcome import DIRECTIONS, GIVE_UP, Failure, Measurements, TrialResult, verdict
 from dro_grasp.simulation.perturbation import draw
-from dro_grasp.simulation.protocols import Protocol, protocol as find_protocol
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol, protocol as find_protocol
 from dro_grasp.simulation.rollout import Rollout
 from dro_grasp.simulation.scene import Scene, cached_scene
 
@@ -32,7 +32,7 @@ CHUNK = 64
 
 
 def simulate(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = "dro", *, workers: int | None = None,
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *, workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> TrialResult:
     """Evaluate grasps of one object in MuJoCo.
@@ -66,7 +66,7 @@ def simulate(
 
 
 def settle(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = "dro", *, workers: int | None = None
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *, workers: int | None = None
 ) -> GraspBatch:
     """The same grasps, relabelled with the poses of hand and object after closing.
 
@@ -96,7 +96,7 @@ def settle(
 
 
 def record(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, index: int, protocol: str | Protocol = "dro", *, stride: int = 10
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, index: int, protocol: str | Protocol = DEFAULT_PROTOCOL, *, stride: int = 10
 ) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames n_dof"]]:
     """Frames of one grasp's trial, as `simulate` runs it: it ends where the trial ends.
 

@@ -28,7 +28,7 @@ from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import evaluate
 from dro_grasp.predictor import GraspPredictor, GraspRequest, Method
-from dro_grasp.simulation.protocols import PROTOCOLS
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 from dro_grasp.simulation.trial import record
 from dro_grasp.viewer.app import POSTURES, Posture, describe, postures_of
 from dro_grasp.viewer.pictures import outcome
@@ -92,8 +92,9 @@ class Studio(ServedPage):
         self._folder.cleanup()
 
     def generate(
-        self, hand: str, obj: str, num: int = 16, direction: str = ANY, temperature: float | None = None,
-        protocol: str = "strict", candidates: int = 4, method: Method = "auto",
+        self, hand: str, obj: str, num: int = GraspRequest.num, direction: str = ANY, temperature: float | None = None,
+        protocol: str = DEFAULT_PROTOCOL, candidates: int = GraspRequest.candidates,
+        method: Method = GraspRequest.method,
     ) -> ShownGrasps:
         """Predict, refine, rank and evaluate, then show the best; bare clouds get no trial.
 
@@ -127,21 +128,25 @@ class Studio(ServedPage):
             kinds = ".stl,.obj,.ply,.glb,.off,.npy,.pcd"
             object_file = gui.add_upload_button("Upload an object (STL, OBJ, PLY)", mime_type=kinds)
         with gui.add_folder("Generate"):
-            self.num = gui.add_slider("Grasps", 1, LARGEST_CALL, 1, 16)
+            self.num = gui.add_slider("Grasps", 1, LARGEST_CALL, 1, GraspRequest.num)
             self.method = gui.add_dropdown(
-                "Method", get_args(Method), initial_value="auto", hint="auto: the optimiser helps where the network is unsure.")
+                "Method", get_args(Method), initial_value=GraspRequest.method,
+                hint="auto: the optimiser helps where the network is unsure.")
             self.candidates = gui.add_slider(
-                "Candidates", 1, MOST_CANDIDATES, 1, 4, hint="Candidates proposed for each grasp; the best by score are kept.")
+                "Candidates", 1, MOST_CANDIDATES, 1, GraspRequest.candidates,
+                hint="Candidates proposed for each grasp; the best by score are kept.")
             self.direction = gui.add_dropdown(
                 "Palm direction", (ANY, *HALF_AXES), initial_value=ANY, hint="-z grasps from above.")
+            self.usual = gui.add_checkbox("Usual diversity", True, hint="1 for a mesh, less for a bare point cloud.")
             self.temperature = gui.add_slider(
-                "Diversity", 0.0, 1.0, 0.05, 1.0, hint="0: the likeliest grasp of each placement.")
-            self.protocol = gui.add_dropdown("Trial", tuple(PROTOCOLS), initial_value="strict")
+                "Diversity", 0.0, 1.0, 0.05, 1.0, disabled=True, hint="0: the likeliest grasp of each placement.")
+            self.protocol = gui.add_dropdown("Trial", tuple(PROTOCOLS), initial_value=DEFAULT_PROTOCOL)
             self.button = gui.add_button("Generate", color="green")
         self.status = gui.add_markdown("")
         hand_file.on_upload(lambda _: self._guarded(lambda: self._take(hand_file.value, self.hand)))
         object_file.on_upload(lambda _: self._guarded(lambda: self._take(object_file.value, self.object)))
         self.button.on_click(lambda _: self._guarded(self._generate))
+        self.usual.on_update(lambda _: setattr(self.temperature, "disabled", self.usual.value))
 
     def _add_display(self) -> None:
         gui = self.server.gui
@@ -195,8 +200,8 @@ class Studio(ServedPage):
         self._say("Generating ...")
         begin = time.perf_counter()
         made = self.generate(
-            self.hand.value, self.object.value, int(self.num.value), self.direction.value, float(self.temperature.value),
-            self.protocol.value, int(self.candidates.value), self.method.value)
+            self.hand.value, self.object.value, int(self.num.value), self.direction.value,
+            None if self.usual.value else float(self.temperature.value), self.protocol.value, int(self.candidates.value), self.method.value)
         held = "" if made.obj.is_cloud else (
             f", **{int(made.refined.success.sum())}** held under *{self.protocol.value}*")
         self._say(f"{len(made.refined)} grasps{held}; {time.perf_counter() - begin:.1f} s")

@@ -1,0 +1,70 @@
+"""What is not asked for is the same on the command line, in Python and in the viewer."""
+
+from __future__ import annotations
+
+import inspect
+import os
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from dro_grasp.cli.evaluate import Evaluate
+from dro_grasp.cli.generate import Generate
+from dro_grasp.cli.main import PATIENCE, main
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.pipeline.stages import evaluate
+from dro_grasp.predictor import GraspPredictor, GraspRequest
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL
+from dro_grasp.simulation.trial import record, settle, simulate
+from dro_grasp.viewer.studio import Studio
+from tests.helpers.browser import free_port
+from tests.helpers.weights import untrained_weights
+
+REQUESTS = {"num": 16, "seed": 0, "direction": None, "table": None, "candidates": 4, "refine": True, "temperature": None,
+            "method": "auto"}
+
+
+def default(function: Callable[..., Any], name: str) -> Any:
+    return inspect.signature(function).parameters[name].default
+
+
+def test_a_request_has_the_same_defaults_everywhere() -> None:
+    for name, value in REQUESTS.items():
+        assert getattr(GraspRequest(), name) == value
+        assert default(Generate, name) == value, f"generate --{name}"
+    assert {default(GraspPredictor.predict, name) == REQUESTS[name] for name in ("num", "seed")} == {True}
+    for name in ("num", "candidates", "temperature", "method"):
+        assert default(Studio.generate, name) == REQUESTS[name], name
+
+
+@pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")
+def test_the_viewer_asks_for_what_the_command_asks(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    studio = Studio("gripper3", "sphere", str(untrained_weights(tmp_path)), port=free_port())
+    asked = []
+    monkeypatch.setattr(studio.predictor, "run", lambda problem, request, *_: asked.append(request) or 1 / 0)
+    try:
+        with pytest.raises(ZeroDivisionError):
+            studio._generate()
+        assert asked == [GraspRequest()]
+        assert studio.protocol.value == DEFAULT_PROTOCOL
+    finally:
+        studio.stop()
+
+
+@pytest.mark.parametrize("function", [simulate, settle, record, evaluate, Evaluate, Studio.generate])
+def test_trials_are_strict_unless_another_protocol_is_named(function: Callable[..., Any]) -> None:
+    assert default(function, "protocol") == DEFAULT_PROTOCOL == "strict"
+
+
+def test_so_are_those_of_generate() -> None:
+    assert Generate(hand="gripper3", object="sphere")._protocol(load_object("sphere")) == "strict"
+
+
+def test_waiting_threads_sleep_unless_the_user_says_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(PATIENCE[0], raising=False)
+    assert main(["hands", "--json"]) == 0
+    assert os.environ[PATIENCE[0]] == "PASSIVE"
+    monkeypatch.setenv(PATIENCE[0], "ACTIVE")
+    assert main(["hands", "--json"]) == 0
+    assert os.environ[PATIENCE[0]] == "ACTIVE"
