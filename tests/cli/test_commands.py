@@ -152,7 +152,7 @@ def test_generate_reports_and_saves_what_it_counts(generate, tmp_path: Path) -> 
     report = generate("--output", str(path), method="auto")
     assert report.keys() >= KEYS
     assert set(report["seconds"]) == {"load", "network", "decode", "optimise", "refine", "rank", "trial"}
-    assert (report["num"], report["protocol"]) == (3, "dro")
+    assert (report["num"], report["protocol"]) == (3, "strict")
     assert report["candidates"] >= 12  # four of the network for each, and those of the optimiser
     assert report["success_rate"] == pytest.approx(report["success"] / 3)
     grasps = GraspBatch.load(path)

@@ -15,9 +15,9 @@ from dro_grasp.grasps.controller import ControllerConfig
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation import trial as trials
-from dro_grasp.simulation.outcome import Failure
-from dro_grasp.simulation.protocols import protocol
-from dro_grasp.simulation.trial import TrialResult, record, settle, simulate
+from dro_grasp.simulation.outcome import GIVE_UP, Failure
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, protocol
+from dro_grasp.simulation.trial import TrialResult, held, record, settle, simulate
 from tests.helpers.claw import ball, claw, grasps_of, power_grasp, wrist_below
 
 
@@ -52,6 +52,28 @@ def test_power_grasp_holds_a_ball(hand, obj, name):
     assert (result.displacement[:, -1] < 0.02).all()
     assert (result.contacts >= 3).all()
     assert result.protocol == f"{name}/1"
+
+
+def test_held_grasps_are_where_the_recorded_trial_has_them_after_closing(hand, obj):
+    grasps = power_grasp(hand, obj, 2)
+    grasps = grasps.with_trial(simulate(hand, obj, grasps))
+    closed, rules = held(hand, obj, grasps), protocol(DEFAULT_PROTOCOL)
+    assert closed.success.tolist() == grasps.success.tolist() and closed.protocol == grasps.protocol
+    assert (closed.joints - grasps.joints).abs().max() > 0.01
+    stride = 10
+    end = round(rules.closing_time / rules.timestep) // stride
+    for i in range(2):
+        poses, joints = record(hand, obj, grasps, i, stride=stride)
+        torch.testing.assert_close(closed.joints[i], joints[end], atol=1e-5, rtol=0)
+        torch.testing.assert_close(closed.T_object_wrist[i], torch.linalg.inv(poses[end]), atol=1e-5, rtol=0)
+    assert len(held(hand, obj, grasps[:0])) == 0
+
+
+def test_a_grasp_that_throws_the_object_away_is_not_drawn_without_it(hand, obj):
+    wild = replace(protocol("dro"), name="wild", stiffness=3e4, damping=0.0, force_limit=1e4)
+    grasps = power_grasp(hand, obj, 2)
+    assert simulate(hand, obj, grasps, wild).closing_shift.nan_to_num(math.inf).min() > GIVE_UP
+    assert torch.equal(held(hand, obj, grasps, wild).joints, grasps.joints)
 
 
 def test_hand_30_cm_away_scores_nothing(hand, obj):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -79,6 +79,8 @@ class Picture:
     """Opacity of the object; below 1 the hand shows through it."""
     contacts: Flag = False
     """Mark contacts in red."""
+    posture: Literal["held", "grasp"] = "held"
+    """Draw hand and object after the hand has closed, or the grasp from which it closes."""
     only_successful: Flag = False
     """Draw only grasps that passed their trial."""
     hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
@@ -105,7 +107,7 @@ class Picture:
         if (pixels := shown * self.size[0] * self.size[1]) > MAX_PIXELS:
             raise OptionError(f"{shown} pictures of {self.size[0]} x {self.size[1]} are {pixels / 1e6:.0f} million pixels; a "
                               f"sheet has at most {MAX_PIXELS // 10**6} million: give a smaller --size or --count")
-        style = PictureStyle(self.size, self.opacity, self.contacts)
+        style = PictureStyle(self.size, self.opacity, self.contacts, self.posture)
         draw_grasps(hand, obj, grasps, self.output, self.count, self.columns, style)
         say(f"picture: {self.output}")
         return 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -11,8 +12,10 @@ from jaxtyping import Bool, Float, Int, UInt8
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.rendering.meshes import Colour, Mesh, corner_normals, unit
 
-PAIRS_AT_ONCE = 4_000_000
-"""Pairs of triangle and pixel that are tested together (ours): bounds the memory."""
+ROWS_AT_ONCE = 200_000
+"""Rows of pixels, of all triangles, that are drawn together (ours): bounds the memory."""
+SLIVER = 1e-9
+"""Twice the area of a triangle below which it is not drawn [pixels^2] (ours)."""
 WHITE = (1.0, 1.0, 1.0)
 """Default background: red, green, blue."""
 
@@ -53,6 +56,16 @@ class _Triangles:
     visible: Bool[np.ndarray, " f"]
     """Whether the triangle lies before the camera."""
 
+    @cached_property
+    def shares(self) -> Float[np.ndarray, "3 3 f"]:
+        """Coefficients (of x, of y, constant) of each corner's barycentric coordinate over the picture."""
+        return _barycentric(self.screen)
+
+    @cached_property
+    def depths(self) -> Float[np.ndarray, "3 f"]:
+        """Coefficients (of x, of y, constant) of the inverse depth over the picture, where it is linear."""
+        return np.einsum("ckf,fk->cf", self.shares, self.screen[..., 2])
+
 
 @dataclass(frozen=True)
 class _Canvas:
@@ -60,15 +73,15 @@ class _Canvas:
 
     width: int
     height: int
-    colours: Float[np.ndarray, "samples 3"]
-    depth: Float[np.ndarray, " samples"]
-    """Depth of the nearest triangle [m]."""
+    inverse: Float[np.ndarray, " samples"]
+    """Inverse depth of the nearest triangle [1/m]; 0 where there is none."""
+    face: Int[np.ndarray, " samples"]
+    """That triangle, where there is one."""
 
     @staticmethod
-    def empty(width: int, height: int, background: Colour) -> _Canvas:
+    def empty(width: int, height: int) -> _Canvas:
         """A canvas with nothing drawn on it."""
-        colours = np.broadcast_to(np.asarray(background, np.float32), (height * width, 3)).copy()
-        return _Canvas(width, height, colours, np.full(height * width, np.inf, np.float32))
+        return _Canvas(width, height, np.zeros(height * width), np.zeros(height * width, np.int64))
 
 
 def render(
@@ -81,14 +94,17 @@ def render(
         oversampling: Samples per pixel and axis; 2 smooths the edges.
     """
     style = style or Style()
-    canvas = _Canvas.empty(width * oversampling, height * oversampling, background)
+    canvas = _Canvas.empty(width * oversampling, height * oversampling)
     triangles = _gather(meshes, camera, canvas, style)
-    for boxes in _pixel_boxes(triangles, canvas):
-        _draw(boxes, triangles, canvas, style)
-    picture = canvas.colours.reshape(canvas.height, canvas.width, 3)
-    picture *= outlines(canvas.depth.reshape(canvas.height, canvas.width), oversampling, style)[..., None]
-    picture = picture.reshape(height, oversampling, width, oversampling, 3).mean((1, 3))
-    return (picture.clip(0, 1) * 255 + 0.5).astype(np.uint8)
+    rows = _rows(triangles, canvas)
+    for start in range(0, len(rows), ROWS_AT_ONCE):
+        _draw(rows[start : start + ROWS_AT_ONCE], triangles, canvas)
+    picture = _shaded(triangles, canvas, background, style).reshape(canvas.height, canvas.width, 3)
+    with np.errstate(divide="ignore"):
+        depth = (1 / canvas.inverse).astype(np.float32)
+    picture *= outlines(depth.reshape(canvas.height, canvas.width), oversampling, style)[..., None]
+    picture = sum(picture[i::oversampling, j::oversampling] for i in range(oversampling) for j in range(oversampling))
+    return ((picture / oversampling**2).clip(0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def _gather(meshes: Sequence[Mesh], camera: Camera, canvas: _Canvas, style: Style) -> _Triangles:
@@ -106,68 +122,84 @@ def _gather(meshes: Sequence[Mesh], camera: Camera, canvas: _Canvas, style: Styl
     return _Triangles(together, np.concatenate(normals), np.concatenate(colours), screen, visible)
 
 
-def _pixel_boxes(triangles: _Triangles, canvas: _Canvas) -> list[Int[np.ndarray, "_ 5"]]:
-    """Bounding boxes of the visible triangles in the picture, in groups of bounded size: rows (triangle, x, y, nx, ny)."""
-    flat, w, h = triangles.screen[..., :2], canvas.width, canvas.height
-    low = np.ceil(flat.min(1) - 0.5).clip(0, (w, h)).astype(np.int64)
-    high = np.floor(flat.max(1) - 0.5).clip(-1, (w - 1, h - 1)).astype(np.int64)
-    size = np.maximum(high - low + 1, 0)
-    area = size.prod(1) * triangles.visible
-    index = area.nonzero()[0]
-    boxes = np.concatenate([index[:, None], low[index], size[index]], 1)
-    groups = np.cumsum(area[index]) // PAIRS_AT_ONCE
-    return [boxes[groups == g] for g in np.unique(groups)]
+def _rows(triangles: _Triangles, canvas: _Canvas) -> Int[np.ndarray, "_ 2"]:
+    """The rows of pixels that each visible triangle may cover: (triangle, y)."""
+    y = triangles.screen[..., 1]
+    low = np.ceil(y.min(1) - 0.5).clip(0, canvas.height).astype(np.int64)
+    high = np.floor(y.max(1) - 0.5).clip(-1, canvas.height - 1).astype(np.int64)
+    face, within = _runs(np.where(triangles.visible, high - low + 1, 0))
+    return np.stack([face, low[face] + within], 1)
 
 
-def _draw(boxes: Int[np.ndarray, "boxes 5"], triangles: _Triangles, canvas: _Canvas, style: Style) -> None:
-    """Test every pixel of every box, keep the nearest hits, and shade them onto the canvas."""
-    # One row per pair of box and pixel: `within` counts the pixels of a box from 0.
-    counts = boxes[:, 3] * boxes[:, 4]
-    owner = np.repeat(np.arange(len(boxes)), counts)
-    within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    x = boxes[owner, 1] + within % boxes[owner, 3]
-    y = boxes[owner, 2] + within // boxes[owner, 3]
-    face = boxes[owner, 0]
-    share, inside = _barycentric(triangles.screen, face, x + 0.5, y + 0.5)
-    face, share, pixel = face[inside], share[inside], (y * canvas.width + x)[inside]
-    # Inverse depth, not depth, is linear in the picture: interpolate it, and correct the shares for perspective.
-    inverse = triangles.screen[face, :, 2] * share
-    distance = (1 / inverse.sum(1)).astype(np.float32)
-    np.minimum.at(canvas.depth, pixel, distance)
-    nearest = distance <= canvas.depth[pixel]
-    face, pixel = face[nearest], pixel[nearest]
-    share = inverse[nearest] * distance[nearest, None]
-    points, normals = ((of[face] * share[..., None]).sum(1) for of in (triangles.corners, triangles.normals))
-    canvas.colours[pixel] = shade(points, normals, triangles.colours[face], style)
+def _runs(counts: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, " total"], Int[np.ndarray, " total"]]:
+    """For each of `counts[i]` entries of every i, one i after the other: i, and its place among them from 0."""
+    counts = np.maximum(counts, 0)
+    owner = np.repeat(np.arange(len(counts)), counts)
+    return owner, np.arange(len(owner)) - (np.cumsum(counts) - counts)[owner]
 
 
-def _barycentric(
-    screen: Float[np.ndarray, "f 3 3"], face: Int[np.ndarray, " pairs"],
-    x: Float[np.ndarray, " pairs"], y: Float[np.ndarray, " pairs"],
-) -> tuple[Float[np.ndarray, "pairs 3"], Bool[np.ndarray, " pairs"]]:
-    """Barycentric coordinates of pixel centres in their triangles' pictures, and whether they lie inside."""
-    a, b, c = (screen[:, k, :2] for k in range(3))
-    twice = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])
-    scale = np.where(np.abs(twice) > 1e-12, 1 / np.where(twice == 0, 1, twice), 0)
-    u = ((b[face, 0] - x) * (c[face, 1] - y) - (c[face, 0] - x) * (b[face, 1] - y)) * scale[face]
-    v = ((c[face, 0] - x) * (a[face, 1] - y) - (a[face, 0] - x) * (c[face, 1] - y)) * scale[face]
-    inside = (u >= 0) & (v >= 0) & (u + v <= 1) & (scale[face] != 0)
-    return np.stack([u, v, 1 - u - v], 1), inside
+def _draw(rows: Int[np.ndarray, "rows 2"], triangles: _Triangles, canvas: _Canvas) -> None:
+    """Find the span of pixels of every row that its triangle covers, and keep the nearest triangles."""
+    face, y = rows.T
+    # A pixel is inside where its three barycentric coordinates, linear in x along a row, are not negative.
+    slope, of_y, constant = triangles.shares[..., face]
+    start = of_y * (y + 0.5) + constant
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossing = -start / slope
+    left = np.where(slope > 0, crossing, np.where((slope == 0) & (start < 0), np.inf, -np.inf)).max(0)
+    right = np.where(slope < 0, crossing, np.inf).min(0)
+    first = np.ceil(left - 0.5).clip(0, canvas.width).astype(np.int64)
+    last = np.floor(right - 0.5).clip(-1, canvas.width - 1).astype(np.int64)
+    row, within = _runs(last - first + 1)
+    x = first[row] + within
+    of_x, of_y, constant = triangles.depths[:, face]
+    inverse = of_x[row] * (x + 0.5) + (of_y * (y + 0.5) + constant)[row]
+    pixel = (y * canvas.width)[row] + x
+    np.maximum.at(canvas.inverse, pixel, inverse)
+    nearest = inverse >= canvas.inverse[pixel]
+    canvas.face[pixel[nearest]] = face[row[nearest]]
+
+
+def _shaded(triangles: _Triangles, canvas: _Canvas, background: Colour, style: Style) -> Float[np.ndarray, "samples 3"]:
+    """The colour of every sample."""
+    colours = np.broadcast_to(np.asarray(background, np.float32), (len(canvas.face), 3)).copy()
+    pixel = canvas.inverse.nonzero()[0]
+    face, inverse = canvas.face[pixel], canvas.inverse[pixel]
+    y, x = np.divmod(pixel, canvas.width)
+    of_x, of_y, constant = triangles.shares[..., face]
+    share = (of_x * (x + 0.5) + of_y * (y + 0.5) + constant) * triangles.screen[..., 2].T[:, face] / inverse
+    points, normals = (np.einsum("kp,pkc->pc", share.astype(np.float32), of.astype(np.float32)[face])
+                       for of in (triangles.corners, triangles.normals))
+    colours[pixel] = shade(points, normals, triangles.colours.astype(np.float32)[face], style)
+    return colours
+
+
+def _barycentric(screen: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "3 3 f"]:
+    """Coefficients (of x, of y, constant) of the three barycentric coordinates over the picture; negative for slivers."""
+    x, y = screen[..., 0].T, screen[..., 1].T
+    (x1, y1), (x2, y2) = ((x[order], y[order]) for order in ([1, 2, 0], [2, 0, 1]))
+    twice = np.stack([y1 - y2, x2 - x1, x1 * y2 - x2 * y1])
+    area = twice[2].sum(0)
+    drawn = np.abs(area) > SLIVER
+    return np.where(drawn, twice / np.where(drawn, area, 1.0), np.array([0.0, 0.0, -1.0])[:, None, None])
 
 
 def shade(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], colours: Float[np.ndarray, "n 3"], style: Style
 ) -> Float[np.ndarray, "n 3"]:
     """Blinn-Phong shading from both sides, because files disagree about which side is out, in the camera's axes [m]."""
-    normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    view = -points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-12)
-    normals = np.where((normals * view).sum(1, keepdims=True) < 0, -normals, normals)
-    light = unit(np.asarray(style.light, float))
+    normals, view = _units(normals), _units(-points)
+    facing_back = np.einsum("nk,nk->n", normals, view) < 0
+    normals = np.where(facing_back[:, None], -normals, normals)
+    light = unit(np.asarray(style.light, float)).astype(points.dtype)
     facing = (normals @ light).clip(0)
-    middle = view + light
-    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
-    gloss = (normals * middle).sum(1).clip(0) ** style.shininess
+    gloss = np.einsum("nk,nk->n", normals, _units(view + light)).clip(0) ** style.shininess
     return colours * (style.ambient + style.diffuse * facing)[:, None] + style.specular * gloss[:, None]
+
+
+def _units(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """The vectors at length 1; zero stays zero."""
+    return vectors / np.sqrt(np.einsum("nk,nk->n", vectors, vectors)).clip(1e-12)[:, None]
 
 
 def outlines(depth: Float[np.ndarray, "h w"], radius: int, style: Style) -> Float[np.ndarray, "h w"]:

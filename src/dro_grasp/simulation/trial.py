@@ -25,7 +25,7 @@ from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol, protocol 
 from dro_grasp.simulation.rollout import Rollout
 from dro_grasp.simulation.scene import Scene, cached_scene
 
-__all__ = ["DIRECTIONS", "Failure", "TrialResult", "record", "settle", "simulate"]
+__all__ = ["DIRECTIONS", "Failure", "TrialResult", "held", "record", "settle", "simulate"]
 
 CHUNK = 64
 """Grasps simulated together. Ours: bounds memory; the result does not depend on it."""
@@ -84,15 +84,34 @@ def settle(
     scene = _scene(hand, obj, grasps, protocol)
     joints, poses = [grasps.joints[:0]], [grasps.T_object_wrist[:0]]
     for part, rollout in _rollouts(scene, hand, grasps, workers):
-        stable = torch.from_numpy(rollout.close().stable)
-        q, T = (torch.from_numpy(x) for x in rollout.poses())
-        reached = q.to(part.joints.dtype).clamp(hand.tree.lower, hand.tree.upper)
-        held = stable[:, None] & _holding_joints(hand, find_contact_links(scene, rollout.qpos))
-        T_object_wrist = torch.linalg.inv(torch.where(stable[:, None, None], T, torch.eye(4, dtype=T.dtype)))
-        joints.append(torch.where(held, reached, part.joints))
-        poses.append(torch.where(stable[:, None, None], T_object_wrist.to(reached.dtype), part.T_object_wrist))
+        reached, T_object_wrist = _reached(part, rollout, hand, torch.from_numpy(rollout.close().stable))
+        holding = _holding_joints(hand, find_contact_links(scene, rollout.qpos))
+        joints.append(torch.where(holding, reached, part.joints))
+        poses.append(T_object_wrist)
     unsettled = grasps.without("pregrasp_joints", "squeeze_joints", "score").without_trial()
     return unsettled.replace(T_object_wrist=torch.cat(poses), joints=torch.cat(joints))
+
+
+def held(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *, workers: int | None = None
+) -> GraspBatch:
+    """The same grasps, outcomes included, in the poses of hand and object after closing, from where a trial goes on.
+
+    A grasp whose simulation is unstable, or that pushes the object farther than GIVE_UP, stays as it is.
+
+    Raises:
+        ObjectError: The object is a bare point cloud.
+        HandError: The hand came without its description.
+        GraspFileError: The grasps are of another hand.
+        OptionError: The protocol does not exist.
+    """
+    scene, parts = _scene(hand, obj, grasps, protocol), [(grasps.joints[:0], grasps.T_object_wrist[:0])]
+    for part, rollout in _rollouts(scene, hand, grasps, workers):
+        closed = rollout.close()
+        sound = torch.from_numpy(closed.stable & (closed.shift(rollout.start) < GIVE_UP))
+        parts.append(_reached(part, rollout, hand, sound))
+    joints, poses = (torch.cat(column) for column in zip(*parts, strict=True))
+    return grasps.replace(joints=joints, T_object_wrist=poses)
 
 
 def record(
@@ -188,6 +207,16 @@ def _scene_of_trial(scene: Scene, trial: int) -> Scene:
     rules = scene.protocol.perturbations
     fine = trial < rules.trials - rules.coarse
     return scene if fine else cached_scene(scene.hand, scene.obj.coarse, scene.protocol)
+
+
+def _reached(
+    part: GraspBatch, rollout: Rollout, hand: Hand, sound: Bool[Tensor, " n"]
+) -> tuple[Float[Tensor, "n n_dof"], Float[Tensor, "n 4 4"]]:
+    """Joints and wrist poses relative to the object as a rollout has them now; those of the grasp where it is not sound."""
+    q, T = (torch.from_numpy(x) for x in rollout.poses())
+    q = q.to(part.joints.dtype).clamp(hand.tree.lower, hand.tree.upper)
+    T_object_wrist = torch.linalg.inv(torch.where(sound[:, None, None], T, torch.eye(4, dtype=T.dtype))).to(q.dtype)
+    return torch.where(sound[:, None], q, part.joints), torch.where(sound[:, None, None], T_object_wrist, part.T_object_wrist)
 
 
 def _holding_joints(hand: Hand, contact_links: Sequence[Sequence[str]]) -> Bool[Tensor, "n n_dof"]:

@@ -120,9 +120,11 @@ def _clarity(points: Float[np.ndarray, "n 3"], owner: Int[np.ndarray, " n"], dir
     right, up, backward = Camera(direction, (0.0, 0.0, 0.0)).axes()
     size = float(np.linalg.norm(np.ptp(points, axis=0))) + 1e-9
     x, y = (((points @ axis) - (points @ axis).min()) / size * CELLS for axis in (right, up))
-    key = x.astype(int) * (CELLS + 1) + y.astype(int)
-    order = np.lexsort((-(points @ backward), key))
-    _, first = np.unique(key[order], return_index=True)
-    nearest = owner[order][first]
-    fingers, obj = int((nearest == 1).sum()), int((nearest == 2).sum())
+    key, height = x.astype(int) * (CELLS + 1) + y.astype(int), points @ backward
+    highest = np.full((CELLS + 1) ** 2, -np.inf)
+    np.maximum.at(highest, key, height)
+    shown = np.zeros(len(highest), int)
+    nearest = height == highest[key]
+    shown[key[nearest]] = owner[nearest]
+    fingers, obj = int((shown == 1).sum()), int((shown == 2).sum())
     return 2 * min(fingers, obj) + max(fingers, obj)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -13,12 +16,15 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from dro_grasp.devices import cores
 from dro_grasp.errors import OutputError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.rendering.meshes import Colour, dots
 from dro_grasp.rendering.rasterizer import render
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
+from dro_grasp.simulation.trial import held
 from dro_grasp.viewer.appearance import best_camera, hand_meshes, object_meshes, success_colour
 
 TILE = (320, 280)
@@ -43,6 +49,10 @@ FAINT = (120, 126, 136)
 """Colour of captions of grasps that were not evaluated (red, green, blue, to 255)."""
 
 
+PicturedPosture = Literal["held", "grasp"]
+"""What a sheet shows of a grasp."""
+
+
 @dataclass(frozen=True)
 class PictureStyle:
     """How a grasp is drawn."""
@@ -53,6 +63,9 @@ class PictureStyle:
     """Opacity of the object; below 1 the hand shows through it."""
     contacts: bool = False
     """Mark contacts in red, even where something hides them."""
+    posture: PicturedPosture = "held"
+    """Hand and object after the hand has closed in a trial, or the grasp itself, which closing starts from; `draw_grasp` draws
+    the joints and poses that it is given."""
 
 
 def draw_grasps(
@@ -61,20 +74,40 @@ def draw_grasps(
 ) -> None:
     """Write a PNG with pictures of the first `count` grasps, `columns` side by side, captioned with score and trial outcome.
 
-    Links above the hand's palm are not drawn.
+    They are drawn as they hold the object after closing, unless the style asks for the grasps themselves or there is no
+    mesh. Links above the hand's palm are not drawn.
 
     Raises:
         OutputError: The file cannot be written, or there is no grasp.
     """
     if len(grasps) == 0:
         raise OutputError(f"no grasp to draw into {path}; ask for at least one")
-    shown = min(count, len(grasps))
-    tiles = [draw_grasp(hand, obj, grasps, i, style) for i in range(shown)]
-    sheet = contact_sheet(tiles, [caption(grasps, i) for i in range(shown)], heading(hand, obj, grasps), columns)
+    shown, closed = grasps[:count], can_close(hand, obj) and (style or PictureStyle()).posture == "held"
+    drawn = after_closing(hand, obj, shown) if closed else shown
+    with ThreadPoolExecutor(cores()) as threads:
+        tiles = list(threads.map(lambda i: draw_grasp(hand, obj, drawn, i, style), range(len(shown))))
+    title = heading(hand, obj, grasps) + (", after closing" if closed else "")
+    sheet = contact_sheet(tiles, [caption(grasps, i) for i in range(len(shown))], title, columns)
     try:
         sheet.save(path, format="PNG")
     except OSError as error:
         raise OutputError(f"cannot write picture {path}: {error.strerror or error}; choose another path") from error
+
+
+def can_close(hand: Hand, obj: ObjectModel) -> bool:
+    """Whether the closing of the hand can be simulated: it needs the hand's description and the object's mesh."""
+    return hand.description is not None and not obj.is_cloud
+
+
+def after_closing(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> GraspBatch:
+    """The grasps as they hold the object after closing, each under the protocol of its trial."""
+    names = [name if (name := re.split("[+/]", label)[0]) in PROTOCOLS else DEFAULT_PROTOCOL for label in grasps.protocol]
+    joints, poses = grasps.joints.clone(), grasps.T_object_wrist.clone()
+    for name in set(names):
+        rows = torch.tensor([i for i, own in enumerate(names) if own == name])
+        closed = held(hand, obj, grasps[rows], name)
+        joints[rows], poses[rows] = closed.joints, closed.T_object_wrist
+    return grasps.replace(joints=joints, T_object_wrist=poses)
 
 
 def draw_grasp(
