@@ -151,7 +151,10 @@ def test_generate_reports_and_saves_what_it_counts(generate, tmp_path: Path) -> 
     path = tmp_path / "grasps.parquet"
     report = generate("--output", str(path), method="auto")
     assert report.keys() >= KEYS
-    assert set(report["seconds"]) == {"load", "network", "decode", "optimise", "refine", "rank", "trial"}
+    assert set(report["seconds"]) == {
+        "start", "load", "network", "decode", "optimise", "refine", "rank", "trial", "files", "total"}
+    parts = sum(value for name, value in report["seconds"].items() if name != "total")
+    assert 0.8 * report["seconds"]["total"] < parts <= report["seconds"]["total"] + 0.01
     assert (report["num"], report["protocol"]) == (3, "strict")
     assert report["candidates"] >= 12  # four of the network for each, and those of the optimiser
     assert report["success_rate"] == pytest.approx(report["success"] / 3)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -55,7 +54,7 @@ class Evaluate:
         from dro_grasp.grasps.batch import GraspBatch
         from dro_grasp.pipeline.problem import GraspProblem
         from dro_grasp.pipeline.stages import evaluate
-        from dro_grasp.simulation.outcome import Failure
+        from dro_grasp.simulation.diagnosis import count_failures, diagnose, next_steps
         from dro_grasp.simulation.protocols import changed
 
         rules = changed(self.protocol, friction=self.friction)
@@ -64,7 +63,7 @@ class Evaluate:
         begin = time.perf_counter()
         grasps = load_grasps(self.file)
         hand = hand_of(grasps, self.hand)
-        rows, evaluated, reasons = [], [], Counter()
+        rows, evaluated = [], []
         parts = dict(grasps.by_object())
         if self.object is not None and len(parts) > 1:
             raise OptionError(f"{self.file} holds grasps of {len(parts)} objects; --object fits a file with one")
@@ -75,7 +74,6 @@ class Evaluate:
                     say_aside(f"the grasps were made for another '{name}' than the given {obj.name}")
                 done = evaluate(GraspProblem(hand, obj), part, rules, progress)
                 evaluated.append(done)
-                reasons.update(Failure[name].value for name in done.extra["failure"] if name)
                 success = int(done.success.sum())
                 rows.append([name, len(done), success, success / max(1, len(done)), *shares(done, hand).values()])
         done = GraspBatch.concatenate(evaluated)
@@ -88,16 +86,15 @@ class Evaluate:
             "file": str(self.file), "hand": hand.name, "protocol": rules.label, "num": len(grasps), "success": success,
             "success_rate": rate, "interval_95": [low, high],
             **beside, "objects": {row[0]: {"num": row[1], "success": row[2]} for row in rows},
-            "reasons": dict(reasons.most_common()), "seconds": round(time.perf_counter() - begin, 3),
+            "reasons": count_failures(done), "next": next_steps(done), "seconds": round(time.perf_counter() - begin, 3),
             "output": None if self.output is None else str(self.output),
         }
         note = f"{success} of {len(grasps)} succeeded: {rate:.1%} (95 %: {low:.1%} to {high:.1%})"
         if "trials_held" in beside:
             mean, low, high = mean_share(done.robustness)
             note += f", and held in {mean:.1%} of their trials (95 %: {low:.1%} to {high:.1%})"
-        failed = [f"  {count} failed: {reason}" for reason, count in reasons.most_common()]
         columns = ["object", "grasps", "success", "rate", *(SHARES[name] for name in beside)]
-        print_result(self.json, report, f"{hand.name}, protocol {rules.label}", columns, rows, note, *failed)
+        print_result(self.json, report, f"{hand.name}, protocol {rules.label}", columns, rows, note, *diagnose(done))
         return 0
 
 

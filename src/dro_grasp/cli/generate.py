@@ -83,6 +83,7 @@ class Generate:
 
     def run(self) -> int:
         """Check everything that can be checked before the work, then do it."""
+        begin = time.perf_counter()
         from dro_grasp.errors import DroGraspError, OptionError
         from dro_grasp.frames import read_motion
         from dro_grasp.hands.library import load_hand
@@ -100,9 +101,10 @@ class Generate:
         outputs = paths_per_object(self.output, names, several, ".parquet")
         pictures = paths_per_object(self.picture, names, several, ".png")
         camera = None if self.camera is None else read_motion(self.camera, "T_frame_camera")
-        begin = time.perf_counter()
-        hand = load_hand(self.hand)
-        job = Job(hand, GraspPredictor(self.weights), request, constraints, camera, time.perf_counter() - begin)
+        start = time.perf_counter() - begin
+        hand, predictor = load_hand(self.hand), GraspPredictor(self.weights)
+        seconds = {"start": start, "load": time.perf_counter() - begin - start}
+        job = Job(hand, predictor, request, constraints, camera, seconds)
         done, failed = [], []
         for name, output, picture in zip(names, outputs, pictures, strict=True):
             try:
@@ -124,10 +126,11 @@ class Generate:
     def _grasp(self, job: Job, name: str, output: Path | None, picture: Path | None) -> ObjectResult:
         """One object, start to end."""
         from dro_grasp.pipeline.problem import GraspProblem
+        from dro_grasp.simulation.diagnosis import count_failures, next_steps
 
         begin = time.perf_counter()
         obj = self._load(name, job.camera)
-        load = job.load_seconds + time.perf_counter() - begin
+        seconds = {**job.seconds, "load": job.seconds["load"] + time.perf_counter() - begin}
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
         problem = GraspProblem(job.hand, obj, constraints=job.constraints)
@@ -135,10 +138,10 @@ class Generate:
             made = job.predictor.run(problem, job.request, progress)
         if made.shortage is not None:
             say_aside(f"warning: {obj.name}: {made.shortage}")
-        begin = time.perf_counter()
+        middle = time.perf_counter()
         grasps = self._evaluate(problem, made.grasps)
         simulated = bool(grasps.evaluated.any())
-        seconds = {"load": load, **made.seconds, "trial": time.perf_counter() - begin if simulated else 0.0}
+        seconds |= {**made.seconds, "trial": time.perf_counter() - middle if simulated else 0.0}
         report = {
             "hand": job.hand.name, "object": obj.name, "num": len(grasps), "asked": self.num, "shortage": made.shortage,
             "candidates": made.candidates,
@@ -146,10 +149,11 @@ class Generate:
             "seed": self.seed, "weights": job.predictor.weights_name, "protocol": self._protocol(obj),
             "success": int(grasps.success.sum()) if simulated else None,
             "success_rate": float(grasps.success.float().mean()) if simulated else None,
-            "seconds": {k: round(v, 4) for k, v in seconds.items()},
+            "reasons": count_failures(grasps), "next": next_steps(grasps),
             "output": None if output is None else str(output),
             "frame": "object" if job.camera is None else job.camera.frame,
         }
+        middle = time.perf_counter()
         keep = grasps.success if simulated and self.only_successful else slice(None)
         kept = grasps[keep]
         if output is not None:
@@ -159,6 +163,9 @@ class Generate:
 
             report["picture"] = str(picture)
             draw_grasps(job.hand, obj, kept if len(kept) else grasps, picture)
+        seconds["files"] = time.perf_counter() - middle
+        seconds["total"] = sum(job.seconds.values()) + time.perf_counter() - begin
+        report["seconds"] = {k: round(v, 4) for k, v in seconds.items()}
         if not self.json:
             self._show(report, grasps, made.origin)
         return ObjectResult(report, obj, kept, made.points[keep])
@@ -184,6 +191,8 @@ class Generate:
             return evaluate(problem, grasps, protocol, progress)
 
     def _show(self, report: dict[str, Any], grasps: GraspBatch, origin: list[str]) -> None:
+        from dro_grasp.simulation.diagnosis import diagnose
+
         rows = []
         for i in range(min(len(grasps), ROWS_SHOWN)):
             outcome: list[Any] = [None] * 4
@@ -197,6 +206,8 @@ class Generate:
         say(seconds)
         if report["success"] is not None:
             say(f"{report['success']} of {report['num']} grasps succeeded under protocol {report['protocol']}")
+            for line in diagnose(grasps):
+                say(line)
         for what, key in (("grasps", "output"), ("picture", "picture")):
             if report.get(key):
                 say(f"{what}: {report[key]}")
@@ -211,8 +222,8 @@ class Job:
     request: GraspRequest
     constraints: Constraints
     camera: NamedMotion | None
-    load_seconds: float
-    """Time to load hand and weights [s]."""
+    seconds: dict[str, float]
+    """Time to start, most of which goes to loading libraries, and to load hand and weights [s]."""
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import evaluate
 from dro_grasp.predictor import GraspPredictor, GraspRequest, Method
+from dro_grasp.simulation.diagnosis import diagnose
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 from dro_grasp.simulation.trial import record
 from dro_grasp.viewer.app import POSTURES, Posture, describe, postures_of
@@ -204,7 +205,8 @@ class Studio(ServedPage):
             None if self.usual.value else float(self.temperature.value), self.protocol.value, int(self.candidates.value), self.method.value)
         held = "" if made.obj.is_cloud else (
             f", **{int(made.refined.success.sum())}** held under *{self.protocol.value}*")
-        self._say(f"{len(made.refined)} grasps{held}; {time.perf_counter() - begin:.1f} s")
+        lines = [f"{len(made.refined)} grasps{held}; {time.perf_counter() - begin:.1f} s", *diagnose(made.refined)]
+        self._say("  \n".join(lines))
 
     def _filter(self) -> None:
         """Show the grasps that pass the filters."""

@@ -1,0 +1,51 @@
+"""Why grasps fail, and what is said to do next."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.simulation.diagnosis import REMEDIES, count_failures, diagnose, next_steps
+from dro_grasp.simulation.outcome import Failure
+from tests.helpers.toy_hand import toy_hand
+
+
+def grasps(*failures: Failure | None, evaluated: bool = True) -> GraspBatch:
+    hand, n = toy_hand(), len(failures)
+    from tests.helpers.claw import ball
+
+    made = GraspBatch.create(hand, ball(), torch.eye(4).expand(n, 4, 4), torch.zeros(n, hand.tree.n_dof))
+    if not evaluated:
+        return made
+    names = [failure.name if failure else None for failure in failures]
+    held = torch.tensor([failure is None for failure in failures])
+    return made.replace(success=held, protocol=("strict/1",) * n, extra={"failure": names})
+
+
+def test_failures_are_counted_in_words_the_most_frequent_first() -> None:
+    batch = grasps(None, Failure.SLIPPED, Failure.PENETRATION, Failure.SLIPPED, None, None)
+    assert list(count_failures(batch).items()) == [("slipped", 2), ("hand penetrates object", 1)]
+    assert diagnose(batch) == ["  2 failed: slipped", "  1 failed: hand penetrates object"]
+
+
+def test_where_few_hold_the_next_step_is_named() -> None:
+    batch = grasps(None, Failure.NO_CONTACT, Failure.NO_CONTACT, Failure.UNSTABLE)
+    assert next_steps(batch) == [REMEDIES[Failure.NO_CONTACT], REMEDIES[Failure.UNSTABLE]]
+    assert diagnose(batch)[-2:] == [f"  next: {step}" for step in next_steps(batch)]
+    same = grasps(Failure.SLIPPED, Failure.LOST)
+    assert len(next_steps(same)) == 1, "no advice is given twice"
+
+
+@pytest.mark.parametrize("batch", [grasps(None, None, Failure.SLIPPED), grasps(None, None), grasps(None, evaluated=False)])
+def test_nothing_is_advised_where_most_hold_or_nothing_was_evaluated(batch: GraspBatch) -> None:
+    assert next_steps(batch) == []
+
+
+def test_every_failure_has_a_remedy() -> None:
+    assert set(REMEDIES) == set(Failure)
+
+
+def test_kinds_of_failure_of_a_later_version_are_left_out() -> None:
+    batch = grasps(None, Failure.SLIPPED)
+    assert count_failures(batch.replace(extra={"failure": [None, "MELTED"]})) == {}
