@@ -43,16 +43,18 @@ def test_a_file_becomes_weights_and_a_report(home: Path, capsys: pytest.CaptureF
     told = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert set(told["seconds"]) == {"check", "before", "data", "training", "after"}
     assert told["grasps"] > 0
-    assert describe_weights(told["weights"])["about"]["data"]["hands"] == {"mine": told["grasps"]}
+    assert describe_weights(told["fine_tuned"])["about"]["data"]["hands"] == {"mine": told["grasps"]}
     page = (home / "out" / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 2, "the hand, and grasps of the one held-out object"
     assert "http" not in page.replace("http-equiv", ""), "nothing is fetched"
-    assert f"{told['after']['refined']['dro/1']:.0%} after" in page
+    assert f"{told['after']['refined']['strict/1']:.0%} after" in page
     for step in ("before", "after"):
-        share = f"{told[step]['returned']['dro/1']:.0%} {step} ({told['optimised'][step]:.0%} of them made by the optimiser)"
+        share = f"{told[step]['returned']['strict/1']:.0%} {step} ({told['optimised'][step]:.0%} of them made by the optimiser)"
         assert share in page
     assert " of 3 made by the optimiser" in page
-    assert str(home / "out" / "weights.safetensors") in page
+    assert told["weights"] == (told["fine_tuned"] if told["gained"] else str(home / "untrained.safetensors"))
+    assert f"--weights {told['weights']}" in page
+    assert told["without_grasps"] == []
 
 
 def test_a_rerun_does_nothing_again(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -88,6 +90,18 @@ def test_a_benchmark_without_what_generate_returns_is_made_again(home: Path, cap
     assert capsys.readouterr().err.count("finished before") == 4
     rows = json.loads((home / "out" / steps.STATE).read_text())["steps"]["after"]["rows"]
     assert [row["stage"] for row in rows] == [row["stage"] for row in whole["rows"]]
+
+
+@pytest.mark.parametrize("after", [0.2, 0.3, 0.4])
+def test_what_gained_nothing_says_so_and_keeps_the_weights_from_before(home: Path, after: float) -> None:
+    rows = [[{"stage": stage, "success": {"strict/1": (rate, 0, 1)}} for stage in ("raw", "refined")] for rate in (0.3, after)]
+    data = {"counts": {"can": 9, "box": 0}, "failures": {"box": "no contact", "torus": "too thin", "can": "too little time"}}
+    done = steps.Onboarded("mine", home, {"before": {"rows": rows[0]}, "after": {"rows": rows[1]}, "data": data}, "multi")
+    told = " ".join(done.verdict())
+    assert done.without_grasps == ["box", "torus"] and "No training grasps of box, torus" in told
+    assert done.gained == (after > 0.3)
+    assert done.weights == (str(home / "weights.safetensors") if done.gained else "multi")
+    assert (f"gained nothing: 30% of the refined grasps hold under strict/1 before, {after:.0%} after" in told) != done.gained
 
 
 def test_the_folder_of_another_hand_is_refused(home: Path, capsys: pytest.CaptureFixture[str]) -> None:

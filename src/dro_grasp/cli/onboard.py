@@ -53,13 +53,16 @@ class Onboard:
         rates = {step: {row["stage"]: {k: v[0] for k, v in row["success"].items()} for row in done.steps[step]["rows"]}
                  for step in ("before", "after")}
         if self.json:
-            print_json({"hand": self.hand, "weights": str(self.output / WEIGHTS), "report": str(report), **rates,
+            print_json({"hand": self.hand, "weights": done.weights, "gained": done.gained, "fine_tuned": str(self.output / WEIGHTS),
+                        "without_grasps": done.without_grasps, "report": str(report), **rates,
                         "optimised": {step: done.optimised(step) for step in ("before", "after")},
                         "grasps": done.steps["training"]["grasps"],
                         "seconds": {name: round(step["seconds"], 1) for name, step in done.steps.items()}})
             return 0
         for step in ("before", "after"):
             say(f"{step}: {done.steps[step]['said']}")
-        say(f"weights: {self.output / WEIGHTS}")
+        for line in done.verdict():
+            say(line)
+        say(f"weights: {done.weights or 'the shipped ones'}" + ("" if done.gained else f"; fine-tuned: {self.output / WEIGHTS}"))
         say(f"report: {report}")
         return 0

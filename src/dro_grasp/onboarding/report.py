@@ -9,7 +9,7 @@ from typing import Any
 from dro_grasp.evaluation.success_rates import BEST, RAW, REFINED, RETURNED
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.onboarding.steps import DATA, PICTURE, REPORT, WEIGHTS, Onboarded
+from dro_grasp.onboarding.steps import DATA, PICTURE, REPORT, STRICT, Onboarded
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import evaluate
 from dro_grasp.predictor import GraspPredictor, GraspRequest
@@ -33,7 +33,7 @@ def write_report(done: Onboarded, held_out: list[str]) -> Path:
     path, name = done.folder / REPORT, html.escape(Path(done.hand).stem)
     parts = [
         f"<h1>{name}</h1>", _summary(done), _rates(done),
-        "<h2>What generate returns after fine-tuning</h2>", _drawn(done, held_out),
+        "<h2>What generate returns with the better weights</h2>", _drawn(done, held_out),
         f"<h2>The description</h2><p class=note>{html.escape(done.hand)}</p>",
         image((done.folder / PICTURE).read_bytes(), f"{name}, open and closed"),
         f"<pre>{html.escape(chr(10).join(done.steps['check']['lines']))}</pre>", "<h2>Training grasps</h2>",
@@ -44,16 +44,16 @@ def write_report(done: Onboarded, held_out: list[str]) -> Path:
 
 
 def _summary(done: Onboarded) -> str:
-    before, after = (done.rate(step, REFINED, "dro/1") for step in ("before", "after"))
-    best = done.rate("after", BEST, "dro/1")
+    before, after = (done.rate(step, REFINED, STRICT) for step in ("before", "after"))
+    best = done.rate("after", BEST, STRICT)
     returned = " and ".join(
-        f"{done.rate(step, RETURNED, 'dro/1'):.0%} {step} ({done.optimised(step):.0%} of them made by the optimiser)"
+        f"{done.rate(step, RETURNED, STRICT):.0%} {step} ({done.optimised(step):.0%} of them made by the optimiser)"
         for step in ("before", "after"))
     minutes = sum(step["seconds"] for step in done.steps.values()) / 60
-    return (f"<p>On held-out objects, {before:.0%} of the refined grasps pass protocol <i>dro</i> before fine-tuning, and "
+    return (f"<p>On held-out objects, {before:.0%} of the refined grasps pass protocol <i>strict</i> before fine-tuning, and "
             f"{after:.0%} after fine-tuning on {done.steps['training']['grasps']:,} grasps of this hand; of the best quarter "
             f"by score, {best:.0%} pass. Of the grasps that <i>generate</i> returns, {returned} pass. All steps took "
-            f"{minutes:.0f} minutes.</p>")
+            f"{minutes:.0f} minutes.</p>" + "".join(f"<p><b>{html.escape(line)}</b></p>" for line in done.verdict()))
 
 
 def _rates(done: Onboarded) -> str:
@@ -73,7 +73,7 @@ def _rates(done: Onboarded) -> str:
 
 
 def _drawn(done: Onboarded, held_out: list[str]) -> str:
-    hand, predictor = load_hand(done.hand), GraspPredictor(str(done.folder / WEIGHTS))
+    hand, predictor = load_hand(done.hand), GraspPredictor(done.weights)
     parts = []
     for name in held_out[:OBJECTS]:
         obj = load_object(name)
@@ -94,8 +94,9 @@ def _data(step: dict[str, Any]) -> str:
 
 
 def _commands(done: Onboarded) -> str:
+    weights = "" if done.weights is None else f" --weights {done.weights}"
     lines = [
-        f"dro-grasp generate --hand {done.hand} --object my_mesh.stl --weights {done.folder / WEIGHTS} --output grasps.parquet",
+        f"dro-grasp generate --hand {done.hand} --object my_mesh.stl{weights} --output grasps.parquet",
         "dro-grasp evaluate grasps.parquet --protocol strict",
         "dro-grasp export grasps.parquet --format isaac_grasp --output grasps.yaml --only-successful",
         f"dro-grasp dataset report {done.folder / DATA} --output data.html",

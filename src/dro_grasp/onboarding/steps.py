@@ -42,6 +42,8 @@ DATA_SHARE = 0.45
 """Share of the time for synthesis (ours); what the shares leave is for the benchmarks before and after."""
 TRAINING_SHARE = 0.40
 """Share of the time for fine-tuning (ours)."""
+STRICT = "strict/1"
+"""Protocol by which fine-tuning is judged."""
 MOST_GRASPS = 400
 """Grasps of an object beyond which time is better spent on training (ours)."""
 
@@ -84,6 +86,36 @@ class Onboarded:
     folder: Path
     steps: dict[str, dict[str, Any]]
     """Result of each step by name, with its seconds: check, before, data, training, after."""
+    initial: str | None = None
+    """Weights that were fine-tuned; None for the shipped ones."""
+
+    @property
+    def gained(self) -> bool:
+        """Whether more of the network's refined grasps hold after fine-tuning than before."""
+        return self.rate("after", REFINED, STRICT) > self.rate("before", REFINED, STRICT)
+
+    @property
+    def weights(self) -> str | None:
+        """Weights to use from now on: the fine-tuned ones if they gained anything, else those from before."""
+        return str(self.folder / WEIGHTS) if self.gained else self.initial
+
+    @property
+    def without_grasps(self) -> list[str]:
+        """Objects of which synthesis found no grasp."""
+        data = self.steps["data"]
+        return [name for name in data["failures"] if not data["counts"].get(name)]
+
+    def verdict(self) -> list[str]:
+        """In words: whether fine-tuning gained anything, which objects are without grasps, and what to try."""
+        before, after = (f"{self.rate(step, REFINED, STRICT):.0%}" for step in ("before", "after"))
+        lines = []
+        if not self.gained:
+            lines.append(f"Fine-tuning gained nothing: {before} of the refined grasps hold under {STRICT} before, {after} after. "
+                         f"Keep the weights from before. To gain, try more --minutes or more --objects.")
+        if self.without_grasps:
+            lines.append(f"No training grasps of {', '.join(self.without_grasps)}: try --objects of a size that suits the hand, "
+                         "and look at its picture for a wrong palm side or opening.")
+        return lines
 
     def rate(self, step: str, stage: str, label: str) -> float:
         """Success rate on the held-out objects, `before` or `after`."""
@@ -126,7 +158,7 @@ def onboard(
     onboarding = _Onboarding(hand, path, config, objects, held_out, say)
     make_folder(path)
     onboarding.run()
-    return Onboarded(hand, path, onboarding.steps)
+    return Onboarded(hand, path, onboarding.steps, config.weights)
 
 
 class _Onboarding:
