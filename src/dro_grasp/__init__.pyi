@@ -60,4 +60,4 @@ from dro_grasp.training.config import (
 from dro_grasp.training.loop import train as train
 from dro_grasp.training.pretraining import pretrain as pretrain, pretrain_motion as pretrain_motion
 from dro_grasp.viewer.app import view_grasps as view_grasps
-from dro_grasp.viewer.pictures import draw_grasps as draw_grasps
+from dro_grasp.viewer.pictures import PictureStyle as PictureStyle, draw_grasps as draw_grasps

@@ -30,6 +30,19 @@ def check_output(path: Path | str) -> Path:
     return path
 
 
+def check_suffix(path: Path | str, suffix: str) -> Path:
+    """Refuse a file name with another suffix than `suffix` or none.
+
+    Raises:
+        OutputError: It has another.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in {"", suffix}:
+        raise OutputError(f"{path} would hold {suffix[1:]} under another ending; call it {path.with_suffix(suffix).name}"
+                          + ("; `dro-grasp export` writes other formats" if suffix == ".parquet" else ""))
+    return path
+
+
 def check_folder(path: Path | str) -> Path:
     """Refuse a folder that cannot be created or written to, without creating it; its parents may be missing too.
 

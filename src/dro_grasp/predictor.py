@@ -14,6 +14,7 @@ from torch import Tensor
 from dro_grasp.devices import Stopwatch, require_device
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.sources import with_own_files
 from dro_grasp.hands.hand import Hand
 from dro_grasp.models.checkpoints import load_weights
 from dro_grasp.models.network import DistanceNetwork
@@ -98,6 +99,9 @@ class Prediction:
     shortage: str | None = None
     """Why there are fewer grasps than were asked for, and what to do; None if there are as many."""
 
+    def __repr__(self) -> str:
+        return f"Prediction({self.grasps!r}, best of {self.candidates} candidates, {sum(self.seconds.values()):.1f} s)"
+
     @property
     def origin(self) -> list[str]:
         """Where each grasp comes from: `network` or `optimiser`."""
@@ -128,6 +132,9 @@ class GraspPredictor:
         require_device(device)
         self.device, self.config = device, config or PredictorConfig()
         self.network: DistanceNetwork = load_weights(weights).to(device).eval()
+
+    def __repr__(self) -> str:
+        return f"GraspPredictor(weights '{self.weights_name}', device '{self.device}')"
 
     @property
     def weights_name(self) -> str:
@@ -242,7 +249,8 @@ class _Pool:
         best = (-grasps.score).argsort(stable=True)[: self.request.num]
         chosen = Proposal.concatenate(self.proposals)[best]
         proposed = complete(self.problem, chosen.grasps)
-        return Prediction(grasps[best], proposed, chosen.points, self.made, self.watch.seconds, shortage)
+        grasps = with_own_files(grasps[best], self.problem.hand, self.problem.obj)
+        return Prediction(grasps, proposed, chosen.points, self.made, self.watch.seconds, shortage)
 
 
 def _shortage(problem: GraspProblem, request: GraspRequest, found: int, made: int) -> str:

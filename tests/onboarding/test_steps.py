@@ -98,7 +98,8 @@ def test_what_gained_nothing_says_so_and_keeps_the_weights_from_before(home: Pat
     data = {"counts": {"can": 9, "box": 0}, "failures": {"box": "no contact", "torus": "too thin", "can": "too little time"}}
     done = steps.Onboarded("mine", home, {"before": {"rows": rows[0]}, "after": {"rows": rows[1]}, "data": data}, "multi")
     told = " ".join(done.verdict())
-    assert done.without_grasps == ["box", "torus"] and "No training grasps of box, torus" in told
+    assert done.without_grasps == ["box", "torus"]
+    assert "No training grasps of box, torus" in told
     assert done.gained == (after > 0.3)
     assert done.weights == (str(home / "weights.safetensors") if done.gained else "multi")
     assert (f"gained nothing: 30% of the refined grasps hold under strict/1 before, {after:.0%} after" in told) != done.gained

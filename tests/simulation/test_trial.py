@@ -58,7 +58,8 @@ def test_held_grasps_are_where_the_recorded_trial_has_them_after_closing(hand, o
     grasps = power_grasp(hand, obj, 2)
     grasps = grasps.with_trial(simulate(hand, obj, grasps))
     closed, rules = held(hand, obj, grasps), protocol(DEFAULT_PROTOCOL)
-    assert closed.success.tolist() == grasps.success.tolist() and closed.protocol == grasps.protocol
+    assert closed.success.tolist() == grasps.success.tolist()
+    assert closed.protocol == grasps.protocol
     assert (closed.joints - grasps.joints).abs().max() > 0.01
     stride = 10
     end = round(rules.closing_time / rules.timestep) // stride

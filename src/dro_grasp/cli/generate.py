@@ -242,15 +242,12 @@ class ObjectResult:
 def paths_per_object(path: Path | None, names: list[str], several: bool, suffix: str) -> list[Path | None]:
     """Where each object's file goes, checked before the work: the path itself, or files in the folder that it names."""
     from dro_grasp.errors import OutputError
-    from dro_grasp.files import check_output
+    from dro_grasp.files import check_output, check_suffix
 
     if path is None:
         return [None] * len(names)
-    if not several and path.suffix.lower() not in {"", suffix}:
-        raise OutputError(f"{path} would hold {suffix[1:]} under another ending; call it {path.with_suffix(suffix).name}"
-                          + ("; `dro-grasp export` writes other formats" if suffix == ".parquet" else ""))
     if not several:
-        return [check_output(path)]
+        return [check_output(check_suffix(path, suffix))]
     if not path.is_dir():
         raise OutputError(f"{path} is no folder; for {len(names)} objects name an existing one (mkdir -p {path})")
     stems = [Path(name).stem for name in names]

@@ -53,8 +53,8 @@ class Onboard:
         rates = {step: {row["stage"]: {k: v[0] for k, v in row["success"].items()} for row in done.steps[step]["rows"]}
                  for step in ("before", "after")}
         if self.json:
-            print_json({"hand": self.hand, "weights": done.weights, "gained": done.gained, "fine_tuned": str(self.output / WEIGHTS),
-                        "without_grasps": done.without_grasps, "report": str(report), **rates,
+            print_json({"hand": self.hand, "weights": done.weights, "gained": done.gained,
+                        "fine_tuned": str(self.output / WEIGHTS), "without_grasps": done.without_grasps, "report": str(report), **rates,
                         "optimised": {step: done.optimised(step) for step in ("before", "after")},
                         "grasps": done.steps["training"]["grasps"],
                         "seconds": {name: round(step["seconds"], 1) for name, step in done.steps.items()}})
@@ -63,6 +63,8 @@ class Onboard:
             say(f"{step}: {done.steps[step]['said']}")
         for line in done.verdict():
             say(line)
-        say(f"weights: {done.weights or 'the shipped ones'}" + ("" if done.gained else f"; fine-tuned: {self.output / WEIGHTS}"))
+        say(f"weights: {done.weights or 'the shipped ones'}")
+        if not done.gained:
+            say(f"fine-tuned: {self.output / WEIGHTS}")
         say(f"report: {report}")
         return 0

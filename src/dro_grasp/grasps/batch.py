@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.errors import GraspFileError
-from dro_grasp.files import check_output, replacing
+from dro_grasp.files import check_output, check_suffix, replacing
 from dro_grasp.grasps import codec, columns, summary
 from dro_grasp.grasps.table import read_table, table_bytes
 
@@ -87,16 +87,7 @@ class GraspBatch:
         Raises:
             ValueError: The columns do not fit together.
         """
-        every = {name: getattr(self, name) for name in columns.COLUMNS} | self.extra
-        wrong = {name: len(column) for name, column in every.items() if len(column) != len(self)}
-        if wrong:
-            raise ValueError(f"a batch of {len(self)} grasps has columns of other lengths: {wrong}")
-        if self.joints.shape[1] != len(self.joint_names):
-            raise ValueError(f"{self.joints.shape[1]} values for {len(self.joint_names)} joint names")
-        if taken_names := sorted(self.extra.keys() & set(columns.COLUMNS)):
-            raise ValueError(f"further columns have the names of fields: {taken_names}; set the fields instead")
-        if bool((self.success & ~self.evaluated).any()):
-            raise ValueError("some grasps succeeded without a protocol; name the protocol of their trial")
+        columns.require_fit(self, len(self.joint_names))
 
     @staticmethod
     def create(
@@ -138,7 +129,13 @@ class GraspBatch:
     def __getitem__(
         self, index: int | slice | Sequence[int] | Sequence[bool] | Int[Tensor, "*k"] | Bool[Tensor, " n"]
     ) -> GraspBatch:
-        """The grasps at an index, slice, list of indices, index tensor or mask; always a batch."""
+        """The grasps at an index, slice, list of indices, index tensor or mask; always a batch.
+
+        Raises:
+            OptionError: The mask is `success`, and no grasp has been evaluated.
+        """
+        if index is self.success:
+            columns.require_outcomes(self)
         rows = torch.arange(len(self))
         if isinstance(index, int) and not -len(self) <= index < len(self):
             raise IndexError(f"grasp {index} of a batch of {len(self)}")
@@ -153,10 +150,7 @@ class GraspBatch:
 
     def by_object(self) -> Iterator[tuple[str, GraspBatch]]:
         """Each object's name with its grasps, in the order in which the objects first appear."""
-        rows: dict[str, list[int]] = {}
-        for i, name in enumerate(self.object):
-            rows.setdefault(name, []).append(i)
-        return ((name, self[own]) for name, own in rows.items())
+        return ((name, self[rows]) for name, rows in columns.places(self.object).items())
 
     def replace(self, **changes: Any) -> GraspBatch:
         """The same batch with other values for some fields."""
@@ -177,6 +171,16 @@ class GraspBatch:
     def evaluated(self) -> Bool[Tensor, " n"]:
         """Which grasps have been through a trial."""
         return torch.tensor([p != columns.NOT_EVALUATED for p in self.protocol], dtype=torch.bool, device=self.success.device)
+
+    @property
+    def wrist_position(self) -> Float[Tensor, "n 3"]:
+        """Position of the root link in the object's frame [m]."""
+        return self.T_object_wrist[:, :3, 3]
+
+    @property
+    def wrist_quaternion_wxyz(self) -> Float[Tensor, "n 4"]:
+        """Orientation of the root link in the object's frame, a unit quaternion."""
+        return codec.quaternions_wxyz(self.T_object_wrist)
 
     @property
     def states_closing(self) -> Bool[Tensor, " n"]:
@@ -248,9 +252,9 @@ class GraspBatch:
             notes: Plain values about the making, kept in the file's header.
 
         Raises:
-            OutputError: The path cannot be written.
+            OutputError: The path cannot be written, or its suffix is not `.parquet`.
         """
-        path = check_output(path)
+        path = check_output(check_suffix(path, ".parquet"))
         with replacing(path) as temporary:
             temporary.write_bytes(self.to_bytes(notes))
 

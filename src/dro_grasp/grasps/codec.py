@@ -30,11 +30,10 @@ SYNTHESISED = re.compile(r"\bsynthesis \d+\b")
 
 def encode(batch: Any) -> tuple[dict[str, pa.Array], dict[str, Any]]:
     """Columns and header of a GraspBatch's file."""
-    xyzw = roma.rotmat_to_unitquat(batch.T_object_wrist[:, :3, :3].to(torch.float64))
     stored: dict[str, pa.Array] = {
         "object": pa.array(list(batch.object), pa.string()),
         "wrist_position": fixed_column(batch.T_object_wrist[:, :3, 3]),
-        "wrist_quaternion_wxyz": fixed_column(roma.quat_xyzw_to_wxyz(xyzw)),
+        "wrist_quaternion_wxyz": fixed_column(batch.wrist_quaternion_wxyz),
         "joints": float_column(batch.joints),
     }
     stored |= {name: float_column(getattr(batch, name)) for name in (*columns.POSTURES, *columns.FLOATS)}
@@ -95,6 +94,11 @@ def decode(table: pa.Table, header: dict[str, Any], path: str) -> dict[str, Any]
         "success": torch.tensor([bool(s) for s in success], dtype=torch.bool), "protocol": protocol, **fields,
         "extra": {name: _decode_further(table[name]) for name in table.column_names if name not in known},
     }
+
+
+def quaternions_wxyz(T: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 4"]:
+    """Unit quaternions of poses."""
+    return roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(T[:, :3, :3].to(torch.float64))).to(T.dtype)
 
 
 def _poses(position: Float[Tensor, "n 3"], quaternion: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4 4"]:

@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from dro_grasp.errors import OptionError
+
 TRIAL_FLOATS = ("displacement", "rotation", "penetration", "robustness", "fingers_in_contact")
 """Columns of one number per grasp that a trial fills; NaN is unknown."""
 FLOATS = ("score", "energy", *TRIAL_FLOATS)
@@ -39,6 +41,42 @@ DEPTH = "depth"
 """Further column of synthesised grasps: deepest penetration of a surface point [m]."""
 ENERGY_TERM = "energy_"
 """How the names of further columns with the terms of the grasp energy begin."""
+
+
+def require_fit(batch: Any, n_names: int) -> None:
+    """Refuse columns of a batch that do not fit together.
+
+    Raises:
+        ValueError: They have unequal lengths, other numbers of joints than names, or successes without a trial.
+    """
+    every = {name: getattr(batch, name) for name in COLUMNS} | batch.extra
+    if wrong := {name: len(column) for name, column in every.items() if len(column) != len(batch)}:
+        raise ValueError(f"a batch of {len(batch)} grasps has columns of other lengths: {wrong}")
+    if batch.joints.shape[1] != n_names:
+        raise ValueError(f"{batch.joints.shape[1]} values for {n_names} joint names")
+    if taken_names := sorted(batch.extra.keys() & set(COLUMNS)):
+        raise ValueError(f"further columns have the names of fields: {taken_names}; set the fields instead")
+    if bool((batch.success & ~batch.evaluated).any()):
+        raise ValueError("some grasps succeeded without a protocol; name the protocol of their trial")
+
+
+def require_outcomes(batch: Any) -> None:
+    """Refuse grasps without any trial where successes are asked for.
+
+    Raises:
+        OptionError: No grasp has been evaluated.
+    """
+    if len(batch) and not batch.evaluated.any():
+        raise OptionError("no grasp has been evaluated, so none is known to hold; run trials first: "
+                          "grasps = dro_grasp.evaluate(dro_grasp.GraspProblem(hand, obj), grasps)")
+
+
+def places(column: Sequence[str]) -> dict[str, list[int]]:
+    """The rows of each value, in the order in which the values first appear."""
+    rows: dict[str, list[int]] = {}
+    for i, value in enumerate(column):
+        rows.setdefault(value, []).append(i)
+    return rows
 
 
 def unknown(name: str, joints: Float[Tensor, "n n_dof"]) -> Any:

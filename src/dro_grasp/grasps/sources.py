@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from dro_grasp.errors import GraspFileError, HandError, ObjectError
+from dro_grasp.errors import GraspFileError, HandError, ObjectError, OptionError
 
 if TYPE_CHECKING:
     from dro_grasp.frames import NamedMotion
@@ -48,6 +48,33 @@ def with_sources(grasps: GraspBatch, hand: str, obj: str, scale: float, camera: 
         extra[FRAME] = (camera.frame,) * n
         extra[CAMERA] = camera.T.reshape(1, 16).expand(n, 16)
     return grasps.replace(extra=extra)
+
+
+def with_own_files(grasps: GraspBatch, hand: Hand, obj: ObjectModel) -> GraspBatch:
+    """Grasps of one object that record the files which a user's own hand and object were loaded from."""
+    from dro_grasp.hands.library import BUILTIN_FOLDER
+
+    file = None if hand.description is None else hand.description.path
+    own = file is not None and hand.name == file.stem and file.parent != BUILTIN_FOLDER
+    return with_sources(grasps, str(file) if own else hand.name, obj.file or obj.name, obj.scale)
+
+
+def require_pair(hand: Any, obj: Any) -> None:
+    """Refuse anything but a hand and an object, in this order.
+
+    Raises:
+        OptionError: They are swapped, or not loaded yet.
+    """
+    from dro_grasp.hands.hand import Hand
+    from dro_grasp.objects.shape import ObjectModel
+
+    if isinstance(hand, ObjectModel) and isinstance(obj, Hand):
+        raise OptionError("the hand and the object are swapped; give the hand first, then the object")
+    for what, given, kind in (("hand", hand, Hand), ("object", obj, ObjectModel)):
+        if not isinstance(given, kind):
+            text = f"'{given}'" if isinstance(given, str | Path) else f"a {type(given).__name__}"
+            example = text if isinstance(given, str | Path) else "NAME_OR_PATH"
+            raise OptionError(f"the {what} is {text}; load it first: dro_grasp.load_{what}({example})")
 
 
 def hand_of(grasps: GraspBatch, given: str | None) -> Hand:
@@ -97,8 +124,10 @@ def object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectMode
 def object_source(grasps: GraspBatch, scale: float = 1.0) -> tuple[str, float]:
     """File or name of the object of some grasps, and its scale; `scale` is for objects found by name."""
     source = _recorded(grasps, OBJECT_FILE)
-    own_scale = float(grasps.extra[OBJECT_SCALE][0]) if source and OBJECT_SCALE in grasps.extra else scale
-    return source or grasps.object[0], own_scale
+    if source and OBJECT_SCALE in grasps.extra:
+        # Files hold single precision: the shortest decimal number is the one that was given, and gives the same object.
+        scale = float(str(grasps.extra[OBJECT_SCALE][0].float().numpy()))
+    return source or grasps.object[0], scale
 
 
 def frame_of(grasps: GraspBatch) -> str | None:

@@ -57,6 +57,11 @@ class HandReport:
     notes: tuple[Note, ...]
     """Findings, repairs and faults."""
 
+    def __repr__(self) -> str:
+        count = {level: sum(note.level == level for note in self.notes) for level in dict.fromkeys(n.level for n in self.notes)}
+        found = ", ".join(f"{n} {level}{'s' * (n > 1)}" for level, n in count.items()) or "nothing wrong was found"
+        return f"HandReport({self.hand!r}, {found}; lines() tells all)"
+
     def lines(self) -> list[str]:
         """The report for people."""
         width = max(len(name) for name in self.facts)

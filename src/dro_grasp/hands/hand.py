@@ -78,6 +78,9 @@ class Hand:
     description: Description | None = field(default=None, repr=False, compare=False)
     """The file behind the hand; None for a hand from a training bundle."""
 
+    def __repr__(self) -> str:
+        return f"Hand('{self.name}', {self.tree.n_dof} joints, {len(self.fingers)} fingers, {self.n_points} surface points)"
+
     @property
     def tips(self) -> tuple[int, ...]:
         """Fingertip links, one per finger."""

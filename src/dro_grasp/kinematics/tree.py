@@ -57,6 +57,9 @@ class KinematicTree:
     offset: Float[Tensor, " n_joints"]
     """See coupling [rad or m]."""
 
+    def __repr__(self) -> str:
+        return f"KinematicTree({self.n_links} links from '{self.link_names[0]}', {self.n_dof} independent joints)"
+
     @property
     def n_links(self) -> int:
         """Number of links, fixed ones included."""

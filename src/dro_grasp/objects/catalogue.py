@@ -7,6 +7,7 @@ import json
 import math
 import os
 import re
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ import trimesh
 from dro_grasp.errors import ObjectError
 from dro_grasp.objects.builtin import BUILTIN, make_builtin
 from dro_grasp.objects.convex_parts import Part
+from dro_grasp.objects.in_memory import ObjectSource, object_in_memory
 from dro_grasp.objects.loading import load_file, mesh_object, read_geometry
 from dro_grasp.objects.shape import ObjectModel
 
@@ -28,17 +30,25 @@ MESH_SUFFIXES = {".obj", ".stl", ".ply", ".glb", ".gltf", ".off", ".dae", ".npy"
 """Suffixes of the files in a folder that count as objects."""
 
 
-def load_object(name: str | Path, *, scale: float = 1.0) -> ObjectModel:
-    """Load an object by name or from a mesh or point cloud file.
+def load_object(source: ObjectSource, *, scale: float = 1.0, name: str | None = None) -> ObjectModel:
+    """Load an object by name, from a mesh or point cloud file, or from a mesh or points in memory.
 
     Args:
-        name: A built-in name, an asset's name (`contactdb+apple`), or a path; `assets/NAME` forces the asset.
+        source: A built-in name, an asset's name (`contactdb+apple`), or a path; `assets/NAME` forces the asset. In memory: a
+            trimesh mesh, cloud or scene, a pair (vertices, faces), or points (n 3), with normals (n 6).
+        scale: Multiplies all coordinates; 0.001 for millimetres.
+        name: What to call the object, instead of its own name.
 
     Raises:
         ObjectError: The object does not exist, it is unusable, or `scale` is not positive.
     """
     if not (math.isfinite(scale) and scale > 0):
         raise ObjectError(f"scale is {scale}; give a positive number, for example --scale 0.001 for millimetres")
+    obj = _load(source, scale) if isinstance(source, str | Path) else object_in_memory(source, scale)
+    return obj if name is None else replace(obj, name=name)
+
+
+def _load(name: str | Path, scale: float) -> ObjectModel:
     text = str(name)
     if text in BUILTIN:
         return make_builtin(text, scale=scale)
@@ -49,7 +59,7 @@ def load_object(name: str | Path, *, scale: float = 1.0) -> ObjectModel:
     if path.is_dir():
         raise ObjectError(f"{path} is a folder; name one of its files, or use a command that takes folders")
     if path.exists() or path.suffix:
-        return load_file(path, scale=scale)
+        return replace(load_file(path, scale=scale), file=str(path.resolve()), scale=scale)
     raise ObjectError(_unknown(text))
 
 

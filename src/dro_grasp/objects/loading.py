@@ -73,7 +73,7 @@ def read_geometry(path: Path) -> tuple[trimesh.Trimesh | Float[np.ndarray, "..."
     try:
         loaded = trimesh.load(path, process=False)
         unit = trimesh.units.unit_conversion(loaded.units, "meters") if loaded.units else 1.0
-        geometry = _merge(loaded) if isinstance(loaded, trimesh.Scene) else loaded
+        geometry = merge_scene(loaded) if isinstance(loaded, trimesh.Scene) else loaded
     except Exception as error:  # each reader behind trimesh raises its own errors
         raise ObjectError(f"{path} cannot be read as a mesh or cloud: {error}. Expected a format that trimesh reads "
                           "(STL, OBJ, PLY, GLB, OFF, ...), NPY or PCD") from error
@@ -85,7 +85,7 @@ def read_geometry(path: Path) -> tuple[trimesh.Trimesh | Float[np.ndarray, "..."
     return geometry, unit
 
 
-def _merge(scene: trimesh.Scene) -> trimesh.Trimesh | trimesh.PointCloud:
+def merge_scene(scene: trimesh.Scene) -> trimesh.Trimesh | trimesh.PointCloud:
     """All meshes of a scene in its frame, or its point clouds if it has no mesh."""
     mesh = scene.to_mesh()
     clouds = [part.vertices for part in scene.dump() if isinstance(part, trimesh.PointCloud)]

@@ -52,6 +52,16 @@ class ObjectModel:
     exact_parts: tuple[Part, ...] | None = None
     """Convex parts known by construction or from a file; None computes them."""
 
+    file: str | None = None
+    """The file it was loaded from, if it is a user's own."""
+    scale: float = 1.0
+    """Factor that the file's coordinates were multiplied by."""
+
+    def __repr__(self) -> str:
+        size = " x ".join(f"{100 * side:.1f}" for side in self.extents)
+        made = f"bare cloud of {len(self.cloud)} points" if self.faces is None else f"mesh of {len(self.faces)} faces"
+        return f"ObjectModel('{self.name}', {made}, {size} cm{'' if self.is_cloud else f', {1e3 * self.mass:.0f} g'})"
+
     @property
     def is_cloud(self) -> bool:
         """Whether there is no mesh."""

@@ -15,6 +15,7 @@ from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.energy.surroundings import Surroundings
 from dro_grasp.errors import OptionError
 from dro_grasp.geometry.distance_field import DistanceField
+from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pipeline.constraints import Constraints
@@ -29,9 +30,9 @@ class GraspProblem:
         >>> grasps = evaluate(problem, rank(problem, refine(problem, grasps)), "strict")
     """
 
-    hand: Hand = field(repr=False)
+    hand: Hand
     """On the CPU, where grasps and trials stay."""
-    obj: ObjectModel = field(repr=False)
+    obj: ObjectModel
     """A mesh or a bare point cloud."""
     device: torch.device | str = "cpu"
     """Where the network and the grasp energy run."""
@@ -41,11 +42,12 @@ class GraspProblem:
     _thinned: dict[int, Hand] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Refuse an absent device, and a table above the object.
+        """Refuse what is no hand or no object, an absent device, and a table above the object.
 
         Raises:
-            OptionError: This machine has no such device, or the table leaves nothing of the object.
+            OptionError: Something else was given, this machine has no such device, or the table leaves nothing of the object.
         """
+        require_pair(self.hand, self.obj)
         require_device(str(self.device))
         table, top = self.constraints.table, self.height_range[1]
         if table is not None and not table < top:

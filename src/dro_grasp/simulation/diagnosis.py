@@ -17,7 +17,7 @@ REMEDIES = {
     Failure.SELF_PENETRATION: f"see what the hand's shapes do in `dro-grasp hand check HAND --picture hand.png`; {MORE}",
     Failure.UNSTABLE: "see what `dro-grasp hand check HAND` warns of: masses, inertias and limits of the description",
     Failure.PUSHED_AWAY: f"{MORE}; ask for another palm direction (--direction X Y Z), from which the fingers close around it",
-    Failure.NO_CONTACT: "check that the object's size suits the hand (--scale), and look at the grasps (--picture, `dro-grasp view`)",
+    Failure.NO_CONTACT: "check that the object's size suits the hand (--scale), and look at the grasps (`dro-grasp view`)",
     Failure.LOST: MORE,
     Failure.TURNED: MORE,
     Failure.SLIPPED: MORE,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -70,6 +71,11 @@ class TrialResult:
     """The trial that was measured; 0 is the protocol's own, without perturbation."""
     protocol: str
     """Name and version."""
+
+    def __repr__(self) -> str:
+        failed = Counter(kind.value for kind in self.failure if kind).most_common()
+        told = "".join(f", {count} failed: {reason}" for reason, count in failed)
+        return f"TrialResult({int(self.success.sum())} of {len(self.success)} hold under {self.protocol}{told})"
 
     @property
     def contacts(self) -> Int[Tensor, " n"]:

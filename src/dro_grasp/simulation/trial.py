@@ -16,6 +16,7 @@ from torch import Tensor
 from dro_grasp.devices import cores
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import completed
+from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.contacts import Penetration, contact_mask, count_fingers, find_contact_links, measure_penetration
@@ -32,8 +33,8 @@ CHUNK = 64
 
 
 def simulate(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *, workers: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *,
+    workers: int | None = None, progress: Callable[[int, int], None] | None = None,
 ) -> TrialResult:
     """Evaluate grasps of one object in MuJoCo.
 
@@ -115,7 +116,8 @@ def held(
 
 
 def record(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, index: int, protocol: str | Protocol = DEFAULT_PROTOCOL, *, stride: int = 10
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, index: int, protocol: str | Protocol = DEFAULT_PROTOCOL, *,
+    stride: int = 10,
 ) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames n_dof"]]:
     """Frames of one grasp's trial, as `simulate` runs it: it ends where the trial ends.
 
@@ -152,6 +154,7 @@ def record(
 
 def _scene(hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol) -> Scene:
     """The scene in which the grasps are simulated."""
+    require_pair(hand, obj)
     grasps.require_hand(hand)
     return cached_scene(hand, obj, find_protocol(protocol))
 

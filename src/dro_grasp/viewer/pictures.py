@@ -19,6 +19,7 @@ from torch import Tensor
 from dro_grasp.devices import cores
 from dro_grasp.errors import OutputError
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.rendering.meshes import Colour, dots
@@ -80,6 +81,7 @@ def draw_grasps(
     Raises:
         OutputError: The file cannot be written, or there is no grasp.
     """
+    require_pair(hand, obj)
     if len(grasps) == 0:
         raise OutputError(f"no grasp to draw into {path}; ask for at least one")
     shown, closed = grasps[:count], can_close(hand, obj) and (style or PictureStyle()).posture == "held"

@@ -200,9 +200,10 @@ class Studio(ServedPage):
     def _generate(self) -> None:
         self._say("Generating ...")
         begin = time.perf_counter()
+        temperature = None if self.usual.value else float(self.temperature.value)
         made = self.generate(
-            self.hand.value, self.object.value, int(self.num.value), self.direction.value,
-            None if self.usual.value else float(self.temperature.value), self.protocol.value, int(self.candidates.value), self.method.value)
+            self.hand.value, self.object.value, int(self.num.value), self.direction.value, temperature, self.protocol.value,
+            int(self.candidates.value), self.method.value)
         held = "" if made.obj.is_cloud else (
             f", **{int(made.refined.success.sum())}** held under *{self.protocol.value}*")
         lines = [f"{len(made.refined)} grasps{held}; {time.perf_counter() - begin:.1f} s", *diagnose(made.refined)]

@@ -35,6 +35,9 @@ class MadeHand:
     redrawn: tuple[str, ...]
     """For each plan that was drawn before and could not grasp, the reason."""
 
+    def __repr__(self) -> str:
+        return f"MadeHand('{self.name}', {self.plan.family}, {len(self.plan.fingers)} fingers, {self.plan.joints} joints)"
+
     def facts(self) -> dict[str, Any]:
         """A row of the listing."""
         plan = self.plan
