@@ -118,7 +118,8 @@ def test_json_example_has_the_keys_of_generate() -> None:
     (example,) = (e for e in (json.loads(text) for _, text in blocks("json")) if "seconds" in e)
     source = (ROOT / "src" / "dro_grasp" / "cli" / "generate.py").read_text()
     assert all(f'"{key}":' in source for key in example)
-    assert list(example["seconds"]) == ["load", "network", "decode", "optimise", "refine", "rank", "trial"]
+    assert list(example["seconds"]) == [
+        "start", "load", "network", "decode", "optimise", "refine", "rank", "trial", "files", "total"]
 
 
 @pytest.mark.parametrize(("document", "key"), [("export.md", "T_frame_object"), ("own-object.md", "T_frame_camera")])

@@ -116,6 +116,16 @@ def test_bad_input_is_one_message_and_status_2(
     assert "Traceback" not in said.err
 
 
+def test_saving_the_successful_without_a_trial_is_refused(weights: str, tmp_path: Path, capsys) -> None:
+    np.save(tmp_path / "cloud.npy", np.random.default_rng(0).normal(size=(500, 3)) * 0.02)
+    common = ["generate", "--hand", "gripper3", "--weights", weights, "--only-successful"]
+    common += ["--output", str(tmp_path / "a.parquet")]
+    for more in (["--object", "sphere", "--protocol", "none"], ["--object", str(tmp_path / "cloud.npy")]):
+        assert main([*common, *more]) == 2
+        assert "name a --protocol" in capsys.readouterr().err
+    assert not (tmp_path / "a.parquet").exists()
+
+
 def test_wrong_arguments_are_status_2(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main(["generate", "--hand", "gripper3", "--object", "sphere", "--numb", "3"])

@@ -125,12 +125,16 @@ class Generate:
 
     def _grasp(self, job: Job, name: str, output: Path | None, picture: Path | None) -> ObjectResult:
         """One object, start to end."""
+        from dro_grasp.errors import OptionError
         from dro_grasp.pipeline.problem import GraspProblem
         from dro_grasp.simulation.diagnosis import count_failures, next_steps
 
         begin = time.perf_counter()
         obj = self._load(name, job.camera)
         seconds = {**job.seconds, "load": job.seconds["load"] + time.perf_counter() - begin}
+        if self.only_successful and self._protocol(obj) == "none":
+            raise OptionError(f"--only-successful saves what passed a trial, and '{obj.name}' gets none; name a "
+                              "--protocol, which needs a mesh, or leave out --only-successful")
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
         problem = GraspProblem(job.hand, obj, constraints=job.constraints)
@@ -149,7 +153,7 @@ class Generate:
             "seed": self.seed, "weights": job.predictor.weights_name, "protocol": self._protocol(obj),
             "success": int(grasps.success.sum()) if simulated else None,
             "success_rate": float(grasps.success.float().mean()) if simulated else None,
-            "reasons": count_failures(grasps), "next": next_steps(grasps),
+            "reasons": count_failures(grasps), "next": next_steps(grasps), "seconds": {},
             "output": None if output is None else str(output),
             "frame": "object" if job.camera is None else job.camera.frame,
         }
@@ -165,7 +169,7 @@ class Generate:
             draw_grasps(job.hand, obj, kept if len(kept) else grasps, picture)
         seconds["files"] = time.perf_counter() - middle
         seconds["total"] = sum(job.seconds.values()) + time.perf_counter() - begin
-        report["seconds"] = {k: round(v, 4) for k, v in seconds.items()}
+        report["seconds"] |= {k: round(v, 4) for k, v in seconds.items()}
         if not self.json:
             self._show(report, grasps, made.origin)
         return ObjectResult(report, obj, kept, made.points[keep])

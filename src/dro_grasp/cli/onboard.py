@@ -54,7 +54,8 @@ class Onboard:
                  for step in ("before", "after")}
         if self.json:
             print_json({"hand": self.hand, "weights": done.weights, "gained": done.gained,
-                        "fine_tuned": str(self.output / WEIGHTS), "without_grasps": done.without_grasps, "report": str(report), **rates,
+                        "fine_tuned": str(self.output / WEIGHTS), "without_grasps": done.without_grasps,
+                        "report": str(report), **rates,
                         "optimised": {step: done.optimised(step) for step in ("before", "after")},
                         "grasps": done.steps["training"]["grasps"],
                         "seconds": {name: round(step["seconds"], 1) for name, step in done.steps.items()}})

@@ -103,8 +103,9 @@ def render(
     with np.errstate(divide="ignore"):
         depth = (1 / canvas.inverse).astype(np.float32)
     picture *= outlines(depth.reshape(canvas.height, canvas.width), oversampling, style)[..., None]
-    picture = sum(picture[i::oversampling, j::oversampling] for i in range(oversampling) for j in range(oversampling))
-    return ((picture / oversampling**2).clip(0, 1) * 255 + 0.5).astype(np.uint8)
+    steps = range(oversampling)
+    mean = np.mean([picture[i::oversampling, j::oversampling] for i in steps for j in steps], axis=0)
+    return (mean.clip(0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def _gather(meshes: Sequence[Mesh], camera: Camera, canvas: _Canvas, style: Style) -> _Triangles:
