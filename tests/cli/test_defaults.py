@@ -13,6 +13,7 @@ from dro_grasp.cli.evaluate import Evaluate
 from dro_grasp.cli.generate import Generate
 from dro_grasp.cli.main import PATIENCE, main
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.stages import evaluate
 from dro_grasp.predictor import GraspPredictor, GraspRequest
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL
@@ -21,8 +22,8 @@ from dro_grasp.viewer.studio import Studio
 from tests.helpers.browser import free_port
 from tests.helpers.weights import untrained_weights
 
-REQUESTS = {"num": 16, "seed": 0, "direction": None, "table": None, "candidates": 4, "refine": True, "temperature": None,
-            "method": "auto"}
+REQUESTS = {"num": 16, "seed": 0, "candidates": 4, "refine": True, "temperature": None, "method": "auto"}
+CONSTRAINTS = {"direction": None, "table": None}
 
 
 def default(function: Callable[..., Any], name: str) -> Any:
@@ -33,6 +34,8 @@ def test_a_request_has_the_same_defaults_everywhere() -> None:
     for name, value in REQUESTS.items():
         assert getattr(GraspRequest(), name) == value
         assert default(Generate, name) == value, f"generate --{name}"
+    for name, value in CONSTRAINTS.items():
+        assert getattr(Constraints(), name) == default(Generate, name) == value, name
     assert {default(GraspPredictor.predict, name) == REQUESTS[name] for name in ("num", "seed")} == {True}
     for name in ("num", "candidates", "temperature", "method"):
         assert default(Studio.generate, name) == REQUESTS[name], name
