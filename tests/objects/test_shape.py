@@ -211,3 +211,27 @@ def test_hash_tells_content_apart():
     points = np.arange(6, dtype=np.float32).reshape(2, 3)
     assert content_hash(points) == content_hash(np.asfortranarray(points))
     assert content_hash(points) != content_hash(points + 1)
+
+
+def test_a_few_wrong_normals_do_not_turn_a_cloud_inside_out() -> None:
+    """A can without its bottom, as a camera's cloud of one on a table is, with wrong normals at its rim; the can is the oracle."""
+    radius, height = 0.035, 0.1
+    angle, z = np.meshgrid(np.linspace(0, 2 * np.pi, 60, endpoint=False), np.linspace(0, height, 26))
+    side = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], -1).reshape(-1, 3)
+    wall = radius * side + z.reshape(-1, 1) * [0, 0, 1]
+    x, y = np.meshgrid(np.linspace(-radius, radius, 18), np.linspace(-radius, radius, 18))
+    inside = np.hypot(x, y) < radius - 0.002
+    lid = np.stack([x[inside], y[inside], np.full(int(inside.sum()), height)], 1)
+    cloud, normals = np.concatenate([wall, lid]), np.concatenate([side, np.tile([0.0, 0, 1], (len(lid), 1))])
+    normals[wall.shape[0] - 60:wall.shape[0]:3] *= -1
+    points = np.random.default_rng(0).uniform([-0.1, -0.1, 0.0], [0.1, 0.1, 0.2], (4000, 3))
+    apart = np.stack([np.hypot(points[:, 0], points[:, 1]) - radius, points[:, 2] - height], 1)
+    true = np.minimum(apart.max(1), 0) + np.linalg.norm(np.maximum(apart, 0), axis=1)
+    clear = np.abs(true) > 0.005
+    found = surface_distances.closed_cloud_distances(cloud, normals, points)
+    assert ((found < 0) == (true < 0))[clear].mean() > 0.995
+    assert np.abs(found - true)[clear].max() < 0.01
+    discs = surface_distances.cloud_distances(cloud, normals, points)
+    assert ((discs < 0) == (true < 0))[clear].mean() < 0.95, "discs alone tell as much"
+    turned = points[:500] * [1, 1, -1]  # below the open end
+    assert (surface_distances.closed_cloud_distances(cloud, normals, turned)[turned[:, 2] < -0.02] > 0).all()

@@ -16,7 +16,7 @@ from dro_grasp.geometry.point_clouds import random_half
 from dro_grasp.objects.cache import cached_arrays
 from dro_grasp.objects.coarse_parts import coarse_parts
 from dro_grasp.objects.convex_parts import Part, decompose
-from dro_grasp.objects.surface_distances import GRID_SPACING, bake_grid, cloud_distances, signed_distances
+from dro_grasp.objects.surface_distances import GRID_SPACING, bake_grid, closed_cloud_distances, signed_distances
 
 DENSITY = 500.0
 """Density of every object in trials [kg/m^3]. Source: the official release."""
@@ -96,7 +96,7 @@ class ObjectModel:
         """Signed distances around the object; for a mesh, their grid is cached on disk."""
         if self.vertices is None or self.faces is None:
             cloud, normals = self.cloud.astype(np.float64), self.cloud_normals.astype(np.float64)
-            grid = bake_grid(cloud, partial(cloud_distances, cloud, normals))
+            grid = bake_grid(cloud, partial(closed_cloud_distances, cloud, normals))
         else:
             vertices, faces = self.vertices, self.faces
             key = f"grid-{self.sha256[:24]}-{GRID_SPACING * 1e6:.0f}"

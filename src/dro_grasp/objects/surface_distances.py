@@ -16,6 +16,10 @@ GRID_PADDING = 0.04
 """Distance that the grid extends beyond the object [m] (ours)."""
 LARGEST_GRID = 8_000_000
 """Most grid points; a larger object gets a wider spacing (ours)."""
+SURE = 0.003
+"""Distance from a cloud up to which the disc around the nearest point tells inside from outside [m] (ours)."""
+MOSTLY_INSIDE = 0.4
+"""Winding number above which a place farther away is inside (ours): 1/2 where a side of the object is missing."""
 DISC_NEIGHBOURS = 7
 """Points of a bare cloud within the disc around each point, itself included (ours)."""
 
@@ -47,6 +51,25 @@ def cloud_distances(
     height = (apart * normals[index]).sum(1)
     beyond = np.maximum(0, np.linalg.norm(apart - height[:, None] * normals[index], axis=1) - reach)
     return np.where(height < 0, -1.0, 1.0) * np.hypot(height, beyond)
+
+
+def closed_cloud_distances(
+    cloud: Float[np.ndarray, "m 3"], normals: Float[np.ndarray, "m 3"], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, " n"]:
+    """As `cloud_distances`, but a rim that is left open, as under an object on a table, is no inside of its own.
+
+    Behind the rim's discs a point may be far outside. Away from the surface the winding number of the cloud decides.
+    """
+    import igl
+
+    distance = cloud_distances(cloud, normals, points)
+    count = min(DISC_NEIGHBOURS, len(cloud))
+    radius = KDTree(cloud).query(cloud, k=count)[0][:, -1]
+    area = np.pi * radius**2 / max(1, count - 1)
+    far = np.abs(distance) > SURE
+    winding = igl.fast_winding_number(cloud, normals, area, np.ascontiguousarray(points[far]))
+    distance[far] = np.where(winding > MOSTLY_INSIDE, -1.0, 1.0) * np.abs(distance[far])
+    return distance
 
 
 def signed_distances(
