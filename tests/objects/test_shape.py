@@ -214,7 +214,7 @@ def test_hash_tells_content_apart():
 
 
 def test_a_few_wrong_normals_do_not_turn_a_cloud_inside_out() -> None:
-    """A can without its bottom, as a camera's cloud of one on a table is, with wrong normals at its rim; the can is the oracle."""
+    """A can without its bottom, as a camera sees it on a table, with wrong normals at its rim; the can is the oracle."""
     radius, height = 0.035, 0.1
     angle, z = np.meshgrid(np.linspace(0, 2 * np.pi, 60, endpoint=False), np.linspace(0, height, 26))
     side = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], -1).reshape(-1, 3)
