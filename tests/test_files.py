@@ -1,4 +1,4 @@
-"""Folders to write to, checked before the work and made with their parents."""
+"""Paths of the user, checked before the work; folders made with their parents; one error for all that a library raises."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from dro_grasp.errors import OutputError
-from dro_grasp.files import check_folder, make_folder
+from dro_grasp.errors import GraspFileError, OptionError, OutputError
+from dro_grasp.files import check_folder, check_output, given_path, make_folder, reading
 
 
 @pytest.mark.parametrize("name", ["run", "runs/main/motion"])
@@ -37,3 +37,32 @@ def test_a_folder_above_that_is_read_only_is_named_before_the_work(tmp_path: Pat
     with pytest.raises(OutputError, match=f"into {tmp_path}: no permission"):
         make_folder(tmp_path / "runs" / "main")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["a" * 10_000, "a" * 300 + ".obj", "~nobody_here/x", "x\0y", "\udcff.stl"])
+def test_what_is_no_path_is_refused(name: str) -> None:
+    for check in (given_path, check_folder, check_output):
+        with pytest.raises(OptionError, match="is no path of a file"):
+            check(name)
+
+
+@pytest.mark.parametrize("name", ["/dev/full", "/dev/null", "fifo"])
+def test_devices_and_pipes_are_not_replaced(tmp_path: Path, name: str) -> None:
+    if name == "fifo":
+        os.mkfifo(tmp_path / name)
+    with pytest.raises(OutputError, match="device or a pipe"):
+        check_output(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "error", [KeyError("x"), RecursionError(), MemoryError(), OSError(28, "No space left"), ValueError("a\nb")])
+def test_what_a_library_raises_becomes_one_error_that_names_the_file(error: Exception) -> None:
+    with pytest.raises(GraspFileError, match=r"^f\.parquet cannot be read \(.+\); expected a grasp file$"):
+        with reading("f.parquet", GraspFileError, "a grasp file"):
+            raise error
+
+
+def test_our_own_errors_and_ctrl_c_pass() -> None:
+    for error in (OptionError("mine"), KeyboardInterrupt()):
+        with pytest.raises(type(error)), reading("f", GraspFileError, "a file"):
+            raise error

@@ -1,30 +1,71 @@
-"""Writing files: paths are checked before the work, and a file is written whole or not at all."""
+"""Files of the user: paths are checked before the work, what is read is refused by one error, what is written is whole."""
 
 from __future__ import annotations
 
 import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from safetensors import SafetensorError
 
-from dro_grasp.errors import OutputError
+from dro_grasp.errors import DroGraspError, OptionError, OutputError
+
+TOLD = 200
+"""Characters of a path or a reason that an error repeats (ours)."""
+
+
+def given_path(name: Path | str) -> Path:
+    """The path that a user gives, with `~` expanded; there may be nothing at it.
+
+    Raises:
+        OptionError: It is none: too long, of a user who does not exist, or with characters that no file system takes.
+    """
+    try:
+        path = Path(name).expanduser()
+        os.fsencode(path).decode()
+        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):
+            os.stat(path)
+    except (OSError, ValueError, RuntimeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise OptionError(f"{str(name)[:TOLD]!r} is no path of a file ({reason}); check its spelling") from error
+    return path
+
+
+@contextmanager
+def reading(path: object, refuse: type[DroGraspError], expected: str) -> Iterator[None]:
+    """Turn whatever a library raises over a damaged file into one error that names the file; our own errors pass.
+
+    Every library behind the readers raises errors of its own, and new ones with each release.
+
+    Raises:
+        refuse: The block raised.
+    """
+    try:
+        yield
+    except DroGraspError:
+        raise
+    except Exception as error:
+        reason = getattr(error, "strerror", None) or next(iter(str(error).splitlines()), "") or type(error).__name__
+        raise refuse(f"{path} cannot be read ({reason[:TOLD]}); expected {expected}") from error
 
 
 def check_output(path: Path | str) -> Path:
     """Refuse a path that cannot be written, before any work is done.
 
     Raises:
-        OutputError: The parent folder is missing or read-only, or the path is a folder or a read-only file.
+        OutputError: The parent folder is missing or read-only, or the path is a folder, a device or a read-only file.
     """
-    path = Path(path)
+    path = given_path(path)
     parent = path.absolute().parent
     if not parent.is_dir():
         raise OutputError(f"cannot write {path}: no folder {parent}; create it first (mkdir -p {parent})")
     if path.is_dir():
         raise OutputError(f"cannot write {path}: it is a folder; give the name of a file in it")
+    if path.exists() and not path.is_file():
+        raise OutputError(f"cannot write {path}: it is a device or a pipe, which writing would replace; give the name of a "
+                          "file")
     if not os.access(parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
         raise OutputError(f"cannot write {path}: no permission; choose another path")
     return path
@@ -49,7 +90,7 @@ def check_folder(path: Path | str) -> Path:
     Raises:
         OutputError: It or a folder above it is a file, or permission is missing.
     """
-    path = Path(path)
+    path = given_path(path)
     there = next(place for place in (path.absolute(), *path.absolute().parents) if place.exists())
     if not there.is_dir():
         raise OutputError(f"cannot write into {path}: {there} is a file; give a folder")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import NamedTuple
 
@@ -46,12 +47,14 @@ def read_motion(path: Path, key: str) -> NamedMotion:
         OptionError: No such file, no such content, or no rigid motion.
     """
     wanted = f'{path} must hold {{"frame": NAME, "{key}": [4 rows of 4 numbers]}}, in metres'
+    if not os.path.isfile(path):  # nothing is read from devices and pipes
+        raise OptionError(f"{wanted}; there is no such file")
     try:
         values = json.loads(path.read_text())
         name, T = values["frame"], torch.tensor(values[key], dtype=torch.float64)
     except KeyError as error:
         raise OptionError(f"{wanted}; it has no entry {error}") from error
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, ValueError, TypeError, LookupError, ArithmeticError, RuntimeError) as error:
         raise OptionError(f"{wanted}; it does not ({error})") from error
     if not isinstance(name, str) or not name:
         raise OptionError(f"{wanted}; its frame is {name!r}, which is not a name")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -27,7 +28,7 @@ from dro_grasp.models.checkpoints import (
     verify_weights,
     weights_names,
 )
-from dro_grasp.models.network import DistanceNetwork
+from dro_grasp.models.network import DistanceNetwork, untrained_network
 from dro_grasp.models.presets import NetworkConfig
 from tests.helpers.tiny_bundle import TINY
 
@@ -122,8 +123,9 @@ def change(path: Path, how: str) -> None:
     ("how", "word"),
     [
         ("cut short", "cut short"), ("empty", "cut short"), ("foreign", "not of dro-grasp"),
-        ("strange header", "not of dro-grasp"), ("no configuration", "does not fit"), ("other sizes", "does not fit"),
-        ("impossible sizes", "does not fit"), ("unknown setting", "unknown settings magic"),
+        ("strange header", "not of dro-grasp"), ("no configuration", "expected weights of this version"),
+        ("other sizes", "has shape|of shape"),
+        ("impossible sizes", "expected weights of this version"), ("unknown setting", "unknown settings magic"),
         ("hand not placed", "placed is no longer a choice"), ("kernel alone", "residual is no longer a choice"),
         ("colder z", "latent_temperature is no longer a choice"), ("contradiction", "knows no placement"),
         ("another version", "version 99, expected 1"), ("zipped pickle", "can run code"), ("bare pickle", "can run code"),
@@ -220,3 +222,52 @@ def test_verify_checks_files_of_the_user_as_well(path: Path, capsys: pytest.Capt
     assert "cut short" in said.err
     assert "multi" in said.out
     assert main(["weights", "verify"]) == 0
+
+
+def rewritten(path: Path, change: Any) -> Path:
+    """The weights with a changed entry and changed tensors."""
+    with safe_open(path, "pt") as file:
+        entry, tensors = json.loads(file.metadata()[KEY]), {key: file.get_tensor(key) for key in file.keys()}
+    change(entry, tensors)
+    save_file(tensors, path, metadata={KEY: json.dumps(entry)})
+    return path
+
+
+@pytest.mark.parametrize("config", [
+    None, 5, [], {}, {"width": None}, {"width": 0}, {"width": 10_000}, {"width": "64"}, {"width": True}, {"encoder_widths": []},
+    {"encoder_widths": [8, None]}, {"encoder_widths": 8}, {"latent_head": [16]}, {"frame": "moon"},
+    {"frame": None}, {"heads": 3}, {"neighbours": 4000}, {"placement_temperature": float("nan")},
+    {"initial_distance": -1.0}, {"kernel_hidden": [16, 4096]},
+])
+def test_a_configuration_that_no_network_has_is_refused(tmp_path: Path, config: Any) -> None:
+    path = tmp_path / "w.safetensors"
+    save_weights(untrained_network(TINY, 0), path)
+
+    def change(entry: dict[str, Any], _: dict[str, torch.Tensor]) -> None:
+        entry["config"] = entry["config"] | config if isinstance(config, dict) and config else config
+
+    with pytest.raises(WeightsError):
+        load_weights(rewritten(path, change))
+
+
+@pytest.mark.parametrize(
+    ("value", "name"), [(torch.nan, "head.last.bias"), (torch.inf, "head.last.weight"), (-1.0, "running_var")])
+def test_weights_that_are_not_finite_are_refused(tmp_path: Path, value: float, name: str) -> None:
+    path = tmp_path / "w.safetensors"
+    save_weights(untrained_network(TINY, 0), path)
+
+    def change(_: dict[str, Any], tensors: dict[str, torch.Tensor]) -> None:
+        tensors[next(key for key in tensors if name in key)].view(-1)[0] = value
+
+    with pytest.raises(WeightsError, match=f"{name}.* holds NaN, infinity, or a negative variance"):
+        load_weights(rewritten(path, change))
+
+
+@pytest.mark.parametrize("entry", [{"about": 5}, {"history": {}}, {"history": [1]}, {"config": []}])
+def test_an_entry_of_other_types_is_refused_by_every_reader(tmp_path: Path, entry: dict[str, Any]) -> None:
+    path = tmp_path / "w.safetensors"
+    save_weights(untrained_network(TINY, 0), path)
+    rewritten(path, lambda old, _: old.update(entry))
+    for read in (load_weights, describe_weights, history_of, verify_weights):
+        with pytest.raises(WeightsError, match="must be objects"):
+            read(path)

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import os
 import struct
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 import trimesh
 
 from dro_grasp.errors import ObjectError
+from dro_grasp.geometry import mesh_files
 from dro_grasp.objects.loading import MIN_CLOUD, estimate_normals, load_file
 from dro_grasp.objects.shape import CLOUD_POINTS
 
@@ -292,7 +295,7 @@ def test_foreign_pcd_is_refused(tmp_path: Path, data: bytes, message: str):
      (np.full((500, 3), 0.1), "1 distinct points"), (np.zeros((0, 3)), "0 distinct points"),
      (np.where(np.arange(600).reshape(200, 3) == 4, np.nan, 0.04 * directions(200)), "1 points with NaN"),
      (np.zeros((20, 4)), r"shape \(20, 4\); expected \(n, 3\)"), (np.zeros(30), r"shape \(30,\)"),
-     (40 * directions(200), r"too large .*0.001"), (np.array(["a", "b"]), "no plain NPY array")])
+     (40 * directions(200), r"too large .*0.001"), (np.array(["a", "b"]), "expected a plain NPY array")])
 def test_unusable_clouds_are_refused(tmp_path: Path, points: np.ndarray, message: str):
     np.save(tmp_path / "c.npy", points)
     with pytest.raises(ObjectError, match=message):
@@ -301,10 +304,10 @@ def test_unusable_clouds_are_refused(tmp_path: Path, points: np.ndarray, message
 
 def test_npy_with_objects_or_noise_is_refused(tmp_path: Path):
     np.save(tmp_path / "c.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    with pytest.raises(ObjectError, match="no plain NPY array"):
+    with pytest.raises(ObjectError, match="expected a plain NPY array"):
         load_file(tmp_path / "c.npy")
     (tmp_path / "c.npy").write_bytes(b"")
-    with pytest.raises(ObjectError, match="no plain NPY array"):
+    with pytest.raises(ObjectError, match="expected a plain NPY array"):
         load_file(tmp_path / "c.npy")
 
 
@@ -330,3 +333,74 @@ def test_estimated_normals_of_a_box_point_outward():
     true = trimesh.creation.box((0.1, 0.1, 0.1)).face_normals[face]
     inner = np.sort(np.abs(points), axis=1)[:, 1] < 0.04  # away from the edges
     assert (normals * true).sum(1)[inner].min() > 0.98
+
+
+def obj_file(path: Path, vertices: np.ndarray, faces: np.ndarray, head: str = "") -> Path:
+    lines = [head, *(f"v {x} {y} {z}" for x, y, z in vertices), *(f"f {a} {b} {c}" for a, b, c in faces + 1)]
+    path.write_text("\n".join(lines))
+    return path
+
+
+def test_faces_without_area_and_soups_are_refused_at_once(tmp_path: Path) -> None:
+    draw = np.random.default_rng(0)
+    points, line = draw.uniform(-0.05, 0.05, (1800, 3)), np.linspace(-0.05, 0.05, 30)[:, None] * np.ones(3)
+    for vertices, faces, message in (
+        (points[:30], np.repeat(np.arange(30)[:, None], 3, 1), "none of which has an area"),
+        (line, np.arange(30).reshape(-1, 3), "none of which has an area"),
+        (points, np.arange(1800).reshape(-1, 3), "is no surface: 100%"),
+        (points[:300], draw.permutation(1800).reshape(-1, 3) % 300, "is no surface: 9.%"),
+    ):
+        with pytest.raises(ObjectError, match=message):
+            load_file(obj_file(tmp_path / "o.obj", vertices, faces))
+
+
+def test_meshes_and_clouds_far_from_their_origin_are_refused(tmp_path: Path) -> None:
+    box = trimesh.creation.box((0.05, 0.05, 0.05))
+    with pytest.raises(ObjectError, match=r"coordinates of up to 1e\+09 m, too large"):
+        load_file(obj_file(tmp_path / "o.obj", box.vertices + 1e9, box.faces))
+    np.save(tmp_path / "c.npy", 0.04 * directions(500) + 1e6)
+    with pytest.raises(ObjectError, match=r"coordinates of up to 1e\+06 m, too large"):
+        load_file(tmp_path / "c.npy")
+
+
+def test_columns_that_are_no_normals_are_refused(tmp_path: Path) -> None:
+    colours = np.random.default_rng(0).uniform(0, 255, (500, 3))
+    np.save(tmp_path / "c.npy", np.concatenate([0.04 * directions(500), colours], 1))
+    with pytest.raises(ObjectError, match="in its columns 4 to 6, which are no normals"):
+        load_file(tmp_path / "c.npy")
+
+
+@pytest.mark.parametrize("header", [
+    "{'descr': '<f8', 'fortran_order': False, 'shape': (10000000000, 3), }",
+    "{'descr': '<U0', 'fortran_order': False, 'shape': (99999999, 3), }", "{'descr': '<f8', 'shape': (",
+    "{'descr': '|O', 'fortran_order': False, 'shape': (3,), }",
+])
+def test_npy_headers_that_lie_are_refused_without_the_memory_that_they_ask_for(tmp_path: Path, header: str) -> None:
+    size = (len(header) + 1).to_bytes(2, "little")
+    (tmp_path / "c.npy").write_bytes(b"\x93NUMPY\x01\x00" + size + header.encode() + b"\n" + bytes(99))
+    with pytest.raises(ObjectError, match="expected a plain NPY array"):
+        load_file(tmp_path / "c.npy")
+
+
+def test_an_archive_that_unpacks_to_much_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with zipfile.ZipFile(tmp_path / "bomb.3mf", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("3D/3dmodel.model", b" " * 3_000_000)
+    monkeypatch.setattr(mesh_files, "MOST_BYTES", 2_000_000)
+    with pytest.raises(ObjectError, match=r"it holds 3 MB, the limit is 2"):
+        load_file(tmp_path / "bomb.3mf")
+
+
+def test_files_that_a_mesh_names_are_plain_ones_beside_it(tmp_path: Path) -> None:
+    box = trimesh.creation.box((0.05, 0.05, 0.05))
+    os.mkfifo(tmp_path / "pipe.mtl")
+    assert load_file(obj_file(tmp_path / "o.obj", box.vertices, box.faces, "mtllib pipe.mtl")).volume == pytest.approx(0.05**3)
+    (tmp_path / "in").mkdir()
+    for name, content in trimesh.exchange.gltf.export_gltf(box).items():
+        (tmp_path / "in" / name).write_bytes(content)
+    assert load_file(tmp_path / "in" / "model.gltf").volume == pytest.approx(0.05**3)
+    for file in (tmp_path / "in").glob("*.bin"):
+        file.rename(tmp_path / file.name)
+        text = (tmp_path / "in" / "model.gltf").read_text().replace(file.name, f"../{file.name}")
+        (tmp_path / "in" / "model.gltf").write_text(text)
+    with pytest.raises(ObjectError, match="no such file beside it"):
+        load_file(tmp_path / "in" / "model.gltf")

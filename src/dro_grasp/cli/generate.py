@@ -175,12 +175,13 @@ class Generate:
         return ObjectResult(report, obj, kept, made.points[keep])
 
     def _load(self, name: str, camera: NamedMotion | None) -> ObjectModel:
+        from dro_grasp.files import given_path
         from dro_grasp.objects.catalogue import load_object
         from dro_grasp.perception.scan import load_scan
 
         if camera is None:
             return load_object(name, scale=self.scale)
-        return load_scan(Path(name).expanduser(), camera.T.double().numpy(), self.scale)
+        return load_scan(given_path(name), camera.T.double().numpy(), self.scale)
 
     def _protocol(self, obj: ObjectModel) -> str:
         return self.protocol or ("none" if obj.is_cloud else DEFAULT_PROTOCOL)

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import mujoco
-import numpy as np
 
+from dro_grasp.descriptions.bounds import check_numbers
 from dro_grasp.descriptions.notes import Note
 from dro_grasp.errors import HandError
 
@@ -46,11 +46,11 @@ def compile_hand(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> mujoco.M
     """The compiled model. Repairs change the specification, so simulation gets them too.
 
     Raises:
-        HandError: MuJoCo refuses the description for a reason that cannot be repaired, or a number is not finite.
+        HandError: MuJoCo refuses the description for a reason that cannot be repaired, or a number is absurd.
     """
     with mujoco_speaks_to(notes, path):
         model = _compile(spec, notes)
-    _check_finite(model, path)
+    check_numbers(model, path)
     return model
 
 
@@ -62,19 +62,6 @@ def _compile(spec: mujoco.MjSpec, notes: list[Note]) -> mujoco.MjModel:
             if not _repair(spec, str(error), notes):
                 raise
     return spec.copy().compile()
-
-
-def _check_finite(model: mujoco.MjModel, path: Path) -> None:
-    """Refuse NaN and infinity, which MuJoCo reads as numbers."""
-    bodies = np.concatenate([np.arange(model.nbody), model.geom_bodyid, model.jnt_bodyid])
-    places = np.concatenate([
-        np.concatenate([model.body_pos, model.body_quat], 1), np.concatenate([model.geom_pos, model.geom_quat], 1),
-        np.concatenate([model.jnt_pos, model.jnt_axis, model.jnt_range[:, :1]], 1),
-    ])
-    lost = bodies[~np.isfinite(places).all(1)]
-    if len(lost):
-        raise HandError(f"{path}: an origin or a limit of link '{model.body(int(lost[0])).name}' is not finite; expected "
-                        "numbers, not nan or inf")
 
 
 def _repair(spec: mujoco.MjSpec, message: str, notes: list[Note]) -> bool:

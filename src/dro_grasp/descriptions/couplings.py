@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from dro_grasp.descriptions.bounds import TURNS
 from dro_grasp.errors import HandError
 
 
@@ -34,7 +35,7 @@ def resolve_couplings(
         Indices of the independent joints, coupling and offset: joints = coupling @ independent joints + offset.
 
     Raises:
-        HandError: Followers follow each other in a cycle.
+        HandError: Followers follow each other in a cycle, or absurdly fast, or all joints are held.
     """
     rule = {c.follower: c for c in couplings}
     free = [j for j in range(n_joints) if j not in rule]
@@ -55,4 +56,9 @@ def resolve_couplings(
         offset[joint] = shift
         if current >= 0:
             coupling[joint, free.index(current)] = factor
+        if not (abs(factor) <= TURNS and abs(shift) <= TURNS):
+            raise HandError(f"{path}: joint '{names[joint]}' follows at {factor:g} times its leader, from {shift:g}; expected "
+                            f"at most {TURNS:g}")
+    if not free:
+        raise HandError(f"{path}: every joint follows another or is held; expected at least one that moves by itself")
     return free, coupling, offset

@@ -28,6 +28,7 @@ from dro_grasp.descriptions.urdf import prepare_urdf
 from dro_grasp.descriptions.urdf_meshes import as_obj
 from dro_grasp.descriptions.xml_files import included_files, parse_xml
 from dro_grasp.errors import HandError
+from dro_grasp.files import given_path
 from dro_grasp.kinematics.tree import KinematicTree
 
 
@@ -37,13 +38,13 @@ def load_description(path: Path | str) -> Description:
     Raises:
         HandError: The file cannot be used; the message gives the reason and a remedy.
     """
-    path = Path(path).expanduser()
+    path = given_path(path)
     root = parse_xml(path)
     notes: list[Note] = []
     if root.tag == "robot":
         spec, files = _read_urdf(root, path, notes)
         srdf = path.with_suffix(".srdf")
-        stated = open_state(srdf) if srdf.is_file() else {}
+        stated = open_state(srdf) if os.path.isfile(srdf) else {}
         files = (*files, srdf) if stated else files
     elif root.tag == "mujoco":
         spec, files = _read_mjcf(root, path, notes)
@@ -127,12 +128,13 @@ def _read_mjcf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.
         raise HandError(f"{path} is MJCF, which MuJoCo reads only from files that end in .xml; rename it")
     with mujoco_speaks_to(notes, path):
         spec = mujoco.MjSpec.from_file(str(path))
-    folder = path.parent / (spec.meshdir or "")
+    folder, pictures = path.parent / (spec.meshdir or ""), path.parent / (spec.texturedir or "")
     meshes = {folder / mesh.file for mesh in spec.meshes if mesh.file}
-    missing = sorted(str(mesh) for mesh in meshes if not mesh.is_file())
+    used = {*meshes, *(pictures / name for texture in spec.textures for name in (texture.file, *texture.cubefiles) if name)}
+    missing = sorted(str(file) for file in used if not os.path.isfile(file))
     if missing:
-        raise HandError(f"{path}: {len(missing)} mesh files are missing (first: {missing[0]}); put them there or correct "
-                        "meshdir")
+        raise HandError(f"{path}: {len(missing)} files of meshes or textures are missing (first: {missing[0]}); put them "
+                        "there or correct meshdir and texturedir")
     return spec, (*included, *meshes)
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import mujoco
 
+from dro_grasp.descriptions.bounds import MOST_JOINTS
 from dro_grasp.descriptions.notes import Note
 from dro_grasp.errors import HandError
 
@@ -83,7 +84,7 @@ def _couple_tendons(spec: mujoco.MjSpec, notes: list[Note]) -> None:
     driven = {a.target for a in spec.actuators if a.trntype == mujoco.mjtTrn.mjTRN_TENDON}
     followers = {e.name1 for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT and e.active}
     for tendon in spec.tendons:
-        wraps = [w for w in tendon.path if w.type == mujoco.mjtWrap.mjWRAP_JOINT]
+        wraps = [w for w in tendon.path if w.type == mujoco.mjtWrap.mjWRAP_JOINT and w.target is not None]
         if tendon.name not in driven or len(wraps) < 2:
             continue
         first = wraps[0]
@@ -122,7 +123,9 @@ def _within(spec: mujoco.MjSpec, equality: mujoco.MjsEquality) -> bool:
 
 
 def _check_joints(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
-    """Give unlimited joints limits; refuse ball joints and inner free joints."""
+    """Give unlimited joints limits; refuse ball joints, inner free joints, and more joints than any hand has."""
+    if (count := len(list(spec.joints))) > MOST_JOINTS:
+        raise HandError(f"{path} has {count} joints; expected at most {MOST_JOINTS}, fix those that are not the hand's")
     for joint in spec.joints:
         if joint.type in {mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_FREE}:
             kind = "ball" if joint.type == mujoco.mjtJoint.mjJNT_BALL else "free"

@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from dro_grasp.descriptions.bounds import DEEPEST
 from dro_grasp.descriptions.compiling import LEAST_INERTIA, LEAST_MASS
 from dro_grasp.descriptions.notes import Note
 from dro_grasp.descriptions.urdf_meshes import resolve_meshes
@@ -166,6 +167,8 @@ def _check_links(root: ET.Element, path: Path) -> str:
         seen = [link]
         while seen[-1] in parent:
             seen.append(parent[seen[-1]])
+            if len(links) >= len(seen) > DEEPEST:
+                raise HandError(f"{path} has more than {DEEPEST} links one below the other; expected a robot hand")
             if len(seen) > len(links):
                 cycle = " -> ".join(seen[: seen.index(seen[-1]) + 2][:6])
                 raise HandError(f"{path}: the links form a cycle ({cycle} ...); a hand must be a tree with one root")

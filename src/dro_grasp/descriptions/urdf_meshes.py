@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import os
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
 from dro_grasp.descriptions.notes import Note
 from dro_grasp.errors import HandError
+from dro_grasp.files import reading
+from dro_grasp.geometry.mesh_files import open_mesh
 
 READABLE_MESHES = {".stl", ".obj", ".msh"}
 """Mesh formats that MuJoCo reads; trimesh converts the others."""
@@ -62,12 +65,10 @@ def as_obj(file: Path) -> bytes:
     """A mesh in any format trimesh reads, as OBJ text."""
     import trimesh
 
-    try:
-        mesh = trimesh.load_mesh(file)
+    with reading(f"mesh {file}", HandError, "STL, OBJ, GLB, DAE or PLY, whole"):
+        loaded = open_mesh(file)
+        mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
         return trimesh.exchange.obj.export_obj(mesh, include_normals=False, include_texture=False).encode()
-    except Exception as error:  # the reader of each mesh format raises its own errors
-        raise HandError(f"mesh {file} cannot be read ({type(error).__name__}: {error}); expected STL, OBJ, GLB, DAE or "
-                        "PLY, whole") from error
 
 
 def _stand_in(name: str) -> str:
@@ -100,4 +101,4 @@ def find_mesh(name: str, folder: Path) -> Path | None:
     """The file of a mesh name (relative, absolute, `package://` or `file://`); None if there is none."""
     if not name:
         return None
-    return next((file.resolve() for file in _candidates(name, folder) if file.is_file()), None)
+    return next((file.resolve() for file in _candidates(name, folder) if os.path.isfile(file)), None)

@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.errors import GraspFileError
-from dro_grasp.files import check_output, check_suffix, replacing
+from dro_grasp.files import check_output, check_suffix, reading, replacing
 from dro_grasp.grasps import codec, columns, summary
-from dro_grasp.grasps.table import read_table, table_bytes
+from dro_grasp.grasps.table import EXPECTED, read_table, table_bytes
 
 if TYPE_CHECKING:
     from dro_grasp.hands.hand import Hand
@@ -271,7 +271,8 @@ class GraspBatch:
             GraspFileError: No such file, or a truncated or foreign one, or one of another version.
         """
         table, header = read_table(path)
-        return GraspBatch(**codec.decode(table, header, str(path)))
+        with reading(path, GraspFileError, EXPECTED):
+            return GraspBatch(**codec.decode(table, header, str(path)))
 
     def to_pandas(self) -> Any:
         """The batch as a pandas DataFrame with the grasp file's columns.

@@ -16,12 +16,11 @@ from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.geometry import se3
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.grasps import columns
+from dro_grasp.grasps.columns import CAMERA, FRAME
 from dro_grasp.grasps.table import fixed_column, float_column, floats
 
 REQUIRED = ("object", "wrist_position", "wrist_quaternion_wxyz", "joints")
 """Columns without which a file holds no grasps."""
-HEADER = ("hand", "hand_sha256", "wrist_link", "joint_names")
-"""Entries of the file's header."""
 TEXT_TYPES = {columns.REASON: pa.string(), columns.FAILURE: pa.string(), columns.CONTACT_LINKS: pa.list_(pa.string())}
 """Types of the trial's further columns, which their values do not tell when all are unknown."""
 SYNTHESISED = re.compile(r"\bsynthesis \d+\b")
@@ -58,12 +57,11 @@ def decode(table: pa.Table, header: dict[str, Any], path: str) -> dict[str, Any]
     """Constructor arguments of a GraspBatch from a grasp file's table and header.
 
     Raises:
-        GraspFileError: Columns or header entries are missing, or poses are not finite.
+        GraspFileError: Columns are missing, or poses are not finite.
     """
     missing = [name for name in REQUIRED if name not in table.column_names]
-    lacking = [key for key in HEADER if key not in header]
-    if missing or lacking:
-        raise GraspFileError(f"{path} lacks columns {missing} and header entries {lacking} of a grasp file")
+    if missing:
+        raise GraspFileError(f"{path} lacks columns {missing} of a grasp file")
     n, n_dof = table.num_rows, len(header["joint_names"])
 
     def text(name: str) -> tuple[str, ...]:
@@ -86,19 +84,30 @@ def decode(table: pa.Table, header: dict[str, Any], path: str) -> dict[str, Any]
     if "energy" not in table.column_names:
         fields |= _energy_apart(fields["score"], fields["provenance"], table)
     known = {*columns.COLUMNS, *REQUIRED}
+    extra = {name: _decode_further(table[name]) for name in table.column_names if name not in known}
+    _check_frames(extra, path)
     seed = [s or 0 for s in table["seed"].to_pylist()] if "seed" in table.column_names else [0] * n
     return {
         "T_object_wrist": T, "joints": joints,
         "hand": header["hand"], "hand_sha256": header["hand_sha256"], "wrist_link": header["wrist_link"],
         "joint_names": tuple(header["joint_names"]), "seed": torch.tensor(seed, dtype=torch.int64),
         "success": torch.tensor([bool(s) for s in success], dtype=torch.bool), "protocol": protocol, **fields,
-        "extra": {name: _decode_further(table[name]) for name in table.column_names if name not in known},
+        "extra": extra,
     }
 
 
 def quaternions_wxyz(T: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 4"]:
     """Unit quaternions of poses."""
     return roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(T[:, :3, :3].to(torch.float64))).to(T.dtype)
+
+
+def _check_frames(extra: dict[str, Any], path: str) -> None:
+    """Refuse grasps in a named frame in which the camera's pose is not known."""
+    named = [i for i, frame in enumerate(extra.get(FRAME, ())) if frame]
+    pose = extra.get(CAMERA)
+    if named and not (isinstance(pose, Tensor) and pose.shape[1:] == (16,) and bool(pose[named].isfinite().all())):
+        raise GraspFileError(f"{path} names the frame of its grasps, and '{CAMERA}' is no pose of 16 finite numbers for each "
+                             "of them; write the file again")
 
 
 def _poses(position: Float[Tensor, "n 3"], quaternion: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4 4"]:

@@ -6,23 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dro_grasp.errors import GraspFileError, HandError, ObjectError, OptionError
+from dro_grasp.files import given_path
+from dro_grasp.grasps.columns import CAMERA, FRAME, HAND_FILE, OBJECT_FILE, OBJECT_SCALE
 
 if TYPE_CHECKING:
     from dro_grasp.frames import NamedMotion
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.hands.hand import Hand
     from dro_grasp.objects.shape import ObjectModel
-
-HAND_FILE = "hand_file"
-"""Further column: path of the hand's description, if the hand is a user's own."""
-OBJECT_FILE = "object_file"
-"""Further column: path of the object, if it is a user's own."""
-OBJECT_SCALE = "object_scale"
-"""Further column: scale of that file."""
-FRAME = "frame"
-"""Further column of grasps on a camera's cloud: name of the frame of the poses."""
-CAMERA = "T_frame_camera"
-"""Further column of such grasps: pose of the camera in that frame, row by row [m]."""
 
 
 def with_sources(grasps: GraspBatch, hand: str, obj: str, scale: float, camera: NamedMotion | None = None) -> GraspBatch:
@@ -39,10 +30,10 @@ def with_sources(grasps: GraspBatch, hand: str, obj: str, scale: float, camera: 
     from dro_grasp.hands.library import locate_hand
 
     n, extra = len(grasps), dict(grasps.extra)
-    if Path(hand).expanduser().is_file() and locate_hand(hand)[0] == Path(hand).expanduser():
-        extra[HAND_FILE] = (str(Path(hand).expanduser().resolve()),) * n
-    if Path(obj).expanduser().is_file():
-        extra[OBJECT_FILE] = (str(Path(obj).expanduser().resolve()),) * n
+    if given_path(hand).is_file() and locate_hand(hand)[0] == given_path(hand):
+        extra[HAND_FILE] = (str(given_path(hand).resolve()),) * n
+    if given_path(obj).is_file():
+        extra[OBJECT_FILE] = (str(given_path(obj).resolve()),) * n
         extra[OBJECT_SCALE] = torch.full((n,), scale)
     if camera is not None:
         extra[FRAME] = (camera.frame,) * n

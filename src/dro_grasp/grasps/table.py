@@ -18,11 +18,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.errors import GraspFileError
+from dro_grasp.files import given_path, reading
+from dro_grasp.grasps.schema import check_columns, check_header
 
 FORMAT_VERSION = 1
 """Version of the grasp file that this code writes and reads."""
 METADATA_KEY = b"dro_grasp"
 """Key of the JSON header in the schema metadata."""
+EXPECTED = "a Parquet file that dro-grasp wrote, whole; write it again"
+"""A grasp file, for messages (ours)."""
 
 
 def table_bytes(columns: dict[str, pa.Array], header: dict[str, Any]) -> bytes:
@@ -54,14 +58,11 @@ def read_table(path: Path | str | io.BytesIO) -> tuple[pa.Table, dict[str, Any]]
     Raises:
         GraspFileError: No such file, a truncated or foreign one, or one of another version.
     """
-    if isinstance(path, (str, Path)) and not Path(path).is_file():
-        raise GraspFileError(f"no grasp file {path}; give the path of a .parquet file that dro-grasp wrote")
-    try:
-        table = pq.read_table(path)
-    except (pa.ArrowException, OSError, ValueError) as error:
-        reason = str(error).splitlines()[0][:200]
-        raise GraspFileError(f"{path} is truncated or no Parquet file ({reason}); write it again") from error
-    return table, read_header(path, table.schema)
+    with reading(path, GraspFileError, EXPECTED):
+        table = pq.read_table(_existing(path))
+        header = read_header(path, table.schema)
+        check_columns(table.schema, path)
+    return table, header
 
 
 def read_footer(path: Path | str) -> tuple[int, dict[str, Any]]:
@@ -70,12 +71,18 @@ def read_footer(path: Path | str) -> tuple[int, dict[str, Any]]:
     Raises:
         GraspFileError: As `read_table`.
     """
-    try:
-        footer = pq.read_metadata(path)
-    except (pa.ArrowException, OSError, ValueError) as error:
-        reason = str(error).splitlines()[0][:200]
-        raise GraspFileError(f"{path} is truncated or no Parquet file ({reason}); write it again") from error
-    return footer.num_rows, read_header(path, footer.schema.to_arrow_schema())
+    with reading(path, GraspFileError, EXPECTED):
+        footer = pq.read_metadata(_existing(path))
+        return footer.num_rows, read_header(path, footer.schema.to_arrow_schema())
+
+
+def _existing(path: Path | str | io.BytesIO) -> Path | io.BytesIO:
+    if isinstance(path, io.BytesIO):
+        return path
+    path = given_path(path)
+    if not path.is_file():
+        raise GraspFileError(f"no grasp file {path}; give the path of a .parquet file that dro-grasp wrote")
+    return path
 
 
 def read_header(path: Path | str | io.BytesIO, schema: pa.Schema) -> dict[str, Any]:
@@ -87,16 +94,15 @@ def read_header(path: Path | str | io.BytesIO, schema: pa.Schema) -> dict[str, A
     raw = (schema.metadata or {}).get(METADATA_KEY)
     if raw is None:
         raise GraspFileError(f"{path} is Parquet, but no grasp file: its schema has no 'dro_grasp' metadata")
-    try:
+    with reading(path, GraspFileError, "a 'dro_grasp' header, which is garbled; write the file again"):
         header = json.loads(raw)
         version = header["format_version"]
-    except (ValueError, TypeError, KeyError) as error:
-        raise GraspFileError(f"{path} has a garbled 'dro_grasp' header: {error!r}") from error
     if version != FORMAT_VERSION:
         raise GraspFileError(
             f"{path} has grasp file version {version}, this dro-grasp reads version {FORMAT_VERSION}; "
             "install the release that wrote it, or write the file again"
         )
+    check_header(header, path)
     return header
 
 

@@ -24,6 +24,10 @@ FEWEST_WITH_THUMB = 4
 THUMB_CLOSING = 0.55
 """Share of the way from open to closed at which thumb opposition is measured (ours). From 0.1 to 0.75 it names the thumb of
 every hand with four or five fingers, built in or among the development assets (ten hands)."""
+MOST_FINGERS = 24
+"""Most fingers of a hand (ours): two hands of a humanoid, and its feet."""
+LONGEST_FINGER = 12
+"""Most joints of one finger (ours): to find which way they close, every combination of their directions is tried."""
 AXIS_ALONG_PALM = 0.75
 """Cosine to the palm direction above which a joint's axis points out of the palm (ours)."""
 PARALLEL = 0.9
@@ -65,7 +69,7 @@ def find_tips(tree: KinematicTree, shaped: Collection[int]) -> tuple[int, ...]:
     """Fingertips: below each last moving joint, the deepest link with a (visual or collision) shape.
 
     Raises:
-        HandError: No moving joint carries a shape.
+        HandError: No moving joint carries a shape, or too many end in one.
     """
     paths = [path_to(tree, link) for link in range(tree.n_links)]
     last_moving = {link: max((i for i in paths[link] if tree.kind[i] != FIXED), default=None) for link in shaped}
@@ -77,6 +81,9 @@ def find_tips(tree: KinematicTree, shaped: Collection[int]) -> tuple[int, ...]:
     if not tips:
         raise HandError("no moving joint of this description carries a shape, so it has no fingertip; give its moving links a "
                         "visual or collision shape")
+    if len(tips) > MOST_FINGERS:
+        raise HandError(f"this description has {len(tips)} fingertips; expected at most {MOST_FINGERS}, fix the joints that "
+                        "are not the hand's")
     return tuple(tips)
 
 
@@ -107,6 +114,9 @@ def find_fingers(tree: KinematicTree, tips: Sequence[int], palm: int) -> tuple[F
 
     A link that carries one tip belongs to that finger; a link that carries none belongs to the finger of its parent. A link
     fixed to the palm belongs to no finger, even if it carries one, because it does not move.
+
+    Raises:
+        HandError: A finger has more joints than any has.
     """
     still, below = set(fixed_below(tree, palm)), tree.descends[:, palm].tolist()
     chains = [tuple(i for i in path_to(tree, tip) if below[i] and i not in still) for tip in tips]
@@ -119,6 +129,9 @@ def find_fingers(tree: KinematicTree, tips: Sequence[int], palm: int) -> tuple[F
     for finger, chain in enumerate(chains):
         links = tuple(link for link, its in enumerate(owner) if its == finger)
         moving = [i for i in chain if tree.kind[i] != FIXED]
+        if (free := int((tree.link_coupling[list(chain)] != 0).any(0).sum())) > LONGEST_FINGER:
+            raise HandError(f"the finger that ends in link '{tree.link_names[chain[-1]]}' has {free} joints; expected at most "
+                            f"{LONGEST_FINGER}, fix those that are not the finger's")
         to_tip = (sum(i > link for i in moving) if link in chain else 0 for link in links)
         fingers.append(Finger(chain, links, tuple(to_tip)))
     return tuple(fingers)

@@ -99,7 +99,10 @@ class HandBuilder:
     @cached_property
     def fingers(self) -> tuple[Finger, ...]:
         """One for each fingertip."""
-        return find_fingers(self.tree, self.tips, self.palm)
+        try:
+            return find_fingers(self.tree, self.tips, self.palm)
+        except HandError as error:
+            raise self._error(str(error)) from error
 
     @cached_property
     def links(self) -> list[int]:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from dro_grasp.descriptions.loader import Description, load_description
 from dro_grasp.errors import HandError
+from dro_grasp.files import given_path
 from dro_grasp.hands.build import build_hand
 from dro_grasp.hands.hand import Hand
 
@@ -63,14 +64,13 @@ def hand_names() -> dict[str, str]:
 
 def locate_hand(name: str | Path) -> tuple[Path, str]:
     """The file of a hand, and the hand's name in results."""
-    text = str(name)
+    text, path = str(name), given_path(name)
     builtin = BUILTIN_FOLDER / f"{text}.urdf"
     if "/" not in text and builtin.is_file():
         return builtin, text
     asset = _asset_file(text.removeprefix(ASSET_PREFIX))
     if asset is not None:
         return asset, ASSET_PREFIX + text.removeprefix(ASSET_PREFIX)
-    path = Path(text).expanduser()
     if path.exists() or path.suffix.lower() in {".urdf", ".xml", ".mjcf"}:
         return path, path.stem
     described = _robot_description(text)

@@ -9,13 +9,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from jaxtyping import Float, Num
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from dro_grasp.errors import OptionError, WeightsError
-from dro_grasp.files import replacing
+from dro_grasp.errors import WeightsError
+from dro_grasp.files import given_path, reading, replacing
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.models.presets import NetworkConfig
 
@@ -70,13 +71,27 @@ def load_weights(name: str | Path | None = None) -> DistanceNetwork:
     """
     path = locate_weights(name)
     entry, tensors = _read(path)
-    try:
-        network = DistanceNetwork(NetworkConfig.from_dict(entry["config"]), name=path.stem)
+    with reading(path, WeightsError, "weights of this version of the network"):
+        config = NetworkConfig.from_dict(entry["config"])
+        with torch.device("meta"):  # a network of the wrong size is never made
+            _check_tensors(DistanceNetwork(config).state_dict(), tensors, path)
+        network = DistanceNetwork(config, name=path.stem)
         network.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in tensors.items()})
-    except (RuntimeError, TypeError, ValueError, KeyError, OptionError) as error:
-        raise WeightsError(f"{path} does not fit this version of the network ({str(error).splitlines()[0]}); use weights "
-                           "made with this version") from error
     return network.eval()
+
+
+def _check_tensors(expected: dict[str, Num[Tensor, "..."]], given: dict[str, Num[Tensor, "..."]], path: Path) -> None:
+    """Refuse tensors that are missing, of another shape or type, not finite, or negative variances."""
+    for name in expected.keys() | given.keys():
+        wanted, tensor = expected.get(name), given.get(name)
+        if wanted is None or tensor is None:
+            raise WeightsError(f"{path} {'lacks the tensor' if tensor is None else 'has a tensor too many,'} '{name}'; use "
+                               "weights made with this version")
+        if tensor.shape != wanted.shape or tensor.is_floating_point() != wanted.is_floating_point() or tensor.is_complex():
+            raise WeightsError(f"{path}: '{name}' is {tensor.dtype} of shape {tuple(tensor.shape)}, expected {wanted.dtype} "
+                               f"of shape {tuple(wanted.shape)}; use weights made with this version")
+        if tensor.is_floating_point() and not (tensor.isfinite().all() and (tensor >= 0).all() | ("running_var" not in name)):
+            raise WeightsError(f"{path}: '{name}' holds NaN, infinity, or a negative variance; train again")
 
 
 def load_small(path: Path) -> dict[str, Float[Tensor, "..."]]:
@@ -86,9 +101,8 @@ def load_small(path: Path) -> dict[str, Float[Tensor, "..."]]:
 
 def history_of(path: Path) -> list[dict[str, Any]]:
     """How the weights of a file were made: one entry a training, oldest first; empty where the file does not say."""
-    with safe_open(path, "pt") as file:
-        entry = json.loads((file.metadata() or {}).get(KEY, "{}"))
-    return [*entry.get("history", []), *([entry["about"]] if entry.get("about") else [])]
+    entry = _read(path)[0]
+    return [*entry["history"], *([entry["about"]] if entry["about"] else [])]
 
 
 def locate_weights(name: str | Path | None = None) -> Path:
@@ -97,7 +111,7 @@ def locate_weights(name: str | Path | None = None) -> Path:
     shipped = SHIPPED_FOLDER / f"{text}.safetensors"
     if "/" not in text and shipped.is_file():
         return shipped
-    path = Path(text).expanduser()
+    path = given_path(text)
     if path.is_file():
         return path
     raise WeightsError(f"no weights at '{text}'; shipped weights are {', '.join(weights_names()) or 'none'}, or give the "
@@ -115,8 +129,8 @@ def describe_weights(name: str | Path | None = None) -> dict[str, Any]:
     entry, tensors = _read(path)
     return {
         "name": path.stem, "parameters": sum(t.numel() for t in tensors.values()), "bytes": path.stat().st_size,
-        "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "config": entry["config"], "about": entry["about"],
-        "history": entry.get("history", []),
+        "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "config": entry.get("config", {}), "about": entry["about"],
+        "history": entry["history"],
     }
 
 
@@ -143,21 +157,24 @@ def verify_weights(name: str | Path | None = None) -> str:
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Num[Tensor, "..."]]]:
-    try:
+    if _starts_like_a_pickle(path):
+        raise WeightsError(f"{path} is a pickled PyTorch file, which can run code and is refused; expected safetensors "
+                           "written by `dro-grasp train`")
+    with reading(path, WeightsError, "a weights file that is not cut short; copy or train it again"):
         with safe_open(path, "pt") as file:
             text = (file.metadata() or {}).get(KEY)
             tensors = {key: file.get_tensor(key) for key in file.keys()}
         entry = None if text is None else json.loads(text)
-    except (SafetensorError, json.JSONDecodeError, OSError) as error:
-        if _starts_like_a_pickle(path):
-            raise WeightsError(f"{path} is a pickled PyTorch file, which can run code and is refused; expected safetensors "
-                               "written by `dro-grasp train`") from error
-        raise WeightsError(f"{path} is not a weights file, or was cut short ({error}); copy or train it again") from error
     if not isinstance(entry, dict):
         raise WeightsError(f"{path} is a safetensors file, but not of dro-grasp; give a file that `dro-grasp train` wrote")
     if entry.get("format_version") != FORMAT_VERSION:
         raise WeightsError(f"{path} has weights version {entry.get('format_version')}, expected {FORMAT_VERSION}; use "
                            "weights made with this version")
+    about, history = entry.setdefault("about", {}), entry.setdefault("history", [])
+    if not (isinstance(entry.get("config", {}), dict) and isinstance(about, dict) and isinstance(history, list)
+            and all(isinstance(each, dict) for each in history)):
+        raise WeightsError(f"{path}: its configuration and 'about' must be objects, and 'history' a list of objects; train "
+                           "again")
     return entry, tensors
 
 

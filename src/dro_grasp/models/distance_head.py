@@ -34,7 +34,7 @@ class DistanceHead(nn.Module):
         self.last = nn.Linear(hidden[1], 1)
         self.initial_distance = initial_distance
         with torch.no_grad():
-            self.last.bias.fill_(float(inverse_softplus(torch.tensor(initial_distance))))
+            self.last.bias.fill_(float(inverse_softplus(torch.tensor(initial_distance, device="cpu"))))
 
     def forward(
         self, hand: Float[Tensor, "b n width"], obj: Float[Tensor, "b m width"], base: Float[Tensor, "b n m"] | None = None

@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
+
+WIDEST = 4096
+"""Largest number of points, features or neighbours (ours): memory grows with their products."""
+MOST_LAYERS = 16
+"""Most layers of a part of the network (ours)."""
+LARGEST = 10.0
+"""Largest distance [m] and temperature (ours)."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +67,14 @@ class NetworkConfig:
     """Scale of the spread of placements drawn at inference."""
 
     def __post_init__(self) -> None:
-        """Refuse forms that contradict each other."""
+        """Refuse sizes that no network has, unknown forms, and forms that contradict each other."""
+        for name, kind in get_type_hints(NetworkConfig).items():
+            if not _fits(value := getattr(self, name), kind):
+                raise OptionError(f"{name} is {str(value)[:60]}, which no network has; the paper's is "
+                                  f"{getattr(NetworkConfig, name)}")
+        if self.width % self.heads or self.neighbours > min(self.n_hand, self.n_object):
+            raise OptionError(f"width is {self.width}, heads {self.heads}, neighbours {self.neighbours}; expected a width "
+                              "that is a multiple of the heads, and no more neighbours than points")
         if self.latent_form == "motion" and not self.placed:
             raise OptionError("latent_form 'motion' moves the placed open hand, but in frame 'object' the network knows no "
                               "placement; choose frame 'palm', as the presets slim and multi do")
@@ -99,7 +113,7 @@ class NetworkConfig:
         """From plain values, as a weights file stores them; lists become tuples.
 
         Raises:
-            ValueError: A setting is unknown, or one that is no longer a choice has another value than it has now.
+            ValueError: A setting is unknown or impossible, or one that is no longer a choice has another value than it has now.
         """
         plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
         placed = plain.get("frame", "object") != "object"
@@ -108,7 +122,23 @@ class NetworkConfig:
                 raise ValueError(f"{name} is no longer a choice; it is {fixed} now, and {values[name]} in the file")
         if unknown := sorted(plain.keys() - {f.name for f in dataclasses.fields(NetworkConfig)}):
             raise ValueError(f"unknown settings {', '.join(unknown)}")
-        return NetworkConfig(**plain)
+        try:
+            return NetworkConfig(**plain)
+        except OptionError as error:  # the settings are a file's, not the user's
+            raise ValueError(str(error)) from error
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    """Whether a setting is of its type, and of a size that a network can have."""
+    if get_origin(kind) is Literal:
+        return isinstance(value, str) and value in get_args(kind)
+    if kind is float:
+        return type(value) in (int, float) and 0 < value <= LARGEST
+    if kind is int:
+        return type(value) is int and 0 < value <= WIDEST
+    each = get_args(kind)
+    length = isinstance(value, tuple) and 0 < len(value) <= MOST_LAYERS and (Ellipsis in each or len(value) == len(each))
+    return length and all(_fits(x, int) for x in value)
 
 
 SLIM = NetworkConfig(

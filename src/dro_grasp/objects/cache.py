@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,9 +13,6 @@ from jaxtyping import Num
 
 from dro_grasp.errors import OutputError
 from dro_grasp.files import replacing
-
-DAMAGED = (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile)
-"""Exceptions of NumPy for a file that is missing, truncated or no archive of arrays."""
 
 Arrays = dict[str, Num[np.ndarray, "..."]]
 """Arrays by name, as in an NPZ file."""
@@ -37,7 +33,7 @@ def cached_arrays(key: str, make: Callable[[], Arrays]) -> Arrays:
     try:
         with path.open("rb") as file, np.load(file) as stored:
             return {name: stored[name] for name in stored.files}
-    except DAMAGED:
+    except Exception:  # missing, truncated, or no archive of arrays: NumPy and zlib each raise their own errors
         made = make()
     with contextlib.suppress(OSError, OutputError):
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -16,6 +16,7 @@ import numpy as np
 import trimesh
 
 from dro_grasp.errors import ObjectError
+from dro_grasp.files import given_path
 from dro_grasp.objects.builtin import BUILTIN, make_builtin
 from dro_grasp.objects.convex_parts import Part
 from dro_grasp.objects.in_memory import ObjectSource, object_in_memory
@@ -55,7 +56,7 @@ def _load(name: str | Path, scale: float) -> ObjectModel:
     entry = _assets().get(text.removeprefix(ASSET_PREFIX))
     if entry is not None:
         return _load_asset(entry, scale)
-    path = Path(text).expanduser()
+    path = given_path(text)
     if path.is_dir():
         raise ObjectError(f"{path} is a folder; name one of its files, or use a command that takes folders")
     if path.exists() or path.suffix:
@@ -81,7 +82,7 @@ def resolve_objects(names: list[str]) -> list[str]:
         if (group := GROUP.fullmatch(name)) is not None:
             found.extend(_members(group[1], group[2]))
             continue
-        folder = Path(name).expanduser()
+        folder = given_path(name)
         if name in BUILTIN or not folder.is_dir():
             found.append(name)
             continue

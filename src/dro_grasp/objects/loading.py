@@ -11,9 +11,12 @@ from jaxtyping import Float, Int, Num
 from scipy.spatial import KDTree
 
 from dro_grasp.errors import ObjectError
+from dro_grasp.files import given_path, reading
+from dro_grasp.geometry.mesh_files import open_mesh
 from dro_grasp.objects.cache import content_hash
+from dro_grasp.objects.cloud_files import CLOUD_SUFFIXES, read_cloud
 from dro_grasp.objects.convex_parts import Part
-from dro_grasp.objects.repair import mass_properties, repair
+from dro_grasp.objects.repair import check_surface, mass_properties, repair
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
 
 LARGEST = 1.0
@@ -22,14 +25,14 @@ SMALLEST = 0.005
 """Smallest such extent [m] (ours)."""
 USUAL = 0.03
 """A suggested scale gives an extent between this and ten times this [m] (ours)."""
+FARTHEST = 100.0
+"""Largest coordinate [m] (ours): single precision rounds it by 4 micrometres."""
+MOST_UNEQUAL = 1.2
+"""Largest ratio of the lengths of the normals of a cloud (ours); what differs more is something else, such as colours."""
 MIN_CLOUD = 16
 """Fewest distinct points of a bare cloud (ours)."""
 NEIGHBOURS = 16
 """Neighbours that estimate the normals of a bare cloud (ours)."""
-CLOUD_SUFFIXES = {".npy", ".pcd"}
-"""Files that hold a bare cloud."""
-PCD_KINDS = {"F": "f", "I": "i", "U": "u"}
-"""NumPy's letters for the number types of PCD."""
 
 
 def load_file(path: Path, *, scale: float = 1.0) -> ObjectModel:
@@ -42,6 +45,7 @@ def load_file(path: Path, *, scale: float = 1.0) -> ObjectModel:
     Raises:
         ObjectError: The file cannot be used; the message says why and what to do.
     """
+    path = given_path(path)
     if not path.is_file():
         raise ObjectError(f"no object file at {path}; give an existing mesh or point cloud, or a name that "
                           "`dro-grasp objects` lists")
@@ -70,13 +74,10 @@ def read_geometry(path: Path) -> tuple[trimesh.Trimesh | Float[np.ndarray, "..."
     """One mesh, scenes merged, or the points of a file without faces; and the file's unit [m], 1 if it states none."""
     if path.suffix.lower() in CLOUD_SUFFIXES:
         return read_cloud(path), 1.0
-    try:
-        loaded = trimesh.load(path, process=False)
+    with reading(path, ObjectError, "a mesh or cloud that trimesh reads (STL, OBJ, PLY, GLB, OFF, ...), NPY or PCD"):
+        loaded = open_mesh(path, process=False)
         unit = trimesh.units.unit_conversion(loaded.units, "meters") if loaded.units else 1.0
         geometry = merge_scene(loaded) if isinstance(loaded, trimesh.Scene) else loaded
-    except Exception as error:  # each reader behind trimesh raises its own errors
-        raise ObjectError(f"{path} cannot be read as a mesh or cloud: {error}. Expected a format that trimesh reads "
-                          "(STL, OBJ, PLY, GLB, OFF, ...), NPY or PCD") from error
     if isinstance(geometry, trimesh.PointCloud):
         return np.asarray(geometry.vertices, np.float64), unit
     if not isinstance(geometry, trimesh.Trimesh):
@@ -110,8 +111,9 @@ def mesh_object(
     vertices, faces = np.asarray(mesh.vertices, np.float64) * scale, np.asarray(mesh.faces, np.int64)
     _check_numbers(vertices, faces, origin)
     used = np.bincount(faces.ravel(), minlength=len(vertices)) > 0
-    _check_size(np.ptp(vertices[used], axis=0), origin, scale)
+    check_extent(vertices[used], origin, scale)
     merged = trimesh.Trimesh(vertices, faces, process=True)
+    check_surface(merged, origin)
     duplicated = int(used.sum()) - len(merged.vertices)
     soup = used.sum() == 3 * len(faces)  # every STL file repeats its vertices: not worth a note
     if duplicated and not soup:
@@ -145,7 +147,7 @@ def cloud_object(name: str, points: Num[np.ndarray, "..."], *, origin: str, scal
     keep = np.random.default_rng(0).permutation(len(xyz))[:CLOUD_POINTS]
     distinct = len(np.unique(xyz[keep].round(6), axis=0))
     if len(xyz) and np.ptp(xyz, axis=0).max() > 0:
-        _check_size(np.ptp(xyz, axis=0), origin, scale)
+        check_extent(xyz, origin, scale)
     if distinct < MIN_CLOUD:
         raise ObjectError(f"{origin} has {distinct} distinct points; a cloud needs at least {MIN_CLOUD} spread over "
                           "the object's surface")
@@ -153,6 +155,9 @@ def cloud_object(name: str, points: Num[np.ndarray, "..."], *, origin: str, scal
     given = points[keep, 3:]
     length = np.linalg.norm(given, axis=1, keepdims=True)
     has_normals = points.shape[1] == 6 and length.min() > 1e-6
+    if has_normals and not length.max() < MOST_UNEQUAL * length.min():
+        raise ObjectError(f"{origin} has vectors of length {length.min():.3g} to {length.max():.3g} in its columns 4 to 6, "
+                          "which are no normals; expected unit normals, or (n, 3) points alone: normals are then estimated")
     normals = given / length if has_normals else estimate_normals(cloud)
     fewer = f", {CLOUD_POINTS} of them kept" if len(points) > CLOUD_POINTS else ""
     estimated = "" if has_normals else "; normals were estimated"
@@ -188,9 +193,16 @@ def _check_numbers(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, ".
         raise ObjectError(f"{origin} has {bad} vertices with NaN or infinite coordinates; repair the mesh first")
 
 
-def _check_size(extents: Float[np.ndarray, "3"], origin: str, scale: float) -> None:
-    """Refuse sizes that are implausible in metres: most files state no unit, and a wrong guess would grasp air."""
-    largest = float(extents.max())
+def check_extent(points: Float[np.ndarray, "n 3"], origin: str, scale: float = 1.0) -> None:
+    """Refuse sizes and places that are implausible in metres: most files state no unit, and a wrong guess would grasp air.
+
+    Raises:
+        ObjectError: As said; for a wrong unit, it suggests a scale.
+    """
+    largest, farthest = float(np.ptp(points, axis=0).max()), float(np.abs(points).max())
+    if SMALLEST <= largest <= LARGEST and farthest > FARTHEST:
+        raise ObjectError(f"{origin} has coordinates of up to {farthest:.3g} m, too large for single precision; move it to "
+                          f"within {FARTHEST:g} m of its origin")
     if SMALLEST <= largest <= LARGEST:
         return
     if largest <= 0:
@@ -199,61 +211,3 @@ def _check_size(extents: Float[np.ndarray, "3"], origin: str, scale: float) -> N
     power = 10.0 ** math.ceil(math.log10(USUAL / largest))
     raise ObjectError(f"{origin} measures {size} for a hand to grasp; if its unit is not the metre, give --scale: 0.001 "
                       f"for millimetres; {scale * power:.3g} makes it {largest * power * 100:.2g} cm")
-
-
-def read_cloud(path: Path) -> Float[np.ndarray, "..."]:
-    """Points of an NPY or PCD file: (n 3), or (n 6) with normals; an NPY file may hold any shape."""
-    try:
-        return _read_npy(path) if path.suffix.lower() == ".npy" else _read_pcd(path)
-    except OSError as error:
-        raise ObjectError(f"{path} cannot be read: {error.strerror or error}") from error
-
-
-def _read_npy(path: Path) -> Float[np.ndarray, "..."]:
-    try:
-        return np.asarray(np.load(path, allow_pickle=False), np.float64)
-    except (ValueError, TypeError, EOFError) as error:
-        raise ObjectError(f"{path} is no plain NPY array ({error}); save it with numpy.save as floats") from error
-
-
-def _read_pcd(path: Path) -> Float[np.ndarray, "n columns"]:
-    """Points, and normals if there are any. A field may take several columns (COUNT)."""
-    raw = path.read_bytes()
-    header, start = _pcd_header(raw, path)
-    try:
-        fields, count, kind = header["FIELDS"], int(header["POINTS"][0]), header["DATA"][0]
-        names = [*"xyz"]
-        if {"normal_x", "normal_y", "normal_z"} <= set(fields):
-            names += ["normal_x", "normal_y", "normal_z"]
-        widths = [int(c) for c in header.get("COUNT", ["1"] * len(fields))]
-        if kind == "ascii":
-            columns = [sum(widths[: fields.index(name)]) for name in names]
-            lines = [line.split() for line in raw[start:].splitlines() if line.strip()][:count]
-            table = np.array(lines, dtype=np.float64).reshape(len(lines), -1)[:, columns]
-        elif kind == "binary":
-            sizes = zip(header["TYPE"], header["SIZE"], widths, strict=True)
-            layout = np.dtype([(f"{i}", f"<{PCD_KINDS[t]}{s}", (c,)) for i, (t, s, c) in enumerate(sizes)])
-            rows = np.frombuffer(raw, layout, count=count, offset=start)
-            table = np.stack([rows[f"{fields.index(name)}"][:, 0].astype(np.float64) for name in names], 1)
-        else:
-            raise ObjectError(f"{path} holds {kind} data; save the cloud as ascii or binary PCD")
-    except (KeyError, ValueError, IndexError, TypeError) as error:
-        raise ObjectError(f"{path} is a damaged PCD file ({error}); expected x y z and all its points") from error
-    if len(table) != count:
-        raise ObjectError(f"{path} is truncated: its header promises {count} points, it holds {len(table)}")
-    return table
-
-
-def _pcd_header(raw: bytes, path: Path) -> tuple[dict[str, list[str]], int]:
-    """Header entries, and the offset of the data."""
-    header: dict[str, list[str]] = {}
-    position = 0
-    while "DATA" not in header:
-        end = raw.find(b"\n", position)
-        if end < 0:
-            raise ObjectError(f"{path} is no PCD file: its header has no DATA line")
-        words = raw[position:end].decode("ascii", "replace").split()
-        position = end + 1
-        if words and not words[0].startswith("#"):
-            header[words[0]] = words[1:]
-    return header, position

@@ -21,6 +21,10 @@ LEAST_FILL = 1e-3
 sheet."""
 OPEN_FILL = 0.05
 """Share of its hull that a mesh with holes must fill (ours); a bent sheet appears to fill a little."""
+FEW_FACES = 100
+"""Meshes with fewer faces are quick, whatever they are (ours)."""
+MOST_ALONE = 0.9
+"""Largest share of edges that belong to one face alone (ours)."""
 OVERLAP = 1e-3
 """Share of the volume by which bodies may overlap without being joined (ours)."""
 PROBES = 48
@@ -28,6 +32,20 @@ PROBES = 48
 
 MassProperties = tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]
 """Volume [m^3], centre of mass [m], and inertia about it at unit density [m^5]."""
+
+
+def check_surface(mesh: trimesh.Trimesh, origin: str) -> None:
+    """Refuse faces that are no surface: those without area, and soups, for which inside and outside take minutes to tell.
+
+    Raises:
+        ObjectError: As said. The mesh has merged vertices.
+    """
+    if not (len(mesh.faces) and mesh.nondegenerate_faces().any()):
+        raise ObjectError(f"{origin} has {len(mesh.faces)} faces, none of which has an area; give a triangle mesh of a solid")
+    alone = float((np.bincount(mesh.faces_unique_edges.ravel()) == 1).mean())
+    if len(mesh.faces) > FEW_FACES and alone > MOST_ALONE:
+        raise ObjectError(f"{origin} is no surface: {alone:.0%} of the edges of its {len(mesh.faces)} faces belong to one face "
+                          "alone; join the faces (merge vertices), or give a point cloud of the surface")
 
 
 def repair(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Num
 from scipy.spatial import KDTree
 
 from dro_grasp.errors import ObjectError
-from dro_grasp.objects.loading import cloud_object, estimate_normals, read_points
+from dro_grasp.objects.loading import check_extent, cloud_object, estimate_normals, read_points
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
 from dro_grasp.perception.completion import complete_cloud
 
@@ -73,7 +73,7 @@ def scanned_object(
         complete: Add the unseen side; switch it off for a scan from all sides.
 
     Raises:
-        ObjectError: Too few points are left, or they are not in metres.
+        ObjectError: Too few points are left, they are not in metres, or some lie behind the camera.
     """
     kept = np.asarray(points, np.float64)
     kept = kept[np.isfinite(kept).all(1)]
@@ -83,6 +83,10 @@ def scanned_object(
         kept = without_outliers(kept)
     if len(kept) < NEIGHBOURS:
         raise ObjectError(f"{name} has {len(kept)} points after cleaning; give a denser cloud or a larger mask")
+    check_extent(kept, name)
+    if float((kept @ kept.mean(0)).min()) <= 0:
+        raise ObjectError(f"{name} has points behind the camera, which is at the cloud's origin; give the cloud in the "
+                          "camera's frame")
     camera = np.zeros(3)
     normals = estimate_normals(kept.astype(np.float32), camera).astype(np.float64)
     if complete:

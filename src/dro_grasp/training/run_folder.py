@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any
 
 import torch
@@ -50,13 +49,14 @@ class RunFolder:
             return None
         try:
             state = torch.load(path, weights_only=True, map_location="cpu")
-            _ = [state[key] for key in ENTRIES]
-        except (RuntimeError, LookupError, TypeError, ValueError, EOFError, OSError, UnpicklingError) as error:
+            found, _ = dict(state["plan"]), [state[key] for key in ENTRIES]
+            state["step"], state["seconds"] = int(state["step"]), float(state["seconds"])
+        except Exception as error:  # PyTorch's reader raises what its parts do
             raise self.misfit(error) from error
         for name, asked in plan.items():
-            if state["plan"].get(name) != asked:
-                raise TrainingError(f"{path} belongs to a run with {name} {state['plan'].get(name)}, {asked} was asked for; "
-                                    "use the same to resume, or another folder")
+            if found.get(name) != asked:
+                raise TrainingError(f"{path} belongs to a run with {name} {found.get(name)}, {asked} was asked for; use the "
+                                    "same to resume, or another folder")
         return state
 
     def misfit(self, error: Exception) -> TrainingError:
@@ -76,11 +76,11 @@ class RunFolder:
         if not log.is_file():
             return
         kept = []
-        for line in log.read_text().splitlines():
+        for line in log.read_text(errors="replace").splitlines():
             try:
                 if json.loads(line)["step"] <= step:
                     kept.append(line)
-            except json.JSONDecodeError:
+            except (ValueError, LookupError, TypeError, RecursionError):
                 break
         log.write_text("".join(line + "\n" for line in kept))
 

@@ -18,6 +18,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.rendering.meshes import Colour
 from dro_grasp.viewer import appearance
+from dro_grasp.viewer.guard import guarded_server
 
 HOST = "127.0.0.1"
 """Default address: only this machine can connect."""
@@ -128,6 +129,8 @@ class ServedPage:
         """
         if port not in PORTS:
             raise OptionError(f"port is {port}; give a number from {PORTS[0]} to {PORTS[-1]}, for example --port 8080")
+        if not host:
+            raise OptionError(f"host is empty; give --host {HOST} for this machine only, or 0.0.0.0 for the whole network")
         try:
             # viser would search for a free port forever.
             socket.create_server((host, 0)).close()
@@ -135,7 +138,7 @@ class ServedPage:
             raise OptionError(f"this machine cannot serve at '{host}' ({error}); give --host {HOST} for this machine only, or "
                               "0.0.0.0 for the whole network") from error
         # viser prints a banner to stdout, which is reserved for tables and JSON.
-        with contextlib.redirect_stdout(sys.stderr):
+        with contextlib.redirect_stdout(sys.stderr), guarded_server(host):
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
         self.stage = Stage(self.server)
 

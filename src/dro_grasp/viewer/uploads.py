@@ -6,7 +6,10 @@ import io
 import zipfile
 from pathlib import Path, PurePosixPath
 
+from dro_grasp.descriptions.urdf_meshes import find_mesh
+from dro_grasp.descriptions.xml_files import parse_xml
 from dro_grasp.errors import OptionError
+from dro_grasp.files import reading
 
 MAX_BYTES = 20_000_000
 """Largest upload [bytes]."""
@@ -25,7 +28,9 @@ def store_upload(name: str, content: bytes, folder: Path) -> Path:
         name: File name from the browser; folders in it are ignored.
 
     Raises:
-        OptionError: The file is too large, its name is invalid, or a ZIP file holds no description or paths outside itself.
+        OptionError: The file is too large, its name is invalid, a ZIP file holds no description or paths outside itself, or a
+            description names files that were not uploaded with it.
+        HandError: A description is not valid XML.
     """
     plain = PurePosixPath(name.replace("\\", "/")).name
     if not plain or plain in {".", ".."}:
@@ -36,8 +41,10 @@ def store_upload(name: str, content: bytes, folder: Path) -> Path:
     if not plain.lower().endswith(".zip"):
         path = folder / plain
         path.write_bytes(content)
+        _confine(folder)
         return path
     _unpack(plain, content, folder)
+    _confine(folder)
     found = sorted((p for p in folder.rglob("*") if p.suffix.lower() in DESCRIPTIONS), key=lambda p: (len(p.parts), p))
     urdf = [p for p in found if p.suffix.lower() == ".urdf"]
     if not found:
@@ -45,12 +52,27 @@ def store_upload(name: str, content: bytes, folder: Path) -> Path:
     return (urdf or found)[0]
 
 
+def _confine(folder: Path) -> None:
+    """Refuse descriptions that read, or look for, files outside their folder; the folder is refused as a whole."""
+    for path in (p for p in folder.rglob("*") if p.suffix.lower() in (*DESCRIPTIONS, ".srdf")):
+        for element in parse_xml(path).iter():
+            if element.tag in {"include", "model"}:
+                raise OptionError(f"{path.name} has <{element.tag}>, which uploads may not; give one file without")
+            for name in (value for key, value in element.items() if key.startswith("file") or key.endswith("dir")):
+                found = find_mesh(name, path.parent)
+                inside = found is None or found.is_relative_to(folder.resolve())
+                if not inside or name.startswith(("/", "\\", "~")) or ".." in PurePosixPath(name.replace("\\", "/")).parts:
+                    raise OptionError(f"{path.name} names '{name}', which was not uploaded with it; pack both into a ZIP "
+                                      "file, and name it by a path within")
+
+
 def _unpack(name: str, content: bytes, folder: Path) -> None:
-    try:
-        archive = zipfile.ZipFile(io.BytesIO(content))
-        entries = archive.infolist()
-    except zipfile.BadZipFile as error:
-        raise OptionError(f"{name} is not a ZIP file or is truncated; pack it again") from error
+    with reading(name, OptionError, "a ZIP file, whole; pack it again"), zipfile.ZipFile(io.BytesIO(content)) as archive:
+        _unpack_entries(name, archive, folder)
+
+
+def _unpack_entries(name: str, archive: zipfile.ZipFile, folder: Path) -> None:
+    entries = archive.infolist()
     size = sum(entry.file_size for entry in entries)
     if size > MAX_UNPACKED or len(entries) > MAX_FILES:
         raise OptionError(f"{name} unpacks to {len(entries)} files of {size / 1e6:.0f} MB, the limits are {MAX_FILES} "

@@ -14,13 +14,13 @@ from typing import Any
 
 import torch
 from jaxtyping import Float, Int, Shaped
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
 from dro_grasp.devices import on_device
 from dro_grasp.errors import BundleError
-from dro_grasp.files import replacing
+from dro_grasp.files import given_path, reading, replacing
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.geometry.se3 import compose
 from dro_grasp.grasps.batch import GraspBatch
@@ -139,24 +139,41 @@ def load_bundle(path: Path | str) -> Bundle:
     Raises:
         BundleError: The file is missing, truncated, foreign or of another version.
     """
-    path = Path(path)
+    path = given_path(path)
     if not path.is_file():
         raise BundleError(f"no bundle at {path}; make one with `dro-grasp dataset bundle`")
-    try:
+    with reading(path, BundleError, "a bundle, whole; make it again with `dro-grasp dataset bundle`"):
         with safe_open(path, "pt") as file:
             header = json.loads((file.metadata() or {}).get("dro_grasp_bundle", "null"))
             tensors = {key: file.get_tensor(key) for key in file.keys()}
-    except (SafetensorError, json.JSONDecodeError, OSError) as error:
-        raise BundleError(f"{path} is no bundle, or was cut short ({error}); make it again") from error
-    if not isinstance(header, dict):
-        raise BundleError(f"{path} is a safetensors file but no bundle; make one with `dro-grasp dataset bundle`")
-    if header.get("format_version") != FORMAT_VERSION:
-        raise BundleError(f"{path} has bundle version {header.get('format_version')}, expected {FORMAT_VERSION}; make it "
-                          "again with this version of dro-grasp")
-    try:
-        return _unpack(header, tensors)
-    except (KeyError, TypeError, ValueError) as error:
-        raise BundleError(f"{path} lacks a part ({error}); make it again with `dro-grasp dataset bundle`") from error
+        if not isinstance(header, dict):
+            raise BundleError(f"{path} is a safetensors file but no bundle; make one with `dro-grasp dataset bundle`")
+        if header.get("format_version") != FORMAT_VERSION:
+            raise BundleError(f"{path} has bundle version {header.get('format_version')}, expected {FORMAT_VERSION}; make it "
+                              "again with this version of dro-grasp")
+        if unreal := [key for key, tensor in tensors.items() if not bool(tensor.isfinite().all())]:
+            raise BundleError(f"{path}: '{unreal[0]}' holds NaN or infinity; make it again with `dro-grasp dataset bundle`")
+        return _checked(_unpack(header, tensors))
+
+
+def _checked(bundle: Bundle) -> Bundle:
+    """Refuse hands, clouds and grasps that do not fit each other.
+
+    Raises:
+        ValueError: As said; its text names the part.
+    """
+    for name, cloud in bundle.objects.items():
+        if cloud.points.shape != cloud.normals.shape or cloud.points.shape[1:] != (3,) or not len(cloud.points):
+            raise ValueError(f"the cloud of object '{name}' has points {tuple(cloud.points.shape)}")
+    for name, grasps in bundle.grasps.items():
+        hand, n = bundle.hands[name], len(grasps.joints)
+        if not (grasps.joints.shape == (n, hand.tree.n_dof) and grasps.T_object_wrist.shape == (n, 4, 4)
+                and grasps.object_index.shape == (n,) and ((grasps.object_index >= 0) & (
+                    grasps.object_index < len(bundle.objects))).all()):
+            raise ValueError(f"the grasps of hand '{name}' do not fit it, or their objects")
+        if hand.points(hand.canonical_joints()).shape != (hand.n_points, 3):
+            raise ValueError(f"hand '{name}' has no points")
+    return bundle
 
 
 def _unpack(header: dict[str, Any], tensors: Tensors) -> Bundle:

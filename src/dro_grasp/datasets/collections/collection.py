@@ -9,6 +9,7 @@ from pathlib import Path
 
 from dro_grasp.datasets.engine.shards import Yield, find_shards, read_yield
 from dro_grasp.errors import GraspFileError
+from dro_grasp.files import given_path
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.table import read_footer
 
@@ -41,7 +42,7 @@ def read_collection(path: Path | str, only_successful: bool = True) -> Iterator[
     Raises:
         GraspFileError: The path holds no grasps, or a file is damaged.
     """
-    path = Path(path)
+    path = given_path(path)
     if path.is_file():
         pairs = _pairs_of_file(path)
     elif path.is_dir() and (files := sorted(path.glob("*.parquet"))):
@@ -62,7 +63,7 @@ def count_collection(path: Path | str) -> dict[str, dict[str, int]]:
         GraspFileError: As `read_collection`.
     """
     counts: dict[str, dict[str, int]] = {}
-    path = Path(path)
+    path = given_path(path)
     if path.is_dir() and (shards := find_shards(path)):
         for shard in shards:
             of_hand = counts.setdefault(shard.hand, {})
@@ -76,6 +77,8 @@ def count_collection(path: Path | str) -> dict[str, dict[str, int]]:
 def _pairs_of_file(path: Path) -> Iterator[PairGrasps]:
     grasps = GraspBatch.load(path)
     yields = (read_footer(path)[1].get("notes") or {}).get(YIELDS) or {}
+    if not isinstance(yields, dict):
+        raise GraspFileError(f"{path}: the notes' '{YIELDS}' are {str(yields)[:60]}, expected an object; write the file again")
     parts = dict(grasps.by_object())
     for obj in dict.fromkeys((*parts, *yields)):
         part = parts.get(obj, grasps[[]])

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from dro_grasp.errors import GraspFileError, ObjectError, OptionError
+from dro_grasp.files import given_path, reading
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import with_sources
 from dro_grasp.hands.library import load_hand
@@ -67,23 +68,20 @@ def read_foreign(path: Path, kind: Format) -> list[ForeignGrasp]:
         GraspFileError: The file is missing, holds something else, or could run code.
     """
     readers = {"cmap": _cmap, "dexgraspnet": _dexgraspnet, "dexgraspbench": _dexgraspbench}
+    path = given_path(path)
     if path.is_dir():
         raise GraspFileError(f"{path} is a folder; name the {kind} files in it")
-    if not path.exists():
+    if not path.is_file():
         raise GraspFileError(f"no file {path}; give the path of a {kind} file")
-    try:
-        return list(readers[kind](path))
-    except _MoreThanData as error:
-        raise GraspFileError(f"{path} holds more than tensors ({error}) and is not opened, for safety: it could run code; take "
-                             "the file that the project publishes, or save its grasps again with tensors or arrays, numbers "
-                             "and names only") from error
-    except _NoEntry as error:
-        raise GraspFileError(f"{path} is no {kind} file: it has no entry '{error}'; expected {EXPECTED[kind]}") from error
-    except (OSError, pickle.UnpicklingError, EOFError, KeyError, ValueError, TypeError, IndexError, AttributeError,
-            RuntimeError) as error:
-        reason = next(iter(str(error).splitlines()), type(error).__name__)
-        raise GraspFileError(f"{path} is no {kind} file that can be read ({reason}); expected {EXPECTED[kind]}; download it "
-                             "again if it is damaged") from error
+    with reading(path, GraspFileError, f"a {kind} file: {EXPECTED[kind]}; download it again if it is damaged"):
+        try:
+            return list(readers[kind](path))
+        except _MoreThanData as error:
+            raise GraspFileError(f"{path} holds more than tensors ({error}) and is not opened, for safety: it could run code; "
+                                 "take the file that the project publishes, or save its grasps again with tensors or arrays, "
+                                 "numbers and names only") from error
+        except _NoEntry as error:
+            raise GraspFileError(f"{path} is no {kind} file: it has no entry '{error}'; expected {EXPECTED[kind]}") from error
 
 
 class _MoreThanData(Exception):

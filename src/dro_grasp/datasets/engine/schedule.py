@@ -18,7 +18,7 @@ from dro_grasp.datasets.engine.shards import Shard, Yield, find_shards, read_yie
 from dro_grasp.datasets.engine.worker import EngineConfig, Job, Task
 from dro_grasp.devices import require_device
 from dro_grasp.errors import GraspFileError, OptionError
-from dro_grasp.files import make_folder
+from dro_grasp.files import given_path, make_folder
 from dro_grasp.hands.library import load_hand, locate_hand
 from dro_grasp.objects.catalogue import ASSET_PREFIX, load_object, object_names
 
@@ -139,11 +139,11 @@ def require_known(hands: Sequence[str], objects: Sequence[str]) -> None:
         ObjectError: Likewise of an object.
     """
     for hand in hands:
-        if not locate_hand(hand)[0].expanduser().is_file():
+        if not locate_hand(hand)[0].is_file():
             load_hand(hand)  # its error says what is wrong
     names = object_names()
     for obj in objects:
-        if obj.removeprefix(ASSET_PREFIX) not in names and not Path(obj).expanduser().is_file():
+        if obj.removeprefix(ASSET_PREFIX) not in names and not given_path(obj).is_file():
             load_object(obj)  # likewise
 
 

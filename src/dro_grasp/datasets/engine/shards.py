@@ -28,6 +28,8 @@ LOCK = ".lock"
 """File in a data set's folder that a run locks while it fills the folder."""
 HOLDER = ".process"
 """File with the number of the process that holds the lock; other systems than Linux let nobody read a locked file."""
+MOST = 1e18
+"""More than any count or time of a yield (ours)."""
 STALE = 3600.0
 """Age from which a temporary file counts as left behind by a killed process [s]. Ours."""
 
@@ -87,10 +89,21 @@ class Yield:
         return dataclasses.asdict(self)
 
     @staticmethod
-    def from_dict(values: dict[str, Any]) -> Yield:
-        """The inverse of `to_dict`; entries of other versions are ignored."""
+    def from_dict(values: Any) -> Yield:
+        """The inverse of `to_dict`; entries of other versions are ignored.
+
+        Raises:
+            GraspFileError: An entry is no count, or no time.
+        """
         known = {f.name for f in dataclasses.fields(Yield)}
-        return Yield(**{name: value for name, value in values.items() if name in known})
+        own = {name: value for name, value in values.items() if name in known} if isinstance(values, dict) else {"": [values]}
+        failures = own.get("failures", {})
+        counts = [value for name, value in own.items() if name != "failures"]
+        counts += failures.values() if isinstance(failures, dict) else [failures]
+        if wrong := [x for x in counts if not isinstance(x, int | float) or not 0 <= x < MOST]:
+            raise GraspFileError(f"the yields in a grasp file's notes hold {str(wrong[0])[:60]}; expected counts and seconds: "
+                                 "write the file again")
+        return Yield(**own)
 
 
 @dataclass(frozen=True, order=True)

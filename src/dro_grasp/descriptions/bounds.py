@@ -1,0 +1,110 @@
+"""How large a hand's description may be, before MuJoCo reads it, and which numbers it may hold, after.
+
+What is beyond these bounds is a mistake or an attack: MuJoCo and the kinematics would run out of time, memory or stack on it.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from dro_grasp.errors import HandError
+
+DEEPEST = 100
+"""Most elements within each other, and most links one below the other (ours); the deepest hand known to us has 30."""
+MOST_ELEMENTS = 50_000
+"""Most elements of one file (ours)."""
+MOST_LINKS = 1_000
+"""Most links, after repetitions (ours); a tactile hand with a frame for every taxel has some 500."""
+MOST_JOINTS = 100
+"""Most joints that move (ours); a humanoid with two hands has some 80."""
+MOST_BYTES = 20_000_000
+"""Largest description [bytes] (ours)."""
+MOST_PIXELS = 10_000
+"""Most pixels of a generated texture along each side (ours)."""
+UNUSED = {"composite", "flexcomp", "flex", "hfield", "skin", "plugin"}
+"""Elements of MJCF that no rigid hand has, and that can grow without limit (ours)."""
+LONGEST = 10.0
+"""Largest coordinate, size or travel of a slide [m] (ours)."""
+TURNS = 1e4
+"""Largest angle [rad], and largest ratio or offset of a coupling (ours)."""
+HEAVIEST = 1e4
+"""Largest mass [kg] and inertia [kg m^2] (ours)."""
+NUMBERS = (
+    ("link", "body_pos", "origin", LONGEST), ("link", "body_quat", "rotation", 2.0),
+    ("link", "body_ipos", "centre of mass", LONGEST), ("link", "body_mass", "mass", HEAVIEST),
+    ("link", "body_inertia", "inertia", HEAVIEST), ("shape", "geom_pos", "origin", LONGEST),
+    ("shape", "geom_quat", "rotation", 2.0), ("shape", "geom_size", "size", LONGEST),
+    ("vertex", "mesh_vert", "vertex", LONGEST), ("joint", "jnt_pos", "anchor", LONGEST),
+    ("joint", "jnt_axis", "axis", 2.0), ("joint", "jnt_range", "limits", TURNS), ("joint", "qpos0", "reference", TURNS),
+    ("coupling", "eq_data", "coefficients", TURNS),
+)
+"""Numbers of a compiled model: the kind of their owner, the array, what it means, and the largest value."""
+
+
+def check_elements(root: ET.Element, path: Path) -> None:
+    """Refuse a file of too many elements or links, too deep ones, or elements that can grow without limit.
+
+    Raises:
+        HandError: As said.
+    """
+    waiting, elements, links = [(root, 1, 1)], 0, 0
+    while waiting:
+        element, depth, times = waiting.pop()
+        elements += 1
+        links += times * (element.tag in {"body", "link"})
+        if depth > DEEPEST or elements > MOST_ELEMENTS or links > MOST_LINKS:
+            raise HandError(f"{path} has more than {DEEPEST} elements within each other, {MOST_LINKS} links, or "
+                            f"{MOST_ELEMENTS} elements; expected a robot hand, leave out what is not part of it")
+        if element.tag in UNUSED:
+            raise HandError(f"{path} has <{element.tag}>, which is no part of a rigid hand; remove it")
+        if element.tag == "texture" and max(_whole(element, "width"), _whole(element, "height")) > MOST_PIXELS:
+            raise HandError(f"{path} has a <texture> wider or higher than {MOST_PIXELS} pixels; remove it")
+        times *= max(1, _whole(element, "count")) if element.tag == "replicate" else 1
+        waiting.extend((child, depth + 1, times) for child in element)
+
+
+def _whole(element: ET.Element, attribute: str) -> int:
+    """A whole number in an attribute; 0 where there is none, which is left to MuJoCo."""
+    try:
+        return int(element.get(attribute, "0"))
+    except ValueError:
+        return 0
+
+
+def check_numbers(model: mujoco.MjModel, path: Path) -> None:
+    """Refuse numbers of a compiled hand that are not finite, or beyond all that a hand has; name their owner.
+
+    Raises:
+        HandError: As said.
+    """
+    for kind, array, what, largest in NUMBERS:
+        values = np.asarray(getattr(model, array), float)
+        values = values[:, None] if values.ndim == 1 else values[:, :4]
+        bad = np.flatnonzero(~(np.abs(values) <= largest).all(1))
+        if len(bad):
+            raise HandError(f"{path}: the {what} of {_owner(model, kind, int(bad[0]))} is {_told(values[bad[0]])}; expected "
+                            f"finite numbers of at most {largest:g}, in metres, radians and kilograms")
+    for j in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE):
+        if np.abs(model.jnt_range[j]).max() > LONGEST:
+            raise HandError(f"{path}: the limits of joint '{model.joint(j).name}' are {_told(model.jnt_range[j])} m; expected "
+                            f"at most {LONGEST:g} m")
+
+
+def _owner(model: mujoco.MjModel, kind: str, index: int) -> str:
+    """The element that an entry of an array belongs to, in words."""
+    if kind == "shape":
+        return f"a shape of link '{model.body(int(model.geom_bodyid[index])).name}'"
+    if kind == "coupling":
+        return f"the coupling of joint '{model.joint(int(model.eq_obj1id[index])).name}'"
+    if kind == "vertex":
+        return f"mesh '{model.mesh(int(np.searchsorted(model.mesh_vertadr, index, 'right')) - 1).name}'"
+    return f"{kind} '{(model.body if kind == 'link' else model.joint)(index).name}'"
+
+
+def _told(values: Float[np.ndarray, " n"]) -> str:
+    return " ".join(f"{x:g}" for x in values)

@@ -1,0 +1,54 @@
+"""Mesh files, read by trimesh within limits: of size, and of what else they may open."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import trimesh
+
+MOST_BYTES = 200_000_000
+"""Largest file, unpacked [bytes] (ours); reading takes some ten times as much memory."""
+
+
+def open_mesh(path: Path, **options: Any) -> trimesh.Geometry:
+    """What trimesh reads from a file, without materials and textures; each reader behind it raises its own errors."""
+    check_bytes(path)
+    return trimesh.load(path, skip_materials=True, resolver=Beside(path.parent), **options)
+
+
+def check_bytes(path: Path) -> None:
+    """Refuse a file that is too large, or an archive that unpacks to too much.
+
+    Raises:
+        ValueError: As said.
+    """
+    size = path.stat().st_size
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            size = max(size, sum(entry.file_size for entry in archive.infolist()))
+    if size > MOST_BYTES:
+        raise ValueError(f"it holds {size / 1e6:.0f} MB, the limit is {MOST_BYTES / 1e6:.0f}: simplify the mesh or thin out "
+                         "the cloud")
+
+
+class Beside(Mapping[str, bytes]):
+    """Files that a mesh file names, such as the buffers of a glTF: plain files in its own folder, of limited size."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder.resolve()
+
+    def __getitem__(self, name: str) -> bytes:
+        file = (self.folder / name).resolve()
+        if not (file.is_relative_to(self.folder) and file.is_file()):
+            raise FileNotFoundError(f"it names '{name}', and there is no such file beside it")
+        check_bytes(file)
+        return file.read_bytes()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(())
+
+    def __len__(self) -> int:
+        return 0
