@@ -87,10 +87,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return DONE
     verbose = "--verbose" in arguments
     arguments = [a for a in arguments if a != "--verbose"] or ["--help"]
-    command = parse(arguments)
     os.environ.setdefault(*PATIENCE)
     try:
-        return command.run()
+        return parse(arguments).run()
     except DroGraspError as error:
         if verbose:
             traceback.print_exc()

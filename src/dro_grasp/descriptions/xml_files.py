@@ -54,7 +54,7 @@ def included_files(root: ET.Element, path: Path) -> tuple[Path, ...]:
         HandError: A file is missing, or a model contains itself, on which MuJoCo dies.
     """
     found: dict[Path, None] = {}
-    waiting = [(root, path, (path.resolve(),))]
+    waiting: list[tuple[ET.Element, Path, tuple[Path, ...]]] = [(root, path, (path.resolve(),))]
     while waiting:
         element, including, above = waiting.pop()
         for include in [*element.iter("include"), *element.iter("model")]:

@@ -270,9 +270,8 @@ class GraspBatch:
         Raises:
             GraspFileError: No such file, or a truncated or foreign one, or one of another version.
         """
-        table, header = read_table(path)
         with reading(path, GraspFileError, EXPECTED):
-            return GraspBatch(**codec.decode(table, header, str(path)))
+            return GraspBatch(**codec.decode(*read_table(path), str(path)))
 
     def to_pandas(self) -> Any:
         """The batch as a pandas DataFrame with the grasp file's columns.

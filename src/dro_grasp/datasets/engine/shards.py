@@ -96,7 +96,8 @@ class Yield:
             GraspFileError: An entry is no count, or no time.
         """
         known = {f.name for f in dataclasses.fields(Yield)}
-        own = {name: value for name, value in values.items() if name in known} if isinstance(values, dict) else {"": [values]}
+        given: dict[str, Any] = values if isinstance(values, dict) else {"valid": [values]}
+        own = {name: value for name, value in given.items() if name in known}
         failures = own.get("failures", {})
         counts = [value for name, value in own.items() if name != "failures"]
         counts += failures.values() if isinstance(failures, dict) else [failures]

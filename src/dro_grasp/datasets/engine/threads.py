@@ -6,10 +6,12 @@ This module imports nothing else at its top: a worker calls it before it loads a
 from __future__ import annotations
 
 import os
+import signal
 
 
 def use_one_thread() -> None:
-    """Compute in one thread from now on, in this process."""
+    """Compute in one thread from now on, in this process, and leave Ctrl-C to the process that started it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     import torch
 
