@@ -142,7 +142,7 @@ def load_bundle(path: Path | str) -> Bundle:
     path = given_path(path)
     if not path.is_file():
         raise BundleError(f"no bundle at {path}; make one with `dro-grasp dataset bundle`")
-    with reading(path, BundleError, "a bundle, whole; make it again with `dro-grasp dataset bundle`"):
+    with reading(path, BundleError, "a bundle that is not cut short; make it again with `dro-grasp dataset bundle`"):
         with safe_open(path, "pt") as file:
             header = json.loads((file.metadata() or {}).get("dro_grasp_bundle", "null"))
             tensors = {key: file.get_tensor(key) for key in file.keys()}
