@@ -131,7 +131,8 @@ def change(path: Path, how: str) -> None:
 
 @pytest.mark.parametrize(
     ("how", "word"),
-    [("cut short", "cut short"), ("empty", "cut short"), ("another format", "expected a bundle"), ("other weights", "no bundle"),
+    [("cut short", "cut short"), ("empty", "cut short"),
+     ("another format", "expected a bundle"), ("other weights", "no bundle"),
      ("strange header", "no bundle"), ("another version", "version 99, expected 1"), ("a part missing", r"grasps\.0\.joints")],
 )
 def test_a_damaged_bundle_is_refused(path: Path, how: str, word: str) -> None:
