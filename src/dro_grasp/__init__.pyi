@@ -15,6 +15,7 @@ from dro_grasp.export.dexgraspbench import dexgraspbench as dexgraspbench
 from dro_grasp.export.isaac_grasp import isaac_grasp as isaac_grasp
 from dro_grasp.export.moveit import moveit_grasps as moveit_grasps
 from dro_grasp.grasps.batch import GraspBatch as GraspBatch
+from dro_grasp.grasps.reading import load_grasps as load_grasps
 from dro_grasp.hands.check import HandReport as HandReport, check_hand as check_hand
 from dro_grasp.hands.hand import Hand as Hand
 from dro_grasp.hands.library import hand_names as hand_names, load_hand as load_hand

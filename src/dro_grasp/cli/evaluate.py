@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from dro_grasp.cli.inputs import Flag, ProtocolName, load_grasps, optional
+from dro_grasp.cli.inputs import Flag, ProtocolName, optional
 from dro_grasp.cli.output import print_result, progress_bar, say_aside
 from dro_grasp.grasps.sources import hand_of, object_of
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL
@@ -30,7 +30,7 @@ class Evaluate:
     """
 
     file: tyro.conf.Positional[Path]
-    """Grasp file."""
+    """Grasp file, or a folder of them, as `generate` fills it for a folder of objects."""
     protocol: ProtocolName = DEFAULT_PROTOCOL
     """The trial."""
     friction: Annotated[float | None, optional("MU", "the protocol's")] = None
@@ -52,6 +52,7 @@ class Evaluate:
         from dro_grasp.evaluation.metrics import mean_share, wilson_interval
         from dro_grasp.files import check_output
         from dro_grasp.grasps.batch import GraspBatch
+        from dro_grasp.grasps.reading import load_grasps
         from dro_grasp.pipeline.problem import GraspProblem
         from dro_grasp.pipeline.stages import evaluate
         from dro_grasp.simulation.diagnosis import count_failures, diagnose, next_steps

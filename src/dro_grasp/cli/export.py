@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from dro_grasp.cli.inputs import Flag, load_grasps, optional
+from dro_grasp.cli.inputs import Flag, optional
 from dro_grasp.cli.output import print_json, say
 from dro_grasp.export.formats import FORMATS, ExportJob
 
@@ -25,7 +25,7 @@ class Export:
     """
 
     file: tyro.conf.Positional[Path]
-    """Grasp file."""
+    """Grasp file, or a folder of them, as `generate` fills it for a folder of objects."""
     format: Annotated[str, tyro.conf.arg(
         constructor=tyro.extras.literal_type_from_choices(FORMATS),
         help=" ".join(f"{name}: {form.explanation}." for name, form in FORMATS.items()))]
@@ -70,6 +70,7 @@ class Export:
     def _load(self) -> GraspBatch:
         """The requested grasps."""
         from dro_grasp.errors import GraspFileError
+        from dro_grasp.grasps.reading import load_grasps
 
         grasps = load_grasps(self.file)
         if not self.only_successful:

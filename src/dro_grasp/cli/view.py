@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from dro_grasp.cli.inputs import Flag, load_grasps, optional
-from dro_grasp.cli.output import say
+from dro_grasp.cli.inputs import Flag, optional
+from dro_grasp.cli.output import say, say_aside
 
 if TYPE_CHECKING:
     from dro_grasp.grasps.batch import GraspBatch
-    from dro_grasp.hands.hand import Hand
     from dro_grasp.objects.shape import ObjectModel
 
 MAX_SIDE = 4096
@@ -30,7 +29,8 @@ class View:
     """
 
     file: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[FILE]")] = None
-    """Grasp file. Without it, the page lets you choose a hand and an object, generate grasps, watch trials and export."""
+    """Grasp file, or a folder of them. Without it, the page lets you choose a hand and an object, generate grasps, watch trials
+    and export."""
     hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Hand to use instead of the one named in the file."""
     object: Annotated[str | None, optional("NAME|PATH", "the names in the file")] = None
@@ -52,9 +52,15 @@ class View:
 
             serve(Studio(weights=self.weights, port=self.port, host=self.host))
             return 0
+        from dro_grasp.grasps.reading import load_grasps
+        from dro_grasp.grasps.sources import hand_of
         from dro_grasp.viewer.app import view_grasps
 
-        view_grasps(*load_grasps_of_one_object(self.file, self.hand, self.object, self.scale), port=self.port, host=self.host)
+        grasps = load_grasps(self.file)
+        obj, chosen = of_object(grasps, self.object, self.scale)
+        if others := [f"--object {name}" for name in dict.fromkeys(grasps.object) if name not in chosen.object]:
+            say_aside(f"showing {obj.name}; for the others: {', '.join(others)}")
+        view_grasps(hand_of(grasps, self.hand), obj, chosen, port=self.port, host=self.host)
         return 0
 
 
@@ -66,7 +72,7 @@ class Picture:
     """
 
     file: tyro.conf.Positional[Path]
-    """Grasp file."""
+    """Grasp file, or a folder of them, as `generate` fills it for a folder of objects."""
     output: Path
     """PNG file to write."""
     count: int = 16
@@ -85,30 +91,37 @@ class Picture:
     """Draw only grasps that passed their trial."""
     hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Hand to use instead of the one named in the file."""
-    object: Annotated[str | None, optional("NAME|PATH", "the names in the file")] = None
-    """Object to draw: a name in the file, or a mesh to use for the file's only object."""
+    object: Annotated[str | None, optional("NAME|PATH", "every object in the file")] = None
+    """Object to draw: a name in the file, or a mesh to use for the file's only object. Several objects share the sheet."""
     scale: float = 1.0
     """Factor for the coordinates of the mesh given with --object."""
 
     def run(self) -> int:
-        """Load the file and draw the grasps of one object."""
+        """Load the file and draw."""
         from dro_grasp.errors import GraspFileError, OptionError
         from dro_grasp.files import check_output
-        from dro_grasp.viewer.pictures import PictureStyle, draw_grasps
+        from dro_grasp.grasps.reading import load_grasps
+        from dro_grasp.grasps.sources import hand_of
+        from dro_grasp.viewer.pictures import PictureStyle, draw_sheet
 
         self._check_options()
         check_output(self.output)
-        hand, obj, grasps = load_grasps_of_one_object(self.file, self.hand, self.object, self.scale)
+        grasps = load_grasps(self.file)
+        hand = hand_of(grasps, self.hand)
         if self.only_successful:
             if not bool(grasps.success.any()):
                 raise GraspFileError(f"no grasp in {self.file} has passed a trial; leave out --only-successful")
             grasps = grasps[grasps.success]
-        shown = min(self.count, len(grasps))
+        names = list(dict.fromkeys(grasps.object)) if self.object is None else [self.object]
+        share = max(1, self.count // len(names))
+        pairs = [of_object(grasps, name, self.scale) for name in names[: self.count]]
+        pairs = [(obj, own[:share]) for obj, own in pairs]
+        shown = sum(len(own) for _, own in pairs)
         if (pixels := shown * self.size[0] * self.size[1]) > MAX_PIXELS:
             raise OptionError(f"{shown} pictures of {self.size[0]} x {self.size[1]} are {pixels / 1e6:.0f} million pixels; a "
                               f"sheet has at most {MAX_PIXELS // 10**6} million: give a smaller --size or --count")
         style = PictureStyle(self.size, self.opacity, self.contacts, self.posture)
-        draw_grasps(hand, obj, grasps, self.output, self.count, self.columns, style)
+        draw_sheet(hand, pairs, self.output, self.columns, style)
         say(f"picture: {self.output}")
         return 0
 
@@ -127,18 +140,14 @@ class Picture:
             raise OptionError(f"--opacity is {self.opacity}; give a number from 0 to 1")
 
 
-def load_grasps_of_one_object(
-    file: Path, hand_name: str | None, object_name: str | None, scale: float
-) -> tuple[Hand, ObjectModel, GraspBatch]:
-    """Read the grasps of one object in a file, with hand and object; by default those of the first object.
+def of_object(grasps: GraspBatch, name: str | None, scale: float) -> tuple[ObjectModel, GraspBatch]:
+    """An object and its grasps: one that the grasps name, or a mesh to use for their first object, which is the default.
 
     Raises:
-        DroGraspError: The file, its hand or its object cannot be loaded.
+        DroGraspError: The object cannot be loaded.
     """
-    from dro_grasp.grasps.sources import hand_of, object_of
+    from dro_grasp.grasps.sources import object_of
 
-    grasps = load_grasps(file)
-    hand = hand_of(grasps, hand_name)
-    name = object_name if object_name in grasps.object else grasps.object[0]
-    chosen = dict(grasps.by_object())[name]
-    return hand, object_of(chosen, None if object_name == name else object_name, scale), chosen
+    own = name if name in grasps.object else grasps.object[0]
+    chosen = dict(grasps.by_object())[own]
+    return object_of(chosen, None if name in {None, own} else name, scale), chosen

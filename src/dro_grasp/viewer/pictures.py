@@ -82,14 +82,48 @@ def draw_grasps(
         OutputError: The file cannot be written, or there is no grasp.
     """
     require_pair(hand, obj)
-    if len(grasps) == 0:
-        raise OutputError(f"no grasp to draw into {path}; ask for at least one")
-    shown, closed = grasps[:count], can_close(hand, obj) and (style or PictureStyle()).posture == "held"
-    drawn = after_closing(hand, obj, shown) if closed else shown
+    _save(*_tiles(hand, obj, grasps[:count], style), heading(hand, obj, grasps), path, columns)
+
+
+def draw_sheet(
+    hand: Hand, pairs: Sequence[tuple[ObjectModel, GraspBatch]], path: Path | str, columns: int = COLUMNS,
+    style: PictureStyle | None = None,
+) -> None:
+    """Write a PNG with pictures of all given grasps, of one object or several, as `draw_grasps` draws them.
+
+    Raises:
+        OutputError: The file cannot be written, or there is no grasp.
+    """
+    if len(pairs) == 1:
+        (obj, grasps), = pairs
+        return draw_grasps(hand, obj, grasps, path, len(grasps), columns, style)
+    tiles, captions = [], []
+    for obj, grasps in pairs:
+        drawn, told = _tiles(hand, obj, grasps, style)
+        tiles += drawn
+        captions += [(f"{obj.name}   {text}", passed) for text, passed in told]
+    together = GraspBatch.concatenate([grasps for _, grasps in pairs])
+    _save(tiles, captions, f"{hand.name} on {len(pairs)} objects: {_told(together)}", path, columns)
+
+
+def _tiles(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, style: PictureStyle | None
+) -> tuple[list[UInt8[np.ndarray, "height width 3"]], list[tuple[str, bool | None]]]:
+    """Pictures of grasps of one object, and their captions."""
+    closed = (style or PictureStyle()).posture == "held" and can_close(hand, obj)
+    drawn = after_closing(hand, obj, grasps) if closed else grasps
     with ThreadPoolExecutor(cores()) as threads:
-        tiles = list(threads.map(lambda i: draw_grasp(hand, obj, drawn, i, style), range(len(shown))))
-    title = heading(hand, obj, grasps) + (", after closing" if closed else "")
-    sheet = contact_sheet(tiles, [caption(grasps, i) for i in range(len(shown))], title, columns)
+        tiles = list(threads.map(lambda i: draw_grasp(hand, obj, drawn, i, style), range(len(grasps))))
+    return tiles, [caption(grasps, i) for i in range(len(grasps))]
+
+
+def _save(
+    tiles: list[UInt8[np.ndarray, "height width 3"]], captions: Sequence[tuple[str, bool | None]], title: str, path: Path | str,
+    columns: int,
+) -> None:
+    if not tiles:
+        raise OutputError(f"no grasp to draw into {path}; ask for at least one")
+    sheet = contact_sheet(tiles, captions, title, columns)
     try:
         sheet.save(path, format="PNG")
     except OSError as error:
@@ -142,7 +176,12 @@ def contact_points(
 
 def heading(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> str:
     """Title of a sheet."""
-    text = f"{hand.name} on {obj.name}: {len(grasps)} grasps"
+    return f"{hand.name} on {obj.name}: {_told(grasps)}"
+
+
+def _told(grasps: GraspBatch) -> str:
+    """Number and outcome of grasps."""
+    text = f"{len(grasps)} grasps"
     if not bool(grasps.evaluated.any()):
         return text
     protocols = sorted({p for p in grasps.protocol if p})

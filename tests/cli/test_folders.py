@@ -1,0 +1,92 @@
+"""Folders of grasp files, as `generate` fills them for a folder of objects: every command that reads grasps takes them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import trimesh
+from PIL import Image
+
+from dro_grasp.cli.main import main
+from dro_grasp.errors import GraspFileError
+from dro_grasp.evaluation.controls import palm_facing_starts
+from dro_grasp.grasps.reading import load_grasps
+from dro_grasp.grasps.sources import with_own_files
+from dro_grasp.hands.library import load_hand
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.viewer.pictures import CAPTION, HEADER, TILE
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Grasps of two objects by one hand, a file each, and a file of no grasp."""
+    place = tmp_path_factory.mktemp("grasps")
+    hand = load_hand("gripper3")
+    for name, num in (("sphere", 3), ("can", 2)):
+        obj = load_object(name)
+        starts = palm_facing_starts(hand, obj, num=num, seed=0)
+        starts.save(place / f"{name}.parquet")
+    starts[:0].save(place / "nothing.parquet")
+    return place
+
+
+def test_evaluate_takes_a_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", str(folder), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["num"] == 5
+    assert {name: entry["num"] for name, entry in told["objects"].items()} == {"sphere": 3, "can": 2}
+
+
+def test_export_takes_a_folder(folder: Path, tmp_path: Path) -> None:
+    assert main(["export", str(folder), "--format", "csv", "--output", str(tmp_path / "out")]) == 0
+    rows = {path.name: sum(not line.startswith("#") for line in path.read_text().splitlines()) - 1
+            for path in (tmp_path / "out").iterdir()}
+    assert rows == {"sphere.csv": 3, "can.csv": 2}
+
+
+@pytest.mark.parametrize(("more", "tiles"), [([], (4, 2)), (["--count", "2"], (2, 1)), (["--object", "can"], (2, 1))])
+def test_picture_takes_a_folder(folder: Path, tmp_path: Path, more: list[str], tiles: tuple[int, int]) -> None:
+    path = tmp_path / "sheet.png"
+    assert main(["picture", str(folder), "--output", str(path), *more]) == 0
+    with Image.open(path) as picture:
+        assert picture.size == (tiles[0] * TILE[0], HEADER + tiles[1] * (TILE[1] + CAPTION))
+
+
+def test_view_takes_a_folder(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    shown = []
+    monkeypatch.setattr(
+        "dro_grasp.viewer.app.view_grasps", lambda hand, obj, grasps, **_: shown.append((obj.name, len(grasps))))
+    assert main(["view", str(folder)]) == 0
+    assert main(["view", str(folder), "--object", "sphere"]) == 0
+    assert shown == [("can", 2), ("sphere", 3)]
+    assert "--object sphere" in capsys.readouterr().err
+
+
+def test_objects_of_the_same_name_are_told_apart(tmp_path: Path) -> None:
+    hand, expected = load_hand("gripper3"), {}
+    for kind, side in (("obj", 0.05), ("ply", 0.06)):
+        trimesh.creation.box((side, side, 0.08)).export(tmp_path / f"box.{kind}")
+        obj = load_object(tmp_path / f"box.{kind}")
+        with_own_files(palm_facing_starts(hand, obj, num=1, seed=0), hand, obj).save(tmp_path / f"box_{kind}.parquet")
+        expected[f"box_{kind}"] = obj.sha256
+    grasps = load_grasps(tmp_path)
+    assert dict(zip(grasps.object, grasps.object_sha256, strict=True)) == expected
+    assert main(["evaluate", str(tmp_path)]) == 0
+
+
+def test_folders_of_several_hands_or_of_no_grasp_are_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(GraspFileError, match="no grasp file"):
+        load_grasps(tmp_path)
+    for hand in ("barrett", "gripper3"):
+        starts = palm_facing_starts(load_hand(hand), load_object("can"), num=1, seed=0)
+        starts[:0].save(tmp_path / f"{hand}.parquet")
+    with pytest.raises(GraspFileError, match="only grasp files without any grasp"):
+        load_grasps(tmp_path)
+    for hand in ("barrett", "gripper3"):
+        palm_facing_starts(load_hand(hand), load_object("can"), num=1, seed=0).save(tmp_path / f"{hand}.parquet")
+    with pytest.raises(GraspFileError, match=r"t\.parquet has grasps of hand 'barrett', .*3\.parquet of 'gripper3'"):
+        load_grasps(tmp_path)
+    with pytest.raises(GraspFileError, match="no grasp file"):
+        load_grasps(tmp_path / "nowhere.parquet")
