@@ -138,7 +138,7 @@ def test_fingers_are_counted_from_the_palm_on(hand) -> None:
 
 def test_captions_and_heading_tell_what_was_tried(hand, obj, grasps) -> None:
     assert [caption(grasps, i)[1] for i in range(3)] == [True, False, None]
-    assert "1.00" in caption(grasps, 0)[0]
+    assert "confidence 73 %" in caption(grasps, 0)[0]
     assert heading(hand, obj, grasps) == "gripper3 on sphere: 3 grasps, 1 of 2 succeeded (dro/1)"
     untried = grasps.without_trial()
     assert heading(hand, obj, untried) == "gripper3 on sphere: 3 grasps"

@@ -38,6 +38,8 @@ class Benchmark:
     """Trials; displacement, rotation and diversity are means over successes of the first."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Weights to measure."""
+    device: str = "cpu"
+    """Device for the network and the energies: cpu, cuda or cuda:1. Trials always run on the CPU."""
     temperature: Annotated[float | None, optional("T", "as the weights say")] = None
     """Diversity of the grasps of one placement: 0 proposes the likeliest, 1 is as diverse as the training grasps."""
     controls: bool = True
@@ -71,7 +73,7 @@ class Benchmark:
                 raise OptionError(f"--{name} is empty; name at least one")
         begin = time.perf_counter()
         bundle = None if self.bundle is None else load_bundle(self.bundle)
-        predictor = GraspPredictor(self.weights, config=PredictorConfig(temperature=self.temperature))
+        predictor = GraspPredictor(self.weights, self.device, config=PredictorConfig(temperature=self.temperature))
         hands = [load_hand(name) for name in self.hands]
         objects = [load_object(name) for name in resolve_objects(list(self.objects))]
         if clouds := [obj.name for obj in objects if obj.is_cloud]:

@@ -65,6 +65,8 @@ class Generate:
     """Multiplies the object's coordinates; 0.001 for files in millimetres."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Name of shipped weights (see `dro-grasp weights list`) or the path of a weights file."""
+    device: str = "cpu"
+    """Device for the network and the energies: cpu, cuda or cuda:1. Trials always run on the CPU."""
     protocol: Annotated[
         ProtocolName | Literal["none"] | None,
         optional(f"{{{','.join(PROTOCOLS)},none}}", f"{DEFAULT_PROTOCOL} for a mesh, none for a bare point cloud"),
@@ -102,7 +104,7 @@ class Generate:
         pictures = paths_per_object(self.picture, names, several, ".png")
         camera = None if self.camera is None else read_motion(self.camera, "T_frame_camera")
         start = time.perf_counter() - begin
-        hand, predictor = load_hand(self.hand), GraspPredictor(self.weights)
+        hand, predictor = load_hand(self.hand), GraspPredictor(self.weights, self.device)
         seconds = {"start": start, "load": time.perf_counter() - begin - start}
         job = Job(hand, predictor, request, constraints, camera, seconds)
         done, failed = [], []
@@ -137,7 +139,7 @@ class Generate:
                               "--protocol, which needs a mesh, or leave out --only-successful")
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
-        problem = GraspProblem(job.hand, obj, constraints=job.constraints)
+        problem = GraspProblem(job.hand, obj, self.device, job.constraints)
         with progress_bar("predicting", self.json) as progress:
             made = job.predictor.run(problem, job.request, progress)
         if made.shortage is not None:
@@ -196,6 +198,7 @@ class Generate:
             return evaluate(problem, grasps, protocol, progress)
 
     def _show(self, report: dict[str, Any], grasps: GraspBatch, origin: list[str]) -> None:
+        from dro_grasp.grasps.summary import percent
         from dro_grasp.simulation.diagnosis import diagnose
 
         rows = []
@@ -204,8 +207,8 @@ class Generate:
             if grasps.evaluated[i]:
                 outcome = [bool(grasps.success[i]), len(grasps.extra["contact_links"][i]), float(grasps.penetration[i]) * 1e3,
                            grasps.extra["reason"][i]]
-            rows.append([i, origin[i], float(grasps.score[i]), *outcome])
-        columns = ["grasp", "origin", "score", "success", "contacts", "penetration [mm]", "reason"]
+            rows.append([i, origin[i], percent(float(grasps.score[i])), *outcome])
+        columns = ["grasp", "origin", "confidence", "success", "contacts", "penetration [mm]", "reason"]
         seconds = "  ".join(f"{k} {v:.2f} s" for k, v in report["seconds"].items())
         print_table(f"{report['hand']} on {report['object']}", columns, rows)
         say(seconds)

@@ -33,6 +33,8 @@ class Onboard:
     """Grasps of the network to evaluate on each held-out object, and a quarter as many that `generate` returns."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Weights to fine-tune."""
+    device: str = "cpu"
+    """Device for the network, its training and the energies: cpu, cuda or cuda:1. Trials always run on the CPU."""
     workers: int = 2
     """Processes that synthesize grasps."""
     seed: int = 0
@@ -47,7 +49,8 @@ class Onboard:
         from dro_grasp.onboarding.steps import WEIGHTS, OnboardingConfig, onboard
 
         config = OnboardingConfig(
-            self.minutes, self.objects, self.held_out, self.num, self.weights, self.workers, seed=self.seed)
+            self.minutes, self.objects, self.held_out, self.num, self.weights, self.workers, seed=self.seed,
+            device=self.device)
         done = onboard(self.hand, self.output, config, say_aside)
         report = write_report(done, resolve_objects(list(self.held_out)))
         rates = {step: {row["stage"]: {k: v[0] for k, v in row["success"].items()} for row in done.steps[step]["rows"]}

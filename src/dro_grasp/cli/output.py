@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import compress
 from typing import Any
 
 from rich.console import Console
@@ -13,6 +14,10 @@ from rich.table import Table
 
 stdout = Console(highlight=False, markup=False)
 stderr = Console(stderr=True, highlight=False, markup=False)
+
+
+NOTHING = ("", "-")
+"""Cells without a value."""
 
 
 def say(text: str) -> None:
@@ -58,12 +63,14 @@ def records(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[dict[
 
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """Print a table for people."""
+    """Print a table for people; columns that say nothing in any row are left out."""
+    cells = [[_cell(value) for value in row] for row in rows]
+    told = [not cells or any(row[i] not in NOTHING for row in cells) for i in range(len(columns))]
     table = Table(title=title, title_justify="left")
-    for column in columns:
+    for column in compress(columns, told):
         table.add_column(column, justify="left" if column in {"name", "hand", "object", "reason", "from"} else "right")
-    for row in rows:
-        table.add_row(*[_cell(value) for value in row])
+    for row in cells:
+        table.add_row(*compress(row, told))
     stdout.print(table)
 
 

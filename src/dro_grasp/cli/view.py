@@ -43,6 +43,8 @@ class View:
     """Address to serve at. By default only this machine can connect; 0.0.0.0 serves the whole network."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Weights for grasps generated on the page."""
+    device: str = "cpu"
+    """Device for the network and the energies of grasps generated on the page: cpu, cuda or cuda:1."""
 
     def run(self) -> int:
         """Serve the grasps of one object, or the page that generates grasps."""
@@ -50,7 +52,7 @@ class View:
             from dro_grasp.viewer.stage import serve
             from dro_grasp.viewer.studio import Studio
 
-            serve(Studio(weights=self.weights, port=self.port, host=self.host))
+            serve(Studio(weights=self.weights, port=self.port, host=self.host, device=self.device))
             return 0
         from dro_grasp.grasps.reading import load_grasps
         from dro_grasp.grasps.sources import hand_of

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from dro_grasp.cli.inputs import Flag
-from dro_grasp.cli.output import print_json, print_result, print_table
+from dro_grasp.cli.output import print_json, print_result, say
 
 
 @dataclass(frozen=True)
@@ -57,10 +57,11 @@ class Verify:
         if self.json:
             print_json({"ok": not damaged, "weights": rows})
         else:
-            if intact := [[row["name"], row["sha256"]] for row in rows if not row["error"]]:
-                print_table("weights", ["name", "sha256"], intact)
-            for row in damaged:
-                print(f"error: {row['error']}", file=sys.stderr)
+            for row in rows:
+                if row["error"]:
+                    print(f"error: {row['error']}", file=sys.stderr)
+                else:
+                    say(f"{row['sha256']}  {row['name']}: ok")
         return 2 if damaged else 0
 
 

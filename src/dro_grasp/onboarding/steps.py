@@ -16,6 +16,7 @@ from dro_grasp.datasets.collections.bundling import make_bundle
 from dro_grasp.datasets.collections.collection import count_collection
 from dro_grasp.datasets.engine.schedule import require_known, synthesize_dataset
 from dro_grasp.datasets.engine.worker import EngineConfig
+from dro_grasp.devices import require_device
 from dro_grasp.errors import BundleError, OptionError
 from dro_grasp.evaluation.success_rates import BEST, RAW, REFINED, RETURNED, BenchmarkConfig, benchmark
 from dro_grasp.files import check_folder, make_folder, replacing
@@ -23,6 +24,7 @@ from dro_grasp.hands.check import check_hand, picture
 from dro_grasp.hands.library import load_hand
 from dro_grasp.models.checkpoints import history_of, load_weights, locate_weights, save_weights
 from dro_grasp.objects.catalogue import load_object, resolve_objects
+from dro_grasp.optimization.synthesis import SynthesisConfig
 from dro_grasp.predictor import GraspPredictor
 from dro_grasp.simulation.protocols import protocol
 from dro_grasp.training.config import ScheduleConfig, TrainConfig
@@ -68,11 +70,14 @@ class OnboardingConfig:
     """Peak rate of fine-tuning; the rate of training from scratch overwrites the initial weights (ours)."""
     seed: int = 0
     """Of synthesis, benchmark and training."""
+    device: str = "cpu"
+    """Device of the network, its training and the energies; trials run on the CPU."""
 
     def __post_init__(self) -> None:
         """Refuse numbers out of range."""
         if not (math.isfinite(self.minutes) and self.minutes > 0):
             raise OptionError(f"minutes is {self.minutes}; give a positive number, for example --minutes 30")
+        require_device(self.device)
         for name, value in (("num", self.num), ("workers", self.workers)):
             if value < 1:
                 raise OptionError(f"{name} is {value}; give at least 1 (--{name})")
@@ -212,7 +217,7 @@ class _Onboarding:
 
     def _benchmark(self, weights: str | None) -> dict[str, Any]:
         """Success rates on held-out objects: of the network, and of the grasps that `generate` returns."""
-        predictor = GraspPredictor(weights)
+        predictor = GraspPredictor(weights, self.config.device)
         rules = tuple(protocol(name) for name in ("dro", "strict"))
         config = BenchmarkConfig(self.config.num, (RAW, REFINED, BEST, RETURNED), rules, controls=False, seed=self.config.seed)
         rows = benchmark([self.hand], [load_object(name) for name in self.held_out], predictor, config)
@@ -223,7 +228,8 @@ class _Onboarding:
     def _data(self) -> dict[str, Any]:
         report = synthesize_dataset(
             [self.name], self.objects, MOST_GRASPS, self.folder / DATA, workers=self.config.workers, seed=self.config.seed,
-            config=EngineConfig(seconds=60 * self.config.minutes * DATA_SHARE), progress=self.say)
+            config=EngineConfig(seconds=60 * self.config.minutes * DATA_SHARE,
+                                synthesis=SynthesisConfig(device=self.config.device)), progress=self.say)
         counts = next(iter(count_collection(self.folder / DATA).values()), {})
         failures = {obj: why for (_, obj), why in report.failures.items()}
         if not sum(counts.values()):
@@ -239,7 +245,7 @@ class _Onboarding:
         bundle, initial = load_bundle(path), load_weights(self.config.weights)
         schedule = ScheduleConfig(
             steps=10**6, minutes=self.config.minutes * TRAINING_SHARE, learning_rate=self.config.learning_rate,
-            seed=self.config.seed)
+            seed=self.config.seed, device=self.config.device)
         config = TrainConfig(schedule, hands_per_step=1, samples_per_hand=16)
         model = train(bundle, initial.config, config, self.folder / "run", name=self.folder.name, initial=initial,
                       report=lambda run, means: self.say(f"step {run.step}: distance {1e3 * means['distance']:.1f} mm"))

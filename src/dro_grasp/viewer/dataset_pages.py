@@ -6,6 +6,7 @@ import html
 import io
 import math
 from collections.abc import Callable, Sequence
+from os.path import commonpath
 from pathlib import Path
 
 import torch
@@ -21,6 +22,8 @@ from dro_grasp.viewer.pictures import caption, contact_sheet, draw_grasp
 
 MAX_PICTURES = 8
 """Grasps drawn for each hand, each on another object."""
+LABEL = 14
+"""Most characters of a joint's label in a chart (ours)."""
 COLOUR = "#2a788e"
 """Blue of the data in charts."""
 ACCENT = "#d1713b"
@@ -114,9 +117,17 @@ def _joints(axes: Axes, hand: HandCoverage) -> None:
     quantiles = torch.quantile(q, torch.tensor([0.1, 0.5, 0.9]), dim=0)
     axes.vlines(places, quantiles[0].tolist(), quantiles[2].tolist(), color=COLOUR, linewidth=4, label="10 to 90 %")
     axes.plot(places, quantiles[1].tolist(), "o", color=ACCENT, markersize=4, label="median")
-    axes.set_xticks(list(places), [n[:14] for n in tree.joint_names], rotation=60, ha="right", fontsize=7)
+    axes.set_xticks(list(places), short_names(tree.joint_names), rotation=60, ha="right", fontsize=7)
     axes.set(title=f"joints; mean standard deviation {hand.diversity['joints']:.2f}", ylabel="[rad or m]")
     axes.legend(fontsize=7, loc="lower right")
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Names without what all begin with, cut to their last LABEL characters unless two would be the same."""
+    begin = len(commonpath(list(names))) if len(names) > 1 else 0
+    own = [name[begin:] or name for name in names]
+    cut = [name if len(name) <= LABEL else f"…{name[1 - LABEL:]}" for name in own]
+    return cut if len(set(cut)) == len(cut) else own
 
 
 def grasps_drawn(hand: HandCoverage) -> bytes:

@@ -15,6 +15,8 @@ body { font: 15px/1.5 system-ui, sans-serif; color: #282c34; max-width: 1180px; 
 h1, h2 { font-weight: 600 } h2 { margin-top: 2.2em; border-top: 1px solid #ddd; padding-top: 1em }
 table { border-collapse: collapse; font-size: 13px; margin: 1em 0 } td, th { padding: 2px 8px; text-align: right }
 td:first-child, th:first-child, td:last-child.words { text-align: left } tr:nth-child(even) { background: #f6f7f8 }
+pre { white-space: pre-wrap } pre, p, td.words { overflow-wrap: anywhere }
+table { display: block; overflow-x: auto; max-width: 100% }
 td.cell { min-width: 2.2em } img { max-width: 100% } p.note { color: #666 }
 """
 """CSS of every page."""

@@ -20,6 +20,7 @@ from dro_grasp.devices import cores
 from dro_grasp.errors import OutputError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import require_pair
+from dro_grasp.grasps.summary import percent
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.rendering.meshes import Colour, dots
@@ -196,8 +197,9 @@ def outcome(grasps: GraspBatch, index: int) -> bool | None:
 def caption(grasps: GraspBatch, index: int) -> tuple[str, bool | None]:
     """The caption of a picture, and the trial outcome that gives its colour."""
     words = {True: "success", False: "failed", None: "not evaluated"}[outcome(grasps, index)]
-    values = {name: float(getattr(grasps, name)[index]) for name in ("score", "energy")}
-    numbers = "".join(f"   {name} {value:.2f}" for name, value in values.items() if math.isfinite(value))
+    confidence, energy = percent(float(grasps.score[index])), float(grasps.energy[index])
+    numbers = "" if confidence is None else f"   confidence {confidence}"
+    numbers += f"   energy {energy:.2f}" if math.isfinite(energy) else ""
     return f"{index}   {words}{numbers}", outcome(grasps, index)
 
 

@@ -73,10 +73,17 @@ class Studio(ServedPage):
     """
 
     def __init__(
-        self, hand: str = "allegro", obj: str = "rubber_duck", weights: str | None = None, port: int = 8080, host: str = HOST
+        self, hand: str = "allegro", obj: str = "rubber_duck", weights: str | None = None, port: int = 8080, host: str = HOST,
+        device: str = "cpu",
     ) -> None:
-        """Start serving with a hand and an object chosen; weights by name or path, port and host as `ServedPage` takes them."""
-        self.predictor = GraspPredictor(weights)
+        """Start serving with a hand and an object chosen.
+
+        Args:
+            hand: Name or path; the object likewise.
+            weights: As `GraspPredictor` takes them; the device likewise.
+            port: As `ServedPage` takes it; the host likewise.
+        """
+        self.predictor = GraspPredictor(weights, device)
         self.made: ShownGrasps | None = None
         self.shown: list[int] = []
         self._folder = tempfile.TemporaryDirectory(prefix="dro-grasp-")

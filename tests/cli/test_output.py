@@ -1,0 +1,68 @@
+"""What people read in a terminal: tables, checksums, probabilities, devices that are not there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from scipy.special import expit
+
+from dro_grasp.cli.main import main
+from dro_grasp.cli.output import print_table
+from dro_grasp.grasps.summary import percent
+from dro_grasp.models.checkpoints import SMALL, weights_names
+from dro_grasp.viewer.dataset_pages import LABEL, short_names
+
+
+def test_columns_that_say_nothing_are_left_out(capsys: pytest.CaptureFixture[str]) -> None:
+    print_table("t", ["name", "size", "reason", "held"], [["a", float("nan"), "", 0], ["b", None, None, False]])
+    said = capsys.readouterr().out
+    assert "name" in said
+    assert "held" in said, "zero and no are values"
+    assert "size" not in said
+    assert "reason" not in said
+    print_table("t", ["name", "size"], [])
+    assert "size" in capsys.readouterr().out, "an empty table keeps its head"
+
+
+@pytest.mark.parametrize("score", [-3.0, -0.2, 0.0, 1.0, 2.823, 1e4, -1e4])
+def test_a_score_is_shown_as_the_probability_that_it_states(score: float) -> None:
+    assert percent(score) == f"{100 * expit(score):.0f} %"
+
+
+def test_without_a_score_there_is_no_probability() -> None:
+    assert percent(float("nan")) is None
+
+
+def test_checksums_are_whole_and_each_is_said_to_be_ok(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["weights", "verify"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == len([*weights_names(), *SMALL])
+    for line in lines:
+        checksum, _, rest = line.partition("  ")
+        assert len(checksum) == 64
+        assert rest.endswith(": ok")
+
+
+def test_labels_of_joints_differ() -> None:
+    names = ["left_hand_finger_1_proximal", "left_hand_finger_2_proximal", "left_hand_thumb_rotation_joint"]
+    labels = short_names(names)
+    assert labels == ["finger_1_proximal", "finger_2_proximal", "thumb_rotation_joint"] or len(set(labels)) == 3
+    assert max(map(len, short_names(["a_first_joint_of_all", "b_second_joint"]))) == LABEL
+    long = [f"{i}_the_same_long_ending" for i in range(3)]
+    assert short_names(long) == long, "not cut where two would be the same"
+    assert short_names(["only_one"]) == ["only_one"]
+
+
+@pytest.mark.parametrize("command", [
+    ["generate", "--hand", "gripper3", "--object", "sphere"], ["benchmark", "--hands", "gripper3", "--objects", "sphere"],
+    ["onboard", "gripper3", "--output", "OUT"], ["view"],
+    ["synthesize", "--hand", "gripper3", "--object", "can", "--output", "OUT"],
+], ids=lambda c: c[0])
+def test_a_device_that_is_not_there_is_refused(command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = [str(tmp_path / "new") if word == "OUT" else word for word in command]
+    assert main([*words, "--device", "cuda:77"]) == 2
+    said = capsys.readouterr()
+    assert "device is 'cuda:77'" in said.err
+    assert "--device cpu" in said.err
+    assert not (tmp_path / "new").exists()
