@@ -83,7 +83,8 @@ def draw_grasps(
         OutputError: The file cannot be written, or there is no grasp.
     """
     require_pair(hand, obj)
-    _save(*_tiles(hand, obj, grasps[:count], style), heading(hand, obj, grasps), path, columns)
+    closed = ", drawn after closing" if shows_held(hand, obj, style) else ""
+    _save(*_tiles(hand, obj, grasps[:count], style), heading(hand, obj, grasps) + closed, path, columns)
 
 
 def draw_sheet(
@@ -111,8 +112,7 @@ def _tiles(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, style: PictureStyle | None
 ) -> tuple[list[UInt8[np.ndarray, "height width 3"]], list[tuple[str, bool | None]]]:
     """Pictures of grasps of one object, and their captions."""
-    closed = (style or PictureStyle()).posture == "held" and can_close(hand, obj)
-    drawn = after_closing(hand, obj, grasps) if closed else grasps
+    drawn = after_closing(hand, obj, grasps) if shows_held(hand, obj, style) else grasps
     with ThreadPoolExecutor(cores()) as threads:
         tiles = list(threads.map(lambda i: draw_grasp(hand, obj, drawn, i, style), range(len(grasps))))
     return tiles, [caption(grasps, i) for i in range(len(grasps))]
@@ -131,9 +131,9 @@ def _save(
         raise OutputError(f"cannot write picture {path}: {error.strerror or error}; choose another path") from error
 
 
-def can_close(hand: Hand, obj: ObjectModel) -> bool:
-    """Whether the closing of the hand can be simulated: it needs the hand's description and the object's mesh."""
-    return hand.description is not None and not obj.is_cloud
+def shows_held(hand: Hand, obj: ObjectModel, style: PictureStyle | None) -> bool:
+    """Whether grasps are drawn after closing, which needs the hand's description and the object's mesh."""
+    return (style or PictureStyle()).posture == "held" and hand.description is not None and not obj.is_cloud
 
 
 def after_closing(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> GraspBatch:
