@@ -16,6 +16,7 @@ from dro_grasp.cli.dataset import Dataset
 from dro_grasp.cli.evaluate import Evaluate
 from dro_grasp.cli.export import Export
 from dro_grasp.cli.generate import Generate
+from dro_grasp.cli.lift_experiment import Tabletop
 from dro_grasp.cli.listing import HandCommand, Hands, Objects
 from dro_grasp.cli.onboard import Onboard
 from dro_grasp.cli.plan_lift import Plan
@@ -56,6 +57,7 @@ Command = (
     | Annotated[Hands, named("hands")]
     | Annotated[Objects, named("objects")]
     | Annotated[Plan, named("plan")]
+    | Annotated[Tabletop, named("tabletop")]
     | Annotated[RobotCommand, named("robot")]
     | Annotated[Weights, named("weights")]
 )

@@ -50,6 +50,8 @@ class PlanConfig:
     """Longest time for one path [s]."""
     closing_seconds: float = 1.0
     """Least time in which the hand closes [s]. Source: as in trials."""
+    grip_seconds: float = 0.5
+    """How long the hand presses before the arm lifts [s]."""
     reach: ReachConfig = field(default_factory=ReachConfig)
     """Approach and lift."""
 
@@ -194,6 +196,7 @@ class _Task:
         shape = smooth(_between(hand.opened, hand.pregrasp), *fingers)
         close = smooth(np.concatenate([_between(hand.pregrasp, hand.grasp), _between(hand.grasp, hand.squeeze)]), *fingers,
                        self.config.closing_seconds)
+        close = joined([close, standing(hand.squeeze, self.config.grip_seconds)])
         approach, lift = smooth(goal.approach, *limits), smooth(goal.lift, *limits)
         start = robot.T_world_wrist(grasp)
         free = self._free(reach.position, hand.opened) and all(

@@ -30,7 +30,7 @@ def robot_spec(robot: Robot, protocol: Protocol, table: Table | None) -> mujoco.
     """Arm, hand and table; nothing drives them yet."""
     scene = mujoco.MjSpec()
     option = scene.option
-    option.timestep, option.impratio = protocol.timestep, protocol.impratio
+    option.timestep, option.impratio, option.noslip_iterations = protocol.timestep, protocol.impratio, protocol.noslip
     option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtCone.mjCONE_ELLIPTIC
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # the sparse Newton solver of MuJoCo 4.0.0 can be wrong
     arm = robot.arm.spec()

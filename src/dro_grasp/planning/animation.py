@@ -1,0 +1,122 @@
+"""Animations of attempts, drawn without a browser or OpenGL: robot, table and object at each moment, as GIF or WebP."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image
+
+from dro_grasp.errors import OutputError
+from dro_grasp.files import check_output, replacing
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.planning.attempts import Attempt, attempt
+from dro_grasp.planning.physics import LiftScene
+from dro_grasp.planning.robot import Robot, load_robot
+from dro_grasp.planning.robot_check import robot_meshes, table_meshes
+from dro_grasp.planning.robot_file import Table
+from dro_grasp.planning.tabletop import TabletopRun
+from dro_grasp.predictor import GraspPredictor
+from dro_grasp.rendering.camera import Camera
+from dro_grasp.rendering.meshes import Colour, Mesh
+from dro_grasp.rendering.rasterizer import render
+
+FORMATS = {".gif": "GIF", ".webp": "WEBP"}
+"""Endings of animation files."""
+RATE = 10
+"""Frames per second (ours)."""
+WATCHED = 50
+"""Calls of a watch per second of simulated time."""
+SIZE = (480, 360)
+"""Width and height [pixels]."""
+VIEW = (0.9, -1.25, 0.75)
+"""Direction from the robot towards the camera, in the world."""
+OBJECT_COLOUR: Colour = (0.95, 0.62, 0.28)
+"""Orange of the object."""
+LAST_SECONDS = 1.0
+"""How long the last frame stays [s] (ours)."""
+
+
+@dataclass
+class Recorder:
+    """Keeps what a scene looks like, RATE times a second; an instance is a `Watch` of an attempt."""
+
+    frames: list[tuple[Float[np.ndarray, " n_arm"], Float[np.ndarray, " n_dof"], Float[np.ndarray, "4 4"]]] = field(
+        default_factory=list)
+    """Arm, hand [rad or m], and the object's pose [m]."""
+    calls: int = 0
+    """How often it was called."""
+
+    def __call__(self, scene: LiftScene) -> None:
+        """Look at the scene."""
+        if self.calls % (WATCHED // RATE) == 0:
+            self.frames.append((*scene.joints(), scene.pose(0)))
+        self.calls += 1
+
+
+def check_animation(path: Path) -> None:
+    """Refuse a path that no animation can be written to.
+
+    Raises:
+        OutputError: The ending is unknown, or the path cannot be written.
+    """
+    check_output(path)
+    if path.suffix.lower() not in FORMATS:
+        raise OutputError(f"{path} is no name of an animation; let it end in {' or '.join(FORMATS)}")
+
+
+def draw_animation(robot: Robot, obj: ObjectModel, recorder: Recorder, path: Path) -> None:
+    """Write the animation of a recorded attempt.
+
+    Raises:
+        OutputError: Nothing was recorded, or the path cannot be written.
+    """
+    check_animation(path)
+    if not recorder.frames:
+        raise OutputError(f"no motion to draw into {path}: the attempt ended before the robot moved")
+    camera = _camera(robot, recorder)
+    pictures = [Image.fromarray(_frame(robot, obj, camera, *frame)) for frame in recorder.frames]
+    seconds = [1000 // RATE] * (len(pictures) - 1) + [round(1000 * LAST_SECONDS)]
+    kind = FORMATS[path.suffix.lower()]
+    options = {"quality": 70, "method": 4} if kind == "WEBP" else {"optimize": True}
+    if kind == "GIF":
+        pictures = [p.quantize(64) for p in pictures]
+    with replacing(path, "animation") as temporary:
+        pictures[0].save(temporary, format=kind, save_all=True, append_images=pictures[1:], duration=seconds, loop=0, **options)
+
+
+def draw_attempt(run: TabletopRun, path: Path) -> Attempt:
+    """Run the first attempt of a run once more, and write its animation.
+
+    Raises:
+        OutputError: The path cannot be written, or the robot did not move.
+    """
+    check_animation(path)
+    robot, obj, recorder = load_robot(run.robot), load_object(run.objects[0]), Recorder()
+    result = attempt(robot, obj, 0, run.seed, GraspPredictor(run.weights), run.config, recorder)
+    draw_animation(robot, obj, recorder, path)
+    return result
+
+
+def _frame(
+    robot: Robot, obj: ObjectModel, camera: Camera, arm: Float[np.ndarray, " n_arm"], hand: Float[np.ndarray, " n_dof"],
+    T_world_object: Float[np.ndarray, "4 4"],
+) -> UInt8[np.ndarray, "height width 3"]:
+    assert obj.vertices is not None
+    assert obj.faces is not None
+    thing = Mesh(obj.vertices @ T_world_object[:3, :3].T + T_world_object[:3, 3], obj.faces, OBJECT_COLOUR)
+    return render([*table_meshes(robot.table), *robot_meshes(robot, arm, hand), thing], camera, *SIZE)
+
+
+def _camera(robot: Robot, recorder: Recorder) -> Camera:
+    """A camera that has the whole motion in its picture, and the part of the table around it."""
+    moved = [mesh.vertices for arm, hand, _ in recorder.frames[:: max(1, len(recorder.frames) // 8)]
+             for mesh in robot_meshes(robot, arm, hand)]
+    places = np.stack([T[:3, 3] for _, _, T in recorder.frames])
+    table = robot.table or Table()
+    around = places[:1, :2] + 0.15 * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+    corners = np.column_stack([around, np.full(4, table.height)])
+    return Camera.around(np.concatenate([*moved, places, corners]), VIEW, aspect=SIZE[0] / SIZE[1], margin=0.03)

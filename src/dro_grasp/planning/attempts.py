@@ -1,0 +1,239 @@
+"""One attempt: an object comes to rest on the table, is seen, planned for, grasped, lifted, held and shaken."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from dro_grasp.errors import DroGraspError, OptionError
+from dro_grasp.geometry.se3 import random_rotations
+from dro_grasp.objects.loading import cloud_object
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.perception.scan import scanned_object
+from dro_grasp.planning.depth_images import depth_image, look
+from dro_grasp.planning.motion import STAGES, MotionPlan
+from dro_grasp.planning.physics import LiftScene
+from dro_grasp.planning.planner import PlanConfig, plan
+from dro_grasp.planning.robot import Robot
+from dro_grasp.planning.robot_file import Table
+from dro_grasp.predictor import GraspPredictor
+
+VERSION = 1
+"""Goes up with every change that can change an outcome."""
+DROP = 0.005
+"""Height above the table from which an object comes to rest [m] (ours)."""
+REST_SECONDS = 4.0
+"""Longest time in which it comes to rest [s] (ours)."""
+REST_SPEED = 0.002
+"""Speed below which it rests [m/s] (ours)."""
+DRAWS = 20
+"""How often it is put down anew if it rolls off the region (ours)."""
+PUSHED = 0.03
+"""Farthest that the object may move before the hand closes [m] (ours)."""
+SLIPPED = 0.05
+"""Farthest that it may move in the hand after the lift [m] (ours)."""
+SHAKE_FREQUENCY = 1.5
+"""[1/s] (ours)"""
+SHAKE_ANGLE = 0.04
+"""Amplitude of the arm's first joint [rad] (ours): 2 cm at half a metre, 1.8 m/s^2."""
+
+
+@dataclass(frozen=True)
+class TabletopConfig:
+    """How an attempt runs. Values without a source are ours."""
+
+    see: Literal["cloud", "mesh"] = "cloud"
+    """What is planned for: the cloud of the robot's camera alone, or, as a control, the true mesh at its true place."""
+    noise: float = 0.0015
+    """Standard deviation of depth [m]."""
+    region: tuple[float, float, float, float] = (0.38, -0.18, 0.58, 0.18)
+    """Least x and y, greatest x and y of where objects are put [m, from the arm's base]."""
+    hold_seconds: float = 3.0
+    """How long the object is held [s]."""
+    shake_seconds: float = 2.0
+    """How long it is shaken then [s]."""
+    plan: PlanConfig = field(default_factory=PlanConfig)
+    """How motions are planned."""
+
+    def label(self) -> str:
+        """Version and every setting, as stored with results: results of other settings are not mixed."""
+        return f"tabletop/{VERSION} " + json.dumps(asdict(self), sort_keys=True)
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """What became of one attempt; plain values."""
+
+    robot: str
+    object: str
+    number: int
+    """Of the attempt with this object."""
+    seed: int
+    settings: str
+    """See `TabletopConfig.label`."""
+    success: bool = False
+    stage: str = "see"
+    """Where it ended: see, plan, one of the motion's stages, hold, shake, or done."""
+    reason: str = ""
+    """Why it failed."""
+    place: str = "[]"
+    """JSON: the object's pose at rest in the world [m]."""
+    raised: float = 0.0
+    """How much higher the object was at the end than at rest [m]."""
+    score: float = float("nan")
+    """Of the grasp."""
+    grasps: int = 0
+    """Grasps to choose from."""
+    dropped: str = "{}"
+    """JSON: how many were dropped, by reason."""
+    see_seconds: float = 0.0
+    """From the depth image to the object's cloud [s]."""
+    plan_seconds: float = 0.0
+    """From the cloud to the timed plan [s]."""
+    grasp_seconds: float = 0.0
+    """Of these, for proposing and refining grasps [s]."""
+    processor_seconds: float = 0.0
+    """Of one core, from the depth image to the timed plan [s]; the others are by the clock, whatever else runs."""
+    motion_seconds: float = 0.0
+    """Duration of the planned motion [s]."""
+
+
+Watch = Callable[[LiftScene], None]
+"""Called fifty times a second of simulated time."""
+
+
+def attempt(
+    robot: Robot, obj: ObjectModel, number: int, seed: int, predictor: GraspPredictor, config: TabletopConfig | None = None,
+    watch: Watch | None = None,
+) -> Attempt:
+    """Run one attempt from beginning to end.
+
+    Args:
+        robot: With table, and with a camera if that is what sees.
+        obj: A mesh.
+        number: Of the attempt; it draws another place of the object.
+        seed: Of all draws.
+        predictor: Proposes grasps.
+        config: How it runs.
+        watch: See `Watch`.
+
+    Raises:
+        OptionError: The robot lacks a table or a camera, or the object is a bare cloud.
+    """
+    config = config or TabletopConfig()
+    _check(robot, obj, config)
+    scene = LiftScene(robot, [obj])
+    result = Attempt(robot.name, obj.name, number, seed, config.label())
+    draw = np.random.default_rng([seed, number])
+    if not rest(scene, 0, config, draw):
+        return replace(result, stage="see", reason="the object rolls off the region wherever it is put")
+    start = scene.pose(0)
+    result = replace(result, place=json.dumps(start.round(6).tolist()))
+    begin, processor = time.perf_counter(), time.process_time()
+    try:
+        seen, T, level = _see(scene, config, int(draw.integers(2**31)))
+        see_seconds = time.perf_counter() - begin
+        result, begin = replace(result, stage="plan", see_seconds=see_seconds), time.perf_counter()
+        made = plan(level, seen, T, (), predictor, config.plan, seed + number)
+    except DroGraspError as error:
+        return replace(result, reason=str(error))
+    notes = made.notes
+    result = replace(
+        result, processor_seconds=time.process_time() - processor, plan_seconds=time.perf_counter() - begin,
+        grasp_seconds=notes.seconds["grasps"], score=notes.score, grasps=notes.grasps, dropped=json.dumps(notes.dropped),
+        motion_seconds=made.seconds)
+    stage, reason = carry_out(scene, made, config, watch)
+    raised = float(scene.pose(0)[2, 3] - start[2, 3])
+    return replace(result, stage=stage, reason=reason, success=not reason, raised=raised)
+
+
+def rest(scene: LiftScene, index: int, config: TabletopConfig, draw: np.random.Generator) -> bool:
+    """Drop an object in a random orientation at a random place, and wait until it rests there; False if it never does."""
+    low, high = np.array(config.region[:2]), np.array(config.region[2:])
+    table, obj = scene.robot.table or Table(), scene.objects[index]
+    assert obj.vertices is not None
+    for _ in range(DRAWS):
+        generator = torch.Generator().manual_seed(int(draw.integers(2**31)))
+        T = np.eye(4)
+        T[:3, :3] = random_rotations(1, generator)[0].double().numpy()
+        T[:2, 3] = scene.robot.T_world_base[:2, 3] + draw.uniform(low, high)
+        T[2, 3] = table.height + DROP - float((obj.vertices @ T[2, :3]).min())
+        scene.place(index, T)
+        for _ in range(round(REST_SECONDS / 0.5)):
+            scene.advance(0.5)
+            if scene.speed(index) < REST_SPEED:
+                break
+        place = scene.pose(index)[:2, 3] - scene.robot.T_world_base[:2, 3]
+        if scene.speed(index) < REST_SPEED and (place > low - 0.05).all() and (place < high + 0.05).all():
+            return True
+    return False
+
+
+def carry_out(scene: LiftScene, made: MotionPlan, config: TabletopConfig, watch: Watch | None = None) -> tuple[str, str]:
+    """Let the servos follow a plan, then hold and shake; where it ended, and why if it failed."""
+    start = scene.pose(0)
+    call = None if watch is None else lambda: watch(scene)
+    for stage in STAGES:
+        rows = made.part(stage)
+        for i in range(rows.start + 1, rows.stop):
+            scene.command(made.arm.position[i], made.arm.velocity[i], made.hand.position[i])
+            scene.advance(float(made.arm.time[i] - made.arm.time[i - 1]), call)
+        if stage == "approach" and (moved := _apart(scene.pose(0), start)) > PUSHED:
+            return stage, f"the hand pushed the object by {100 * moved:.1f} cm before it closed"
+    lifted = float(scene.pose(0)[2, 3] - start[2, 3])
+    if lifted < config.plan.reach.lift / 2:
+        return "lift", "the object stayed on the table" if lifted < 0.02 else "the object fell during the lift"
+    grip = np.linalg.inv(scene.wrist()) @ scene.pose(0)
+    arm, hand = made.arm.position[-1], made.hand.position[-1]
+    for stage, seconds in (("hold", config.hold_seconds), ("shake", config.shake_seconds)):
+        for k in range(round(seconds / 0.02)):
+            target, velocity = arm.copy(), np.zeros_like(arm)
+            if stage == "shake":
+                phase = 2 * np.pi * SHAKE_FREQUENCY
+                target[0] += SHAKE_ANGLE * np.sin(phase * 0.02 * k)
+                velocity[0] = SHAKE_ANGLE * phase * np.cos(phase * 0.02 * k)
+            scene.command(target, velocity, hand)
+            scene.advance(0.02, call)
+        slip = _apart(np.linalg.inv(scene.wrist()) @ scene.pose(0), grip)
+        if slip > SLIPPED or not scene.touched(0):
+            return stage, f"the object slipped by {100 * slip:.0f} cm out of the hand"
+    return "done", ""
+
+
+def _see(scene: LiftScene, config: TabletopConfig, seed: int) -> tuple[ObjectModel, Float[np.ndarray, "4 4"], Robot]:
+    """The object as it is known, where its frame is, and the robot with the table that was seen."""
+    robot = scene.robot
+    if config.see == "mesh":
+        return scene.objects[0], scene.pose(0), robot
+    assert robot.camera is not None
+    assert robot.table is not None
+    sight = look(depth_image(scene, robot.camera, config.noise, seed), robot.camera, robot.table)
+    cloud = scanned_object(scene.objects[0].name, sight.points, robot.camera.T_world_camera)
+    return above(cloud, sight.table_height), np.eye(4), replace(robot, table=replace(robot.table, height=sight.table_height))
+
+
+def above(cloud: ObjectModel, height: float) -> ObjectModel:
+    """A bare cloud without what completion put below the table."""
+    kept = cloud.cloud[:, 2] > height
+    rows = np.concatenate([cloud.cloud, cloud.cloud_normals], 1)[kept]
+    return replace(cloud_object(cloud.name, rows, origin=cloud.name), notes=cloud.notes)
+
+
+def _apart(first: Float[np.ndarray, "4 4"], second: Float[np.ndarray, "4 4"]) -> float:
+    return float(np.linalg.norm(first[:3, 3] - second[:3, 3]))
+
+
+def _check(robot: Robot, obj: ObjectModel, config: TabletopConfig) -> None:
+    if robot.table is None or (config.see == "cloud" and robot.camera is None):
+        raise OptionError(f"robot '{robot.name}' has no {'table' if robot.table is None else 'camera'}; state it in the robot "
+                          "file: attempts need both")
+    if obj.is_cloud:
+        raise OptionError(f"object '{obj.name}' is a bare cloud; attempts are simulated, and need a mesh")
+

@@ -1,0 +1,159 @@
+"""The robot at work in MuJoCo: gravity, position servos with the arm's real limits, and objects that may slip and fall."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from dro_grasp.geometry.rotations import roma
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.planning.collisions import exclude_constant_contacts, open_hand
+from dro_grasp.planning.robot import Robot
+from dro_grasp.planning.workcell import ARM, TABLE, arm_addresses, robot_spec, wxyz
+from dro_grasp.simulation.protocols import PROTOCOLS
+from dro_grasp.simulation.rollout import quiet
+from dro_grasp.simulation.scene import PREFIX, add_object, add_servos, joint_addresses
+
+LIFT_PROTOCOL = replace(PROTOCOLS["dro"], name="tabletop", timestep=0.002, force_limit=3.0, noslip=3)
+"""Contacts and servos of the hand: friction 1, density 500 kg/m^3 and the servos' gains as in trials; at most 3 Nm (ours).
+
+Without the solver against slip, held objects creep out of soft contacts; DexGraspBench has two of its iterations."""
+STIFFNESS_PER_EFFORT = 40.0
+"""Gain of an arm's servo for each Nm that it can exert [1/rad]: full torque at an error of 1.4 degrees (ours)."""
+DAMPING_TIME = 0.03
+"""Damping of an arm's servo over its stiffness [s] (ours); the wanted velocity is fed forward, so nothing lags behind."""
+ARMATURE = 0.1
+"""Inertia of the motors of an arm's joints [kg m^2]. Source: the usual value of models of such arms."""
+ROLLING = 0.002
+"""Rolling friction of the table, as of a cloth: balls come to rest [m] (ours)."""
+SHAPE_GROUP = 4
+"""Group of the geoms that only cameras see: the objects' true meshes."""
+PART_GROUP = 3
+"""Group of the convex parts, with which objects collide."""
+
+
+class LiftScene:
+    """Robot, table and objects, and the state that they are in."""
+
+    def __init__(self, robot: Robot, objects: Sequence[ObjectModel]) -> None:
+        """Build the scene, with the robot at home and the objects far away; the table is the robot's."""
+        self.robot, self.objects = robot, tuple(objects)
+        scene = robot_spec(robot, LIFT_PROTOCOL, robot.table)
+        for body in list(scene.bodies)[1:]:
+            body.gravcomp = 1.0  # a robot's controller holds its own weight
+        _add_arm_servos(scene, robot)
+        add_servos(scene, robot.hand, LIFT_PROTOCOL)
+        for i, obj in enumerate(objects):
+            _add_thing(scene, obj, i)
+        if robot.table is not None:
+            board = scene.geom(TABLE)
+            board.condim, board.friction = 6, [LIFT_PROTOCOL.friction, 0.005, ROLLING]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            exclude_constant_contacts(scene, robot)
+            self.model = scene.compile()
+        self.data = mujoco.MjData(self.model)
+        self._arm, (self._hand, moving) = arm_addresses(self.model, robot), joint_addresses(self.model, robot.hand)
+        self._objects = [int(self.model.jnt_qposadr[self.model.joint(f"object{i}-").id]) for i in range(len(objects))]
+        names = [self.model.actuator(i).name for i in range(self.model.nu)]
+        self._arm_servos = np.array([names.index(ARM + n) for n in robot.arm_joints])
+        self._hand_servos = np.array([names.index(n) for n in robot.hand_joints])
+        tree, opened = robot.hand.tree, open_hand(robot)
+        self.data.qpos[self._arm] = robot.home
+        self.data.qpos[self._hand] = (tree.coupling.double().numpy() @ opened + tree.offset.double().numpy())[moving]
+        self.command(robot.home, np.zeros(len(robot.home)), opened)
+
+    def place(self, index: int, T_world_object: Float[np.ndarray, "4 4"]) -> None:
+        """Put an object somewhere, at rest."""
+        start = self._objects[index]
+        self.data.qpos[start:start + 7] = [*T_world_object[:3, 3], *wxyz(T_world_object[:3, :3])]
+        velocity = int(self.model.jnt_dofadr[self.model.joint(f"object{index}-").id])
+        self.data.qvel[velocity:velocity + 6] = 0.0
+        mujoco.mj_forward(self.model, self.data)
+
+    def pose(self, index: int) -> Float[np.ndarray, "4 4"]:
+        """Where an object is [m]."""
+        start = self._objects[index]
+        T = np.eye(4)
+        T[:3, 3] = self.data.qpos[start:start + 3]
+        quaternion = torch.from_numpy(self.data.qpos[start + 3:start + 7].copy())
+        T[:3, :3] = roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(quaternion / quaternion.norm())).numpy()
+        return T
+
+    def speed(self, index: int) -> float:
+        """How fast an object moves, its rotation counted at 5 cm from its centre [m/s]."""
+        start = int(self.model.jnt_dofadr[self.model.joint(f"object{index}-").id])
+        linear, angular = self.data.qvel[start:start + 3], self.data.qvel[start + 3:start + 6]
+        return float(np.linalg.norm(linear) + 0.05 * np.linalg.norm(angular))
+
+    def wrist(self) -> Float[np.ndarray, "4 4"]:
+        """Where the hand's root link really is [m]."""
+        body, T = self.data.body(PREFIX + self.robot.hand.wrist_link), np.eye(4)
+        T[:3, :3], T[:3, 3] = body.xmat.reshape(3, 3), body.xpos
+        return T
+
+    def joints(self) -> tuple[Float[np.ndarray, " n_arm"], Float[np.ndarray, " n_dof"]]:
+        """Where arm and hand really are, in independent joints [rad or m]."""
+        names = {self.model.joint(j).name: int(self.model.jnt_qposadr[j]) for j in range(self.model.njnt)}
+        rest = self.robot.hand.rest.double().tolist()
+        places = [names.get(PREFIX + n) for n in self.robot.hand_joints]
+        hand = [rest[i] if place is None else self.data.qpos[place] for i, place in enumerate(places)]
+        return self.data.qpos[self._arm].copy(), np.array(hand, float)
+
+    def command(
+        self, arm: Float[np.ndarray, " n_arm"], velocity: Float[np.ndarray, " n_arm"], hand: Float[np.ndarray, " n_dof"]
+    ) -> None:
+        """Set the targets of all servos."""
+        self.data.ctrl[self._arm_servos] = arm + DAMPING_TIME * velocity
+        self.data.ctrl[self._hand_servos] = hand
+
+    def advance(self, seconds: float, watch: Callable[[], None] | None = None, every: float = 0.02) -> None:
+        """Let time pass; `watch` is called at intervals of `every` seconds."""
+        steps, stride = round(seconds / self.model.opt.timestep), max(1, round(every / self.model.opt.timestep))
+        with quiet():
+            for done in range(0, steps, stride):
+                mujoco.mj_step(self.model, self.data, min(stride, steps - done))
+                if watch is not None:
+                    watch()
+
+    def touched(self, index: int) -> int:
+        """How many links of the hand touch an object."""
+        body = self.model.body(f"object{index}-").id
+        links = set()
+        for a, b in self.model.geom_bodyid[self.data.contact.geom].reshape(-1, 2).tolist():
+            if body in (a, b):
+                other = self.model.body(a if b == body else b).name
+                links |= {other} if other.startswith(PREFIX) else set()
+        return len(links)
+
+
+def _add_thing(scene: mujoco.MjSpec, obj: ObjectModel, index: int) -> None:
+    """An object that collides as its convex parts, and is seen as its mesh."""
+    assert obj.vertices is not None
+    assert obj.faces is not None
+    body = add_object(scene, obj, LIFT_PROTOCOL, f"object{index}-")
+    for geom in body.geoms:
+        geom.group = PART_GROUP
+    shape = scene.add_mesh(
+        name=f"shape{index}", uservert=obj.vertices.ravel(), userface=obj.faces.astype(np.int32).ravel())
+    shape.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    body.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_MESH, meshname=shape.name, contype=0, conaffinity=0, group=SHAPE_GROUP, mass=0.0)
+
+
+def _add_arm_servos(scene: mujoco.MjSpec, robot: Robot) -> None:
+    for name, effort in zip(robot.arm_joints, robot.effort.tolist(), strict=True):
+        joint = scene.joint(ARM + name)
+        joint.armature, joint.frictionloss = ARMATURE, 0.0
+        joint.damping[:], joint.stiffness[:] = 0.0, 0.0
+        joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        servo = scene.add_actuator(name=ARM + name, target=ARM + name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        stiffness = STIFFNESS_PER_EFFORT * effort
+        servo.set_to_position(kp=stiffness, kv=DAMPING_TIME * stiffness)
+        servo.forcelimited, servo.forcerange = True, [-effort, effort]

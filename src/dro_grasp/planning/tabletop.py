@@ -1,0 +1,145 @@
+"""The experiment: many attempts on many objects, stored as they come, resumable, with rates and where attempts end."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from dro_grasp.devices import one_thread
+from dro_grasp.errors import GraspFileError, OptionError
+from dro_grasp.files import check_output, replacing
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.planning.attempts import Attempt, TabletopConfig, attempt
+from dro_grasp.planning.extra import require_arm_extra
+from dro_grasp.planning.robot import load_robot
+from dro_grasp.predictor import GraspPredictor
+
+Progress = Callable[[Attempt], None]
+"""Called after each attempt."""
+
+
+@dataclass(frozen=True)
+class TabletopRun:
+    """What is attempted."""
+
+    robot: str
+    """Name or file."""
+    objects: tuple[str, ...]
+    """Names or files of meshes."""
+    attempts: int = 10
+    """With each object. Source: paper, real-robot experiment."""
+    seed: int = 0
+    """Of all draws."""
+    weights: str | None = None
+    """Name or file of weights; the shipped ones by default."""
+    config: TabletopConfig = field(default_factory=TabletopConfig)
+    """How attempts run."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be run.
+
+        Raises:
+            OptionError: No attempts, or no objects.
+        """
+        if self.attempts < 1 or not self.objects:
+            raise OptionError(f"{self.attempts} attempts on {len(self.objects)} objects; ask for at least one of each")
+
+
+def run_tabletop(
+    run: TabletopRun, output: Path | None = None, workers: int = 1, progress: Progress | None = None
+) -> list[Attempt]:
+    """Run all attempts that `output` does not hold yet; each is stored when it ends.
+
+    Args:
+        run: What is attempted.
+        output: Parquet file; attempts of the same robot, settings and seed in it are not repeated, others stay.
+        workers: Processes, which share out the objects; with several, attempts are stored object by object.
+        progress: See `Progress`.
+
+    Raises:
+        OptionError: The extra is missing, or something cannot be attempted.
+        RobotError: The robot cannot be used.
+        ObjectError: An object cannot be used.
+        GraspFileError: `output` is there and is no such file.
+    """
+    require_arm_extra()
+    stored = read_attempts(output) if output is not None and check_output(output).exists() else []
+    name, label = load_robot(run.robot).name, run.config.label()
+    names = {o: load_object(o).name for o in run.objects}
+    done = {(a.object, a.number): a for a in stored if (a.robot, a.settings, a.seed) == (name, label, run.seed)}
+    missing = {o: [k for k in range(run.attempts) if (names[o], k) not in done] for o in run.objects}
+    for result in _results(run, {o: numbers for o, numbers in missing.items() if numbers}, workers):
+        stored.append(result)
+        done[result.object, result.number] = result
+        if output is not None:
+            write_attempts(stored, output)
+        if progress is not None:
+            progress(result)
+    return [done[names[o], k] for o in run.objects for k in range(run.attempts)]
+
+
+def _results(run: TabletopRun, missing: dict[str, list[int]], workers: int) -> Iterator[Attempt]:
+    if workers <= 1 or len(missing) <= 1:
+        for name, numbers in missing.items():
+            yield from _attempts(run, name, numbers)
+        return
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+        for future in as_completed([pool.submit(_all_attempts, run, *item) for item in missing.items()]):
+            yield from future.result()
+
+
+def _all_attempts(run: TabletopRun, name: str, numbers: Sequence[int]) -> list[Attempt]:
+    with one_thread():
+        return list(_attempts(run, name, numbers))
+
+
+def _attempts(run: TabletopRun, name: str, numbers: Sequence[int]) -> Iterator[Attempt]:
+    robot, obj, predictor = load_robot(run.robot), load_object(name), GraspPredictor(run.weights)
+    for number in numbers:
+        yield attempt(robot, obj, number, run.seed, predictor, run.config)
+
+
+def write_attempts(attempts: Sequence[Attempt], path: Path) -> None:
+    """Write all attempts to a Parquet file, which appears whole or not at all."""
+    with replacing(path, "attempts") as temporary:
+        pq.write_table(pa.Table.from_pylist([asdict(a) for a in attempts]), temporary)
+
+
+def read_attempts(path: Path) -> list[Attempt]:
+    """Read such a file.
+
+    Raises:
+        GraspFileError: It is another file.
+    """
+    known = {f.name for f in fields(Attempt)}
+    try:
+        rows = pq.read_table(path).to_pylist()
+        return [Attempt(**{k: v for k, v in row.items() if k in known}) for row in rows]
+    except (OSError, pa.ArrowInvalid, TypeError) as error:
+        raise GraspFileError(f"{path} holds no attempts ({error}); name another file, or move this one away") from error
+
+
+def endings(attempts: Sequence[Attempt]) -> dict[str, int]:
+    """How many attempts ended in each stage, the successful ones as `done`."""
+    return dict(Counter(a.stage for a in attempts))
+
+
+def failures(attempts: Sequence[Attempt]) -> list[str]:
+    """One line for each failure."""
+    return [f"{a.object}, attempt {a.number}, {a.stage}: {a.reason}" for a in attempts if not a.success]
+
+
+def processor_seconds(attempts: Sequence[Attempt]) -> dict[str, float] | None:
+    """Time of one core from depth image to timed plan [s], of attempts that were planned; None if none was."""
+    seconds = [a.processor_seconds for a in attempts if a.processor_seconds > 0]
+    if not seconds:
+        return None
+    return {"median": float(np.median(seconds)), "within_95": float(np.quantile(seconds, 0.95)), "n": len(seconds)}

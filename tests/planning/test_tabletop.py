@@ -1,0 +1,163 @@
+"""The experiment: physics of the scene, what the camera sees, attempts, their storage and their animation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import dro_grasp as dro
+from dro_grasp.cli.main import main
+from dro_grasp.planning import tabletop
+from dro_grasp.planning.animation import Recorder, draw_animation
+from dro_grasp.planning.attempts import Attempt, TabletopConfig, attempt, rest
+from dro_grasp.planning.depth_images import STRIDE, clusters, depth_image, fit_plane, look
+from dro_grasp.planning.physics import LiftScene
+from dro_grasp.planning.planner import PlanConfig
+from dro_grasp.planning.tabletop import TabletopRun, read_attempts, run_tabletop, write_attempts
+
+QUICK = TabletopConfig(see="mesh", hold_seconds=0.5, shake_seconds=0.5, plan=PlanConfig(num=16))
+
+
+@pytest.fixture(scope="module")
+def robot() -> dro.Robot:
+    return dro.load_robot("xarm7_leaphand")
+
+
+@pytest.fixture(scope="module")
+def can() -> dro.ObjectModel:
+    return dro.load_object("can")
+
+
+@pytest.fixture(scope="module")
+def scene(robot: dro.Robot, can: dro.ObjectModel) -> LiftScene:
+    scene = LiftScene(robot, [can])
+    assert rest(scene, 0, TabletopConfig(), np.random.default_rng(0))
+    return scene
+
+
+def test_the_robot_stays_at_home_and_an_object_comes_to_rest_on_the_table(scene: LiftScene, can: dro.ObjectModel) -> None:
+    assert np.abs(scene.joints()[0] - scene.robot.home).max() < 1e-3
+    vertices = np.asarray(can.vertices) @ scene.pose(0)[:3, :3].T + scene.pose(0)[:3, 3]
+    assert abs(vertices[:, 2].min()) < 2e-3
+    assert scene.touched(0) == 0
+
+
+def test_servos_follow_a_trajectory_within_a_degree(robot: dro.Robot, can: dro.ObjectModel) -> None:
+    scene = LiftScene(robot, [can])
+    hand, worst = scene.joints()[1], 0.0
+    for k in range(100):
+        target, velocity = robot.home.copy(), np.zeros(7)
+        target[0] += 0.3 * (1 - np.cos(np.pi * k / 50))
+        velocity[0] = 0.3 * np.pi * np.sin(np.pi * k / 50)
+        scene.command(target, velocity, hand)
+        scene.advance(0.02)
+        worst = max(worst, float(np.abs(scene.joints()[0] - target).max()))
+    assert worst < np.radians(2)
+
+
+def test_depth_is_the_distance_to_the_table_plane(scene: LiftScene, robot: dro.Robot) -> None:
+    assert robot.camera is not None
+    depth, T = depth_image(scene, robot.camera, 0.0, 0), robot.camera.T_world_camera
+    row, column = np.meshgrid(np.arange(depth.shape[0]) * STRIDE, np.arange(depth.shape[1]) * STRIDE, indexing="ij")
+    pixels = np.stack([column, row, np.ones_like(row)], -1)
+    rays = pixels @ np.linalg.inv(robot.camera.intrinsics).T @ T[:3, :3].T
+    expected = -T[2, 3] / rays[..., 2]
+    seen = depth > 0
+    assert np.isclose(depth[seen], expected[seen], atol=1e-6).mean() > 0.8
+    assert (depth[seen] <= expected[seen] + 1e-6).all()
+
+
+def test_a_camera_sees_the_object_where_it_is_and_nothing_of_the_table(scene: LiftScene, robot: dro.Robot) -> None:
+    assert robot.camera is not None
+    assert robot.table is not None
+    depth, T = depth_image(scene, robot.camera, 0.0015, 1), robot.camera.T_world_camera
+    sight = look(depth, robot.camera, robot.table)
+    assert abs(sight.table_height) < 1e-3
+    in_object = (sight.points @ T[:3, :3].T + T[:3, 3] - scene.pose(0)[:3, 3]) @ scene.pose(0)[:3, :3]
+    distance = scene.objects[0].distance_field.distances(torch.from_numpy(in_object).float())[0].abs()
+    assert float(distance.median()) < 0.0015
+    assert float(distance.quantile(0.95)) < 0.005
+
+
+def test_a_plane_is_found_under_noise_and_clutter_and_a_wall_is_none() -> None:
+    random = np.random.default_rng(0)
+    flat = np.column_stack([random.uniform(-1, 1, (800, 2)), random.normal(0.1, 0.001, 800)])
+    things = random.uniform([-0.2, -0.2, 0.12], [0.2, 0.2, 0.3], (300, 3))
+    normal, offset = fit_plane(np.concatenate([flat, things]))
+    assert np.allclose(normal, [0, 0, 1], atol=5e-3)
+    assert offset == pytest.approx(0.1, abs=1e-3)
+    with pytest.raises(dro.DroGraspError, match="no level table"):
+        fit_plane(flat[:, [2, 0, 1]])
+    assert len(set(clusters(np.array([[0, 0, 0], [0, 0, 0.01], [0, 0, 0.1]], float)).tolist())) == 2
+
+
+def test_an_empty_table_is_refused_in_words(robot: dro.Robot, can: dro.ObjectModel) -> None:
+    scene = LiftScene(robot, [can])
+    aside = np.eye(4)
+    aside[:3, 3] = 3.0, 3.0, 0.5
+    scene.place(0, aside)
+    assert robot.camera is not None
+    assert robot.table is not None
+    with pytest.raises(dro.DroGraspError, match="nothing stands on the table"):
+        look(depth_image(scene, robot.camera, 0.0015, 0), robot.camera, robot.table)
+
+
+def test_an_attempt_lifts_a_can_is_repeatable_and_becomes_an_animation(
+    robot: dro.Robot, can: dro.ObjectModel, tmp_path: Path
+) -> None:
+    recorder, predictor = Recorder(), dro.GraspPredictor()
+    result = attempt(robot, can, 0, 0, predictor, QUICK, recorder)
+    assert result.stage == "done", result.reason
+    assert result.raised > 0.15
+    again = attempt(robot, can, 0, 0, predictor, QUICK)
+    assert (again.stage, again.raised, again.place) == (result.stage, result.raised, result.place)
+    recorder.frames = recorder.frames[::40]
+    draw_animation(robot, can, recorder, tmp_path / "lift.gif")
+    with Image.open(tmp_path / "lift.gif") as film:
+        assert film.n_frames == len(recorder.frames)  # type: ignore[attr-defined]
+
+
+def test_attempts_are_stored_and_not_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    output, calls = tmp_path / "results.parquet", []
+
+    def counted(robot: dro.Robot, obj: dro.ObjectModel, number: int, seed: int, *others: object) -> Attempt:
+        calls.append(number)
+        ended = "done" if number else "plan"
+        return Attempt(robot.name, obj.name, number, seed, QUICK.label(), number > 0, ended, "no path", score=0.5)
+
+    monkeypatch.setattr(tabletop, "attempt", counted)
+    run = TabletopRun("xarm7_leaphand", ("can",), attempts=2, config=QUICK)
+    first = run_tabletop(run, output)
+    assert calls == [0, 1]
+    assert run_tabletop(replace(run, attempts=3), output)[:2] == first
+    assert calls == [0, 1, 2]
+    assert tabletop.endings(first) == {"plan": 1, "done": 1}
+    assert tabletop.failures(first) == ["can, attempt 0, plan: no path"]
+    stored = read_attempts(output)
+    assert len(stored) == 3
+    write_attempts(stored[:1], output)
+    run_tabletop(run, output)
+    assert calls == [0, 1, 2, 1]
+    (tmp_path / "other.parquet").write_bytes(b"not this")
+    with pytest.raises(dro.DroGraspError, match="holds no attempts"):
+        run_tabletop(run, tmp_path / "other.parquet")
+
+
+def test_the_command_prints_rates_and_refuses_what_cannot_be(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(tabletop, "attempt", lambda robot, obj, number, seed, *_: Attempt(
+        robot.name, obj.name, number, seed, "", True, "done", processor_seconds=2.0))
+    common = ["tabletop", "--robot", "xarm7_leaphand", "--objects", "can", "--attempts"]
+    assert main([*common, "4"]) == 0
+    said = capsys.readouterr().out
+    assert "4 of 4 attempts succeeded (100%, 95 % interval 51% to 100%)" in said
+    assert "median 2.0 s" in said
+    assert main([*common, "0"]) == 2
+    assert main([*common, "1", "--video", str(tmp_path / "film.avi")]) == 2
+    assert ".gif or .webp" in capsys.readouterr().err
