@@ -3,7 +3,7 @@
     python scripts/train_ranking.py --folder FOLDER [--num N] [--objects N] [--collect-only]
 
 Grasps are drawn at several temperatures and evaluated raw, refined, shaken, opened and moved away, beside optimised ones;
-some features come from a depth image or half of a cloud. `--hands` also takes files, such as those of `dro-grasp hand make`.
+some features come from a depth image or half of a cloud. Settled grasps, of both origins, are most of them. `--hands` also takes files, such as those of `dro-grasp hand make`.
 The folder keeps the trials of each hand, so a stopped script resumes. The network with the lowest loss on objects left out
 is written to the package. Needs the development assets.
 """
@@ -35,6 +35,7 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.partial_views import View, partial_view
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.proposal import ProposalConfig, propose
+from dro_grasp.pipeline.settling import settled
 from dro_grasp.pipeline.stages import complete, optimise, refine
 from dro_grasp.ranking.features import feature_names, grasp_features
 from dro_grasp.ranking.score import ScoreConfig
@@ -111,11 +112,15 @@ def collect(
         proposal = propose(problem, network, num, torch.Generator().manual_seed(rng.randrange(10**6)), config=config)
         raw, refined = complete(problem, proposal.grasps), refine(problem, proposal.grasps)
         best = refine(problem, optimise(problem, num, rng.randrange(10**6)))
+        # Closing is simulated with the whole object, as `generate` does; on a bare cloud it is left out.
+        whole = GraspProblem(hand, obj)
+        closed = {kind: settled(whole, grasps) for kind, grasps in (("settled", refined), ("optimised, settled", best))}
         some = refined[slice(0, num // 8)]
         opened = hand.canonical_joints(1.0).expand_as(some.joints)
         groups = {
-            "raw": raw[slice(0, num // 4)], "refined": refined, "optimised": best,
-            "shaken": shaken(hand, refined[slice(0, num // 2)], generator),
+            "raw": raw[slice(0, num // 8)], "refined": refined[slice(0, num // 2)], "optimised": best[slice(0, num // 2)],
+            **{kind: grasps[held] for kind, (grasps, held) in closed.items()},
+            "shaken": shaken(hand, refined[slice(0, num // 4)], generator),
             "opened": some.moved_to(some.T_object_wrist, opened), "away": away(some, generator),
         }
         parts += [{"hand": hand.name, "object": label, "kind": kind, "view": view, **evaluated(hand, obj, grasps, known)}
@@ -173,7 +178,7 @@ def fit(parts: list[dict[str, Any]], left_out: set[str], seed: int) -> tuple[Sco
             if now < best:
                 best, best_state = now, {k: v.clone() for k, v in network.state_dict().items()}
     network.load_state_dict(best_state)
-    return network.eval(), areas(network, [p for p in others if p["kind"] in ("refined", "optimised")]), best
+    return network.eval(), areas(network, [p for p in others if p["kind"] in ("refined", "settled", "optimised", "optimised, settled")]), best
 
 
 def main() -> None:

@@ -22,6 +22,7 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.proposal import Proposal, ProposalConfig, check_temperature, propose
+from dro_grasp.pipeline.settling import can_settle, replaced, settled
 from dro_grasp.pipeline.stages import complete, optimise, permitted, refine, scored
 
 LARGEST_CALL = 100_000
@@ -32,6 +33,10 @@ Method = Literal["auto", "network", "optimise"]
 """Where candidates come from."""
 TRUSTED_SCORE = 0.5
 """Log-odds of holding from which on a grasp needs no rival from the optimiser (ours)."""
+SETTLED = 0.5
+"""Share of the candidates that are settled, the best by score; the others are left out (ours)."""
+ESCAPED_SCORE = -4.0
+"""Highest score of a grasp that lost the object when its closing was simulated [log-odds of holding] (ours)."""
 OPTIMISED_PER_GRASP = 8
 """Candidates that the optimiser makes for each grasp below TRUSTED_SCORE (ours)."""
 
@@ -95,7 +100,7 @@ class Prediction:
     candidates: int
     """Candidates made, those that constraints rejected included."""
     seconds: dict[str, float]
-    """Time by part: network, decode, optimise, refine, rank [s]."""
+    """Time by part: network, decode, optimise, refine, settle, rank [s]."""
     shortage: str | None = None
     """Why there are fewer grasps than were asked for, and what to do; None if there are as many."""
 
@@ -179,16 +184,18 @@ class GraspPredictor:
         Raises:
             OptionError: The table is above the object, or no grasp was found.
         """
-        watch = Stopwatch("network", "decode", "optimise", "refine", "rank")
+        watch = Stopwatch("network", "decode", "optimise", "refine", "settle", "rank")
         pool = _Pool(problem, request, watch)
         if request.method != "optimise":
             self._ask_network(pool, progress)
+            pool.settle()
         if count := pool.to_optimise():
             with watch("optimise"):
                 grasps = optimise(problem, count, request.seed, progress)
                 hand = problem.thinned(self.network.config.n_hand).to("cpu")
                 proposal = Proposal(grasps, hand.points(grasps.joints, grasps.T_object_wrist))
             pool.add(proposal)
+            pool.settle()
         return pool.best()
 
     def _ask_network(self, pool: _Pool, progress: Progress | None) -> None:
@@ -211,6 +218,8 @@ class _Pool:
         """Candidates made, those that constraints rejected included."""
         self.proposals: list[Proposal] = []
         self.grasps: list[GraspBatch] = []
+        self.settled = 0
+        """The first so many parts of the two lists are settled."""
 
     def __len__(self) -> int:
         return sum(map(len, self.grasps))
@@ -225,6 +234,27 @@ class _Pool:
         with self.watch("rank"):
             self.grasps.append(scored(problem, grasps[kept]))
         self.proposals.append(proposal[kept])
+
+    def settle(self) -> None:
+        """Settle the better half of the parts that are not, and leave out the rest; without a mesh, all stay as they are."""
+        if self.request.refine and can_settle(self.problem) and self.grasps[self.settled :]:
+            grasps = GraspBatch.concatenate(self.grasps[self.settled :])
+            proposal = Proposal.concatenate(self.proposals[self.settled :])
+            count = max(round(SETTLED * len(grasps)), min(len(grasps), self.request.num))
+            best = grasps.score.topk(count).indices.sort().values
+            self.grasps[self.settled :], self.proposals[self.settled :] = [self._settled(grasps[best])], [proposal[best]]
+        self.settled = len(self.grasps)
+
+    def _settled(self, grasps: GraspBatch) -> GraspBatch:
+        """The grasps after closing, scored again; those that lose the object stay as they are, with a low score."""
+        problem = self.problem
+        with self.watch("settle"):
+            closed, held = settled(problem, grasps)
+            wrong = ~permitted(problem, closed)
+            closed, held = replaced(closed, wrong, grasps[wrong]), held & ~wrong
+        with self.watch("rank"):
+            score = scored(problem, closed).score
+        return closed.replace(score=torch.where(held, score, score.clamp_max(ESCAPED_SCORE)))
 
     def to_optimise(self) -> int:
         """How many candidates synthesis is asked for: some for each grasp that is missing or that the score does not trust."""

@@ -19,7 +19,7 @@ from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize_with
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.ranking.score import ScoreConfig, score_grasps
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
-from dro_grasp.simulation.trial import settle, simulate
+from dro_grasp.simulation.trial import simulate
 
 FARTHEST_DIRECTION = math.radians(20.0)
 """Largest angle between the palm direction of an optimised grasp and the direction that was asked for [rad] (ours)."""
@@ -27,8 +27,6 @@ FARTHEST_DIRECTION = math.radians(20.0)
 
 STARTS_PER_CANDIDATE = 4
 """Grasps that are optimised for each candidate; those of lowest energy are kept (ours)."""
-FARTHEST_SETTLED = 0.05
-"""How far the object may move in the hand while a grasp settles [m] (ours)."""
 
 
 def complete(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
@@ -102,24 +100,18 @@ def optimise(
     problem: GraspProblem, num: int, seed: int,
     progress: Callable[[int, int], None] | None = None,
 ) -> GraspBatch:
-    """Candidates from synthesis, settled in simulation on a mesh; no network is asked, so any hand and object will do.
+    """Candidates from synthesis; no network is asked, so any hand and object will do.
 
     Args:
         problem: Hand and object.
-        num: How many, at most: those are left out that lose the object while they settle, or turn away from the direction.
+        num: How many, at most: those are left out that turn away from the direction.
         seed: The same seed gives the same candidates.
         progress: Called with (grasps optimised, grasps to optimise).
     """
-    hand, obj, direction = problem.hand, problem.obj, problem.constraints.direction
-    config = SynthesisConfig(starts=StartConfig(direction=direction))
+    config = SynthesisConfig(starts=StartConfig(direction=problem.constraints.direction))
     energy = problem.energy(config.energy)
-    grasps = synthesize_with(energy, obj, STARTS_PER_CANDIDATE * num, seed, config, progress)
-    grasps = grasps[facing(problem, grasps)][:num]
-    if hand.description is not None and not obj.is_cloud:
-        settled = settle(hand, obj, grasps)
-        moved = hand.grasp_centres(settled.T_object_wrist) - hand.grasp_centres(grasps.T_object_wrist)
-        grasps = settled[moved.norm(dim=-1) < FARTHEST_SETTLED]  # an object that flies away leaves no grasp behind
-    return grasps.bare()
+    grasps = synthesize_with(energy, problem.obj, STARTS_PER_CANDIDATE * num, seed, config, progress)
+    return grasps[facing(problem, grasps)][:num].bare()
 
 
 def facing(problem: GraspProblem, grasps: GraspBatch) -> Bool[Tensor, " n"]:
