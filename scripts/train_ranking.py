@@ -2,10 +2,10 @@
 
     python scripts/train_ranking.py --folder FOLDER [--num N] [--objects N] [--collect-only]
 
-Grasps are drawn at several temperatures and evaluated raw, refined, shaken, opened and moved away, beside optimised ones;
-some features come from a depth image or half of a cloud. Settled grasps, of both origins, are most of them. `--hands` also takes files, such as those of `dro-grasp hand make`.
-The folder keeps the trials of each hand, so a stopped script resumes. The network with the lowest loss on objects left out
-is written to the package. Needs the development assets.
+Grasps are drawn at several temperatures. Most are evaluated settled, the network's and the optimiser's; some refined, raw,
+shaken, opened and moved away. Some features come from a depth image or half of a cloud. `--hands` also takes files, such as
+those of `dro-grasp hand make`. The folder keeps the trials of each hand, so a stopped script resumes. The network with the
+lowest loss on objects left out is written to the package. Needs the development assets.
 """
 
 from __future__ import annotations
@@ -63,6 +63,8 @@ RATE = 2e-3
 """Peak learning rate."""
 DECAY = 0.05
 """Weight decay."""
+FINISHED = ("refined", "settled", "optimised", "optimised, settled")
+"""Kinds of grasps that a request ranks, by which a fit is judged."""
 NOISE = 0.05
 """Standard deviation of the noise on link features."""
 
@@ -178,7 +180,7 @@ def fit(parts: list[dict[str, Any]], left_out: set[str], seed: int) -> tuple[Sco
             if now < best:
                 best, best_state = now, {k: v.clone() for k, v in network.state_dict().items()}
     network.load_state_dict(best_state)
-    return network.eval(), areas(network, [p for p in others if p["kind"] in ("refined", "settled", "optimised", "optimised, settled")]), best
+    return network.eval(), areas(network, [p for p in others if p["kind"] in FINISHED]), best
 
 
 def main() -> None:

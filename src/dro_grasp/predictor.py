@@ -22,7 +22,7 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.proposal import Proposal, ProposalConfig, check_temperature, propose
-from dro_grasp.pipeline.settling import can_settle, replaced, settled
+from dro_grasp.pipeline.settling import best_settled, can_settle
 from dro_grasp.pipeline.stages import complete, optimise, permitted, refine, scored
 
 LARGEST_CALL = 100_000
@@ -33,10 +33,6 @@ Method = Literal["auto", "network", "optimise"]
 """Where candidates come from."""
 TRUSTED_SCORE = 0.5
 """Log-odds of holding from which on a grasp needs no rival from the optimiser (ours)."""
-SETTLED = 0.5
-"""Share of the candidates that are settled, the best by score; the others are left out (ours)."""
-ESCAPED_SCORE = -4.0
-"""Highest score of a grasp that lost the object when its closing was simulated [log-odds of holding] (ours)."""
 OPTIMISED_PER_GRASP = 8
 """Candidates that the optimiser makes for each grasp below TRUSTED_SCORE (ours)."""
 
@@ -236,25 +232,13 @@ class _Pool:
         self.proposals.append(proposal[kept])
 
     def settle(self) -> None:
-        """Settle the better half of the parts that are not, and leave out the rest; without a mesh, all stay as they are."""
-        if self.request.refine and can_settle(self.problem) and self.grasps[self.settled :]:
-            grasps = GraspBatch.concatenate(self.grasps[self.settled :])
-            proposal = Proposal.concatenate(self.proposals[self.settled :])
-            count = max(round(SETTLED * len(grasps)), min(len(grasps), self.request.num))
-            best = grasps.score.topk(count).indices.sort().values
-            self.grasps[self.settled :], self.proposals[self.settled :] = [self._settled(grasps[best])], [proposal[best]]
+        """Settle the better half of what is not, and leave out the rest; without a mesh, everything stays as it is."""
+        fresh = slice(self.settled, None)
+        if self.request.refine and can_settle(self.problem) and self.grasps[fresh]:
+            with self.watch("settle"):
+                best, grasps = best_settled(self.problem, GraspBatch.concatenate(self.grasps[fresh]), self.request.num)
+            self.grasps[fresh], self.proposals[fresh] = [grasps], [Proposal.concatenate(self.proposals[fresh])[best]]
         self.settled = len(self.grasps)
-
-    def _settled(self, grasps: GraspBatch) -> GraspBatch:
-        """The grasps after closing, scored again; those that lose the object stay as they are, with a low score."""
-        problem = self.problem
-        with self.watch("settle"):
-            closed, held = settled(problem, grasps)
-            wrong = ~permitted(problem, closed)
-            closed, held = replaced(closed, wrong, grasps[wrong]), held & ~wrong
-        with self.watch("rank"):
-            score = scored(problem, closed).score
-        return closed.replace(score=torch.where(held, score, score.clamp_max(ESCAPED_SCORE)))
 
     def to_optimise(self) -> int:
         """How many candidates synthesis is asked for: some for each grasp that is missing or that the score does not trust."""

@@ -117,7 +117,7 @@ def test_threads_come_back() -> None:
         torch.set_num_threads(before)
 
 
-def test_controls_are_refined_but_for_settled_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_controls_are_refined_and_settled_as_the_networks_grasps_are(monkeypatch: pytest.MonkeyPatch) -> None:
     done: list[str] = []
 
     def stage(name: str) -> object:
@@ -125,11 +125,12 @@ def test_controls_are_refined_but_for_settled_ones(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(module, "refine", stage("refine"))
     monkeypatch.setattr(module, "scored", stage("score"))
+    monkeypatch.setattr(module, "best_settled", lambda problem, grasps, least: (None, done.append("settle") or grasps))
     names = (MEAN, MEAN_CHOSEN, START, SYNTHESISED)
     made = {name: lambda num, seed: made_up_grasps(HAND, count=num, seed=seed) for name in names}
     makers = control_makers(GraspProblem(HAND, load_object("sphere")), made)
     assert set(makers) == {MEAN_CHOSEN, START, SYNTHESISED}
-    for name, make in makers.items():
+    for make in makers.values():
         done.clear()
         assert len(make(3, 1)) == 3
-        assert done == (["score"] if name == SYNTHESISED else ["refine", "score"])
+        assert done == ["refine", "score", "settle"]

@@ -31,8 +31,10 @@ class Benchmark:
     """Objects with meshes: names, paths, folders, or groups such as assets:validate."""
     num: int = 100
     """Grasps of each hand on each object, of which ranking keeps the best quarter."""
-    stages: tuple[Literal["raw", "ranked", "refined", "returned", "equal-time"], ...] = ("raw", "ranked", "refined")
-    """What is done to the grasps before the trials; of refined grasps, all and the best by score are reported. returned: what
+    stages: tuple[Literal["raw", "ranked", "refined", "settled", "returned", "equal-time"], ...] = (
+        "raw", "ranked", "refined")
+    """What is done to the grasps before the trials; of refined and of settled grasps, all and the best by score are reported.
+    settled: refined grasps after their closing was simulated. returned: what
     `generate` returns, with the optimiser's share. equal-time: controls with as much CPU time for each grasp as the network."""
     protocols: tuple[ProtocolName, ...] = ("dro", "strict", "dexgraspbench")
     """Trials; displacement, rotation and diversity are means over successes of the first."""
@@ -59,7 +61,7 @@ class Benchmark:
         """Load everything, measure, print."""
         from dro_grasp.datasets.bundle.training_file import load_bundle
         from dro_grasp.errors import ObjectError, OptionError
-        from dro_grasp.evaluation.success_rates import BEST, TOP, BenchmarkConfig, benchmark
+        from dro_grasp.evaluation.success_rates import BEST, REFINED, SETTLED, SETTLED_BEST, TOP, BenchmarkConfig, benchmark
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.catalogue import load_object, resolve_objects
         from dro_grasp.predictor import GraspPredictor, GraspRequest, PredictorConfig
@@ -78,7 +80,8 @@ class Benchmark:
         objects = [load_object(name) for name in resolve_objects(list(self.objects))]
         if clouds := [obj.name for obj in objects if obj.is_cloud]:
             raise ObjectError(f"{', '.join(clouds)}: bare point clouds cannot be simulated; give meshes")
-        stages = (*self.stages, BEST, *TOP) if "refined" in self.stages else self.stages
+        further = {REFINED: (BEST, *TOP), SETTLED: (SETTLED_BEST,)}
+        stages = tuple(name for stage in self.stages for name in (stage, *further.get(stage, ())))
         config = BenchmarkConfig(
             num=self.num, stages=stages, protocols=tuple(protocol(p) for p in self.protocols), controls=self.controls,
             seed=self.seed, view=self.view, views=self.views,

@@ -26,7 +26,7 @@ MEAN_CHOSEN = "mean grasp, chosen"
 START = "unoptimised start"
 """Half-closed hands that face the object."""
 SYNTHESISED = "synthesised"
-"""Grasps that the optimiser makes without a network, settled."""
+"""Grasps that the optimiser makes without a network."""
 Maker = Callable[[int, int], GraspBatch]
 """Makes a number of grasps from a seed."""
 CHOICE_POINTS = 160

@@ -6,6 +6,7 @@ prepared once for a pair (distance field, contacts, collision scene) is not coun
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -13,9 +14,10 @@ from dataclasses import dataclass
 import torch
 
 from dro_grasp.devices import one_thread
-from dro_grasp.evaluation.controls import MEAN, SYNTHESISED, Maker
+from dro_grasp.evaluation.controls import MEAN, Maker
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.pipeline.settling import best_settled, can_settle
 from dro_grasp.pipeline.stages import refine, scored
 from dro_grasp.predictor import GraspPredictor, GraspRequest
 
@@ -86,21 +88,22 @@ def best_within(budget: float, make: Maker, keep: int, seed: int, clock: Callabl
 
 
 def network_maker(problem: GraspProblem, predictor: GraspPredictor) -> Maker:
-    """Candidates of the network: placed, chosen, decoded, refined and scored."""
-    return lambda num, seed: predictor.run(problem, GraspRequest(num, seed, candidates=1, method="network")).grasps
+    """Candidates of the network: placed, chosen, decoded, refined, and the better half settled."""
+    return lambda num, seed: predictor.run(
+        problem, GraspRequest(math.ceil(num / 2), seed, candidates=2, method="network")).grasps
 
 
 def control_makers(problem: GraspProblem, controls: Mapping[str, Maker]) -> dict[str, Maker]:
-    """Candidates of each control, scored and, but for settled ones, refined; the mean grasp is always a chosen one."""
+    """Candidates of each control, refined, and the better half settled; the mean grasp is always a chosen one."""
 
-    def finished(name: str, make: Maker) -> Maker:
+    def finished(make: Maker) -> Maker:
         def maker(num: int, seed: int) -> GraspBatch:
-            grasps = make(num, seed)
-            return scored(problem, grasps if name == SYNTHESISED else refine(problem, grasps))
+            grasps = scored(problem, refine(problem, make(num, seed)))
+            return best_settled(problem, grasps, 1)[1] if can_settle(problem) else grasps
 
         return maker
 
-    return {name: finished(name, make) for name, make in controls.items() if name != MEAN}
+    return {name: finished(make) for name, make in controls.items() if name != MEAN}
 
 
 def _best(grasps: GraspBatch, keep: int) -> GraspBatch:

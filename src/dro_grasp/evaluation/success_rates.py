@@ -19,6 +19,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.partial_views import View, partial_view
 from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.pipeline.settling import best_settled, can_settle
 from dro_grasp.pipeline.stages import refine, scored
 from dro_grasp.predictor import GraspPredictor, GraspRequest
 from dro_grasp.simulation.protocols import Protocol
@@ -32,9 +33,13 @@ REFINED = "refined"
 """Stage: refined grasps."""
 BEST = "refined, ranked"
 """Stage: the best quarter of the refined grasps by score."""
+SETTLED = "settled"
+"""Stage: refined grasps after closing in simulation."""
+SETTLED_BEST = "settled, ranked"
+"""Stage: the best quarter of the settled grasps by score."""
 TOP = {f"refined, top {count}": count for count in (5, 1)}
 """Stages that keep the few best refined grasps of a pair by score, and how many."""
-STAGES = (RAW, RANKED, REFINED, BEST, *TOP)
+STAGES = (RAW, RANKED, REFINED, BEST, *TOP, SETTLED, SETTLED_BEST)
 """Stages of every source."""
 RETURNED = "returned"
 """Stage: what `generate` returns, with candidates of the network and, where the score asks for them, of the optimiser."""
@@ -160,22 +165,32 @@ def _stages(source: _Source, obj: ObjectModel, config: BenchmarkConfig) -> Itera
     asked = set(config.stages)
     problem, grasps, seconds = source.problem, source.grasps, source.seconds
     quarter = _quarter(len(grasps))
-    for whole, best in ((RAW, {RANKED: quarter}), (REFINED, {BEST: quarter, **TOP})):
-        wanted = {whole, *best} & asked
-        if not wanted:
-            continue
-        if whole == REFINED:
+    steps: list[tuple[str, dict[str, int], Callable[[GraspProblem, GraspBatch], GraspBatch] | None]] = [
+        (RAW, {RANKED: quarter}, None), (REFINED, {BEST: quarter, **TOP}, refine)]
+    if can_settle(problem):
+        steps.append((SETTLED, {SETTLED_BEST: quarter}, _settle))
+    while steps and not asked & {steps[-1][0], *steps[-1][1]}:
+        steps.pop()
+    for whole, best, make in steps:
+        if make is not None:
             begin = time.perf_counter()
-            grasps = refine(problem, grasps)
-            seconds = seconds | {"refine": (time.perf_counter() - begin) / max(1, len(grasps))}
+            grasps = make(problem, grasps)
+            seconds = seconds | {make.__name__.strip("_"): (time.perf_counter() - begin) / max(1, len(grasps))}
+        if not asked & {whole, *best}:
+            continue
         if grasps.score.isnan().any():
             grasps = scored(problem, grasps)
         evaluated = _evaluated(problem.hand, obj, grasps, config, seconds, config.num)
-        if whole in wanted:
+        if whole in asked:
             yield source.name, whole, evaluated
         for stage, count in best.items():
-            if stage in wanted:
+            if stage in asked:
                 yield source.name, stage, evaluated.rows(grasps.score.topk(min(count, len(grasps))).indices)
+
+
+def _settle(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
+    """All the grasps settled; those that lose the object stay as they were, with a low score."""
+    return best_settled(problem, scored(problem, grasps), len(grasps))[1]
 
 
 def _quarter(num: int) -> int:

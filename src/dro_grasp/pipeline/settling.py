@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.geometry.rotations import roma
@@ -19,8 +19,13 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.optimization.grip import gripping
 from dro_grasp.optimization.refinement import RefineConfig
 from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.stages import complete, refine
+from dro_grasp.pipeline.stages import complete, permitted, refine, scored
 from dro_grasp.simulation.trial import settle
+
+SHARE = 0.5
+"""Share of scored candidates that are settled, the best ones (ours)."""
+ESCAPED_SCORE = -4.0
+"""Highest score of a grasp that loses the object when its closing is simulated [log-odds of holding] (ours)."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +33,7 @@ class SettleConfig:
     """What counts as holding still while the hand closes (ours)."""
 
     still: float = 0.005
-    """A grasp that moves the object less than this has settled; the others are refined where they stand, and close again [m]."""
+    """A grasp that moves the object less than this has settled; others are refined where they stand, and close again [m]."""
     lost: float = 0.05
     """An object that moves farther than this is lost [m]."""
     farthest: float = 0.02
@@ -42,6 +47,26 @@ class SettleConfig:
 def can_settle(problem: GraspProblem) -> bool:
     """Whether the closing can be simulated: on a mesh, with a hand that has its description."""
     return problem.hand.description is not None and not problem.obj.is_cloud
+
+
+def best_settled(problem: GraspProblem, grasps: GraspBatch, least: int) -> tuple[Int[Tensor, " k"], GraspBatch]:
+    """The better half of scored grasps, settled and scored again, in their order; which rows they are comes first.
+
+    A grasp that loses the object when it closes, or ends where the problem's constraints forbid, stays as it was and scores
+    at most ESCAPED_SCORE.
+
+    Args:
+        problem: Hand and object; see `can_settle`.
+        grasps: Refined grasps with scores.
+        least: Settle as many at least, where there are.
+    """
+    count = max(round(SHARE * len(grasps)), min(len(grasps), least))
+    best = grasps.score.topk(count).indices.sort().values
+    closed, held = settled(problem, grasps[best])
+    wrong = ~permitted(problem, closed)
+    closed, held = replaced(closed, wrong, grasps[best[wrong]]), held & ~wrong
+    score = scored(problem, closed).score
+    return best, closed.replace(score=torch.where(held, score, score.clamp_max(ESCAPED_SCORE)))
 
 
 def settled(

@@ -1,0 +1,103 @@
+"""Settling: what closing does to a grasp decides what becomes of it."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
+from dro_grasp.perception.partial_views import partial_view
+from dro_grasp.pipeline import settling
+from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.pipeline.settling import ESCAPED_SCORE, best_settled, can_settle, motion, settled
+from dro_grasp.pipeline.stages import refine, scored
+from dro_grasp.simulation.outcome import Failure
+from dro_grasp.simulation.trial import simulate
+from tests.helpers.loaded_hands import loaded_hand
+
+HAND, CAN = loaded_hand("gripper3"), load_object("can")
+PROBLEM = GraspProblem(HAND, CAN)
+
+
+@pytest.fixture(scope="module")
+def grasps() -> GraspBatch:
+    return refine(PROBLEM, synthesize(HAND, CAN, 5, 0, SynthesisConfig(batch_size=6, steps=20)))
+
+
+def shifted(grasps: GraspBatch, distances: list[float]) -> GraspBatch:
+    T = grasps.T_object_wrist.clone()
+    T[:, 2, 3] += torch.tensor(distances)
+    return grasps.without("pregrasp_joints", "squeeze_joints").replace(T_object_wrist=T)
+
+
+def test_still_grasps_stay_where_they_settle_others_are_refined_there_and_close_again(
+    grasps: GraspBatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = [0.001, 0.01, 0.01, 0.01, 0.3], [0.001, 0.03, 0.0]
+    turned = torch.eye(4)
+    turned[:2, :2] = torch.tensor([[math.cos(0.6), -math.sin(0.6)], [math.sin(0.6), math.cos(0.6)]])
+    seen = []
+
+    def settle(hand: Hand, obj: ObjectModel, some: GraspBatch) -> GraspBatch:
+        seen.append(some)
+        if len(seen) == 1:
+            return shifted(some, first)
+        moved = shifted(some, second)
+        T = moved.T_object_wrist.clone()
+        # The third one turns by 0.6 rad about its own grasp centre.
+        centre = HAND.grasp_centre_wrist
+        T[2, :3, :3] = T[2, :3, :3] @ turned[:3, :3]
+        T[2, :3, 3] += some.T_object_wrist[2, :3, :3] @ centre - T[2, :3, :3] @ centre
+        return moved.replace(T_object_wrist=T)
+
+    monkeypatch.setattr(settling, "settle", settle)
+    found, held = settled(PROBLEM, grasps)
+    assert held.tolist() == [True, True, False, False, False]
+    T = grasps.T_object_wrist
+    assert float(found.T_object_wrist[0, 2, 3] - T[0, 2, 3]) == pytest.approx(0.001, abs=1e-6)
+    expected = refine(PROBLEM, shifted(grasps, first)[[1, 2, 3]])
+    torch.testing.assert_close(seen[1].T_object_wrist, expected.T_object_wrist)
+    for name in ("T_object_wrist", "joints", "squeeze_joints"):
+        torch.testing.assert_close(getattr(found, name)[1], getattr(expected, name)[0])
+        torch.testing.assert_close(getattr(found, name)[2:], getattr(grasps, name)[2:])
+
+
+def test_motion_is_that_of_the_grasp_centre_and_of_the_hand(grasps: GraspBatch) -> None:
+    shift, turn = motion(HAND, grasps, shifted(grasps, [0.0, 0.01, 0.02, 0.03, 0.04]))
+    torch.testing.assert_close(shift, torch.tensor([0.0, 0.01, 0.02, 0.03, 0.04]), atol=1e-6, rtol=0)
+    torch.testing.assert_close(turn, torch.zeros(5), atol=1e-3, rtol=0)
+
+
+def test_settled_grasps_hardly_push_the_object_away(grasps: GraspBatch) -> None:
+    many = refine(PROBLEM, synthesize(HAND, CAN, 24, 1, SynthesisConfig(batch_size=24, steps=20)))
+    found, held = settled(PROBLEM, many)
+    before, after = (simulate(HAND, CAN, g, "strict") for g in (many, found[held]))
+    assert before.failure.count(Failure.PUSHED_AWAY) > 2
+    assert after.failure.count(Failure.PUSHED_AWAY) <= 1
+
+
+def test_only_the_better_half_is_settled_and_escapes_score_low(
+    grasps: GraspBatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def none_held(problem: GraspProblem, some: GraspBatch) -> tuple[GraspBatch, torch.Tensor]:
+        return some.without("score"), torch.zeros(len(some), dtype=torch.bool)
+
+    monkeypatch.setattr(settling, "settled", none_held)
+    known = scored(PROBLEM, grasps).replace(score=torch.tensor([0.0, 3.0, 1.0, 2.0, -1.0]))
+    rows, found = best_settled(PROBLEM, known, 1)
+    assert rows.tolist() == [1, 3]
+    assert found.score.amax() <= ESCAPED_SCORE
+    torch.testing.assert_close(found.T_object_wrist, known.T_object_wrist[[1, 3]])
+    assert len(best_settled(PROBLEM, known, 4)[0]) == 4
+    assert len(best_settled(PROBLEM, known, 9)[0]) == 5
+
+
+def test_a_bare_cloud_cannot_settle() -> None:
+    assert can_settle(PROBLEM)
+    assert not can_settle(GraspProblem(HAND, partial_view(CAN, "cloud", 0)))
