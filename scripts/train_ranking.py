@@ -28,7 +28,7 @@ from dro_grasp.geometry.rotations import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
-from dro_grasp.models.checkpoints import DEFAULT, load_weights
+from dro_grasp.models.checkpoints import DEFAULT, history_of, load_weights
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
@@ -39,7 +39,7 @@ from dro_grasp.pipeline.settling import settled
 from dro_grasp.pipeline.stages import complete, optimise, refine
 from dro_grasp.ranking.features import feature_names, grasp_features
 from dro_grasp.ranking.score import ScoreConfig
-from dro_grasp.ranking.score_network import SHIPPED, ScoreNetwork, save_score_network
+from dro_grasp.ranking.score_network import SHIPPED, ScoreNetwork, load_score_network, save_score_network
 from dro_grasp.simulation.trial import simulate
 
 HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand", "assets/leaphand", "assets/allegro_right",
@@ -57,6 +57,10 @@ LEFT_OUT = 6
 """Training objects left out of the fit, which select its best step."""
 STEPS = 4000
 """Steps of the fit."""
+FURTHER_STEPS, FURTHER_RATE = 1200, 7e-4
+"""The same, and the peak learning rate, of a fit that continues from the shipped network."""
+SETTLED_WEIGHT = 3.0
+"""How much more often settled grasps are drawn than others: these are what is ranked in the end."""
 BATCH = 256
 """Grasps in a step."""
 RATE = 2e-3
@@ -153,19 +157,24 @@ def areas(network: ScoreNetwork, parts: list[dict[str, Any]]) -> list[float]:
     return [sum(x for x in a if x == x) / max(1, sum(x == x for x in a)) for a in found]
 
 
-def fit(parts: list[dict[str, Any]], left_out: set[str], seed: int) -> tuple[ScoreNetwork, list[float], float]:
+def fit(
+    parts: list[dict[str, Any]], left_out: set[str], seed: int, further: bool
+) -> tuple[ScoreNetwork, list[float], float]:
     """The network at its best step on objects left out, with its ROC areas and its loss there."""
     torch.manual_seed(seed)  # of the initial weights
     generator = torch.Generator().manual_seed(seed)
     train = joined([p for p in parts if p["object"] not in left_out])
     others = [p for p in parts if p["object"] in left_out]
     check = joined(others)
-    network = ScoreNetwork(len(TRIALS))
-    optimiser = torch.optim.AdamW(network.parameters(), RATE, weight_decay=DECAY)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=STEPS)
+    network = load_score_network(SHIPPED).requires_grad_(True) if further else ScoreNetwork(len(TRIALS))
+    steps, rate = (FURTHER_STEPS, FURTHER_RATE) if further else (STEPS, RATE)
+    optimiser = torch.optim.AdamW(network.parameters(), rate, weight_decay=DECAY)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=steps)
+    chance = torch.cat([torch.full((len(p["whole"]),), SETTLED_WEIGHT if "settled" in p["kind"] else 1.0)
+                        for p in parts if p["object"] not in left_out])
     best, best_state = float("inf"), network.state_dict()
-    for step in range(1, STEPS + 1):
-        rows = torch.randint(len(train["whole"]), (BATCH,), generator=generator)
+    for step in range(1, steps + 1):
+        rows = torch.multinomial(chance, BATCH, generator=generator)
         links, nearness, whole, outcomes = (train[k][rows] for k in ("links", "nearness", "whole", "outcomes"))
         links = links + NOISE * torch.randn(links.shape, generator=generator)
         loss = functional.binary_cross_entropy_with_logits(network(links, nearness, whole), outcomes)
@@ -194,6 +203,7 @@ def main() -> None:
     parser.add_argument("--views", nargs="+", choices=get_args(View), default=["whole", "whole", "half", "depth"],
                         help="views of the objects; naming one twice doubles its share")
     parser.add_argument("--seed", type=int, default=0, help="seed of everything")
+    parser.add_argument("--further", action="store_true", help="continue from the shipped network instead of random weights")
     parser.add_argument("--collect-only", action="store_true", help="do not fit")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -211,17 +221,19 @@ def main() -> None:
     parts = [part for path in sorted(options.folder.glob(f"*-{FEATURES}.pt")) for part in torch.load(path, weights_only=True)]
     names = sorted({part["object"] for part in parts})
     left_out = set(random.Random(0).sample(names, LEFT_OUT))
-    network, found, loss = fit(parts, left_out, options.seed)
+    network, found, loss = fit(parts, left_out, options.seed, options.further)
     print(f"{sum(len(p['whole']) for p in parts)} grasps; objects left out: loss {loss:.3f}, ROC area of refined grasps "
           + ", ".join(f"{rules} {area:.3f}" for rules, area in zip(TRIALS, found, strict=True)))
     about = {
-        "stage": "ranking", "script": Path(__file__).name, "weights": options.weights or DEFAULT, "steps": STEPS,
+        "stage": "ranking", "script": Path(__file__).name, "weights": options.weights or DEFAULT,
+        "steps": FURTHER_STEPS if options.further else STEPS, "further": options.further,
         "trials": TRIALS, "seed": options.seed, "left_out": sorted(left_out), "loss": loss, "areas": found,
         "data": {"hands": dict(Counter(p["hand"] for p in parts for _ in p["whole"])), "objects": len(names),
                  "grasps": sum(len(p["whole"]) for p in parts)},
     }
     SHIPPED.parent.mkdir(exist_ok=True)
-    save_score_network(network, SHIPPED, about)
+    before = history_of(SHIPPED) if options.further else []
+    save_score_network(network, SHIPPED, about, before)
 
 
 if __name__ == "__main__":

@@ -33,8 +33,10 @@ Method = Literal["auto", "network", "optimise"]
 """Where candidates come from."""
 TRUSTED_SCORE = 0.5
 """Log-odds of holding from which on a grasp needs no rival from the optimiser (ours)."""
+DOUBTED_SCORE = -0.5
+"""Log-odds of holding below which a grasp gets further rivals in a second round (ours)."""
 OPTIMISED_PER_GRASP = 8
-"""Candidates that the optimiser makes for each grasp below TRUSTED_SCORE (ours)."""
+"""Candidates that the optimiser makes in a round for each grasp that needs rivals (ours)."""
 
 
 @dataclass(frozen=True)
@@ -185,13 +187,14 @@ class GraspPredictor:
         if request.method != "optimise":
             self._ask_network(pool, progress)
             pool.settle()
-        if count := pool.to_optimise():
-            with watch("optimise"):
-                grasps = optimise(problem, count, request.seed, progress)
-                hand = problem.thinned(self.network.config.n_hand).to("cpu")
-                proposal = Proposal(grasps, hand.points(grasps.joints, grasps.T_object_wrist))
-            pool.add(proposal)
-            pool.settle()
+        for turn, trusted in enumerate((TRUSTED_SCORE, DOUBTED_SCORE)):
+            if request.method != "network" and (count := OPTIMISED_PER_GRASP * pool.lacking(trusted)):
+                with watch("optimise"):
+                    grasps = optimise(problem, count, request.seed + turn, progress)
+                    hand = problem.thinned(self.network.config.n_hand).to("cpu")
+                    proposal = Proposal(grasps, hand.points(grasps.joints, grasps.T_object_wrist))
+                pool.add(proposal)
+                pool.settle()
         return pool.best()
 
     def _ask_network(self, pool: _Pool, progress: Progress | None) -> None:
@@ -240,13 +243,10 @@ class _Pool:
             self.grasps[fresh], self.proposals[fresh] = [grasps], [Proposal.concatenate(self.proposals[fresh])[best]]
         self.settled = len(self.grasps)
 
-    def to_optimise(self) -> int:
-        """How many candidates synthesis is asked for: some for each grasp that is missing or that the score does not trust."""
-        if self.request.method == "network":
-            return 0
-        scores = torch.cat([torch.zeros(0), *(g.score for g in self.grasps)]).sort(descending=True).values
-        trusted = int((scores[: self.request.num] > TRUSTED_SCORE).sum())
-        return OPTIMISED_PER_GRASP * (self.request.num - trusted)
+    def lacking(self, trusted: float) -> int:
+        """How many of the grasps that were asked for are missing, or score no better than this."""
+        scores = torch.cat([torch.zeros(0), *(g.score for g in self.grasps)])
+        return max(0, self.request.num - int((scores > trusted).sum()))
 
     def best(self) -> Prediction:
         """The best grasps by score.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -48,18 +49,21 @@ class ScoreNetwork(nn.Module):
         return self.grasp(pooled)
 
 
-def save_score_network(network: ScoreNetwork, path: Path, about: dict[str, Any] | None = None) -> None:
+def save_score_network(
+    network: ScoreNetwork, path: Path, about: dict[str, Any] | None = None, history: Sequence[dict[str, Any]] = ()
+) -> None:
     """Write weights in half precision, with the features they were trained with.
 
     Args:
         network: The network.
         path: The file.
         about: How the weights were made.
+        history: The same of the weights that training began with, oldest first.
 
     Raises:
         OutputError: The file cannot be written.
     """
-    save_weights(network, path, {FEATURES_KEY: feature_names()} | (about or {}))
+    save_weights(network, path, {FEATURES_KEY: feature_names()} | (about or {}), history)
 
 
 def load_score_network(path: Path) -> ScoreNetwork:
