@@ -31,9 +31,9 @@ Progress = Callable[[int, int], None]
 """Called with (candidates made so far, candidates wanted), by the network and then by the optimiser."""
 Method = Literal["auto", "network", "optimise"]
 """Where candidates come from."""
-TRUSTED_SCORE = 0.5
+TRUSTED_SCORE = 1.5
 """Log-odds of holding from which on a grasp needs no rival from the optimiser (ours)."""
-DOUBTED_SCORE = -0.5
+DOUBTED_SCORE = 0.5
 """Log-odds of holding below which a grasp gets further rivals in a second round (ours)."""
 OPTIMISED_PER_GRASP = 8
 """Candidates that the optimiser makes in a round for each grasp that needs rivals (ours)."""
