@@ -94,7 +94,7 @@ def test_a_run_returns_how_the_grasps_were_made(predictor: GraspPredictor, ball:
     assert steps == [(16, 20), (20, 20)]
     assert (len(made.grasps), made.candidates) == (10, 20)
     assert set(made.seconds) == {"network", "decode", "optimise", "refine", "settle", "rank"}
-    assert min(v for k, v in made.seconds.items() if k != "optimise") > 0
+    assert {part for part, seconds in made.seconds.items() if seconds == 0} == {"optimise", "settle"}
     # Solved hands stay near the multilaterated points they were fitted to, row by row.
     hand = HAND.with_points(predictor.network.config.n_hand)
     for grasps in (made.proposed, made.grasps):
@@ -268,7 +268,7 @@ def test_the_optimiser_alone_asks_no_network(
         problem = GraspProblem(HAND, obj, constraints=constraints)
         made = predictor.run(problem, GraspRequest(2, seed=1, method="optimise"))
         assert made.origin == ["optimiser"] * 2
-        assert 2 <= made.candidates <= 8  # the descent turned some away from the direction
+        assert 2 <= made.candidates <= 16  # of two rounds; the descent turned some away from the direction
         assert made.seconds["optimise"] > 0 == made.seconds["network"]
         angles = torch.rad2deg(torch.acos(HAND.palm_directions(made.proposed.T_object_wrist) @ direction))
         assert float(angles.max()) < 20

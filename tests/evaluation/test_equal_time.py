@@ -125,6 +125,7 @@ def test_controls_are_refined_and_settled_as_the_networks_grasps_are(monkeypatch
 
     monkeypatch.setattr(module, "refine", stage("refine"))
     monkeypatch.setattr(module, "scored", stage("score"))
+    monkeypatch.setattr(module, "can_settle", lambda problem: True)
     monkeypatch.setattr(module, "best_settled", lambda problem, grasps, least: (None, done.append("settle") or grasps))
     names = (MEAN, MEAN_CHOSEN, START, SYNTHESISED)
     made = {name: lambda num, seed: made_up_grasps(HAND, count=num, seed=seed) for name in names}
