@@ -68,7 +68,7 @@ def closed_cloud_distances(
     area = np.pi * radius**2 / max(1, count - 1)
     far = np.abs(distance) > SURE
     winding = igl.fast_winding_number(cloud, normals, area, np.ascontiguousarray(points[far]))
-    distance[far] = np.where(winding > MOSTLY_INSIDE, -1.0, 1.0) * np.abs(distance[far])
+    distance[far] = np.where(np.asarray(winding) > MOSTLY_INSIDE, -1.0, 1.0) * np.abs(distance[far])
     return distance
 
 
