@@ -11,7 +11,6 @@ import tyro
 
 from dro_grasp.cli.inputs import Flag, ProtocolName, optional
 from dro_grasp.cli.output import print_result, progress_bar, say_aside
-from dro_grasp.grasps.sources import hand_of, object_of
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL
 
 if TYPE_CHECKING:
@@ -53,6 +52,7 @@ class Evaluate:
         from dro_grasp.files import check_output
         from dro_grasp.grasps.batch import GraspBatch
         from dro_grasp.grasps.reading import load_grasps
+        from dro_grasp.grasps.sources import hand_of, object_of
         from dro_grasp.pipeline.problem import GraspProblem
         from dro_grasp.pipeline.stages import evaluate
         from dro_grasp.simulation.diagnosis import count_failures, diagnose, next_steps

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from dro_grasp.cli.inputs import Flag, ProtocolName, optional
 from dro_grasp.cli.output import print_json, print_table, progress_bar, say, say_aside
-from dro_grasp.grasps.sources import with_sources
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 
 if TYPE_CHECKING:
@@ -128,6 +127,7 @@ class Generate:
     def _grasp(self, job: Job, name: str, output: Path | None, picture: Path | None) -> ObjectResult:
         """One object, start to end."""
         from dro_grasp.errors import OptionError
+        from dro_grasp.grasps.sources import with_sources
         from dro_grasp.pipeline.problem import GraspProblem
         from dro_grasp.simulation.diagnosis import count_failures, next_steps
 
