@@ -1,10 +1,10 @@
-# make setup | demo | test | test-slow | lint | wheels | docs | rehearse | docs-pictures | data | clean
+# make setup | demo | demo-arm | test | test-slow | lint | wheels | docs | rehearse | docs-pictures | data | clean
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo test test-slow lint wheels docs rehearse docs-pictures data clean
+.PHONY: setup demo demo-arm test test-slow lint wheels docs rehearse docs-pictures data clean
 
 setup: $(STAMP)
 
@@ -19,6 +19,11 @@ demo: setup
 	mkdir -p out
 	$(BIN)/dro-grasp generate --hand allegro --object rubber_duck --num 16 --seed 0 \
 		--output out/demo.parquet --picture out/demo.png
+
+demo-arm: setup  # a robot sees an object on a table, plans and lifts it; out/lift.webp shows it
+	mkdir -p out
+	$(BIN)/dro-grasp tabletop --robot xarm7_leaphand --objects rubber_duck --attempts 1 --seed 1 \
+		--output out/lift.parquet --video out/lift.webp
 
 test: setup
 	$(BIN)/python -m pytest -n 2 --dist loadfile -q
@@ -52,6 +57,8 @@ rehearse: setup  # the training of a GPU machine with the slim network, in two m
 
 docs-pictures: setup
 	$(BIN)/dro-grasp generate --hand allegro --object rubber_duck --num 16 --seed 0 --picture docs/pictures/grasps.png
+	$(BIN)/dro-grasp tabletop --robot xarm7_leaphand --objects rubber_duck --attempts 1 --seed 1 --video docs/pictures/lift.webp
+	$(BIN)/dro-grasp robot check xarm7_leaphand --picture docs/pictures/robot-check.png
 
 PAPER_HANDS := assets/barrett_multidex assets/allegro_left assets/shadowhand assets/leaphand
 OTHER_HANDS := allegro barrett gripper3 leaphand shadowhand assets/allegro_right
