@@ -74,6 +74,8 @@ def run_case(case: int, seed: int, kind: str, seeds: Path, keep: Path | None) ->
             while causes[-1].__cause__ is not None:
                 causes.append(causes[-1].__cause__)  # type: ignore[arg-type]
             return ("memory", place_of(error)) if any(isinstance(c, MemoryError) for c in causes) else ("refused", "")
+        except MemoryError as error:
+            return "memory", place_of(error)
         except Exception as error:
             if keep is not None:
                 shutil.copytree(folder, keep / f"{kind}-{case}", dirs_exist_ok=True)

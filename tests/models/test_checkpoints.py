@@ -271,3 +271,8 @@ def test_an_entry_of_other_types_is_refused_by_every_reader(tmp_path: Path, entr
     for read in (load_weights, describe_weights, history_of, verify_weights):
         with pytest.raises(WeightsError, match="must be objects"):
             read(path)
+
+
+def test_a_name_that_is_too_long_for_a_file_beside_the_shipped_ones_is_unknown() -> None:
+    with pytest.raises(WeightsError, match="shipped weights are"):
+        load_weights("a" * 250)

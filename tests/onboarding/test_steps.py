@@ -10,7 +10,9 @@ from pathlib import Path
 import pytest
 
 from dro_grasp.cli.main import main
+from dro_grasp.datasets.engine.shards import sole_run
 from dro_grasp.datasets.engine.worker import EngineConfig
+from dro_grasp.errors import OutputError
 from dro_grasp.hands.library import BUILTIN_FOLDER
 from dro_grasp.models.checkpoints import describe_weights
 from dro_grasp.onboarding import report, steps
@@ -150,3 +152,17 @@ def test_what_is_refused_leaves_no_folder(
     assert main(line) == 2
     assert word in capsys.readouterr().err
     assert not (home / "new").exists()
+
+
+def test_a_damaged_state_is_set_aside_and_a_second_run_kept_out(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(steps._Onboarding, "run", lambda self: None)
+    for content in ("{", "[]", '{"hand": "mine", "sha256": "x", "steps": 5}', '{"hand": "mine"}'):
+        (tmp_path / steps.STATE).write_text(content)
+        made = steps.onboard(str(home / "mine.urdf"), tmp_path, say=told.append)
+        assert made.steps == {}
+        assert (tmp_path / f"{steps.STATE}.damaged").read_text() == content
+    assert len(told) == 4
+    assert all("is damaged" in line and "made again" in line for line in told)
+    with sole_run(tmp_path), pytest.raises(OutputError, match="another run is filling"):
+        steps.onboard(str(home / "mine.urdf"), tmp_path)

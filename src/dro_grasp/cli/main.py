@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Annotated, Any
 
 import tyro
@@ -35,7 +38,8 @@ BAD_INPUT = 2
 """Exit code after invalid input."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C: 128 plus the number of SIGINT, as shells have it."""
-
+INSISTENCE = 5.0
+"""Time after which Ctrl-C is repeated if the command still runs [s] (ours); workers stop in less."""
 PATIENCE = ("OMP_WAIT_POLICY", "PASSIVE")
 """Environment variable that lets PyTorch's threads sleep while they wait, which they otherwise spend spinning: beside other
 programs at work that takes several times as long. It counts if it is set before PyTorch is loaded."""
@@ -81,6 +85,26 @@ def parse(arguments: Sequence[str]) -> Any:
     return getattr(command, "command", command)
 
 
+@contextmanager
+def insistent_interrupts() -> Iterator[None]:
+    """Ctrl-C raises KeyboardInterrupt again every few seconds until the block ends: now and then a library swallows it."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(*_: Any) -> None:
+        signal.setitimer(signal.ITIMER_REAL, INSISTENCE)
+        raise KeyboardInterrupt
+
+    before = [signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGALRM)]
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        for number, handler in zip((signal.SIGINT, signal.SIGALRM), before, strict=True):
+            signal.signal(number, handler)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command, and return its exit code: 0 for success, 2 for invalid input, 1 for an internal error."""
     arguments = list(sys.argv[1:] if argv is None else argv)
@@ -91,7 +115,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = [a for a in arguments if a != "--verbose"] or ["--help"]
     os.environ.setdefault(*PATIENCE)
     try:
-        return parse(arguments).run()
+        with insistent_interrupts():
+            return parse(arguments).run()
     except DroGraspError as error:
         if verbose:
             traceback.print_exc()

@@ -66,7 +66,7 @@ def locate_hand(name: str | Path) -> tuple[Path, str]:
     """The file of a hand, and the hand's name in results."""
     text, path = str(name), given_path(name)
     builtin = BUILTIN_FOLDER / f"{text}.urdf"
-    if "/" not in text and builtin.is_file():
+    if "/" not in text and os.path.isfile(builtin):
         return builtin, text
     asset = _asset_file(text.removeprefix(ASSET_PREFIX))
     if asset is not None:

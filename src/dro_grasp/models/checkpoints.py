@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -109,7 +110,7 @@ def locate_weights(name: str | Path | None = None) -> Path:
     """The file behind a name."""
     text = str(name or DEFAULT)
     shipped = SHIPPED_FOLDER / f"{text}.safetensors"
-    if "/" not in text and shipped.is_file():
+    if "/" not in text and os.path.isfile(shipped):
         return shipped
     path = given_path(text)
     if path.is_file():

@@ -15,6 +15,7 @@ from dro_grasp.datasets.bundle.training_file import load_bundle, split_of
 from dro_grasp.datasets.collections.bundling import make_bundle
 from dro_grasp.datasets.collections.collection import count_collection
 from dro_grasp.datasets.engine.schedule import require_known, synthesize_dataset
+from dro_grasp.datasets.engine.shards import sole_run
 from dro_grasp.datasets.engine.worker import EngineConfig
 from dro_grasp.devices import require_device
 from dro_grasp.errors import BundleError, OptionError
@@ -149,7 +150,7 @@ def onboard(
         HandError: The description cannot be used.
         ObjectError: An object does not exist.
         WeightsError: No weights have the name.
-        OutputError: The folder cannot be made or written.
+        OutputError: The folder cannot be made or written, or another run is filling it.
         OptionError: Training and held-out objects overlap, or the folder is another hand's.
         BundleError: No grasp of the hand holds, so there is nothing to train on.
     """
@@ -161,8 +162,8 @@ def onboard(
     require_known([hand], [*objects, *held_out])
     locate_weights(config.weights)
     onboarding = _Onboarding(hand, path, config, objects, held_out, say)
-    make_folder(path)
-    onboarding.run()
+    with sole_run(make_folder(path)):
+        onboarding.run()
     return Onboarded(hand, path, onboarding.steps, config.weights)
 
 
@@ -178,14 +179,24 @@ class _Onboarding:
         self.hand = load_hand(hand)
         self.steps: dict[str, dict[str, Any]] = {}
         state = folder / STATE
-        if state.exists():
-            known = json.loads(state.read_text())
+        known = self._known(state) if state.exists() else None
+        if known is not None:
             if known["sha256"] != self.hand.sha256:
                 raise OptionError(f"{folder} belongs to hand '{known['hand']}', whose description differs; name another "
                                   "folder, or restore that description")
             # A benchmark of an earlier version, which does not tell what `generate` returns, is made again.
             self.steps = {name: step for name, step in known["steps"].items()
                           if "rows" not in step or any(row["stage"] == RETURNED for row in step["rows"])}
+
+    def _known(self, state: Path) -> dict[str, Any] | None:
+        """What a run before has stored; a damaged file is set aside, and its steps are made again."""
+        try:
+            known = json.loads(state.read_text())
+            return {name: dict(known[name]) if name == "steps" else str(known[name]) for name in ("hand", "sha256", "steps")}
+        except (ValueError, LookupError, TypeError) as error:
+            aside = state.replace(state.with_name(f"{state.name}.damaged"))
+            self.say(f"{state} is damaged ({type(error).__name__}) and set aside as {aside.name}; its steps are made again")
+            return None
 
     def run(self) -> None:
         """Run every step that is not finished."""
