@@ -154,7 +154,9 @@ def test_what_is_refused_leaves_no_folder(
     assert not (home / "new").exists()
 
 
-def test_a_damaged_state_is_set_aside_and_a_second_run_kept_out(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_damaged_state_is_set_aside_and_a_second_run_kept_out(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     told: list[str] = []
     monkeypatch.setattr(steps._Onboarding, "run", lambda self: None)
     for content in ("{", "[]", '{"hand": "mine", "sha256": "x", "steps": 5}', '{"hand": "mine"}'):
