@@ -22,7 +22,7 @@ demo: setup
 
 demo-arm: setup  # a robot sees an object on a table, plans and lifts it; out/lift.webp shows it
 	mkdir -p out
-	$(BIN)/dro-grasp tabletop --robot xarm7_leaphand --objects rubber_duck --attempts 1 --seed 1 \
+	$(BIN)/dro-grasp tabletop --robot xarm7_leaphand --objects spray_bottle --attempts 1 \
 		--output out/lift.parquet --video out/lift.webp
 
 test: setup
@@ -57,7 +57,7 @@ rehearse: setup  # the training of a GPU machine with the slim network, in two m
 
 docs-pictures: setup
 	$(BIN)/dro-grasp generate --hand allegro --object rubber_duck --num 16 --seed 0 --picture docs/pictures/grasps.png
-	$(BIN)/dro-grasp tabletop --robot xarm7_leaphand --objects rubber_duck --attempts 1 --seed 1 --video docs/pictures/lift.webp
+	$(BIN)/dro-grasp tabletop --robot xarm7_leaphand --objects spray_bottle --attempts 1 --video docs/pictures/lift.webp
 	$(BIN)/dro-grasp robot check xarm7_leaphand --picture docs/pictures/robot-check.png
 
 PAPER_HANDS := assets/barrett_multidex assets/allegro_left assets/shadowhand assets/leaphand

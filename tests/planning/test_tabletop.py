@@ -114,9 +114,10 @@ def test_an_attempt_lifts_a_can_is_repeatable_and_becomes_an_animation(
     result = attempt(robot, can, 0, 0, predictor, QUICK, recorder)
     assert result.stage == "done", result.reason
     assert result.raised > 0.15
+    assert len(recorder.frames) == pytest.approx(10 * (result.motion_seconds + 1.0), abs=2)
     again = attempt(robot, can, 0, 0, predictor, QUICK)
     assert (again.stage, again.raised, again.place) == (result.stage, result.raised, result.place)
-    recorder.frames = recorder.frames[::40]
+    recorder.frames = recorder.frames[::20]
     draw_animation(robot, can, recorder, tmp_path / "lift.gif")
     with Image.open(tmp_path / "lift.gif") as film:
         assert film.n_frames == len(recorder.frames)  # type: ignore[attr-defined]

@@ -28,8 +28,6 @@ FORMATS = {".gif": "GIF", ".webp": "WEBP"}
 """Endings of animation files."""
 RATE = 10
 """Frames per second (ours)."""
-WATCHED = 50
-"""Calls of a watch per second of simulated time."""
 SIZE = (480, 360)
 """Width and height [pixels]."""
 VIEW = (0.9, -1.25, 0.75)
@@ -47,14 +45,14 @@ class Recorder:
     frames: list[tuple[Float[np.ndarray, " n_arm"], Float[np.ndarray, " n_dof"], Float[np.ndarray, "4 4"]]] = field(
         default_factory=list)
     """Arm, hand [rad or m], and the object's pose [m]."""
-    calls: int = 0
-    """How often it was called."""
+    next_time: float = 0.0
+    """Simulated time of the next frame [s]."""
 
     def __call__(self, scene: LiftScene) -> None:
         """Look at the scene."""
-        if self.calls % (WATCHED // RATE) == 0:
+        if scene.data.time >= self.next_time:
             self.frames.append((*scene.joints(), scene.pose(0)))
-        self.calls += 1
+            self.next_time = scene.data.time + 1 / RATE - scene.model.opt.timestep / 2
 
 
 def check_animation(path: Path) -> None:

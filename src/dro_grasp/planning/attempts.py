@@ -106,7 +106,7 @@ class Attempt:
 
 
 Watch = Callable[[LiftScene], None]
-"""Called fifty times a second of simulated time."""
+"""Called at least fifty times a second of simulated time."""
 
 
 def attempt(
