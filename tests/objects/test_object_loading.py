@@ -349,6 +349,7 @@ def test_faces_without_area_and_soups_are_refused_at_once(tmp_path: Path) -> Non
         (line, np.arange(30).reshape(-1, 3), "none of which has an area"),
         (points, np.arange(1800).reshape(-1, 3), "is no surface: 100%"),
         (points[:300], draw.permutation(1800).reshape(-1, 3) % 300, "is no surface: 9.%"),
+        (points, np.concatenate([np.arange(1800).reshape(-1, 3), np.arange(1800)[::-1].reshape(-1, 3)]), "is no surface: 100%"),
     ):
         with pytest.raises(ObjectError, match=message):
             load_file(obj_file(tmp_path / "o.obj", vertices, faces))

@@ -42,7 +42,8 @@ def check_surface(mesh: trimesh.Trimesh, origin: str) -> None:
     """
     if not (len(mesh.faces) and mesh.nondegenerate_faces().any()):
         raise ObjectError(f"{origin} has {len(mesh.faces)} faces, none of which has an area; give a triangle mesh of a solid")
-    alone = float((np.bincount(mesh.faces_unique_edges.ravel()) == 1).mean())
+    edges = mesh.faces_unique_edges[mesh.unique_faces()]  # a face and its reverse side count once
+    alone = float((np.unique(edges, return_counts=True)[1] == 1).mean())
     if len(mesh.faces) > FEW_FACES and alone > MOST_ALONE:
         raise ObjectError(f"{origin} is no surface: {alone:.0%} of the edges of its {len(mesh.faces)} faces belong to one face "
                           "alone; join the faces (merge vertices), or give a point cloud of the surface")
