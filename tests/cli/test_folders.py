@@ -17,6 +17,7 @@ from dro_grasp.grasps.sources import with_own_files
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.viewer.pictures import CAPTION, HEADER, TILE
+from tests.helpers.browser import free_port
 
 
 @pytest.fixture(scope="module")
@@ -54,14 +55,25 @@ def test_picture_takes_a_folder(folder: Path, tmp_path: Path, more: list[str], t
         assert picture.size == (tiles[0] * TILE[0], HEADER + tiles[1] * (TILE[1] + CAPTION))
 
 
-def test_view_takes_a_folder(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    shown = []
-    monkeypatch.setattr(
-        "dro_grasp.viewer.app.view_grasps", lambda hand, obj, grasps, **_: shown.append((obj.name, len(grasps))))
-    assert main(["view", str(folder)]) == 0
-    assert main(["view", str(folder), "--object", "sphere"]) == 0
-    assert shown == [("can", 2), ("sphere", 3)]
-    assert "--object sphere" in capsys.readouterr().err
+@pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")
+def test_view_takes_a_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pages = []
+    monkeypatch.setattr("dro_grasp.viewer.stage.serve", pages.append)
+    for more in ([], ["--object", "sphere"]):
+        assert main(["view", str(folder), "--port", str(free_port()), *more]) == 0
+    first, second = pages
+    try:
+        assert (first.made.obj.name, len(first.made.refined)) == ("can", 2)
+        assert (second.made.obj.name, len(second.made.refined)) == ("sphere", 3)
+        assert {"can", "sphere"} <= set(first.object.options)
+        assert first.hand.value == "gripper3"
+        first.object.value = "sphere"
+        first._pick_object()
+        assert len(first.made.refined) == 3, "the other object's grasps can be picked"
+        assert "not evaluated" in first.status.content
+    finally:
+        for page in pages:
+            page.stop()
 
 
 def test_objects_of_the_same_name_are_told_apart(tmp_path: Path) -> None:

@@ -18,8 +18,9 @@ from dro_grasp.frames import HALF_AXES, half_axis_direction
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import BUILTIN_FOLDER
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.viewer import studio as module
-from dro_grasp.viewer.studio import EXPORTS, Studio, chosen
+from dro_grasp.viewer import grasp_page as module
+from dro_grasp.viewer.grasp_page import EXPORTS, chosen
+from dro_grasp.viewer.studio import Studio
 from dro_grasp.viewer.uploads import MAX_BYTES, store_upload
 from tests.helpers.browser import free_port, page_of
 from tests.helpers.weights import untrained_weights
@@ -44,7 +45,9 @@ def made(studio: Studio) -> module.ShownGrasps:
 
 def test_it_starts_empty_and_for_this_machine_alone(studio: Studio) -> None:
     assert studio.server.get_host() == "127.0.0.1"
-    assert "Generate" in studio.status.content or "held" in studio.status.content
+    if studio.made is None:
+        assert "gripper3 above sphere" in studio.status.content
+        assert studio.stage.hand is not None, "the hand is shown at once"
 
 
 def test_generating_shows_the_best_and_says_what_held(studio: Studio, made: module.ShownGrasps) -> None:
@@ -53,6 +56,9 @@ def test_generating_shows_the_best_and_says_what_held(studio: Studio, made: modu
     assert scores == sorted(scores, reverse=True)
     assert f"**{int(made.refined.success.sum())}** held" in studio.status.content
     assert "Grasp 0" in studio.text.content
+    assert "posture: held" in studio.text.content
+    studio.posture.value = "grasp"
+    assert "posture: grasp" in studio.text.content
     expected = made.refined.T_object_wrist[0] @ made.hand.tree.forward(made.refined.joints[0])
     np.testing.assert_allclose(studio.stage.links[0].position, expected[0, :3, 3], atol=1e-5)
     studio.stage_of.value = "network"
@@ -95,10 +101,15 @@ def test_a_trial_plays_and_ends_where_it_began(
 
     monkeypatch.setattr(studio.stage, "show", show)
     studio._guarded(studio._play)
+    assert (studio.moment.max, studio.moment.disabled) == (len(seen) - 1, False)
+    studio._show_moment(7)
+    assert torch.equal(seen.pop(), seen[7]), "any moment can be seen again"
     moved = [T for T in seen if T is not None]
     assert len(moved) > 50
     assert float((moved[0] - torch.eye(4)).abs().max()) < 1e-4, "the object starts where it was"
+    studio._show()
     assert seen[-1] is None
+    assert studio.moment.disabled, "another picture has no moments"
 
 
 @pytest.mark.parametrize("kind", EXPORTS)
@@ -117,11 +128,13 @@ def test_what_is_taken_away_is_what_is_shown(studio: Studio, made: module.ShownG
 def test_uploads_are_picked_and_errors_are_shown(studio: Studio) -> None:
     text = (BUILTIN_FOLDER / "gripper3.urdf").read_bytes()
     studio._guarded(lambda: studio._take(viser.UploadedFile(name="../mine.urdf", content=text), studio.hand))
-    assert studio.hand.value.endswith("mine.urdf")
-    assert ".." not in studio.hand.value
+    assert studio.hand.value == "mine.urdf", "no path of a temporary folder"
+    assert studio.stage.hand is not None
+    assert studio.stage.hand.name == "mine", "the uploaded hand is shown at once"
     studio._guarded(lambda: studio._take(viser.UploadedFile(name="bad.urdf", content=b"<robot"), studio.hand))
     assert studio.status.content.startswith("**Error:**")
     assert "bad.urdf" in studio.status.content
+    assert "/" not in studio.status.content.split("bad.urdf")[0], "no path of a temporary folder"
     studio.hand.value = "gripper3"
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from dro_grasp.cli.inputs import Flag, optional
-from dro_grasp.cli.output import say, say_aside
+from dro_grasp.cli.output import say
 
 if TYPE_CHECKING:
     from dro_grasp.grasps.batch import GraspBatch
@@ -34,7 +34,7 @@ class View:
     hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Hand to use instead of the one named in the file."""
     object: Annotated[str | None, optional("NAME|PATH", "the names in the file")] = None
-    """Object to show: a name in the file, or a mesh to use for the file's only object."""
+    """Object to show first: a name in the file, or a mesh to use for the file's only object."""
     scale: float = 1.0
     """Factor for the coordinates of the mesh given with --object."""
     port: int = 8080
@@ -47,22 +47,24 @@ class View:
     """Device for the network and the energies of grasps generated on the page: cpu, cuda or cuda:1."""
 
     def run(self) -> int:
-        """Serve the grasps of one object, or the page that generates grasps."""
-        if self.file is None:
-            from dro_grasp.viewer.stage import serve
-            from dro_grasp.viewer.studio import Studio
+        """Serve the page, with the grasps of the file if there is one."""
+        from dro_grasp.viewer.stage import serve
+        from dro_grasp.viewer.studio import Studio
 
+        if self.file is None:
             serve(Studio(weights=self.weights, port=self.port, host=self.host, device=self.device))
             return 0
         from dro_grasp.grasps.reading import load_grasps
         from dro_grasp.grasps.sources import hand_of
-        from dro_grasp.viewer.app import view_grasps
 
         grasps = load_grasps(self.file)
+        hand = hand_of(grasps, self.hand)
+        grasps.require_hand(hand)
         obj, chosen = of_object(grasps, self.object, self.scale)
-        if others := [f"--object {name}" for name in dict.fromkeys(grasps.object) if name not in chosen.object]:
-            say_aside(f"showing {obj.name}; for the others: {', '.join(others)}")
-        view_grasps(hand_of(grasps, self.hand), obj, chosen, port=self.port, host=self.host)
+        studio = Studio(weights=self.weights, port=self.port, host=self.host, device=self.device, preview=False)
+        given = self.object is not None and self.object not in grasps.object
+        studio.open(hand, chosen if given else grasps, obj if given else None, chosen.object[0])
+        serve(studio)
         return 0
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import CONTACT_LINKS, REASON
 from dro_grasp.grasps.controller import completed
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
@@ -103,7 +104,9 @@ def describe(grasps: GraspBatch, index: int) -> str:
     """Summary of one grasp, in Markdown."""
     lines = [f"**Grasp {index}** of {len(grasps)}"]
     if bool(grasps.evaluated[index]):
-        lines.append(f"**{'success' if grasps.success[index] else 'failed'}** under {grasps.protocol[index]}")
+        why = (grasps.extra.get(REASON) or [""] * len(grasps))[index]
+        outcome = "success" if grasps.success[index] else "failed"
+        lines.append(f"**{outcome}** under {grasps.protocol[index]}{f': {why}' if why else ''}")
     else:
         lines.append("not evaluated")
     values = {"confidence": (grasps.score.sigmoid(), 100.0, " %"), "energy": (grasps.energy, 1.0, ""),
@@ -112,6 +115,8 @@ def describe(grasps: GraspBatch, index: int) -> str:
     for name, (column, factor, unit) in values.items():
         if bool(column[index].isfinite()):
             lines.append(f"{name} {float(column[index]) * factor:.2f}{unit}")
+    if links := (grasps.extra.get(CONTACT_LINKS) or [None] * len(grasps))[index]:
+        lines.append(f"touched by {', '.join(links)}")
     if bool(grasps.fingers_in_contact[index].isfinite()):
         lines.append(f"fingers in contact {int(grasps.fingers_in_contact[index])}")
     return "  \n".join(lines)

@@ -8,6 +8,7 @@ from functools import lru_cache
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dro_grasp.geometry.point_clouds import even_directions
@@ -25,6 +26,8 @@ PREDICTED_COLOUR: Colour = (0.85, 0.20, 0.55)
 """Pink of hand points predicted by the network."""
 SOLVED_COLOUR: Colour = (0.15, 0.45, 0.85)
 """Blue of hand points after the joint solver."""
+CONTACT_COLOUR: Colour = (0.86, 0.10, 0.16)
+"""Red of contact marks."""
 SUCCESS_COLOUR: Colour = (0.16, 0.60, 0.30)
 """Green of grasps that passed their trial."""
 FAILURE_COLOUR: Colour = (0.80, 0.22, 0.20)
@@ -32,6 +35,8 @@ FAILURE_COLOUR: Colour = (0.80, 0.22, 0.20)
 UNEVALUATED_COLOUR: Colour = (0.50, 0.50, 0.50)
 """Grey of grasps that were not evaluated."""
 
+WAITING_HEIGHT = 0.05
+"""Height of the grasp centre of a waiting hand above the object [m]."""
 CELLS = 28
 """Cells along each side of the coarse picture that rates a viewpoint."""
 VIEWPOINTS = 48
@@ -88,6 +93,17 @@ def object_meshes(obj: ObjectModel) -> list[Mesh]:
         radius = 0.01 * float(np.linalg.norm(obj.extents))
         return [dots(obj.cloud[:: max(1, len(obj.cloud) // 3000)], OBJECT_COLOUR, radius)]
     return [Mesh(np.asarray(obj.vertices, float), np.asarray(obj.faces, np.int64), OBJECT_COLOUR)]
+
+
+def waiting_pose(hand: Hand, obj: ObjectModel) -> Float[Tensor, "4 4"]:
+    """Wrist pose of a hand that waits above an object, palm down [m]."""
+    T = torch.eye(4)
+    turn = Rotation.align_vectors(np.array([[0.0, 0.0, -1.0]]), hand.palm_direction_wrist[None].numpy())[0]
+    T[:3, :3] = torch.from_numpy(turn.as_matrix())
+    low, high = obj.cloud.min(0), obj.cloud.max(0)
+    above = torch.tensor([*((low + high) / 2)[:2].tolist(), float(high[2]) + WAITING_HEIGHT])
+    T[:3, 3] = above - T[:3, :3] @ hand.grasp_centre_wrist
+    return T
 
 
 def best_camera(

@@ -23,11 +23,11 @@ from dro_grasp.grasps.sources import require_pair
 from dro_grasp.grasps.summary import percent
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.rendering.meshes import Colour, dots
+from dro_grasp.rendering.meshes import dots
 from dro_grasp.rendering.rasterizer import render
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 from dro_grasp.simulation.trial import held
-from dro_grasp.viewer.appearance import best_camera, hand_meshes, object_meshes, success_colour
+from dro_grasp.viewer.appearance import CONTACT_COLOUR, best_camera, hand_meshes, object_meshes, success_colour
 
 TILE = (320, 280)
 """Width and height of the picture of one grasp [pixels]."""
@@ -37,8 +37,6 @@ COLUMNS = 4
 """Default number of pictures side by side."""
 CONTACT_DISTANCE = 0.002
 """Hand points closer than this to the object's surface count as contacts [m]."""
-CONTACT_COLOUR: Colour = (0.86, 0.10, 0.16)
-"""Red of contact marks."""
 CONTACT_RADIUS = 0.0022
 """Radius of a contact mark [m]."""
 CAPTION = 26
@@ -138,13 +136,19 @@ def shows_held(hand: Hand, obj: ObjectModel, style: PictureStyle | None) -> bool
 
 def after_closing(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> GraspBatch:
     """The grasps as they hold the object after closing, each under the protocol of its trial."""
-    names = [name if (name := re.split("[+/]", label)[0]) in PROTOCOLS else DEFAULT_PROTOCOL for label in grasps.protocol]
+    names = [protocol_name(label) for label in grasps.protocol]
     joints, poses = grasps.joints.clone(), grasps.T_object_wrist.clone()
     for name in set(names):
         rows = torch.tensor([i for i, own in enumerate(names) if own == name])
         closed = held(hand, obj, grasps[rows], name)
         joints[rows], poses[rows] = closed.joints, closed.T_object_wrist
     return grasps.replace(joints=joints, T_object_wrist=poses)
+
+
+def protocol_name(label: str) -> str:
+    """Name of the protocol of a trial's label, such as `strict/1`; the default one where there was no trial of a known one."""
+    name = re.split("[+/]", label)[0]
+    return name if name in PROTOCOLS else DEFAULT_PROTOCOL
 
 
 def draw_grasp(

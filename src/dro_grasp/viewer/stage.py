@@ -26,6 +26,8 @@ PORTS = range(1, 65536)
 """Valid TCP ports."""
 POINT_SIZE = 0.0022
 """Size of a drawn point [m]."""
+CONTACT_SIZE = 0.005
+"""Size of a drawn contact [m]."""
 CAMERA_DISTANCE = 1.15
 """Initial camera distance, as a multiple of that of a picture."""
 GRID_DEPTH = 0.12
@@ -64,6 +66,7 @@ class Stage:
         for k, (link, vertices, faces) in enumerate(appearance.link_shapes(hand)):
             scene.add_mesh_simple(f"{name}/hand/{link}/{k}", vertices, faces, color=rgb(colours[link]), side="double")
         self.solved = self.cloud("solved", np.zeros((1, 3)), appearance.SOLVED_COLOUR)
+        self.contacts = self.cloud("contacts", np.zeros((1, 3)), appearance.CONTACT_COLOUR, CONTACT_SIZE)
         position = (*obj.cloud.mean(0)[:2].tolist(), float(obj.cloud.min(0)[2]) - GRID_DEPTH)
         self._grid = scene.add_grid(f"{name}/grid", width=0.4, height=0.4, cell_size=0.05, section_size=0.1, position=position)
         camera = appearance.best_camera(hand, joints, T, obj)
@@ -75,10 +78,12 @@ class Stage:
             client.camera.position, client.camera.look_at, client.camera.fov = position, camera.target, camera.field_of_view
         self.show(joints, T)
 
-    def cloud(self, name: str, points: Float[np.ndarray, "n 3"], colour: Colour) -> viser.PointCloudHandle:
-        """Add points, hidden at first."""
+    def cloud(
+        self, name: str, points: Float[np.ndarray, "n 3"], colour: Colour, size: float = POINT_SIZE
+    ) -> viser.PointCloudHandle:
+        """Add points of a size [m], hidden at first."""
         return self.server.scene.add_point_cloud(
-            f"/pair{self._root}/{name}", points.astype(np.float32), colors=rgb(colour), point_size=POINT_SIZE,
+            f"/pair{self._root}/{name}", points.astype(np.float32), colors=rgb(colour), point_size=size,
             point_shape="circle", precision="float32", visible=False,
         )
 
@@ -140,6 +145,9 @@ class ServedPage:
         # viser prints a banner to stdout, which is reserved for tables and JSON.
         with contextlib.redirect_stdout(sys.stderr), guarded_server(host):
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
+        # A panel at the side leaves the hand in sight; narrow windows get it at the bottom.
+        self.server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self.server.gui.main_panel.dock_right()
         self.stage = Stage(self.server)
 
     @property

@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-import tempfile
-import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
-from typing import cast, get_args
+from typing import get_args
 
-import torch
 import viser
-from jaxtyping import Bool
-from torch import Tensor
 
-from dro_grasp.errors import DroGraspError
-from dro_grasp.export.contents import Frame
-from dro_grasp.export.formats import FORMATS, ExportJob
-from dro_grasp.frames import HALF_AXES, half_axis, half_axis_direction
+from dro_grasp.frames import HALF_AXES, half_axis_direction
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
-from dro_grasp.hands.library import hand_names, load_hand
-from dro_grasp.objects.catalogue import load_object, object_names
+from dro_grasp.hands.library import hand_names
+from dro_grasp.objects.catalogue import object_names
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem
@@ -30,41 +20,19 @@ from dro_grasp.pipeline.stages import evaluate
 from dro_grasp.predictor import GraspPredictor, GraspRequest, Method
 from dro_grasp.simulation.diagnosis import diagnose
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
-from dro_grasp.simulation.trial import record
-from dro_grasp.viewer.app import POSTURES, Posture, describe, postures_of
-from dro_grasp.viewer.pictures import outcome
-from dro_grasp.viewer.stage import HOST, ServedPage
-from dro_grasp.viewer.uploads import store_upload
+from dro_grasp.viewer.appearance import waiting_pose
+from dro_grasp.viewer.grasp_page import ANY, GraspPage, ShownGrasps
+from dro_grasp.viewer.pictures import protocol_name
+from dro_grasp.viewer.shelf import Shelf
+from dro_grasp.viewer.stage import HOST
 
-FRAME_TIME = 0.04
-"""Time between two pictures of a trial [s] (ours)."""
-ANY = "any"
-"""The choice of every palm direction."""
-GRASP_FILE = "grasp file (Parquet)"
-"""Choice of the grasp file itself among the formats that can be downloaded."""
-EXPORTS = (GRASP_FILE, *(form.title for form in FORMATS.values() if not form.file_per_grasp))
-"""What can be downloaded."""
 LARGEST_CALL = 64
 """Most grasps of one click (ours)."""
 MOST_CANDIDATES = 8
 """Most candidates for each of them (ours)."""
 
 
-@dataclass(frozen=True)
-class ShownGrasps:
-    """Grasps on the page, with the outcome of their trials; bare clouds have none."""
-
-    hand: Hand
-    obj: ObjectModel
-    raw: GraspBatch
-    """As the network proposed them, in the order of the refined ones."""
-    refined: GraspBatch
-    """Best score first."""
-    protocol: str
-    """Protocol of the trials."""
-
-
-class Studio(ServedPage):
+class Studio(GraspPage):
     """A running page; `stop()` ends it.
 
     Example:
@@ -74,7 +42,7 @@ class Studio(ServedPage):
 
     def __init__(
         self, hand: str = "allegro", obj: str = "rubber_duck", weights: str | None = None, port: int = 8080, host: str = HOST,
-        device: str = "cpu",
+        device: str = "cpu", preview: bool = True,
     ) -> None:
         """Start serving with a hand and an object chosen.
 
@@ -82,22 +50,33 @@ class Studio(ServedPage):
             hand: Name or path; the object likewise.
             weights: As `GraspPredictor` takes them; the device likewise.
             port: As `ServedPage` takes it; the host likewise.
+            preview: Show hand and object at once; not needed where `open` follows.
         """
         self.predictor = GraspPredictor(weights, device)
-        self.made: ShownGrasps | None = None
-        self.shown: list[int] = []
-        self._folder = tempfile.TemporaryDirectory(prefix="dro-grasp-")
-        self._busy = threading.Lock()
-        self._uploads = 0
+        self.shelf, self._first = Shelf(), (hand, obj)
         super().__init__(port, host)
-        self._add_choices(hand, obj)
-        self._add_display()
-        self._say("Pick a hand and an object, or upload your own, and press *Generate*.")
+        if preview:
+            self._guarded(self._preview)
 
     def stop(self) -> None:
         """Stop serving and delete the uploads."""
         super().stop()
-        self._folder.cleanup()
+        self.shelf.close()
+
+    def open(self, hand: Hand, grasps: GraspBatch, obj: ObjectModel | None = None, first: str | None = None) -> None:
+        """Show the grasps of a file. Its hand and objects can be picked, and more grasps generated, like any other.
+
+        Args:
+            hand: The hand of the grasps.
+            grasps: Of one object or several.
+            obj: Their object, where it is not the one that they name.
+            first: Name of the object that is shown first.
+        """
+        self.shelf.put(hand, grasps, obj)
+        self.hand.options, self.object.options = self.shelf.hand_names(), self.shelf.object_names()
+        self.hand.value = hand.name
+        self.object.value = obj.name if obj is not None else first or grasps.object[0]
+        self._guarded(self._pick_object)
 
     def generate(
         self, hand: str, obj: str, num: int = GraspRequest.num, direction: str = ANY, temperature: float | None = None,
@@ -116,23 +95,47 @@ class Studio(ServedPage):
             DroGraspError: An argument cannot be used.
         """
         along = None if direction == ANY else half_axis_direction(direction)
-        problem = GraspProblem(load_hand(hand), load_object(obj), self.predictor.device, Constraints(along))
+        problem = GraspProblem(self.shelf.hand(hand), self.shelf.obj(obj), self.predictor.device, Constraints(along))
         request = GraspRequest(num, candidates=candidates, temperature=temperature, method=method)
-        found = self.predictor.run(problem, request)
+        found = self.predictor.run(problem, request, self._counting("proposing"))
         raw, refined = found.proposed, found.grasps
         if not problem.obj.is_cloud:
-            raw, refined = (evaluate(problem, grasps, protocol) for grasps in (raw, refined))
+            raw, refined = (evaluate(problem, grasps, protocol, self._counting("evaluating")) for grasps in (raw, refined))
         self.made = ShownGrasps(problem.hand, problem.obj, raw, refined, protocol)
-        self.stage.set_pair(problem.hand, problem.obj, refined.joints[0].float(), refined.T_object_wrist[0].float())
-        self._filter()
+        self._present()
         return self.made
 
-    def _add_choices(self, hand: str, obj: str) -> None:
-        gui = self.server.gui
+    def _preview(self) -> None:
+        """Show the chosen hand above the chosen object, before there are grasps."""
+        hand, obj = self.shelf.hand(self.hand.value), self.shelf.obj(self.object.value)
+        self.made, self.shown, self.text.content = None, [], ""
+        self.slider.disabled = self.play.disabled = self.download.disabled = True
+        self._forget_film()
+        self.stage.set_pair(hand, obj, hand.canonical_joints(), waiting_pose(hand, obj))
+        self._say(f"{hand.name} above {obj.name}. Press *Generate*, or pick or upload others.")
+
+    def _pick_object(self) -> None:
+        """Show the grasps of the chosen object if a file has some of the chosen hand, and the pair alone otherwise."""
+        grasps = self.shelf.batches.get(self.object.value)
+        hand = self.shelf.hand(self.hand.value)
+        if grasps is None or grasps.hand_sha256 != hand.sha256:
+            self._preview()
+            return
+        obj, label = self.shelf.obj(self.object.value), next(filter(None, grasps.protocol), "")
+        self.made = ShownGrasps(hand, obj, grasps, grasps, protocol_name(label))
+        self._present()
+        held = f", **{int(grasps.success.sum())}** held under *{label}*" if label else ", not evaluated"
+        self._say("  \n".join([f"{len(grasps)} grasps of {obj.name}{held}", *diagnose(grasps)]))
+
+    def _plain(self, text: str) -> str:
+        return self.shelf.plain(text)
+
+    def _add_choices(self) -> None:
+        (hand, obj), gui = self._first, self.server.gui
         with gui.add_folder("Hand and object"):
-            self.hand = gui.add_dropdown("Hand", tuple(hand_names()), initial_value=hand)
+            self.hand = gui.add_dropdown("Hand", tuple(dict.fromkeys([*hand_names(), hand])), initial_value=hand)
             hand_file = gui.add_upload_button("Upload a hand (URDF, MJCF, ZIP)", mime_type=".urdf,.xml,.zip")
-            self.object = gui.add_dropdown("Object", tuple(object_names()), initial_value=obj)
+            self.object = gui.add_dropdown("Object", tuple(dict.fromkeys([*object_names(), obj])), initial_value=obj)
             kinds = ".stl,.obj,.ply,.glb,.off,.npy,.pcd"
             object_file = gui.add_upload_button("Upload an object (STL, OBJ, PLY)", mime_type=kinds)
         with gui.add_folder("Generate"):
@@ -150,59 +153,24 @@ class Studio(ServedPage):
                 "Diversity", 0.0, 1.0, 0.05, 1.0, disabled=True, hint="0: the likeliest grasp of each placement.")
             self.protocol = gui.add_dropdown("Trial", tuple(PROTOCOLS), initial_value=DEFAULT_PROTOCOL)
             self.button = gui.add_button("Generate", color="green")
-        self.status = gui.add_markdown("")
         hand_file.on_upload(lambda _: self._guarded(lambda: self._take(hand_file.value, self.hand)))
         object_file.on_upload(lambda _: self._guarded(lambda: self._take(object_file.value, self.object)))
         self.button.on_click(lambda _: self._guarded(self._generate))
+        for choice in (self.hand, self.object):
+            choice.on_update(lambda event: None if event.client is None else self._guarded(self._pick_object))
         self.usual.on_update(lambda _: setattr(self.temperature, "disabled", self.usual.value))
-
-    def _add_display(self) -> None:
-        gui = self.server.gui
-        with gui.add_folder("Display"):
-            self.success = gui.add_dropdown("Show", ("all", "succeeded", "failed"), initial_value="all")
-            self.palm = gui.add_dropdown("Palm along", (ANY, *HALF_AXES), initial_value=ANY)
-            self.slider = gui.add_slider("Grasp", 0, 1, 1, 0, disabled=True, hint="Best score first.")
-            self.stage_of = gui.add_button_group("Stage", ("network", "refined"))
-            self.posture = gui.add_button_group("Posture", POSTURES)
-            self.play = gui.add_button("Play the trial", disabled=True)
-            self.text = gui.add_markdown("")
-        with gui.add_folder("Download"):
-            self.format = gui.add_dropdown("Format", EXPORTS, initial_value=GRASP_FILE)
-            self.download = gui.add_button("Download the shown grasps", disabled=True)
-        self.stage_of.value = "refined"
-        self.posture.value = "grasp"
-        for choice in (self.success, self.palm):
-            choice.on_update(lambda _: self._filter())
-        self.slider.on_update(lambda _: self._show())
-        self.stage_of.on_click(lambda _: self._show())
-        self.posture.on_click(lambda _: self._show())
-        self.play.on_click(lambda _: self._guarded(self._play))
-        self.download.on_click(lambda event: self._guarded(lambda: self._send(event)))
-
-    def _guarded(self, work: Callable[[], None]) -> None:
-        """Do one thing at a time, and show errors on the page."""
-        if not self._busy.acquire(blocking=False):
-            self._say("Busy; wait a moment.")
-            return
-        try:
-            work()
-        except DroGraspError as error:
-            self._say(f"**Error:** {error}")
-        finally:
-            self._busy.release()
-
-    def _say(self, text: str) -> None:
-        self.status.content = text
 
     def _take(self, upload: viser.UploadedFile, choice: viser.GuiDropdownHandle[str]) -> None:
         """Store an upload and pick it."""
-        self._uploads += 1
-        folder = Path(self._folder.name) / str(self._uploads)
-        folder.mkdir()
-        path = store_upload(upload.name, upload.content, folder)
-        choice.options = (*choice.options, str(path))
-        choice.value = str(path)
-        self._say(f"{upload.name} is picked.")
+        label = self.shelf.take(upload.name, upload.content)
+        choice.options = tuple(dict.fromkeys([*choice.options, label]))
+        choice.value = label
+        self._preview()
+        self._say(f"{label} is picked. {self.status.content}")
+
+    def _counting(self, what: str) -> Callable[[int, int], None]:
+        """What tells the progress of some work on the page."""
+        return lambda done, total: self._say(f"{what}: {done} of {total}")
 
     def _generate(self) -> None:
         self._say("Generating ...")
@@ -215,76 +183,3 @@ class Studio(ServedPage):
             f", **{int(made.refined.success.sum())}** held under *{self.protocol.value}*")
         lines = [f"{len(made.refined)} grasps{held}; {time.perf_counter() - begin:.1f} s", *diagnose(made.refined)]
         self._say("  \n".join(lines))
-
-    def _filter(self) -> None:
-        """Show the grasps that pass the filters."""
-        if self.made is None:
-            return
-        keep = chosen(self.made.hand, self.made.refined, self.success.value, self.palm.value)
-        self.shown = keep.nonzero()[:, 0].tolist()
-        some = bool(self.shown)
-        self.slider.max = max(1, len(self.shown) - 1)
-        self.slider.disabled = len(self.shown) < 2
-        self.play.disabled = not some or self.made.obj.is_cloud
-        self.download.disabled = not some
-        self.slider.value = 0
-        if some:
-            self._show()
-        else:
-            self.text.content = "No grasp passes these filters."
-
-    def _batch(self) -> GraspBatch:
-        assert self.made is not None
-        return self.made.raw if self.stage_of.value == "network" else self.made.refined
-
-    def _show(self) -> None:
-        """Move the hand to the picked grasp."""
-        if self.made is None or not self.shown:
-            return
-        index, grasps = self.shown[min(int(self.slider.value), len(self.shown) - 1)], self._batch()
-        joints = postures_of(self.made.hand, self.made.obj, grasps[index])[cast(Posture, self.posture.value)][0]
-        with self.server.atomic():
-            self.stage.show(joints, grasps.T_object_wrist[index].float())
-            self.stage.colour_grid(outcome(grasps, index))
-            self.text.content = describe(grasps, index)
-
-    def _play(self) -> None:
-        """Play the trial of the picked grasp."""
-        assert self.made is not None
-        index, grasps = self.shown[int(self.slider.value)], self._batch()
-        self._say(f"Playing the trial under *{self.made.protocol}*.")
-        poses, joints = record(self.made.hand, self.made.obj, grasps, index, self.made.protocol)
-        T = grasps.T_object_wrist[index].float()
-        for pose, q in zip(poses, joints, strict=True):
-            self.stage.show(q, T, T @ pose)
-            time.sleep(FRAME_TIME)
-        self._show()
-        self._say("Played.")
-
-    def _send(self, event: viser.GuiEvent) -> None:
-        """Send the shown grasps to the browser."""
-        name, content = self.exported(self.format.value)
-        if event.client is not None:
-            event.client.send_file_download(name, content, save_immediately=True)
-        self._say(f"{name}: {len(self.shown)} grasps.")
-
-    def exported(self, kind: str) -> tuple[str, bytes]:
-        """Name and content of a file with the shown grasps, in one of EXPORTS."""
-        assert self.made is not None
-        grasps = self._batch()[self.shown]
-        stem = f"{Path(self.made.hand.name).name}_{Path(self.made.obj.name).name}"
-        if kind == GRASP_FILE:
-            return f"{stem}.parquet", grasps.to_bytes()
-        name, form = next((name, form) for name, form in FORMATS.items() if form.title == kind)
-        content = form.content(ExportJob(grasps, Frame(), self.made.hand))
-        return f"{stem}_{name}{form.suffix}", cast(bytes, content)
-
-
-def chosen(hand: Hand, grasps: GraspBatch, success: str, palm: str) -> Bool[Tensor, " n"]:
-    """Grasps with an outcome (`all`, `succeeded`, `failed`) whose palm points along a half-axis (or `any`)."""
-    keep = torch.ones(len(grasps), dtype=torch.bool)
-    if success != "all":
-        keep &= grasps.success if success == "succeeded" else grasps.evaluated & ~grasps.success
-    if palm != ANY:
-        keep &= half_axis(hand.palm_directions(grasps.T_object_wrist)) == HALF_AXES.index(palm)
-    return keep

@@ -1,0 +1,88 @@
+"""What a page can pick from: hands and objects with a name, uploads, and the hand and objects of a grasp file."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from pathlib import Path
+
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.sources import object_of
+from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.library import hand_names, load_hand
+from dro_grasp.objects.catalogue import load_object, object_names
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.viewer.uploads import store_upload
+
+
+class Shelf:
+    """Hands and objects by the names that people see; each is loaded when it is first picked, and then kept."""
+
+    def __init__(self) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="dro-grasp-")
+        self._uploads = 0
+        self._paths: dict[str, Path] = {}
+        self._hands: dict[str, Hand] = {}
+        self._objects: dict[str, ObjectModel] = {}
+        self.batches: dict[str, GraspBatch] = {}
+        """Grasps of a file, by the name of their object."""
+
+    def close(self) -> None:
+        """Delete the uploads."""
+        self._folder.cleanup()
+
+    def take(self, name: str, content: bytes) -> str:
+        """Store an upload, and return the name under which it can be picked.
+
+        Raises:
+            OptionError: The upload is refused.
+        """
+        self._uploads += 1
+        folder = Path(self._folder.name) / str(self._uploads)
+        folder.mkdir()
+        path = store_upload(name, content, folder)
+        label = path.name
+        self._paths[label] = path
+        for kept in (self._hands, self._objects, self.batches):
+            kept.pop(label, None)
+        return label
+
+    def put(self, hand: Hand, grasps: GraspBatch, obj: ObjectModel | None = None) -> None:
+        """Add the hand, the grasps and the objects of a file; an object, if given, is that of all its grasps."""
+        self._hands[hand.name] = hand
+        self.batches |= dict(grasps.by_object()) if obj is None else {obj.name: grasps}
+        if obj is not None:
+            self._objects[obj.name] = obj
+
+    def hand_names(self) -> tuple[str, ...]:
+        """Names of hands, those of a file first."""
+        return tuple(dict.fromkeys([*self._hands, *hand_names()]))
+
+    def object_names(self) -> tuple[str, ...]:
+        """Names of objects, those of a file first."""
+        return tuple(dict.fromkeys([*self.batches, *object_names()]))
+
+    def hand(self, name: str) -> Hand:
+        """The hand of a name.
+
+        Raises:
+            HandError: It cannot be used.
+        """
+        if name not in self._hands:
+            self._hands[name] = load_hand(self._paths.get(name, name))
+        return self._hands[name]
+
+    def obj(self, name: str) -> ObjectModel:
+        """The object of a name.
+
+        Raises:
+            ObjectError: It cannot be used.
+        """
+        if name not in self._objects:
+            batch = self.batches.get(name)
+            self._objects[name] = load_object(self._paths.get(name, name)) if batch is None else object_of(batch, None, 1.0)
+        return self._objects[name]
+
+    def plain(self, text: str) -> str:
+        """A message without the folders in which uploads lie."""
+        return re.sub(re.escape(self._folder.name) + r"/\d+/", "", text)
