@@ -14,9 +14,10 @@ import torch
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.rendering.camera import Camera
 from dro_grasp.viewer.app import GraspViewer, describe
 from dro_grasp.viewer.appearance import success_colour
-from dro_grasp.viewer.stage import HOST, ServedPage
+from dro_grasp.viewer.stage import HOST, ServedPage, position_of
 from tests.helpers.browser import free_port, page_of
 from tests.helpers.loaded_hands import loaded_hand
 
@@ -104,6 +105,14 @@ def test_text_says_what_is_known(grasps: GraspBatch) -> None:
     assert describe(several, 0).endswith("robustness 75.00 %  \nfingers in contact 3")
 
 
+def test_narrow_windows_are_seen_from_farther_away() -> None:
+    camera = Camera((0.3, 0.4, 0.0), (0.0, 0.0, 0.0))
+    wide, phone = (np.linalg.norm(position_of(camera, aspect)) for aspect in (16 / 9, 390 / 844))
+    assert wide == pytest.approx(np.linalg.norm(position_of(camera)))
+    # The horizontal half-angle of the narrow window sees what that of the picture sees.
+    assert phone / wide == pytest.approx((4 / 3) / (390 / 844))
+
+
 def test_nothing_to_show_and_foreign_hands_are_refused(grasps: GraspBatch) -> None:
     hand, obj = loaded_hand("gripper3"), load_object("sphere")
     with pytest.raises(OptionError, match="no grasp"):
@@ -118,8 +127,7 @@ def test_a_browser_shows_the_grasp(grasps: GraspBatch, tmp_path: Path) -> None:
     grasps.save(file)
     with page_of(str(file), size=(1000, 700)) as page:
         page.get_by_text("success under dro/1").wait_for(timeout=60_000)
-        page.get_by_role("button", name="open", exact=True).click(timeout=60_000)
-        page.get_by_text("Solved hand points").click(timeout=60_000)
+        page.get_by_text("Hand points").click(timeout=60_000)
         time.sleep(4)
         page.screenshot(path=str(tmp_path / "viewer.png"))
     from PIL import Image

@@ -88,6 +88,19 @@ def test_filters_keep_what_they_say(studio: Studio, made: module.ShownGrasps) ->
     studio._filter()
 
 
+def test_contacts_are_marked_where_the_hand_touches_and_only_when_asked(studio: Studio, made: module.ShownGrasps) -> None:
+    assert not studio.stage.contacts.visible
+    studio.contacts.value = True
+    try:
+        points = torch.as_tensor(np.asarray(studio.stage.contacts.points)).float()
+        if len(points):
+            assert float(made.obj.distance_field.distances(points)[0].abs().max()) < 0.003
+        assert studio.stage.contacts.visible
+    finally:
+        studio.contacts.value = False
+    assert not studio.stage.contacts.visible
+
+
 def test_a_trial_plays_and_ends_where_it_began(
     studio: Studio, made: module.ShownGrasps, monkeypatch: pytest.MonkeyPatch
 ) -> None:

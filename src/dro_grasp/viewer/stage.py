@@ -16,6 +16,7 @@ from torch import Tensor
 from dro_grasp.errors import OptionError
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.rendering.camera import Camera
 from dro_grasp.rendering.meshes import Colour
 from dro_grasp.viewer import appearance
 from dro_grasp.viewer.guard import guarded_server
@@ -30,6 +31,8 @@ CONTACT_SIZE = 0.005
 """Size of a drawn contact [m]."""
 CAMERA_DISTANCE = 1.15
 """Initial camera distance, as a multiple of that of a picture."""
+ASPECT = 4 / 3
+"""Width over height of a window from which on nothing is cut off."""
 GRID_DEPTH = 0.12
 """Distance from the object's lowest point down to the grid [m]."""
 
@@ -42,6 +45,8 @@ class Stage:
         self.server = server
         self.hand: Hand | None = None
         server.scene.set_up_direction("+z")
+        self._camera: Camera | None = None
+        server.on_client_connect(self._aim)
         self._root = 0
 
     def set_pair(self, hand: Hand, obj: ObjectModel, joints: Float[Tensor, " n_dof"], T: Float[Tensor, "4 4"]) -> None:
@@ -69,14 +74,18 @@ class Stage:
         self.contacts = self.cloud("contacts", np.zeros((1, 3)), appearance.CONTACT_COLOUR, CONTACT_SIZE)
         position = (*obj.cloud.mean(0)[:2].tolist(), float(obj.cloud.min(0)[2]) - GRID_DEPTH)
         self._grid = scene.add_grid(f"{name}/grid", width=0.4, height=0.4, cell_size=0.05, section_size=0.1, position=position)
-        camera = appearance.best_camera(hand, joints, T, obj)
-        start, target = np.asarray(camera.position), np.asarray(camera.target)
-        position = tuple((target + CAMERA_DISTANCE * (start - target)).tolist())
+        self._camera = camera = appearance.best_camera(hand, joints, T, obj)
         initial = self.server.initial_camera
-        initial.position, initial.look_at, initial.fov = position, camera.target, camera.field_of_view
+        initial.position, initial.look_at, initial.fov = position_of(camera), camera.target, camera.field_of_view
         for client in self.server.get_clients().values():
-            client.camera.position, client.camera.look_at, client.camera.fov = position, camera.target, camera.field_of_view
+            self._aim(client)
         self.show(joints, T)
+
+    def _aim(self, client: viser.ClientHandle) -> None:
+        """Turn a client's camera to the pair, from farther away where its window is narrow."""
+        if (camera := self._camera) is not None:
+            client.camera.position = position_of(camera, client.camera.aspect)
+            client.camera.look_at, client.camera.fov = camera.target, camera.field_of_view
 
     def cloud(
         self, name: str, points: Float[np.ndarray, "n 3"], colour: Colour, size: float = POINT_SIZE
@@ -111,6 +120,13 @@ class Stage:
         with self.server.atomic():
             for frame in self.links:
                 frame.visible = visible
+
+
+def position_of(camera: Camera, aspect: float = ASPECT) -> tuple[float, float, float]:
+    """Where a camera stands so that a window of this width over height shows all that a picture shows [m]."""
+    start, target = np.asarray(camera.position), np.asarray(camera.target)
+    x, y, z = (target + CAMERA_DISTANCE * max(1.0, ASPECT / aspect) * (start - target)).tolist()
+    return x, y, z
 
 
 def rgb(colour: Colour) -> tuple[int, int, int]:
