@@ -37,7 +37,7 @@ def main() -> None:
     parser.add_argument("--objects", nargs="+", default=["builtin:test"], help="columns")
     options = parser.parse_args()
     objects = [dro.load_object(name) for name in resolve_objects(options.objects)]
-    predictor, held = dro.GraspPredictor(), 0
+    predictor, held, dots = dro.GraspPredictor(), 0, []
     sheet = Image.new("RGB", (MARGIN[0] + len(objects) * TILE[0], MARGIN[1] + len(options.hands) * TILE[1]), (255, 255, 255))
     pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(13)
     for column, obj in enumerate(objects):
@@ -53,10 +53,19 @@ def main() -> None:
             if len(grasps):
                 picture = draw_grasp(hand, obj, after_closing(hand, obj, grasps), 0, dro.PictureStyle(TILE))
                 sheet.paste(Image.fromarray(picture), (x, y))
-                red, green, blue = (round(255 * c) for c in success_colour(outcome(grasps, 0)))
-                pen.ellipse((x + 4, y + 4, x + 12, y + 12), fill=(red, green, blue))
+                dots.append((x + 4, y + 4, outcome(grasps, 0)))
         print(f"{hand.name}: {held} of {(row + 1) * len(objects)} so far hold under strict", flush=True)
-    sheet.quantize(COLOURS).save(options.output, optimize=True)
+    finished(sheet, dots).save(options.output, optimize=True)
+
+
+def finished(sheet: Image.Image, dots: list[tuple[int, int, bool | None]]) -> Image.Image:
+    """The sheet in few colours, and a dot in the exact colour of its outcome on each picture."""
+    small = sheet.quantize(COLOURS).convert("RGB")
+    pen = ImageDraw.Draw(small)
+    for x, y, passed in dots:
+        red, green, blue = (round(255 * c) for c in success_colour(passed))
+        pen.ellipse((x, y, x + 8, y + 8), fill=(red, green, blue))
+    return small.quantize(COLOURS + 8)
 
 
 if __name__ == "__main__":
