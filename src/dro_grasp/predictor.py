@@ -37,6 +37,8 @@ DOUBTED_SCORE = 0.5
 """Log-odds of holding below which a grasp gets further rivals in a second round (ours)."""
 OPTIMISED_PER_GRASP = 8
 """Candidates that the optimiser makes in a round for each grasp that needs rivals (ours)."""
+OPTIMISED_IN_SURROUNDINGS = 4
+"""The same where a descent also watches surroundings, which takes twice as long; as many of the grasps hold (ours)."""
 
 
 @dataclass(frozen=True)
@@ -164,6 +166,8 @@ class GraspPredictor:
         names = {f.name for f in fields(Constraints)} & set(options)
         constraints = replace(constraints or Constraints(), **{name: options.pop(name) for name in names})
         problem = GraspProblem(hand, obj, self.device, constraints)
+        if (doubt := problem.constraints.doubt(obj)) is not None:
+            warnings.warn(doubt, stacklevel=2)
         made = self.run(problem, GraspRequest(num, seed, **options))
         if made.shortage is not None:
             warnings.warn(made.shortage, stacklevel=2)
@@ -187,8 +191,9 @@ class GraspPredictor:
         if request.method != "optimise":
             self._ask_network(pool, progress)
             pool.settle()
+        each = OPTIMISED_PER_GRASP if problem.surroundings is None else OPTIMISED_IN_SURROUNDINGS
         for turn, trusted in enumerate((TRUSTED_SCORE, DOUBTED_SCORE)):
-            if request.method != "network" and (count := OPTIMISED_PER_GRASP * pool.lacking(trusted)):
+            if request.method != "network" and (count := each * pool.lacking(trusted)):
                 with watch("optimise"):
                     grasps = optimise(problem, count, request.seed + turn, progress)
                     hand = problem.thinned(self.network.config.n_hand).to("cpu")

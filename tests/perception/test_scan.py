@@ -189,3 +189,48 @@ def test_frames_that_mean_nothing_are_refused(content: dict[str, object], word: 
     (tmp_path / "frame.json").write_text(json.dumps(content))
     with pytest.raises(OptionError, match=word):
         read_motion(tmp_path / "frame.json", "T_frame_camera")
+
+
+def on_a_table(seen: np.ndarray, T_object_camera: np.ndarray) -> np.ndarray:
+    """The seen points with a table at the mug's foot, in the camera's frame."""
+    rng = np.random.default_rng(0)
+    foot = load_object("mug").cloud[:, 2].min()
+    table = np.column_stack([rng.uniform(-0.25, 0.25, (4000, 2)), np.full(4000, foot) + rng.normal(0, 0.001, 4000)])
+    return np.concatenate([seen, (table - T_object_camera[:3, 3]) @ T_object_camera[:3, :3]])
+
+
+def test_a_table_in_a_scan_is_cut_off_and_known_in_the_frame_asked_for(
+    mug: ObjectModel, depth: np.ndarray, T_object_camera: np.ndarray
+) -> None:
+    T = T_object_camera if T_object_camera[2, 3] > 0 else np.diag([1.0, 1.0, -1.0, 1.0])
+    assert T is T_object_camera, "the camera is above the mug's foot"
+    points = on_a_table(depth_points(depth, INTRINSICS), T)
+    scan = scanned_object("mug on a table", points, T, complete=False)
+    assert off_surface(mug, scan.cloud.astype(float)).max() < 0.004
+    assert scan.table is not None
+    np.testing.assert_allclose(scan.table, [0, 0, 1, mug.cloud[:, 2].min()], atol=0.02)
+    assert "a table was found in the cloud" in scan.notes[-1]
+    kept = scanned_object("mug on a table", points, T, complete=False, keep_table=True)
+    assert kept.table is None
+    assert len(kept.cloud) > 2 * len(scan.cloud)
+    assert np.ptp(kept.cloud[:, 0]) > 0.4
+
+
+def test_a_cloud_file_loses_its_table(
+    tmp_path: Path, depth: np.ndarray, T_object_camera: np.ndarray, capsys: pytest.CaptureFixture[str]
+) -> None:
+    points = on_a_table(depth_points(depth, INTRINSICS), T_object_camera)
+    path = tmp_path / "scene.npy"
+    np.save(path, points)
+    cut, whole = load_object(path), load_object(points, keep_table=True)
+    assert np.ptp(cut.cloud, axis=0).max() < 0.2 < np.ptp(whole.cloud, axis=0).max()
+    np.testing.assert_allclose(cut.table[:3], T_object_camera[2, :3], atol=0.02)
+    weights = str(untrained_weights(tmp_path))
+    command = ["generate", "--hand", "gripper3", "--object", str(path), "--num", "1", "--method", "network"]
+    command += ["--weights", weights]
+    assert main([*command, "--table", "0.0"]) == 0
+    told = capsys.readouterr().err
+    assert "a table was found in the cloud" in told
+    assert "but the table in the cloud is where" in told
+    assert main([*command, "--table", "-1.0", "--keep-table"]) == 0
+    assert "counts along the z axis of the cloud" in capsys.readouterr().err

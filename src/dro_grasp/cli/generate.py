@@ -58,6 +58,8 @@ class Generate:
     network, and the optimiser for the grasps with which the score does not trust it."""
     refine: bool = True
     """Refine the candidates on the object's geometry, near where the network proposed them."""
+    keep_table: Flag = False
+    """Take every point of a cloud for the object's. By default a table in it is found and cut off, and hands stay above it."""
     temperature: Annotated[float | None, optional("T", "as the weights say")] = None
     """Diversity of the grasps of one placement: 0 takes the likeliest, 1 is as diverse as the training grasps."""
     scale: float = 1.0
@@ -139,6 +141,8 @@ class Generate:
                               "--protocol, which needs a mesh, or leave out --only-successful")
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
+        if (doubt := self._doubt(job, obj)) is not None:
+            say_aside(f"warning: {obj.name}: {doubt}")
         problem = GraspProblem(job.hand, obj, self.device, job.constraints)
         with progress_bar("predicting", self.json) as progress:
             made = job.predictor.run(problem, job.request, progress)
@@ -182,8 +186,15 @@ class Generate:
         from dro_grasp.perception.scan import load_scan
 
         if camera is None:
-            return load_object(name, scale=self.scale)
-        return load_scan(given_path(name), camera.T.double().numpy(), self.scale)
+            return load_object(name, scale=self.scale, keep_table=self.keep_table)
+        return load_scan(given_path(name), camera.T.double().numpy(), self.scale, self.keep_table)
+
+    def _doubt(self, job: Job, obj: ObjectModel) -> str | None:
+        """What is odd about the table, in words; None for nothing."""
+        if obj.is_cloud and obj.table is None and self.table is not None and job.camera is None:
+            return (f"--table {self.table:g} counts along the z axis of the cloud. If that is a camera's, which points "
+                    "forward, give the camera's pose with --camera")
+        return job.constraints.doubt(obj)
 
     def _protocol(self, obj: ObjectModel) -> str:
         return self.protocol or ("none" if obj.is_cloud else DEFAULT_PROTOCOL)

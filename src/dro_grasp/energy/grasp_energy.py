@@ -55,7 +55,7 @@ class EnergyConfig:
     """Weight of the hand's penetration into its surroundings, in pregrasp, grasp and squeeze [1/m] (ours)."""
     clearance_points: int = 120
     """Number of hand points at which that is measured (ours)."""
-    clear: float = 0.003
+    clear: float = 0.005
     """Distance that the hand keeps from its surroundings [m] (ours)."""
 
 

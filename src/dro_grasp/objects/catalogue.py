@@ -31,7 +31,9 @@ MESH_SUFFIXES = {".obj", ".stl", ".ply", ".glb", ".gltf", ".off", ".dae", ".npy"
 """Suffixes of the files in a folder that count as objects."""
 
 
-def load_object(source: ObjectSource, *, scale: float = 1.0, name: str | None = None) -> ObjectModel:
+def load_object(
+    source: ObjectSource, *, scale: float = 1.0, name: str | None = None, keep_table: bool = False
+) -> ObjectModel:
     """Load an object by name, from a mesh or point cloud file, or from a mesh or points in memory.
 
     Args:
@@ -39,17 +41,20 @@ def load_object(source: ObjectSource, *, scale: float = 1.0, name: str | None = 
             trimesh mesh, cloud or scene, a pair (vertices, faces), or points (n 3), with normals (n 6).
         scale: Multiplies all coordinates; 0.001 for millimetres.
         name: What to call the object, instead of its own name.
+        keep_table: Take every point of a bare cloud for the object's. By default a table in it is found and cut off, said in a
+            note, and hands stay above it.
 
     Raises:
         ObjectError: The object does not exist, it is unusable, or `scale` is not positive.
     """
     if not (math.isfinite(scale) and scale > 0):
         raise ObjectError(f"scale is {scale}; give a positive number, for example --scale 0.001 for millimetres")
-    obj = _load(source, scale) if isinstance(source, str | Path) else object_in_memory(source, scale)
+    obj = (
+        _load(source, scale, keep_table) if isinstance(source, str | Path) else object_in_memory(source, scale, keep_table))
     return obj if name is None else replace(obj, name=name)
 
 
-def _load(name: str | Path, scale: float) -> ObjectModel:
+def _load(name: str | Path, scale: float, keep_table: bool) -> ObjectModel:
     text = str(name)
     if text in BUILTIN:
         return make_builtin(text, scale=scale)
@@ -60,7 +65,7 @@ def _load(name: str | Path, scale: float) -> ObjectModel:
     if path.is_dir():
         raise ObjectError(f"{path} is a folder; name one of its files, or use a command that takes folders")
     if path.exists() or path.suffix:
-        return replace(load_file(path, scale=scale), file=str(path.resolve()), scale=scale)
+        return replace(load_file(path, scale=scale, keep_table=keep_table), file=str(path.resolve()), scale=scale)
     raise ObjectError(_unknown(text))
 
 

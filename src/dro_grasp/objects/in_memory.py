@@ -23,7 +23,7 @@ ORIGIN = "the given object"
 """What messages call it."""
 
 
-def object_in_memory(source: Any, scale: float = 1.0) -> ObjectModel:
+def object_in_memory(source: Any, scale: float = 1.0, keep_table: bool = False) -> ObjectModel:
     """An object from a trimesh mesh, cloud or scene, from (vertices, faces), or from points (n 3) or with normals (n 6).
 
     Raises:
@@ -33,7 +33,8 @@ def object_in_memory(source: Any, scale: float = 1.0) -> ObjectModel:
         unit = trimesh.units.unit_conversion(source.units, "meters") if source.units else 1.0
         geometry = merge_scene(source) if isinstance(source, trimesh.Scene) else source
         if isinstance(geometry, trimesh.PointCloud):
-            return cloud_object("cloud", np.asarray(geometry.vertices, np.float64), origin=ORIGIN, scale=scale * unit)
+            points, scale = np.asarray(geometry.vertices, np.float64), scale * unit
+            return cloud_object("cloud", points, origin=ORIGIN, scale=scale, keep_table=keep_table)
         return mesh_object("mesh", geometry, origin=ORIGIN, scale=scale * unit)
     if isinstance(source, tuple) and len(source) == 2:
         vertices, faces = _numbers(source[0]), _numbers(source[1])
@@ -45,7 +46,8 @@ def object_in_memory(source: Any, scale: float = 1.0) -> ObjectModel:
         mesh = trimesh.Trimesh(vertices, faces, process=False)
         return mesh_object("mesh", mesh, origin=ORIGIN, scale=scale)
     if isinstance(source, np.ndarray | Tensor):
-        return cloud_object("cloud", _numbers(source).astype(np.float64), origin=ORIGIN, scale=scale)
+        points = _numbers(source).astype(np.float64)
+        return cloud_object("cloud", points, origin=ORIGIN, scale=scale, keep_table=keep_table)
     raise ObjectError(f"an object cannot be loaded from a {type(source).__name__}; give a name, the path of a mesh or cloud, a "
                       "trimesh mesh, a pair (vertices, faces), or an array of points (n, 3)")
 

@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 from dro_grasp.errors import ObjectError
 from dro_grasp.files import given_path, reading
 from dro_grasp.geometry.mesh_files import open_mesh
+from dro_grasp.geometry.table_plane import above_plane, table_plane
 from dro_grasp.objects.cache import content_hash
 from dro_grasp.objects.cloud_files import CLOUD_SUFFIXES, read_cloud
 from dro_grasp.objects.convex_parts import Part
@@ -35,12 +36,13 @@ NEIGHBOURS = 16
 """Neighbours that estimate the normals of a bare cloud (ours)."""
 
 
-def load_file(path: Path, *, scale: float = 1.0) -> ObjectModel:
+def load_file(path: Path, *, scale: float = 1.0, keep_table: bool = False) -> ObjectModel:
     """Read a mesh in any format trimesh knows, or a point cloud (PLY without faces, NPY, PCD).
 
     Args:
         path: The file. A unit stated in it (glTF, 3MF, DAE) is honoured.
         scale: Multiplies all coordinates; 0.001 for files in millimetres that state no unit.
+        keep_table: As for `cloud_object`.
 
     Raises:
         ObjectError: The file cannot be used; the message says why and what to do.
@@ -51,7 +53,7 @@ def load_file(path: Path, *, scale: float = 1.0) -> ObjectModel:
                           "`dro-grasp objects` lists")
     geometry, unit = read_geometry(path)
     if isinstance(geometry, np.ndarray):
-        return cloud_object(path.stem, geometry * unit, origin=str(path), scale=scale)
+        return cloud_object(path.stem, geometry * unit, origin=str(path), scale=scale, keep_table=keep_table)
     if unit != 1.0:
         geometry.apply_scale(unit)
     return mesh_object(path.stem, geometry, origin=str(path), scale=scale)
@@ -131,8 +133,17 @@ def mesh_object(
     )
 
 
-def cloud_object(name: str, points: Num[np.ndarray, "..."], *, origin: str, scale: float = 1.0) -> ObjectModel:
+def cloud_object(
+    name: str, points: Num[np.ndarray, "..."], *, origin: str, scale: float = 1.0, keep_table: bool = False
+) -> ObjectModel:
     """An object from a bare point cloud (n 3), or a cloud with normals (n 6); only the points are scaled.
+
+    Args:
+        name: What to call it.
+        points: The cloud.
+        origin: Source of the cloud, for messages.
+        scale: Multiplies all coordinates.
+        keep_table: Take every point for the object's, also those of a table.
 
     Raises:
         ObjectError: Another shape, NaN, too few distinct points, or an implausible size in metres.
@@ -143,7 +154,11 @@ def cloud_object(name: str, points: Num[np.ndarray, "..."], *, origin: str, scal
     bad = int((~np.isfinite(points)).any(1).sum())
     if bad:
         raise ObjectError(f"{origin} has {bad} points with NaN or infinite coordinates; remove them first")
-    xyz = points[:, :3] * scale
+    xyz, total = points[:, :3] * scale, len(points)
+    table = None if keep_table else table_plane(xyz)
+    if table is not None:
+        kept = above_plane(xyz, table)
+        xyz, points = xyz[kept], points[kept]
     keep = np.random.default_rng(0).permutation(len(xyz))[:CLOUD_POINTS]
     distinct = len(np.unique(xyz[keep].round(6), axis=0))
     if len(xyz) and np.ptp(xyz, axis=0).max() > 0:
@@ -159,13 +174,22 @@ def cloud_object(name: str, points: Num[np.ndarray, "..."], *, origin: str, scal
         raise ObjectError(f"{origin} has vectors of length {length.min():.3g} to {length.max():.3g} in its columns 4 to 6, "
                           "which are no normals; expected unit normals, or (n, 3) points alone: normals are then estimated")
     normals = given / length if has_normals else estimate_normals(cloud)
+    cut = () if table is None else (table_note(table, total - len(points), total),)
     fewer = f", {CLOUD_POINTS} of them kept" if len(points) > CLOUD_POINTS else ""
     estimated = "" if has_normals else "; normals were estimated"
     return ObjectModel(
         name=name, cloud=cloud, cloud_normals=np.ascontiguousarray(normals, np.float32),
         centre_of_mass=cloud.mean(0, dtype=np.float64), sha256=content_hash(cloud),
-        notes=(f"bare point cloud of {len(points)} points{fewer}{estimated}: no trial is possible without a mesh",),
+        table=table,
+        notes=(f"bare point cloud of {len(points)} points{fewer}{estimated}: no trial is possible without a mesh", *cut),
     )
+
+
+def table_note(table: Float[np.ndarray, "4"], removed: int, total: int) -> str:
+    """What to say of a table that was cut off."""
+    x, y, z, height = (round(float(value), 3) + 0.0 for value in table)
+    return (f"a table was found in the cloud (all points where {x:g} x + {y:g} y + {z:g} z = {height:g} m) and {removed} of "
+            f"{total} points were cut off with it; hands stay above it. Keep them with --keep-table, keep_table=True in Python")
 
 
 def estimate_normals(

@@ -45,6 +45,8 @@ class ObjectModel:
     """Volume [m^3]; 0 for a bare cloud."""
     inertia: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
     """Inertia about the centre of mass at unit density [m^5]."""
+    table: Float[np.ndarray, "4"] | None = None
+    """Plane that a bare cloud was cut from: upward unit normal, and height along it [m]."""
     notes: tuple[str, ...] = ()
     """Findings and repairs of the loader."""
     split: str | None = None

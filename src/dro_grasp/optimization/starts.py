@@ -17,7 +17,7 @@ from dro_grasp.hands.hand import Hand
 
 Direction = tuple[float, float, float]
 """A vector in the object's frame, of any length but zero."""
-CLEAR = 0.003
+CLEAR = 0.005
 """Distance from its surroundings at which a hand starts [m] (ours)."""
 LARGEST_TILT = math.radians(60.0)
 """How far palms tilt from the wanted direction towards a plane, where the hand needs room [rad] (ours)."""

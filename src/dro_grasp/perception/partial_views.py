@@ -40,9 +40,9 @@ def partial_view(obj: ObjectModel, view: View, seed: int, camera: DepthCamera | 
         return obj
     name = f"{obj.name}, {view} seen"
     if view == "cloud":
-        return cloud_object(name, np.concatenate([obj.cloud, obj.cloud_normals], 1), origin=name)
+        return cloud_object(name, np.concatenate([obj.cloud, obj.cloud_normals], 1), origin=name, keep_table=True)
     both = complete_cloud(*visible_side(obj, view, seed, camera))
-    return cloud_object(name, np.concatenate([both.points, both.normals], 1), origin=name)
+    return cloud_object(name, np.concatenate([both.points, both.normals], 1), origin=name, keep_table=True)
 
 
 def visible_side(
@@ -54,7 +54,7 @@ def visible_side(
     """
     generator = torch.Generator().manual_seed(seed)
     if view == "half":
-        half = cloud_object(obj.name, obj.sample_partial(POINTS, generator).numpy(), origin=obj.name)
+        half = cloud_object(obj.name, obj.sample_partial(POINTS, generator).numpy(), origin=obj.name, keep_table=True)
         return half.cloud.astype(np.float64), half.cloud_normals.astype(np.float64), None
     direction = torch.nn.functional.normalize(torch.randn(3, generator=generator), dim=0)
     camera = camera or DepthCamera()

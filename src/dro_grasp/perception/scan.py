@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,8 @@ from jaxtyping import Bool, Float, Num
 from scipy.spatial import KDTree
 
 from dro_grasp.errors import ObjectError
-from dro_grasp.objects.loading import check_extent, cloud_object, estimate_normals, read_points
+from dro_grasp.geometry.table_plane import above_plane, table_plane
+from dro_grasp.objects.loading import check_extent, cloud_object, estimate_normals, read_points, table_note
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
 from dro_grasp.perception.completion import complete_cloud
 
@@ -50,18 +52,20 @@ def depth_points(
     return (rays / rays[2] * z).T
 
 
-def load_scan(path: Path, T_frame_camera: Float[np.ndarray, "4 4"], scale: float = 1.0) -> ObjectModel:
+def load_scan(
+    path: Path, T_frame_camera: Float[np.ndarray, "4 4"], scale: float = 1.0, keep_table: bool = False
+) -> ObjectModel:
     """The object in a cloud file (PLY, NPY, PCD) in the camera's frame, times `scale`; see `scanned_object`.
 
     Raises:
         ObjectError: The file holds no cloud, or none of an object's size.
     """
-    return scanned_object(path.stem, read_points(path) * scale, T_frame_camera)
+    return scanned_object(path.stem, read_points(path) * scale, T_frame_camera, keep_table=keep_table)
 
 
 def scanned_object(
     name: str, points: Float[np.ndarray, "n 3"], T_frame_camera: Float[np.ndarray, "4 4"] | None = None, denoise: bool = True,
-    complete: bool = True,
+    complete: bool = True, keep_table: bool = False,
 ) -> ObjectModel:
     """An object from the points of a camera at the origin; its grasps are in the given frame.
 
@@ -71,12 +75,18 @@ def scanned_object(
             are given; the camera's own frame by default.
         denoise: Drop outliers.
         complete: Add the unseen side; switch it off for a scan from all sides.
+        keep_table: Take every point for the object's. By default a table in the cloud is found and cut off, said in a note, and
+            hands stay above it.
 
     Raises:
         ObjectError: Too few points are left, they are not in metres, or some lie behind the camera.
     """
     kept = np.asarray(points, np.float64)
-    kept = kept[np.isfinite(kept).all(1)]
+    kept, camera = kept[np.isfinite(kept).all(1)], np.zeros(3)
+    total, table = len(kept), None if keep_table else table_plane(kept, camera)
+    if table is not None:
+        kept = kept[above_plane(kept, table)]
+    cut = total - len(kept)
     if len(kept) > CLOUD_POINTS:
         kept = kept[np.random.default_rng(0).permutation(len(kept))[:CLOUD_POINTS]]
     if denoise and len(kept) > NEIGHBOURS:
@@ -87,15 +97,18 @@ def scanned_object(
     if float((kept @ kept.mean(0)).min()) <= 0:
         raise ObjectError(f"{name} has points behind the camera, which is at the cloud's origin; give the cloud in the "
                           "camera's frame")
-    camera = np.zeros(3)
     normals = estimate_normals(kept.astype(np.float32), camera).astype(np.float64)
     if complete:
         up = None if T_frame_camera is None else T_frame_camera[2, :3].astype(np.float64)
         kept, normals, _ = complete_cloud(kept, normals, camera, up)
     if T_frame_camera is not None:
-        R = T_frame_camera[:3, :3]
-        kept, normals = kept @ R.T + T_frame_camera[:3, 3], normals @ R.T
-    return cloud_object(name, np.concatenate([kept, normals], 1), origin=name)
+        R, t = T_frame_camera[:3, :3], T_frame_camera[:3, 3]
+        kept, normals = kept @ R.T + t, normals @ R.T
+        if table is not None:
+            up = R @ table[:3]
+            table = np.append(up, table[3] + up @ t)
+    obj = cloud_object(name, np.concatenate([kept, normals], 1), origin=name, keep_table=True)
+    return obj if table is None else replace(obj, table=table, notes=(*obj.notes, table_note(table, cut, total)))
 
 
 def without_outliers(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:

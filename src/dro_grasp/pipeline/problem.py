@@ -88,7 +88,7 @@ class GraspProblem:
     @cached_property
     def _default_energy(self) -> GraspEnergy:
         return GraspEnergy.of_object(
-            self.hand, self.obj, device=self.device, surroundings=self.constraints.surroundings())
+            self.hand, self.obj, device=self.device, surroundings=self.constraints.surroundings(self.obj))
 
     def thinned(self, count: int) -> Hand:
         """The hand with `count` surface points, on the device.

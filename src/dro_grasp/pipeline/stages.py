@@ -27,6 +27,8 @@ FARTHEST_DIRECTION = math.radians(20.0)
 
 STARTS_PER_CANDIDATE = 4
 """Grasps that are optimised for each candidate; those of lowest energy are kept (ours)."""
+LEAST_CLEARANCE = 0.002
+"""Least distance of a hand's surface points to its surroundings [m] (ours); its corners come up to 2 mm nearer."""
 
 
 def complete(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
@@ -137,4 +139,4 @@ def clear(problem: GraspProblem, grasps: GraspBatch) -> Bool[Tensor, " n"]:
         return torch.ones(len(grasps), dtype=torch.bool)
     T = grasps.T_object_wrist.to(problem.device)
     postures = (grasps.pregrasp_joints, grasps.joints, grasps.squeeze_joints)
-    return torch.stack([near.distance(T, q.to(problem.device)) for q in postures]).amin(0).cpu() > 0
+    return torch.stack([near.distance(T, q.to(problem.device)) for q in postures]).amin(0).cpu() > LEAST_CLEARANCE

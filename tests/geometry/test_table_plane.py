@@ -1,0 +1,59 @@
+"""Tables in clouds: found where there is one, with its pose known, and nowhere else."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dro_grasp.geometry.table_plane import THICKNESS, above_plane, table_plane
+from dro_grasp.objects.catalogue import load_object
+
+
+def on_table(name: str, side: float, noise: float = 0.001) -> tuple[np.ndarray, int]:
+    """An object on a square table at its foot, with its number of points; the object comes first."""
+    rng = np.random.default_rng(0)
+    obj = load_object(name).cloud[::8].astype(np.float64)
+    table = np.column_stack([rng.uniform(-side / 2, side / 2, (3000, 2)), np.full(3000, obj[:, 2].min())])
+    points = np.concatenate([obj, table])
+    return points + rng.normal(0, noise, points.shape), len(obj)
+
+
+@pytest.mark.parametrize("name", ["soap", "mug", "cube", "wrench"])
+def test_a_table_is_found_in_any_pose(name: str) -> None:
+    points, own = on_table(name, 0.5)
+    R, t = Rotation.random(random_state=3).as_matrix(), np.array([0.3, -0.2, 0.7])
+    plane = table_plane(points @ R.T + t)
+    assert plane is not None
+    assert np.degrees(np.arccos(np.clip(plane[:3] @ R[:, 2], -1, 1))) < 2
+    foot = R @ [0, 0, load_object(name).cloud[:, 2].min()] + t
+    assert abs(foot @ plane[:3] - plane[3]) < 0.003  # [m]
+    kept = above_plane(points @ R.T + t, plane)
+    higher = points[:own, 2] > points[:own, 2].min() + 3 * THICKNESS
+    assert kept[:own][higher].all()
+    assert kept[own:].mean() < 0.001
+
+
+def test_a_table_is_seen_from_above() -> None:
+    points, _ = on_table("mug", 0.5)
+    above = table_plane(points, np.array([0.2, 0.0, 1.0]))
+    assert above is not None
+    assert above[2] > 0.99
+    assert table_plane(points, np.array([0.2, 0.0, -1.0])) is None
+
+
+@pytest.mark.parametrize("name", ["flat_box", "soap", "bowl", "tin", "toy_airplane", "wine_glass"])
+def test_no_object_is_a_table(name: str) -> None:
+    cloud = load_object(name).cloud.astype(np.float64)
+    assert table_plane(cloud) is None
+    for axis in range(3):
+        half = cloud[cloud[:, axis] > np.median(cloud[:, axis])]
+        assert table_plane(half) is None
+
+
+def test_too_little_is_no_table() -> None:
+    assert table_plane(np.zeros((100, 3))) is None
+    assert table_plane(np.zeros((3, 3))) is None
+    rng = np.random.default_rng(0)
+    flat = np.column_stack([rng.uniform(-0.2, 0.2, (500, 2)), np.zeros(500)])
+    assert table_plane(flat) is None, "nothing stands on it"
