@@ -51,8 +51,8 @@ class Constraints:
         if abs(height - self.table) < ELSEWHERE and float(found[2]) > UPRIGHT:
             return None
         x, y, z, distance = (f"{float(value):.3g}" for value in obj.table)
-        return (f"table is z = {self.table:g} m, but the table in the cloud is where {x} x + {y} y + {z} z = {distance} m. "
-                "Leave out table, which takes the one in the cloud; or, if the cloud is in a camera's frame, give the camera's pose")
+        return (f"table is z = {self.table:g} m, but the table in the cloud is where {x} x + {y} y + {z} z = {distance} "
+                "m. Leave out table, which takes the one in the cloud; or, if the cloud is a camera's, give the camera's pose")
 
     def surroundings(self, obj: ObjectModel) -> Surroundings | None:
         """What the hand stays clear of around an object; None for nothing."""
