@@ -111,6 +111,9 @@ def mesh_object(
     """
     notes: list[str] = []
     vertices, faces = np.asarray(mesh.vertices, np.float64) * scale, np.asarray(mesh.faces, np.int64)
+    if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
+        raise ObjectError(f"{origin} has vertices {vertices.shape} and faces {faces.shape}; expected triangles in space: "
+                          "export it again")
     _check_numbers(vertices, faces, origin)
     used = np.bincount(faces.ravel(), minlength=len(vertices)) > 0
     check_extent(vertices[used], origin, scale)
