@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -162,7 +163,7 @@ def test_generate_reports_and_saves_what_it_counts(generate, tmp_path: Path) -> 
     report = generate("--output", str(path), method="auto")
     assert report.keys() >= KEYS
     assert set(report["seconds"]) == {
-        "start", "load", "network", "decode", "optimise", "refine", "rank", "trial", "files", "total"}
+        "start", "load", "network", "decode", "optimise", "refine", "settle", "rank", "trial", "files", "total"}
     parts = sum(value for name, value in report["seconds"].items() if name != "total")
     assert 0.8 * report["seconds"]["total"] < parts <= report["seconds"]["total"] + 0.01
     assert (report["num"], report["protocol"]) == (3, "strict")
@@ -398,4 +399,4 @@ def test_verify_prints_no_empty_table(weights: str, tmp_path: Path, capsys: pyte
     assert said.out == ""
     assert "bad.safetensors" in said.err
     assert main(["weights", "verify", str(tmp_path / "bad.safetensors"), weights]) == 2
-    assert "sha256" in capsys.readouterr().out
+    assert capsys.readouterr().out == f"{sha256(Path(weights).read_bytes()).hexdigest()}  {weights}: ok\n"

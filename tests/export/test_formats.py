@@ -194,7 +194,7 @@ def test_missing_pregrasps_are_made(grasps: GraspBatch, tmp_path: Path) -> None:
         ('{"frame": "a", "T_frame_object": [[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]}', "not a rotation"),
         ('{"frame": "a", "T_frame_object": [[-1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}', "not a rotation"),
         ('{"frame": "a", "T_frame_object": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[1,0,0,1]]}', "last row"),
-        (None, "it does not"),
+        (None, "no such file"),
     ],
 )
 def test_a_frame_that_is_none_is_refused(

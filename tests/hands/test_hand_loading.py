@@ -55,8 +55,8 @@ READER = '<!DOCTYPE r [<!ENTITY a SYSTEM "file:///etc/passwd">]>'
               + joint("b", "palm", "right", "0 0 0", more=LIMIT + '<mimic joint="a"/>')), "cycle (a -> b -> a)"),
         (claw(joints=joint("a", "palm", "left", "0 0 0") + joint("a", "palm", "right", "0 0 0")), "two joints are called 'a'"),
         (claw(link("left")), "two links are called 'left'"),
-        (claw(joints=joint("a", "palm", "left", "nan 0 0") + joint("b", "palm", "right", "0 0 0")), "link 'left' is not"),
-        (claw(links=link("left").replace("0 0 0.03", "0 inf 0") + link("right")), "link 'left' is not"),
+        (claw(joints=joint("a", "palm", "left", "nan 0 0") + joint("b", "palm", "right", "0 0 0")), "of link 'left' is nan"),
+        (claw(links=link("left").replace("0 0 0.03", "0 inf 0") + link("right")), "of link 'left' is 0 inf"),
         (claw(links=link("left", '<sphere radius="big"/>') + link("right")), "link 'left' has radius=\"big\""),
     ],
 )

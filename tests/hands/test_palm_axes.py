@@ -13,6 +13,8 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import BUILTIN_FOLDER, load_hand
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.pipeline.constraints import Constraints
+from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.proposal import ProposalConfig, _placements
 from tests.helpers.bracket_hand import bracket_hand, bracket_urdf
 from tests.helpers.claw_urdf import joint, written
@@ -85,7 +87,8 @@ def test_placements_put_the_grasp_centre_where_the_prior_says(
 
     monkeypatch.setattr(network, "sample_placements", sample)
     points = torch.from_numpy(obj.cloud)
-    T = _placements(hand, network, points, 5, (0.0, 1.0, 0.0), ProposalConfig(), torch.Generator().manual_seed(0))
+    problem = GraspProblem(hand, obj, constraints=Constraints(direction=(0.0, 1.0, 0.0)))
+    T = _placements(problem, hand, network, points, 5, ProposalConfig(), torch.Generator().manual_seed(0))
     axes = T[:, :3, :3] @ (hand.palm_axes_wrist if frame == "palm" else torch.eye(3))
     torch.testing.assert_close(hand.grasp_centres(T), points.mean(0) + (axes @ offset), atol=1e-5, rtol=0)
     assert float(hand.palm_directions(T)[:, 1].min()) > 0.9

@@ -19,7 +19,10 @@ from dro_grasp.geometry.se3 import apply_to_cloud
 from dro_grasp.hands.hand import Hand
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.models.presets import PRESETS, NetworkConfig
+from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.starts import Direction
+from dro_grasp.pipeline.constraints import Constraints
+from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.proposal import ProposalConfig, _placements
 from dro_grasp.training import loop
 from dro_grasp.training.config import AugmentationConfig, LossConfig, PretrainConfig, TrainConfig
@@ -89,7 +92,8 @@ def test_nothing_is_learned_about_placements(bundle: Bundle, tmp_path: Path, mon
 def test_wrists_are_turned_at_random_or_face_the_direction(direction: Direction | None) -> None:
     network, hand = DistanceNetwork(PAPER), loaded_hand("leaphand").with_points(PAPER.n_hand)
     cloud = torch.rand(60, 3) * torch.tensor([0.2, 0.02, 0.05])
-    T = _placements(hand, network, cloud, COUNT, direction, ProposalConfig(), torch.Generator().manual_seed(0))
+    problem = GraspProblem(hand, load_object("sphere"), constraints=Constraints(direction=direction))
+    T = _placements(problem, hand, network, cloud, COUNT, ProposalConfig(), torch.Generator().manual_seed(0))
     torch.testing.assert_close(hand.grasp_centres(T), cloud.mean(0).expand(COUNT, 3), atol=1e-5, rtol=0)
     facing = hand.palm_directions(T)
     if direction is None:  # each coordinate of a uniform direction is uniform, and so is that of any other axis of the hand

@@ -88,11 +88,18 @@ def check_numbers(model: mujoco.MjModel, path: Path) -> None:
         bad = np.flatnonzero(~(np.abs(values) <= largest).all(1))
         if len(bad):
             raise HandError(f"{path}: the {what} of {_owner(model, kind, int(bad[0]))} is {_told(values[bad[0]])}; expected "
-                            f"finite numbers of at most {largest:g}, in metres, radians and kilograms")
+                            f"finite numbers of at most {largest:g}, in metres, radians and kilograms"
+                            f"{_hint(values[bad[0]], largest)}")
     for j in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE):
         if np.abs(model.jnt_range[j]).max() > LONGEST:
             raise HandError(f"{path}: the limits of joint '{model.joint(j).name}' are {_told(model.jnt_range[j])} m; expected "
                             f"at most {LONGEST:g} m")
+
+
+def _hint(values: Float[np.ndarray, " n"], largest: float) -> str:
+    """What lengths beyond all bounds may be, if they are finite."""
+    metres = largest == LONGEST and np.isfinite(values).all()
+    return "; this looks like millimetres: scale the file by 0.001" if metres else ""
 
 
 def _owner(model: mujoco.MjModel, kind: str, index: int) -> str:

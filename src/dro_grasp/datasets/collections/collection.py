@@ -53,7 +53,7 @@ def read_collection(path: Path | str, only_successful: bool = True) -> Iterator[
         raise GraspFileError(f"no grasps at {path}: expected a .parquet file, a folder of them, or a folder that "
                              "`dro-grasp synthesize` filled")
     for pair in pairs:
-        yield replace(pair, grasps=pair.grasps[pair.grasps.success]) if only_successful else pair
+        yield replace(pair, grasps=pair.grasps[pair.grasps.success.nonzero()[:, 0]]) if only_successful else pair
 
 
 def count_collection(path: Path | str) -> dict[str, dict[str, int]]:
