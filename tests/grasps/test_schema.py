@@ -15,7 +15,7 @@ import torch
 from dro_grasp.datasets.collections.collection import count_collection
 from dro_grasp.errors import GraspFileError
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.columns import CAMERA, FRAME
+from dro_grasp.grasps.columns import CAMERA, FRAME, OBJECT_SCALE
 from dro_grasp.grasps.table import METADATA_KEY, read_footer
 from tests.helpers.tiny_bundle import made_up_grasps
 from tests.helpers.toy_hand import toy_hand
@@ -72,3 +72,7 @@ def test_columns_of_other_types_are_refused(tmp_path: Path, columns: dict[str, A
 def test_yields_that_are_no_counts_are_refused(tmp_path: Path, yields: Any) -> None:
     with pytest.raises(GraspFileError, match="yields"):
         count_collection(written(tmp_path / "g.parquet", {"notes": {"yields": yields}}))
+
+
+def test_a_scale_that_is_not_stated_is_none(tmp_path: Path) -> None:
+    assert OBJECT_SCALE not in GraspBatch.load(written(tmp_path / "g.parquet", columns={OBJECT_SCALE: pa.nulls(2)})).extra

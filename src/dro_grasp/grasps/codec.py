@@ -16,7 +16,7 @@ from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.geometry import se3
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.grasps import columns
-from dro_grasp.grasps.columns import CAMERA, FRAME
+from dro_grasp.grasps.columns import CAMERA, FRAME, OBJECT_SCALE
 from dro_grasp.grasps.table import fixed_column, float_column, floats
 
 REQUIRED = ("object", "wrist_position", "wrist_quaternion_wxyz", "joints")
@@ -85,6 +85,8 @@ def decode(table: pa.Table, header: dict[str, Any], path: str) -> dict[str, Any]
         fields |= _energy_apart(fields["score"], fields["provenance"], table)
     known = {*columns.COLUMNS, *REQUIRED}
     extra = {name: _decode_further(table[name]) for name in table.column_names if name not in known}
+    if not isinstance(extra.get(OBJECT_SCALE), Tensor):  # null for every grasp
+        extra.pop(OBJECT_SCALE, None)
     _check_frames(extra, path)
     seed = [s or 0 for s in table["seed"].to_pylist()] if "seed" in table.column_names else [0] * n
     return {

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from dro_grasp.descriptions.link_geometry import LinkGeometry
 from dro_grasp.descriptions.loader import Description
+from dro_grasp.errors import HandError
 from dro_grasp.geometry import se3
 from dro_grasp.geometry.point_clouds import sample_surface
 from dro_grasp.kinematics.tree import KinematicTree
@@ -49,13 +50,21 @@ class LinkSurface:
 
 
 def sample_links(description: Description, links: list[int], seed: int) -> LinkSurface:
-    """Dense samples on the collision shapes as MuJoCo uses them, or on the visual shapes of links without any."""
+    """Dense samples on the collision shapes as MuJoCo uses them, or on the visual shapes of links without any.
+
+    Raises:
+        HandError: The shapes of a link have no area.
+    """
     generator = torch.Generator().manual_seed(seed)
     points, normals, index = [], [], []
     for link in links:
         shapes = [g for g in description.geometry if g.link == link]
         shapes = [g for g in shapes if g.collides] or shapes
-        p, n = _sample_shapes(shapes, generator)
+        try:
+            p, n = _sample_shapes(shapes, generator)
+        except ValueError as error:
+            raise HandError(f"{description.path}: the shapes of link '{description.tree.link_names[link]}' have no area; give "
+                            "it a shape that is not flat in two directions") from error
         points.append(p)
         normals.append(n)
         index.append(torch.full((len(p),), link))
