@@ -190,16 +190,8 @@ class GraspPredictor:
         pool = _Pool(problem, request, watch)
         if request.method != "optimise":
             self._ask_network(pool, progress)
-            pool.settle()
-        each = OPTIMISED_PER_GRASP if problem.surroundings is None else OPTIMISED_IN_SURROUNDINGS
-        for turn, trusted in enumerate((TRUSTED_SCORE, DOUBTED_SCORE)):
-            if request.method != "network" and (count := each * pool.lacking(trusted)):
-                with watch("optimise"):
-                    grasps = optimise(problem, count, request.seed + turn, progress)
-                    hand = problem.thinned(self.network.config.n_hand).to("cpu")
-                    proposal = Proposal(grasps, hand.points(grasps.joints, grasps.T_object_wrist))
-                pool.add(proposal)
-                pool.settle()
+        if request.method != "network":
+            self._ask_optimiser(pool, progress)
         return pool.best()
 
     def _ask_network(self, pool: _Pool, progress: Progress | None) -> None:
@@ -211,6 +203,20 @@ class GraspPredictor:
             pool.add(propose(pool.problem, self.network, wanted, generator, config, pool.watch, progress), wanted)
             if len(pool) >= wanted or len(pool) < config.least_yield * pool.made:
                 break
+        pool.settle()
+
+    def _ask_optimiser(self, pool: _Pool, progress: Progress | None) -> None:
+        """Rivals for each grasp that the score does not trust, and once more for each that it still doubts."""
+        problem, request = pool.problem, pool.request
+        each = OPTIMISED_PER_GRASP if problem.surroundings is None else OPTIMISED_IN_SURROUNDINGS
+        hand = problem.thinned(self.network.config.n_hand).to("cpu")
+        for number, least_score in enumerate((TRUSTED_SCORE, DOUBTED_SCORE)):
+            if not (count := each * pool.lacking(least_score)):
+                break
+            with pool.watch("optimise"):
+                grasps = optimise(problem, count, request.seed + number, progress)
+            pool.add(Proposal(grasps, hand.points(grasps.joints, grasps.T_object_wrist)))
+            pool.settle()
 
 
 class _Pool:
@@ -248,10 +254,10 @@ class _Pool:
             self.grasps[fresh], self.proposals[fresh] = [grasps], [Proposal.concatenate(self.proposals[fresh])[best]]
         self.settled = len(self.grasps)
 
-    def lacking(self, trusted: float) -> int:
-        """How many of the grasps that were asked for are missing, or score no better than this."""
+    def lacking(self, least_score: float) -> int:
+        """How many of the grasps that were asked for are missing, or score no better than `least_score`."""
         scores = torch.cat([torch.zeros(0), *(g.score for g in self.grasps)])
-        return max(0, self.request.num - int((scores > trusted).sum()))
+        return max(0, self.request.num - int((scores > least_score).sum()))
 
     def best(self) -> Prediction:
         """The best grasps by score.

@@ -126,12 +126,12 @@ def test_controls_are_refined_and_settled_as_the_networks_grasps_are(monkeypatch
     monkeypatch.setattr(module, "refine", stage("refine"))
     monkeypatch.setattr(module, "scored", stage("score"))
     monkeypatch.setattr(module, "can_settle", lambda problem: True)
-    monkeypatch.setattr(module, "best_settled", lambda problem, grasps, least: (None, done.append("settle") or grasps))
+    monkeypatch.setattr(module, "best_settled", lambda problem, grasps, least: (None, done.append(f"settle {least}") or grasps))
     names = (MEAN, MEAN_CHOSEN, START, SYNTHESISED)
     made = {name: lambda num, seed: made_up_grasps(HAND, count=num, seed=seed) for name in names}
-    makers = control_makers(GraspProblem(HAND, load_object("sphere")), made)
+    makers = control_makers(GraspProblem(HAND, load_object("sphere")), made, 2)
     assert set(makers) == {MEAN_CHOSEN, START, SYNTHESISED}
     for make in makers.values():
         done.clear()
         assert len(make(3, 1)) == 3
-        assert done == ["refine", "score", "settle"]
+        assert done == ["refine", "score", "settle 2"]

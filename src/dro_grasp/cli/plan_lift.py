@@ -104,6 +104,7 @@ class Plan:
         import numpy as np
 
         from dro_grasp.errors import OptionError
+        from dro_grasp.files import given_path
         from dro_grasp.frames import read_motion
         from dro_grasp.objects.catalogue import load_object
         from dro_grasp.perception.scan import load_scan
@@ -118,7 +119,7 @@ class Plan:
                 raise OptionError(f"robot '{robot.name}' has no camera; state it in the robot file, or give --camera JSON")
             else:
                 camera = robot.camera.T_world_camera
-            return load_scan(Path(self.object).expanduser(), camera), T
+            return load_scan(given_path(self.object), camera), T
         obj = load_object(self.object)
         if self.pose is not None:
             T = read_motion(self.pose, "T_frame_object").T.double().numpy()

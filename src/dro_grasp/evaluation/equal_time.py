@@ -93,13 +93,13 @@ def network_maker(problem: GraspProblem, predictor: GraspPredictor) -> Maker:
         problem, GraspRequest(math.ceil(num / 2), seed, candidates=2, method="network")).grasps
 
 
-def control_makers(problem: GraspProblem, controls: Mapping[str, Maker]) -> dict[str, Maker]:
-    """Candidates of each control, refined, and the better half settled; the mean grasp is always a chosen one."""
+def control_makers(problem: GraspProblem, controls: Mapping[str, Maker], keep: int) -> dict[str, Maker]:
+    """Candidates of each control, refined, and the better half settled, `keep` at least; the mean grasp is a chosen one."""
 
     def finished(make: Maker) -> Maker:
         def maker(num: int, seed: int) -> GraspBatch:
             grasps = scored(problem, refine(problem, make(num, seed)))
-            return best_settled(problem, grasps, 1)[1] if can_settle(problem) else grasps
+            return best_settled(problem, grasps, keep)[1] if can_settle(problem) else grasps
 
         return maker
 

@@ -9,6 +9,7 @@ import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.evaluation.controls import controls
@@ -142,7 +143,7 @@ def _measured(
         seconds = {part: value / keep for part, value in made.seconds.items()}
         yield BOTH, RETURNED, _evaluated(hand, obj, made.grasps, config, seconds, made.candidates)
     if EQUAL_TIME in config.stages:
-        makers = {NETWORK: network_maker(visible, predictor), **control_makers(problem, rivals)}
+        makers = {NETWORK: network_maker(visible, predictor), **control_makers(problem, rivals, keep)}
         for name, best in equal_time(makers, num, keep, seed).items():
             seconds = {"CPU": best.seconds / max(1, len(best.grasps))}
             yield name, EQUAL_TIME, _evaluated(hand, obj, best.grasps, config, seconds, best.candidates)
@@ -160,30 +161,39 @@ class _Source:
     """Time to make one of them, by part [s]."""
 
 
+class _Step(NamedTuple):
+    """A stage of all grasps of a source, which takes those of the stage before."""
+
+    stage: str
+    best: dict[str, int]
+    """Stages that keep the best of them by score, and how many."""
+    part: str = ""
+    """Name of its time."""
+    make: Callable[[GraspProblem, GraspBatch], GraspBatch] | None = None
+
+
 def _stages(source: _Source, obj: ObjectModel, config: BenchmarkConfig) -> Iterator[tuple[str, str, EvaluatedGrasps]]:
     """Those stages of a source that are asked for; what several of them share is made once."""
     asked = set(config.stages)
     problem, grasps, seconds = source.problem, source.grasps, source.seconds
     quarter = _quarter(len(grasps))
-    steps: list[tuple[str, dict[str, int], Callable[[GraspProblem, GraspBatch], GraspBatch] | None]] = [
-        (RAW, {RANKED: quarter}, None), (REFINED, {BEST: quarter, **TOP}, refine)]
+    steps = [_Step(RAW, {RANKED: quarter}), _Step(REFINED, {BEST: quarter, **TOP}, "refine", refine)]
     if can_settle(problem):
-        steps.append((SETTLED, {SETTLED_BEST: quarter}, _settle))
-    while steps and not asked & {steps[-1][0], *steps[-1][1]}:
-        steps.pop()
-    for whole, best, make in steps:
-        if make is not None:
+        steps.append(_Step(SETTLED, {SETTLED_BEST: quarter}, "settle", _settle))
+    last = max((i for i, step in enumerate(steps) if asked & {step.stage, *step.best}), default=-1)
+    for step in steps[: last + 1]:
+        if step.make is not None:
             begin = time.perf_counter()
-            grasps = make(problem, grasps)
-            seconds = seconds | {make.__name__.strip("_"): (time.perf_counter() - begin) / max(1, len(grasps))}
-        if not asked & {whole, *best}:
+            grasps = step.make(problem, grasps)
+            seconds = seconds | {step.part: (time.perf_counter() - begin) / max(1, len(grasps))}
+        if not asked & {step.stage, *step.best}:
             continue
         if grasps.score.isnan().any():
             grasps = scored(problem, grasps)
         evaluated = _evaluated(problem.hand, obj, grasps, config, seconds, config.num)
-        if whole in asked:
-            yield source.name, whole, evaluated
-        for stage, count in best.items():
+        if step.stage in asked:
+            yield source.name, step.stage, evaluated
+        for stage, count in step.best.items():
             if stage in asked:
                 yield source.name, stage, evaluated.rows(grasps.score.topk(min(count, len(grasps))).indices)
 

@@ -13,6 +13,7 @@ import yaml
 from jaxtyping import Float
 
 from dro_grasp.errors import RobotError
+from dro_grasp.files import given_path
 from dro_grasp.frames import motion_fault
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.rendering.camera import Camera
@@ -89,10 +90,9 @@ def locate_robot(name: str | Path) -> Path:
     Raises:
         RobotError: There is neither.
     """
-    builtin = BUILTIN_ROBOTS / f"{name}.yaml"
+    path, builtin = given_path(name), BUILTIN_ROBOTS / f"{name}.yaml"
     if "/" not in str(name) and builtin.is_file():
         return builtin
-    path = Path(name).expanduser()
     if not path.is_file():
         raise RobotError(f"no robot is called '{name}' and no file is there; give a robot.yaml, or one of "
                          f"{', '.join(robot_names())}")
@@ -121,7 +121,7 @@ def read_robot_file(path: Path) -> RobotFile:
     hand = str(values["hand"])
     beside = path.parent / hand
     return RobotFile(
-        path, str(values.get("name", path.stem)), path.parent / Path(str(values["arm"])).expanduser(),
+        path, str(values.get("name", path.stem)), path.parent / given_path(str(values["arm"])),
         str(beside) if beside.is_file() else hand, str(mount["link"]), read.pose(mount, "mount"),
         read.pose(read.mapping(values.get("base", {}), "base", POSE_KEYS), "base"),
         {str(k): read.number(v, f"home of joint {k}") for k, v in read.mapping(values["home"], "home").items()},

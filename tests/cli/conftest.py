@@ -1,0 +1,25 @@
+"""Untrained weights, and `generate` with them."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from dro_grasp.cli.main import main
+from tests.helpers.weights import untrained_weights
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return str(untrained_weights(tmp_path_factory.mktemp("weights")))
+
+
+@pytest.fixture
+def generate(weights: str, capsys: pytest.CaptureFixture[str]):
+    def run(*arguments: str, num: int = 3, name: str = "sphere", method: str = "network") -> dict:
+        base = ["generate", "--hand", "gripper3", "--object", name, "--weights", weights, "--num", str(num), "--json"]
+        assert main([*base, "--method", method, *arguments]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    return run

@@ -1,0 +1,152 @@
+"""`dro-grasp generate`: what it reports, saves and refuses. Weights are untrained throughout."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dro_grasp.cli.main import main
+from dro_grasp.grasps.batch import GraspBatch
+
+KEYS = {
+    "hand", "object", "num", "candidates", "origin", "seed", "weights", "protocol", "success", "success_rate", "seconds",
+    "output", "frame",
+}
+
+
+def test_saving_the_successful_without_a_trial_is_refused(weights: str, tmp_path: Path, capsys) -> None:
+    np.save(tmp_path / "cloud.npy", np.random.default_rng(0).normal(size=(500, 3)) * 0.02)
+    common = ["generate", "--hand", "gripper3", "--weights", weights, "--only-successful"]
+    common += ["--output", str(tmp_path / "a.parquet")]
+    for more in (["--object", "sphere", "--protocol", "none"], ["--object", str(tmp_path / "cloud.npy")]):
+        assert main([*common, *more]) == 2
+        assert "name a --protocol" in capsys.readouterr().err
+    assert not (tmp_path / "a.parquet").exists()
+
+
+def test_outputs_are_checked_before_the_work(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    def working(*_: object) -> None:
+        raise AssertionError("the work began")
+
+    monkeypatch.setattr("dro_grasp.hands.library.load_hand", working)
+    assert main(["generate", "--hand", "gripper3", "--object", "sphere", "--output", "nowhere/a.parquet"]) == 2
+    assert "nowhere" in capsys.readouterr().err
+
+
+def test_generate_reports_and_saves_what_it_counts(generate, tmp_path: Path) -> None:
+    path = tmp_path / "grasps.parquet"
+    report = generate("--output", str(path), method="auto")
+    assert report.keys() >= KEYS
+    assert set(report["seconds"]) == {
+        "start", "load", "network", "decode", "optimise", "refine", "settle", "rank", "trial", "files", "total"}
+    parts = sum(value for name, value in report["seconds"].items() if name != "total")
+    assert 0.8 * report["seconds"]["total"] < parts <= report["seconds"]["total"] + 0.01
+    assert (report["num"], report["protocol"]) == (3, "strict")
+    assert report["candidates"] >= 12  # four of the network for each, and those of the optimiser
+    assert report["success_rate"] == pytest.approx(report["success"] / 3)
+    grasps = GraspBatch.load(path)
+    assert len(grasps) == 3
+    assert int(grasps.success.sum()) == report["success"]
+    assert (grasps.score[:-1] >= grasps.score[1:]).all()
+    assert "predicted_points" not in grasps.extra
+
+
+def test_same_seed_same_grasps(generate, tmp_path: Path) -> None:
+    files = [tmp_path / f"{i}.parquet" for i in range(3)]
+    for file, seed in zip(files, (5, 5, 6), strict=True):
+        generate("--output", str(file), "--seed", str(seed), "--protocol", "none")
+    first, again, other = (GraspBatch.load(f).joints for f in files)
+    assert (first == again).all()
+    assert not (first == other).all()
+
+
+def test_only_successful_filters_the_file_never_the_rate(generate, tmp_path: Path) -> None:
+    path = tmp_path / "grasps.parquet"
+    report = generate("--output", str(path), "--only-successful", num=6)
+    assert report["num"] == 6
+    assert report["success_rate"] == pytest.approx(report["success"] / 6)
+    assert len(GraspBatch.load(path)) == report["success"]
+
+
+def test_bare_cloud_is_not_tried(generate, tmp_path: Path) -> None:
+    directions = np.random.default_rng(0).normal(size=(3000, 3))
+    np.save(tmp_path / "cloud.npy", 0.03 * directions / np.linalg.norm(directions, axis=1, keepdims=True))
+    report = generate(name=str(tmp_path / "cloud.npy"))
+    assert (report["protocol"], report["success"], report["success_rate"]) == ("none", None, None)
+
+
+def test_folder_of_objects_gets_a_file_each(generate, tmp_path: Path) -> None:
+    import trimesh
+
+    objects, results = tmp_path / "objects", tmp_path / "results"
+    objects.mkdir(), results.mkdir()
+    trimesh.creation.icosphere(radius=0.03).export(objects / "a.stl")
+    trimesh.creation.icosphere(radius=0.03).export(objects / "a.ply")
+    report = generate("--output", str(results), "--protocol", "none", name=str(objects))
+    assert [r["num"] for r in report["results"]] == [3, 3]
+    assert sorted(f.name for f in results.iterdir()) == ["a_ply.parquet", "a_stl.parquet"]
+
+
+def test_a_bad_object_in_a_folder_costs_only_its_own_grasps(
+    weights: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import trimesh
+
+    objects, results = tmp_path / "objects", tmp_path / "results"
+    objects.mkdir(), results.mkdir()
+    trimesh.creation.icosphere(radius=0.03).export(objects / "a.stl")
+    trimesh.creation.icosphere(radius=30.0).export(objects / "huge.stl")
+    trimesh.creation.box((0.05, 0.05, 0.05)).export(objects / "z.stl")
+    base = ["generate", "--hand", "gripper3", "--object", str(objects), "--weights", weights, "--num", "2"]
+    assert main([*base, "--method", "network", "--protocol", "none", "--output", str(results), "--json"]) == 2
+    said = capsys.readouterr()
+    report = json.loads(said.out)
+    assert [r["object"] for r in report["results"]] == ["a", "z"]
+    (failed,) = report["failed"]
+    assert failed["object"].endswith("huge.stl")
+    assert "too large" in failed["error"]
+    assert "huge.stl" in said.err
+    assert sorted(f.name for f in results.iterdir()) == ["a.parquet", "z.parquet"]
+
+
+def test_a_bad_camera_file_is_refused_once_for_all_objects(weights: str, tmp_path: Path, capsys) -> None:
+    for name in ("a.npy", "b.npy"):
+        np.save(tmp_path / name, np.zeros((3, 3)))
+    base = ["generate", "--hand", "gripper3", "--object", str(tmp_path), "--weights", weights]
+    assert main([*base, "--camera", str(tmp_path / "nowhere.json"), "--json"]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith("error: ")
+    assert said.err.count("nowhere.json must hold") == 1
+
+
+def test_folder_of_objects_needs_a_folder_for_results(weights: str, tmp_path: Path, capsys) -> None:
+    (tmp_path / "a.stl").write_text("")
+    (tmp_path / "b.stl").write_text("")
+    base = ["generate", "--hand", "gripper3", "--object", str(tmp_path), "--weights", weights]
+    assert main([*base, "--output", str(tmp_path / "nowhere")]) == 2
+    assert "no folder" in capsys.readouterr().err
+
+
+def test_table_keeps_hands_above_it(generate, tmp_path: Path) -> None:
+    from dro_grasp.hands.library import load_hand
+    from dro_grasp.objects.catalogue import load_object
+    from dro_grasp.pipeline.constraints import Constraints
+    from dro_grasp.pipeline.problem import GraspProblem
+    from dro_grasp.pipeline.stages import permitted
+
+    path = tmp_path / "grasps.parquet"
+    report = generate("--table", "-0.15", "--protocol", "none", "--output", str(path))
+    assert report["candidates"] >= report["num"] == report["asked"] == 3
+    assert report["shortage"] is None
+    problem = GraspProblem(load_hand("gripper3"), load_object("sphere"), constraints=Constraints(table=-0.15))
+    assert permitted(problem, GraspBatch.load(path)).all()
+
+
+def test_impossible_table_says_so(weights: str, capsys: pytest.CaptureFixture[str]) -> None:
+    base = ["generate", "--hand", "gripper3", "--object", "sphere", "--weights", weights, "--num", "2"]
+    assert main([*base, "--table", "5"]) == 2
+    assert "leaves nothing of the object" in capsys.readouterr().err

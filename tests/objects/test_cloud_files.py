@@ -1,0 +1,166 @@
+"""Bare clouds: read from files, refused, thinned, and given normals."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from dro_grasp.errors import ObjectError
+from dro_grasp.objects.loading import MIN_CLOUD, estimate_normals, load_file
+from dro_grasp.objects.shape import CLOUD_POINTS
+
+
+def directions(count: int, seed: int = 0) -> np.ndarray:
+    points = np.random.default_rng(seed).normal(size=(count, 3))
+    return points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+def test_cloud_from_npy(tmp_path: Path):
+    np.save(tmp_path / "c.npy", 0.04 * directions(3000))
+    obj = load_file(tmp_path / "c.npy")
+    assert obj.is_cloud
+    assert obj.cloud.shape == (3000, 3)
+    assert ((obj.cloud / 0.04) * obj.cloud_normals).sum(1).min() > 0.9
+    assert obj.volume == 0
+    assert "normals were estimated" in obj.notes[0]
+
+
+def test_given_normals_are_kept_and_not_scaled(tmp_path: Path):
+    normals = directions(500, 1)
+    np.save(tmp_path / "c.npy", np.concatenate([40 * directions(500), 3 * normals], 1))
+    obj = load_file(tmp_path / "c.npy", scale=0.001)
+    assert obj.extents.max() < 0.081
+    assert "estimated" not in obj.notes[0]
+    kept, given = obj.cloud_normals, normals.astype(np.float32)
+    np.testing.assert_allclose(kept[np.lexsort(kept.T)], given[np.lexsort(given.T)], atol=1e-6)
+
+
+def test_zero_normals_are_estimated(tmp_path: Path):
+    np.save(tmp_path / "c.npy", np.concatenate([0.04 * directions(500), np.zeros((500, 3))], 1))
+    np.testing.assert_allclose(np.linalg.norm(load_file(tmp_path / "c.npy").cloud_normals, axis=1), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "glb", "obj"])
+def test_faceless_file_is_a_cloud(tmp_path: Path, suffix: str):
+    points = 0.04 * directions(200)
+    path = tmp_path / f"c.{suffix}"
+    if suffix == "obj":
+        path.write_text("\n".join(f"v {x} {y} {z}" for x, y, z in points))
+    else:
+        trimesh.PointCloud(points).export(path)
+    obj = load_file(path)
+    assert obj.is_cloud
+    np.testing.assert_allclose(obj.centre_of_mass, points.mean(0), atol=1e-6)
+
+
+def pcd(points: np.ndarray, kind: str) -> bytes:
+    names = "x y z normal_x normal_y normal_z"
+    count = points.shape[1]
+    head = (f"# .PCD v0.7\nVERSION 0.7\nFIELDS rgb {' '.join(names.split()[:count])}\nSIZE 4{' 4' * count}\n"
+            f"TYPE U{' F' * count}\nCOUNT 2{' 1' * count}\nWIDTH {len(points)}\nHEIGHT 1\n"
+            f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(points)}\nDATA {kind}\n").encode()
+    if kind == "ascii":
+        return head + "".join(f"7 8 {' '.join(map(str, row))}\n" for row in points).encode()
+    return head + b"".join(struct.pack(f"<II{count}f", 7, 8, *row) for row in points)
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary"])
+@pytest.mark.parametrize("width", [3, 6])
+def test_cloud_from_pcd(tmp_path: Path, kind: str, width: int):
+    points = np.concatenate([0.04 * directions(300), directions(300)], 1)[:, :width]
+    (tmp_path / "c.pcd").write_bytes(pcd(points, kind))
+    obj = load_file(tmp_path / "c.pcd")
+    order, given = np.lexsort(obj.cloud.T), np.lexsort(points[:, :3].astype(np.float32).T)
+    np.testing.assert_allclose(obj.cloud[order], points[given, :3], atol=1e-7)
+    if width == 6:
+        np.testing.assert_allclose(obj.cloud_normals[order], points[given, 3:], atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary"])
+def test_cut_pcd_is_refused(tmp_path: Path, kind: str):
+    whole = pcd(0.04 * directions(300), kind)
+    middle = len(whole) * 3 // 4
+    for end in (middle, whole.find(b"\n", middle) + 1):  # within a row, and after one
+        (tmp_path / "c.pcd").write_bytes(whole[:end])
+        with pytest.raises(ObjectError, match=r"promises 300 points|damaged"):
+            load_file(tmp_path / "c.pcd")
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [(b"not a cloud at all", "no DATA line"), (b"FIELDS x y\nPOINTS 1\nDATA ascii\n0 0\n", "damaged"),
+     (b"FIELDS x y z\nPOINTS 1\nDATA binary_compressed\n", "binary_compressed data; save the cloud as ascii"),
+     (b"FIELDS x y z\nPOINTS 1\nDATA\n", "damaged")])
+def test_foreign_pcd_is_refused(tmp_path: Path, data: bytes, message: str):
+    (tmp_path / "c.pcd").write_bytes(data)
+    with pytest.raises(ObjectError, match=message):
+        load_file(tmp_path / "c.pcd")
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0.0]]), f"3 distinct points; a cloud needs at least {MIN_CLOUD}"),
+     (np.full((500, 3), 0.1), "1 distinct points"), (np.zeros((0, 3)), "0 distinct points"),
+     (np.where(np.arange(600).reshape(200, 3) == 4, np.nan, 0.04 * directions(200)), "1 points with NaN"),
+     (np.zeros((20, 4)), r"shape \(20, 4\); expected \(n, 3\)"), (np.zeros(30), r"shape \(30,\)"),
+     (40 * directions(200), r"too large .*0.001"), (np.array(["a", "b"]), "expected a plain NPY array")])
+def test_unusable_clouds_are_refused(tmp_path: Path, points: np.ndarray, message: str):
+    np.save(tmp_path / "c.npy", points)
+    with pytest.raises(ObjectError, match=message):
+        load_file(tmp_path / "c.npy")
+
+
+def test_npy_with_objects_or_noise_is_refused(tmp_path: Path):
+    np.save(tmp_path / "c.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    with pytest.raises(ObjectError, match="expected a plain NPY array"):
+        load_file(tmp_path / "c.npy")
+    (tmp_path / "c.npy").write_bytes(b"")
+    with pytest.raises(ObjectError, match="expected a plain NPY array"):
+        load_file(tmp_path / "c.npy")
+
+
+def test_planar_cloud_works(tmp_path: Path):
+    points = np.random.default_rng(0).uniform(-0.05, 0.05, (400, 3)) * (1, 1, 0)
+    np.save(tmp_path / "c.npy", points)
+    obj = load_file(tmp_path / "c.npy")
+    np.testing.assert_allclose(np.abs(obj.cloud_normals[:, 2]), 1, atol=1e-5)
+
+
+def test_huge_cloud_is_thinned_the_same_way_every_time(tmp_path: Path):
+    np.save(tmp_path / "c.npy", 0.04 * directions(100_000))
+    first, second = load_file(tmp_path / "c.npy"), load_file(tmp_path / "c.npy")
+    assert len(first.cloud) == CLOUD_POINTS
+    np.testing.assert_array_equal(first.cloud, second.cloud)
+    assert first.sha256 == second.sha256
+    assert f"{CLOUD_POINTS} of them kept" in first.notes[0]
+
+
+def test_estimated_normals_of_a_box_point_outward():
+    points, face = trimesh.sample.sample_surface(trimesh.creation.box((0.1, 0.1, 0.1)), 4000, seed=0)[:2]
+    normals = estimate_normals(np.asarray(points, np.float32))
+    true = trimesh.creation.box((0.1, 0.1, 0.1)).face_normals[face]
+    inner = np.sort(np.abs(points), axis=1)[:, 1] < 0.04  # away from the edges
+    assert (normals * true).sum(1)[inner].min() > 0.98
+
+
+def test_columns_that_are_no_normals_are_refused(tmp_path: Path) -> None:
+    colours = np.random.default_rng(0).uniform(0, 255, (500, 3))
+    np.save(tmp_path / "c.npy", np.concatenate([0.04 * directions(500), colours], 1))
+    with pytest.raises(ObjectError, match="in its columns 4 to 6, which are no normals"):
+        load_file(tmp_path / "c.npy")
+
+
+@pytest.mark.parametrize("header", [
+    "{'descr': '<f8', 'fortran_order': False, 'shape': (10000000000, 3), }",
+    "{'descr': '<U0', 'fortran_order': False, 'shape': (99999999, 3), }", "{'descr': '<f8', 'shape': (",
+    "{'descr': '|O', 'fortran_order': False, 'shape': (3,), }",
+])
+def test_npy_headers_that_lie_are_refused_without_the_memory_that_they_ask_for(tmp_path: Path, header: str) -> None:
+    size = (len(header) + 1).to_bytes(2, "little")
+    (tmp_path / "c.npy").write_bytes(b"\x93NUMPY\x01\x00" + size + header.encode() + b"\n" + bytes(99))
+    with pytest.raises(ObjectError, match="expected a plain NPY array"):
+        load_file(tmp_path / "c.npy")
