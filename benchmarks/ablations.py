@@ -22,6 +22,7 @@ import torch
 from report import ROOT, emit
 from synthesis import HANDS
 
+from dro_grasp.baselines.ours import DistanceMethod
 from dro_grasp.cli.main import main as command
 from dro_grasp.datasets.bundle.training_file import HELD_OUT_HANDS, Bundle, load_bundle
 from dro_grasp.evaluation.distance_error import distance_errors
@@ -150,8 +151,8 @@ def measured(name: str, ablation: Ablation, folder: Path, steps: int, num: int, 
     model, seconds = trained(name, ablation, folder, steps)
     predictor = GraspPredictor(str(folder / f"{name.replace(' ', '_')}.safetensors"))
     objects = [load_object(o) for o in resolve_objects(object_names)]
-    config = BenchmarkConfig(num, (RAW, REFINED), (protocol("dro"), protocol("strict")), controls=False, view=ablation.view)
-    rows = benchmark([load_hand(h) for h in ablation.evaluated], objects, predictor, config)
+    config = BenchmarkConfig(num, (RAW, REFINED), (protocol("dro"), protocol("strict")), view=ablation.view)
+    rows = benchmark([load_hand(h) for h in ablation.evaluated], objects, [DistanceMethod(predictor)], config)
     errors = []
     if set(ablation.evaluated) <= set(HANDS):
         validate = folder / "validate.safetensors"

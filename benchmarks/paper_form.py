@@ -24,6 +24,7 @@ import torch
 from report import emit
 from synthesis import HANDS
 
+from dro_grasp.baselines.ours import DistanceMethod
 from dro_grasp.datasets.bundle.training_file import Bundle, load_bundle
 from dro_grasp.evaluation.distance_error import distance_errors
 from dro_grasp.evaluation.metrics import wilson_interval
@@ -102,8 +103,9 @@ def measured(options: argparse.Namespace, row: str, seed: int, bundle: Bundle) -
     stored = weights.with_name(f"{weights.stem}_on_{where}_{options.num}.json")
     if not stored.exists():
         objects = [load_object(name) for name in resolve_objects(options.objects)]
-        config = BenchmarkConfig(options.num, STAGES, tuple(map(protocol, PROTOCOLS)), controls=False, seed=seed, workers=1)
-        rows = benchmark([load_hand(h) for h in options.hands], objects, GraspPredictor(str(weights)), config)
+        config = BenchmarkConfig(options.num, STAGES, tuple(map(protocol, PROTOCOLS)), seed=seed, workers=1)
+        methods = [DistanceMethod(GraspPredictor(str(weights)))]
+        rows = benchmark([load_hand(h) for h in options.hands], objects, methods, config)
         errors = []
         if options.validation is not None:
             errors = distance_errors(load_weights(weights), part(load_bundle(options.validation), options.hands))

@@ -1,13 +1,15 @@
 """The public names: type checkers read them here, and the package loads each from its module on first use."""
 
 from dro_grasp._version import __version__ as __version__
+from dro_grasp.baselines.controls import palm_facing_starts as palm_facing_starts
+from dro_grasp.baselines.method import Method as Method
+from dro_grasp.baselines.registry import MethodOptions as MethodOptions, make_method as make_method
 from dro_grasp.datasets.bundle.training_file import load_bundle as load_bundle
 from dro_grasp.datasets.collections.bundling import make_bundle as make_bundle
 from dro_grasp.datasets.collections.collection import read_collection as read_collection
 from dro_grasp.datasets.engine.schedule import synthesize_dataset as synthesize_dataset
 from dro_grasp.datasets.engine.worker import EngineConfig as EngineConfig
 from dro_grasp.errors import DroGraspError as DroGraspError
-from dro_grasp.evaluation.controls import palm_facing_starts as palm_facing_starts
 from dro_grasp.evaluation.metrics import wilson_interval as wilson_interval
 from dro_grasp.export.contents import Frame as Frame
 from dro_grasp.export.csv_table import csv_table as csv_table

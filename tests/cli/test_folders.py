@@ -9,9 +9,9 @@ import pytest
 import trimesh
 from PIL import Image
 
+from dro_grasp.baselines.controls import palm_facing_starts
 from dro_grasp.cli.main import main
 from dro_grasp.errors import GraspFileError
-from dro_grasp.evaluation.controls import palm_facing_starts
 from dro_grasp.grasps.reading import load_grasps
 from dro_grasp.grasps.sources import with_own_files
 from dro_grasp.hands.library import load_hand

@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 import pytest
 import torch
 
+from dro_grasp.baselines import method as face
+from dro_grasp.baselines.method import Method
 from dro_grasp.evaluation import equal_time as module
-from dro_grasp.evaluation.controls import MEAN, MEAN_CHOSEN, START, SYNTHESISED
-from dro_grasp.evaluation.equal_time import control_makers, equal_time
+from dro_grasp.evaluation.equal_time import equal_time, finished_maker
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.pipeline.problem import GraspProblem
@@ -117,21 +118,22 @@ def test_threads_come_back() -> None:
         torch.set_num_threads(before)
 
 
-def test_controls_are_refined_and_settled_as_the_networks_grasps_are(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_methods_candidates_are_refined_and_settled(monkeypatch: pytest.MonkeyPatch) -> None:
     done: list[str] = []
+
+    class Made(Method):
+        name = "made up"
+
+        def make(self, problem: GraspProblem, num: int, seed: int) -> GraspBatch:
+            return made_up_grasps(HAND, count=num, seed=seed)
 
     def stage(name: str) -> object:
         return lambda problem, grasps: done.append(name) or grasps
 
-    monkeypatch.setattr(module, "refine", stage("refine"))
-    monkeypatch.setattr(module, "scored", stage("score"))
-    monkeypatch.setattr(module, "can_settle", lambda problem: True)
-    monkeypatch.setattr(module, "best_settled", lambda problem, grasps, least: (None, done.append(f"settle {least}") or grasps))
-    names = (MEAN, MEAN_CHOSEN, START, SYNTHESISED)
-    made = {name: lambda num, seed: made_up_grasps(HAND, count=num, seed=seed) for name in names}
-    makers = control_makers(GraspProblem(HAND, load_object("sphere")), made, 2)
-    assert set(makers) == {MEAN_CHOSEN, START, SYNTHESISED}
-    for make in makers.values():
-        done.clear()
-        assert len(make(3, 1)) == 3
-        assert done == ["refine", "score", "settle 2"]
+    monkeypatch.setattr(face, "refine", stage("refine"))
+    monkeypatch.setattr(face, "scored", stage("score"))
+    monkeypatch.setattr(face, "can_settle", lambda problem: True)
+    monkeypatch.setattr(face, "best_settled", lambda problem, grasps, least: (None, done.append(f"settle {least}") or grasps))
+    make = finished_maker(GraspProblem(HAND, load_object("sphere")), Made(), 2)
+    assert len(make(3, 1)) == 3
+    assert done == ["refine", "score", "settle 2"]

@@ -10,8 +10,8 @@ import torch
 from scipy.spatial.transform import Rotation
 from scipy.stats import mannwhitneyu
 
+from dro_grasp.baselines.controls import CHOICE_POINTS, mean_grasp, mean_grasps, palm_facing_starts
 from dro_grasp.datasets.bundle.training_file import Bundle
-from dro_grasp.evaluation.controls import CHOICE_POINTS, mean_grasp, mean_grasps, palm_facing_starts
 from dro_grasp.evaluation.metrics import diversity, finger_contact, mean_share, roc_area, wilson_interval
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.shape import ObjectModel

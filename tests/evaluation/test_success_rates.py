@@ -9,15 +9,15 @@ import math
 import pytest
 import torch
 
+from dro_grasp.baselines.controls import StartMethod
+from dro_grasp.baselines.method import Method
+from dro_grasp.baselines.ours import DistanceMethod, SynthesisMethod
 from dro_grasp.cli.main import main
 from dro_grasp.evaluation import success_rates as evaluated
-from dro_grasp.evaluation.controls import START, SYNTHESISED
 from dro_grasp.evaluation.rows import ALL, Row
 from dro_grasp.evaluation.success_rates import (
     BEST,
-    BOTH,
     EQUAL_TIME,
-    NETWORK,
     RANKED,
     RAW,
     REFINED,
@@ -37,13 +37,14 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.settling import settled
 from dro_grasp.pipeline.stages import refine, scored
-from dro_grasp.predictor import GraspPredictor, GraspRequest, Prediction
+from dro_grasp.predictor import GraspPredictor, GraspRequest
 from dro_grasp.simulation.outcome import TrialResult
 from dro_grasp.simulation.protocols import Perturbations, protocol
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.weights import untrained_weights
 
+DRO, START, SYNTHESISED = "dro", StartMethod.name, SynthesisMethod.name
 HANDS = ("gripper3", "barrett")
 OBJECTS = ("sphere", "can")
 CONFIG = BenchmarkConfig(num=6, protocols=(protocol("dro"), protocol("strict")))
@@ -52,13 +53,17 @@ CONFIG = BenchmarkConfig(num=6, protocols=(protocol("dro"), protocol("strict")))
 @pytest.fixture(scope="module")
 def rows() -> list[Row]:
     hands, objects = [loaded_hand(n) for n in HANDS], [load_object(n) for n in OBJECTS]
-    return benchmark(hands, objects, GraspPredictor(), CONFIG)
+    return benchmark(hands, objects, every(GraspPredictor()), CONFIG)
 
 
 @pytest.fixture(scope="module")
 def untrained(tmp_path_factory: pytest.TempPathFactory) -> GraspPredictor:
     """For what does not ask how good grasps are."""
     return GraspPredictor(str(untrained_weights(tmp_path_factory.mktemp("weights"))))
+
+
+def every(predictor: GraspPredictor) -> list[Method]:
+    return [DistanceMethod(predictor), StartMethod(), SynthesisMethod()]
 
 
 def find(rows: list[Row], grasps: str, stage: str, hand: str) -> Row:
@@ -68,7 +73,7 @@ def find(rows: list[Row], grasps: str, stage: str, hand: str) -> Row:
 
 def test_every_source_has_its_stages_for_every_hand_and_on_average(rows: list[Row]) -> None:
     names = {(r.grasps, r.stage) for r in rows}
-    assert names == {(source, stage) for source in (NETWORK, START, SYNTHESISED) for stage in STAGES}
+    assert names == {(source, stage) for source in (DRO, START, SYNTHESISED) for stage in STAGES}
     assert len(rows) == len(names) * 3
     assert {r.num for r in rows if r.stage in {RAW, REFINED, SETTLED} and r.hand != ALL} == {12}
     assert {r.num for r in rows if r.stage in {RANKED, BEST, SETTLED_BEST} and r.hand != ALL} == {4}
@@ -99,15 +104,15 @@ def test_raw_and_ranked_rows_are_what_single_trials_say(rows: list[Row]) -> None
             first = simulate(hand, obj, grasps, "dro")
             held.append(first.displacement[first.success, -1])
         share, share_best, share_first = (float(torch.cat(x).double().mean()) for x in (passed, passed_best, passed_first))
-        assert find(rows, NETWORK, stage, "gripper3").success["strict/1"][0] == pytest.approx(share)
-        assert find(rows, NETWORK, best, "gripper3").success["strict/1"][0] == pytest.approx(share_best)
+        assert find(rows, DRO, stage, "gripper3").success["strict/1"][0] == pytest.approx(share)
+        assert find(rows, DRO, best, "gripper3").success["strict/1"][0] == pytest.approx(share_best)
         counts = torch.cat(fingers)
-        assert find(rows, NETWORK, stage, "gripper3").fingers["strict/1"] == pytest.approx(
+        assert find(rows, DRO, stage, "gripper3").fingers["strict/1"] == pytest.approx(
             (float(counts.float().mean()) / 3, float((counts == 3).float().mean())))
         if stage == REFINED:
-            alone = find(rows, NETWORK, "refined, top 1", "gripper3").success["strict/1"][0]
+            alone = find(rows, DRO, "refined, top 1", "gripper3").success["strict/1"][0]
             assert alone == pytest.approx(share_first)
-        assert find(rows, NETWORK, stage, "gripper3").displacement == pytest.approx(float(torch.cat(held).mean()))
+        assert find(rows, DRO, stage, "gripper3").displacement == pytest.approx(float(torch.cat(held).mean()))
 
 
 def test_pairs_share_no_random_numbers() -> None:
@@ -119,34 +124,38 @@ def test_pairs_share_no_random_numbers() -> None:
 
 def test_each_view_is_from_another_side_with_grasps_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     shown: list[ObjectModel] = []
-    honest = GraspPredictor.run
-
-    def run(self: GraspPredictor, problem: GraspProblem, request: GraspRequest) -> Prediction:
-        shown.append(problem.obj)
-        return honest(self, problem, request)
-
-    monkeypatch.setattr(GraspPredictor, "run", run)
+    watch_what_is_shown(shown, monkeypatch)
     hand, obj = loaded_hand("gripper3"), load_object("can")
     predictor = GraspPredictor()
     config = dataclasses.replace(
-        CONFIG, num=4, stages=(RANKED,), controls=False, protocols=(protocol("strict"),), view="half")
-    both = benchmark([hand], [obj], predictor, dataclasses.replace(config, views=2))
+        CONFIG, num=4, stages=(RANKED,), protocols=(protocol("strict"),), view="half")
+    both = benchmark([hand], [obj], [DistanceMethod(predictor)], dataclasses.replace(config, views=2))
     seen_one_by_one = list(shown)
     # The best quarter of each view, not of all of them together.
     assert both[0].num == 2
     assert len({o.sha256 for o in seen_one_by_one}) == 2
     passed = []
     for k in range(2):
-        (row,) = benchmark([hand], [obj], predictor, dataclasses.replace(config, seed=k))
+        (row,) = benchmark([hand], [obj], [DistanceMethod(predictor)], dataclasses.replace(config, seed=k))
         assert shown[-1].sha256 == seen_one_by_one[k].sha256
         passed.append(row.success["strict/1"][0])
     assert both[0].success["strict/1"][0] == pytest.approx(sum(passed) / 2)
 
 
+def watch_what_is_shown(shown: list[ObjectModel], monkeypatch: pytest.MonkeyPatch) -> None:
+    honest = DistanceMethod.make
+
+    def make(self: DistanceMethod, problem: GraspProblem, num: int, seed: int) -> GraspBatch:
+        shown.append(problem.obj)
+        return honest(self, problem, num, seed)
+
+    monkeypatch.setattr(DistanceMethod, "make", make)
+
+
 def test_the_average_is_over_hands(rows: list[Row]) -> None:
     for stage in STAGES:
-        parts = [find(rows, NETWORK, stage, name) for name in HANDS]
-        whole = find(rows, NETWORK, stage, ALL)
+        parts = [find(rows, DRO, stage, name) for name in HANDS]
+        whole = find(rows, DRO, stage, ALL)
         mean, low, high = whole.success["dro/1"]
         assert mean == pytest.approx(sum(p.success["dro/1"][0] for p in parts) / 2)
         assert low <= mean <= high
@@ -155,14 +164,14 @@ def test_the_average_is_over_hands(rows: list[Row]) -> None:
         assert whole.trials_held == {}
         assert whole.num == sum(p.num for p in parts)
         assert whole.diversity == pytest.approx(sum(p.diversity for p in parts) / 2)
-        assert whole.seconds["network"] > 0
+        assert whole.seconds["make"] > 0
 
 
 def test_refined_grasps_cost_time_and_controls_say_what_they_are(rows: list[Row]) -> None:
-    assert "refine" not in find(rows, NETWORK, RAW, ALL).seconds
-    assert find(rows, NETWORK, REFINED, ALL).seconds["refine"] > 0
+    assert "refine" not in find(rows, DRO, RAW, ALL).seconds
+    assert find(rows, DRO, REFINED, ALL).seconds["refine"] > 0
     assert find(rows, SYNTHESISED, RAW, ALL).seconds["make"] > 0
-    assert find(rows, START, RAW, ALL).success["strict/1"][0] < find(rows, NETWORK, REFINED, ALL).success["strict/1"][0]
+    assert find(rows, START, RAW, ALL).success["strict/1"][0] < find(rows, DRO, REFINED, ALL).success["strict/1"][0]
 
 
 def test_what_generate_returns_and_what_controls_return_in_the_networks_time(
@@ -172,12 +181,12 @@ def test_what_generate_returns_and_what_controls_return_in_the_networks_time(
     hand, obj, predictor = loaded_hand("gripper3"), load_object("can"), GraspPredictor()
     config = dataclasses.replace(
         CONFIG, num=6, stages=(RETURNED, EQUAL_TIME), protocols=(protocol("strict"),))
-    rows, problem = benchmark([hand], [obj], predictor, config), GraspProblem(hand, obj)
-    alone = find(rows, NETWORK, EQUAL_TIME, "gripper3")
+    rows, problem = benchmark([hand], [obj], every(predictor), config), GraspProblem(hand, obj)
+    alone = find(rows, DRO, EQUAL_TIME, "gripper3")
     made = predictor.run(problem, GraspRequest(3, pair_seed(0, hand, obj), candidates=2, method="network"))
     assert (alone.candidates, made.candidates) == (6, 6)
     assert alone.success["strict/1"][0] == float(simulate(hand, obj, made.grasps[:2], "strict").success.float().mean())
-    returned = find(rows, BOTH, RETURNED, "gripper3")
+    returned = find(rows, DRO, RETURNED, "gripper3")
     made = predictor.run(problem, GraspRequest(2, pair_seed(0, hand, obj)))
     assert returned.success["strict/1"][0] == float(simulate(hand, obj, made.grasps, "strict").success.float().mean())
     assert returned.candidates == made.candidates
@@ -195,24 +204,24 @@ def test_no_grasp_at_all_has_a_row_without_numbers(untrained: GraspPredictor, mo
     """The optimiser may find none that respects a direction."""
     hand, obj = loaded_hand("gripper3"), load_object("can")
     none = untrained.predict(hand, obj, num=1, method="network")[:0]
-    monkeypatch.setattr(evaluated, "controls", lambda *_: {SYNTHESISED: lambda num, seed: none.without("score")})
+    monkeypatch.setattr(SynthesisMethod, "make", lambda *_: none.without("score"))
     config = dataclasses.replace(CONFIG, num=2, protocols=(protocol("strict"),))
-    for row in benchmark([hand], [obj], untrained, config):
-        assert row.num == 0 or row.grasps == NETWORK
+    for row in benchmark([hand], [obj], [DistanceMethod(untrained), SynthesisMethod()], config):
+        assert row.num == 0 or row.grasps == DRO
         assert math.isnan(row.success["strict/1"][0]) == (row.num == 0)
 
 
 def test_grasps_that_all_fail_have_no_means(untrained: GraspPredictor, monkeypatch: pytest.MonkeyPatch) -> None:
-    def far(self: GraspPredictor, problem: GraspProblem, request: GraspRequest) -> Prediction:
-        made = honest(self, problem, request)
-        away = made.grasps.T_object_wrist.clone()
+    def far(self: DistanceMethod, problem: GraspProblem, num: int, seed: int) -> GraspBatch:
+        grasps = honest(self, problem, num, seed)
+        away = grasps.T_object_wrist.clone()
         away[:, :3, 3] += 1.0
-        return dataclasses.replace(made, grasps=made.grasps.replace(T_object_wrist=away))
+        return grasps.replace(T_object_wrist=away)
 
-    honest = GraspPredictor.run
-    monkeypatch.setattr(GraspPredictor, "run", far)
-    config = dataclasses.replace(CONFIG, num=2, stages=(RAW,), controls=False)
-    (row,) = benchmark([loaded_hand("gripper3")], [load_object("can")], untrained, config)
+    honest = DistanceMethod.make
+    monkeypatch.setattr(DistanceMethod, "make", far)
+    config = dataclasses.replace(CONFIG, num=2, stages=(RAW,))
+    (row,) = benchmark([loaded_hand("gripper3")], [load_object("can")], [DistanceMethod(untrained)], config)
     assert row.success["dro/1"][0] == 0
     assert math.isnan(row.displacement)
     assert row.diversity == 0
@@ -221,8 +230,8 @@ def test_grasps_that_all_fail_have_no_means(untrained: GraspPredictor, monkeypat
 def test_trials_held_stand_beside_the_success_of_a_protocol_that_perturbs() -> None:
     hands, obj = [loaded_hand(n) for n in HANDS], load_object("can")
     few = dataclasses.replace(protocol("robust"), perturbations=Perturbations(trials=3, needed=2, shift=0.01))
-    config = dataclasses.replace(CONFIG, num=3, stages=(RAW,), controls=False, protocols=(protocol("dro"), few))
-    first, second, whole = benchmark(hands, [obj], GraspPredictor(), config)
+    config = dataclasses.replace(CONFIG, num=3, stages=(RAW,), protocols=(protocol("dro"), few))
+    first, second, whole = benchmark(hands, [obj], [DistanceMethod(GraspPredictor())], config)
     for hand, row in zip(hands, (first, second), strict=True):
         grasps = GraspPredictor().predict(
             hand, obj, num=3, seed=pair_seed(0, hand, obj), candidates=1, refine=False, method="network")
@@ -240,21 +249,17 @@ def test_a_view_hides_the_object_from_the_network_alone(
     view: str, untrained: GraspPredictor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown, tried = [], []
-    honest_run, honest_simulate = GraspPredictor.run, simulate
-
-    def run(self: GraspPredictor, problem: GraspProblem, request: GraspRequest) -> Prediction:
-        shown.append(problem.obj)
-        return honest_run(self, problem, request)
+    honest_simulate = simulate
 
     def trial(hand: Hand, obj: ObjectModel, grasps: GraspBatch, *rest: object, **options: object) -> TrialResult:
         tried.append(obj)
         return honest_simulate(hand, obj, grasps, *rest, **options)
 
-    monkeypatch.setattr(GraspPredictor, "run", run)
+    watch_what_is_shown(shown, monkeypatch)
     monkeypatch.setattr(evaluated, "simulate", trial)
-    config = dataclasses.replace(CONFIG, num=1, stages=(REFINED,), controls=False, protocols=(protocol("dro"),), view=view)
+    config = dataclasses.replace(CONFIG, num=1, stages=(REFINED,), protocols=(protocol("dro"),), view=view)
     sphere = load_object("sphere")
-    benchmark([loaded_hand("gripper3")], [sphere], untrained, config)
+    benchmark([loaded_hand("gripper3")], [sphere], [DistanceMethod(untrained)], config)
     assert [o.is_cloud for o in shown] == [True]
     assert tried == [sphere]
     ball = torch.from_numpy(shown[0].cloud)
@@ -275,7 +280,7 @@ def test_the_command_prints_rows_and_json(capsys: pytest.CaptureFixture[str]) ->
     fingers, everyone = row["fingers"]["dro/1"]
     assert 0 < fingers <= 1
     assert main(command) == 0
-    line = next(x for x in capsys.readouterr().out.splitlines() if x.startswith("| network"))
+    line = next(x for x in capsys.readouterr().out.splitlines() if x.startswith("| dro"))
     assert f"| {100 * row['success']['dro/1'][0]:.1f} [" in line
     assert f" | {100 * fingers:.0f} ({100 * everyone:.0f}) | " in line
     assert main(["benchmark", "--hands", "gripper3", "--objects", "can", "--num", "0"]) == 2

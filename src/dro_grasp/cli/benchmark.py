@@ -1,4 +1,4 @@
-"""`dro-grasp benchmark`: success rates of weights beside their controls."""
+"""`dro-grasp benchmark`: success rates of methods side by side."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -15,15 +15,24 @@ from dro_grasp.cli.inputs import Flag, ProtocolName, optional
 from dro_grasp.cli.output import print_json, progress_bar, say
 
 if TYPE_CHECKING:
+    from dro_grasp.baselines.method import Method
     from dro_grasp.evaluation.rows import Row
+
+QUICK: dict[str, Any] = {"num": 16, "stages": ("returned",), "protocols": ("dro", "strict")}
+"""What --quick measures: of 16 grasps a pair, methods return a quarter (ours)."""
 
 
 @dataclass(frozen=True)
 class Benchmark:
-    """Evaluate grasps of the network and of its controls, before and after refinement and ranking.
+    """Evaluate grasps of several methods, before and after refinement and ranking: one table.
 
-    Example: dro-grasp benchmark --hands allegro barrett --objects builtin:test --num 20 --bundle bundle.safetensors
+    Example: dro-grasp benchmark --methods dro synthesise dfc my_module:MyMethod --hands allegro barrett --stages returned
     """
+
+    methods: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--method"], metavar="NAME...", help_behavior_hint=(
+        "(default: dro, start, synthesise, and with a bundle mean-grasp, mean-grasp-chosen)"))] = ()
+    """What makes the grasps: dro, synthesise, dfc, start, mean-grasp, mean-grasp-chosen; dro@WEIGHTS for other weights;
+    module:Class for a class of yours that has predict(hand, obj, num, seed); or a grasp file."""
 
     hands: tuple[str, ...] = ("allegro", "barrett", "shadowhand")
     """Names or paths of hands."""
@@ -34,22 +43,24 @@ class Benchmark:
     stages: tuple[Literal["raw", "ranked", "refined", "settled", "returned", "equal-time"], ...] = (
         "raw", "ranked", "refined")
     """What is done to the grasps before the trials; of refined and of settled grasps, all and the best by score are reported.
-    settled: refined grasps after their closing was simulated. returned: what
-    `generate` returns, with the optimiser's share. equal-time: controls with as much CPU time for each grasp as the network."""
+    settled: refined grasps after their closing was simulated. returned: what each method returns to a user, and for dro that
+    is what `generate` returns. equal-time: all methods with as much CPU time for each grasp as the first."""
     protocols: tuple[ProtocolName, ...] = ("dro", "strict", "dexgraspbench")
     """Trials; displacement, rotation and diversity are means over successes of the first."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
-    """Weights to measure."""
+    """Weights of the method dro."""
     device: str = "cpu"
     """Device for the network and the energies: cpu, cuda or cuda:1. Trials always run on the CPU."""
     temperature: Annotated[float | None, optional("T", "as the weights say")] = None
     """Diversity of the grasps of one placement: 0 proposes the likeliest, 1 is as diverse as the training grasps."""
     controls: bool = True
-    """Also evaluate unoptimised starts, synthesised grasps and, with a bundle, the mean grasp."""
+    """Without --methods: also evaluate start, synthesise and, with a bundle, the mean grasp."""
     bundle: Annotated[Path | None, optional("PATH", "no mean grasp")] = None
     """Training bundle whose grasps are averaged to the mean grasp."""
+    quick: Flag = False
+    """A first look: what the methods return, four grasps of each hand on the first two objects, under dro and strict."""
     view: Literal["whole", "cloud", "half", "depth"] = "whole"
-    """What the network, refinement and ranking see: the mesh, its points, the paper's half of them, or a depth image."""
+    """What methods, refinement and ranking see: the mesh, its points, the paper's half of them, or a depth image."""
     views: Annotated[int, tyro.conf.arg(aliases=["--looks"])] = 1
     """Views of each object for each hand, with --num grasps each."""
     seed: int = 0
@@ -59,14 +70,15 @@ class Benchmark:
 
     def run(self) -> int:
         """Load everything, measure, print."""
-        from dro_grasp.datasets.bundle.training_file import load_bundle
         from dro_grasp.errors import ObjectError, OptionError
         from dro_grasp.evaluation.success_rates import BEST, REFINED, SETTLED, SETTLED_BEST, TOP, BenchmarkConfig, benchmark
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.catalogue import load_object, resolve_objects
-        from dro_grasp.predictor import GraspPredictor, GraspRequest, PredictorConfig
+        from dro_grasp.predictor import GraspRequest
         from dro_grasp.simulation.protocols import protocol
 
+        if self.quick:
+            return dataclasses.replace(self, quick=False, **QUICK, objects=resolve_objects(list(self.objects))[:2]).run()
         GraspRequest(self.num, candidates=1, temperature=self.temperature)
         if self.views < 1:
             raise OptionError(f"--views is {self.views}; give at least 1")
@@ -74,8 +86,7 @@ class Benchmark:
             if not getattr(self, name):
                 raise OptionError(f"--{name} is empty; name at least one")
         begin = time.perf_counter()
-        bundle = None if self.bundle is None else load_bundle(self.bundle)
-        predictor = GraspPredictor(self.weights, self.device, config=PredictorConfig(temperature=self.temperature))
+        methods = self._methods()
         hands = [load_hand(name) for name in self.hands]
         objects = [load_object(name) for name in resolve_objects(list(self.objects))]
         if clouds := [obj.name for obj in objects if obj.is_cloud]:
@@ -83,20 +94,25 @@ class Benchmark:
         further = {REFINED: (BEST, *TOP), SETTLED: (SETTLED_BEST,)}
         stages = tuple(name for stage in self.stages for name in (stage, *further.get(stage, ())))
         config = BenchmarkConfig(
-            num=self.num, stages=stages, protocols=tuple(protocol(p) for p in self.protocols), controls=self.controls,
-            seed=self.seed, view=self.view, views=self.views,
+            num=self.num, stages=stages, protocols=tuple(protocol(p) for p in self.protocols), seed=self.seed, view=self.view,
+            views=self.views, device=self.device,
         )
         with progress_bar("pairs", self.json) as progress:
-            rows = benchmark(hands, objects, predictor, config, bundle, progress)
+            rows = benchmark(hands, objects, methods, config, progress)
+        if not rows:
+            raise OptionError(f"none of {', '.join(m.name for m in methods)} knows any of {', '.join(h.name for h in hands)}")
         seconds = time.perf_counter() - begin
         if self.json:
             print_json({
-                "weights": predictor.weights_name, "objects": [obj.name for obj in objects], "num": self.num,
+                "methods": [method.name for method in methods], "weights": self.weights or "default",
+                "objects": [obj.name for obj in objects], "num": self.num,
                 "view": self.view, "views": self.views, "seed": self.seed, "seconds": round(seconds, 1),
                 "rows": [dataclasses.asdict(row) for row in rows],
             })
             return 0
-        title = f"weights '{predictor.weights_name}', {self.num} grasps of each hand on each of {len(objects)} objects"
+        title = f"{self.num} grasps of each hand on each of {len(objects)} objects"
+        if self.weights is not None:
+            title = f"weights '{self.weights}', {title}"
         if self.view != "whole":
             title += f", view '{self.view}'"
         if self.views > 1:
@@ -109,6 +125,19 @@ class Benchmark:
             say("| " + " | ".join(map(str, line)) + " |")
         say(f"\n{seconds:.0f} s")
         return 0
+
+    def _methods(self) -> list[Method]:
+        """The methods that were named, or the network and its controls."""
+        from dro_grasp.baselines.registry import MethodOptions, make_method
+        from dro_grasp.datasets.bundle.training_file import load_bundle
+
+        names = self.methods
+        if not names:
+            controls = ("start", "synthesise", *(("mean-grasp", "mean-grasp-chosen") if self.bundle is not None else ()))
+            names = ("dro", *(controls if self.controls else ()))
+        bundle = None if self.bundle is None else load_bundle(self.bundle)
+        options = MethodOptions(self.weights, self.device, self.temperature, bundle)
+        return [make_method(name, options) for name in dict.fromkeys(names)]
 
 
 def cells(row: Row) -> list[object]:

@@ -1,4 +1,4 @@
-"""Equal time: every control makes candidates for as long as the network, and returns as many grasps, the best by score.
+"""Equal time: every method makes candidates for as long as the first one, and returns as many grasps, the best by score.
 
 Time is the CPU time of this process, with one thread of PyTorch: other programs make it wait, but hardly work longer. What is
 prepared once for a pair (distance field, contacts, collision scene) is not counted. Ours.
@@ -6,28 +6,26 @@ prepared once for a pair (distance field, contacts, collision scene) is not coun
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
 
+from dro_grasp.baselines.method import Method, finished
 from dro_grasp.devices import one_thread
-from dro_grasp.evaluation.controls import MEAN, Maker
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.settling import best_settled, can_settle
-from dro_grasp.pipeline.stages import refine, scored
-from dro_grasp.predictor import GraspPredictor, GraspRequest
 
+Maker = Callable[[int, int], GraspBatch]
+"""Makes a number of grasps with scores from a seed."""
 SMALLEST_ROUND = 0.1
-"""A control goes on if this share of the candidates that it has made still fits into the time (ours)."""
+"""A method goes on if this share of the candidates that it has made still fits into the time (ours)."""
 
 
 @dataclass(frozen=True)
 class Returned:
-    """What a source returns."""
+    """What a method returns."""
 
     grasps: GraspBatch
     """The best by score, best first."""
@@ -40,12 +38,12 @@ class Returned:
 def equal_time(
     makers: Mapping[str, Maker], num: int, keep: int, seed: int, clock: Callable[[], float] = time.process_time
 ) -> dict[str, Returned]:
-    """The best candidates of each source, all in the time that the first source takes for `num`.
+    """The best candidates of each method, all in the time that the first one takes for `num`.
 
     Args:
-        makers: How each source makes candidates with scores; what they share is prepared at their first call.
-        num: Candidates of the first source.
-        keep: Grasps that each source returns, fewer if it has lost candidates.
+        makers: How each method makes candidates with scores; what they share is prepared at their first call.
+        num: Candidates of the first method.
+        keep: Grasps that each method returns, fewer if it has lost candidates.
         seed: The same seed gives the same candidates, but time decides how many.
         clock: Tells the time [s].
     """
@@ -87,23 +85,9 @@ def best_within(budget: float, make: Maker, keep: int, seed: int, clock: Callabl
     return Returned(_best(GraspBatch.concatenate(pool), keep), made, spent)
 
 
-def network_maker(problem: GraspProblem, predictor: GraspPredictor) -> Maker:
-    """Candidates of the network: placed, chosen, decoded, refined, and the better half settled."""
-    return lambda num, seed: predictor.run(
-        problem, GraspRequest(math.ceil(num / 2), seed, candidates=2, method="network")).grasps
-
-
-def control_makers(problem: GraspProblem, controls: Mapping[str, Maker], keep: int) -> dict[str, Maker]:
-    """Candidates of each control, refined, and the better half settled, `keep` at least; the mean grasp is a chosen one."""
-
-    def finished(make: Maker) -> Maker:
-        def maker(num: int, seed: int) -> GraspBatch:
-            grasps = scored(problem, refine(problem, make(num, seed)))
-            return best_settled(problem, grasps, keep)[1] if can_settle(problem) else grasps
-
-        return maker
-
-    return {name: finished(make) for name, make in controls.items() if name != MEAN}
+def finished_maker(problem: GraspProblem, method: Method, keep: int) -> Maker:
+    """Candidates of a method, refined, and the better half settled, `keep` at least."""
+    return lambda num, seed: finished(problem, method.make(problem, num, seed), keep)
 
 
 def _best(grasps: GraspBatch, keep: int) -> GraspBatch:

@@ -1,6 +1,6 @@
-"""Success rates of a network and of its controls, before and after refinement and ranking.
+"""Success rates of methods, before and after refinement and ranking.
 
-Source: paper section IV; the stages, the controls and the trials beside the paper's are ours.
+Source: paper section IV; the stages, the methods and the trials beside the paper's are ours.
 """
 
 from __future__ import annotations
@@ -9,11 +9,10 @@ import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
-from dro_grasp.datasets.bundle.training_file import Bundle
-from dro_grasp.evaluation.controls import controls
-from dro_grasp.evaluation.equal_time import control_makers, equal_time, network_maker
+from dro_grasp.baselines.method import Method
+from dro_grasp.evaluation.equal_time import equal_time, finished_maker
 from dro_grasp.evaluation.rows import EvaluatedGrasps, Row, average, hand_row
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
@@ -22,7 +21,6 @@ from dro_grasp.perception.partial_views import View, partial_view
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.settling import best_settled, can_settle
 from dro_grasp.pipeline.stages import refine, scored
-from dro_grasp.predictor import GraspPredictor, GraspRequest
 from dro_grasp.simulation.protocols import Protocol
 from dro_grasp.simulation.trial import simulate
 
@@ -41,15 +39,13 @@ SETTLED_BEST = "settled, ranked"
 TOP = {f"refined, top {count}": count for count in (5, 1)}
 """Stages that keep the few best refined grasps of a pair by score, and how many."""
 STAGES = (RAW, RANKED, REFINED, BEST, *TOP, SETTLED, SETTLED_BEST)
-"""Stages of every source."""
+"""Stages of every method."""
 RETURNED = "returned"
-"""Stage: what `generate` returns, with candidates of the network and, where the score asks for them, of the optimiser."""
+"""Stage: what a method returns to a user; `generate`, with candidates of the network and, where the score asks for them, of
+the optimiser."""
 EQUAL_TIME = "equal-time"
-"""Stage: the best that each source returns with the CPU time of the network's best quarter."""
-NETWORK = "network"
-"""Source: the network under test."""
-BOTH = "network and optimiser"
-"""Source: the network, and the optimiser where the score does not trust it."""
+"""Stage: the best that each method returns with the CPU time of the first method's best quarter."""
+Result = TypeVar("Result")
 KEPT = 0.25
 """Share of the grasps of a pair that ranking keeps, before any trial."""
 
@@ -64,30 +60,29 @@ class BenchmarkConfig:
     """Which of STAGES, RETURNED and EQUAL_TIME."""
     protocols: tuple[Protocol, ...] = ()
     """Trials of every grasp."""
-    controls: bool = True
-    """Whether the controls are measured beside the network."""
     view: View = "whole"
-    """What the network, refinement and ranking see of the object; controls see all of it."""
+    """What methods, refinement and ranking see of the object; trials are on all of it."""
     views: int = 1
     """Views of each object for each hand, with other random numbers and `num` grasps each."""
     seed: int = 0
     """Of all grasps and views; each pair's seeds are derived from it."""
     workers: int | None = None
     """Threads of the trials; all cores by default."""
+    device: str = "cpu"
+    """Where the grasp energy is computed."""
 
 
 def benchmark(
-    hands: Sequence[Hand], objects: Sequence[ObjectModel], predictor: GraspPredictor, config: BenchmarkConfig,
-    bundle: Bundle | None = None, progress: Callable[[int, int], None] | None = None,
+    hands: Sequence[Hand], objects: Sequence[ObjectModel], methods: Sequence[Method], config: BenchmarkConfig,
+    progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:
     """Measure the success rates.
 
     Args:
-        hands: Which hands.
+        hands: Which hands; a method has no rows of those that it does not know.
         objects: Which objects, all with meshes.
-        predictor: The network under test.
+        methods: What makes the grasps.
         config: Numbers, stages and protocols.
-        bundle: Training data of the mean grasp; hands that are not in it have no such rows.
         progress: Called with (pairs done, pairs in all).
     """
     table: dict[tuple[str, str], list[list[EvaluatedGrasps]]] = {}
@@ -95,18 +90,22 @@ def benchmark(
     for hand in hands:
         found: dict[tuple[str, str], list[EvaluatedGrasps]] = {}
         for obj in objects:
-            problem = GraspProblem(hand, obj, predictor.device)
+            known = [method for method in methods if method.knows(hand)]
+            whole = GraspProblem(hand, obj, config.device)
             for seed in view_seeds(config, hand, obj):
-                for source, stage, evaluated in _measured(problem, predictor, config, bundle, seed):
-                    found.setdefault((source, stage), []).append(evaluated)
+                problem = whole
+                if config.view != "whole":
+                    problem = GraspProblem(hand, partial_view(obj, config.view, seed), config.device)
+                for name, stage, evaluated in _measured(problem, obj, known, config, seed):
+                    found.setdefault((name, stage), []).append(evaluated)
             done += 1
             if progress is not None:
                 progress(done, pairs)
         for key, evaluated in found.items():
             table.setdefault(key, []).append(evaluated)
     rows = []
-    for (source, stage), per_hand in table.items():
-        single = [hand_row(source, stage, evaluated, config.protocols) for evaluated in per_hand]
+    for (name, stage), per_hand in table.items():
+        single = [hand_row(name, stage, evaluated, config.protocols) for evaluated in per_hand]
         rows += single if len(single) == 1 else [*single, average(single)]
     return rows
 
@@ -123,30 +122,30 @@ def view_seeds(config: BenchmarkConfig, hand: Hand, obj: ObjectModel) -> range:
 
 
 def _measured(
-    problem: GraspProblem, predictor: GraspPredictor, config: BenchmarkConfig, bundle: Bundle | None, seed: int
+    problem: GraspProblem, obj: ObjectModel, methods: Sequence[Method], config: BenchmarkConfig, seed: int
 ) -> Iterator[tuple[str, str, EvaluatedGrasps]]:
-    """Source, stage and grasps of one view of a pair, for the stages asked for. Trials see the whole object."""
-    hand, obj, num = problem.hand, problem.obj, config.num
-    visible = problem if config.view == "whole" else GraspProblem(hand, partial_view(obj, config.view, seed), predictor.device)
-    rivals = controls(problem, bundle) if config.controls else {}
-    keep = _quarter(num)
-    if set(config.stages) & set(STAGES):
-        made = predictor.run(visible, GraspRequest(num, seed, candidates=1, refine=False, method="network"))
-        network = _Source(NETWORK, visible, made.grasps, {k: made.seconds[k] / num for k in ("network", "decode")})
-        yield from _stages(network, obj, config)
-        for name, make in rivals.items():
-            begin = time.perf_counter()
-            grasps = make(num, seed)
-            yield from _stages(_Source(name, problem, grasps, {"make": (time.perf_counter() - begin) / num}), obj, config)
-    if RETURNED in config.stages:
-        made = predictor.run(visible, GraspRequest(keep, seed, candidates=round(1 / KEPT)))
-        seconds = {part: value / keep for part, value in made.seconds.items()}
-        yield BOTH, RETURNED, _evaluated(hand, obj, made.grasps, config, seconds, made.candidates)
-    if EQUAL_TIME in config.stages:
-        makers = {NETWORK: network_maker(visible, predictor), **control_makers(problem, rivals, keep)}
+    """Method, stage and grasps of one view of a pair, for the stages asked for. Trials see the whole object."""
+    hand, num, keep = problem.hand, config.num, _quarter(config.num)
+    _ = problem.field  # what methods share is prepared before a clock runs
+    for method in methods:
+        if set(config.stages) & set(STAGES):
+            grasps, seconds = _timed(lambda method=method: method.make(problem, num, seed), num)
+            yield from _stages(_Source(method.name, problem, grasps, seconds), obj, config)
+        if RETURNED in config.stages:
+            made, seconds = _timed(lambda method=method: method.best(problem, keep, seed), keep)
+            yield method.name, RETURNED, _evaluated(hand, obj, made.grasps, config, seconds, made.candidates)
+    if EQUAL_TIME in config.stages and methods:
+        makers = {method.name: finished_maker(problem, method, keep) for method in methods}
         for name, best in equal_time(makers, num, keep, seed).items():
             seconds = {"CPU": best.seconds / max(1, len(best.grasps))}
             yield name, EQUAL_TIME, _evaluated(hand, obj, best.grasps, config, seconds, best.candidates)
+
+
+def _timed(work: Callable[[], Result], num: int) -> tuple[Result, dict[str, float]]:
+    """The result of some work, and the time of each of `num` grasps [s]."""
+    begin = time.perf_counter()
+    result = work()
+    return result, {"make": (time.perf_counter() - begin) / num}
 
 
 @dataclass(frozen=True)

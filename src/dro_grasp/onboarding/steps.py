@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dro_grasp.baselines.ours import DistanceMethod
 from dro_grasp.datasets.bundle.training_file import load_bundle, split_of
 from dro_grasp.datasets.collections.bundling import make_bundle
 from dro_grasp.datasets.collections.collection import count_collection
@@ -230,8 +231,10 @@ class _Onboarding:
         """Success rates on held-out objects: of the network, and of the grasps that `generate` returns."""
         predictor = GraspPredictor(weights, self.config.device)
         rules = tuple(protocol(name) for name in ("dro", "strict"))
-        config = BenchmarkConfig(self.config.num, (RAW, REFINED, BEST, RETURNED), rules, controls=False, seed=self.config.seed)
-        rows = benchmark([self.hand], [load_object(name) for name in self.held_out], predictor, config)
+        config = BenchmarkConfig(self.config.num, (RAW, REFINED, BEST, RETURNED), rules, seed=self.config.seed,
+                                 device=self.config.device)
+        objects = [load_object(name) for name in self.held_out]
+        rows = benchmark([self.hand], objects, [DistanceMethod(predictor)], config)
         told = "; ".join(f"{r.stage}: " + ", ".join(f"{k} {v[0]:.0%}" for k, v in r.success.items()) for r in rows)
         share = f"{rows[-1].optimised:.0%} from the optimiser"
         return {"rows": [dataclasses.asdict(row) for row in rows], "said": f"{predictor.weights_name}, {told}, {share}"}

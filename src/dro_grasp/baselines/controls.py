@@ -1,15 +1,14 @@
-"""Controls: grasps without a network, from those that ignore the object's shape to the optimiser's."""
+"""Controls: methods that ignore the object's shape, or hardly look at it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dro_grasp.baselines.method import Method
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.geometry.se3 import apply, apply_to_cloud, compose, random_rotations
 from dro_grasp.grasps.batch import GraspBatch
@@ -17,18 +16,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pipeline.choice import ChoiceConfig, choice_scores
 from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.stages import optimise
 
-MEAN = "mean grasp"
-"""The mean of the training grasps at random rotations."""
-MEAN_CHOSEN = "mean grasp, chosen"
-"""The same, each rotation chosen by geometry as z is."""
-START = "unoptimised start"
-"""Half-closed hands that face the object."""
-SYNTHESISED = "synthesised"
-"""Grasps that the optimiser makes without a network."""
-Maker = Callable[[int, int], GraspBatch]
-"""Makes a number of grasps from a seed."""
 CHOICE_POINTS = 160
 """Hand points by which a rotation of the mean grasp is chosen; as many as the shipped weights see (ours)."""
 
@@ -43,14 +31,30 @@ class MeanGrasp:
     """Position of the object's centre in the wrist frame [m]."""
 
 
-def controls(problem: GraspProblem, bundle: Bundle | None) -> dict[str, Maker]:
-    """Every control by name; the mean grasp needs a bundle with grasps of the hand."""
-    hand, found = problem.hand, dict[str, Maker]()
-    if bundle is not None and hand.name in bundle.grasps:
-        mean = mean_grasp(bundle, hand.name)
-        for name, choice in ((MEAN, ChoiceConfig(draws=1)), (MEAN_CHOSEN, ChoiceConfig())):
-            found[name] = partial(mean_grasps, problem, mean, config=choice)
-    return found | {START: partial(palm_facing_starts, hand, problem.obj), SYNTHESISED: partial(optimise, problem)}
+class StartMethod(Method):
+    """Half-closed hands that face the object, never optimised."""
+
+    name = "start"
+
+    def make(self, problem: GraspProblem, num: int, seed: int) -> GraspBatch:
+        """See `palm_facing_starts`."""
+        return palm_facing_starts(problem.hand, problem.obj, num, seed)
+
+
+class MeanGraspMethod(Method):
+    """The mean of a hand's training grasps at random rotations, or at rotations chosen by geometry as z is."""
+
+    def __init__(self, bundle: Bundle, chosen: bool = False) -> None:
+        self.bundle, self.config = bundle, ChoiceConfig() if chosen else ChoiceConfig(draws=1)
+        self.name = "mean-grasp-chosen" if chosen else "mean-grasp"
+
+    def knows(self, hand: Hand) -> bool:
+        """Hands with training grasps."""
+        return hand.name in self.bundle.grasps
+
+    def make(self, problem: GraspProblem, num: int, seed: int) -> GraspBatch:
+        """See `mean_grasps`."""
+        return mean_grasps(problem, mean_grasp(self.bundle, problem.hand.name), num, seed, self.config)
 
 
 def mean_grasp(bundle: Bundle, hand_name: str) -> MeanGrasp:
@@ -103,4 +107,3 @@ def palm_facing_starts(hand: Hand, obj: ObjectModel, num: int, seed: int) -> Gra
     T = compose(rotation, surface - rotation @ palm_centre)
     joints = hand.canonical_joints(0.5).expand(num, -1).contiguous()
     return GraspBatch.create(hand, obj, T, joints, seed=seed, provenance="control: palm-facing start")
-

@@ -1,0 +1,91 @@
+"""Methods of others: objects with a `predict` of their own, and grasps that somebody stored in a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+
+from dro_grasp.baselines.method import Method
+from dro_grasp.errors import GraspFileError, OptionError
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.reading import load_grasps
+from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.pipeline.problem import GraspProblem
+
+
+class Predicts(Protocol):
+    """What a class of yours has to offer."""
+
+    def predict(self, hand: Hand, obj: ObjectModel, num: int, seed: int) -> GraspBatch:
+        """Grasps of an object, as `GraspBatch.create` makes them from wrist poses and joints."""
+        ...
+
+
+class ForeignMethod(Method):
+    """An object of yours as a method."""
+
+    def __init__(self, name: str, predictor: Any) -> None:
+        """Take an object that can predict, as `Predicts` says.
+
+        Raises:
+            OptionError: It cannot.
+        """
+        if not callable(getattr(predictor, "predict", None)):
+            raise OptionError(f"method '{name}' has no predict(hand, obj, num, seed); give its class one that returns a "
+                              "GraspBatch (GraspBatch.create makes one from wrist poses and joints)")
+        self.name = name
+        self.predictor: Predicts = predictor
+
+    def make(self, problem: GraspProblem, num: int, seed: int) -> GraspBatch:
+        """What it predicts.
+
+        Raises:
+            OptionError: It returns something else than grasps of this hand on this object.
+        """
+        grasps = self.predictor.predict(problem.hand, problem.obj, num, seed)
+        if not isinstance(grasps, GraspBatch):
+            raise OptionError(f"method '{self.name}' returned a {type(grasps).__name__}, expected a GraspBatch; make one with "
+                              "GraspBatch.create(hand, obj, T_object_wrist, joints)")
+        grasps.require_hand(problem.hand)
+        if set(grasps.object) - {problem.obj.name}:
+            raise OptionError(f"method '{self.name}' returned grasps of {', '.join(sorted(set(grasps.object)))}, asked for was "
+                              f"'{problem.obj.name}'; give GraspBatch.create the object that it was asked for")
+        return grasps[:num]
+
+
+class FileMethod(Method):
+    """Stored grasps, such as `dataset import` makes of other projects' files; outcomes and scores in them count for nothing."""
+
+    def __init__(self, path: Path) -> None:
+        """Read the file, or all files of a folder.
+
+        Raises:
+            GraspFileError: It cannot be read, or holds no grasp.
+        """
+        self.name, self.grasps = path.stem, load_grasps(path)
+
+    def knows(self, hand: Hand) -> bool:
+        """The hand of the file."""
+        return hand.name == self.grasps.hand
+
+    def make(self, problem: GraspProblem, num: int, seed: int) -> GraspBatch:
+        """Some of the stored grasps of the object, drawn at random; all if there are not enough.
+
+        Raises:
+            GraspFileError: There is none, or it is of other geometry.
+        """
+        rows = torch.tensor([name == problem.obj.name for name in self.grasps.object]).nonzero()[:, 0]
+        if not len(rows):
+            held = ", ".join(sorted(set(self.grasps.object))[:5])
+            raise GraspFileError(f"'{self.name}' holds no grasp of '{problem.obj.name}', but of {held}; name its objects with "
+                                 "--objects")
+        self.grasps.require_hand(problem.hand)
+        if wrong := set(self.grasps[rows].object_sha256) - {problem.obj.sha256, ""}:
+            raise GraspFileError(f"'{self.name}' holds grasps of another '{problem.obj.name}' ({wrong.pop()[:12]}, not "
+                                 f"{problem.obj.sha256[:12]}); evaluate them on the object that they were made for")
+        order = torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))
+        stored = self.grasps[rows[order[:num]]]
+        return stored.without("score").without_trial()

@@ -1,0 +1,65 @@
+"""The methods of this package: the network, the optimiser, and DFC, which is the optimiser without any choice."""
+
+from __future__ import annotations
+
+import torch
+
+from dro_grasp.baselines.method import Made, Method, finished
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize_with
+from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.pipeline.proposal import propose
+from dro_grasp.pipeline.stages import optimise
+from dro_grasp.predictor import GraspPredictor, GraspRequest
+
+CANDIDATES = 4
+"""Candidates for each grasp that a method returns which ranks them, as `generate` has it (ours)."""
+
+
+class DistanceMethod(Method):
+    """The D(R,O) network; it returns what `generate` does, with the optimiser's help where the score asks for it."""
+
+    def __init__(self, predictor: GraspPredictor, name: str = "dro") -> None:
+        self.predictor, self.name = predictor, name
+
+    @torch.no_grad()
+    def make(self, problem: GraspProblem, num: int, seed: int) -> GraspBatch:
+        """Grasps of the network alone."""
+        generator = torch.Generator().manual_seed(seed)
+        return propose(problem, self.predictor.network, num, generator, self.predictor.config).grasps
+
+    def best(self, problem: GraspProblem, num: int, seed: int) -> Made:
+        """Grasps as `generate` returns them."""
+        made = self.predictor.run(problem, GraspRequest(num, seed, candidates=CANDIDATES))
+        return Made(made.grasps, made.candidates)
+
+
+class SynthesisMethod(Method):
+    """Grasps that the optimiser makes without a network; it returns the best by the score that also ranks the network's."""
+
+    name = "synthesise"
+
+    def make(self, problem: GraspProblem, num: int, seed: int) -> GraspBatch:
+        """The data engine's candidates: of several descents, those of lowest energy."""
+        return optimise(problem, num, seed)
+
+    def best(self, problem: GraspProblem, num: int, seed: int) -> Made:
+        """The best of refined, settled candidates by score."""
+        grasps = finished(problem, self.make(problem, CANDIDATES * num, seed), num)
+        return Made(grasps.sorted_by_score()[:num], CANDIDATES * num)
+
+
+class DescentMethod(Method):
+    """DFC (Liu et al. 2021), as in DexGraspNet: one descent a grasp, none of which is left out.
+
+    Differs from DFC: the energies and the steps are the data engine's.
+    """
+
+    name = "dfc"
+
+    def __init__(self, config: SynthesisConfig | None = None) -> None:
+        self.config = config or SynthesisConfig()
+
+    def make(self, problem: GraspProblem, num: int, seed: int) -> GraspBatch:
+        """All that the descents end at, in no particular order of quality."""
+        return synthesize_with(problem.energy(self.config.energy), problem.obj, num, seed, self.config).bare()
