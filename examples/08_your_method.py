@@ -22,7 +22,7 @@ def pinch_from_above(hand: dro.Hand, obj: dro.ObjectModel, num: int, seed: int) 
     poses[:, :3, :3] = roll @ wrist_axes
     top = torch.tensor([*obj.centre_of_mass[:2], float(obj.cloud[:, 2].max())]).float()
     poses[:, :3, 3] = top - poses[:, :3, :3] @ hand.grasp_centre_wrist
-    return poses, hand.canonical_joints(0.7).repeat(num, 1)
+    return poses, hand.canonical_joints(0.45).repeat(num, 1)
 
 
 class PinchFromAbove:

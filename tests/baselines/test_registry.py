@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from dro_grasp.baselines import ours
 from dro_grasp.baselines.foreign import FileMethod, ForeignMethod
 from dro_grasp.baselines.method import Method
 from dro_grasp.baselines.ours import DescentMethod
@@ -44,7 +45,8 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_every_name_makes_a_method_that_predicts_as_the_predictor_does(bundle, quick_synthesis: None) -> None:
+def test_every_name_makes_a_method_that_predicts_as_the_predictor_does(bundle, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ours, "DESCENT_STEPS", 4)
     hand, obj = toy_hand(), load_object("sphere")
     for name in sorted(set(METHODS) - {"dro", "synthesise"}):
         method = make_method(name, MethodOptions(bundle=bundle))

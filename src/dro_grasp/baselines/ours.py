@@ -5,7 +5,9 @@ from __future__ import annotations
 import torch
 
 from dro_grasp.baselines.method import Made, Method, finished
+from dro_grasp.energy.contact_candidates import ContactConfig
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.optimization.starts import StartConfig
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize_with
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.proposal import propose
@@ -14,6 +16,8 @@ from dro_grasp.predictor import GraspPredictor, GraspRequest
 
 CANDIDATES = 4
 """Candidates for each grasp that a method returns which ranks them, as `generate` has it (ours)."""
+DESCENT_STEPS = 1200
+"""Steps of a descent that is not settled: ten times those of the data engine (ours)."""
 
 
 class DistanceMethod(Method):
@@ -52,13 +56,15 @@ class SynthesisMethod(Method):
 class DescentMethod(Method):
     """DFC (Liu et al. 2021), as in DexGraspNet: one descent a grasp, none of which is left out.
 
-    Differs from DFC: the energies and the steps are the data engine's.
+    Differs from DFC: the energies and the scheme are the data engine's. Every finger holds, and descents begin with open
+    hands, which no choice among candidates makes up for; both were chosen on built-in training objects.
     """
 
     name = "dfc"
 
     def __init__(self, config: SynthesisConfig | None = None) -> None:
-        self.config = config or SynthesisConfig()
+        self.config = config or SynthesisConfig(
+            steps=DESCENT_STEPS, contacts=ContactConfig(idle=0.0), starts=StartConfig(openness=(0.4, 1.0), joint_noise=0.1))
 
     def make(self, problem: GraspProblem, num: int, seed: int) -> GraspBatch:
         """All that the descents end at, in no particular order of quality."""
