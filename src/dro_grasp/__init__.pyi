@@ -51,6 +51,7 @@ from dro_grasp.predictor import (
     Prediction as Prediction,
     PredictorConfig as PredictorConfig,
 )
+from dro_grasp.serve.client import GraspClient as GraspClient
 from dro_grasp.simulation.outcome import Failure as Failure, TrialResult as TrialResult
 from dro_grasp.simulation.protocols import Perturbations as Perturbations, Protocol as Protocol
 from dro_grasp.simulation.trial import simulate as simulate

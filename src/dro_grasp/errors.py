@@ -49,3 +49,7 @@ class OutputError(DroGraspError):
 
 class TrainingError(DroGraspError):
     """Training cannot continue, for example after a non-finite loss."""
+
+
+class ServerError(DroGraspError):
+    """A grasp server refuses a request, fails, or is not there."""

@@ -72,6 +72,8 @@ class GraspRequest:
         if self.num * self.candidates > LARGEST_CALL:
             raise OptionError(f"{self.num} grasps of {self.candidates} candidates each do not fit memory; predict at most "
                               f"{LARGEST_CALL} at once, with another --seed for more")
+        if not 0 <= self.seed < 2**63:
+            raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^63 - 1")
         check_temperature(self.temperature)
         if self.method not in get_args(Method):
             raise OptionError(f"method is '{self.method}'; choose {', '.join(get_args(Method))}")

@@ -87,15 +87,13 @@ class Generate:
     def run(self) -> int:
         """Check everything that can be checked before the work, then do it."""
         begin = time.perf_counter()
-        from dro_grasp.errors import DroGraspError, OptionError
+        from dro_grasp.errors import DroGraspError
         from dro_grasp.frames import read_motion
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.catalogue import resolve_objects
         from dro_grasp.pipeline.constraints import Constraints
         from dro_grasp.predictor import GraspPredictor, GraspRequest
 
-        if not 0 <= self.seed < 2**63:
-            raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^63 - 1")
         request = GraspRequest(
             self.num, self.seed, self.candidates, self.refine, self.temperature, self.method)
         constraints = Constraints(self.direction, self.table)

@@ -24,6 +24,7 @@ from dro_grasp.cli.listing import HandCommand, Hands, Objects
 from dro_grasp.cli.onboard import Onboard
 from dro_grasp.cli.plan_lift import Plan
 from dro_grasp.cli.robots import RobotCommand
+from dro_grasp.cli.serve import Serve
 from dro_grasp.cli.synthesize import Synthesize
 from dro_grasp.cli.train import Pretrain, Train
 from dro_grasp.cli.view import Picture, View
@@ -56,6 +57,7 @@ Command = (
     | Annotated[Pretrain, named("pretrain")]
     | Annotated[Train, named("train")]
     | Annotated[View, named("view")]
+    | Annotated[Serve, named("serve")]
     | Annotated[Picture, named("picture")]
     | Annotated[HandCommand, named("hand")]
     | Annotated[Hands, named("hands")]

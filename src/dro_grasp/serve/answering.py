@@ -1,0 +1,204 @@
+"""The computing side of a grasp server: what it has loaded, and the answer to one request."""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+import torch
+
+from dro_grasp.errors import DroGraspError, HandError, ObjectError, OptionError
+from dro_grasp.frames import motion_fault
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.library import hand_names, load_hand
+from dro_grasp.objects.catalogue import load_object, object_names, resolve_objects
+from dro_grasp.objects.loading import read_points
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.perception.scan import scanned_object
+from dro_grasp.pipeline.constraints import Constraints
+from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.pipeline.stages import evaluate
+from dro_grasp.predictor import GraspPredictor, GraspRequest, Prediction, Progress
+from dro_grasp.serve.messages import GraspAnswer, SentCamera, SentGrasp, SentObject, settings_in
+from dro_grasp.viewer.uploads import store_upload
+
+KEPT_HANDS = 16
+"""Most hands that stay loaded (ours)."""
+KEPT_OBJECTS = 32
+"""Most objects that stay loaded (ours); sent ones count."""
+KEPT_PROBLEMS = 8
+"""Most pairs of hand and object, with constraints, of which all that was derived stays (ours)."""
+LARGEST_REQUEST = 1_000
+"""Most candidates of one request (ours): a server answers robots, `generate` fills files."""
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True)
+class Stock:
+    """What a server computes with."""
+
+    weights: str | None = None
+    """Name of shipped weights or path of a weights file; None takes the default."""
+    device: str = "cpu"
+    """Where the network and the energies run."""
+    hands: tuple[str, ...] = ()
+    """Names or files of hands that are loaded before serving; built-in ones can be asked for besides."""
+    objects: tuple[str, ...] = ()
+    """Files and folders of objects that can be asked for by the names of the files; built-in ones can be besides."""
+
+
+class Kept(Generic[Value]):
+    """The values used last, each made at its first use."""
+
+    def __init__(self, most: int) -> None:
+        """Keep at most so many."""
+        self.most = most
+        self._values: OrderedDict[Hashable, Value] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
+        """The value of a key."""
+        if key not in self._values:
+            self._values[key] = make()
+            while len(self._values) > self.most:
+                self._values.popitem(last=False)
+        self._values.move_to_end(key)
+        return self._values[key]
+
+
+class Answerer:
+    """Answers requests one by one, with hands and objects that stay loaded; nothing is read but what it was given and sent."""
+
+    def __init__(self, stock: Stock) -> None:
+        """Load the weights and the hands.
+
+        Raises:
+            DroGraspError: Something cannot be used.
+        """
+        self.predictor = GraspPredictor(stock.weights, stock.device)
+        self.own_hands = {hand.name: hand for hand in map(load_hand, stock.hands)}
+        self.own_objects = {Path(name).stem: name for name in resolve_objects(list(stock.objects))}
+        self.hands: Kept[Hand] = Kept(KEPT_HANDS)
+        self.objects: Kept[ObjectModel] = Kept(KEPT_OBJECTS)
+        self.problems: Kept[GraspProblem] = Kept(KEPT_PROBLEMS)
+
+    def answer(self, call: Any, progress: Progress | None = None) -> GraspAnswer:
+        """The answer to a GraspCall.
+
+        Args:
+            call: What is asked.
+            progress: Called now and then; what it raises ends the work.
+
+        Raises:
+            DroGraspError: The request cannot be met.
+        """
+        begin = time.perf_counter()
+        request, constraints = settings_in(call, GraspRequest), settings_in(call, Constraints)
+        if request.num * request.candidates > LARGEST_REQUEST:
+            raise OptionError(f"{request.num} grasps of {request.candidates} candidates each are asked for; a server makes at "
+                              f"most {LARGEST_REQUEST} candidates at once, `dro-grasp generate` more")
+        hand, (key, obj) = self.hand(call.hand), self.object(call.object, call.camera)
+        if call.protocol is not None and obj.is_cloud:
+            raise OptionError(f"protocol is '{call.protocol}', and a bare cloud gets no trial; send a mesh, or leave it out")
+        problem = self.problems.get(
+            (hand.name, key, constraints), lambda: GraspProblem(hand, obj, self.predictor.device, constraints))
+        loaded = time.perf_counter() - begin
+        made = self.predictor.run(problem, request, progress)
+        middle = time.perf_counter()
+        grasps = made.grasps if call.protocol is None else evaluate(problem, made.grasps, call.protocol, progress)
+        doubt = constraints.doubt(obj)
+        seconds = {"load": loaded, **made.seconds, "trial": time.perf_counter() - middle, "whole": time.perf_counter() - begin}
+        return GraspAnswer(
+            id=call.id, hand=hand.name, object=obj.name, frame="object" if call.camera is None else call.camera.frame,
+            wrist_link=grasps.wrist_link, joint_names=list(grasps.joint_names), grasps=sent_grasps(grasps, made),
+            candidates=made.candidates, weights=self.predictor.weights_name, protocol=call.protocol,
+            notes=[*obj.notes, *filter(None, [doubt])], shortage=made.shortage,
+            seconds={name: round(value, 4) for name, value in seconds.items()})
+
+    def hand_names(self) -> list[str]:
+        """Names of the hands that can be asked for."""
+        return list({**self.own_hands, **hand_names()})
+
+    def object_names(self) -> list[str]:
+        """Names of the objects that can be asked for."""
+        return list({**self.own_objects, **object_names()})
+
+    def hand(self, name: str) -> Hand:
+        """A hand by its name.
+
+        Raises:
+            HandError: The server knows no such hand.
+        """
+        if name in self.own_hands:
+            return self.own_hands[name]
+        if name not in hand_names():
+            raise HandError(f"this server knows no hand '{name}'; it knows {', '.join(self.hand_names())}. Start it with "
+                            "--hand FILE for another one")
+        return self.hands.get(name, lambda: load_hand(name))
+
+    def object(self, sent: SentObject, camera: SentCamera | None) -> tuple[Hashable, ObjectModel]:
+        """An object that was named or sent, and the key under which it is kept.
+
+        Raises:
+            ObjectError: It cannot be used, or the server knows none of this name.
+            OptionError: It cannot be used together with a camera.
+        """
+        if sent.name is not None and camera is not None:
+            raise OptionError("a camera is given, and the object is named; send the cloud that the camera saw")
+        if sent.name is not None and sent.name not in (known := self.object_names()):
+            raise ObjectError(f"this server knows no object '{sent.name}', but {', '.join(known[:12])} and others (page "
+                              "/objects); send the mesh or cloud, or start the server with --object FILE")
+        key = hashlib.sha256(sent.model_dump_json(exclude={"file": {"content"}}).encode())
+        key.update(b"" if sent.file is None else sent.file.content)
+        key.update(b"" if camera is None else camera.model_dump_json().encode())
+        return key.digest(), self.objects.get(key.digest(), lambda: self._load(sent, camera))
+
+    def _load(self, sent: SentObject, camera: SentCamera | None) -> ObjectModel:
+        source, options = sent.name, {"scale": sent.scale, "keep_table": sent.keep_table}
+        if source is not None:
+            return load_object(self.own_objects.get(source, source), **options)
+        with tempfile.TemporaryDirectory(prefix="dro-grasp-") as folder:
+            try:
+                if camera is not None:
+                    return self._scan(sent, camera, Path(folder))
+                if sent.file is None:
+                    return load_object(np.array(sent.points, np.float64).reshape(-1, 3), **options)
+                obj = load_object(store_upload(sent.file.name, sent.file.content, Path(folder)), **options)
+                return replace(obj, file=None)
+            except DroGraspError as error:
+                raise type(error)(str(error).replace(f"{folder}/", "")) from error
+
+    def _scan(self, sent: SentObject, camera: SentCamera, folder: Path) -> ObjectModel:
+        T = torch.tensor(camera.T_frame_camera, dtype=torch.float64)
+        if (fault := motion_fault(T)) is not None:
+            raise OptionError(f"T_frame_camera must be 4 rows of 4 numbers, in metres; {fault}")
+        if sent.file is None:
+            name, points = "cloud", np.array(sent.points, np.float64).reshape(-1, 3)
+        else:
+            path = store_upload(sent.file.name, sent.file.content, folder)
+            name, points = path.stem, read_points(path)
+        return scanned_object(name, points * sent.scale, T.numpy(), keep_table=sent.keep_table)
+
+
+def sent_grasps(grasps: GraspBatch, made: Prediction) -> list[SentGrasp]:
+    """The grasps of a batch one by one."""
+    rows = zip(grasps.wrist_position.tolist(), grasps.wrist_quaternion_wxyz.tolist(), grasps.joints.tolist(),
+               grasps.pregrasp_joints.tolist(), grasps.squeeze_joints.tolist(), grasps.score.tolist(), made.origin, strict=True)
+    reasons = grasps.extra.get("reason") or [None] * len(grasps)
+    return [
+        SentGrasp(
+            wrist_position=tuple(position), wrist_quaternion_wxyz=tuple(quaternion), joints=joints, pregrasp_joints=pregrasp,
+            squeeze_joints=squeeze, score=score, origin=origin,
+            success=bool(grasps.success[i]) if grasps.evaluated[i] else None, reason=reasons[i] or None)
+        for i, (position, quaternion, joints, pregrasp, squeeze, score, origin) in enumerate(rows)
+    ]

@@ -1,0 +1,83 @@
+"""Asking a grasp server from Python, with the standard library and NumPy alone."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from pathlib import Path
+from typing import Any
+from urllib.error import HTTPError, URLError
+from urllib.request import Request, urlopen
+
+import numpy as np
+from jaxtyping import Float
+
+from dro_grasp.errors import ServerError
+
+
+class GraspClient:
+    """A grasp server at an address.
+
+    Example:
+        >>> answer = GraspClient().predict("allegro", cloud, num=4, direction=(0, 0, -1))
+        >>> answer["grasps"][0]["wrist_position"]
+    """
+
+    def __init__(self, url: str = "http://127.0.0.1:8090", token: str | None = None, timeout: float = 120.0) -> None:
+        """Remember where to ask; nothing is sent yet.
+
+        Args:
+            url: Of the server.
+            token: That it wants, if it does.
+            timeout: Longest wait for an answer [s].
+        """
+        self.url, self.timeout = url.rstrip("/"), timeout
+        self.headers = {"Content-Type": "application/json"} | ({"Authorization": f"Bearer {token}"} if token else {})
+
+    def predict(self, hand: str, obj: str | Path | Float[np.ndarray, "n 3"], num: int = 16, **options: Any) -> dict[str, Any]:
+        """The server's answer: its list `grasps`, the best first, and all that is known of it.
+
+        Args:
+            hand: Name of a hand that the server knows.
+            obj: The path of a mesh or cloud, which is sent; the name of an object that the server knows; or points [m].
+            num: Grasps to return.
+            options: What else a request holds, such as direction, table, camera, protocol; scale and keep_table are the
+                object's.
+
+        Raises:
+            ServerError: The server refuses, fails or is not there.
+        """
+        of_object = {name: options.pop(name) for name in ("scale", "keep_table") if name in options}
+        if isinstance(obj, np.ndarray):
+            np.save(file := io.BytesIO(), obj)
+            sent = sent_file("cloud.npy", file.getvalue())
+        else:
+            sent = sent_file(Path(obj).name, Path(obj).read_bytes()) if Path(obj).is_file() else {"name": str(obj)}
+        return self.ask("POST", "/grasps", {"hand": hand, "object": sent | of_object, "num": num, **options})
+
+    def cancel(self, name: str) -> None:
+        """Cancel the request of this id."""
+        self.ask("DELETE", f"/grasps/{name}")
+
+    def ask(self, method: str, page: str, content: dict[str, Any] | None = None) -> Any:
+        """What a page of the server answers.
+
+        Raises:
+            ServerError: It refuses, fails or is not there.
+        """
+        body = None if content is None else json.dumps(content).encode()
+        try:
+            with urlopen(Request(self.url + page, body, self.headers, method=method), timeout=self.timeout) as answer:
+                return json.load(answer)
+        except HTTPError as error:
+            with error:
+                why = error.read().decode(errors="replace")
+            raise ServerError(json.loads(why)["error"] if why.startswith('{"error"') else f"{error}: {why[:200]}") from error
+        except (URLError, OSError) as error:
+            raise ServerError(f"no grasp server answers at {self.url} ({error}); start one with `dro-grasp serve`") from error
+
+
+def sent_file(name: str, content: bytes) -> dict[str, Any]:
+    """An object's file as a request holds it."""
+    return {"file": {"name": name, "content": base64.b64encode(content).decode()}}

@@ -1,0 +1,248 @@
+"""The grasp server over HTTP: its pages, who may ask, and how much."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+import signal
+import socket
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from http import HTTPStatus
+from typing import Any
+
+import uvicorn  # pyright: ignore[reportMissingImports]
+from fastapi import FastAPI, HTTPException, Request  # pyright: ignore[reportMissingImports]
+from fastapi.exceptions import RequestValidationError  # pyright: ignore[reportMissingImports]
+from fastapi.responses import PlainTextResponse, Response  # pyright: ignore[reportMissingImports]
+from starlette.exceptions import HTTPException as AnyHTTPException  # pyright: ignore[reportMissingImports]
+
+from dro_grasp._version import __version__
+from dro_grasp.errors import OptionError, ServerError
+from dro_grasp.serve.computing import Reply, refused
+from dro_grasp.serve.desk import Desk
+from dro_grasp.serve.messages import GraspAnswer, GraspCall, Refusal
+from dro_grasp.viewer.guard import refusal
+
+SLOWEST_BODY = 30.0
+"""Time within which the whole of a request must arrive [s] (ours)."""
+FAREWELL = 10.0
+"""Time that requests under way get to end when the server is stopped [s] (ours)."""
+MOST_CONNECTIONS = 128
+"""Most open connections (ours)."""
+OPEN = ("/health",)
+"""Pages that need no token."""
+THIS_MACHINE = ("127.0.0.1", "localhost", "::1")
+"""Addresses at which only this machine can connect."""
+
+
+@dataclass(frozen=True)
+class Access:
+    """Who may ask, and how much at once."""
+
+    host: str = "127.0.0.1"
+    """Address to serve at; only this machine can connect by default."""
+    token: str | None = None
+    """What requests must bear; needed where others can connect."""
+    megabytes: float = 32.0
+    """Largest body of a request [MB]."""
+
+    def __post_init__(self) -> None:
+        """Refuse to serve others without a token.
+
+        Raises:
+            OptionError: As said, or a limit is out of range.
+        """
+        if self.host not in THIS_MACHINE and not self.token:
+            raise OptionError(f"host is '{self.host}', where others can connect; give a token that they must bear (--token, or "
+                              "the environment variable DRO_GRASP_TOKEN), or serve this machine only (--host 127.0.0.1)")
+        if not 0 < self.megabytes <= 1000:
+            raise OptionError(f"megabytes is {self.megabytes}; give a number above 0, and at most 1000")
+
+
+class Gate:
+    """Refuses what comes from foreign pages, bears no token, or is too large or too slow, before anything reads it."""
+
+    def __init__(self, app: Callable[..., Awaitable[None]], access: Access) -> None:
+        """Stand before an application."""
+        self.app, self.access = app, access
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        """Pass a request on, or refuse it."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        headers = {name.decode("latin-1").title(): value.decode("latin-1") for name, value in scope["headers"]}
+        reply = self._refusal(headers, scope["path"])
+        if reply is not None:
+            await Response(reply.body, reply.status, media_type="application/json")(scope, receive, send)
+            return
+        await self.app(scope, self._limited(receive), send)
+
+    def _refusal(self, headers: dict[str, str], path: str) -> Reply | None:
+        if why := refusal(headers, self.access.host):
+            return refused(HTTPStatus.FORBIDDEN, f"the request is refused: {why}")
+        borne = headers.get("Authorization", "").removeprefix("Bearer ").encode()
+        if self.access.token and path not in OPEN and not secrets.compare_digest(borne, self.access.token.encode()):
+            return refused(HTTPStatus.UNAUTHORIZED, "the request bears no token, or another one than the server's; send the "
+                                                    "header 'Authorization: Bearer TOKEN'")
+        length = headers.get("Content-Length", "0")
+        if not length.isdecimal() or int(length) > 1e6 * self.access.megabytes:
+            return refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, self._too_large)
+        return None
+
+    @property
+    def _too_large(self) -> str:
+        return f"the request has more than {self.access.megabytes:g} MB; simplify the mesh or thin out the cloud"
+
+    def _limited(self, receive: Any) -> Any:
+        """The request's parts, until there are too many or they come too slowly."""
+        size, whole, deadline = 0, False, asyncio.get_running_loop().time() + SLOWEST_BODY
+
+        async def part() -> Any:
+            nonlocal size, whole
+            if whole:
+                return await receive()
+            try:
+                message = await asyncio.wait_for(receive(), deadline - asyncio.get_running_loop().time())
+            except TimeoutError:
+                raise HTTPException(HTTPStatus.REQUEST_TIMEOUT, f"the request did not arrive in {SLOWEST_BODY:g} s") from None
+            size += len(message.get("body", b""))
+            whole = not message.get("more_body", False)
+            if size > 1e6 * self.access.megabytes:
+                raise HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, self._too_large)
+            return message
+
+        return part
+
+
+def application(desk: Desk, access: Access) -> FastAPI:
+    """The pages of a server; the desk is closed when it stops."""
+
+    @asynccontextmanager
+    async def life(_: Any) -> AsyncIterator[None]:
+        yield
+        await asyncio.to_thread(desk.close)
+
+    app = FastAPI(title="dro-grasp", version=__version__, lifespan=life,
+                  description="Grasps of any object by any hand. Lengths are metres, angles radians, quaternions WXYZ.")
+    app.add_middleware(Gate, access=access)
+    app.add_exception_handler(RequestValidationError, _invalid)
+    app.add_exception_handler(AnyHTTPException, _failed)
+    told = {status: {"model": Refusal} for status in (401, 403, 409, 413, 422, 500, 503, 504)}
+
+    @app.post("/grasps", response_model=GraspAnswer, responses=told)
+    async def grasps(call: GraspCall, request: Request) -> Any:
+        """Grasps of an object by a hand, the best first. Closing the connection cancels the request."""
+        reply = await _answered(desk, call, request)
+        return Response(reply.body, reply.status, media_type="application/json")
+
+    @app.delete("/grasps/{id}", responses={404: {"model": Refusal}})
+    async def cancel(id: str) -> dict[str, str]:
+        """Cancel a request, in the queue or under way."""
+        if not desk.cancel(id):
+            raise HTTPException(HTTPStatus.NOT_FOUND, f"no request '{id}' is under way")
+        return {"cancelled": id}
+
+    @app.get("/health")
+    async def health() -> dict[str, Any]:
+        """Whether the server answers, and how busy it is."""
+        return {"status": "ok", "version": __version__, "waiting": desk.waiting, "computing": desk.computing}
+
+    @app.get("/hands")
+    async def hands() -> list[str]:
+        """Names of hands that can be asked for."""
+        return desk.ready.hands
+
+    @app.get("/objects")
+    async def objects() -> list[str]:
+        """Names of objects that can be asked for."""
+        return desk.ready.objects
+
+    @app.get("/metrics", response_class=PlainTextResponse)
+    async def metrics() -> str:
+        """Counts and times in the text format of Prometheus."""
+        return metrics_text(desk)
+
+    return app
+
+
+async def _answered(desk: Desk, call: Any, request: Request) -> Reply:
+    """The reply to a call, which is cancelled when its connection closes."""
+    try:
+        taken = desk.submit(call)
+    except ServerError as error:
+        desk.tally.replies[int(HTTPStatus.SERVICE_UNAVAILABLE)] += 1
+        return refused(HTTPStatus.SERVICE_UNAVAILABLE, str(error))
+    reply, gone = asyncio.wrap_future(taken.reply), asyncio.ensure_future(_left(request))
+    try:
+        await asyncio.wait({reply, gone}, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        gone.cancel()
+        if not taken.reply.done():
+            desk.cancel(call.id)
+    return await reply
+
+
+async def _left(request: Request) -> None:
+    """Wait until the other side closes the connection."""
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
+
+
+async def _invalid(_: Any, error: Any) -> Response:
+    first = error.errors()[0]
+    place = ".".join(str(part) for part in first["loc"] if part != "body")
+    why = f"{place or 'the request'}: {first['msg']}; the page /docs shows what a request holds"
+    reply = refused(HTTPStatus.UNPROCESSABLE_ENTITY, why)
+    return Response(reply.body, reply.status, media_type="application/json")
+
+
+async def _failed(_: Any, error: Any) -> Response:
+    return Response(refused(HTTPStatus(error.status_code), error.detail).body, error.status_code, media_type="application/json")
+
+
+def metrics_text(desk: Desk) -> str:
+    """What a desk has done, in the text format of Prometheus."""
+    tally = desk.tally
+    lines = ["# TYPE dro_grasp_replies_total counter"]
+    lines += [f'dro_grasp_replies_total{{status="{status}"}} {count}' for status, count in sorted(tally.replies.items())]
+    for name, kind, value in (
+        ("waiting", "gauge", desk.waiting), ("computing", "gauge", int(desk.computing)),
+        ("waiting_seconds_total", "counter", round(tally.waiting_seconds, 3)),
+        ("computing_seconds_total", "counter", round(tally.computing_seconds, 3)),
+        ("process_starts_total", "counter", tally.starts), ("process_memory_bytes", "gauge", desk.memory),
+    ):
+        lines += [f"# TYPE dro_grasp_{name} {kind}", f"dro_grasp_{name} {value}"]
+    return "\n".join(lines) + "\n"
+
+
+def listening_socket(host: str, port: int) -> socket.socket:
+    """A socket that listens at an address.
+
+    Raises:
+        OptionError: This machine cannot listen there.
+    """
+    if not 0 <= port < 2**16:
+        raise OptionError(f"port is {port}; give a number up to 65535, for example --port 8090, or 0 for any that is free")
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family, backlog=MOST_CONNECTIONS)
+    except OSError as error:
+        raise OptionError(f"this machine cannot serve at '{host}', port {port} ({error}); give another --port, or --host "
+                          "127.0.0.1 for this machine only") from error
+
+
+def serve_grasps(desk: Desk, access: Access, listener: socket.socket) -> None:
+    """Serve until SIGTERM or Ctrl-C; requests under way get FAREWELL to end, and the desk is closed."""
+    signal.signal(signal.SIGTERM, lambda *_: None)  # uvicorn raises it again once it has stopped
+    config = uvicorn.Config(
+        application(desk, access), log_level="warning", access_log=False, limit_concurrency=MOST_CONNECTIONS,
+        timeout_graceful_shutdown=int(FAREWELL), server_header=False)
+    try:
+        uvicorn.Server(config).run(sockets=[listener])
+    except KeyboardInterrupt:
+        pass
+    finally:
+        desk.close()

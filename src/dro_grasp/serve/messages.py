@@ -1,0 +1,192 @@
+"""What a grasp server is asked and what it answers, as JSON: the one place where both are defined."""
+
+from __future__ import annotations
+
+import ast
+import base64
+import inspect
+import textwrap
+import uuid
+from dataclasses import MISSING, fields
+from itertools import pairwise
+from typing import Any, TypeVar, get_type_hints
+
+from pydantic import (  # pyright: ignore[reportMissingImports]
+    BaseModel,
+    ConfigDict,
+    Field,
+    create_model,
+    field_validator,
+    model_validator,
+)
+
+from dro_grasp.pipeline.constraints import Constraints
+from dro_grasp.predictor import GraspRequest
+
+MOST_POINTS = 200_000
+"""Most points of a cloud that is sent as numbers (ours); files may hold more."""
+Point = tuple[float, float, float]
+Row = tuple[float, float, float, float]
+Settings = TypeVar("Settings")
+
+
+class Message(BaseModel):
+    """A JSON object; what is not named here is refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, ser_json_bytes="base64")
+
+
+class SentFile(Message):
+    """A file that travels within the request."""
+
+    name: str = Field(max_length=200)
+    """Its name; the suffix tells the format."""
+    content: bytes = Field(json_schema_extra={"contentEncoding": "base64"})
+    """The bytes, in base64."""
+
+    @field_validator("content", mode="before")
+    @classmethod
+    def _decoded(cls, given: Any) -> bytes:
+        return base64.b64decode(given, validate=True)
+
+
+class SentObject(Message):
+    """An object: one of name, file and points. A text instead is its name."""
+
+    name: str | None = None
+    """Name of an object that the server knows."""
+    file: SentFile | None = None
+    """A mesh or cloud file, whole; it cannot name other files."""
+    points: list[Point] | None = Field(None, max_length=MOST_POINTS)
+    """A point cloud [m]."""
+    scale: float = 1.0
+    """Multiplies the coordinates; 0.001 for millimetres."""
+    keep_table: bool = False
+    """Take every point of a cloud for the object's; by default a table in it is found and cut off."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _named(cls, given: Any) -> Any:
+        return {"name": given} if isinstance(given, str) else given
+
+    @model_validator(mode="after")
+    def _one_source(self) -> SentObject:
+        if sum(source is not None for source in (self.name, self.file, self.points)) != 1:
+            raise ValueError("give one of name, file and points")
+        return self
+
+
+class SentCamera(Message):
+    """The camera that saw a cloud; the grasps are in the named frame, and so are direction and table."""
+
+    frame: str = Field(min_length=1, max_length=200)
+    """Name of the frame."""
+    T_frame_camera: tuple[Row, Row, Row, Row]
+    """The camera's pose in it [m]."""
+
+
+class _Call(Message):
+    hand: str
+    """Name of a hand that the server knows."""
+    object: SentObject
+    """What to grasp."""
+    camera: SentCamera | None = None
+    """Where the cloud was seen from; without one, it is taken to be in the frame of the grasps."""
+    protocol: str | None = None
+    """Evaluate each grasp in simulation under this protocol, which needs a mesh; by default grasps get no trial."""
+    id: str = Field(default_factory=lambda: uuid.uuid4().hex, max_length=64, pattern=r"^[\w-]+$")
+    """Name of the request, by which it can be cancelled."""
+
+
+WIRE_TYPES: dict[str, Any] = {}
+"""Types as JSON of those fields whose types in Python are none (ours)."""
+
+
+def fields_of(settings: type[Any]) -> dict[str, Any]:
+    """The fields of a dataclass with type, default and description, as pydantic takes them."""
+    types, told = get_type_hints(settings), field_docs(settings)
+    return {f.name: (WIRE_TYPES.get(f.name, types[f.name]), Field(... if f.default is MISSING else f.default,
+                                                                  description=told.get(f.name))) for f in fields(settings)}
+
+
+def field_docs(settings: type[Any]) -> dict[str, str]:
+    """The docstring under each field of a dataclass."""
+    body = ast.parse(textwrap.dedent(inspect.getsource(settings))).body[0].body  # type: ignore[attr-defined]
+    return {field.target.id: " ".join(text.value.value.split()) for field, text in pairwise(body)
+            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(text, ast.Expr)
+            and isinstance(text.value, ast.Constant)}
+
+
+GraspCall: Any = create_model(
+    "GraspCall", __base__=_Call, __module__=__name__, __doc__="What is asked: hand, object, and what grasps have to respect.",
+    **fields_of(GraspRequest), **fields_of(Constraints))
+
+
+def settings_in(call: Any, settings: type[Settings]) -> Settings:
+    """The dataclass whose fields a GraspCall holds.
+
+    Raises:
+        OptionError: A value is out of range.
+    """
+    return settings(**{f.name: getattr(call, f.name) for f in fields(settings)})  # type: ignore[arg-type]
+
+
+class SentGrasp(Message):
+    """A grasp: wrist pose, and the joints of its three postures in the order of `joint_names`."""
+
+    wrist_position: Point
+    """Position of the hand's root link [m]."""
+    wrist_quaternion_wxyz: Row
+    """Its orientation."""
+    joints: list[float]
+    """Joints in the grasp [rad or m]."""
+    pregrasp_joints: list[float]
+    """Joints before closing, clear of the object [rad or m]."""
+    squeeze_joints: list[float]
+    """Targets that press on the object [rad or m]."""
+    score: float
+    """Log-odds of holding; higher is better."""
+    origin: str
+    """`network` or `optimiser`."""
+    success: bool | None = None
+    """Whether it held in its trial; null without one."""
+    reason: str | None = None
+    """Why it did not, in words."""
+
+
+class GraspAnswer(Message):
+    """Grasps, the best first."""
+
+    id: str
+    """Of the request."""
+    hand: str
+    """Name of the hand."""
+    object: str
+    """Name of the object."""
+    frame: str
+    """Frame of the wrist poses: the camera's named frame, or `object`, that of the given mesh or cloud."""
+    wrist_link: str
+    """The hand's root link, which the wrist poses are of."""
+    joint_names: list[str]
+    """The independent joints."""
+    grasps: list[SentGrasp]
+    """The best first."""
+    candidates: int
+    """How many candidates they were chosen from."""
+    weights: str
+    """Name of the weights."""
+    protocol: str | None
+    """Of the trial; null without one."""
+    notes: list[str]
+    """What was found and repaired in the object, and what is doubtful."""
+    shortage: str | None
+    """Why there are fewer grasps than were asked for; null if there are as many."""
+    seconds: dict[str, float]
+    """Time by part [s]."""
+
+
+class Refusal(Message):
+    """Why there is no answer."""
+
+    error: str
+    """What was given, what was expected and what to do."""

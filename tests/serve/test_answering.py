@@ -1,0 +1,96 @@
+"""What a grasp server answers, and what it refuses."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+import dro_grasp as dro
+from tests.helpers.weights import untrained_weights
+
+pytest.importorskip("pydantic", reason="needs the extra [serve]: pip install 'dro-grasp[serve]'")
+
+from dro_grasp.serve.answering import Answerer, Kept, Stock
+from dro_grasp.serve.client import sent_file
+from dro_grasp.serve.messages import GraspAnswer, GraspCall
+
+QUICK: dict[str, Any] = {"method": "network", "candidates": 1, "refine": False}
+TUBE = trimesh.creation.cylinder(0.03, 0.1)
+
+
+@pytest.fixture(scope="module")
+def answerer(tmp_path_factory: pytest.TempPathFactory) -> Answerer:
+    weights = untrained_weights(tmp_path_factory.mktemp("weights"))
+    own = tmp_path_factory.mktemp("own") / "own_tube.stl"
+    TUBE.export(own)
+    return Answerer(Stock(str(weights), hands=("gripper3",), objects=(str(own),)))
+
+
+def ask(answerer: Answerer, obj: Any, **options: Any) -> GraspAnswer:
+    return answerer.answer(GraspCall(hand="gripper3", object=obj, **QUICK | options))
+
+
+def check(answer: GraspAnswer, expected: dro.GraspBatch) -> None:
+    for name in ("wrist_position", "wrist_quaternion_wxyz", "joints", "pregrasp_joints", "squeeze_joints", "score"):
+        found = torch.tensor([getattr(grasp, name) for grasp in answer.grasps])
+        torch.testing.assert_close(found, getattr(expected, name))
+    assert answer.joint_names == list(expected.joint_names)
+
+
+def test_answers_are_the_predictors_grasps(answerer: Answerer) -> None:
+    hand, predictor = dro.load_hand("gripper3"), answerer.predictor
+    above = ask(answerer, "can", num=2, seed=3, direction=(0, 0, -1), protocol="dro")
+    check(above, predictor.predict(hand, dro.load_object("can"), 2, 3, direction=(0.0, 0.0, -1.0), **QUICK))
+    assert above.frame == "object"
+    assert all(isinstance(grasp.success, bool) for grasp in above.grasps)
+    seen = TUBE.sample(300, seed=0) + np.array([0, 0, 0.5])
+    T = trimesh.transformations.rotation_matrix(2.5, [1, 0, 0], [0.3, 0.2, 0.8])
+    scan = ask(answerer, {"points": seen.tolist()}, num=1, camera={"frame": "base", "T_frame_camera": T.tolist()})
+    check(scan, predictor.predict(hand, dro.scanned_object("cloud", seen, T), 1, **QUICK))
+    assert scan.frame == "base"
+    assert scan.grasps[0].success is None
+
+
+def test_what_was_sent_or_named_once_stays_loaded(answerer: Answerer) -> None:
+    stl = TUBE.export(file_type="stl")
+    first = answerer.object(GraspCall(hand="", object=sent_file("tube.stl", stl)).object, None)
+    again = answerer.object(GraspCall(hand="", object=sent_file("tube.stl", stl)).object, None)
+    assert first[1] is again[1]
+    assert first[1].name == "tube"
+    assert first[1].file is None
+    for other in (sent_file("tube.stl", stl) | {"scale": 1.5}, sent_file("other.stl", stl), "own_tube"):
+        assert answerer.object(GraspCall(hand="", object=other).object, None)[1] is not first[1]
+    assert answerer.hand("gripper3") is answerer.hand("gripper3")
+    assert answerer.hand("barrett") is answerer.hand("barrett")
+    assert "own_tube" in answerer.object_names()
+
+
+def test_only_the_values_used_last_are_kept() -> None:
+    kept, made = Kept(2), []
+    for key in "abacab":
+        assert kept.get(key, lambda key=key: made.append(key) or key) == key
+    assert made == ["a", "b", "c", "b"]
+    assert len(kept) == 2
+
+
+GLTF = b'{"asset": {"version": "2.0"}, "buffers": [{"uri": "/etc/passwd", "byteLength": 9}]}'
+SPHERE = trimesh.creation.icosphere(1, 0.03).vertices.tolist()
+
+
+@pytest.mark.parametrize(("asked", "told"), [
+    ({"hand": "/etc/passwd"}, "knows no hand '/etc/passwd'"), ({"object": "/etc/passwd"}, "knows no object '/etc/passwd'"),
+    ({"object": sent_file("../../gone.stl", b"hello")}, "^gone.stl "),
+    ({"object": sent_file("a.gltf", GLTF)}, "^a.gltf .*passwd"),
+    ({"num": 0}, "num is 0"), ({"direction": [0, 0, 0]}, "no direction"), ({"seed": -1}, "seed is -1"),
+    ({"num": 1001}, "at most 1000"), ({"object": {"points": [[0, 0, 0.1]] * 40}}, "1 distinct points"),
+    ({"object": {"points": SPHERE}, "protocol": "dro"}, "no trial"), ({"object": {"points": []}}, "distinct points"),
+    ({"camera": {"frame": "base", "T_frame_camera": np.eye(4).tolist()}}, "send the cloud"),
+    ({"camera": {"frame": "base", "T_frame_camera": np.zeros((4, 4)).tolist()}, "object": {"points": SPHERE}}, "last row"),
+])
+def test_refusals_say_why_and_nothing_but_what_was_sent_is_read(answerer: Answerer, asked: dict[str, Any], told: str) -> None:
+    with pytest.raises(dro.DroGraspError, match=told):
+        answerer.answer(GraspCall(**{"hand": "gripper3", "object": "can", **QUICK, **asked}))
