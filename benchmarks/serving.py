@@ -49,7 +49,7 @@ def ask(client: GraspClient, hand: str, number: int, mesh: Path) -> float:
     obj: Any = "can" if number % 4 < 2 else mesh
     if number % 4 == 3:
         cloud = trimesh.creation.cylinder(0.03, 0.1).sample(2000, seed=number)
-        obj = cloud @ Rotation.random(rng=number).as_matrix()
+        obj = cloud @ Rotation.random(rng=np.random.default_rng(number)).as_matrix()
     begin = time.perf_counter()
     answer = client.predict(hand, obj, 1, candidates=1, method="network", seed=number, id=f"load-{number}")
     seconds = time.perf_counter() - begin

@@ -133,7 +133,7 @@ def application(desk: Desk, access: Access) -> FastAPI:
     told = {status: {"model": Refusal} for status in (401, 403, 409, 413, 422, 500, 503, 504)}
 
     @app.post("/grasps", response_model=GraspAnswer, responses=told)
-    async def grasps(call: GraspCall, request: Request) -> Any:
+    async def grasps(call: GraspCall, request: Request) -> Any:  # pyright: ignore[reportInvalidTypeForm]
         """Grasps of an object by a hand, the best first. Closing the connection cancels the request."""
         reply = await _answered(desk, call, request)
         return Response(reply.body, reply.status, media_type="application/json")

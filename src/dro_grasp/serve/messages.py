@@ -112,7 +112,7 @@ def fields_of(settings: type[Any]) -> dict[str, Any]:
 def field_docs(settings: type[Any]) -> dict[str, str]:
     """The docstring under each field of a dataclass."""
     body = ast.parse(textwrap.dedent(inspect.getsource(settings))).body[0].body  # type: ignore[attr-defined]
-    return {field.target.id: " ".join(text.value.value.split()) for field, text in pairwise(body)
+    return {field.target.id: " ".join(str(text.value.value).split()) for field, text in pairwise(body)
             if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(text, ast.Expr)
             and isinstance(text.value, ast.Constant)}
 
