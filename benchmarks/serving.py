@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 from dro_grasp.serve.client import GraspClient
 
 LONE = 12
-"""Lone calls that are timed, after as many that are not."""
+"""Lone calls that are timed before the load, after as many that are not, and again after it."""
 MILLION = 1e6
 
 
@@ -90,6 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 seconds += crowd.map(lambda number: ask(client, options.hand, int(number), mesh), part)
                 grown.append(memory(client, process.pid))
             whole = time.perf_counter() - begin
+            lone += [ask(client, options.hand, options.requests + 2 * LONE + number, mesh) for number in range(LONE)]
     finally:
         process.terminate()
     process.communicate()

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
 
 from dro_grasp.cli.inputs import Flag, ProtocolName, optional
 from dro_grasp.cli.output import print_result, say_aside
@@ -34,6 +37,9 @@ class Synthesize:
     """Start no new work after this time [min]. A rerun resumes."""
     workers: int = 2
     """Processes of one thread each. A running Ray cluster uses all its CPUs instead."""
+    shard: Annotated[str, tyro.conf.arg(metavar="I/N", help_behavior_hint="(default: 1/1, all of them)")] = "1/1"
+    """Part of the pairs that this run fills: 3/16 is the third of sixteen. All parts may share the folder and run at once, as
+    the tasks of an array job."""
     engine: Literal["local", "ray"] = "local"
     """Processes on this machine, or a Ray cluster."""
     ray_address: Annotated[str | None, optional("HOST:PORT", "RAY_ADDRESS, or a new local cluster")] = None
@@ -60,7 +66,7 @@ class Synthesize:
         objects = resolve_objects(list(self.object))
         require_known(self.hand, objects)
         config = EngineConfig(
-            self.protocol, self.scale, None if self.minutes is None else 60 * self.minutes,
+            self.protocol, self.scale, None if self.minutes is None else 60 * self.minutes, shard=self._part(),
             synthesis=SynthesisConfig(device=self.device))
         report = synthesize_dataset(
             self.hand, objects, self.grasps, self.output, self._ray_pool if self.engine == "ray" else self.workers, self.seed,
@@ -89,6 +95,14 @@ class Synthesize:
             raise OptionError(f"--minutes is {self.minutes}; give a positive number, or leave it out for no limit")
         if not (math.isfinite(self.scale) and self.scale > 0):
             raise OptionError(f"--scale is {self.scale}; give a positive number, for example 0.001 for millimetres")
+
+    def _part(self) -> tuple[int, int]:
+        from dro_grasp.errors import OptionError
+
+        found = re.fullmatch(r"(\d+)/(\d+)", self.shard)
+        if found is None:
+            raise OptionError(f"--shard is '{self.shard}'; give a part from 1 on, and of how many, such as 3/16")
+        return int(found[1]), int(found[2])
 
     def _ray_pool(self, job: Job) -> Pool:
         from dro_grasp.datasets.engine.ray_pool import RayPool

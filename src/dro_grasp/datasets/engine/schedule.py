@@ -9,16 +9,18 @@ import itertools
 import math
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 from dro_grasp.datasets.engine.pools import Failed, LocalPool, Outcome, Pool
-from dro_grasp.datasets.engine.shards import Shard, Yield, find_shards, read_yield, remove_leftovers, sole_run
+from dro_grasp.datasets.engine.shards import Shard, Yield, find_shards, read_yield, remove_leftovers, set_aside, sole_run
 from dro_grasp.datasets.engine.worker import EngineConfig, Job, Task
 from dro_grasp.devices import require_device
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.files import given_path, make_folder
+from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand, locate_hand
 from dro_grasp.objects.catalogue import ASSET_PREFIX, load_object, object_names
 
@@ -27,6 +29,7 @@ REPORT_EVERY = 10.0
 CANDIDATE_STEP = 64
 """Shards have a multiple of this many candidates. Ours."""
 Pair = tuple[str, str]
+Content = TypeVar("Content")
 
 
 @dataclass
@@ -119,9 +122,9 @@ def synthesize_dataset(
         require_device(config.synthesis.device)
     folder = make_folder(output_dir)
     say = progress or (lambda line: print(line, file=sys.stderr, flush=True))
-    with sole_run(folder):
-        states = {(hand, obj): PairState() for hand in hands for obj in objects}
-        resume(folder, states, say)
+    with sole_run(folder, config.shard):
+        states = {pair: PairState() for pair in own_pairs(hands, objects, config.shard)}
+        resume(folder, states, grasps_per_pair, say)
         before, started, job = sum(s.grasps for s in states.values()), time.perf_counter(), Job(seed, config)
         pool = LocalPool(job, workers, config.shard_seconds) if isinstance(workers, int) else workers(job)
         end = math.inf if config.seconds is None else started + config.seconds
@@ -147,17 +150,42 @@ def require_known(hands: Sequence[str], objects: Sequence[str]) -> None:
             load_object(obj)  # likewise
 
 
-def resume(folder: Path, states: dict[Pair, PairState], say: Callable[[str], None]) -> None:
-    """Take up the shards of earlier runs; a damaged or foreign shard is named and made again."""
+def own_pairs(hands: Sequence[str], objects: Sequence[str], shard: tuple[int, int]) -> list[Pair]:
+    """The pairs of one part of a run: every pair belongs to exactly one, and parts differ by one pair at most."""
+    return list(dict.fromkeys(itertools.product(hands, objects)))[shard[0] - 1 :: shard[1]]
+
+
+def resume(folder: Path, states: dict[Pair, PairState], goal: int, say: Callable[[str], None]) -> None:
+    """Take up the shards of earlier runs; a damaged or foreign shard is named, set aside, and made again.
+
+    Footers tell how many grasps there are; only pairs that lack some are read whole, as their next shard needs them.
+    """
     remove_leftovers(folder)
-    for shard in find_shards(folder):
-        state = states.get((shard.hand, shard.object))
-        if state is None:
-            continue
+    for pair, own in itertools.groupby(find_shards(folder), lambda shard: (shard.hand, shard.object)):
+        if pair in states:
+            sound = _readable(folder, own, read_yield, say)
+            if sum(made.valid for _, made in sound) < goal:
+                whole = _readable(folder, (shard for shard, _ in sound), _load, say)
+                sound = [(shard, made) for shard, made in sound if shard in {one for one, _ in whole}]
+            for shard, made in sound:
+                states[pair].note(shard, made)
+
+
+def _load(folder: Path, shard: Shard) -> GraspBatch:
+    return GraspBatch.load(shard.path(folder))
+
+
+def _readable(
+    folder: Path, shards: Iterable[Shard], read: Callable[[Path, Shard], Content], say: Callable[[str], None]
+) -> list[tuple[Shard, Content]]:
+    """The shards that can be read, with what was read; the others are named and set aside."""
+    found = []
+    for shard in shards:
         try:
-            state.note(shard, read_yield(folder, shard))
+            found.append((shard, read(folder, shard)))
         except GraspFileError as error:
-            say(f"{error}; it is made again")
+            say(f"{error}; it is set aside as {set_aside(folder, shard).name} and made again")
+    return found
 
 
 def next_pair(states: dict[Pair, PairState], busy: set[Pair], goal: int, config: EngineConfig) -> Pair | None:

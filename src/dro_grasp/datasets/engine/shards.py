@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import re
+import socket
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -25,9 +26,11 @@ from dro_grasp.files import replacing
 from dro_grasp.grasps.table import read_footer
 
 LOCK = ".lock"
-"""File in a data set's folder that a run locks while it fills the folder."""
+"""File in a data set's folder that a run locks while it fills the folder; one for each part of a run that is divided."""
 HOLDER = ".process"
 """File with the number of the process that holds the lock; other systems than Linux let nobody read a locked file."""
+DAMAGED = ".damaged"
+"""Ending of a shard that could not be read and was set aside (ours)."""
 MOST = 1e18
 """More than any count or time of a yield (ours)."""
 STALE = 3600.0
@@ -171,27 +174,53 @@ def read_yield(folder: Path, shard: Shard) -> Yield:
 
 
 @contextmanager
-def sole_run(folder: Path) -> Iterator[None]:
-    """Keep a second run out of a folder while the block lasts; the lock goes with the process.
+def sole_run(folder: Path, part: tuple[int, int] = (1, 1)) -> Iterator[None]:
+    """Keep a second run of the same part out of a folder while the block lasts, and runs that divide the work otherwise.
+
+    The lock goes with the process.
 
     Raises:
         OutputError: Another run is filling the folder.
     """
-    lock, holder = FileLock(folder / LOCK, timeout=0, fallback_to_soft=False), folder / HOLDER
+    suffix = "" if part[1] == 1 else f"-{part[0]}-of-{part[1]}"
+    lock = FileLock(folder / f"{LOCK}{suffix}", timeout=0, fallback_to_soft=False)
+    fellows = {f"{LOCK}-{i}-of-{part[1]}" for i in range(1, part[1] + 1)} - {LOCK + suffix}
     try:
-        lock.acquire()
-    except Timeout as error:
-        process = holder.read_text() if holder.exists() else ""
-        raise OutputError(f"another run is filling {folder} (process {process or 'unknown'}); wait for it, or give another "
-                          "folder and join both with `dro-grasp dataset merge`") from error
-    except OSError:
-        pass  # a file system without locks
-    with suppress(OSError):  # on a full disk the first shard tells
-        holder.write_text(str(os.getpid()))
-    try:
+        _take(lock, folder)
+        with suppress(OSError):  # on a full disk the first shard tells
+            (folder / f"{HOLDER}{suffix}").write_text(f"{os.getpid()} on {socket.gethostname()}")
+        for other in sorted({path.name for path in folder.glob(f"{LOCK}*")} - fellows - {LOCK + suffix}):
+            rival = FileLock(folder / other, timeout=0, fallback_to_soft=False)
+            _take(rival, folder)
+            rival.release()
         yield
     finally:
         lock.release()
+
+
+def _take(lock: FileLock, folder: Path) -> None:
+    """Acquire a lock where the file system has locks.
+
+    Raises:
+        OutputError: Another run holds it.
+    """
+    try:
+        lock.acquire()
+    except Timeout as error:
+        name = Path(lock.lock_file).name
+        holder = folder / name.replace(LOCK, HOLDER)
+        process = holder.read_text() if holder.exists() else "unknown"
+        part = f" as part {name.removeprefix(LOCK + '-').replace('-of-', ' of ')}" if name != LOCK else ""
+        raise OutputError(f"another run is filling {folder}{part} (process {process}); wait for it, or give another "
+                          "folder and join both with `dro-grasp dataset merge`") from error
+    except OSError:
+        pass  # a file system without locks
+
+
+def set_aside(folder: Path, shard: Shard) -> Path:
+    """Rename a shard's file, so that it counts no longer and nothing in it is lost; returns its new path."""
+    path = shard.path(folder)
+    return path.replace(path.with_name(path.name + DAMAGED))
 
 
 def remove_leftovers(folder: Path) -> int:

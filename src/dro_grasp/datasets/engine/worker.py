@@ -12,6 +12,7 @@ from functools import lru_cache
 
 from dro_grasp.datasets.bundle.training_file import split_of
 from dro_grasp.datasets.engine.shards import Shard, Yield, notes_of
+from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.duplicates import distinct
 from dro_grasp.grasps.sources import with_sources
@@ -58,10 +59,22 @@ class EngineConfig:
     """A pair is given up after this many candidates."""
     max_crashes: int = 2
     """A pair is given up after this many deaths of workers in a row."""
+    shard: tuple[int, int] = (1, 1)
+    """Which part of the pairs this run fills, and of how many: (3, 16) is the third of sixteen, as `--shard 3/16`. Runs of all
+    parts may fill one folder at the same time, and together make the same grasps as one run."""
     shard_seconds: float = 1800.0
     """A shard that takes longer is stopped, as if its worker had died [s]; this includes preparing the object."""
     synthesis: SynthesisConfig = field(default_factory=SynthesisConfig)
     """The optimiser."""
+
+    def __post_init__(self) -> None:
+        """Refuse a part that is none.
+
+        Raises:
+            OptionError: As said.
+        """
+        if not 1 <= self.shard[0] <= self.shard[1]:
+            raise OptionError(f"shard is {self.shard[0]}/{self.shard[1]}; give a part from 1 on, and of how many, such as 3/16")
 
 
 @dataclass(frozen=True)
