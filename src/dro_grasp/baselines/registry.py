@@ -5,16 +5,21 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from dro_grasp.baselines.controls import MeanGraspMethod, StartMethod
 from dro_grasp.baselines.foreign import FileMethod, ForeignMethod
+from dro_grasp.baselines.gendexgrasp.contact_maps import FITTING_GAMMA, TRAINING_GAMMA
+from dro_grasp.baselines.gendexgrasp.map_fitting import FittingConfig
+from dro_grasp.baselines.gendexgrasp.map_method import ContactMapMethod
 from dro_grasp.baselines.method import Method
 from dro_grasp.baselines.ours import DescentMethod, DistanceMethod, SynthesisMethod
 from dro_grasp.datasets.bundle.training_file import Bundle
-from dro_grasp.errors import OptionError
+from dro_grasp.errors import OptionError, WeightsError
+from dro_grasp.models.checkpoints import SHIPPED_FOLDER
 from dro_grasp.predictor import GraspPredictor, PredictorConfig
 
 
@@ -43,16 +48,38 @@ def _mean(chosen: bool, options: MethodOptions) -> Method:
     return MeanGraspMethod(options.bundle, chosen)
 
 
+def _contact_maps(gamma: float, name: str, options: MethodOptions) -> Method:
+    return ContactMapMethod(baseline_weights("gendexgrasp", options.weights), name, FittingConfig(gamma=gamma))
+
+
+def baseline_weights(name: str, given: str | None) -> Path:
+    """The weights of a method beside D(R,O): those given, or those that ship.
+
+    Raises:
+        WeightsError: None are given, and none ship.
+    """
+    if given is not None:
+        return Path(given)
+    path = SHIPPED_FOLDER / "baselines" / f"{name}.safetensors"
+    if not path.is_file():
+        raise WeightsError(f"the weights of {name} do not ship; train them (`dro-grasp train --method {name} --bundle "
+                           f"BUNDLE --run-folder runs/{name} --output {name}.safetensors`), and give them as "
+                           f"{name}@{name}.safetensors")
+    return path
+
+
 METHODS: dict[str, Callable[[MethodOptions], Method]] = {
     "dro": _dro,
     "synthesise": lambda options: SynthesisMethod(),
     "dfc": lambda options: DescentMethod(),
+    "gendexgrasp": partial(_contact_maps, FITTING_GAMMA, "gendexgrasp"),
+    "gendexgrasp-gamma1": partial(_contact_maps, TRAINING_GAMMA, "gendexgrasp-gamma1"),
     "start": lambda options: StartMethod(),
     "mean-grasp": lambda options: _mean(False, options),
     "mean-grasp-chosen": lambda options: _mean(True, options),
 }
 """Methods of this package."""
-WITH_WEIGHTS = ("dro",)
+WITH_WEIGHTS = ("dro", "gendexgrasp", "gendexgrasp-gamma1")
 """Those that have weights."""
 
 
@@ -71,8 +98,9 @@ def make_method(name: str, options: MethodOptions | None = None) -> Method:
     options = options or MethodOptions()
     plain, at, weights = name.partition("@")
     if plain in METHODS and (not at or plain in WITH_WEIGHTS):
-        method = METHODS[plain](MethodOptions(weights, options.device, options.temperature) if at else options)
-        method.name = name
+        method = METHODS[plain](replace(options, weights=weights) if at else options)
+        if at:
+            method.name = name
         return method
     if name.endswith(".parquet") or Path(name).is_dir():
         return FileMethod(Path(name))

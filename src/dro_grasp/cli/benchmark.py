@@ -31,9 +31,8 @@ class Benchmark:
 
     methods: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--method"], metavar="NAME...", help_behavior_hint=(
         "(default: dro, start, synthesise, and with a bundle mean-grasp, mean-grasp-chosen)"))] = ()
-    """What makes the grasps: dro, synthesise, dfc, start, mean-grasp, mean-grasp-chosen; dro@WEIGHTS for other weights;
-    module:Class for a class of yours that has predict(hand, obj, num, seed); or a grasp file."""
-
+    """What makes the grasps: dro, synthesise, dfc, gendexgrasp, gendexgrasp-gamma1, start, mean-grasp, mean-grasp-chosen;
+    dro@WEIGHTS for other weights; module:Class for a class of yours that has predict(hand, obj, num, seed); or a grasp file."""
     hands: tuple[str, ...] = ("allegro", "barrett", "shadowhand")
     """Names or paths of hands."""
     objects: tuple[str, ...] = ("builtin:test",)
@@ -136,8 +135,9 @@ class Benchmark:
             controls = ("start", "synthesise", *(("mean-grasp", "mean-grasp-chosen") if self.bundle is not None else ()))
             names = ("dro", *(controls if self.controls else ()))
         bundle = None if self.bundle is None else load_bundle(self.bundle)
-        options = MethodOptions(self.weights, self.device, self.temperature, bundle)
-        return [make_method(name, options) for name in dict.fromkeys(names)]
+        options = MethodOptions(None, self.device, self.temperature, bundle)
+        own = dataclasses.replace(options, weights=self.weights)
+        return [make_method(name, own if name == "dro" else options) for name in dict.fromkeys(names)]
 
 
 def cells(row: Row) -> list[object]:

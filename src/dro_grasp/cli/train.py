@@ -143,6 +143,9 @@ class Train(Stage):
     --output my_weights.safetensors
     """
 
+    method: Literal["dro", "gendexgrasp"] = "dro"
+    """What is trained: the D(R,O) network, or the contact maps of GenDexGrasp, to which only bundle, folder, output, steps,
+    minutes, learning rate, device and seed apply."""
     pretrained: Annotated[str | None, optional("PATH", "none")] = None
     """Weights from `dro-grasp pretrain`; without them, and without --initial, the hand encoder is trained along."""
     initial: Annotated[str | None, optional("NAME|PATH", "none")] = None
@@ -188,6 +191,8 @@ class Train(Stage):
         from dro_grasp.training.processes import is_first
 
         check_output(self.output)
+        if self.method != "dro":
+            return self._baseline()
         given = [name for name in (self.initial, self.pretrained) if name is not None]
         pretrained, initial = (None if name is None else load_weights(name) for name in (self.pretrained, self.initial))
         network = network_config(
@@ -218,6 +223,24 @@ class Train(Stage):
         if errors and not self.json:
             rows = [[e.hand, 1e3 * e.posterior, 1e3 * e.prior, e.divergence] for e in errors]
             print_table("distance error", ["hand", "posterior z [mm]", "prior z [mm]", "divergence [nat]"], rows)
+        return 0
+
+    def _baseline(self) -> int:
+        """Train the network of a method beside D(R,O)."""
+        import dataclasses
+
+        from dro_grasp.baselines.gendexgrasp.map_training import MapTrainingConfig, train_contact_maps
+        from dro_grasp.datasets.bundle.training_file import load_bundle
+        from dro_grasp.models.checkpoints import save_weights
+
+        config = MapTrainingConfig(self.schedule(steps=self.steps, learning_rate=self.learning_rate))
+        bundle = load_bundle(self.bundle)
+        model = train_contact_maps(bundle, config, self.run_folder)
+        about = how_long(self.run_folder) | {
+            "stage": self.method, "data": bundle.summary(), "settings": dataclasses.asdict(config)}
+        save_weights(model, self.output, about)
+        report = {"output": str(self.output), "steps": about["steps"], "log": str(self.run_folder / "log.jsonl")}
+        print_result(self.json, report, "training", ["weights", "steps", "log"], [[*report.values()]])
         return 0
 
 

@@ -8,7 +8,7 @@ import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float, Num
@@ -21,6 +21,7 @@ from dro_grasp.files import given_path, reading, replacing
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.models.presets import NetworkConfig
 
+Network = TypeVar("Network", bound=nn.Module)
 SHIPPED_FOLDER = Path(__file__).parent.parent / "weights"
 """Folder of the shipped weights."""
 KEY = "dro_grasp_weights"
@@ -93,6 +94,18 @@ def _check_tensors(expected: dict[str, Num[Tensor, "..."]], given: dict[str, Num
                                f"of shape {tuple(wanted.shape)}; use weights made with this version")
         if tensor.is_floating_point() and not (tensor.isfinite().all() and (tensor >= 0).all() | ("running_var" not in name)):
             raise WeightsError(f"{path}: '{name}' holds NaN, infinity, or a negative variance; train again")
+
+
+def load_into(network: Network, path: Path) -> Network:
+    """A network of a method beside D(R,O) with the weights of a file, in evaluation mode.
+
+    Raises:
+        WeightsError: The file is missing, truncated, foreign, or of another network.
+    """
+    _, tensors = _read(locate_weights(path))
+    _check_tensors(network.state_dict(), tensors, path)
+    network.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in tensors.items()})
+    return network.eval()
 
 
 def load_small(path: Path) -> dict[str, Float[Tensor, "..."]]:
