@@ -125,7 +125,7 @@ def collect(
         opened = hand.canonical_joints(1.0).expand_as(some.joints)
         groups = {
             "raw": raw[slice(0, num // 8)], "refined": refined[slice(0, num // 2)], "optimised": best[slice(0, num // 2)],
-            **{kind: grasps[held] for kind, (grasps, held) in closed.items()},
+            **{kind: found.grasps[found.held] for kind, found in closed.items()},
             "shaken": shaken(hand, refined[slice(0, num // 4)], generator),
             "opened": some.moved_to(some.T_object_wrist, opened), "away": away(some, generator),
         }

@@ -94,7 +94,7 @@ def test_raw_and_ranked_rows_are_what_single_trials_say(rows: list[Row]) -> None
                 grasps = refine(problem, grasps)
             held_still = torch.ones(len(grasps), dtype=torch.bool)
             if stage == SETTLED:
-                grasps, held_still = settled(problem, grasps)
+                grasps, held_still, _ = settled(problem, grasps)
             strict = simulate(hand, obj, grasps, "strict")
             passed.append(strict.success)
             fingers.append(strict.fingers_in_contact)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 
@@ -15,8 +13,9 @@ from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
 from dro_grasp.perception.partial_views import partial_view
 from dro_grasp.pipeline import settling
 from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.settling import ESCAPED_SCORE, best_settled, can_settle, motion, settled
+from dro_grasp.pipeline.settling import ESCAPED_SCORE, Settled, best_settled, can_settle, motion, settled
 from dro_grasp.pipeline.stages import refine, scored
+from dro_grasp.simulation.holding import Holding, holding
 from dro_grasp.simulation.outcome import Failure
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.loaded_hands import loaded_hand
@@ -36,36 +35,32 @@ def shifted(grasps: GraspBatch, distances: list[float]) -> GraspBatch:
     return grasps.without("pregrasp_joints", "squeeze_joints").replace(T_object_wrist=T)
 
 
-def test_still_grasps_stay_where_they_settle_others_are_refined_there_and_close_again(
+def test_still_grasps_squeeze_anew_others_are_refined_and_what_then_moves_stays_as_it_was(
     grasps: GraspBatch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first, second = [0.001, 0.01, 0.01, 0.01, 0.3], [0.001, 0.03, 0.0]
-    turned = torch.eye(4)
-    turned[:2, :2] = torch.tensor([[math.cos(0.6), -math.sin(0.6)], [math.sin(0.6), math.cos(0.6)]])
-    seen = []
+    moved, seen = [0.001, 0.01, 0.002, 0.01, 0.3], []
 
-    def settle(hand: Hand, obj: ObjectModel, some: GraspBatch) -> GraspBatch:
+    def state(shift: list[float], turn: list[float]) -> Holding:
+        n = len(shift)
+        return Holding(torch.tensor(shift), torch.tensor(turn), *(torch.arange(float(n)) for _ in range(6)), torch.zeros(n, 2))
+
+    def close_again(hand: Hand, obj: ObjectModel, some: GraspBatch) -> Holding:
         seen.append(some)
-        if len(seen) == 1:
-            return shifted(some, first)
-        moved = shifted(some, second)
-        T = moved.T_object_wrist.clone()
-        # The third one turns by 0.6 rad about its own grasp centre.
-        centre = HAND.grasp_centre_wrist
-        T[2, :3, :3] = T[2, :3, :3] @ turned[:3, :3]
-        T[2, :3, 3] += some.T_object_wrist[2, :3, :3] @ centre - T[2, :3, :3] @ centre
-        return moved.replace(T_object_wrist=T)
+        return state([0.001, 0.03, 0.0, 0.0], [0.0, 0.0, 0.6, 0.1])
 
-    monkeypatch.setattr(settling, "settle", settle)
-    found, held = settled(PROBLEM, grasps)
-    assert held.tolist() == [True, True, False, False, False]
+    monkeypatch.setattr(settling, "settle", lambda hand, obj, some: shifted(some, moved))
+    monkeypatch.setattr(settling, "holding", close_again)
+    found, held, kept = settled(PROBLEM, grasps)
+    assert held.tolist() == [True, False, False, True, False]
+    assert kept.speed.tolist() == [0.0, 3.0]
     T = grasps.T_object_wrist
     assert float(found.T_object_wrist[0, 2, 3] - T[0, 2, 3]) == pytest.approx(0.001, abs=1e-6)
-    expected = refine(PROBLEM, shifted(grasps, first)[[1, 2, 3]])
-    torch.testing.assert_close(seen[1].T_object_wrist, expected.T_object_wrist)
+    assert (found.squeeze_joints[0] - grasps.squeeze_joints[0]).abs().max() > 1e-4
+    expected = refine(PROBLEM, shifted(grasps, moved)[[1, 3]])
+    torch.testing.assert_close(seen[0].T_object_wrist[[1, 3]], expected.T_object_wrist)
     for name in ("T_object_wrist", "joints", "squeeze_joints"):
-        torch.testing.assert_close(getattr(found, name)[1], getattr(expected, name)[0])
-        torch.testing.assert_close(getattr(found, name)[2:], getattr(grasps, name)[2:])
+        torch.testing.assert_close(getattr(found, name)[3], getattr(expected, name)[1])
+        torch.testing.assert_close(getattr(found, name)[[1, 2, 4]], getattr(grasps, name)[[1, 2, 4]])
 
 
 def test_motion_is_that_of_the_grasp_centre_and_of_the_hand(grasps: GraspBatch) -> None:
@@ -76,7 +71,7 @@ def test_motion_is_that_of_the_grasp_centre_and_of_the_hand(grasps: GraspBatch) 
 
 def test_settled_grasps_hardly_push_the_object_away(grasps: GraspBatch) -> None:
     many = refine(PROBLEM, synthesize(HAND, CAN, 24, 1, SynthesisConfig(batch_size=24, steps=20)))
-    found, held = settled(PROBLEM, many)
+    found, held, _ = settled(PROBLEM, many)
     before, after = (simulate(HAND, CAN, g, "strict") for g in (many, found[held]))
     assert before.failure.count(Failure.PUSHED_AWAY) > 2
     assert after.failure.count(Failure.PUSHED_AWAY) <= 1
@@ -85,8 +80,8 @@ def test_settled_grasps_hardly_push_the_object_away(grasps: GraspBatch) -> None:
 def test_only_the_better_half_is_settled_and_escapes_score_low(
     grasps: GraspBatch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def none_held(problem: GraspProblem, some: GraspBatch) -> tuple[GraspBatch, torch.Tensor]:
-        return some.without("score"), torch.zeros(len(some), dtype=torch.bool)
+    def none_held(problem: GraspProblem, some: GraspBatch) -> Settled:
+        return Settled(some.without("score"), torch.zeros(len(some), dtype=torch.bool), holding(HAND, CAN, some[:0]))
 
     monkeypatch.setattr(settling, "settled", none_held)
     known = scored(PROBLEM, grasps).replace(score=torch.tensor([0.0, 3.0, 1.0, 2.0, -1.0]))

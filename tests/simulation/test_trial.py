@@ -14,10 +14,11 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import ControllerConfig
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.simulation import trial as trials
+from dro_grasp.simulation import rollout as rollouts
+from dro_grasp.simulation.closing import held, settle
 from dro_grasp.simulation.outcome import GIVE_UP, Failure
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, protocol
-from dro_grasp.simulation.trial import TrialResult, held, record, settle, simulate
+from dro_grasp.simulation.trial import TrialResult, record, simulate
 from tests.helpers.claw import ball, claw, grasps_of, power_grasp, wrist_below
 
 
@@ -189,7 +190,7 @@ def test_result_depends_neither_on_workers_nor_on_company(hand, obj, monkeypatch
     first = simulate(hand, obj, grasps, "dro", workers=1)
     same(first, simulate(hand, obj, grasps, "dro", workers=3))
     same(first, simulate(hand, obj, grasps, "dro", workers=1))
-    monkeypatch.setattr(trials, "CHUNK", 2)
+    monkeypatch.setattr(rollouts, "CHUNK", 2)
     same(first, simulate(hand, obj, grasps, "dro", workers=2))
 
 
@@ -268,7 +269,7 @@ def test_outcome_in_a_batch_and_its_file(hand, obj, tmp_path):
 
 
 def test_progress_and_empty_batches(hand, obj, monkeypatch):
-    monkeypatch.setattr(trials, "CHUNK", 2)
+    monkeypatch.setattr(rollouts, "CHUNK", 2)
     seen: list[tuple[int, int]] = []
     simulate(hand, obj, power_grasp(hand, obj, 3), progress=lambda done, total: seen.append((done, total)))
     assert seen == [(2, 3), (3, 3)]

@@ -32,7 +32,7 @@ PICKLES = (b"PK", b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")
 """First two bytes of zipped and of bare pickles."""
 CHECKSUMS = "SHA256SUMS"
 """File beside the shipped weights with their checksums, as `sha256sum` writes it."""
-SMALL = ("completion/surface", "ranking/quality")
+SMALL = ("completion/surface", "ranking/quality", "ranking/holding")
 """Networks that ship beside those that predict grasps."""
 DEFAULT = "multi"
 """Name of the default weights."""

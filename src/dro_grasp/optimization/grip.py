@@ -112,7 +112,7 @@ def contact_forces(
     rows = torch.arange(n, device=kept.device)[:, None]
     inward, arm = -near.object_normals[rows, kept], (near.points[rows, kept] - centre) / length
     on = touches[rows, kept].to(arm)
-    edges = _cone(inward, config)
+    edges = friction_cone(inward, config.friction, config.edges)
     wrench = torch.cat([edges, torch.linalg.cross(arm[..., None, :].expand_as(edges), edges)], -1) * on[..., None, None]
     # Columns of the least squares: net wrench, share of each finger, the forces themselves, and their sum, which is 1.
     member = finger.to(arm).mT[kept] * on[..., None]
@@ -147,11 +147,11 @@ def nonnegative_least_squares(
     return x
 
 
-def _cone(inward: Float[Tensor, "n l 3"], config: GripConfig) -> Float[Tensor, "n l edges 3"]:
+def friction_cone(inward: Float[Tensor, "*n 3"], friction: float, edges: int) -> Float[Tensor, "*n edges 3"]:
     """Edges of the friction cones about unit directions, with a normal component of one."""
     helper = torch.eye(3, dtype=inward.dtype, device=inward.device)[inward.abs().argmin(-1)]
     first = torch.nn.functional.normalize(torch.linalg.cross(inward, helper), dim=-1)
     second = torch.linalg.cross(inward, first)
-    angle = torch.arange(config.edges, dtype=inward.dtype, device=inward.device) * (2 * math.pi / config.edges)
+    angle = torch.arange(edges, dtype=inward.dtype, device=inward.device) * (2 * math.pi / edges)
     around = angle.cos()[:, None] * first[..., None, :] + angle.sin()[:, None] * second[..., None, :]
-    return inward[..., None, :] + config.friction * around
+    return inward[..., None, :] + friction * around

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -18,9 +19,11 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.optimization.grip import gripping
 from dro_grasp.optimization.refinement import RefineConfig
+from dro_grasp.pipeline.holding_score import holding_score
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import complete, permitted, refine, scored
-from dro_grasp.simulation.trial import settle
+from dro_grasp.simulation.closing import settle
+from dro_grasp.simulation.holding import Holding, holding
 
 SHARE = 0.5
 """Share of scored candidates that are settled, the best ones (ours)."""
@@ -44,6 +47,17 @@ class SettleConfig:
     """How grasps are refined between the two closings, and how settled ones squeeze."""
 
 
+class Settled(NamedTuple):
+    """What became of n grasps, m of which hold still."""
+
+    grasps: GraspBatch
+    """All of them, in their order."""
+    held: Bool[Tensor, " n"]
+    """Which ones hold still."""
+    holding: Holding
+    """How these m hold the object."""
+
+
 def can_settle(problem: GraspProblem) -> bool:
     """Whether the closing can be simulated: on a mesh, with a hand that has its description."""
     return problem.hand.description is not None and not problem.obj.is_cloud
@@ -52,8 +66,8 @@ def can_settle(problem: GraspProblem) -> bool:
 def best_settled(problem: GraspProblem, grasps: GraspBatch, least: int) -> tuple[Int[Tensor, " k"], GraspBatch]:
     """The better half of scored grasps, settled and scored again, in their order; which rows they are comes first.
 
-    A grasp that loses the object when it closes, or ends where the problem's constraints forbid, stays as it was and scores
-    at most ESCAPED_SCORE.
+    The score counts how the object is held then. A grasp that loses the object when it closes, or ends where the problem's
+    constraints forbid, stays as it was and scores at most ESCAPED_SCORE.
 
     Args:
         problem: Hand and object; see `can_settle`.
@@ -62,20 +76,20 @@ def best_settled(problem: GraspProblem, grasps: GraspBatch, least: int) -> tuple
     """
     count = max(round(SHARE * len(grasps)), min(len(grasps), least))
     best = grasps.score.topk(count).indices.sort().values
-    closed, held = settled(problem, grasps[best])
+    closed, held, state = settled(problem, grasps[best])
     wrong = ~permitted(problem, closed)
-    closed, held = replaced(closed, wrong, grasps[best[wrong]]), held & ~wrong
+    closed = replaced(closed, wrong, grasps[best[wrong]])
     score = scored(problem, closed).score
-    return best, closed.replace(score=torch.where(held, score, score.clamp_max(ESCAPED_SCORE)))
+    score[held] = holding_score(score[held], state)
+    return best, closed.replace(score=torch.where(held & ~wrong, score, score.clamp_max(ESCAPED_SCORE)))
 
 
-def settled(
-    problem: GraspProblem, grasps: GraspBatch, config: SettleConfig | None = None
-) -> tuple[GraspBatch, Bool[Tensor, " n"]]:
+def settled(problem: GraspProblem, grasps: GraspBatch, config: SettleConfig | None = None) -> Settled:
     """Grasps where closing leaves them, and which of them hold still.
 
-    Each hand closes once. Where the object moves, the grasp that comes out is refined and closes again. A grasp that still
-    moves the object, or loses it at once, is returned as it was.
+    Each hand closes twice. Where the object hardly moves the first time, the grasp that comes out squeezes with balanced
+    forces; where it moves, the grasp is refined there. A grasp that then still moves the object, or loses it at once, is
+    returned as it was.
 
     Args:
         problem: Hand and object; see `can_settle`.
@@ -86,20 +100,19 @@ def settled(
         ObjectError: The object is a bare point cloud.
         HandError: The hand came without its description.
     """
-    config, hand = config or SettleConfig(), problem.hand
+    config, hand, obj = config or SettleConfig(), problem.hand, problem.obj
     grasps = complete(problem, grasps.without("score"))
-    if not len(grasps):
-        return grasps, torch.zeros(0, dtype=torch.bool)
-    closed = settle(hand, problem.obj, grasps)
+    closed = settle(hand, obj, grasps)
     moved, _ = motion(hand, grasps, closed)
-    held = moved < config.still
-    grasps = replaced(grasps, held, gripping(problem.energy(config.refinement.energy), closed[held], config.refinement.grip))
-    again = (~held & (moved < config.lost)).nonzero()[:, 0]
-    better = refine(problem, closed[again], config.refinement)
-    moved, turned = motion(hand, better, settle(hand, problem.obj, better))
-    holds = (moved < config.farthest) & (turned < config.largest_turn)
-    rows = torch.zeros_like(held).index_fill(0, again[holds], True)
-    return replaced(grasps, rows, better[holds]), held | rows
+    still, near = moved < config.still, moved < config.lost
+    again, rows = near & ~still, near.nonzero()[:, 0]
+    energy = problem.energy(config.refinement.energy)
+    better = replaced(closed, still, gripping(energy, closed[still], config.refinement.grip))
+    better = replaced(better, again, refine(problem, closed[again], config.refinement))[rows]
+    state = holding(hand, obj, better)
+    holds = (state.shift < config.farthest) & (state.turn < config.largest_turn)
+    held = torch.zeros_like(still).index_fill(0, rows[holds], True)
+    return Settled(replaced(grasps, held, better[holds]), held, state.rows(holds))
 
 
 def replaced(grasps: GraspBatch, rows: Bool[Tensor, " n"], others: GraspBatch) -> GraspBatch:

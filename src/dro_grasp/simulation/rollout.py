@@ -10,17 +10,26 @@ from itertools import pairwise
 import mujoco
 import mujoco.batch
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int
 
+from dro_grasp.devices import cores
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.controller import completed
+from dro_grasp.grasps.sources import require_pair
+from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.outcome import GIVE_UP
 from dro_grasp.simulation.perturbation import Conditions
-from dro_grasp.simulation.scene import Scene, object_mass
+from dro_grasp.simulation.protocols import Protocol, protocol as find_protocol
+from dro_grasp.simulation.scene import Scene, cached_scene, object_mass
 
 FORCES = np.concatenate([np.eye(3), -np.eye(3)])
 """Directions of the forces, in the object's frame."""
 RAMP = 10
 """Number of stages in which a gradual protocol moves the servos' targets from one posture to the next. Ours."""
+CHUNK = 64
+"""Grasps simulated together. Ours: bounds memory; the result does not depend on it."""
 STATE = ("qpos", "qvel", "qacc_warmstart")
 """Quantities that a trial needs to continue from an earlier moment."""
 
@@ -178,6 +187,25 @@ class Rollout:
                 self.batch.step(rows.tolist(), nstep=min(stride, steps - done))
                 if self.stride is not None:
                     self.frames.append(self.poses())
+
+
+def scene_of(hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol) -> Scene:
+    """The scene in which the grasps are simulated."""
+    require_pair(hand, obj)
+    grasps.require_hand(hand)
+    return cached_scene(hand, obj, find_protocol(protocol))
+
+
+def rollouts(
+    scene: Scene, hand: Hand, grasps: GraspBatch, workers: int | None, stride: int | None = None
+) -> Iterator[tuple[GraspBatch, Rollout]]:
+    """The grasps in parts that are simulated together, with pregrasp and squeeze; each part's rollout at its start."""
+    centre = torch.as_tensor(scene.obj.centre_of_mass)
+    for start in range(0, len(grasps), CHUNK):
+        part = grasps[slice(start, start + CHUNK)]
+        if scene.protocol.closing:
+            part = completed(hand, part, centre, scene.protocol.controller)
+        yield part, Rollout(scene, part, workers or cores(), stride)
 
 
 @contextmanager

@@ -5,31 +5,26 @@ Source: paper, evaluation metric details.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.devices import cores
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.controller import completed
-from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.simulation.contacts import Penetration, contact_mask, count_fingers, find_contact_links, measure_penetration
+from dro_grasp.simulation.contacts import Penetration, count_fingers, find_contact_links, measure_penetration
 from dro_grasp.simulation.outcome import DIRECTIONS, GIVE_UP, Failure, Measurements, TrialResult, verdict
 from dro_grasp.simulation.perturbation import draw
-from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol, protocol as find_protocol
-from dro_grasp.simulation.rollout import Rollout
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
+from dro_grasp.simulation.rollout import Rollout, rollouts, scene_of
 from dro_grasp.simulation.scene import Scene, cached_scene
 
-__all__ = ["DIRECTIONS", "Failure", "TrialResult", "held", "record", "settle", "simulate"]
-
-CHUNK = 64
-"""Grasps simulated together. Ours: bounds memory; the result does not depend on it."""
+__all__ = ["DIRECTIONS", "Failure", "TrialResult", "record", "simulate"]
 
 
 def simulate(
@@ -52,9 +47,9 @@ def simulate(
         GraspFileError: The grasps are of another hand.
         OptionError: The protocol does not exist.
     """
-    scene = _scene(hand, obj, grasps, protocol)
+    scene = scene_of(hand, obj, grasps, protocol)
     results, done = [], 0
-    for part, rollout in _rollouts(scene, hand, grasps, workers):
+    for part, rollout in rollouts(scene, hand, grasps, workers):
         penetration = measure_penetration(scene, part)
         result = _run(rollout, penetration)
         if scene.protocol.perturbations.trials > 1:
@@ -64,55 +59,6 @@ def simulate(
         if progress is not None:
             progress(done, len(grasps))
     return TrialResult.join(results, scene.protocol.label)
-
-
-def settle(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *, workers: int | None = None
-) -> GraspBatch:
-    """The same grasps, relabelled with the poses of hand and object after closing.
-
-    A joint above a link that touches the object takes the value it reached, held back by the contact, so that the
-    label touches the surface. The other joints keep their values: closing would only drive them towards a fist. A
-    grasp whose simulation is unstable keeps its label. Energies and depth stay those before settling; scores and
-    outcomes are dropped.
-
-    Raises:
-        ObjectError: The object is a bare point cloud.
-        HandError: The hand came without its description.
-        GraspFileError: The grasps are of another hand.
-        OptionError: The protocol does not exist.
-    """
-    scene = _scene(hand, obj, grasps, protocol)
-    joints, poses = [grasps.joints[:0]], [grasps.T_object_wrist[:0]]
-    for part, rollout in _rollouts(scene, hand, grasps, workers):
-        reached, T_object_wrist = _reached(part, rollout, hand, torch.from_numpy(rollout.close().stable))
-        holding = _holding_joints(hand, find_contact_links(scene, rollout.qpos))
-        joints.append(torch.where(holding, reached, part.joints))
-        poses.append(T_object_wrist)
-    unsettled = grasps.without("pregrasp_joints", "squeeze_joints", "score").without_trial()
-    return unsettled.replace(T_object_wrist=torch.cat(poses), joints=torch.cat(joints))
-
-
-def held(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *, workers: int | None = None
-) -> GraspBatch:
-    """The same grasps, outcomes included, in the poses of hand and object after closing, from where a trial goes on.
-
-    A grasp whose simulation is unstable, or that pushes the object farther than GIVE_UP, stays as it is.
-
-    Raises:
-        ObjectError: The object is a bare point cloud.
-        HandError: The hand came without its description.
-        GraspFileError: The grasps are of another hand.
-        OptionError: The protocol does not exist.
-    """
-    scene, parts = _scene(hand, obj, grasps, protocol), [(grasps.joints[:0], grasps.T_object_wrist[:0])]
-    for part, rollout in _rollouts(scene, hand, grasps, workers):
-        closed = rollout.close()
-        sound = torch.from_numpy(closed.stable & (closed.shift(rollout.start) < GIVE_UP))
-        parts.append(_reached(part, rollout, hand, sound))
-    joints, poses = (torch.cat(column) for column in zip(*parts, strict=True))
-    return grasps.replace(joints=joints, T_object_wrist=poses)
 
 
 def record(
@@ -140,8 +86,8 @@ def record(
         GraspFileError: The grasps are of another hand.
         OptionError: The protocol does not exist.
     """
-    scene = _scene(hand, obj, grasps, protocol)
-    (grasp, rollout), = _rollouts(scene, hand, grasps[index], workers=1, stride=stride)
+    scene = scene_of(hand, obj, grasps, protocol)
+    (grasp, rollout), = rollouts(scene, hand, grasps[index], workers=1, stride=stride)
     penetration = measure_penetration(scene, grasp)
     if shown := int(simulate(hand, obj, grasp, scene.protocol, workers=1).shown):
         conditions = draw(scene.protocol.perturbations, grasp).rows(slice(shown - 1, shown))
@@ -150,25 +96,6 @@ def record(
     joints, poses = (
         torch.from_numpy(np.concatenate(part).astype(np.float32)) for part in zip(*rollout.frames, strict=True))
     return poses, joints
-
-
-def _scene(hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol) -> Scene:
-    """The scene in which the grasps are simulated."""
-    require_pair(hand, obj)
-    grasps.require_hand(hand)
-    return cached_scene(hand, obj, find_protocol(protocol))
-
-
-def _rollouts(
-    scene: Scene, hand: Hand, grasps: GraspBatch, workers: int | None, stride: int | None = None
-) -> Iterator[tuple[GraspBatch, Rollout]]:
-    """The grasps in parts that are simulated together, with pregrasp and squeeze; each part's rollout at its start."""
-    centre = torch.as_tensor(scene.obj.centre_of_mass)
-    for start in range(0, len(grasps), CHUNK):
-        part = grasps[slice(start, start + CHUNK)]
-        if scene.protocol.closing:
-            part = completed(hand, part, centre, scene.protocol.controller)
-        yield part, Rollout(scene, part, workers or cores(), stride)
 
 
 def _run(rollout: Rollout, penetration: Penetration) -> TrialResult:
@@ -210,18 +137,3 @@ def _scene_of_trial(scene: Scene, trial: int) -> Scene:
     rules = scene.protocol.perturbations
     fine = trial < rules.trials - rules.coarse
     return scene if fine else cached_scene(scene.hand, scene.obj.coarse, scene.protocol)
-
-
-def _reached(
-    part: GraspBatch, rollout: Rollout, hand: Hand, sound: Bool[Tensor, " n"]
-) -> tuple[Float[Tensor, "n n_dof"], Float[Tensor, "n 4 4"]]:
-    """Joints and wrist poses relative to the object as a rollout has them now; those of the grasp where it is not sound."""
-    q, T = (torch.from_numpy(x) for x in rollout.poses())
-    q = q.to(part.joints.dtype).clamp(hand.tree.lower, hand.tree.upper)
-    T_object_wrist = torch.linalg.inv(torch.where(sound[:, None, None], T, torch.eye(4, dtype=T.dtype))).to(q.dtype)
-    return torch.where(sound[:, None], q, part.joints), torch.where(sound[:, None, None], T_object_wrist, part.T_object_wrist)
-
-
-def _holding_joints(hand: Hand, contact_links: Sequence[Sequence[str]]) -> Bool[Tensor, "n n_dof"]:
-    """Joints that move a contact link."""
-    return contact_mask(hand, contact_links).float() @ hand.tree.moves.float() > 0

@@ -1,0 +1,81 @@
+"""Close hands on their object, without the forces of a trial."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.simulation.contacts import contact_mask, find_contact_links
+from dro_grasp.simulation.outcome import GIVE_UP
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
+from dro_grasp.simulation.rollout import Rollout, rollouts, scene_of
+
+
+def settle(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *, workers: int | None = None
+) -> GraspBatch:
+    """The same grasps, relabelled with the poses of hand and object after closing.
+
+    A joint above a link that touches the object takes the value it reached, held back by the contact, so that the
+    label touches the surface. The other joints keep their values: closing would only drive them towards a fist. A
+    grasp whose simulation is unstable keeps its label. Energies and depth stay those before settling; scores and
+    outcomes are dropped.
+
+    Raises:
+        ObjectError: The object is a bare point cloud.
+        HandError: The hand came without its description.
+        GraspFileError: The grasps are of another hand.
+        OptionError: The protocol does not exist.
+    """
+    scene = scene_of(hand, obj, grasps, protocol)
+    joints, poses = [grasps.joints[:0]], [grasps.T_object_wrist[:0]]
+    for part, rollout in rollouts(scene, hand, grasps, workers):
+        reached, T_object_wrist = _reached(part, rollout, hand, torch.from_numpy(rollout.close().stable))
+        holding = _holding_joints(hand, find_contact_links(scene, rollout.qpos))
+        joints.append(torch.where(holding, reached, part.joints))
+        poses.append(T_object_wrist)
+    unsettled = grasps.without("pregrasp_joints", "squeeze_joints", "score").without_trial()
+    return unsettled.replace(T_object_wrist=torch.cat(poses), joints=torch.cat(joints))
+
+
+def held(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *, workers: int | None = None
+) -> GraspBatch:
+    """The same grasps, outcomes included, in the poses of hand and object after closing, from where a trial goes on.
+
+    A grasp whose simulation is unstable, or that pushes the object farther than GIVE_UP, stays as it is.
+
+    Raises:
+        ObjectError: The object is a bare point cloud.
+        HandError: The hand came without its description.
+        GraspFileError: The grasps are of another hand.
+        OptionError: The protocol does not exist.
+    """
+    scene, parts = scene_of(hand, obj, grasps, protocol), [(grasps.joints[:0], grasps.T_object_wrist[:0])]
+    for part, rollout in rollouts(scene, hand, grasps, workers):
+        closed = rollout.close()
+        sound = torch.from_numpy(closed.stable & (closed.shift(rollout.start) < GIVE_UP))
+        parts.append(_reached(part, rollout, hand, sound))
+    joints, poses = (torch.cat(column) for column in zip(*parts, strict=True))
+    return grasps.replace(joints=joints, T_object_wrist=poses)
+
+
+def _reached(
+    part: GraspBatch, rollout: Rollout, hand: Hand, sound: Bool[Tensor, " n"]
+) -> tuple[Float[Tensor, "n n_dof"], Float[Tensor, "n 4 4"]]:
+    """Joints and wrist poses relative to the object as a rollout has them now; those of the grasp where it is not sound."""
+    q, T = (torch.from_numpy(x) for x in rollout.poses())
+    q = q.to(part.joints.dtype).clamp(hand.tree.lower, hand.tree.upper)
+    T_object_wrist = torch.linalg.inv(torch.where(sound[:, None, None], T, torch.eye(4, dtype=T.dtype))).to(q.dtype)
+    return torch.where(sound[:, None], q, part.joints), torch.where(sound[:, None, None], T_object_wrist, part.T_object_wrist)
+
+
+def _holding_joints(hand: Hand, contact_links: Sequence[Sequence[str]]) -> Bool[Tensor, "n n_dof"]:
+    """Joints that move a contact link."""
+    return contact_mask(hand, contact_links).float() @ hand.tree.moves.float() > 0

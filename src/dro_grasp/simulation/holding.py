@@ -1,0 +1,176 @@
+"""What holds the object once the hand has closed: the motion that is left, the contacts, and what their forces could answer.
+
+Nothing pushes the object here, so this is no trial; it tells a squeeze that slips from one that grips. Ours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import mujoco
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.optimization.grip import friction_cone, nonnegative_least_squares
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
+from dro_grasp.simulation.rollout import FORCES, Rollout, quiet, rollouts, scene_of
+from dro_grasp.simulation.scene import Scene
+
+CONTACTS = 16
+"""Most contacts of a grasp that are weighed, those that press hardest (ours)."""
+PUSH = 5.0
+"""Acceleration of the object that the contacts are asked to answer, along each axis and against it [m/s^2] (ours)."""
+FRICTION = 0.5
+"""Share of the friction that the answer may use (ours)."""
+LENGTH = 0.05
+"""Lever that makes a torque comparable with a force [m] (ours)."""
+CHANGE = 0.3
+"""Cost of doubling or dropping the force of a contact, beside an unanswered push of ten m/s^2 (ours)."""
+RIDGE, STEPS = 1e-4, 80
+"""Weight of the squared forces, and steps, of the solver (ours)."""
+NO_ANSWER = 3.0
+"""Largest value of `unanswered`, and its value without contacts (ours)."""
+
+
+@dataclass(frozen=True)
+class Holding:
+    """How the object is held in n closed grasps."""
+
+    shift: Float[Tensor, " n"]
+    """How far closing moved the object [m]."""
+    turn: Float[Tensor, " n"]
+    """How far it turned the object [rad]."""
+    speed: Float[Tensor, " n"]
+    """How fast the object still moves [m/s]."""
+    spin: Float[Tensor, " n"]
+    """How fast it still turns [rad/s]."""
+    contacts: Float[Tensor, " n"]
+    """Number of contact points of hand and object."""
+    links: Float[Tensor, " n"]
+    """Number of links that touch the object."""
+    pressure: Float[Tensor, " n"]
+    """Sum of the normal forces [N]."""
+    slip: Float[Tensor, " n"]
+    """Largest ratio of tangential to normal force at a contact that bears."""
+    unanswered: Float[Tensor, "n 2"]
+    """What is missing for contacts near their present forces to answer a push: for the worst direction, and on average."""
+
+    def rows(self, index: Bool[Tensor, " n"]) -> Holding:
+        """Some of the grasps."""
+        return Holding(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+
+@dataclass(frozen=True)
+class ContactForces:
+    """Contacts of one configuration with the object; normals point into it."""
+
+    normal: Float[np.ndarray, "k 3"]
+    arm: Float[np.ndarray, "k 3"]
+    """From the object's centre of mass [m]."""
+    pressure: Float[np.ndarray, " k"]
+    """Normal force [N]."""
+    tangential: Float[np.ndarray, " k"]
+    """Tangential force [N]."""
+    links: int
+
+
+def holding(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *, workers: int | None = None
+) -> Holding:
+    """Close hands as a trial does, and look at what holds the object then.
+
+    Args:
+        hand: The hand of the grasps.
+        obj: Their object; it needs a mesh.
+        grasps: The controller makes each pregrasp and squeeze that a grasp does not state.
+        protocol: Its closing, friction and servos.
+        workers: Threads; all cores by default. The result does not depend on it.
+
+    Raises:
+        ObjectError: The object is a bare point cloud.
+        HandError: The hand came without its description.
+        GraspFileError: The grasps are of another hand.
+        OptionError: The protocol does not exist.
+    """
+    scene = scene_of(hand, obj, grasps, protocol)
+    parts = [Holding(**{f.name: torch.zeros(0, 2) if f.name == "unanswered" else torch.zeros(0) for f in fields(Holding)})]
+    parts += [_observed(scene, rollout) for _, rollout in rollouts(scene, hand, grasps, workers)]
+    return Holding(**{f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Holding)})
+
+
+def _observed(scene: Scene, rollout: Rollout) -> Holding:
+    """Close the hands of a rollout."""
+    closed = rollout.close()
+    first = int(scene.model.body_dofadr[scene.object_body])
+    velocity = np.nan_to_num(np.array(rollout.batch.bind("qvel"))[:, first:first + 6])
+    found = _contacts(scene, rollout)
+    bearing = [c.tangential[c.pressure > 0.05] / c.pressure[c.pressure > 0.05] for c in found]
+    columns = {
+        "shift": closed.shift(rollout.start), "turn": closed.turn(rollout.start),
+        "speed": np.linalg.norm(velocity[:, :3], axis=1), "spin": np.linalg.norm(velocity[:, 3:], axis=1),
+        "contacts": [len(c.pressure) for c in found], "links": [c.links for c in found],
+        "pressure": [c.pressure.sum() for c in found],
+        "slip": [ratio.max(initial=0.0) if len(ratio) else NO_ANSWER for ratio in bearing],
+    }
+    friction = FRICTION * rollout.scene.protocol.friction
+    values = {name: torch.as_tensor(np.array(column), dtype=torch.float32) for name, column in columns.items()}
+    return Holding(**values, unanswered=unanswered(found, torch.as_tensor(rollout.mass, dtype=torch.float32), friction))
+
+
+def _contacts(scene: Scene, rollout: Rollout) -> list[ContactForces]:
+    """The contacts with the object in each simulation, with the forces that they bear now."""
+    model, data, force = scene.model, mujoco.MjData(scene.model), np.zeros(6)
+    names = ("qpos", "qvel", "ctrl", "qacc_warmstart")
+    state = {name: np.nan_to_num(np.array(rollout.batch.bind(name))) for name in names}
+    found = []
+    for i in range(rollout.size):
+        for name in names:
+            getattr(data, name)[:] = state[name][i]
+        with quiet():
+            mujoco.mj_forward(model, data)
+        bodies = model.geom_bodyid[data.contact.geom].reshape(-1, 2)
+        rows = np.flatnonzero((bodies == scene.object_body).any(1))
+        forces = np.zeros((len(rows), 3))
+        for k, row in enumerate(rows):
+            mujoco.mj_contactForce(model, data, row, force)
+            forces[k] = force[:3]
+        into = np.where(bodies[rows, 1] == scene.object_body, 1.0, -1.0)[:, None]
+        touching = bodies[rows][bodies[rows] != scene.object_body]
+        found.append(ContactForces(
+            into * data.contact.frame.reshape(-1, 9)[rows, :3], data.contact.pos[rows] - data.xipos[scene.object_body],
+            forces[:, 0], np.linalg.norm(forces[:, 1:], axis=1), len(np.unique(touching))))
+    return found
+
+
+def unanswered(contacts: list[ContactForces], mass: Float[Tensor, " n"], friction: float) -> Float[Tensor, "n 2"]:
+    """What is missing for the contacts to answer pushes: for the worst of six directions, and on average.
+
+    Each contact may change its force within its friction cone; a change relative to its present pressure costs as much as a
+    share of the push that stays unanswered.
+    """
+    n, edges = len(contacts), 6
+    normal, arm = torch.zeros(n, CONTACTS, 3), torch.zeros(n, CONTACTS, 3)
+    normal[..., 2], pressure = 1.0, torch.zeros(n, CONTACTS)
+    for i, c in enumerate(contacts):
+        kept = np.argsort(-c.pressure)[:CONTACTS]
+        for table, values in ((normal, c.normal), (arm, c.arm), (pressure, c.pressure)):
+            table[i, :len(kept)] = torch.as_tensor(values[kept], dtype=torch.float32)
+    on = (pressure > 0).float()
+    cone = friction_cone(normal, friction, edges)
+    scale = (pressure / (10 * mass[:, None]))[..., None, None]
+    wrench = torch.cat([cone, torch.linalg.cross(arm[..., None, :].expand_as(cone) / LENGTH, cone)], -1) * scale
+    same = CHANGE * torch.eye(CONTACTS).repeat_interleave(edges, 1) * on.repeat_interleave(edges, 1)[:, None]
+    matrix = torch.cat([wrench.flatten(1, 2).mT, same], 1)
+    push = torch.as_tensor(FORCES, dtype=torch.float32) * PUSH / 10
+    answer = torch.cat([-push, torch.zeros(6, 3)], 1).expand(n, 6, 6)
+    goal = torch.cat([answer, (CHANGE * on)[:, None].expand(n, 6, CONTACTS)], -1).flatten(0, 1)
+    matrix = matrix.repeat_interleave(6, 0)
+    x = nonnegative_least_squares(matrix, goal, RIDGE, STEPS)
+    missing = ((matrix @ x[..., None])[..., 0] - goal).norm(dim=-1).reshape(n, 6).clamp_max(NO_ANSWER)
+    missing[on.sum(1) == 0] = NO_ANSWER
+    return torch.stack([missing.amax(1), missing.mean(1)], 1)
