@@ -16,7 +16,7 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.stages import evaluate
 from dro_grasp.predictor import GraspPredictor, GraspRequest
-from dro_grasp.simulation.closing import settle
+from dro_grasp.simulation.closed_poses import settle
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL
 from dro_grasp.simulation.trial import record, simulate
 from dro_grasp.viewer.studio import Studio

@@ -258,7 +258,7 @@ def test_a_success_that_hardly_anything_touches_is_not_kept():
 
 
 def test_settled_labels_move_only_joints_that_hold(tmp_path):
-    from dro_grasp.simulation.closing import settle
+    from dro_grasp.simulation.closed_poses import settle
     from dro_grasp.simulation.trial import simulate
 
     hand, can = load_hand("allegro"), load_object("can")

@@ -178,7 +178,8 @@ def test_weights_remember_every_training_before(path: Path, network: DistanceNet
     stages = [entry["stage"] for entry in history_of(tmp_path / "small.safetensors")]
     assert stages == ["test", "second", "third"]
     assert [entry["initial"] for entry in history_of(locate_weights("multi"))] == ["multi"]
-    for name, stage in (("ranking/quality", "ranking"), ("completion/surface", "completion")):
+    small = {"ranking/quality": "ranking", "ranking/holding": "ranking of settled grasps", "completion/surface": "completion"}
+    for name, stage in small.items():
         assert {entry["stage"] for entry in history_of(SHIPPED_FOLDER / f"{name}.safetensors")} == {stage}
 
 

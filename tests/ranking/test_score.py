@@ -16,7 +16,7 @@ from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import scored
 from dro_grasp.ranking.score import ScoreConfig
-from dro_grasp.simulation.closing import settle
+from dro_grasp.simulation.closed_poses import settle
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.toy_hand import toy_hand

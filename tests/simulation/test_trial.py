@@ -15,7 +15,7 @@ from dro_grasp.grasps.controller import ControllerConfig
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation import rollout as rollouts
-from dro_grasp.simulation.closing import held, settle
+from dro_grasp.simulation.closed_poses import held, settle
 from dro_grasp.simulation.outcome import GIVE_UP, Failure
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, protocol
 from dro_grasp.simulation.trial import TrialResult, record, simulate

@@ -22,7 +22,7 @@ from dro_grasp.optimization.refinement import RefineConfig
 from dro_grasp.pipeline.holding_score import holding_score
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import complete, permitted, refine, scored
-from dro_grasp.simulation.closing import settle
+from dro_grasp.simulation.closed_poses import settle
 from dro_grasp.simulation.holding import Holding, holding
 
 SHARE = 0.5

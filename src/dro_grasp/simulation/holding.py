@@ -31,8 +31,10 @@ LENGTH = 0.05
 """Lever that makes a torque comparable with a force [m] (ours)."""
 CHANGE = 0.3
 """Cost of doubling or dropping the force of a contact, beside an unanswered push of ten m/s^2 (ours)."""
-RIDGE, STEPS = 1e-4, 80
-"""Weight of the squared forces, and steps, of the solver (ours)."""
+RIDGE = 1e-4
+"""Weight of the squared forces in the solver (ours)."""
+STEPS = 80
+"""Steps of the solver (ours)."""
 NO_ANSWER = 3.0
 """Largest value of `unanswered`, and its value without contacts (ours)."""
 

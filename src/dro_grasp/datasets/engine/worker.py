@@ -21,7 +21,7 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
-from dro_grasp.simulation.closing import settle
+from dro_grasp.simulation.closed_poses import settle
 from dro_grasp.simulation.trial import simulate
 
 LOOSE = "held by too few links"
