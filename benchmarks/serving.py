@@ -79,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     own = ["--hand", options.hand, *(["--weights", options.weights] if options.weights else [])]
     process, url = started(own)
-    client = GraspClient(url)
+    client = GraspClient(url, timeout=600.0)
     try:
         with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(options.clients) as crowd:
             mesh = Path(folder) / "cylinder.stl"

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import threading
 from pathlib import Path
 
 import pytest
 import torch
 
-from dro_grasp.devices import choose_device, on_device, require_device
+from dro_grasp.devices import choose_device, cores, on_device, require_device, side_by_side
 from dro_grasp.energy.grasp_energy import link_spheres
 from dro_grasp.errors import OptionError
 from dro_grasp.objects.catalogue import load_object
@@ -75,3 +76,37 @@ def test_the_optimiser_s_predictions_on_a_device_are_those_of_the_cpu(
     assert there.joints.device.type == "cpu"
     for name in ("joints", "T_object_wrist", "pregrasp_joints", "squeeze_joints", "score"):
         torch.testing.assert_close(getattr(there, name), getattr(here, name), atol=1e-3, rtol=1e-3)
+
+
+def test_parts_side_by_side_give_what_they_give_one_by_one_each_in_one_thread() -> None:
+    before, seen, numbers = torch.get_num_threads(), [], torch.rand(7, 3, requires_grad=True)
+
+    def work(part: torch.Tensor, factor: torch.Tensor) -> torch.Tensor:
+        seen.append((threading.get_ident(), torch.get_num_threads(), torch.is_grad_enabled()))
+        barrier.wait(5)
+        return factor * part.sum()
+
+    try:
+        torch.set_num_threads(2)
+        barrier = threading.Barrier(2)  # only two threads at once get past it
+        with torch.no_grad():
+            found = side_by_side(work, numbers[:6].split(1), torch.arange(6.0).split(1))
+        assert torch.equal(torch.stack(found).flatten(), torch.arange(6.0) * numbers[:6].detach().sum(1))
+        assert len({thread for thread, *_ in seen}) == 2
+        assert {tuple(rest) for _, *rest in seen} == {(1, False)}
+        barrier = threading.Barrier(1)
+        assert side_by_side(work, numbers[:2].split(2), torch.ones(1).split(1))[0].requires_grad
+        assert seen[-1] == (threading.get_ident(), 1, True)
+        assert torch.get_num_threads() == 2
+        with pytest.raises(ZeroDivisionError):
+            side_by_side(lambda part: 1 / 0, numbers.split(1))
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_cores_are_at_most_the_threads_that_are_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(8)))
+    for wanted, expected in (("3", 3), ("16", 8), ("0", 8), ("many", 8), ("", 8)):
+        monkeypatch.setenv("OMP_NUM_THREADS", wanted)
+        assert cores() == expected

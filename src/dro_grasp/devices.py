@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from functools import cache, cached_property
 from typing import Any, TypeVar
@@ -15,6 +16,7 @@ import torch
 from dro_grasp.errors import OptionError
 
 Record = TypeVar("Record")
+Result = TypeVar("Result")
 LARGEST_DEVIATION = 1e-5
 """Largest relative deviation of a test product with which the quick path is taken. Source: ours; single precision has 4e-7."""
 PROBE_SIZE = 256
@@ -43,8 +45,10 @@ def require_device(name: str) -> None:
 
 
 def cores() -> int:
-    """Cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Cores this process may use: those that it is bound to, and at most OMP_NUM_THREADS, which `--threads` sets."""
+    bound = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    wanted = os.environ.get("OMP_NUM_THREADS", "")
+    return min(bound, int(wanted)) if wanted.isdecimal() and int(wanted) > 0 else bound
 
 
 @contextmanager
@@ -56,6 +60,27 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+def side_by_side(work: Callable[..., Result], *parts: Iterable[Any]) -> list[Result]:
+    """The results for all parts of a task, as `map` gives them, computed by as many threads as PyTorch may use.
+
+    Each part is computed in one thread. Threads that share a part wait for each other after every operation, which costs
+    more than they gain where operations are small or other programs are at work; these wait once. Parts on another
+    device follow each other.
+    """
+    jobs, threads, gradients = list(zip(*parts, strict=True)), torch.get_num_threads(), torch.is_grad_enabled()
+    on_cpu = all(value.device.type == "cpu" for job in jobs for value in job if isinstance(value, torch.Tensor))
+    if min(len(jobs), threads) < 2 or not on_cpu:
+        with one_thread():
+            return [work(*job) for job in jobs]
+
+    def prepare() -> None:  # both settings belong to a thread
+        torch.set_num_threads(1)
+        torch.set_grad_enabled(gradients)
+
+    with one_thread(), ThreadPoolExecutor(threads, initializer=prepare) as pool:
+        return list(pool.map(lambda job: work(*job), jobs))
 
 
 @contextmanager

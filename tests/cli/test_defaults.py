@@ -11,7 +11,7 @@ import pytest
 
 from dro_grasp.cli.evaluate import Evaluate
 from dro_grasp.cli.generate import Generate
-from dro_grasp.cli.main import PATIENCE, main
+from dro_grasp.cli.main import PATIENCE, THREADS, main
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.stages import evaluate
@@ -72,3 +72,16 @@ def test_waiting_threads_sleep_unless_the_user_says_otherwise(monkeypatch: pytes
     monkeypatch.setenv(PATIENCE[0], "ACTIVE")
     assert main(["hands", "--json"]) == 0
     assert os.environ[PATIENCE[0]] == "ACTIVE"
+
+
+@pytest.mark.parametrize("given", [["--threads", "3", "hands"], ["hands", "--threads=3"], ["hands"]])
+def test_threads_are_chosen_at_any_place(monkeypatch: pytest.MonkeyPatch, given: list[str]) -> None:
+    monkeypatch.setenv(THREADS, "5")
+    assert main([*given, "--json"]) == 0
+    assert os.environ[THREADS] == ("5" if given == ["hands"] else "3")
+
+
+@pytest.mark.parametrize("number", ["0", "-1", "two", ""])
+def test_threads_that_are_none_are_refused(capsys: pytest.CaptureFixture[str], number: str) -> None:
+    assert main(["hands", "--threads", number]) == 2
+    assert f"--threads is '{number}'; give a number" in capsys.readouterr().err

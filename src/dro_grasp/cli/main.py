@@ -29,7 +29,7 @@ from dro_grasp.cli.synthesize import Synthesize
 from dro_grasp.cli.train import Pretrain, Train
 from dro_grasp.cli.view import Picture, View
 from dro_grasp.cli.weights import Weights
-from dro_grasp.errors import DroGraspError
+from dro_grasp.errors import DroGraspError, OptionError
 
 DONE = 0
 """Exit code of a command that succeeded."""
@@ -44,6 +44,8 @@ INSISTENCE = 5.0
 PATIENCE = ("OMP_WAIT_POLICY", "PASSIVE")
 """Environment variable that lets PyTorch's threads sleep while they wait, which they otherwise spend spinning: beside other
 programs at work that takes several times as long. It counts if it is set before PyTorch is loaded."""
+THREADS = "OMP_NUM_THREADS"
+"""Environment variable of the number of threads, for which the same holds."""
 
 named = tyro.conf.subcommand
 Command = (
@@ -80,11 +82,29 @@ def parse(arguments: Sequence[str]) -> Any:
         Command,  # type: ignore[arg-type]
         prog="dro-grasp",
         description="Any robot hand description in, simulation-checked dexterous grasps out. "
-        "--version prints the version; --verbose, at any place, shows tracebacks.",
+        "--version prints the version. At any place, --verbose shows tracebacks, and --threads N computes in N threads "
+        "(default: one for each core).",
         args=list(arguments),
         config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
     )
     return getattr(command, "command", command)
+
+
+def without_threads(arguments: Sequence[str]) -> list[str]:
+    """The arguments without `--threads N`, which is set for this process and those that it starts.
+
+    Raises:
+        OptionError: N is no number, or less than 1.
+    """
+    rest = [word for argument in arguments for word in argument.split("=", int(argument.startswith("--threads=")))]
+    if "--threads" in rest:
+        place = rest.index("--threads")
+        number = "".join(rest[place + 1 : place + 2])
+        if not (number.isdecimal() and int(number) > 0):
+            raise OptionError(f"--threads is '{number}'; give a number of threads from 1 on")
+        os.environ[THREADS] = number
+        del rest[place : place + 2]
+    return rest
 
 
 @contextmanager
@@ -118,7 +138,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault(*PATIENCE)
     try:
         with insistent_interrupts():
-            return parse(arguments).run()
+            return parse(without_threads(arguments)).run()
     except DroGraspError as error:
         if verbose:
             traceback.print_exc()

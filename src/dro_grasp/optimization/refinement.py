@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dro_grasp.devices import side_by_side
 from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.geometry.se3 import turned_about
@@ -51,7 +52,7 @@ class RefineConfig:
     """How idle fingers close before the descent."""
     grip: GripConfig = field(default_factory=GripConfig)
     """How the refined grasps squeeze."""
-    batch_size: int = 64
+    batch_size: int = 32
     """Grasps refined at once."""
 
 
@@ -69,9 +70,9 @@ def refine_grasps(energy: GraspEnergy, grasps: GraspBatch, config: RefineConfig 
     if not len(grasps):
         return grasps
     device = energy.centre.device
-    parts = zip(grasps.T_object_wrist.split(config.batch_size), grasps.joints.split(config.batch_size), strict=True)
+    parts = (column.to(device).split(config.batch_size) for column in (grasps.T_object_wrist, grasps.joints))
     with torch.no_grad():
-        ends = [_descend(energy, T.to(device), q.to(device), config) for T, q in parts]
+        ends = side_by_side(lambda T, q: _descend(energy, T, q, config), *parts)
     T, q = (torch.cat(part).cpu() for part in zip(*ends, strict=True))
     return grasps.moved_to(T, q)
 

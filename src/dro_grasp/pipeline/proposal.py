@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp import distance_matrix
-from dro_grasp.devices import Stopwatch
+from dro_grasp.devices import Stopwatch, one_thread, side_by_side
 from dro_grasp.errors import OptionError
 from dro_grasp.geometry.se3 import apply_to_cloud, compose, rotate
 from dro_grasp.grasps.batch import GraspBatch
@@ -104,7 +104,7 @@ def propose(
         part = slice(start, min(start + config.batch_size, num))
         with watch("network"):
             distances = _distances(problem, network, cloud, placement[part], joints[part], noise[part], config)
-        with watch("decode"):
+        with watch("decode"), one_thread():
             links = distance_matrix.decode(hand, distances, cloud.expand(len(distances), -1, -1))
             solution = distance_matrix.solve(hand, links, joints[part])
         found.append((solution.T_world_wrist, solution.joints, links.points))
@@ -163,15 +163,20 @@ def _distances(
     placed = hand.points(joints, placement)
     turned = placement[:, :3, :3] @ network.config.axes(hand.palm_axes_wrist)
     centre, size = cloud.mean(0), config.network_batch_size
-    found = []
-    for points, axes, z in zip(placed.split(size), turned.split(size), noise.split(size), strict=True):
+    field = problem.field  # made before threads ask for it
+
+    def predict(
+        points: Float[Tensor, "b n 3"], axes: Float[Tensor, "b 3 3"], z: Float[Tensor, "b k latent"]
+    ) -> Float[Tensor, "b n m"]:
         centres = centre.expand(len(points), 3)
         opened = network.to_frame(points, centres, axes)
         obj = network.to_frame(cloud.expand(len(points), -1, -1), centres, axes)
 
-        def choose(moves: Float[Tensor, "b k n 3"], axes: Float[Tensor, "b 3 3"] = axes) -> Int[Tensor, " b"]:
-            points = moves @ axes[:, None].mT + centre
-            return choice_scores(hand, problem.field, points, config.choice, problem.surroundings).argmax(-1)
+        def choose(moves: Float[Tensor, "b k n 3"]) -> Int[Tensor, " b"]:
+            return choice_scores(hand, field, moves @ axes[:, None].mT + centre, config.choice, problem.surroundings).argmax(-1)
 
-        found.append(network.predict(opened, obj, z, choose).float())
-    return torch.cat(found)
+        return network.predict(opened, obj, z, choose).float()
+
+    if len(placed) <= size:  # all threads for the one part that there is
+        return predict(placed, turned, noise)
+    return torch.cat(side_by_side(predict, placed.split(size), turned.split(size), noise.split(size)))

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from dro_grasp.devices import one_thread
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import completed
 from dro_grasp.optimization.finger_closing import close_idle_fingers
@@ -56,8 +57,11 @@ def refine(problem: GraspProblem, grasps: GraspBatch, config: RefineConfig | Non
     config = config or RefineConfig()
     grasps.require_hand(problem.hand)
     energy = problem.energy(config.energy)
-    closed = close_idle_fingers(energy, grasps, config.closing)
-    return gripping(energy, refine_grasps(energy, closed, config), config.grip)
+    with one_thread():
+        closed = close_idle_fingers(energy, grasps, config.closing)
+    refined = refine_grasps(energy, closed, config)
+    with one_thread():
+        return gripping(energy, refined, config.grip)
 
 
 def rank(problem: GraspProblem, grasps: GraspBatch, config: ScoreConfig | None = None) -> GraspBatch:

@@ -74,6 +74,9 @@ class GraspClient:
             with error:
                 why = error.read().decode(errors="replace")
             raise ServerError(json.loads(why)["error"] if why.startswith('{"error"') else f"{error}: {why[:200]}") from error
+        except TimeoutError as error:
+            raise ServerError(f"the grasp server at {self.url} gave no answer in {self.timeout:g} s; ask for fewer grasps, or "
+                              "give GraspClient a longer timeout") from error
         except (URLError, OSError) as error:
             raise ServerError(f"no grasp server answers at {self.url} ({error}); start one with `dro-grasp serve`") from error
 
