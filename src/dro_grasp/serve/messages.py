@@ -15,6 +15,8 @@ from pydantic import (  # pyright: ignore[reportMissingImports]
     BaseModel,
     ConfigDict,
     Field,
+    PydanticSchemaGenerationError,
+    TypeAdapter,
     create_model,
     field_validator,
     model_validator,
@@ -103,10 +105,18 @@ WIRE_TYPES: dict[str, Any] = {}
 
 
 def fields_of(settings: type[Any]) -> dict[str, Any]:
-    """The fields of a dataclass with type, default and description, as pydantic takes them."""
-    types, told = get_type_hints(settings), field_docs(settings)
-    return {f.name: (WIRE_TYPES.get(f.name, types[f.name]), Field(... if f.default is MISSING else f.default,
-                                                                  description=told.get(f.name))) for f in fields(settings)}
+    """Type, default and description of a dataclass's fields, as pydantic takes them; what has no form in JSON is left out."""
+    types, told = get_type_hints(settings) | WIRE_TYPES, field_docs(settings)
+    return {f.name: (types[f.name], Field(... if f.default is MISSING else f.default, description=told.get(f.name)))
+            for f in fields(settings) if _has_json(types[f.name])}
+
+
+def _has_json(kind: Any) -> bool:
+    try:
+        TypeAdapter(kind)
+    except PydanticSchemaGenerationError:
+        return False
+    return True
 
 
 def field_docs(settings: type[Any]) -> dict[str, str]:
@@ -128,7 +138,8 @@ def settings_in(call: Any, settings: type[Settings]) -> Settings:
     Raises:
         OptionError: A value is out of range.
     """
-    return settings(**{f.name: getattr(call, f.name) for f in fields(settings)})  # type: ignore[arg-type]
+    names = [f.name for f in fields(settings) if f.name in type(call).model_fields]  # type: ignore[arg-type]
+    return settings(**{name: getattr(call, name) for name in names})
 
 
 class SentGrasp(Message):
