@@ -52,6 +52,7 @@ from dro_grasp.predictor import (
     PredictorConfig as PredictorConfig,
 )
 from dro_grasp.serve.client import GraspClient as GraspClient
+from dro_grasp.simulation.contact_quality import ContactQuality as ContactQuality, measure_contacts as measure_contacts
 from dro_grasp.simulation.outcome import Failure as Failure, TrialResult as TrialResult
 from dro_grasp.simulation.protocols import Perturbations as Perturbations, Protocol as Protocol
 from dro_grasp.simulation.trial import simulate as simulate

@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import fields, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -18,6 +19,10 @@ from dro_grasp._version import __version__
 from dro_grasp.cli import main as cli
 from dro_grasp.cli.main import main
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.library import load_hand
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.simulation.contact_quality import measure_contacts
+from dro_grasp.simulation.protocols import protocol
 
 
 def names_of(command: Any) -> list[list[str]]:
@@ -131,6 +136,7 @@ def test_evaluate_and_view_take_the_file_that_generate_wrote(generate, tmp_path:
     assert report["fingers_in_contact"] == pytest.approx(float(fingers.mean()) / 3)
     assert report["all_fingers_in_contact"] == pytest.approx(float((fingers == 3).float().mean()))
     assert "trials_held" not in report
+    assert report["contact_quality"] == {}
     assert main(["evaluate", str(grasps), "--protocol", "robust", "--output", str(tried), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["trials_held"] == pytest.approx(float(GraspBatch.load(tried).robustness.mean()))
@@ -138,6 +144,23 @@ def test_evaluate_and_view_take_the_file_that_generate_wrote(generate, tmp_path:
     assert "held in" in capsys.readouterr().out
     assert main(["picture", str(tried), "--output", str(picture)]) == 0
     assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_evaluate_measures_contacts_with_the_protocols_friction(generate, tmp_path: Path, capsys) -> None:
+    grasps, tried = tmp_path / "a.parquet", tmp_path / "b.parquet"
+    generate("--output", str(grasps), "--protocol", "none", num=2)
+    options = ["--protocol", "dexgraspbench", "--friction", "0.9", "--contact-quality"]
+    assert main(["evaluate", str(grasps), *options, "--output", str(tried), "--json"]) == 0
+    means = json.loads(capsys.readouterr().out)["contact_quality"]
+    measured = GraspBatch.load(tried)
+    rules = replace(protocol("dexgraspbench"), friction=0.9)
+    wanted = measure_contacts(load_hand("gripper3"), load_object("sphere"), measured, rules)
+    assert set(means) == {field.name for field in fields(wanted)}
+    for name, mean in means.items():
+        torch.testing.assert_close(measured.extra[name], getattr(wanted, name))
+        assert mean == pytest.approx(float(getattr(wanted, name).mean()), rel=1e-4)  # files hold single precision
+    assert main(["evaluate", str(grasps), *options]) == 0
+    assert "contact distance" in capsys.readouterr().out
 
 
 def test_evaluation_on_another_object_is_told(generate, tmp_path: Path, capsys) -> None:

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from dro_grasp.cli.main import main
-from dro_grasp.datasets.collections.importing import read_foreign
+from dro_grasp.datasets.collections.importing import import_grasps, read_foreign
 from dro_grasp.errors import GraspFileError
 from dro_grasp.grasps.batch import GraspBatch
 from tests.helpers.loaded_hands import loaded_hand
@@ -99,6 +99,20 @@ def test_dexgraspbench_is_read_as_it_is_exported(made, tmp_path: Path, capsys: p
     back = GraspBatch.load(json.loads(capsys.readouterr().out.splitlines()[-1])["files"][0]["file"])
     np.testing.assert_allclose(back.T_object_wrist, T, atol=1e-5)
     np.testing.assert_allclose(back.joints, joints, atol=1e-6)
+    for i, file in enumerate(files):
+        entry = np.load(file, allow_pickle=True).item()
+        np.testing.assert_allclose(back.pregrasp_joints[i], entry["pregrasp_qpos"][7:], atol=1e-6)
+        np.testing.assert_allclose(back.squeeze_joints[i], entry["squeeze_qpos"][7:], atol=1e-6)
+    assert (back.pregrasp_joints - back.squeeze_joints).abs().max() > 0.05
+
+
+def test_a_dexgraspbench_file_with_a_grasp_alone_states_no_closing(made, tmp_path: Path) -> None:
+    entry = {"grasp_qpos": np.array([0, 0, 0.1, 1, 0, 0, 0, *made[2][0]])}
+    np.save(tmp_path / "0.npy", np.array(entry, dtype=object), allow_pickle=True)
+    grasps, missing = import_grasps([tmp_path / "0.npy"], "dexgraspbench", {"": HAND}, "can")
+    assert not missing
+    np.testing.assert_allclose(grasps[HAND].joints[0], made[2][0], atol=1e-6)
+    assert not grasps[HAND].states_closing.any()
 
 
 class Evil:

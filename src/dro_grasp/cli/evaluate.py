@@ -40,6 +40,9 @@ class Evaluate:
     """Mesh to use, likewise, for a file with one object."""
     scale: float = 1.0
     """Scale of the mesh given with --object."""
+    contact_quality: Flag = False
+    """Also measure penetration, contact distance and force closure of the grasps as they are, without any motion: the analytic
+    metrics of DexGraspBench, with the protocol's friction."""
     output: Annotated[Path | None, optional("PATH", "not saved")] = None
     """Save the grasps with their results."""
     json: Flag = False
@@ -55,6 +58,7 @@ class Evaluate:
         from dro_grasp.grasps.sources import hand_of, object_of
         from dro_grasp.pipeline.problem import GraspProblem
         from dro_grasp.pipeline.stages import evaluate
+        from dro_grasp.simulation.contact_quality import with_contacts
         from dro_grasp.simulation.diagnosis import count_failures, diagnose, next_steps
         from dro_grasp.simulation.protocols import changed
 
@@ -74,7 +78,7 @@ class Evaluate:
                 if part.object_sha256[0] not in {"", obj.sha256}:
                     say_aside(f"the grasps were made for another '{name}' than the given {obj.name}")
                 done = evaluate(GraspProblem(hand, obj), part, rules, progress)
-                evaluated.append(done)
+                evaluated.append(with_contacts(hand, obj, done, rules) if self.contact_quality else done)
                 success = int(done.success.sum())
                 rows.append([name, len(done), success, success / max(1, len(done)), *shares(done, hand).values()])
         done = GraspBatch.concatenate(evaluated)
@@ -86,7 +90,8 @@ class Evaluate:
         report = {
             "file": str(self.file), "hand": hand.name, "protocol": rules.label, "num": len(grasps), "success": success,
             "success_rate": rate, "interval_95": [low, high],
-            **beside, "objects": {row[0]: {"num": row[1], "success": row[2]} for row in rows},
+            **beside, "contact_quality": qualities(done),
+            "objects": {row[0]: {"num": row[1], "success": row[2]} for row in rows},
             "reasons": count_failures(done), "next": next_steps(done), "seconds": round(time.perf_counter() - begin, 3),
             "output": None if self.output is None else str(self.output),
         }
@@ -95,7 +100,9 @@ class Evaluate:
             mean, low, high = mean_share(done.robustness)
             note += f", and held in {mean:.1%} of their trials (95 %: {low:.1%} to {high:.1%})"
         columns = ["object", "grasps", "success", "rate", *(SHARES[name] for name in beside)]
-        print_result(self.json, report, f"{hand.name}, protocol {rules.label}", columns, rows, note, *diagnose(done))
+        means = ", ".join(f"{name.replace('_', ' ')} {mean:.3g}" for name, mean in report["contact_quality"].items())
+        notes = [note, *([f"means: {means} (lengths in m)"] if means else []), *diagnose(done)]
+        print_result(self.json, report, f"{hand.name}, protocol {rules.label}", columns, rows, *notes)
         return 0
 
 
@@ -106,3 +113,10 @@ def shares(grasps: GraspBatch, hand: Hand) -> dict[str, float]:
     held = [float(grasps.robustness.mean())] if bool(grasps.robustness.isfinite().all()) else []
     names = list(SHARES)[-2 - len(held):]
     return dict(zip(names, [*held, *finger_contact(grasps.fingers_in_contact, len(hand.fingers))], strict=True))
+
+
+def qualities(grasps: GraspBatch) -> dict[str, float]:
+    """Means of the analytic metrics of grasps that have them."""
+    from dro_grasp.simulation.contact_quality import NAMES
+
+    return {name: float(grasps.extra[name].mean()) for name in NAMES if name in grasps.extra}

@@ -21,6 +21,7 @@ from dro_grasp.objects.builtin import BUILTIN, make_builtin
 from dro_grasp.objects.convex_parts import Part
 from dro_grasp.objects.in_memory import ObjectSource, object_in_memory
 from dro_grasp.objects.loading import load_file, mesh_object, read_geometry
+from dro_grasp.objects.mesh_process import load_processed, processed_folder
 from dro_grasp.objects.shape import ObjectModel
 
 ASSET_PREFIX = "assets/"
@@ -37,8 +38,9 @@ def load_object(
     """Load an object by name, from a mesh or point cloud file, or from a mesh or points in memory.
 
     Args:
-        source: A built-in name, an asset's name (`contactdb+apple`), or a path; `assets/NAME` forces the asset. In memory: a
-            trimesh mesh, cloud or scene, a pair (vertices, faces), or points (n 3), with normals (n 6).
+        source: A built-in name, an asset's name (`contactdb+apple`), or a path; `assets/NAME` forces the asset. A folder of
+            DexGraspBench is one object, with its convex parts. In memory: a trimesh mesh, cloud or scene, a pair (vertices,
+            faces), or points (n 3), with normals (n 6).
         scale: Multiplies all coordinates; 0.001 for millimetres.
         name: What to call the object, instead of its own name.
         keep_table: Take every point of a bare cloud for the object's. By default a table in it is found and cut off, said in a
@@ -62,6 +64,8 @@ def _load(name: str | Path, scale: float, keep_table: bool) -> ObjectModel:
     if entry is not None:
         return _load_asset(entry, scale)
     path = given_path(text)
+    if (folder := processed_folder(path)) is not None:
+        return load_processed(folder, scale)
     if path.is_dir():
         raise ObjectError(f"{path} is a folder; name one of its files, or use a command that takes folders")
     if path.exists() or path.suffix:
@@ -88,7 +92,7 @@ def resolve_objects(names: list[str]) -> list[str]:
             found.extend(_members(group[1], group[2]))
             continue
         folder = given_path(name)
-        if name in BUILTIN or not folder.is_dir():
+        if name in BUILTIN or not folder.is_dir() or processed_folder(folder) is not None:
             found.append(name)
             continue
         files = sorted(str(f) for f in folder.iterdir() if f.suffix.lower() in MESH_SUFFIXES)

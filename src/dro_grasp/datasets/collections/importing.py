@@ -7,6 +7,7 @@ axes), the readme of DexGraspBench.
 
 from __future__ import annotations
 
+import math
 import pickle
 import re
 import warnings
@@ -45,6 +46,10 @@ EXPECTED = {
 """Entries of each format, for messages."""
 
 
+Joints = dict[str, float] | Float[np.ndarray, " n_joints"]
+"""Values by name, or in the order of the hand's moving joints."""
+
+
 @dataclass(frozen=True)
 class ForeignGrasp:
     """One grasp in a file's own terms."""
@@ -57,8 +62,12 @@ class ForeignGrasp:
     """Scale of the object."""
     T_object_wrist: Float[np.ndarray, "4 4"]
     """Wrist pose [m]."""
-    joints: dict[str, float] | Float[np.ndarray, " n_joints"]
-    """By name, or in the order of the hand's moving joints [rad or m]."""
+    joints: Joints
+    """[rad or m]"""
+    pregrasp: Joints | None = None
+    """Joints from which the hand closes, if the format has them, in this wrist pose too [rad or m]."""
+    squeeze: Joints | None = None
+    """Joint targets that press on the object, likewise."""
 
 
 def read_foreign(path: Path, kind: Format) -> list[ForeignGrasp]:
@@ -128,7 +137,7 @@ def _cmap(path: Path) -> Iterator[ForeignGrasp]:
 
 
 def _dexgraspnet(path: Path) -> Iterator[ForeignGrasp]:
-    for entry in _load_npy(path):
+    for entry in read_npy(path):
         qpos = {str(name): float(value) for name, value in _entry(entry, "qpos").items()}
         position = [_entry(qpos, name) for name in WRIST[:3]]
         angles = [_entry(qpos, name) for name in WRIST[3:]]
@@ -141,15 +150,20 @@ def _dexgraspbench(path: Path) -> Iterator[ForeignGrasp]:
     def pose(row: Float[np.ndarray, " k"]) -> Float[np.ndarray, "4 4"]:
         return _pose(Rotation.from_quat(row[3:7], scalar_first=True), row[:3])
 
-    entry = _load_npy(path).item()
+    entry = read_npy(path).item()
     rows = np.atleast_2d(np.asarray(_entry(entry, "grasp_qpos"), np.float64))
     obj = np.atleast_2d(np.asarray(entry.get("obj_pose", [0, 0, 0, 1, 0, 0, 0]), np.float64))
-    for row, place in zip(rows, np.broadcast_to(obj, (len(rows), 7)), strict=True):
+    names = entry.get("joint_names")
+    postures: list[list[Joints] | list[None]] = []
+    for posture in ("grasp", "pregrasp", "squeeze"):
+        stated = entry.get(f"{posture}_qpos")
+        values = [] if stated is None else np.broadcast_to(np.asarray(stated, np.float64), rows.shape)[:, 7:]
+        joints = [row if names is None else dict(zip(map(str, names), row.tolist(), strict=True)) for row in values]
+        postures.append(joints or [None] * len(rows))
+    for row, place, *joints in zip(rows, np.broadcast_to(obj, (len(rows), 7)), *postures, strict=True):
         T = np.linalg.inv(pose(place)) @ pose(row)
         scale = float(np.ravel(entry.get("obj_scale", 1.0))[0])
-        names = entry.get("joint_names")
-        joints = row[7:] if names is None else dict(zip(map(str, names), row[7:].tolist(), strict=True))
-        yield ForeignGrasp(str(entry.get("hand", "")), Path(str(entry.get("obj_path", ""))).name, scale, T, joints)
+        yield ForeignGrasp(str(entry.get("hand", "")), Path(str(entry.get("obj_path", ""))).name, scale, T, *joints)
 
 
 class _Harmless(pickle.Unpickler):
@@ -161,7 +175,7 @@ class _Harmless(pickle.Unpickler):
         return super().find_class(module, name)
 
 
-def _load_npy(path: Path) -> Shaped[np.ndarray, "..."]:
+def read_npy(path: Path) -> Shaped[np.ndarray, "..."]:
     """An array of objects from a npy file."""
     with path.open("rb") as file:
         version = np.lib.format.read_magic(file)
@@ -173,11 +187,11 @@ def _load_npy(path: Path) -> Shaped[np.ndarray, "..."]:
     return np.asarray(loaded, dtype=object).reshape(shape)
 
 
-def in_order(grasp: ForeignGrasp, moving: Sequence[str], independent: Sequence[str]) -> list[float]:
-    """A grasp's independent joints.
+def in_order(joints: Joints, moving: Sequence[str], independent: Sequence[str]) -> list[float]:
+    """Values of the independent joints.
 
     Args:
-        grasp: Of any format.
+        joints: Of a grasp of any format.
         moving: Names of all the hand's moving joints, followers included, in the order of the description.
         independent: Names of the joints that others follow.
 
@@ -185,18 +199,18 @@ def in_order(grasp: ForeignGrasp, moving: Sequence[str], independent: Sequence[s
         GraspFileError: The grasp has other joints.
     """
     give = "give the description that the data was made with (--hands)"
-    if isinstance(grasp.joints, dict):
+    if isinstance(joints, dict):
         # Names of MuJoCo's Shadow hand begin with the robot's.
-        values = {**grasp.joints, **{name.rpartition(":")[2]: value for name, value in grasp.joints.items()}}
+        values = {**joints, **{name.rpartition(":")[2]: value for name, value in joints.items()}}
         if missing := [name for name in independent if name not in values]:
             raise GraspFileError(
-                f"the grasp has no joint {', '.join(missing[:4])} among {', '.join(list(grasp.joints)[:6])}; {give}")
+                f"the grasp has no joint {', '.join(missing[:4])} among {', '.join(list(joints)[:6])}; {give}")
         return [values[name] for name in independent]
-    names = moving if len(grasp.joints) == len(moving) else independent
-    if len(grasp.joints) != len(names):
-        raise GraspFileError(f"the grasp has {len(grasp.joints)} joints, the hand {len(moving)} that move, {len(independent)} "
+    names = moving if len(joints) == len(moving) else independent
+    if len(joints) != len(names):
+        raise GraspFileError(f"the grasp has {len(joints)} joints, the hand {len(moving)} that move, {len(independent)} "
                              f"of them independent; {give}")
-    by_name = dict(zip(names, grasp.joints.tolist(), strict=True))
+    by_name = dict(zip(names, joints.tolist(), strict=True))
     return [by_name[name] for name in independent]
 
 
@@ -239,6 +253,10 @@ def _batch(hand_name: str, obj_name: str, scale: float, grasps: list[ForeignGras
     """Grasps of one hand on one object."""
     hand, obj = load_hand(hand_name), load_object(obj_name, scale=scale)
     T = torch.from_numpy(np.stack([grasp.T_object_wrist for grasp in grasps])).float()
-    q = torch.tensor([in_order(grasp, hand.tree.moving_names, hand.tree.joint_names) for grasp in grasps])
-    made = GraspBatch.create(hand, obj, T, q, provenance=f"imported from {origin}")
+    names = hand.tree.moving_names, hand.tree.joint_names
+    unknown = [math.nan] * len(names[1])
+    q, pregrasp, squeeze = (torch.tensor([unknown if joints is None else in_order(joints, *names) for joints in column])
+                            for column in zip(*((g.joints, g.pregrasp, g.squeeze) for g in grasps), strict=True))
+    made = GraspBatch.create(
+        hand, obj, T, q, pregrasp_joints=pregrasp, squeeze_joints=squeeze, provenance=f"imported from {origin}")
     return with_sources(made, hand_name, obj_name, scale)
