@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ import torch
 from dro_grasp.baselines.controls import StartMethod
 from dro_grasp.baselines.method import Method
 from dro_grasp.baselines.ours import DistanceMethod, SynthesisMethod
+from dro_grasp.baselines.registry import make_method
 from dro_grasp.cli.main import main
 from dro_grasp.evaluation import success_rates as evaluated
 from dro_grasp.evaluation.rows import ALL, Row
@@ -33,14 +35,17 @@ from dro_grasp.evaluation.success_rates import (
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.mesh_process import SCALES
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.settling import settled
 from dro_grasp.pipeline.stages import refine, scored
 from dro_grasp.predictor import GraspPredictor, GraspRequest
+from dro_grasp.simulation.contact_quality import measure_contacts
 from dro_grasp.simulation.outcome import TrialResult
 from dro_grasp.simulation.protocols import Perturbations, protocol
 from dro_grasp.simulation.trial import simulate
+from tests.helpers.bench_clone import clone_of_bars
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.weights import untrained_weights
 
@@ -285,3 +290,22 @@ def test_the_command_prints_rows_and_json(capsys: pytest.CaptureFixture[str]) ->
     assert f" | {100 * fingers:.0f} ({100 * everyone:.0f}) | " in line
     assert main(["benchmark", "--hands", "gripper3", "--objects", "can", "--num", "0"]) == 2
     assert "ask for at least one grasp" in capsys.readouterr().err
+
+
+def test_objects_and_metrics_of_dexgraspbench(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    clone = clone_of_bars(tmp_path, ("bar",))
+    command = ["benchmark", "--methods", "start", "--hands", "gripper3", "--dexgraspbench", str(clone), "--num", "2",
+               "--stages", "raw", "--protocols", "dexgraspbench", "--contact-quality"]
+    assert main([*command, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["objects"] == [f"bar@{scale}" for scale in ("0.06", "0.08", "0.1", "0.12")]
+    hand, wanted = loaded_hand("gripper3"), []
+    for scale in SCALES:
+        obj = load_object(clone / "assets" / "bar", scale=scale)
+        grasps = make_method("start").make(GraspProblem(hand, obj), 2, pair_seed(0, hand, obj))
+        wanted.append(measure_contacts(hand, obj, grasps))
+    (row,) = told["rows"]
+    assert row["num"] == 8
+    assert list(row["contact_quality"]) == [field.name for field in dataclasses.fields(wanted[0])]
+    for name, mean in row["contact_quality"].items():
+        assert mean == pytest.approx(float(torch.cat([getattr(part, name) for part in wanted]).mean()), rel=1e-5)

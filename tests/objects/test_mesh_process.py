@@ -2,26 +2,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import trimesh
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.mesh_process import processed_objects
+from tests.helpers.bench_clone import clone_of_bars
 
 
 @pytest.fixture
 def clone(tmp_path):
-    """Two objects as DexGraspBench has them: bars of two boxes, and a folder that is none."""
-    for name in ("b", "a"):
-        folder = tmp_path / "assets" / name
-        (folder / "mesh").mkdir(parents=True)
-        (folder / "urdf" / "meshes").mkdir(parents=True)
-        trimesh.creation.box((2, 1, 1)).export(folder / "mesh" / "simplified.obj")
-        for i in (0, 1):
-            box = trimesh.creation.box((1, 1, 1)).apply_translation([i - 0.5, 0, 0])
-            box.export(folder / "urdf" / "meshes" / f"convex_piece_00{i}.obj")
-    (tmp_path / "assets" / "empty" / "mesh").mkdir(parents=True)
-    return tmp_path
+    return clone_of_bars(tmp_path, ("b", "a"))
 
 
 def test_objects_have_the_benchmarks_parts_at_the_scale(clone):

@@ -17,6 +17,7 @@ from dro_grasp.cli.output import print_json, progress_bar, say
 if TYPE_CHECKING:
     from dro_grasp.baselines.method import Method
     from dro_grasp.evaluation.rows import Row
+    from dro_grasp.objects.shape import ObjectModel
 
 QUICK: dict[str, Any] = {"num": 16, "stages": ("returned",), "protocols": ("dro", "strict")}
 """What --quick measures: of 16 grasps a pair, methods return a quarter (ours)."""
@@ -37,6 +38,9 @@ class Benchmark:
     """Names or paths of hands."""
     objects: tuple[str, ...] = ("builtin:test",)
     """Objects with meshes: names, paths, folders, or groups such as assets:validate."""
+    dexgraspbench: Annotated[Path | None, optional("FOLDER", "the objects above")] = None
+    """Folder of a clone of DexGraspBench, or of its archive of objects: all objects in it at the official scales take the place
+    of --objects."""
     num: int = 100
     """Grasps of each hand on each object, of which ranking keeps the best quarter."""
     stages: tuple[Literal["raw", "ranked", "refined", "settled", "returned", "equal-time"], ...] = (
@@ -56,6 +60,8 @@ class Benchmark:
     """Without --methods: also evaluate start, synthesise and, with a bundle, the mean grasp."""
     bundle: Annotated[Path | None, optional("PATH", "no mean grasp")] = None
     """Training bundle whose grasps are averaged to the mean grasp."""
+    contact_quality: Flag = False
+    """Also measure the analytic metrics of DexGraspBench, with its friction: penetration, contact distance, force closure."""
     quick: Flag = False
     """A first look: what the methods return, four grasps of each hand on the first two objects, under dro and strict."""
     view: Literal["whole", "cloud", "half", "depth"] = "whole"
@@ -72,7 +78,7 @@ class Benchmark:
         from dro_grasp.errors import ObjectError, OptionError
         from dro_grasp.evaluation.success_rates import BEST, REFINED, SETTLED, SETTLED_BEST, TOP, BenchmarkConfig, benchmark
         from dro_grasp.hands.library import load_hand
-        from dro_grasp.objects.catalogue import load_object, resolve_objects
+        from dro_grasp.objects.catalogue import resolve_objects
         from dro_grasp.predictor import GraspRequest
         from dro_grasp.simulation.protocols import protocol
 
@@ -87,14 +93,14 @@ class Benchmark:
         begin = time.perf_counter()
         methods = self._methods()
         hands = [load_hand(name) for name in self.hands]
-        objects = [load_object(name) for name in resolve_objects(list(self.objects))]
+        objects = self._objects()
         if clouds := [obj.name for obj in objects if obj.is_cloud]:
             raise ObjectError(f"{', '.join(clouds)}: bare point clouds cannot be simulated; give meshes")
         further = {REFINED: (BEST, *TOP), SETTLED: (SETTLED_BEST,)}
         stages = tuple(name for stage in self.stages for name in (stage, *further.get(stage, ())))
         config = BenchmarkConfig(
             num=self.num, stages=stages, protocols=tuple(protocol(p) for p in self.protocols), seed=self.seed, view=self.view,
-            views=self.views, device=self.device,
+            views=self.views, device=self.device, contact_quality=self.contact_quality,
         )
         with progress_bar("pairs", self.json) as progress:
             rows = benchmark(hands, objects, methods, config, progress)
@@ -117,13 +123,23 @@ class Benchmark:
         if self.views > 1:
             title += f", {self.views} views"
         columns = ["grasps", "stage", "hand", "n", *rows[0].success, *(f"{label} trials" for label in rows[0].trials_held),
-                   "fingers", "shift [mm]", "turn [deg]", "diversity", "ROC area", "candidates", "optimiser [%]", "ms a grasp"]
+                   "fingers", "shift [mm]", "turn [deg]", "diversity", "ROC area", "candidates", "optimiser [%]", "ms a grasp",
+                   *rows[0].contact_quality]
         say(title + "; success, and trials held where a grasp has several, in % with 95 % intervals; for each protocol fingers "
             "in contact (grasps with all of them) in %, and ROC area of the score; candidates made for each pair\n")
         for line in [columns, ["---"] * len(columns), *map(cells, rows)]:
             say("| " + " | ".join(map(str, line)) + " |")
         say(f"\n{seconds:.0f} s")
         return 0
+
+    def _objects(self) -> list[ObjectModel]:
+        """The objects, loaded."""
+        from dro_grasp.objects.catalogue import load_object, resolve_objects
+        from dro_grasp.objects.mesh_process import SCALES, processed_objects
+
+        if self.dexgraspbench is None:
+            return [load_object(name) for name in resolve_objects(list(self.objects))]
+        return [load_object(folder, scale=scale) for folder in processed_objects(self.dexgraspbench) for scale in SCALES]
 
     def _methods(self) -> list[Method]:
         """The methods that were named, or the network and its controls."""
@@ -150,5 +166,5 @@ def cells(row: Row) -> list[object]:
     return [
         row.grasps, row.stage, row.hand, row.num, *rates, fingers, f"{1e3 * row.displacement:.1f}",
         f"{math.degrees(row.rotation):.1f}", f"{row.diversity:.3f}", areas, f"{row.candidates:.0f}",
-        f"{100 * row.optimised:.0f}", parts,
+        f"{100 * row.optimised:.0f}", parts, *(f"{mean:.3g}" for mean in row.contact_quality.values()),
     ]

@@ -13,6 +13,7 @@ from torch import Tensor
 from dro_grasp.evaluation.metrics import diversity, finger_contact, mean_share, roc_area, wilson_interval
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.optimization.synthesis import PROVENANCE
+from dro_grasp.simulation.contact_quality import NAMES
 from dro_grasp.simulation.outcome import TrialResult
 from dro_grasp.simulation.protocols import Protocol
 
@@ -70,6 +71,8 @@ class Row:
     """Grasps made for each pair, of which these are the best by score."""
     optimised: float
     """Share of the grasps that the optimiser made."""
+    contact_quality: dict[str, float]
+    """Means of the analytic metrics of DexGraspBench, if they were measured."""
 
 
 def hand_row(source: str, stage: str, parts: Sequence[EvaluatedGrasps], protocols: Sequence[Protocol]) -> Row:
@@ -103,6 +106,10 @@ def hand_row(source: str, stage: str, parts: Sequence[EvaluatedGrasps], protocol
         diversity=diversity(held.T_object_wrist, held.joints)["all"], trials_held=held_in, fingers=fingers, ranking=areas,
         seconds=seconds, candidates=_mean([t.candidates for t in parts]),
         optimised=_mean([float(maker == PROVENANCE) for t in parts for maker in t.grasps.provenance]),
+        contact_quality={
+            name: _mean([float(x) for t in parts for x in t.grasps.extra[name]])
+            for name in NAMES if name in parts[0].grasps.extra
+        },
     )
 
 
@@ -121,6 +128,7 @@ def average(rows: Sequence[Row]) -> Row:
         ranking={label: _mean([r.ranking[label] for r in rows]) for label in rows[0].ranking},
         seconds={name: _mean([r.seconds[name] for r in rows]) for name in rows[0].seconds},
         candidates=_mean([r.candidates for r in rows]), optimised=_mean([r.optimised for r in rows]),
+        contact_quality={name: _mean([r.contact_quality[name] for r in rows]) for name in rows[0].contact_quality},
     )
 
 

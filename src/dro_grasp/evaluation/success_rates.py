@@ -21,6 +21,7 @@ from dro_grasp.perception.partial_views import View, partial_view
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.settling import best_settled, can_settle
 from dro_grasp.pipeline.stages import refine, scored
+from dro_grasp.simulation.contact_quality import with_contacts
 from dro_grasp.simulation.protocols import Protocol
 from dro_grasp.simulation.trial import simulate
 
@@ -70,6 +71,8 @@ class BenchmarkConfig:
     """Threads of the trials; all cores by default."""
     device: str = "cpu"
     """Where the grasp energy is computed."""
+    contact_quality: bool = False
+    """Whether contacts are measured too, as DexGraspBench does."""
 
 
 def benchmark(
@@ -211,5 +214,7 @@ def _evaluated(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, config: BenchmarkConfig, seconds: dict[str, float], candidates: int
 ) -> EvaluatedGrasps:
     """Grasps after all trials."""
+    if config.contact_quality:
+        grasps = with_contacts(hand, obj, grasps)
     results = tuple(simulate(hand, obj, grasps, rules, workers=config.workers) for rules in config.protocols)
     return EvaluatedGrasps(grasps, results, seconds, len(hand.fingers), candidates)
