@@ -15,6 +15,7 @@ import json
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -128,9 +129,9 @@ def trials(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> tuple[np.ndarray
     return torch.stack([result.success for result in results]).numpy(), moved.double().numpy()
 
 
-def lines(name: str, per_hand: dict[str, list[Measured]]) -> list[list[object]]:
+def lines(name: str, per_hand: dict[str, list[Measured]]) -> list[list[Any]]:
     """Rows of one method: its hands, and their mean."""
-    rows: list[list[object]] = []
+    rows: list[list[Any]] = []
     for hand, parts in per_hand.items():
         held, moved = np.concatenate([p.held for p in parts], 1), np.concatenate([p.moved for p in parts], 1)
         grasps = GraspBatch.concatenate([p.grasps.replace(extra={}) for p in parts])[torch.from_numpy(held[0])]
