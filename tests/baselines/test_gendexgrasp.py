@@ -12,14 +12,15 @@ import pytest
 import torch
 
 from dro_grasp.baselines import registry
+from dro_grasp.baselines.bundle_draws import BundleDraws
 from dro_grasp.baselines.gendexgrasp import map_training
 from dro_grasp.baselines.gendexgrasp.contact_maps import contact_map, sharpened
 from dro_grasp.baselines.gendexgrasp.map_fitting import FittingConfig, MapTarget, fit, map_energy
 from dro_grasp.baselines.gendexgrasp.map_network import LATENT, ContactMapNetwork
 from dro_grasp.baselines.gendexgrasp.map_training import (
     MapSamples,
-    MapSource,
     MapTrainingConfig,
+    draw_maps,
     map_losses,
     train_contact_maps,
 )
@@ -92,8 +93,7 @@ def test_the_heads_first_layer_sees_everything_at_once() -> None:
 
 
 def test_training_lowers_the_error_and_resumes(bundle, tmp_path: Path) -> None:
-    source, generator = MapSource(bundle, SMALL), torch.Generator().manual_seed(0)
-    drawn = source.draw(generator)
+    drawn = draw_maps(BundleDraws(bundle, SMALL.hand_points), SMALL, torch.Generator().manual_seed(0))
     assert drawn.contact.shape == (4, 32)
     assert float(drawn.points.mean(1).norm(dim=-1).max()) < 0.02, "about the object's centre"
     torch.manual_seed(0)

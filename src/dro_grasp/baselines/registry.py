@@ -15,6 +15,7 @@ from dro_grasp.baselines.foreign import FileMethod, ForeignMethod
 from dro_grasp.baselines.gendexgrasp.contact_maps import FITTING_GAMMA, TRAINING_GAMMA
 from dro_grasp.baselines.gendexgrasp.map_fitting import FittingConfig
 from dro_grasp.baselines.gendexgrasp.map_method import ContactMapMethod
+from dro_grasp.baselines.manifm.contact_method import ContactMethod
 from dro_grasp.baselines.method import Method
 from dro_grasp.baselines.ours import DescentMethod, DistanceMethod, SynthesisMethod
 from dro_grasp.datasets.bundle.training_file import Bundle
@@ -52,6 +53,10 @@ def _contact_maps(gamma: float, name: str, options: MethodOptions) -> Method:
     return ContactMapMethod(baseline_weights("gendexgrasp", options.weights), name, FittingConfig(gamma=gamma))
 
 
+def _contacts(options: MethodOptions) -> Method:
+    return ContactMethod(baseline_weights("manifm", options.weights))
+
+
 def baseline_weights(name: str, given: str | None) -> Path:
     """The weights of a method beside D(R,O): those given, or those that ship.
 
@@ -74,12 +79,13 @@ METHODS: dict[str, Callable[[MethodOptions], Method]] = {
     "dfc": lambda options: DescentMethod(),
     "gendexgrasp": partial(_contact_maps, FITTING_GAMMA, "gendexgrasp"),
     "gendexgrasp-gamma1": partial(_contact_maps, TRAINING_GAMMA, "gendexgrasp-gamma1"),
+    "manifm": _contacts,
     "start": lambda options: StartMethod(),
     "mean-grasp": lambda options: _mean(False, options),
     "mean-grasp-chosen": lambda options: _mean(True, options),
 }
 """Methods of this package."""
-WITH_WEIGHTS = ("dro", "gendexgrasp", "gendexgrasp-gamma1")
+WITH_WEIGHTS = ("dro", "gendexgrasp", "gendexgrasp-gamma1", "manifm")
 """Those that have weights."""
 
 

@@ -143,9 +143,9 @@ class Train(Stage):
     --output my_weights.safetensors
     """
 
-    method: Literal["dro", "gendexgrasp"] = "dro"
-    """What is trained: the D(R,O) network, or the contact maps of GenDexGrasp, to which only bundle, folder, output, steps,
-    minutes, learning rate, device and seed apply."""
+    method: Literal["dro", "gendexgrasp", "manifm"] = "dro"
+    """What is trained: the D(R,O) network, or that of GenDexGrasp or in the style of ManiFM, to which only bundle, folder,
+    output, steps, minutes, learning rate, device and seed apply."""
     pretrained: Annotated[str | None, optional("PATH", "none")] = None
     """Weights from `dro-grasp pretrain`; without them, and without --initial, the hand encoder is trained along."""
     initial: Annotated[str | None, optional("NAME|PATH", "none")] = None
@@ -230,12 +230,17 @@ class Train(Stage):
         import dataclasses
 
         from dro_grasp.baselines.gendexgrasp.map_training import MapTrainingConfig, train_contact_maps
+        from dro_grasp.baselines.manifm.contact_training import ContactTrainingConfig, train_contacts
         from dro_grasp.datasets.bundle.training_file import load_bundle
         from dro_grasp.models.checkpoints import save_weights
 
-        config = MapTrainingConfig(self.schedule(steps=self.steps, learning_rate=self.learning_rate))
-        bundle = load_bundle(self.bundle)
-        model = train_contact_maps(bundle, config, self.run_folder)
+        schedule, bundle = self.schedule(steps=self.steps, learning_rate=self.learning_rate), load_bundle(self.bundle)
+        if self.method == "manifm":
+            config: Any = ContactTrainingConfig(schedule)
+            model: Any = train_contacts(bundle, config, self.run_folder)
+        else:
+            config = MapTrainingConfig(schedule)
+            model = train_contact_maps(bundle, config, self.run_folder)
         about = how_long(self.run_folder) | {
             "stage": self.method, "data": bundle.summary(), "settings": dataclasses.asdict(config)}
         save_weights(model, self.output, about)

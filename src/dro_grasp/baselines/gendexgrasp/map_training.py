@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dro_grasp.baselines.bundle_draws import BundleDraws
 from dro_grasp.baselines.gendexgrasp.contact_maps import TRAINING_GAMMA, contact_map
 from dro_grasp.baselines.gendexgrasp.map_network import LATENT, ContactMapNetwork, MapOutput
 from dro_grasp.datasets.bundle.training_file import Bundle
-from dro_grasp.errors import BundleError
 from dro_grasp.training.config import ScheduleConfig
 from dro_grasp.training.reports import Report, console_report
 from dro_grasp.training.runs import Losses, TrainingRun, begin, recalibrate
@@ -51,41 +51,15 @@ class MapSamples:
     contact: Float[Tensor, "b m"]
 
 
-class MapSource:
-    """Draws maps of a bundle's grasps, all hands alike."""
-
-    def __init__(self, bundle: Bundle, config: MapTrainingConfig, device: torch.device | str = "cpu") -> None:
-        """Put hands, grasps and objects on the device of the generators that draw from them.
-
-        Raises:
-            BundleError: The bundle holds no grasps.
-        """
-        self.config = config
-        names = [name for name, grasps in bundle.grasps.items() if len(grasps.joints)]
-        if not names:
-            raise BundleError("the bundle holds no grasps; synthesise some first")
-        self.hands = [bundle.hands[n].with_points(min(config.hand_points, bundle.hands[n].n_points)).to(device) for n in names]
-        self.grasps = [bundle.grasps[n].to(device) for n in names]
-        self.points = torch.stack([cloud.points for cloud in bundle.objects.values()]).to(device)
-        self.normals = torch.stack([cloud.normals for cloud in bundle.objects.values()]).to(device)
-        self.centres = self.points.mean(1)
-
-    def draw(self, generator: torch.Generator) -> MapSamples:
-        """One step's maps, of one or two hands."""
-        config, device = self.config, generator.device
-        parts = []
-        for hand_index in torch.randint(len(self.hands), (2,), generator=generator, device=device).tolist():
-            hand, grasps = self.hands[hand_index], self.grasps[hand_index]
-            count = config.batch // 2
-            chosen = torch.randint(len(grasps.joints), (count,), generator=generator, device=device)
-            picks = torch.randint(self.points.shape[1], (count, config.points), generator=generator, device=device)
-            of = grasps.object_index[chosen]
-            points, normals = self.points[of[:, None], picks], self.normals[of[:, None], picks]
-            noise = config.noise * torch.randn(points.shape, generator=generator, device=device)
-            touched = hand.points(grasps.joints[chosen], grasps.T_object_wrist[chosen])
-            parts.append((points + noise - self.centres[of][:, None], contact_map(points, normals, touched, TRAINING_GAMMA)))
-        points, contact = (torch.cat(part) for part in zip(*parts, strict=True))
-        return MapSamples(points, contact)
+def draw_maps(draws: BundleDraws, config: MapTrainingConfig, generator: torch.Generator) -> MapSamples:
+    """One step's maps, of one or two hands."""
+    parts = []
+    for _ in range(2):
+        drawn = draws.draw(config.batch // 2, config.points, generator)
+        noise = config.noise * torch.randn(drawn.points.shape, generator=generator, device=generator.device)
+        parts.append((drawn.points + noise, contact_map(drawn.points, drawn.normals, drawn.body, TRAINING_GAMMA)))
+    points, contact = (torch.cat(part) for part in zip(*parts, strict=True))
+    return MapSamples(points, contact)
 
 
 def train_contact_maps(
@@ -104,12 +78,12 @@ def train_contact_maps(
     processes, device = begin(config.schedule)
     torch.manual_seed(config.schedule.seed)
     model = ContactMapNetwork().to(device)
-    generator, source = torch.Generator(device), MapSource(bundle, config, device)
+    generator, draws = torch.Generator(device), BundleDraws(bundle, config.hand_points, device)
     run = TrainingRun(folder, model, config.schedule, generator, processes)
     model.train()
 
     def forward() -> tuple[MapSamples, MapOutput]:
-        drawn = source.draw(generator)
+        drawn = draw_maps(draws, config, generator)
         noise = torch.randn(len(drawn.points), LATENT, generator=generator, device=device)
         return drawn, model(drawn.points, drawn.contact, noise)
 
