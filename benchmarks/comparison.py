@@ -50,7 +50,7 @@ PAPER = {
 }
 """Success [%], diversity [rad] and seconds on Barrett, Allegro and Shadow hand. Source: paper, table of the overall comparison,
 in Isaac Gym; DFC took more than the seconds stated."""
-METHODS = ("dro:raw", "dro", "synthesise", "dfc")
+METHODS = ("dro:raw", "dro", "synthesise", "dfc", "start")
 """Rows by default."""
 
 
@@ -159,15 +159,16 @@ def draw(found: dict[str, dict[str, list[Measured]]], path: Path) -> None:
             held = np.concatenate([p.held[list(TRIALS).index(trial)] for p in parts])
             low, high = wilson_interval(int(held.sum()), len(held))
             share, seconds = held.mean(), np.mean([p.seconds for p in parts])
-            ax.errorbar(seconds, 100 * share, [[100 * (share - low)], [100 * (high - share)]], fmt="o", capsize=3)
-            ax.annotate(f" {name}", (seconds, 100 * share), xytext=(5, 5), textcoords="offset points")
+            below, above = (100 * max(0.0, part) for part in (share - low, high - share))
+            ax.errorbar(seconds, 100 * share, [[below], [above]], fmt="o", capsize=3, label=name)
         ax.set(xscale="log", title=trial, xlabel="time for a returned grasp [s]", ylim=(0, 104))
         ax.grid(alpha=0.3)
     for name, (success, _, seconds) in PAPER.items():
         x, y = np.nanmean(seconds), np.nanmean(success)
         axes[0].plot(x, y, "x", color="grey")
-        axes[0].annotate(f" {name}, paper", (x, y), xytext=(4, -12), textcoords="offset points", color="grey")
-    axes[0].set_ylabel("success [%]")
+        axes[0].annotate(f" {name}, paper", (x, y), xytext=(0, -14), textcoords="offset points", ha="center", color="grey")
+    axes[0].set(ylabel="success [%]", xlim=(None, 2e4))
+    axes[0].legend(loc="lower left")
     figure.savefig(path, dpi=110)
 
 
