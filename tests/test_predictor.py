@@ -13,7 +13,7 @@ from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimization.starts import wrist_rotations
+from dro_grasp.optimization.starts import Spread, wrist_rotations
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import scored
@@ -155,7 +155,7 @@ def test_the_temperature_scales_what_z_is_made_of(weights: str, ball: ObjectMode
 def test_placements_face_the_direction_at_any_roll(
     direction: tuple[float, float, float]
 ) -> None:
-    turns = wrist_rotations(HAND, 400, direction, math.radians(5), torch.Generator().manual_seed(0))
+    turns = wrist_rotations(HAND, 400, direction, Spread(math.radians(5)), torch.Generator().manual_seed(0))
     wanted = torch.nn.functional.normalize(torch.tensor(direction, dtype=torch.float32), dim=0)
     angles = torch.acos((turns @ HAND.palm_direction_wrist @ wanted).clamp(-1, 1))
     # Two normal tilts of 5 degrees: their length is Rayleigh distributed.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, get_args
@@ -19,11 +20,13 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.models.checkpoints import load_weights
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.pipeline.admission import permitted, reasons_against
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.proposal import Proposal, ProposalConfig, check_temperature, propose
 from dro_grasp.pipeline.settling import best_settled, can_settle
-from dro_grasp.pipeline.stages import complete, optimise, permitted, refine, scored
+from dro_grasp.pipeline.shortage import shortage_in_words
+from dro_grasp.pipeline.stages import complete, optimise, refine, scored
 
 LARGEST_CALL = 100_000
 """Most candidates of one call; more do not fit memory."""
@@ -101,6 +104,8 @@ class Prediction:
     """Hand points of the proposed grasps [m]; the network's are multilaterated, and the solved hand differs from them."""
     candidates: int
     """Candidates made, those that constraints rejected included."""
+    dropped: dict[str, int]
+    """Candidates that constraints rejected, by reason."""
     seconds: dict[str, float]
     """Time by part: network, decode, optimise, refine, settle, rank [s]."""
     shortage: str | None = None
@@ -228,6 +233,8 @@ class _Pool:
         self.problem, self.request, self.watch = problem, request, watch
         self.made = 0
         """Candidates made, those that constraints rejected included."""
+        self.dropped: Counter[str] = Counter()
+        """Those that constraints rejected, by reason."""
         self.proposals: list[Proposal] = []
         self.grasps: list[GraspBatch] = []
         self.settled = 0
@@ -242,7 +249,9 @@ class _Pool:
         self.made += len(proposal.grasps)
         with self.watch("refine"):
             grasps = refine(problem, proposal.grasps) if request.refine else complete(problem, proposal.grasps)
-        kept = permitted(problem, grasps).nonzero()[:, 0][: None if most is None else most - len(self)]
+        allowed = permitted(problem, grasps)
+        self.dropped += reasons_against(problem, grasps[~allowed])
+        kept = allowed.nonzero()[:, 0][: None if most is None else most - len(self)]
         with self.watch("rank"):
             self.grasps.append(scored(problem, grasps[kept]))
         self.proposals.append(proposal[kept])
@@ -269,7 +278,8 @@ class _Pool:
         """
         shortage = None
         if len(self) < self.request.num:
-            shortage = _shortage(self.problem, self.request, len(self), self.made)
+            alone = self.request.method != "auto"
+            shortage = shortage_in_words(self.problem, self.request.num, len(self), self.made, self.dropped, alone)
         if not len(self):
             raise OptionError(str(shortage))
         grasps = GraspBatch.concatenate(self.grasps)
@@ -277,18 +287,5 @@ class _Pool:
         chosen = Proposal.concatenate(self.proposals)[best]
         proposed = complete(self.problem, chosen.grasps)
         grasps = with_own_files(grasps[best], self.problem.hand, self.problem.obj)
-        return Prediction(grasps, proposed, chosen.points, self.made, self.watch.seconds, shortage)
-
-
-def _shortage(problem: GraspProblem, request: GraspRequest, found: int, made: int) -> str:
-    """What to say where there are fewer grasps than were asked for."""
-    constraints, low, high = problem.constraints, *problem.height_range
-    advice = []
-    if constraints.table is not None:
-        advice.append(f"lower table (now {constraints.table:g} m; the object spans z = {low:.3f} to {high:.3f} m)")
-    if constraints.direction is not None:
-        advice.append("leave out direction, or give another one")
-    if request.method != "auto":
-        advice.append("use the method 'auto'")
-    return (f"only {found} of {made} candidates on object '{problem.obj.name}' meet what was asked of them; {request.num} were "
-            f"asked for. {'; or '.join(['Try another seed', *advice])}")
+        return Prediction(
+            grasps, proposed, chosen.points, self.made, dict(self.dropped), self.watch.seconds, shortage)

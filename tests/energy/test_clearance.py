@@ -8,8 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
+from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy, Room
 from dro_grasp.energy.surroundings import Surroundings
+from dro_grasp.geometry.balls import Balls
 from dro_grasp.geometry.se3 import turned_about
 from dro_grasp.grasps.controller_config import ControllerConfig
 from tests.helpers.energy_samples import near_kinks, precise, rounded_box
@@ -19,13 +20,17 @@ HAND = precise(toy_hand())
 SLANTED = torch.nn.functional.normalize(torch.tensor([0.2, -0.1, 1.0], dtype=torch.float64), dim=0)
 PLANE = torch.cat([SLANTED, torch.tensor([-0.03], dtype=torch.float64)])
 ASIDE = dataclasses.replace(rounded_box(), origin=torch.tensor([-0.02, -0.08, -0.08], dtype=torch.float64))
-KINDS = {"plane": Surroundings(PLANE), "obstacle": Surroundings(obstacles=ASIDE), "both": Surroundings(PLANE, ASIDE)}
+SPARED = Balls(torch.tensor([[0.05, 0.0, 0.02], [-0.04, 0.03, 0.0]]).double(), torch.tensor([0.05, 0.04]).double())
+HELD = Balls(torch.tensor([[0.03, 0.0, 0.0], [0.0, 0.02, 0.02]]).double(), torch.tensor([0.02, 0.015]).double())
+KINDS = {
+    "plane": Room(Surroundings(PLANE)), "obstacle": Room(Surroundings(obstacles=ASIDE)),
+    "spared": Room(Surroundings(spared=SPARED)), "all": Room(Surroundings(PLANE, ASIDE, SPARED)), "hold": Room(hold=HELD)}
 ONLY = EnergyConfig(
     force_closure=0, distance=0, penetration=0, self_penetration=0, alignment=0, joints=0, clearance=100, clearance_points=64)
 
 
 def energy_in(kind: str) -> GraspEnergy:
-    return GraspEnergy(HAND, rounded_box(), torch.zeros(3).double(), 0.03, ONLY, surroundings=KINDS[kind])
+    return GraspEnergy(HAND, rounded_box(), torch.zeros(3).double(), 0.03, ONLY, room=KINDS[kind])
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -7,7 +7,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from dro_grasp.energy.grasp_energy import Room
 from dro_grasp.energy.surroundings import Surroundings
+from dro_grasp.geometry.balls import Balls
 from dro_grasp.geometry.se3 import random_rotations
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.hand import Hand
@@ -77,10 +79,22 @@ def test_a_hand_at_the_surface_is_preferred_to_one_inside_and_to_one_far_away() 
 def test_a_hand_under_a_plane_is_worse_by_its_depth(clouds: torch.Tensor) -> None:
     free = choice_scores(HAND, SPHERE.distance_field, clouds, CONFIG)
     plane = Surroundings(torch.tensor([0.0, 0.0, 1.0, -0.09]))
-    above = choice_scores(HAND, SPHERE.distance_field, clouds, CONFIG, plane)
+    above = choice_scores(HAND, SPHERE.distance_field, clouds, CONFIG, Room(plane))
     depth = (CONFIG.margin - (clouds[..., 2].amin(-1) + 0.09)).clamp_min(0)
     torch.testing.assert_close(free - above, CONFIG.clearance * depth)
     assert 0 < int((depth > 0).sum()) < depth.numel()
+
+
+def test_fingers_at_the_place_to_hold_are_preferred() -> None:
+    unit = torch.nn.functional.normalize(HAND.points(HAND.canonical_joints()) - HAND.grasp_centre_wrist, dim=-1)
+    radius = torch.as_tensor(SPHERE.cloud).norm(dim=-1).mean()
+    at = (radius + 0.002) * unit
+    tip = at[HAND.finger_of_link[HAND.link_index] == 0].mean(0).tolist()
+    away = [-x for x in tip]
+    there, elsewhere = (
+        choice_scores(HAND, SPHERE.distance_field, at, CONFIG, Room(hold=Balls.of(((*place, 0.03),))))  # type: ignore[arg-type]
+        for place in (tip, away))
+    assert float(there) > float(elsewhere)
 
 
 def test_the_moved_hands_are_judged_in_the_object_s_frame_and_the_best_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -95,7 +109,7 @@ def test_the_moved_hands_are_judged_in_the_object_s_frame_and_the_best_is_taken(
     monkeypatch.setattr(type(HAND), "random_open_joints", lambda *_: joints)
     judged, kept = [], []
 
-    def scores(hand: Hand, field: object, points: torch.Tensor, config: ChoiceConfig, surroundings: object) -> torch.Tensor:
+    def scores(hand: Hand, field: object, points: torch.Tensor, config: ChoiceConfig, room: object) -> torch.Tensor:
         judged.append(points)
         return torch.arange(points.shape[1]).remainder(6).float().expand(points.shape[:2])  # the fifth is the best
 

@@ -40,8 +40,8 @@ class Clearance:
             weight: Of the summed penetration [1/m].
         """
         self.hand, self.surroundings, self.weight, self.clear = hand, surroundings, weight, clear
-        # Of a plane, the spheres know nothing that surface points do not know; an obstacle may be thin.
-        filled = surroundings.obstacles is not None
+        # Of a plane, the spheres know nothing that surface points do not know; other things may be thin or small.
+        filled = surroundings.obstacles is not None or surroundings.spared is not None
         self.parts = ((body, torch.zeros_like(body.layout[0])), (ball, radii))[: 1 + filled]
         config, moving = ControllerConfig(), hand.movable & ~hand.abduction
         self.postures = [
@@ -77,8 +77,11 @@ class Clearance:
             x.unflatten(0, (-1, n)).sum(0) for x in (self.weight * depth[:, None], by_pose, by_joint * follow))
         return ClearanceTerm(value, by_pose, by_joint)
 
-    def distance(self, T: Float[Tensor, "*n 4 4"], q: Float[Tensor, "*n n_dof"]) -> Float[Tensor, "*n"]:
-        """Least distance of hands to the surroundings [m]."""
+    def distance(
+        self, T: Float[Tensor, "*n 4 4"], q: Float[Tensor, "*n n_dof"], surroundings: Surroundings | None = None
+    ) -> Float[Tensor, "*n"]:
+        """Least distance of hands to the surroundings, or to others [m]."""
         poses = (T[..., None, :, :] @ self.hand.tree.forward(q)).flatten(0, -4)
-        nearest = [(self.surroundings.distances(points.place(poses))[0] - radii).amin(-1) for points, radii in self.parts]
+        around = surroundings or self.surroundings
+        nearest = [(around.distances(points.place(poses))[0] - radii).amin(-1) for points, radii in self.parts]
         return torch.stack(nearest).amin(0).reshape(q.shape[:-1])

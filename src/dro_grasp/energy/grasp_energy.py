@@ -14,10 +14,12 @@ from dro_grasp.devices import on_device
 from dro_grasp.energy import terms as energies
 from dro_grasp.energy.clearance import Clearance
 from dro_grasp.energy.contact_candidates import ContactCandidates, ContactConfig, contact_candidates
+from dro_grasp.energy.holding import Holding
 from dro_grasp.energy.link_points import LinkPoints
 from dro_grasp.energy.link_spheres import link_spheres
 from dro_grasp.energy.surroundings import Surroundings
 from dro_grasp.geometry import se3
+from dro_grasp.geometry.balls import Balls
 from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
@@ -52,7 +54,8 @@ class EnergyConfig:
     margin: float = 0.001
     """Clearance that hand points keep from the object before they count as penetrating [m] (ours)."""
     clearance: float = 100.0
-    """Weight of the hand's penetration into its surroundings, in pregrasp, grasp and squeeze [1/m] (ours)."""
+    """Weight of the hand's penetration into its surroundings, in pregrasp, grasp and squeeze, and of the distance of contacts
+    and other hand points from where they may be [1/m] (ours)."""
     clearance_points: int = 120
     """Number of hand points at which that is measured (ours)."""
     clear: float = 0.005
@@ -66,7 +69,8 @@ class Evaluation:
     terms: Float[Tensor, "n 6"]
     """Weighted terms in the order of TERMS."""
     clearance: Float[Tensor, "n 1"]
-    """Weighted penetration into the surroundings. It says nothing about the grasp itself, so it is not among the terms."""
+    """Weighted penetration into the surroundings, and touch beside the place to hold. It says nothing about the grasp itself,
+    so it is not among the terms."""
     by_pose: Float[Tensor, "n 6"]
     """Derivative by the hand's translation [1/m] and rotation about its grasp centre [1/rad]."""
     by_joint: Float[Tensor, "n n_dof"]
@@ -84,12 +88,27 @@ class Evaluation:
             for name in ("terms", "clearance", "by_pose", "by_joint")))
 
 
+@dataclass(frozen=True, eq=False)
+class Room:
+    """Where a hand may be, and where it may touch the object; anywhere by default."""
+
+    surroundings: Surroundings | None = None
+    """What it stays clear of."""
+    hold: Balls | None = None
+    """The only place where it touches the object."""
+
+    def to(self, device: torch.device | str) -> Room:
+        """The same on another device."""
+        around = None if self.surroundings is None else self.surroundings.to(device)
+        return Room(around, None if self.hold is None else on_device(self.hold, device))
+
+
 class GraspEnergy:
     """The energy of a hand on an object, prepared for many evaluations."""
 
     def __init__(
         self, hand: Hand, field: DistanceField, centre: Float[Tensor, 3], length: float, config: EnergyConfig | None = None,
-        contacts: ContactConfig | None = None, device: torch.device | str = "cpu", surroundings: Surroundings | None = None,
+        contacts: ContactConfig | None = None, device: torch.device | str = "cpu", room: Room | None = None,
     ) -> None:
         """Prepare everything that stays the same from step to step.
 
@@ -98,10 +117,10 @@ class GraspEnergy:
             centre: The object's centre of mass [m].
             length: Typical distance of its surface from there [m].
             device: Device of the evaluations; hand, field and centre are on the CPU.
-            surroundings: What the hand stays clear of, on the CPU.
+            room: Where the hand may be, and where it may touch the object, on the CPU.
         """
-        self.length = length
-        self.surroundings = None if surroundings is None else surroundings.to(device)
+        self.length, room = length, room or Room()
+        self.room = room.to(device)
         self.candidates: ContactCandidates = on_device(contact_candidates(hand, contacts), device)
         self.spheres = on_device(link_spheres(hand), device)
         self.source, hand = hand, hand.to(device)
@@ -114,13 +133,13 @@ class GraspEnergy:
     @staticmethod
     def of_object(
         hand: Hand, obj: ObjectModel, config: EnergyConfig | None = None, contacts: ContactConfig | None = None,
-        device: torch.device | str = "cpu", surroundings: Surroundings | None = None,
+        device: torch.device | str = "cpu", room: Room | None = None,
     ) -> GraspEnergy:
         """The energy on the object's grid of signed distances."""
         surface = torch.as_tensor(obj.cloud, dtype=torch.float32)
         centre = torch.as_tensor(obj.centre_of_mass, dtype=torch.float32)
         length = float((surface - centre).norm(dim=-1).mean())
-        return GraspEnergy(hand, obj.distance_field, centre, length, config, contacts, device, surroundings)
+        return GraspEnergy(hand, obj.distance_field, centre, length, config, contacts, device, room)
 
     def weighted(self, config: EnergyConfig) -> GraspEnergy:
         """This energy under other weights; it shares contacts, link spheres and distance field."""
@@ -135,11 +154,12 @@ class GraspEnergy:
         self.config, self.body = config, LinkPoints.of(thin.link_points, thin.link_index, hand.tree.n_links)
         room = config.closing_room * (hand.upper - hand.lower) * ~hand.abduction
         self.clearance = None
-        if self.surroundings is not None:
+        if self.room.surroundings is not None:
             few = self.source.with_points(min(config.clearance_points, hand.n_points)).to(hand.link_points.device)
             body = LinkPoints.of(few.link_points, few.link_index, hand.tree.n_links)
             self.clearance = Clearance(
-                hand, self.surroundings, body, self.ball, self.spheres.radii, config.clear, config.clearance)
+                hand, self.room.surroundings, body, self.ball, self.spheres.radii, config.clear, config.clearance)
+        self.holding = None if self.room.hold is None else Holding(self.room.hold, config.clear)
         self.lower = torch.where(hand.opening_signs > 0, hand.lower + room, hand.lower)
         self.upper = torch.where(hand.opening_signs > 0, hand.upper, hand.upper - room)
 
@@ -161,9 +181,13 @@ class GraspEnergy:
         body = self.body.place(poses)
         distance, gradient = self.field.distances(body)
         inside = energies.penetration(distance - config.margin, gradient)
-        wrenches = wrenches + energies.link_wrenches(
-            body, config.penetration * inside.by_point, self.body.members
-        )
+        beside, by_point = torch.zeros_like(T_object_wrist[:, :1, 0]), config.penetration * inside.by_point
+        if self.holding is not None:
+            off = self.holding.push(body, distance, gradient)
+            beside, by_point = config.clearance * off.value.sum(-1, keepdim=True), by_point + config.clearance * off.by_point
+            pulled, by_link = self._pull(self.holding, poses, contacts)
+            beside, wrenches = beside + pulled, wrenches + by_link
+        wrenches = wrenches + energies.link_wrenches(body, by_point, self.body.members)
         spheres = self.ball.place(poses)
         own = energies.self_penetration(spheres, self.spheres.radii, self.spheres.pairs)
         depth, by_sphere = inside.value.sum(-1), config.self_penetration * own.by_point
@@ -183,11 +207,11 @@ class GraspEnergy:
             config.alignment * alignment,
             config.joints * beyond.sum(-1),
         ], -1)
-        by_joint, blocked = by_joint + config.joints * slope, torch.zeros_like(terms[:, :1])
+        by_joint = by_joint + config.joints * slope
         if self.clearance is not None:
             near = self.clearance(T_object_wrist, q, poses, self.pivot(T_object_wrist))
-            blocked, by_pose, by_joint = near.value, by_pose + near.by_pose, by_joint + near.by_joint
-        return Evaluation(terms, blocked, by_pose, by_joint * self.hand.movable.to(q.dtype))
+            beside, by_pose, by_joint = beside + near.value, by_pose + near.by_pose, by_joint + near.by_joint
+        return Evaluation(terms, beside, by_pose, by_joint * self.hand.movable.to(q.dtype))
 
     def nearest_contacts(
         self, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], reach: float = math.inf
@@ -198,7 +222,10 @@ class GraspEnergy:
         """
         candidates = self.candidates
         poses = T_object_wrist[:, None] @ self.hand.tree.forward(q)
-        distance = self.field.distances(self.contact_points.place(poses))[0].abs()
+        points = self.contact_points.place(poses)
+        distance = self.field.distances(points)[0].abs()
+        if self.holding is not None:
+            distance = distance + self.holding.pull(points).value
         taken = torch.zeros_like(distance)
         allowed = candidates.slot_weights > 0
         nearest = torch.where(allowed, distance[:, None], torch.inf).amin(-1)
@@ -241,4 +268,15 @@ class GraspEnergy:
         wrenches = members.transpose(-1, -2) @ torch.cat([by_point, moment], -1)
         return (closure.value.sum(-1), apart.value.sum(-1), align.value.sum(-1)), wrenches
 
-
+    def _pull(
+        self, holding: Holding, poses: Float[Tensor, "n n_links 4 4"], contacts: Int[Tensor, "n c"]
+    ) -> tuple[Float[Tensor, "n 1"], Float[Tensor, "n n_links 6"]]:
+        """Weighted distance of the contacts to the place to hold, and their wrenches on the links."""
+        links = self.candidates.links[contacts]
+        chosen = poses[torch.arange(len(poses), device=links.device)[:, None], links]
+        points = se3.apply(chosen, self.candidates.points[contacts])
+        pull = holding.pull(points)
+        by_point = self.config.clearance * pull.by_point
+        moment = torch.linalg.cross(points, by_point, dim=-1)
+        wrenches = self.one_hot[links].transpose(-1, -2) @ torch.cat([by_point, moment], -1)
+        return self.config.clearance * pull.value.sum(-1, keepdim=True), wrenches

@@ -1,4 +1,4 @@
-"""What a hand must stay clear of beside the object: all below a plane, and obstacles."""
+"""What a hand must stay clear of beside the object: all below a plane, obstacles, and places that are to be left alone."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.devices import on_device
+from dro_grasp.geometry.balls import Balls
 from dro_grasp.geometry.distance_field import DistanceField
 
 
@@ -19,25 +20,33 @@ class Surroundings:
     plane: Float[Tensor, "4"] | None = None
     """Upward unit normal of a plane, and its height along the normal [m]."""
     obstacles: DistanceField | None = None
-    """Signed distances of everything else."""
+    """Signed distances of other things."""
+    spared: Balls | None = None
+    """Places where the hand is not wanted."""
 
     @property
     def up(self) -> Float[Tensor, "3"] | None:
         """Normal of the plane."""
         return None if self.plane is None else self.plane[:3]
 
+    @property
+    def parts(self) -> dict[str, Surroundings]:
+        """The same one by one: plane, obstacles, spared."""
+        return {name: Surroundings(**{name: part}) for name in ("plane", "obstacles", "spared")
+                if (part := getattr(self, name)) is not None}
+
     def distances(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
         """Signed distance [m] and its gradient, as of a `DistanceField`."""
-        if self.plane is None:
-            if self.obstacles is None:
-                return torch.full_like(points[..., 0], torch.inf), torch.zeros_like(points)
-            return self.obstacles.distances(points)
-        distance, gradient = points @ self.plane[:3] - self.plane[3], self.plane[:3].expand_as(points)
-        if self.obstacles is None:
-            return distance, gradient
-        other, slope = self.obstacles.distances(points)
-        nearer = other < distance
-        return torch.where(nearer, other, distance), torch.where(nearer[..., None], slope, gradient)
+        distance, gradient = torch.full_like(points[..., 0], torch.inf), torch.zeros_like(points)
+        if self.plane is not None:
+            distance, gradient = points @ self.plane[:3] - self.plane[3], self.plane[:3].expand_as(points)
+        for part in (self.obstacles, self.spared):
+            if part is not None:
+                other, slope = part.distances(points)
+                nearer = other < distance
+                distance = torch.where(nearer, other, distance)
+                gradient = torch.where(nearer[..., None], slope, gradient)
+        return distance, gradient
 
     def lift(self, points: Float[Tensor, "*b p 3"], clear: float) -> Float[Tensor, "*b 3"]:
         """The shift up the plane's normal that brings points this far above it [m]; none where they are already."""
@@ -48,5 +57,5 @@ class Surroundings:
 
     def to(self, device: torch.device | str) -> Surroundings:
         """The same on another device."""
-        obstacles = None if self.obstacles is None else on_device(self.obstacles, device)
-        return Surroundings(None if self.plane is None else self.plane.to(device), obstacles)
+        obstacles, spared = (None if part is None else on_device(part, device) for part in (self.obstacles, self.spared))
+        return Surroundings(None if self.plane is None else self.plane.to(device), obstacles, spared)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from jaxtyping import Num, Shaped
+from jaxtyping import Float, Num, Shaped
 from torch import Tensor
 
 from dro_grasp.errors import ObjectError
@@ -29,13 +29,22 @@ def object_in_memory(source: Any, scale: float = 1.0, keep_table: bool = False) 
     Raises:
         ObjectError: It is none of these, or unusable.
     """
+    geometry, unit = geometry_in_memory(source)
+    if isinstance(geometry, trimesh.Trimesh):
+        return mesh_object("mesh", geometry, origin=ORIGIN, scale=scale * unit)
+    return cloud_object("cloud", geometry, origin=ORIGIN, scale=scale * unit, keep_table=keep_table)
+
+
+def geometry_in_memory(source: Any) -> tuple[trimesh.Trimesh | Float[np.ndarray, "..."], float]:
+    """One mesh, scenes merged, or points; and their unit [m], 1 where none is stated.
+
+    Raises:
+        ObjectError: It is no geometry.
+    """
     if isinstance(source, trimesh.Trimesh | trimesh.PointCloud | trimesh.Scene):
         unit = trimesh.units.unit_conversion(source.units, "meters") if source.units else 1.0
         geometry = merge_scene(source) if isinstance(source, trimesh.Scene) else source
-        if isinstance(geometry, trimesh.PointCloud):
-            points, scale = np.asarray(geometry.vertices, np.float64), scale * unit
-            return cloud_object("cloud", points, origin=ORIGIN, scale=scale, keep_table=keep_table)
-        return mesh_object("mesh", geometry, origin=ORIGIN, scale=scale * unit)
+        return (np.asarray(geometry.vertices, np.float64) if isinstance(geometry, trimesh.PointCloud) else geometry), unit
     if isinstance(source, tuple) and len(source) == 2:
         vertices, faces = _numbers(source[0]), _numbers(source[1])
         for what, array in (("vertices", vertices), ("faces", faces)):
@@ -43,11 +52,9 @@ def object_in_memory(source: Any, scale: float = 1.0, keep_table: bool = False) 
                 raise ObjectError(f"the {what} have shape {array.shape}; expected (n, 3)")
         if faces.dtype.kind not in "iu":
             raise ObjectError(f"the faces are numbers of type {faces.dtype}; give the indices of their vertices as integers")
-        mesh = trimesh.Trimesh(vertices, faces, process=False)
-        return mesh_object("mesh", mesh, origin=ORIGIN, scale=scale)
+        return trimesh.Trimesh(vertices, faces, process=False), 1.0
     if isinstance(source, np.ndarray | Tensor):
-        points = _numbers(source).astype(np.float64)
-        return cloud_object("cloud", points, origin=ORIGIN, scale=scale, keep_table=keep_table)
+        return _numbers(source).astype(np.float64), 1.0
     raise ObjectError(f"an object cannot be loaded from a {type(source).__name__}; give a name, the path of a mesh or cloud, a "
                       "trimesh mesh, a pair (vertices, faces), or an array of points (n, 3)")
 

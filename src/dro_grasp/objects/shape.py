@@ -98,7 +98,7 @@ class ObjectModel:
         """Signed distances around the object; for a mesh, their grid is cached on disk."""
         if self.vertices is None or self.faces is None:
             cloud, normals = self.cloud.astype(np.float64), self.cloud_normals.astype(np.float64)
-            grid = bake_grid(cloud, partial(closed_cloud_distances, cloud, normals))
+            grid = bake_grid(cloud, partial(closed_cloud_distances, cloud, normals), banded=True)
         else:
             vertices, faces = self.vertices, self.faces
             key = f"grid-{self.sha256[:24]}-{GRID_SPACING * 1e6:.0f}"

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.energy.surroundings import Surroundings
+from dro_grasp.geometry.balls import Ball, Balls
 from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.geometry.se3 import apply_to_cloud, compose, random_rotations, rotate, rotation_between
@@ -25,6 +27,8 @@ TILT_COST = 0.03
 """Depth in the surroundings that a tilt of one radian is worth [m/rad] (ours)."""
 CHOICES = 8
 """Wrist rotations among which each hand takes the one with most room (ours)."""
+APPROACH = 0.10
+"""Length of the straight approach along the palm direction, which a hand has room for [m] (ours)."""
 ROOM_POINTS = 96
 """Hand points, spread evenly, at which room is measured (ours)."""
 
@@ -44,6 +48,10 @@ class StartConfig:
     """Palm direction in the object's frame; any by default."""
     direction_spread: float = math.radians(5.0)
     """Standard deviation of the palm direction around the given one [rad]."""
+    cone: float | None = None
+    """Palm directions are spread evenly within this angle of the given one instead [rad]."""
+    hold: tuple[Ball, ...] = ()
+    """Places at which palms aim, where there are any; at all of the object by default."""
     gap: tuple[float, float] = (0.0, 0.01)
     """Range of the distance between hand and object [m]."""
     clearance: float = 0.6
@@ -86,8 +94,12 @@ def starts(
     """
     q = start_joints(hand, n, config, generator)
     points = hand.points(q)
-    pick = torch.randint(len(surface), (n,), generator=generator)
-    aim = centre + config.aim * torch.rand(n, 1, generator=generator) * (surface[pick] - centre)
+    wanted, middle = surface, centre
+    if (place := Balls.of(config.hold)) is not None:
+        wanted = surface[place.distances(surface)[0] <= 0]
+        middle = wanted.mean(0)
+    pick = torch.randint(len(wanted), (n,), generator=generator)
+    aim = middle + config.aim * torch.rand(n, 1, generator=generator) * (wanted[pick] - middle)
     rotation = roomy_rotations(hand, points, aim, config, generator, surroundings)
     direction = rotation @ hand.palm_direction_wrist
     offset = aim - rotation @ hand.grasp_centre_wrist
@@ -112,12 +124,13 @@ def roomy_rotations(
 ) -> Float[Tensor, "n 3 3"]:
     """Wrist rotations of hands that aim at points; of several for each, the one that has most room in the surroundings."""
     n, up = len(aim), None if surroundings is None else surroundings.up
+    spread = Spread(config.direction_spread, config.cone)
     if surroundings is None:
-        return wrist_rotations(hand, n, config.direction, config.direction_spread, generator)
-    rotations = wrist_rotations(hand, n * CHOICES, config.direction, config.direction_spread, generator, up)
+        return wrist_rotations(hand, n, config.direction, spread, generator)
+    rotations = wrist_rotations(hand, n * CHOICES, config.direction, spread, generator, up)
     rotations = rotations.unflatten(0, (n, CHOICES))
     placed = compose(rotations, aim[:, None] - rotations @ hand.grasp_centre_wrist)
-    lack = lack_of_room(hand, placed, points[:, None], config.direction, surroundings)
+    lack = lack_of_room(hand, placed, points[:, None], None if config.cone else config.direction, surroundings)
     return rotations[torch.arange(n), lack.argmin(1)]
 
 
@@ -125,17 +138,19 @@ def lack_of_room(
     hand: Hand, T: Float[Tensor, "*b 4 4"], points: Float[Tensor, "*n p 3"], direction: Direction | None,
     surroundings: Surroundings,
 ) -> Float[Tensor, "*b"]:
-    """How deep hands are in their surroundings [m], and for how much of a tilt from the direction that was wanted.
+    """How deep hands get into their surroundings on a straight approach [m], and for how much of a tilt from the direction.
 
     Args:
         hand: The hand.
         T: Wrist poses [m].
         points: The hand's surface points in the wrist frame [m].
-        direction: The palm direction that was wanted.
+        direction: The palm direction that was wanted; tilts from it cost something.
         surroundings: What the hand stays clear of.
     """
     placed = apply_to_cloud(T, points[..., hand.spread_rank < ROOM_POINTS, :])
-    lack = (CLEAR - surroundings.distances(placed)[0].amin(-1)).clamp_min(0)
+    back = -APPROACH * hand.palm_directions(T)[..., None, :]
+    nearest = [surroundings.distances(placed + share * back)[0].amin(-1) for share in (0.0, 0.5, 1.0)]
+    lack = (CLEAR - torch.stack(nearest).amin(0)).clamp_min(0)
     if direction is None:
         return lack
     wanted = torch.nn.functional.normalize(torch.tensor(direction).to(T), dim=0)
@@ -162,8 +177,17 @@ def _tilt(wanted: Float[Tensor, "3"], up: Float[Tensor, "3"]) -> tuple[Float[Ten
     return torch.nn.functional.normalize(across, dim=0), most
 
 
+class Spread(NamedTuple):
+    """How palm directions are spread around the wanted one."""
+
+    deviation: float
+    """Standard deviation [rad]."""
+    cone: float | None = None
+    """Evenly within a cone of this half angle instead [rad]."""
+
+
 def wrist_rotations(
-    hand: Hand, count: int, direction: Direction | None, spread: float, generator: torch.Generator,
+    hand: Hand, count: int, direction: Direction | None, spread: Spread, generator: torch.Generator,
     up: Float[Tensor, "3"] | None = None,
 ) -> Float[Tensor, "count 3 3"]:
     """Random wrist rotations: uniform, or with the palm near a direction and any roll.
@@ -172,9 +196,9 @@ def wrist_rotations(
         hand: The hand; its device is the result's.
         count: How many.
         direction: Palm direction in the object's frame.
-        spread: Standard deviation of the palm direction around it [rad].
+        spread: Of palm directions around it.
         generator: Source of randomness, on the CPU.
-        up: Normal of a plane towards which palms also tilt, by up to LARGEST_TILT.
+        up: Normal of a plane towards which palms also tilt, by up to LARGEST_TILT; not in a cone.
     """
     palm = hand.palm_direction_wrist
     if direction is None:
@@ -182,10 +206,13 @@ def wrist_rotations(
     wanted = torch.tensor(direction, dtype=torch.float32)
     wanted = wanted / wanted.norm()
     roll = torch.rand(count, generator=generator) * 2 * math.pi
-    tilt = torch.randn(count, 3, generator=generator) * spread
+    tilt = torch.randn(count, 3, generator=generator) * spread.deviation
     tilt = tilt - (tilt @ wanted)[:, None] * wanted
     align = rotation_between(palm.cpu(), wanted)
-    if up is not None:
+    if spread.cone is not None:
+        height = 1 - torch.rand(count, 1, generator=generator) * (1 - math.cos(spread.cone))
+        tilt = torch.nn.functional.normalize(tilt, dim=-1) * torch.acos(height)
+    elif up is not None:
         axis, most = _tilt(wanted, up.cpu())
         tilt = tilt + torch.rand(count, 1, generator=generator) * most * axis
     return (roma.rotvec_to_rotmat(tilt) @ roma.rotvec_to_rotmat(roll[:, None] * wanted) @ align).to(palm)

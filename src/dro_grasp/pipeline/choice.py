@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.energy.surroundings import Surroundings
+from dro_grasp.energy.grasp_energy import Room
 from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.hand import Hand
@@ -47,7 +47,7 @@ class ChoiceConfig:
 
 def choice_scores(
     hand: Hand, field: DistanceField, points: Float[Tensor, "*b n_points 3"], config: ChoiceConfig,
-    surroundings: Surroundings | None = None,
+    room: Room | None = None,
 ) -> Float[Tensor, "*b"]:
     """How well moved hands suit the object; higher is better, comparable among hands of one kind.
 
@@ -56,22 +56,25 @@ def choice_scores(
         field: Signed distances of the object, from its mesh or from its cloud and normals.
         points: The hand's surface points after the motion, in the object's frame [m].
         config: Penalties.
-        surroundings: What the hand stays clear of.
+        room: Where the hand may be, and where it may touch the object.
     """
+    room = room or Room()
     distance, _ = field.distances(points)
+    wanted = distance if room.hold is None else distance.clamp_min(0) + room.hold.distances(points)[0].clamp_min(0)
     finger = hand.finger_of_link[hand.link_index]
 
-    def nearest(part: int) -> Float[Tensor, "*b"]:
+    def nearest(part: int, distance: Float[Tensor, "*b n_points"] = distance) -> Float[Tensor, "*b"]:
         return distance[..., finger == part].amin(-1)
 
     fingers = [i for i in range(len(hand.fingers)) if bool((finger == i).any())]
-    nearest_of = torch.stack([nearest(i) for i in fingers], -1)
+    nearest_of, gap_of = (torch.stack([nearest(i, d) for i in fingers], -1) for d in (distance, wanted))
     score = -config.finger_penetration * (config.margin - nearest_of).clamp_min(0).mean(-1)
-    score = score - config.gap * nearest_of.clamp(0, config.reach).mean(-1)
+    score = score - config.gap * gap_of.clamp(0, config.reach).mean(-1)
     if bool((finger == PALM).any()):
         score = score - config.palm_penetration * (config.margin - nearest(PALM)).clamp_min(0)
-    if surroundings is not None:
-        score = score - config.clearance * (config.margin - surroundings.distances(points)[0].amin(-1)).clamp_min(0)
+    if room.surroundings is not None:
+        closest = room.surroundings.distances(points)[0].amin(-1)
+        score = score - config.clearance * (config.margin - closest).clamp_min(0)
     some = hand.spread_rank < CROWDING_POINTS
     owner = finger[some]
     rivals = (owner[:, None] != owner) & (owner[:, None] != PALM) & (owner != PALM)

@@ -1,4 +1,4 @@
-"""What grasps have to respect beside hand and object: where the palm points, what the hand stays clear of."""
+"""What grasps have to respect beside hand and object: palm directions, what stays clear, where the object is touched."""
 
 from __future__ import annotations
 
@@ -7,8 +7,11 @@ from dataclasses import dataclass
 
 import torch
 
+from dro_grasp.energy.grasp_energy import Room
 from dro_grasp.energy.surroundings import Surroundings
 from dro_grasp.errors import OptionError
+from dro_grasp.geometry.balls import Ball, Balls
+from dro_grasp.objects.scene import Scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.starts import Direction
 
@@ -18,29 +21,89 @@ UPRIGHT = math.cos(math.radians(5.0))
 """Least cosine between z and the normal of a table whose height along z is given (ours)."""
 SIDEWAYS = 0.1
 """Least such cosine of a plane that has a height at all (ours)."""
+LARGEST_OPENING = 0.2
+"""Largest opening that is accepted [m] (ours)."""
+MOST_BALLS = 1000
+"""Most balls of a place (ours): each costs time at every step."""
+FEWEST_HELD = 16
+"""Fewest points of an object's cloud that a place to hold must contain (ours)."""
 
 
 @dataclass(frozen=True)
 class Constraints:
-    """What grasps have to respect; nothing by default. All in the object's frame."""
+    """What grasps have to respect; nothing by default. All in the object's frame.
+
+    Example:
+        >>> above = Constraints(direction=(0, 0, -1), cone=0.5, table=0.0, avoid=load_scene("shelf.ply"))
+        >>> grasps = GraspPredictor().predict(hand, obj, constraints=above)
+    """
 
     direction: Direction | None = None
     """Palm direction; any by default. Over a table, palms tilt towards it as far as the hand needs room."""
+    cone: float | None = None
+    """Largest angle between the palm direction and `direction` [rad]; palms are spread evenly within it and tilt no farther.
+    By default palms point roughly along the direction."""
     table: float | None = None
-    """Height of a plane [m]; the hand stays above it, in pregrasp, grasp and squeeze. By default the table that was found in a
-    cloud, if any."""
+    """Height of a plane [m]; the hand stays above it. By default the table that was found in a cloud, if any."""
+    avoid: Scene | None = None
+    """What else the hand stays clear of: see `load_scene`."""
+    hold: tuple[Ball, ...] = ()
+    """Places, as balls (x, y, z, radius) [m]: in the grasp, the hand touches the object nowhere else. Anywhere by default."""
+    spare: tuple[Ball, ...] = ()
+    """Places, as balls (x, y, z, radius) [m], that the hand stays out of."""
+    opening: float | None = None
+    """Least distance between the object and every link that closes, in pregrasp [m]: by so much may hand and object be off
+    their places. The pregrasp opens as far as that takes. By default it opens by a quarter of what is left."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be done, before any work.
 
         Raises:
-            OptionError: A number is out of range, or the direction is zero.
+            OptionError: A number is out of range, the direction is zero, or a cone has no direction.
         """
         if self.direction is not None and not 1e-9 <= math.hypot(*self.direction) < math.inf:
             raise OptionError(f"direction {self.direction} has no direction; give the palm direction in the object's frame, "
                               "for example --direction 0 0 -1 to grasp from above")
         if self.table is not None and not math.isfinite(self.table):
             raise OptionError(f"table is {self.table}; give the height in metres, for example --table 0")
+        if self.cone is not None and not 0 < self.cone <= math.pi:
+            degrees = f"; {self.cone:g} degrees are {math.radians(self.cone):.3g}" if 0 < self.cone <= 180 else ""
+            raise OptionError(f"cone is {self.cone}; give the largest angle in radians, above 0 and at most 3.14{degrees}")
+        if self.cone is not None and self.direction is None:
+            raise OptionError("cone is an angle from direction, which is absent; give both, for example --direction 0 0 -1 "
+                              "--cone 0.5")
+        if self.opening is not None and not 0 < self.opening <= LARGEST_OPENING:
+            raise OptionError(f"opening is {self.opening}; give metres, above 0 and at most {LARGEST_OPENING:g}: 0.01 for 1 cm")
+        for name, balls in (("hold", self.hold), ("spare", self.spare)):
+            _check_balls(name, balls)
+
+    def require_fit(self, obj: ObjectModel) -> None:
+        """Refuse what leaves nothing of this object to grasp.
+
+        Raises:
+            OptionError: The table is above it, or a place to hold is not on it, or everything is spared.
+            ObjectError: The scene contains it.
+        """
+        cloud = torch.from_numpy(obj.cloud)
+        top = float(cloud[:, 2].max())
+        if self.table is not None and not self.table < top:
+            raise OptionError(f"a table at {self.table} m leaves nothing of the object, which ends at z = {top:.3f} m; give "
+                              "the table's height in metres in the frame of the grasps")
+        spans = ", ".join(f"{axis} = {a:.3f} to {b:.3f}" for axis, a, b in zip("xyz", obj.cloud.min(0), obj.cloud.max(0),
+                                                                              strict=True))
+        free = torch.ones(len(cloud), dtype=torch.bool)
+        if (place := Balls.of(self.hold)) is not None:
+            free = place.distances(cloud)[0] <= 0
+            if int(free.sum()) < FEWEST_HELD:
+                raise OptionError(f"hold is not on the object: of {len(cloud)} points of its surface {int(free.sum())} are within "
+                                  f"the balls, and it spans {spans} m. Move the balls, or give a larger radius")
+        if (place := Balls.of(self.spare)) is not None:
+            free &= place.distances(cloud)[0] > 0
+            if int(free.sum()) < FEWEST_HELD:
+                raise OptionError(f"spare leaves nothing{' of hold' if self.hold else ''} to touch on the object, which "
+                                  f"spans {spans} m; give a smaller radius")
+        if self.avoid is not None:
+            self.avoid.require_apart(obj)
 
     def doubt(self, obj: ObjectModel) -> str | None:
         """What is odd about the table, in words; None for nothing."""
@@ -54,7 +117,32 @@ class Constraints:
         return (f"table is z = {self.table:g} m, but the table in the cloud is where {x} x + {y} y + {z} z = {distance} "
                 "m. Leave out table, which takes the one in the cloud; or, if the cloud is a camera's, give the camera's pose")
 
-    def surroundings(self, obj: ObjectModel) -> Surroundings | None:
-        """What the hand stays clear of around an object; None for nothing."""
+    def room(self, obj: ObjectModel, reach: float) -> Room:
+        """Where a hand may be around an object, and where it may touch it.
+
+        Args:
+            obj: The object.
+            reach: How far the hand gets from it [m]; nothing farther away matters.
+        """
         plane = obj.table if self.table is None else (0.0, 0.0, 1.0, self.table)
-        return None if plane is None else Surroundings(torch.tensor(plane, dtype=torch.float32))
+        obstacles, spared = None, Balls.of(self.spare)
+        if self.avoid is not None:
+            obstacles = self.avoid.near(obj.cloud.min(0) - reach, obj.cloud.max(0) + reach)
+        surroundings = None
+        if plane is not None or obstacles is not None or spared is not None:
+            surroundings = Surroundings(None if plane is None else torch.tensor(plane, dtype=torch.float32), obstacles, spared)
+        return Room(surroundings, Balls.of(self.hold))
+
+
+def _check_balls(name: str, balls: tuple[Ball, ...]) -> None:
+    """Refuse balls that are none.
+
+    Raises:
+        OptionError: One has no four numbers, or no radius; or there are too many.
+    """
+    if len(balls) > MOST_BALLS:
+        raise OptionError(f"{name} has {len(balls)} balls; give at most {MOST_BALLS}, with a larger radius")
+    for ball in balls:
+        if len(ball) != 4 or not all(map(math.isfinite, ball)) or not ball[3] > 0:
+            raise OptionError(f"{name} has the ball {tuple(ball)}; give x, y, z and a radius above 0 in metres, for example "
+                              f"--{name} 0 0 0.1 0.03")

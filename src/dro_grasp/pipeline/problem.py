@@ -11,13 +11,14 @@ from torch import Tensor
 
 from dro_grasp.devices import require_device
 from dro_grasp.energy.clearance import Clearance
-from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
+from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy, Room
 from dro_grasp.energy.surroundings import Surroundings
-from dro_grasp.errors import OptionError
+from dro_grasp.geometry.balls import Balls
 from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.optimization.starts import APPROACH
 from dro_grasp.pipeline.constraints import Constraints
 
 
@@ -42,22 +43,34 @@ class GraspProblem:
     _thinned: dict[int, Hand] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Refuse what is no hand or no object, an absent device, and a table above the object.
+        """Refuse what is no hand or no object, an absent device, and constraints that leave nothing of the object.
 
         Raises:
-            OptionError: Something else was given, this machine has no such device, or the table leaves nothing of the object.
+            OptionError: Something else was given, this machine has no such device, or nothing is left of the object.
+            ObjectError: The scene to avoid contains the object.
         """
         require_pair(self.hand, self.obj)
         require_device(str(self.device))
-        table, top = self.constraints.table, self.height_range[1]
-        if table is not None and not table < top:
-            raise OptionError(f"a table at {table} m leaves nothing of the object, which ends at z = {top:.3f} m; give the "
-                              "table's height in metres in the frame of the grasps")
+        self.constraints.require_fit(self.obj)
 
     @property
     def height_range(self) -> tuple[float, float]:
         """Least and greatest z of the object [m]."""
         return float(self.obj.cloud[:, 2].min()), float(self.obj.cloud[:, 2].max())
+
+    @property
+    def hand_reach(self) -> float:
+        """How far the hand gets from the object on a straight approach [m]: the way, and its size."""
+        points = self.hand.points(self.hand.canonical_joints(1.0))
+        return APPROACH + float((points - self.hand.grasp_centre_wrist).norm(dim=-1).max())
+
+    @cached_property
+    def held(self) -> Float[Tensor, "k 3"] | None:
+        """Points of the object's cloud in the place to hold, on the CPU [m]; None where all of it may be touched."""
+        if (place := Balls.of(self.constraints.hold)) is None:
+            return None
+        cloud = torch.from_numpy(self.obj.cloud)
+        return cloud[place.distances(cloud)[0] <= 0]
 
     @cached_property
     def centre(self) -> Float[Tensor, "3"]:
@@ -70,9 +83,14 @@ class GraspProblem:
         return self._default_energy.field
 
     @property
+    def room(self) -> Room:
+        """Where the hand may be, and where it may touch the object, on the device."""
+        return self._default_energy.room
+
+    @property
     def surroundings(self) -> Surroundings | None:
         """What the hand stays clear of, on the device; None for nothing."""
-        return self._default_energy.surroundings
+        return self.room.surroundings
 
     @property
     def clearance(self) -> Clearance | None:
@@ -88,7 +106,7 @@ class GraspProblem:
     @cached_property
     def _default_energy(self) -> GraspEnergy:
         return GraspEnergy.of_object(
-            self.hand, self.obj, device=self.device, surroundings=self.constraints.surroundings(self.obj))
+            self.hand, self.obj, device=self.device, room=self.constraints.room(self.obj, self.hand_reach))
 
     def thinned(self, count: int) -> Hand:
         """The hand with `count` surface points, on the device.
@@ -101,5 +119,7 @@ class GraspProblem:
         return self._thinned[count]
 
     def cloud(self, count: int, generator: torch.Generator) -> Float[Tensor, "count 3"]:
-        """Random surface points of the object, on the device [m]."""
-        return self.obj.sample_points(count, generator).to(self.device)
+        """Random surface points of the object, or of the place to hold, on the device [m]."""
+        if self.held is None:
+            return self.obj.sample_points(count, generator).to(self.device)
+        return self.held[torch.randint(len(self.held), (count,), generator=generator)].to(self.device)

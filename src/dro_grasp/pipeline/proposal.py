@@ -22,7 +22,7 @@ from dro_grasp.geometry.se3 import apply_to_cloud, compose, rotate
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.models.network import DistanceNetwork
-from dro_grasp.optimization.starts import CHOICES, CLEAR, lack_of_room, wrist_rotations
+from dro_grasp.optimization.starts import CHOICES, CLEAR, Spread, lack_of_room, wrist_rotations
 from dro_grasp.pipeline.choice import ChoiceConfig, choice_scores
 from dro_grasp.pipeline.problem import GraspProblem
 
@@ -139,17 +139,19 @@ def _placements(
 ) -> Float[Tensor, "num 4 4"]:
     """Wrist poses of the open hand near which the network is asked for grasps, in the object's frame."""
     axes, surroundings = network.config.axes(hand.palm_axes_wrist), problem.surroundings
-    direction, up = problem.constraints.direction, None if surroundings is None else surroundings.up
+    direction, cone = problem.constraints.direction, problem.constraints.cone
+    spread, up = Spread(config.direction_spread, cone), None if surroundings is None else surroundings.up
     offered = num if surroundings is None else CHOICES * num
     count = num * (config.rotations_per_grasp if direction is None else config.rolls_per_grasp)
-    rotations = wrist_rotations(hand, max(count, offered), direction, config.direction_spread, generator, up)
+    rotations = wrist_rotations(hand, max(count, offered), direction, spread, generator, up)
     opened = hand.points(hand.canonical_joints())
     rotation, position = network.sample_placements(opened @ axes, cloud, rotations @ axes, offered, generator)
     offset = cloud.mean(0) + rotate(rotation, position - hand.grasp_centre_wrist @ axes)
     placed = compose(rotation @ axes.mT, offset)
     if surroundings is None:
         return placed
-    best = lack_of_room(hand, placed, opened, direction, surroundings).topk(num, largest=False).indices
+    lack = lack_of_room(hand, placed, opened, None if cone else direction, surroundings)
+    best = lack.topk(num, largest=False).indices
     rotation, offset = rotation[best] @ axes.mT, offset[best]
     return compose(rotation, offset + surroundings.lift(apply_to_cloud(placed[best], opened), CLEAR))
 
@@ -173,7 +175,7 @@ def _distances(
         obj = network.to_frame(cloud.expand(len(points), -1, -1), centres, axes)
 
         def choose(moves: Float[Tensor, "b k n 3"]) -> Int[Tensor, " b"]:
-            return choice_scores(hand, field, moves @ axes[:, None].mT + centre, config.choice, problem.surroundings).argmax(-1)
+            return choice_scores(hand, field, moves @ axes[:, None].mT + centre, config.choice, problem.room).argmax(-1)
 
         return network.predict(opened, obj, z, choose).float()
 

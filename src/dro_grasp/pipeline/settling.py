@@ -17,11 +17,11 @@ from torch import Tensor
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
-from dro_grasp.optimization.grip import gripping
 from dro_grasp.optimization.refinement import RefineConfig
+from dro_grasp.pipeline.admission import permitted
 from dro_grasp.pipeline.holding_score import holding_score
 from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.stages import complete, permitted, refine, scored
+from dro_grasp.pipeline.stages import complete, grip, refine, scored
 from dro_grasp.simulation.closed_poses import settle
 from dro_grasp.simulation.holding import Holding, holding
 
@@ -106,8 +106,7 @@ def settled(problem: GraspProblem, grasps: GraspBatch, config: SettleConfig | No
     moved, _ = motion(hand, grasps, closed)
     still, near = moved < config.still, moved < config.lost
     again, rows = near & ~still, near.nonzero()[:, 0]
-    energy = problem.energy(config.refinement.energy)
-    better = replaced(closed, still, gripping(energy, closed[still], config.refinement.grip))
+    better = replaced(closed, still, grip(problem, closed[still], config.refinement))
     better = replaced(better, again, refine(problem, closed[again], config.refinement))[rows]
     state = holding(hand, obj, better)
     holds = (state.shift < config.farthest) & (state.turn < config.largest_turn)

@@ -1,0 +1,145 @@
+"""Which grasps respect the constraints of a problem, and why the others do not."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from dro_grasp.energy.surroundings import Surroundings
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.anatomy import PALM
+from dro_grasp.optimization.starts import APPROACH, angle_to_arc
+from dro_grasp.pipeline.problem import GraspProblem
+
+FARTHEST_DIRECTION = math.radians(20.0)
+"""Largest angle between the palm direction of an optimised grasp and the direction that was asked for [rad] (ours)."""
+LEAST_CLEARANCE = 0.002
+"""Least distance of a hand's surface points to its surroundings [m] (ours); its corners come up to 2 mm nearer."""
+TOUCH = 0.003
+"""Distance at which a hand touches the object [m] (ours): refined grasps keep 1 mm off it."""
+FEWEST_FINGERS = 2
+"""Fingers that touch the place to hold, at least (ours)."""
+REACH = 0.006
+"""Distance up to which they count as touching [m], as where forces are balanced (ours)."""
+WAYPOINTS = 9
+"""Places on the approach at which the hand is checked, both ends included (ours)."""
+OPENINGS = 9
+"""Steps in which a pregrasp opens (ours)."""
+PLANE, OBSTACLES, SPARED = "in the table", "in the scene to avoid", "in a place to spare"
+"""Where a hand is dropped for; the approach, with the hand in pregrasp and open, counts."""
+TURNED, BESIDE, NARROW = "turned away", "touching beside the place to hold", "too close in pregrasp"
+"""Other reasons for which grasps are dropped."""
+REASONS = {"plane": PLANE, "obstacles": OBSTACLES, "spared": SPARED}
+"""Reason by part of the surroundings."""
+
+
+def permitted(problem: GraspProblem, grasps: GraspBatch) -> Bool[Tensor, " n"]:
+    """Which complete grasps respect the problem's constraints."""
+    kept = torch.ones(len(grasps), dtype=torch.bool)
+    if not len(grasps):
+        return kept
+    for faults in _faults(problem, grasps, apart=False).values():
+        kept &= ~faults
+    return kept
+
+
+def reasons_against(problem: GraspProblem, grasps: GraspBatch) -> Counter[str]:
+    """How many complete grasps do not respect the constraints, by the first reason."""
+    counted: Counter[str] = Counter()
+    left = torch.ones(len(grasps), dtype=torch.bool)
+    if not len(grasps):
+        return counted
+    for reason, faults in _faults(problem, grasps, apart=True).items():
+        counted[reason] += int((faults & left).sum())
+        left &= ~faults
+    return +counted
+
+
+def _faults(problem: GraspProblem, grasps: GraspBatch, apart: bool) -> dict[str, Bool[Tensor, " n"]]:
+    """Which grasps violate what; with `apart`, table, scene and spared places one by one."""
+    found, constraints = {}, problem.constraints
+    if problem.surroundings is not None:
+        parts = problem.surroundings.parts if apart else {"obstacles": problem.surroundings}
+        found = {REASONS[name]: ~clear(problem, grasps, part) for name, part in parts.items()}
+    if constraints.cone is not None:
+        found[TURNED] = ~facing(problem, grasps)
+    if constraints.hold:
+        found[BESIDE] = ~holding(problem, grasps)
+    if constraints.opening is not None:
+        found[NARROW] = finger_gap(problem, grasps.T_object_wrist, grasps.pregrasp_joints) < constraints.opening
+    return found
+
+
+def facing(problem: GraspProblem, grasps: GraspBatch) -> Bool[Tensor, " n"]:
+    """Which grasps have palms in the cone, or near the wanted direction; over a plane, those too that tilt towards it."""
+    direction, cone, surroundings = problem.constraints.direction, problem.constraints.cone, problem.surroundings
+    if direction is None:
+        return torch.ones(len(grasps), dtype=torch.bool)
+    palm = problem.hand.palm_directions(grasps.T_object_wrist)
+    wanted = torch.nn.functional.normalize(torch.tensor(direction, dtype=palm.dtype), dim=0)
+    if cone is not None:
+        return angle_to_arc(palm, wanted, None) <= cone
+    up = None if surroundings is None else surroundings.up
+    return angle_to_arc(palm, wanted, None if up is None else up.to(palm)) < FARTHEST_DIRECTION
+
+
+def clear(problem: GraspProblem, grasps: GraspBatch, surroundings: Surroundings) -> Bool[Tensor, " n"]:
+    """Which complete grasps keep the hand out of surroundings.
+
+    The hand comes along the palm direction, fully open and in pregrasp, grasps and squeezes.
+    """
+    near, hand = problem.clearance, problem.hand
+    assert near is not None
+    T = grasps.T_object_wrist
+    back = torch.zeros_like(T)
+    back[:, :3, 3] = -APPROACH * hand.palm_directions(T)
+    opened = hand.canonical_joints(1.0).expand_as(grasps.joints)
+    postures = [(T, grasps.joints), (T, grasps.squeeze_joints)]
+    for share in torch.linspace(0, 1, WAYPOINTS).tolist():
+        postures += [(T + share * back, q) for q in (grasps.pregrasp_joints, opened)]
+    closest = torch.full((len(T),), torch.inf)
+    for pose, q in postures:
+        distance = near.distance(pose.to(problem.device), q.to(problem.device), surroundings)
+        closest = torch.minimum(closest, distance.cpu())
+    return closest > LEAST_CLEARANCE
+
+
+def holding(problem: GraspProblem, grasps: GraspBatch) -> Bool[Tensor, " n"]:
+    """Which grasps touch the object in the place to hold alone, with two fingers at least."""
+    place, hand = problem.room.hold, problem.hand.to(problem.device)
+    assert place is not None
+    points = hand.points(grasps.joints.to(problem.device), grasps.T_object_wrist.to(problem.device))
+    distance, beside = problem.field.distances(points)[0], place.distances(points)[0] > 0
+    finger = hand.finger_of_link[hand.link_index]
+    reached = (distance < REACH) & ~beside
+    touching = sum((reached & (finger == index)).any(-1).int() for index in range(len(hand.fingers)))
+    enough = torch.as_tensor(touching) >= min(FEWEST_FINGERS, len(hand.fingers))
+    return (enough & ~(beside & (distance < TOUCH)).any(-1)).cpu()
+
+
+def finger_gap(problem: GraspProblem, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"]) -> Float[Tensor, " n"]:
+    """Least distance of the links that close to the object [m]."""
+    hand = problem.hand.to(problem.device)
+    closing = hand.tree.moves[:, hand.movable & ~hand.abduction].any(-1) & (hand.finger_of_link != PALM)
+    moving = closing[hand.link_index]
+    points = hand.points(q.to(problem.device), T.to(problem.device))[:, moving]
+    return problem.field.distances(points)[0].amin(-1).cpu()
+
+
+def opened_wide(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
+    """Complete grasps whose pregrasp opens as far as the constraints ask, or as far as the hand does."""
+    opening, hand = problem.constraints.opening, problem.hand
+    if opening is None or not len(grasps):
+        return grasps
+    q = grasps.pregrasp_joints
+    end = torch.where(hand.movable & ~hand.abduction, hand.open_ends, q)
+    for share in torch.linspace(0, 1, OPENINGS).tolist():
+        tight = finger_gap(problem, grasps.T_object_wrist, q) < opening
+        if not bool(tight.any()):
+            break
+        q = torch.where(tight[:, None], grasps.pregrasp_joints + share * (end - grasps.pregrasp_joints), q)
+    return grasps.replace(pregrasp_joints=q)
