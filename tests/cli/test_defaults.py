@@ -24,7 +24,7 @@ from tests.helpers.browser import free_port
 from tests.helpers.weights import untrained_weights
 
 REQUESTS = {"num": 16, "seed": 0, "candidates": 4, "refine": True, "temperature": None, "method": "auto"}
-CONSTRAINTS = {"direction": None, "table": None}
+CONSTRAINTS = {"direction": None, "table": None, "cone": None, "avoid": None, "hold": (), "spare": (), "opening": None}
 
 
 def default(function: Callable[..., Any], name: str) -> Any:

@@ -134,9 +134,9 @@ def test_folder_of_objects_needs_a_folder_for_results(weights: str, tmp_path: Pa
 def test_table_keeps_hands_above_it(generate, tmp_path: Path) -> None:
     from dro_grasp.hands.library import load_hand
     from dro_grasp.objects.catalogue import load_object
+    from dro_grasp.pipeline.admission import permitted
     from dro_grasp.pipeline.constraints import Constraints
     from dro_grasp.pipeline.problem import GraspProblem
-    from dro_grasp.pipeline.stages import permitted
 
     path = tmp_path / "grasps.parquet"
     report = generate("--table", "-0.15", "--protocol", "none", "--output", str(path))

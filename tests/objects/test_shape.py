@@ -235,3 +235,27 @@ def test_a_few_wrong_normals_do_not_turn_a_cloud_inside_out() -> None:
     assert ((discs < 0) == (true < 0))[clear].mean() < 0.95, "discs alone tell as much"
     turned = points[:500] * [1, 1, -1]  # below the open end
     assert (surface_distances.closed_cloud_distances(cloud, normals, turned)[turned[:, 2] < -0.02] > 0).all()
+
+
+def test_a_banded_grid_is_exact_near_the_surface_and_close_to_it_elsewhere() -> None:
+    rng = np.random.default_rng(0)
+    cloud = rng.normal(size=(3000, 3))
+    normals = cloud / np.linalg.norm(cloud, axis=1, keepdims=True)
+    cloud = normals * [0.04, 0.03, 0.05]
+    normals = normals / [0.04, 0.03, 0.05]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    shell = cloud[:, 2] > -0.02  # open at the bottom, as on a table
+    asked = []
+
+    def distance(points: np.ndarray) -> np.ndarray:
+        asked.append(len(points))
+        return surface_distances.closed_cloud_distances(cloud[shell], normals[shell], points)
+
+    naive = surface_distances.bake_grid(cloud[shell], distance)
+    banded = surface_distances.bake_grid(cloud[shell], distance, banded=True)
+    near = np.abs(naive["values"]) < surface_distances.NEAR
+    np.testing.assert_array_equal(naive["values"][near], banded["values"][near])
+    assert np.abs(naive["values"] - banded["values"]).max() < 0.004
+    assert ((naive["values"] < 0) == (banded["values"] < 0)).all()
+    assert sum(asked[1:]) < 0.7 * asked[0]
+    np.testing.assert_array_equal(naive["origin"], banded["origin"])

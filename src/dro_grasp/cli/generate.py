@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from dro_grasp.cli.inputs import Flag, ProtocolName, optional
+from dro_grasp.cli.inputs import Ball, Flag, ProtocolName, optional
 from dro_grasp.cli.output import print_json, print_table, progress_bar, say, say_aside
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 
@@ -49,7 +49,18 @@ class Generate:
     """Palm direction in the object's frame: 0 0 -1 grasps from above. Over a table, palms tilt towards it as far as the hand
     needs room."""
     table: Annotated[float | None, optional("Z", "no table")] = None
-    """Height [m] of a table in the object's frame; the hand stays above it, in pregrasp, grasp and squeeze."""
+    """Height [m] of a table in the object's frame; the whole hand stays above it."""
+    cone: Annotated[float | None, optional("RAD", "roughly along the direction")] = None
+    """Largest angle [rad] between palm direction and --direction; palms are spread evenly within it."""
+    avoid: Annotated[Path | None, optional("MESH|CLOUD", "nothing")] = None
+    """Mesh or cloud of what stands around the object, in its frame and unit and without it. The hand stays clear of it: open,
+    10 cm back; straight from there in pregrasp; in grasp and squeeze."""
+    hold: Annotated[tuple[Ball, ...], optional("X Y Z RADIUS", "anywhere")] = ()
+    """Balls [m]: in the grasp, the hand touches the object nowhere else. Four numbers for each ball."""
+    spare: Annotated[tuple[Ball, ...], optional("X Y Z RADIUS", "nothing")] = ()
+    """Balls [m] that the hand stays out of."""
+    opening: Annotated[float | None, optional("M", "a quarter of what is left")] = None
+    """Least distance [m] between the object and every link that closes, in pregrasp."""
     camera: Annotated[Path | None, optional("JSON", "the object's own frame")] = None
     """File with {"frame": "base", "T_frame_camera": 4x4}: the object is a cloud in that camera's frame; it is cleaned. Grasps,
     direction and table are in the named frame."""
@@ -91,17 +102,21 @@ class Generate:
         from dro_grasp.frames import read_motion
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.catalogue import resolve_objects
+        from dro_grasp.objects.scene import load_scene
         from dro_grasp.pipeline.constraints import Constraints
         from dro_grasp.predictor import GraspPredictor, GraspRequest
 
         request = GraspRequest(
             self.num, self.seed, self.candidates, self.refine, self.temperature, self.method)
-        constraints = Constraints(self.direction, self.table)
+        constraints = Constraints(self.direction, self.table, self.cone, None, self.hold, self.spare, self.opening)
         names = resolve_objects([self.object])
         several = names != [self.object]
         outputs = paths_per_object(self.output, names, several, ".parquet")
         pictures = paths_per_object(self.picture, names, several, ".png")
         camera = None if self.camera is None else read_motion(self.camera, "T_frame_camera")
+        if self.avoid is not None:
+            scene = load_scene(self.avoid, scale=self.scale)
+            constraints = replace(constraints, avoid=scene if camera is None else scene.moved(camera.T.double().numpy()))
         start = time.perf_counter() - begin
         hand, predictor = load_hand(self.hand), GraspPredictor(self.weights, self.device)
         seconds = {"start": start, "load": time.perf_counter() - begin - start}
@@ -152,7 +167,7 @@ class Generate:
         seconds |= {**made.seconds, "trial": time.perf_counter() - middle if simulated else 0.0}
         report = {
             "hand": job.hand.name, "object": obj.name, "num": len(grasps), "asked": self.num, "shortage": made.shortage,
-            "candidates": made.candidates,
+            "candidates": made.candidates, "dropped": made.dropped,
             "origin": dict(Counter(made.origin)),
             "seed": self.seed, "weights": job.predictor.weights_name, "protocol": self._protocol(obj),
             "success": int(grasps.success.sum()) if simulated else None,
@@ -221,6 +236,9 @@ class Generate:
         seconds = "  ".join(f"{k} {v:.2f} s" for k, v in report["seconds"].items())
         print_table(f"{report['hand']} on {report['object']}", columns, rows)
         say(seconds)
+        if report["dropped"]:
+            reasons = ", ".join(f"{count} {reason}" for reason, count in report["dropped"].items())
+            say(f"{report['candidates']} candidates; dropped: {reasons}")
         if report["success"] is not None:
             say(f"{report['success']} of {report['num']} grasps succeeded under protocol {report['protocol']}")
             for line in diagnose(grasps):

@@ -92,9 +92,9 @@ class Scene:
             return
         flat = float(np.linalg.norm(obj.cloud_normals[on].mean(0)))
         if flat < SAME_SIDE or on.mean() > 0.5:
-            raise ObjectError(f"the scene to avoid, '{self.name}', contains object '{obj.name}': {100 * on.mean():.0f} % of the "
-                              "object's surface lies on it or inside. Cut the object out of the scene, or check that both "
-                              "are in one frame and in metres")
+            raise ObjectError(f"the scene to avoid, '{self.name}', contains object '{obj.name}': {100 * on.mean():.0f} % of "
+                              "the object's surface lies on it or inside. Cut the object out of the scene, or check that "
+                              "both are in one frame and in metres")
 
 
 def load_scene(source: ObjectSource, name: str | None = None, scale: float = 1.0) -> Scene:

@@ -30,7 +30,7 @@ WAYPOINTS = 9
 OPENINGS = 9
 """Steps in which a pregrasp opens (ours)."""
 PLANE, OBSTACLES, SPARED = "in the table", "in the scene to avoid", "in a place to spare"
-"""Where a hand is dropped for; the approach, with the hand in pregrasp and open, counts."""
+"""Where a hand is dropped for; its approach counts."""
 TURNED, BESIDE, NARROW = "turned away", "touching beside the place to hold", "too close in pregrasp"
 """Other reasons for which grasps are dropped."""
 REASONS = {"plane": PLANE, "obstacles": OBSTACLES, "spared": SPARED}
@@ -90,7 +90,7 @@ def facing(problem: GraspProblem, grasps: GraspBatch) -> Bool[Tensor, " n"]:
 def clear(problem: GraspProblem, grasps: GraspBatch, surroundings: Surroundings) -> Bool[Tensor, " n"]:
     """Which complete grasps keep the hand out of surroundings.
 
-    The hand comes along the palm direction, fully open and in pregrasp, grasps and squeezes.
+    The hand is fully open 10 cm back along the palm direction, comes straight in pregrasp, grasps and squeezes.
     """
     near, hand = problem.clearance, problem.hand
     assert near is not None
@@ -98,9 +98,8 @@ def clear(problem: GraspProblem, grasps: GraspBatch, surroundings: Surroundings)
     back = torch.zeros_like(T)
     back[:, :3, 3] = -APPROACH * hand.palm_directions(T)
     opened = hand.canonical_joints(1.0).expand_as(grasps.joints)
-    postures = [(T, grasps.joints), (T, grasps.squeeze_joints)]
-    for share in torch.linspace(0, 1, WAYPOINTS).tolist():
-        postures += [(T + share * back, q) for q in (grasps.pregrasp_joints, opened)]
+    postures = [(T, grasps.joints), (T, grasps.squeeze_joints), (T + back, opened)]
+    postures += [(T + share * back, grasps.pregrasp_joints) for share in torch.linspace(0, 1, WAYPOINTS).tolist()]
     closest = torch.full((len(T),), torch.inf)
     for pose, q in postures:
         distance = near.distance(pose.to(problem.device), q.to(problem.device), surroundings)

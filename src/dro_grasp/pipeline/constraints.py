@@ -40,11 +40,11 @@ class Constraints:
 
     direction: Direction | None = None
     """Palm direction; any by default. Over a table, palms tilt towards it as far as the hand needs room."""
+    table: float | None = None
+    """Height of a plane [m]; the hand stays above it. By default the table that was found in a cloud, if any."""
     cone: float | None = None
     """Largest angle between the palm direction and `direction` [rad]; palms are spread evenly within it and tilt no farther.
     By default palms point roughly along the direction."""
-    table: float | None = None
-    """Height of a plane [m]; the hand stays above it. By default the table that was found in a cloud, if any."""
     avoid: Scene | None = None
     """What else the hand stays clear of: see `load_scene`."""
     hold: tuple[Ball, ...] = ()
@@ -95,8 +95,8 @@ class Constraints:
         if (place := Balls.of(self.hold)) is not None:
             free = place.distances(cloud)[0] <= 0
             if int(free.sum()) < FEWEST_HELD:
-                raise OptionError(f"hold is not on the object: of {len(cloud)} points of its surface {int(free.sum())} are within "
-                                  f"the balls, and it spans {spans} m. Move the balls, or give a larger radius")
+                raise OptionError(f"hold is not on the object: {int(free.sum())} of {len(cloud)} points of its surface are "
+                                  f"within the balls, and it spans {spans} m. Move the balls, or give a larger radius")
         if (place := Balls.of(self.spare)) is not None:
             free &= place.distances(cloud)[0] > 0
             if int(free.sum()) < FEWEST_HELD:
