@@ -23,6 +23,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.trial import record
 from dro_grasp.viewer.app import POSTURES, Posture, describe, postures_of
+from dro_grasp.viewer.constraint_panel import ANY
 from dro_grasp.viewer.pictures import after_closing, contact_points, outcome, shows_held
 from dro_grasp.viewer.stage import ServedPage
 
@@ -30,8 +31,6 @@ FRAME_TIME = 0.04
 """Time between two pictures of a trial [s] (ours)."""
 HELD = "held"
 """The posture after closing."""
-ANY = "any"
-"""The choice of every palm direction."""
 GRASP_FILE = "grasp file (Parquet)"
 """Choice of the grasp file itself among the formats that can be downloaded."""
 EXPORTS = (GRASP_FILE, *(form.title for form in FORMATS.values() if not form.file_per_grasp))
@@ -50,6 +49,8 @@ class ShownGrasps:
     """Best score first."""
     protocol: str
     """Protocol of the trials."""
+    shortage: str | None = None
+    """Why there are fewer than were asked for."""
 
 
 class GraspPage(ServedPage):

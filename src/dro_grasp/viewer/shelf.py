@@ -11,6 +11,7 @@ from dro_grasp.grasps.sources import object_of
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import hand_names, load_hand
 from dro_grasp.objects.catalogue import load_object, object_names
+from dro_grasp.objects.scene import Scene, load_scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.viewer.uploads import store_upload
 
@@ -24,6 +25,7 @@ class Shelf:
         self._paths: dict[str, Path] = {}
         self._hands: dict[str, Hand] = {}
         self._objects: dict[str, ObjectModel] = {}
+        self._scenes: dict[str, Scene] = {}
         self.batches: dict[str, GraspBatch] = {}
         """Grasps of a file, by the name of their object."""
 
@@ -43,7 +45,7 @@ class Shelf:
         path = store_upload(name, content, folder)
         label = path.name
         self._paths[label] = path
-        for kept in (self._hands, self._objects, self.batches):
+        for kept in (self._hands, self._objects, self._scenes, self.batches):
             kept.pop(label, None)
         return label
 
@@ -82,6 +84,16 @@ class Shelf:
             batch = self.batches.get(name)
             self._objects[name] = load_object(self._paths.get(name, name)) if batch is None else object_of(batch, None, 1.0)
         return self._objects[name]
+
+    def scene(self, name: str) -> Scene:
+        """The upload of a name, as a scene to avoid.
+
+        Raises:
+            ObjectError: It cannot be used.
+        """
+        if name not in self._scenes:
+            self._scenes[name] = load_scene(self._paths[name])
+        return self._scenes[name]
 
     def plain(self, text: str) -> str:
         """A message without the folders in which uploads lie."""

@@ -8,7 +8,6 @@ from typing import get_args
 
 import viser
 
-from dro_grasp.frames import HALF_AXES, half_axis_direction
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import hand_names
@@ -21,7 +20,8 @@ from dro_grasp.predictor import GraspPredictor, GraspRequest, Method
 from dro_grasp.simulation.diagnosis import diagnose
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 from dro_grasp.viewer.appearance import waiting_pose
-from dro_grasp.viewer.grasp_page import ANY, GraspPage, ShownGrasps
+from dro_grasp.viewer.constraint_panel import ConstraintPanel
+from dro_grasp.viewer.grasp_page import GraspPage, ShownGrasps
 from dro_grasp.viewer.pictures import protocol_name
 from dro_grasp.viewer.shelf import Shelf
 from dro_grasp.viewer.stage import HOST
@@ -79,14 +79,14 @@ class Studio(GraspPage):
         self._guarded(self._pick_object)
 
     def generate(
-        self, hand: str, obj: str, num: int = GraspRequest.num, direction: str = ANY, temperature: float | None = None,
-        protocol: str = DEFAULT_PROTOCOL, candidates: int = GraspRequest.candidates,
+        self, hand: str, obj: str, num: int = GraspRequest.num, constraints: Constraints | None = None,
+        temperature: float | None = None, protocol: str = DEFAULT_PROTOCOL, candidates: int = GraspRequest.candidates,
         method: Method = GraspRequest.method,
     ) -> ShownGrasps:
         """Predict, refine, rank and evaluate, then show the best; bare clouds get no trial.
 
         Args:
-            direction: One of HALF_AXES, or `any`.
+            constraints: What the grasps have to respect.
             temperature: Of z; the weights' own by default.
             candidates: Proposed for each grasp.
             method: Their source, as in `GraspRequest`.
@@ -94,15 +94,16 @@ class Studio(GraspPage):
         Raises:
             DroGraspError: An argument cannot be used.
         """
-        along = None if direction == ANY else half_axis_direction(direction)
-        problem = GraspProblem(self.shelf.hand(hand), self.shelf.obj(obj), self.predictor.device, Constraints(along))
+        wanted = constraints or Constraints()
+        problem = GraspProblem(self.shelf.hand(hand), self.shelf.obj(obj), self.predictor.device, wanted)
         request = GraspRequest(num, candidates=candidates, temperature=temperature, method=method)
         found = self.predictor.run(problem, request, self._counting("proposing"))
         raw, refined = found.proposed, found.grasps
         if not problem.obj.is_cloud:
             raw, refined = (evaluate(problem, grasps, protocol, self._counting("evaluating")) for grasps in (raw, refined))
-        self.made = ShownGrasps(problem.hand, problem.obj, raw, refined, protocol)
+        self.made = ShownGrasps(problem.hand, problem.obj, raw, refined, protocol, found.shortage)
         self._present()
+        self.panel.draw(wanted, problem.obj)
         return self.made
 
     def _preview(self) -> None:
@@ -146,15 +147,16 @@ class Studio(GraspPage):
             self.candidates = gui.add_slider(
                 "Candidates", 1, MOST_CANDIDATES, 1, GraspRequest.candidates,
                 hint="Candidates proposed for each grasp; the best by score are kept.")
-            self.direction = gui.add_dropdown(
-                "Palm direction", (ANY, *HALF_AXES), initial_value=ANY, hint="-z grasps from above.")
             self.usual = gui.add_checkbox("Usual diversity", True, hint="1 for a mesh, less for a bare point cloud.")
             self.temperature = gui.add_slider(
                 "Diversity", 0.0, 1.0, 0.05, 1.0, disabled=True, hint="0: the likeliest grasp of each placement.")
             self.protocol = gui.add_dropdown("Trial", tuple(PROTOCOLS), initial_value=DEFAULT_PROTOCOL)
             self.button = gui.add_button("Generate", color="green")
+        self.panel = panel = ConstraintPanel(self.server, lambda: self._guarded(self._draw_constraints))
         hand_file.on_upload(lambda _: self._guarded(lambda: self._take(hand_file.value, self.hand)))
         object_file.on_upload(lambda _: self._guarded(lambda: self._take(object_file.value, self.object)))
+        panel.upload.on_upload(lambda _: self._guarded(lambda: self._take_scene(panel.upload.value)))
+        panel.under.on_click(lambda _: self._guarded(self._table_under))
         self.button.on_click(lambda _: self._guarded(self._generate))
         for choice in (self.hand, self.object):
             choice.on_update(lambda event: None if event.client is None else self._guarded(self._pick_object))
@@ -168,6 +170,23 @@ class Studio(GraspPage):
         self._preview()
         self._say(f"{label} is picked. {self.status.content}")
 
+    def _take_scene(self, upload: viser.UploadedFile) -> None:
+        """Store a scene, pick it and show it."""
+        label = self.shelf.take(upload.name, upload.content)
+        self.panel.avoid.options = tuple(dict.fromkeys([*self.panel.avoid.options, label]))
+        self.panel.avoid.value = label
+        self._draw_constraints()
+
+    def _table_under(self) -> None:
+        """Put the table under the chosen object."""
+        self.panel.put_under(self.shelf.obj(self.object.value))
+        self._draw_constraints()
+
+    def _draw_constraints(self) -> None:
+        """Show what the controls ask for."""
+        self.panel.draw(self.panel.constraints(self.shelf.scene), self.shelf.obj(self.object.value))
+        self._say("Grasps of the next click respect these constraints.")
+
     def _counting(self, what: str) -> Callable[[int, int], None]:
         """What tells the progress of some work on the page."""
         return lambda done, total: self._say(f"{what}: {done} of {total}")
@@ -177,9 +196,10 @@ class Studio(GraspPage):
         begin = time.perf_counter()
         temperature = None if self.usual.value else float(self.temperature.value)
         made = self.generate(
-            self.hand.value, self.object.value, int(self.num.value), self.direction.value, temperature, self.protocol.value,
-            int(self.candidates.value), self.method.value)
+            self.hand.value, self.object.value, int(self.num.value), self.panel.constraints(self.shelf.scene), temperature,
+            self.protocol.value, int(self.candidates.value), self.method.value)
         held = "" if made.obj.is_cloud else (
             f", **{int(made.refined.success.sum())}** held under *{self.protocol.value}*")
-        lines = [f"{len(made.refined)} grasps{held}; {time.perf_counter() - begin:.1f} s", *diagnose(made.refined)]
+        short = [] if made.shortage is None else [made.shortage]
+        lines = [f"{len(made.refined)} grasps{held}; {time.perf_counter() - begin:.1f} s", *short, *diagnose(made.refined)]
         self._say("  \n".join(lines))
