@@ -26,7 +26,7 @@ from dro_grasp.hands.variants import vary_hand as vary_hand
 from dro_grasp.models.checkpoints import load_weights as load_weights, save_weights as save_weights
 from dro_grasp.models.presets import NetworkConfig as NetworkConfig
 from dro_grasp.objects.catalogue import load_object as load_object, object_names as object_names
-from dro_grasp.objects.scene import Scene as Scene, load_scene as load_scene
+from dro_grasp.objects.scenery import Scene as Scene, load_scene as load_scene
 from dro_grasp.objects.shape import ObjectModel as ObjectModel
 from dro_grasp.optimization.finger_closing import ClosingConfig as ClosingConfig
 from dro_grasp.optimization.grip import GripConfig as GripConfig

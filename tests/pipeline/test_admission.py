@@ -17,7 +17,7 @@ from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.objects.scene import Scene, load_scene
+from dro_grasp.objects.scenery import Scene, load_scene
 from dro_grasp.pipeline.admission import BESIDE, NARROW, OBSTACLES, PLANE, SPARED, TURNED, permitted, reasons_against
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem

@@ -102,7 +102,7 @@ class Generate:
         from dro_grasp.frames import read_motion
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.catalogue import resolve_objects
-        from dro_grasp.objects.scene import load_scene
+        from dro_grasp.objects.scenery import load_scene
         from dro_grasp.pipeline.constraints import Constraints
         from dro_grasp.predictor import GraspPredictor, GraspRequest
 

@@ -11,7 +11,7 @@ import viser
 from dro_grasp.errors import OptionError
 from dro_grasp.frames import HALF_AXES, half_axis_direction
 from dro_grasp.geometry.balls import Ball
-from dro_grasp.objects.scene import Scene
+from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.viewer.stage import rgb
@@ -22,8 +22,12 @@ NOTHING = "nothing"
 """The choice of no scene."""
 TABLE_SIZE = 0.5
 """Edge of the table that is drawn [m] (ours)."""
-AVOIDED, HELD, TABLE = (0.75, 0.35, 0.3), (0.3, 0.65, 0.4), (0.82, 0.80, 0.76)
-"""Colours of what is avoided, of what is held, and of the table (ours)."""
+AVOIDED = (0.75, 0.35, 0.3)
+"""Colour of what the hand stays clear of (ours)."""
+HELD = (0.3, 0.65, 0.4)
+"""Colour of the place to hold (ours)."""
+TABLE = (0.82, 0.80, 0.76)
+"""Colour of the table (ours)."""
 
 
 class ConstraintPanel:

@@ -11,7 +11,7 @@ from dro_grasp.grasps.sources import object_of
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import hand_names, load_hand
 from dro_grasp.objects.catalogue import load_object, object_names
-from dro_grasp.objects.scene import Scene, load_scene
+from dro_grasp.objects.scenery import Scene, load_scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.viewer.uploads import store_upload
 
