@@ -14,10 +14,10 @@ from dro_grasp.devices import on_device
 from dro_grasp.energy import terms as energies
 from dro_grasp.energy.clearance import Clearance
 from dro_grasp.energy.contact_candidates import ContactCandidates, ContactConfig, contact_candidates
-from dro_grasp.energy.holding import Holding
 from dro_grasp.energy.link_points import LinkPoints
 from dro_grasp.energy.link_spheres import link_spheres
 from dro_grasp.energy.surroundings import Surroundings
+from dro_grasp.energy.touching import Touching
 from dro_grasp.geometry import se3
 from dro_grasp.geometry.balls import Balls
 from dro_grasp.geometry.distance_field import DistanceField
@@ -159,7 +159,7 @@ class GraspEnergy:
             body = LinkPoints.of(few.link_points, few.link_index, hand.tree.n_links)
             self.clearance = Clearance(
                 hand, self.room.surroundings, body, self.ball, self.spheres.radii, config.clear, config.clearance)
-        self.holding = None if self.room.hold is None else Holding(self.room.hold, config.clear)
+        self.touching = None if self.room.hold is None else Touching(self.room.hold, config.clear)
         self.lower = torch.where(hand.opening_signs > 0, hand.lower + room, hand.lower)
         self.upper = torch.where(hand.opening_signs > 0, hand.upper, hand.upper - room)
 
@@ -182,10 +182,10 @@ class GraspEnergy:
         distance, gradient = self.field.distances(body)
         inside = energies.penetration(distance - config.margin, gradient)
         beside, by_point = torch.zeros_like(T_object_wrist[:, :1, 0]), config.penetration * inside.by_point
-        if self.holding is not None:
-            off = self.holding.push(body, distance, gradient)
+        if self.touching is not None:
+            off = self.touching.push(body, distance, gradient)
             beside, by_point = config.clearance * off.value.sum(-1, keepdim=True), by_point + config.clearance * off.by_point
-            pulled, by_link = self._pull(self.holding, poses, contacts)
+            pulled, by_link = self._pull(self.touching, poses, contacts)
             beside, wrenches = beside + pulled, wrenches + by_link
         wrenches = wrenches + energies.link_wrenches(body, by_point, self.body.members)
         spheres = self.ball.place(poses)
@@ -224,8 +224,8 @@ class GraspEnergy:
         poses = T_object_wrist[:, None] @ self.hand.tree.forward(q)
         points = self.contact_points.place(poses)
         distance = self.field.distances(points)[0].abs()
-        if self.holding is not None:
-            distance = distance + self.holding.pull(points).value
+        if self.touching is not None:
+            distance = distance + self.touching.pull(points).value
         taken = torch.zeros_like(distance)
         allowed = candidates.slot_weights > 0
         nearest = torch.where(allowed, distance[:, None], torch.inf).amin(-1)
@@ -269,13 +269,13 @@ class GraspEnergy:
         return (closure.value.sum(-1), apart.value.sum(-1), align.value.sum(-1)), wrenches
 
     def _pull(
-        self, holding: Holding, poses: Float[Tensor, "n n_links 4 4"], contacts: Int[Tensor, "n c"]
+        self, touching: Touching, poses: Float[Tensor, "n n_links 4 4"], contacts: Int[Tensor, "n c"]
     ) -> tuple[Float[Tensor, "n 1"], Float[Tensor, "n n_links 6"]]:
         """Weighted distance of the contacts to the place to hold, and their wrenches on the links."""
         links = self.candidates.links[contacts]
         chosen = poses[torch.arange(len(poses), device=links.device)[:, None], links]
         points = se3.apply(chosen, self.candidates.points[contacts])
-        pull = holding.pull(points)
+        pull = touching.pull(points)
         by_point = self.config.clearance * pull.by_point
         moment = torch.linalg.cross(points, by_point, dim=-1)
         wrenches = self.one_hot[links].transpose(-1, -2) @ torch.cat([by_point, moment], -1)

@@ -9,7 +9,7 @@ from dro_grasp.energy.terms import PointTerm
 from dro_grasp.geometry.balls import Balls
 
 
-class Holding:
+class Touching:
     """A place on an object, as balls, in which all contacts are to be."""
 
     def __init__(self, place: Balls, clear: float) -> None:
