@@ -57,5 +57,6 @@ class Surroundings:
 
     def to(self, device: torch.device | str) -> Surroundings:
         """The same on another device."""
-        obstacles, spared = (None if part is None else on_device(part, device) for part in (self.obstacles, self.spared))
-        return Surroundings(None if self.plane is None else self.plane.to(device), obstacles, spared)
+        plane = None if self.plane is None else self.plane.to(device)
+        obstacles = None if self.obstacles is None else on_device(self.obstacles, device)
+        return Surroundings(plane, obstacles, None if self.spared is None else on_device(self.spared, device))

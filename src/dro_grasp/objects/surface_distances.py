@@ -63,7 +63,7 @@ def banded_values(
     nearest = minimum_filter(np.abs(coarse), 2)[corner]
     turns = minimum_filter(coarse, 2)[corner] * maximum_filter(coarse, 2)[corner] <= 0
     close = turns | (nearest < NEAR + math.sqrt(3) / 2 * STRIDE * spacing)
-    index = np.indices(counts).reshape(3, -1)
+    index = np.indices(tuple(counts)).reshape(3, -1)
     own = np.minimum(index // STRIDE, cells[:, None] - 1)
     exact = close[tuple(own)]
     values = map_coordinates(coarse, index / STRIDE, order=1, mode="nearest")
@@ -73,7 +73,7 @@ def banded_values(
 
 def _places(low: Float[np.ndarray, "3"], counts: Int[np.ndarray, "3"], spacing: float) -> Float[np.ndarray, "n 3"]:
     """Points of a grid [m]."""
-    return low + spacing * np.indices(counts).reshape(3, -1).T
+    return low + spacing * np.indices(tuple(counts)).reshape(3, -1).T
 
 
 def cloud_distances(

@@ -16,9 +16,9 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.viewer.stage import rgb
 
-ANY = "any"
+ANY: str = "any"
 """The choice of every palm direction."""
-NOTHING = "nothing"
+NOTHING: str = "nothing"
 """The choice of no scene."""
 TABLE_SIZE = 0.5
 """Edge of the table that is drawn [m] (ours)."""
@@ -50,7 +50,7 @@ class ConstraintPanel:
             self.hold = gui.add_text("Hold", "", hint="x y z radius [m], more after a semicolon: the only places to touch.")
             self.spare = gui.add_text("Spare", "", hint="x y z radius [m], more after a semicolon: places to stay out of.")
             self.opening = gui.add_text("Opening [mm]", "", hint="Least distance from closing fingers to the object, before.")
-            self.avoid = gui.add_dropdown("Avoid", (NOTHING,), initial_value=NOTHING, hint="A scene without the object.")
+            self.avoid = gui.add_dropdown("Avoid", tuple([NOTHING]), initial_value=NOTHING, hint="A scene without the object.")
             kinds = ".stl,.obj,.ply,.glb,.off,.npy,.pcd"
             self.upload = gui.add_upload_button("Upload a scene to avoid", mime_type=kinds)
         for control in (self.table, self.hold, self.spare, self.avoid):
