@@ -55,6 +55,22 @@ def test_answers_are_the_predictors_grasps(answerer: Answerer) -> None:
     assert scan.grasps[0].success is None
 
 
+def test_a_scene_is_avoided_in_the_frame_of_the_grasps(answerer: Answerer) -> None:
+    wall, T = np.array([[0.06, y, z] for y in np.linspace(-0.2, 0.2, 40) for z in np.linspace(-0.2, 0.2, 40)]), np.eye(4)
+    T[0, 3] = 0.01
+    for camera, points in ((None, wall), ({"frame": "base", "T_frame_camera": T.tolist()}, wall - T[:3, 3])):
+        call = GraspCall(hand="gripper3", object="can", avoid={"points": points.tolist()}, camera=camera)
+        scene = answerer.scene(call.avoid, call.camera)
+        expected = dro.load_scene(points).moved(np.eye(4) if camera is None else T)
+        np.testing.assert_allclose(scene.points, expected.points)
+        assert answerer.scene(call.avoid, call.camera) is scene
+    assert answerer.scene(None, None) is None
+    asked = ask(answerer, "can", num=1, avoid={"points": wall.tolist()}, hold=[[0, 0, 0, 0.3]])
+    avoiding = dro.Constraints(avoid=dro.load_scene(wall), hold=((0.0, 0.0, 0.0, 0.3),))
+    hand, can = dro.load_hand("gripper3"), dro.load_object("can")
+    check(asked, answerer.predictor.predict(hand, can, 1, constraints=avoiding, **QUICK))
+
+
 def test_what_was_sent_or_named_once_stays_loaded(answerer: Answerer) -> None:
     stl = TUBE.export(file_type="stl")
     first = answerer.object(GraspCall(hand="", object=sent_file("tube.stl", stl)).object, None)
@@ -88,6 +104,7 @@ SPHERE = trimesh.creation.icosphere(1, 0.03).vertices.tolist()
     ({"num": 0}, "num is 0"), ({"direction": [0, 0, 0]}, "no direction"), ({"seed": -1}, "seed is -1"),
     ({"num": 1001}, "at most 1000"), ({"object": {"points": [[0, 0, 0.1]] * 40}}, "1 distinct points"),
     ({"object": {"points": SPHERE}, "protocol": "dro"}, "no trial"), ({"object": {"points": []}}, "distinct points"),
+    ({"avoid": "/etc/passwd"}, "avoid names '/etc/passwd'"), ({"avoid": {"points": []}}, "holds no point"),
     ({"camera": {"frame": "base", "T_frame_camera": np.eye(4).tolist()}}, "send the cloud"),
     ({"camera": {"frame": "base", "T_frame_camera": np.zeros((4, 4)).tolist()}, "object": {"points": SPHERE}}, "last row"),
 ])

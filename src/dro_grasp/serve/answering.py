@@ -6,13 +6,16 @@ import hashlib
 import tempfile
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from dro_grasp.errors import DroGraspError, HandError, ObjectError, OptionError
 from dro_grasp.frames import motion_fault
@@ -21,6 +24,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import hand_names, load_hand
 from dro_grasp.objects.catalogue import load_object, object_names, resolve_objects
 from dro_grasp.objects.loading import read_points
+from dro_grasp.objects.scenery import Scene, load_scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.scan import scanned_object
 from dro_grasp.pipeline.constraints import Constraints
@@ -34,6 +38,8 @@ KEPT_HANDS = 16
 """Most hands that stay loaded (ours)."""
 KEPT_OBJECTS = 32
 """Most objects that stay loaded (ours); sent ones count."""
+KEPT_SCENES = 8
+"""Most scenes to avoid that stay loaded (ours)."""
 KEPT_PROBLEMS = 8
 """Most pairs of hand and object, with constraints, of which all that was derived stays (ours)."""
 LARGEST_REQUEST = 1_000
@@ -90,6 +96,7 @@ class Answerer:
         self.own_objects = {Path(name).stem: name for name in resolve_objects(list(stock.objects))}
         self.hands: Kept[Hand] = Kept(KEPT_HANDS)
         self.objects: Kept[ObjectModel] = Kept(KEPT_OBJECTS)
+        self.scenes: Kept[Scene] = Kept(KEPT_SCENES)
         self.problems: Kept[GraspProblem] = Kept(KEPT_PROBLEMS)
 
     def answer(self, call: Any, progress: Progress | None = None) -> GraspAnswer:
@@ -103,7 +110,8 @@ class Answerer:
             DroGraspError: The request cannot be met.
         """
         begin = time.perf_counter()
-        request, constraints = settings_in(call, GraspRequest), settings_in(call, Constraints)
+        request = settings_in(call, GraspRequest)
+        constraints = settings_in(call, Constraints, avoid=self.scene(call.avoid, call.camera))
         if request.num * request.candidates > LARGEST_REQUEST:
             raise OptionError(f"{request.num} grasps of {request.candidates} candidates each are asked for; a server makes at "
                               f"most {LARGEST_REQUEST} candidates at once, `dro-grasp generate` more")
@@ -158,36 +166,69 @@ class Answerer:
         if sent.name is not None and sent.name not in (known := self.object_names()):
             raise ObjectError(f"this server knows no object '{sent.name}', but {', '.join(known[:12])} and others (page "
                               "/objects); send the mesh or cloud, or start the server with --object FILE")
-        key = hashlib.sha256(sent.model_dump_json(exclude={"file": {"content"}}).encode())
-        key.update(b"" if sent.file is None else sent.file.content)
-        key.update(b"" if camera is None else camera.model_dump_json().encode())
-        return key.digest(), self.objects.get(key.digest(), lambda: self._load(sent, camera))
+        key = content_key(sent, camera)
+        return key, self.objects.get(key, lambda: self._load(sent, camera))
+
+    def scene(self, sent: SentObject | None, camera: SentCamera | None) -> Scene | None:
+        """What the hand is to avoid, in the frame of the grasps: what was sent, or an object that the server was started with.
+
+        Raises:
+            ObjectError: It cannot be used.
+        """
+        if sent is None:
+            return None
+        if sent.name is not None and sent.name not in self.own_objects:
+            raise ObjectError(f"avoid names '{sent.name}', which the server was not started with; send the mesh or cloud")
+
+        def load() -> Scene:
+            with unpacked(sent, self.own_objects) as source:
+                scene = load_scene(source, scale=sent.scale)
+                return scene if camera is None else scene.moved(camera_pose(camera).numpy())
+
+        return self.scenes.get(content_key(sent, camera), load)
 
     def _load(self, sent: SentObject, camera: SentCamera | None) -> ObjectModel:
-        source, options = sent.name, {"scale": sent.scale, "keep_table": sent.keep_table}
-        if source is not None:
-            return load_object(self.own_objects.get(source, source), **options)
+        with unpacked(sent, self.own_objects) as source:
+            if camera is None:
+                return replace(load_object(source, scale=sent.scale, keep_table=sent.keep_table), file=None)
+            T, named = camera_pose(camera), isinstance(source, Path)
+            points = read_points(source) if named else source
+            return scanned_object(source.stem if named else "cloud", points * sent.scale, T.numpy(), keep_table=sent.keep_table)
+
+
+def content_key(sent: SentObject, camera: SentCamera | None) -> bytes:
+    """What tells objects apart: all that was sent of them."""
+    key = hashlib.sha256(sent.model_dump_json(exclude={"file": {"content"}}).encode())
+    key.update(b"" if sent.file is None else sent.file.content)
+    key.update(b"" if camera is None else camera.model_dump_json().encode())
+    return key.digest()
+
+
+@contextmanager
+def unpacked(sent: SentObject, own: Mapping[str, str]) -> Iterator[Any]:
+    """What an object or scene is loaded from: a name or own file, points, or a sent file, alone in a folder of its own."""
+    if sent.name is not None:
+        yield own.get(sent.name, sent.name)
+    elif sent.file is None:
+        yield np.array(sent.points, np.float64).reshape(-1, 3)
+    else:
         with tempfile.TemporaryDirectory(prefix="dro-grasp-") as folder:
             try:
-                if camera is not None:
-                    return self._scan(sent, camera, Path(folder))
-                if sent.file is None:
-                    return load_object(np.array(sent.points, np.float64).reshape(-1, 3), **options)
-                obj = load_object(store_upload(sent.file.name, sent.file.content, Path(folder)), **options)
-                return replace(obj, file=None)
+                yield store_upload(sent.file.name, sent.file.content, Path(folder))
             except DroGraspError as error:
                 raise type(error)(str(error).replace(f"{folder}/", "")) from error
 
-    def _scan(self, sent: SentObject, camera: SentCamera, folder: Path) -> ObjectModel:
-        T = torch.tensor(camera.T_frame_camera, dtype=torch.float64)
-        if (fault := motion_fault(T)) is not None:
-            raise OptionError(f"T_frame_camera must be 4 rows of 4 numbers, in metres; {fault}")
-        if sent.file is None:
-            name, points = "cloud", np.array(sent.points, np.float64).reshape(-1, 3)
-        else:
-            path = store_upload(sent.file.name, sent.file.content, folder)
-            name, points = path.stem, read_points(path)
-        return scanned_object(name, points * sent.scale, T.numpy(), keep_table=sent.keep_table)
+
+def camera_pose(camera: SentCamera) -> Float[Tensor, "4 4"]:
+    """The camera's pose in the named frame [m].
+
+    Raises:
+        OptionError: It is no rigid motion.
+    """
+    T = torch.tensor(camera.T_frame_camera, dtype=torch.float64)
+    if (fault := motion_fault(T)) is not None:
+        raise OptionError(f"T_frame_camera must be 4 rows of 4 numbers, in metres; {fault}")
+    return T
 
 
 def sent_grasps(grasps: GraspBatch, made: Prediction) -> list[SentGrasp]:

@@ -43,18 +43,15 @@ class GraspClient:
             obj: The path of a mesh or cloud, which is sent; the name of an object that the server knows; or points [m].
             num: Grasps to return.
             options: What else a request holds, such as direction, table, camera, protocol; scale and keep_table are the
-                object's.
+                object's, and avoid is a path or points, as the object is.
 
         Raises:
             ServerError: The server refuses, fails or is not there.
         """
         of_object = {name: options.pop(name) for name in ("scale", "keep_table") if name in options}
-        if isinstance(obj, np.ndarray):
-            np.save(file := io.BytesIO(), obj)
-            sent = sent_file("cloud.npy", file.getvalue())
-        else:
-            sent = sent_file(Path(obj).name, Path(obj).read_bytes()) if Path(obj).is_file() else {"name": str(obj)}
-        return self.ask("POST", "/grasps", {"hand": hand, "object": sent | of_object, "num": num, **options})
+        if "avoid" in options:
+            options["avoid"] = sent_object(options["avoid"])
+        return self.ask("POST", "/grasps", {"hand": hand, "object": sent_object(obj) | of_object, "num": num, **options})
 
     def cancel(self, name: str) -> None:
         """Cancel the request of this id."""
@@ -79,6 +76,14 @@ class GraspClient:
                               "give GraspClient a longer timeout") from error
         except (URLError, OSError) as error:
             raise ServerError(f"no grasp server answers at {self.url} ({error}); start one with `dro-grasp serve`") from error
+
+
+def sent_object(obj: str | Path | Float[np.ndarray, "n 3"]) -> dict[str, Any]:
+    """An object as a request holds it: its file's bytes, its points as a file, or its name."""
+    if isinstance(obj, np.ndarray):
+        np.save(file := io.BytesIO(), obj)
+        return sent_file("cloud.npy", file.getvalue())
+    return sent_file(Path(obj).name, Path(obj).read_bytes()) if Path(obj).is_file() else {"name": str(obj)}
 
 
 def sent_file(name: str, content: bytes) -> dict[str, Any]:

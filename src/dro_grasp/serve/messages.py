@@ -100,7 +100,7 @@ class _Call(Message):
     """Name of the request, by which it can be cancelled."""
 
 
-WIRE_TYPES: dict[str, Any] = {}
+WIRE_TYPES: dict[str, Any] = {"avoid": SentObject | None}
 """Types as JSON of those fields whose types in Python are none (ours)."""
 
 
@@ -132,14 +132,19 @@ GraspCall: Any = create_model(
     **fields_of(GraspRequest), **fields_of(Constraints))
 
 
-def settings_in(call: Any, settings: type[Settings]) -> Settings:
+def settings_in(call: Any, settings: type[Settings], **loaded: Any) -> Settings:
     """The dataclass whose fields a GraspCall holds.
+
+    Args:
+        call: What is asked.
+        settings: Its class.
+        loaded: Fields whose values were made of what the call holds.
 
     Raises:
         OptionError: A value is out of range.
     """
     names = [f.name for f in fields(settings) if f.name in type(call).model_fields]  # type: ignore[arg-type]
-    return settings(**{name: getattr(call, name) for name in names})
+    return settings(**{name: getattr(call, name) for name in names} | loaded)
 
 
 class SentGrasp(Message):
