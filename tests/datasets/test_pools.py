@@ -152,7 +152,7 @@ def test_a_killed_parent_leaves_whole_shards_and_no_process_and_a_rerun_finishes
 def test_a_second_run_into_a_folder_is_refused_and_the_first_goes_on(tmp_path):
     with (
         sole_run(tmp_path),
-        pytest.raises(OutputError, match=rf"another run is filling .* \(process {os.getpid()}\)"),
+        pytest.raises(OutputError, match=rf"another run is filling .* \(process {os.getpid()} on"),
     ):
         synthesize_dataset(["a"], ["x"], 1, tmp_path, workers=pool(engine_work.easy))
     report = synthesize_dataset(["a"], ["x"], 1, tmp_path, progress=lambda _: None, workers=pool(engine_work.easy, 1))

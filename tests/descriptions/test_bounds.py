@@ -63,6 +63,13 @@ def test_an_mjcf_that_grows_or_contains_itself_is_refused(tmp_path: Path, text: 
         load_description(written(tmp_path, text, "claw.xml"))
 
 
+def test_a_urdf_with_the_plugins_of_a_simulator_loads(tmp_path: Path) -> None:
+    simulated = '<gazebo><plugin name="control" filename="libgazebo_ros_control.so"/></gazebo></robot>'
+    text = claw().replace("</robot>", simulated)
+    assert simulated in text
+    assert load_hand(written(tmp_path, text)).tree.joint_names == ("a", "b")
+
+
 def test_long_chains_and_many_joints_are_refused(tmp_path: Path) -> None:
     chain = claw(links="".join(link(f"l{i}") for i in range(150)), joints="".join(
         joint(f"j{i}", f"l{i - 1}" if i else "palm", f"l{i}", "0 0 0.01") for i in range(150)))

@@ -18,7 +18,7 @@ from dro_grasp.grasps.controller import completed
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.simulation import trial as trials
+from dro_grasp.simulation import rollout as rollouts, trial as trials
 from dro_grasp.simulation.contacts import count_fingers, measure_penetration
 from dro_grasp.simulation.outcome import Failure, TrialResult, verdict
 from dro_grasp.simulation.perturbation import Conditions, draw
@@ -203,7 +203,7 @@ def test_result_depends_neither_on_workers_nor_on_company(hand, obj, monkeypatch
     assert first.protocol == "robust/1"
     assert 0 < int(first.success.sum()) < len(grasps)
     same(first, simulate(hand, obj, grasps, "robust", workers=2))
-    monkeypatch.setattr(trials, "CHUNK", 2)
+    monkeypatch.setattr(rollouts, "CHUNK", 2)
     order = torch.tensor([5, 0, 6, 3, 1])
     same(first.rows(order), simulate(hand, obj, grasps[order], "robust", workers=2))
 

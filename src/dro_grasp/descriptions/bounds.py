@@ -60,7 +60,7 @@ def check_elements(root: ET.Element, path: Path) -> None:
         if depth > DEEPEST or elements > MOST_ELEMENTS or links > MOST_LINKS:
             raise HandError(f"{path} has more than {DEEPEST} elements within each other, {MOST_LINKS} links, or "
                             f"{MOST_ELEMENTS} elements; expected a robot hand, leave out what is not part of it")
-        if element.tag in UNUSED:
+        if element.tag in UNUSED and root.tag == "mujoco":  # in a URDF these belong to simulators, and nobody here reads them
             raise HandError(f"{path} has <{element.tag}>, which is no part of a rigid hand; remove it")
         if element.tag == "texture" and max(_whole(element, "width"), _whole(element, "height")) > MOST_PIXELS:
             raise HandError(f"{path} has a <texture> wider or higher than {MOST_PIXELS} pixels; remove it")

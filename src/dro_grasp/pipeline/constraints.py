@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 
@@ -54,6 +54,10 @@ class Constraints:
     opening: float | None = None
     """Least distance between the object and every link that closes, in pregrasp [m]: by so much may hand and object be off
     their places. The pregrasp opens as far as that takes. By default it opens by a quarter of what is left."""
+
+    def __repr__(self) -> str:
+        given = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) != f.default}
+        return f"Constraints({', '.join(f'{name}={value!r}' for name, value in given.items())})"
 
     def __post_init__(self) -> None:
         """Refuse what cannot be done, before any work.

@@ -1,6 +1,6 @@
 """A method of yours in the benchmark's table. Any function that returns wrist poses and joints will do.
 
-Beside others: `dro-grasp benchmark --method 08_your_method:PinchFromAbove dro --hands barrett --objects can --stages returned`
+Beside others: `dro-grasp benchmark --method 09_your_method:PinchFromAbove dro --hands barrett --objects can --stages returned`
 """
 
 import torch
