@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Any
 
-import uvicorn  # pyright: ignore[reportMissingImports]
-from fastapi import FastAPI, HTTPException, Request  # pyright: ignore[reportMissingImports]
-from fastapi.exceptions import RequestValidationError  # pyright: ignore[reportMissingImports]
-from fastapi.responses import PlainTextResponse, Response  # pyright: ignore[reportMissingImports]
-from starlette.exceptions import HTTPException as AnyHTTPException  # pyright: ignore[reportMissingImports]
+import uvicorn
+from fastapi import FastAPI, HTTPException, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import PlainTextResponse, Response
+from starlette.exceptions import HTTPException as AnyHTTPException
 
 from dro_grasp._version import __version__
 from dro_grasp.errors import OptionError, ServerError
@@ -130,7 +130,7 @@ def application(desk: Desk, access: Access) -> FastAPI:
     app.add_middleware(Gate, access=access)
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(AnyHTTPException, _failed)
-    told = {status: {"model": Refusal} for status in (401, 403, 409, 413, 422, 500, 503, 504)}
+    told: dict[int | str, dict[str, Any]] = {status: {"model": Refusal} for status in (401, 403, 409, 413, 422, 500, 503, 504)}
 
     @app.post("/grasps", response_model=GraspAnswer, responses=told)
     async def grasps(call: GraspCall, request: Request) -> Any:  # pyright: ignore[reportInvalidTypeForm]

@@ -11,7 +11,7 @@ from dataclasses import MISSING, fields
 from itertools import pairwise
 from typing import Any, TypeVar, get_type_hints
 
-from pydantic import (  # pyright: ignore[reportMissingImports]
+from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
