@@ -98,7 +98,8 @@ def closed_cloud_distances(
 ) -> Float[np.ndarray, " n"]:
     """As `cloud_distances`, but a rim that is left open, as under an object on a table, is no inside of its own.
 
-    Behind the rim's discs a point may be far outside. Away from the surface the winding number of the cloud decides.
+    Behind the rim's discs a point may be far outside. Away from the surface the winding number of the cloud decides, and beyond
+    the cloud's extent nothing is inside.
     """
     import igl
 
@@ -107,8 +108,10 @@ def closed_cloud_distances(
     radius = KDTree(cloud).query(cloud, k=count)[0][:, -1]
     area = np.pi * radius**2 / max(1, count - 1)
     far = np.abs(distance) > SURE
-    winding = igl.fast_winding_number(cloud, normals, area, np.ascontiguousarray(points[far]))
-    distance[far] = np.where(np.asarray(winding) > MOSTLY_INSIDE, -1.0, 1.0) * np.abs(distance[far])
+    distance[far] = np.abs(distance[far])
+    deep = far & ((points > cloud.min(0)) & (points < cloud.max(0))).all(1)
+    winding = igl.fast_winding_number(cloud, normals, area, np.ascontiguousarray(points[deep]))
+    distance[deep] *= np.where(np.asarray(winding) > MOSTLY_INSIDE, -1.0, 1.0)
     return distance
 
 

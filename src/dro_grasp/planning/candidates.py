@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from typing import Literal
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dro_grasp.devices import cores, fast_products, one_thread
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
@@ -23,6 +25,8 @@ Directions = Literal["paper", "all"]
 """Palm directions that are asked for."""
 PAPER_DIRECTIONS = 32
 """Palm directions of the paper, from above to the right side."""
+PARTS = 2
+"""Parts that grasps from all directions are made in, side by side where there are cores (ours)."""
 
 
 def paper_directions(count: int) -> Float[Tensor, "k 3"]:
@@ -35,8 +39,6 @@ def paper_directions(count: int) -> Float[Tensor, "k 3"]:
     return every[torch.linspace(0, len(every) - 1, min(count, len(every))).round().long()]
 
 
-# no_grad, not inference_mode: roma caches a tensor at first use, which training could then not use.
-@torch.no_grad()
 def grasps_in_world(
     predictor: GraspPredictor, hand: Hand, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"], num: int,
     directions: Directions = "all", table: float | None = None, seed: int = 0,
@@ -55,13 +57,22 @@ def grasps_in_world(
     """
     T = torch.from_numpy(T_world_object).float()
     height = None if table is None else table - float(T[2, 3])
-    generator, parts = torch.Generator().manual_seed(seed), []
-    wanted = [None] if directions == "all" else [(x, y, z) for x, y, z in (paper_directions(num) @ T[:3, :3]).tolist()]
-    for i, direction in enumerate(wanted):
-        problem = GraspProblem(hand, obj, predictor.device, Constraints(direction, height))
+    wanted = [None] * min(num, PARTS) if directions == "all" else [
+        (x, y, z) for x, y, z in (paper_directions(num) @ T[:3, :3]).tolist()]
+    seeds = np.random.default_rng(seed).integers(2**31, size=len(wanted)).tolist()
+
+    # no_grad, not inference_mode: roma caches a tensor at first use, which training could then not use.
+    @torch.no_grad()
+    def made(i: int) -> GraspBatch:
+        problem = GraspProblem(hand, obj, predictor.device, Constraints(wanted[i], height))
         count = num * (i + 1) // len(wanted) - num * i // len(wanted)
+        generator = torch.Generator().manual_seed(seeds[i])
         proposed = propose(problem, predictor.network, count, generator, predictor.config).grasps
-        parts.append(scored(problem, refine(problem, proposed)))
+        return scored(problem, refine(problem, proposed))
+
+    obj.distance_field  # noqa: B018  (made once, before the threads share it)
+    with one_thread(), fast_products(), ThreadPoolExecutor(cores()) as threads:
+        parts = list(threads.map(made, range(len(wanted))))
     ranked = GraspBatch.concatenate(parts).sorted_by_score()
     return ranked.replace(T_object_wrist=T @ ranked.T_object_wrist)
 

@@ -6,10 +6,8 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
-import torch
 from jaxtyping import Float, Int
 
-from dro_grasp.geometry.rotations import roma
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.robot_file import Table
@@ -60,8 +58,9 @@ def placed_frame(body: mujoco.MjsBody, T: Float[np.ndarray, "4 4"]) -> mujoco.Mj
 
 def wxyz(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
     """Unit quaternion WXYZ of a rotation."""
-    rotation = roma.special_procrustes(torch.from_numpy(np.asarray(R, np.float64)))
-    return roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(rotation)).numpy()
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, np.asarray(R, np.float64).ravel())
+    return quaternion / np.linalg.norm(quaternion)
 
 
 def add_solids(scene: mujoco.MjSpec, body: mujoco.MjsBody, things: Sequence[ObjectModel], hull: bool = False) -> None:
