@@ -9,32 +9,24 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
 from dro_grasp.errors import DroGraspError, OptionError
-from dro_grasp.geometry.se3 import random_rotations
 from dro_grasp.objects.loading import cloud_object
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.perception.scan import scanned_object
-from dro_grasp.planning.depth_images import depth_image, look
+from dro_grasp.perception.scan import depth_points, scanned_object
+from dro_grasp.planning.clutter import Region, other_objects, scatter
+from dro_grasp.planning.depth_images import depth_image, thinned_intrinsics
 from dro_grasp.planning.motion import STAGES, MotionPlan
 from dro_grasp.planning.physics import LiftScene
 from dro_grasp.planning.planner import PlanConfig, plan
 from dro_grasp.planning.robot import Robot
-from dro_grasp.planning.robot_file import Table
+from dro_grasp.planning.standing import moved
+from dro_grasp.planning.table_scene import pick_object
 from dro_grasp.predictor import GraspPredictor
 
-VERSION = 1
+VERSION = 2
 """Goes up with every change that can change an outcome."""
-DROP = 0.005
-"""Height above the table from which an object comes to rest [m] (ours)."""
-REST_SECONDS = 4.0
-"""Longest time in which it comes to rest [s] (ours)."""
-REST_SPEED = 0.002
-"""Speed below which it rests [m/s] (ours)."""
-DRAWS = 20
-"""How often it is put down anew if it rolls off the region (ours)."""
 PUSHED = 0.03
 """Farthest that the object may move before the hand closes [m] (ours)."""
 SLIPPED = 0.05
@@ -53,8 +45,12 @@ class TabletopConfig:
     """What is planned for: the cloud of the robot's camera alone, or, as a control, the true mesh at its true place."""
     noise: float = 0.0015
     """Standard deviation of depth [m]."""
-    region: tuple[float, float, float, float] = (0.38, -0.18, 0.58, 0.18)
-    """Least x and y, greatest x and y of where objects are put [m, from the arm's base]."""
+    region: Region = (0.38, -0.18, 0.58, 0.18)
+    """Where objects are put."""
+    clutter: int = 0
+    """Other objects, drawn from the built-in ones, that stand around the one that is asked for."""
+    segment: Literal["cluster", "mask"] = "cluster"
+    """How its points are told from those of others: by distance, from a place near its middle, or by its true mask."""
     hold_seconds: float = 3.0
     """How long the object is held [s]."""
     shake_seconds: float = 2.0
@@ -103,6 +99,8 @@ class Attempt:
     """Of one core, from the depth image to the timed plan [s]; the others are by the clock, whatever else runs."""
     motion_seconds: float = 0.0
     """Duration of the planned motion [s]."""
+    pushed: float = 0.0
+    """Farthest that one of the other objects was moved [m]."""
 
 
 Watch = Callable[[LiftScene], None]
@@ -129,19 +127,19 @@ def attempt(
     """
     config = config or TabletopConfig()
     _check(robot, obj, config)
-    scene = LiftScene(robot, [obj])
+    scene = LiftScene(robot, [obj, *other_objects(obj.name, config.clutter, np.random.default_rng([seed, number, 1]))])
     result = Attempt(robot.name, obj.name, number, seed, config.label())
     draw = np.random.default_rng([seed, number])
-    if not rest(scene, 0, config, draw):
-        return replace(result, stage="see", reason="the object rolls off the region wherever it is put")
-    start = scene.pose(0)
+    if not scatter(scene, config.region, draw):
+        return replace(result, stage="see", reason="an object rolls off the region wherever it is put")
+    start, *others = (scene.pose(i) for i in range(len(scene.objects)))
     result = replace(result, place=json.dumps(start.round(6).tolist()))
     begin, processor = time.perf_counter(), time.process_time()
     try:
-        seen, T, level = _see(scene, config, int(draw.integers(2**31)))
+        seen, T, level, obstacles = _see(scene, config, int(draw.integers(2**31)))
         see_seconds = time.perf_counter() - begin
         result, begin = replace(result, stage="plan", see_seconds=see_seconds), time.perf_counter()
-        made = plan(level, seen, T, (), predictor, config.plan, seed + number)
+        made = plan(level, seen, T, obstacles, predictor, config.plan, seed + number)
     except DroGraspError as error:
         return replace(result, reason=str(error))
     notes = made.notes
@@ -151,29 +149,8 @@ def attempt(
         motion_seconds=made.seconds)
     stage, reason = carry_out(scene, made, config, watch)
     raised = float(scene.pose(0)[2, 3] - start[2, 3])
-    return replace(result, stage=stage, reason=reason, success=not reason, raised=raised)
-
-
-def rest(scene: LiftScene, index: int, config: TabletopConfig, draw: np.random.Generator) -> bool:
-    """Drop an object in a random orientation at a random place, and wait until it rests there; False if it never does."""
-    low, high = np.array(config.region[:2]), np.array(config.region[2:])
-    table, obj = scene.robot.table or Table(), scene.objects[index]
-    assert obj.vertices is not None
-    for _ in range(DRAWS):
-        generator = torch.Generator().manual_seed(int(draw.integers(2**31)))
-        T = np.eye(4)
-        T[:3, :3] = random_rotations(1, generator)[0].double().numpy()
-        T[:2, 3] = scene.robot.T_world_base[:2, 3] + draw.uniform(low, high)
-        T[2, 3] = table.height + DROP - float((obj.vertices @ T[2, :3]).min())
-        scene.place(index, T)
-        for _ in range(round(REST_SECONDS / 0.5)):
-            scene.advance(0.5)
-            if scene.speed(index) < REST_SPEED:
-                break
-        place = scene.pose(index)[:2, 3] - scene.robot.T_world_base[:2, 3]
-        if scene.speed(index) < REST_SPEED and (place > low - 0.05).all() and (place < high + 0.05).all():
-            return True
-    return False
+    pushed = max((_apart(scene.pose(i), T) for i, T in enumerate(others, 1)), default=0.0)
+    return replace(result, stage=stage, reason=reason, success=not reason, raised=raised, pushed=pushed)
 
 
 def carry_out(scene: LiftScene, made: MotionPlan, config: TabletopConfig, watch: Watch | None = None) -> tuple[str, str]:
@@ -207,23 +184,32 @@ def carry_out(scene: LiftScene, made: MotionPlan, config: TabletopConfig, watch:
     return "done", ""
 
 
-def _see(scene: LiftScene, config: TabletopConfig, seed: int) -> tuple[ObjectModel, Float[np.ndarray, "4 4"], Robot]:
-    """The object as it is known, where its frame is, and the robot with the table that was seen."""
+def _see(
+    scene: LiftScene, config: TabletopConfig, seed: int
+) -> tuple[ObjectModel, Float[np.ndarray, "4 4"], Robot, list[ObjectModel]]:
+    """The object as it is known, where its frame is, the robot with the table that was seen, and other things."""
     robot = scene.robot
     if config.see == "mesh":
-        return scene.objects[0], scene.pose(0), robot
-    assert robot.camera is not None
-    assert robot.table is not None
-    sight = look(depth_image(scene, robot.camera, config.noise, seed), robot.camera, robot.table)
-    cloud = scanned_object(scene.objects[0].name, sight.points, robot.camera.T_world_camera)
-    return above(cloud, sight.table_height), np.eye(4), replace(robot, table=replace(robot.table, height=sight.table_height))
+        return scene.objects[0], scene.pose(0), robot, [
+            moved(obj, scene.pose(i)) for i, obj in enumerate(scene.objects[1:], 1)]
+    camera, table = robot.camera, robot.table
+    assert camera is not None
+    assert table is not None
+    depth, mask = depth_image(scene, camera, config.noise, seed)
+    T, middle = scene.pose(0), scene.objects[0].cloud.mean(0)
+    x, y = (T[:2, :3] @ middle + T[:2, 3]).tolist()
+    sight = pick_object(depth_points(depth, thinned_intrinsics(camera)), camera.T_world_camera, table, (x, y),
+                        mask[depth > 0] if config.segment == "mask" else None)
+    cloud = scanned_object(scene.objects[0].name, sight.points, camera.T_world_camera, keep_table=True)
+    level = replace(robot, table=replace(table, height=sight.table_height))
+    return above(cloud, sight.table_height), np.eye(4), level, sight.obstacles()
 
 
 def above(cloud: ObjectModel, height: float) -> ObjectModel:
     """A bare cloud without what completion put below the table."""
     kept = cloud.cloud[:, 2] > height
     rows = np.concatenate([cloud.cloud, cloud.cloud_normals], 1)[kept]
-    return replace(cloud_object(cloud.name, rows, origin=cloud.name), notes=cloud.notes)
+    return replace(cloud_object(cloud.name, rows, origin=cloud.name, keep_table=True), notes=cloud.notes)
 
 
 def _apart(first: Float[np.ndarray, "4 4"], second: Float[np.ndarray, "4 4"]) -> float:

@@ -32,6 +32,8 @@ ARMATURE = 0.1
 """Inertia of the motors of an arm's joints [kg m^2]. Source: the usual value of models of such arms."""
 ROLLING = 0.002
 """Rolling friction of the table, as of a cloth: balls come to rest [m] (ours)."""
+ASIDE = 10.0
+"""Where objects wait until they are placed, a metre apart [m]."""
 SHAPE_GROUP = 4
 """Group of the geoms that only cameras see: the objects' true meshes."""
 PART_GROUP = 3
@@ -68,6 +70,8 @@ class LiftScene:
         self.data.qpos[self._arm] = robot.home
         self.data.qpos[self._hand] = (tree.coupling.double().numpy() @ opened + tree.offset.double().numpy())[moving]
         self.command(robot.home, np.zeros(len(robot.home)), opened)
+        for i in range(len(objects)):
+            self.place(i, np.array([[1, 0, 0, ASIDE + i], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]))
 
     def place(self, index: int, T_world_object: Float[np.ndarray, "4 4"]) -> None:
         """Put an object somewhere, at rest."""

@@ -8,9 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-import torch
 from jaxtyping import Float, Int
-from torch import Tensor
 
 from dro_grasp.devices import Stopwatch
 from dro_grasp.errors import OptionError, PlanError, RobotError
@@ -26,6 +24,8 @@ from dro_grasp.planning.standing import upright
 from dro_grasp.planning.timing import Trajectory, cornered, joined, smooth, standing
 from dro_grasp.predictor import GraspPredictor
 
+BATCH_SEED = 7919
+"""Between the seeds of batches of grasps (ours)."""
 NO_PATH = "without a path"
 """The planner connects none of the goals, or a timed motion would touch something."""
 TRAVEL_CLEARANCE = 0.001
@@ -46,8 +46,14 @@ class PlanConfig:
     """Which reachable grasps are taken: the best by score, or any, as a control."""
     rounds: int = 3
     """How often the planner is asked, each time with the next `top` grasps."""
+    trusted_score: float = 1.0
+    """Log-odds of holding that the best grasp that can be carried out should have."""
+    batches: int = 3
+    """How often at most `num` grasps are made, while none of them has that, or none works."""
+    best_seconds: float = 1.0
+    """Longest time for a path to the best grasp alone, which is tried before all goals are given at once [s]."""
     planner_seconds: float = 3.0
-    """Longest time for one path [s]."""
+    """Longest time for one path to several goals [s]."""
     closing_seconds: float = 1.0
     """Least time in which the hand closes [s]. Source: as in trials."""
     grip_seconds: float = 0.5
@@ -61,7 +67,7 @@ class PlanConfig:
         Raises:
             OptionError: A number is not positive.
         """
-        for name in ("num", "top", "rounds", "planner_seconds"):
+        for name in ("num", "top", "rounds", "batches", "planner_seconds"):
             if getattr(self, name) <= 0:
                 raise OptionError(f"{name} is {getattr(self, name)}; give a number above 0")
 
@@ -92,11 +98,19 @@ def plan(
     require_arm_extra()
     task = _Task(robot, obj, np.eye(4) if T_world_object is None else T_world_object, obstacles, config or PlanConfig(), seed)
     task.check_start()
-    if grasps is None:
-        with task.watch("grasps"):
-            grasps = grasps_in_world(predictor or GraspPredictor(), robot.hand, task.obj, task.T_world_object,
-                                     task.config.num, task.config.directions, task.height, seed)
-    return task.run(grasps)
+    predictor = predictor or GraspPredictor() if grasps is None else None
+    batches = task.config.batches if predictor is not None else 1
+    for batch in range(batches):
+        if predictor is not None:
+            with task.watch("grasps"):
+                grasps = grasps_in_world(
+                    predictor, robot.hand, task.obj, task.T_world_object, task.config.num, task.config.directions,
+                    task.height, seed + batch * BATCH_SEED)
+        assert grasps is not None
+        task.add(grasps)
+        if (made := task.run(last=batch == batches - 1)) is not None:
+            return made
+    raise PlanError(f"{dropped_in_words(len(task.grasps), task.dropped)}, and none is left for '{obj.name}'; {task.advice()}")
 
 
 class _Task:
@@ -111,13 +125,23 @@ class _Task:
         self.watch = Stopwatch("grasps", "reach", "path", "timing")
         self.checker = CollisionChecker(robot, robot.table, obstacles, self.obj, self.T_world_object)
         self.height = None if robot.table is None else robot.table.height
-        self.reach = Reachability(robot, self.checker, self.obj, self.height, config.reach, seed)
-        self.opened = open_hand(robot)
+        self.reach = Reachability(robot, self.checker, self.obj, obstacles, self.height, config.reach, seed)
+        self.opened, self.parts = open_hand(robot), list[GraspBatch]()
+        self.waiting: list[int] = []
+        """Numbers of grasps that were not tried yet, in the order of trying."""
+        self.known: dict[int, Feasible] = {}
+        self.goals: list[Feasible] = []
+        """Grasps that can be carried out and were not tried yet, in the same order."""
 
     @property
-    def dropped(self) -> Counter[str]:
-        """Grasps that were dropped, by reason."""
-        return self.reach.dropped
+    def grasps(self) -> GraspBatch:
+        """All that were made so far, numbered in this order."""
+        return GraspBatch.concatenate(self.parts)
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """How many grasps were dropped, by reason."""
+        return dict(Counter(self.reach.reasons.values()))
 
     def check_start(self) -> None:
         """Refuse a robot or an object that stands in the way of each other from the start."""
@@ -136,49 +160,63 @@ class _Task:
             raise RobotError(f"robot '{self.robot.name}' collides at home: {contact.first} and {contact.second}, by "
                              f"{-1e3 * contact.distance:.1f} mm; `dro-grasp robot check` shows it")
 
-    def run(self, grasps: GraspBatch) -> MotionPlan:
-        """The plan for the best grasps that work."""
+    def add(self, grasps: GraspBatch) -> None:
+        """Further grasps to choose from."""
+        first = sum(len(part) for part in self.parts)
+        self.parts.append(grasps)
         with self.watch("reach"):
-            waiting = self._in_order(self.reach.promising(grasps).nonzero()[:, 0])
-        for attempt in range(self.config.rounds):
-            goals: list[Feasible] = []
-            with self.watch("reach"):
-                while waiting and len(goals) < self.config.top:
-                    if (found := self.reach.feasible(grasps, waiting.pop(0))) is not None:
-                        goals.append(found)
-            if not goals:
-                break
-            if (made := self._move(grasps, goals, attempt)) is not None:
-                return made
-        raise PlanError(f"{dropped_in_words(len(grasps), dict(self.dropped))}, and none is left for '{self.obj.name}'; "
-                        f"{self._advice()}")
-
-    def _in_order(self, rows: Int[Tensor, " k"]) -> list[int]:
+            self.waiting += self.reach.promising(grasps, first) + [goal.index for goal in self.goals]
+        self.known, self.goals = {goal.index: goal for goal in self.goals}, []
         if self.config.order == "random":
-            rows = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(self.seed))]
-        return rows.tolist()
+            np.random.default_rng(self.seed).shuffle(self.waiting)
+        else:
+            score = self.grasps.score.tolist()
+            self.waiting.sort(key=lambda i: -score[i])
 
-    def _move(self, grasps: GraspBatch, goals: list[Feasible], attempt: int) -> MotionPlan | None:
-        """The motion to the first goal that a path leads to; None, and counted, if there is no path."""
+    def run(self, last: bool) -> MotionPlan | None:
+        """The plan for the best grasps that work; None if none does, or is trusted and these are not the last ones."""
+        grasps = self.grasps
+        for attempt in range(self.config.rounds):
+            with self.watch("reach"):
+                self._find_goals(grasps)
+            if not self.goals or not (last or self._trusted(grasps)):
+                break
+            if (made := self._move(grasps, attempt)) is not None:
+                return made
+        return None
+
+    def _find_goals(self, grasps: GraspBatch) -> None:
+        while self.waiting and len(self.goals) < self.config.top:
+            number = self.waiting.pop(0)
+            if (found := self.known.get(number) or self.reach.feasible(grasps, number)) is not None:
+                self.goals.append(found)
+
+    def _trusted(self, grasps: GraspBatch) -> bool:
+        return self.config.order == "random" or float(grasps.score[self.goals[0].index]) >= self.config.trusted_score
+
+    def _move(self, grasps: GraspBatch, attempt: int) -> MotionPlan | None:
+        """The motion to the best goal, or to the first that a path leads to; None, with the reason noted, if there is none."""
         from dro_grasp.planning.paths import find_path
 
-        lower, upper = self.robot.working_range
-        count = len(goals)
+        goals, self.goals = self.goals, []
+        count, (lower, upper), best = len(goals), self.robot.working_range, True
         while goals:
+            asked = goals[:1] if best else goals
             with self.watch("path"):
-                path = find_path(self.robot.home, np.stack([g.approach[0] for g in goals]),
-                                 lambda q: self.checker.free(q, self.opened), lower, upper, self.config.planner_seconds,
-                                 self.seed + attempt)
-            if path is None:
+                path = find_path(self.robot.home, np.stack([g.approach[0] for g in asked]),
+                                 lambda q: self.checker.free(q, self.opened), lower, upper,
+                                 self.config.best_seconds if best else self.config.planner_seconds, self.seed + attempt)
+            if path is not None:
+                chosen = goals.pop(path.goal)
+                with self.watch("timing"):
+                    made = self._timed(path.waypoints, chosen, Postures.of(self.robot, grasps, chosen.index))
+                if made is not None:
+                    return MotionPlan(self._notes(grasps, chosen.index, count), *made)
+                self.reach.reasons[chosen.index] = NO_PATH
+            elif not best:
                 break
-            chosen = goals.pop(path.goal)
-            with self.watch("timing"):
-                made = self._timed(path.waypoints, chosen, Postures.of(self.robot, grasps, chosen.index))
-            if made is not None:
-                notes = self._notes(grasps, chosen.index, count)
-                return MotionPlan(notes, *made)
-            self.dropped[NO_PATH] += 1
-        self.dropped[NO_PATH] += len(goals)
+            best = False
+        self.reach.reasons |= dict.fromkeys((g.index for g in goals), NO_PATH)
         return None
 
     def _timed(
@@ -215,7 +253,7 @@ class _Task:
     def _notes(self, grasps: GraspBatch, index: int, goals: int) -> PlanNotes:
         return PlanNotes(
             self.robot.name, self.obj.name, self.robot.arm_joints, self.robot.hand_joints, "world", self.height, len(grasps),
-            dict(self.dropped), goals, index, float(grasps.score[index]), grasps.T_object_wrist[index].double().tolist(),
+            self.dropped, goals, index, float(grasps.score[index]), grasps.T_object_wrist[index].double().tolist(),
             self.seed, self.watch.seconds)
 
     def _distance(self) -> float:
@@ -223,7 +261,7 @@ class _Task:
         middle = self.T_world_object[:2, :3] @ self.obj.cloud.mean(0) + self.T_world_object[:2, 3]
         return float(np.linalg.norm(middle - self.robot.T_world_base[:2, 3]))
 
-    def _advice(self) -> str:
+    def advice(self) -> str:
         reason = max(self.dropped, key=lambda r: self.dropped[r], default="")
         return (f"the object stands {self._distance():.2f} m from the base, and most grasps are {reason}; move the object, ask "
                 "for more grasps (--num), or for other palm directions (--directions)")

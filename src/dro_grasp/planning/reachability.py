@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
+from scipy.spatial import KDTree
 from torch import Tensor
 
+from dro_grasp.geometry.se3 import apply_to_cloud
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.planning.candidates import lowest_points
 from dro_grasp.planning.collisions import CollisionChecker, open_hand
 from dro_grasp.planning.robot import Robot
+from dro_grasp.planning.workcell import VOXEL
 
 BELOW_TABLE = "below the table"
 """A finger, or the palm, would be in the table."""
 HITS_OBJECT = "through the object on the way to it"
 """The opened fingers would push the object away."""
+HITS_OBSTACLE = "in an obstacle or through one on the way"
+"""The hand would meet an obstacle."""
 OUT_OF_REACH = "out of reach"
 """Inverse kinematics finds no configuration."""
 COLLIDES = "with the robot in collision"
@@ -42,6 +47,8 @@ class ReachConfig:
     """Distance between the poses that are solved on both [m]."""
     deepest: float = 0.008
     """How far opened fingers may pass through the object's estimated surface on the approach [m]."""
+    obstacle_margin: float = 0.003
+    """Distance that the hand's points keep from obstacles, or the cells of a cloud of them [m]."""
     table_margin: float = 0.002
     """Distance that the hand's points keep from the table [m]."""
     clearance: float = 0.001
@@ -83,34 +90,55 @@ class Reachability:
     """Goes through grasps of one object, and counts why it drops them."""
 
     def __init__(
-        self, robot: Robot, checker: CollisionChecker, obj: ObjectModel, table: float | None, config: ReachConfig, seed: int
+        self, robot: Robot, checker: CollisionChecker, obj: ObjectModel, obstacles: Sequence[ObjectModel], table: float | None,
+        config: ReachConfig, seed: int,
     ) -> None:
         """Prepare the solver; `table` is the height of the table [m], the object stands where the checker has it."""
         from dro_grasp.planning.inverse_kinematics import WristSolver
 
         self.robot, self.checker, self.obj, self.table, self.config = robot, checker, obj, table, config
         self.solver, self.random = WristSolver(robot), np.random.default_rng(seed)
-        self.dropped: Counter[str] = Counter()
+        self.reasons: dict[int, str] = {}
+        """Why grasps were dropped, by their number."""
+        clouds = [thing.cloud for thing in obstacles if thing.is_cloud]
+        self._cloud = KDTree(np.concatenate(clouds)) if clouds else None
+        self._fields = [thing.distance_field for thing in obstacles if not thing.is_cloud]
 
-    def promising(self, grasps: GraspBatch) -> Bool[Tensor, " n"]:
-        """Which grasps are worth inverse kinematics: geometry of the hand alone decides."""
+    def promising(self, grasps: GraspBatch, first: int = 0) -> list[int]:
+        """Numbers of the grasps that are worth inverse kinematics: geometry of the hand alone decides.
+
+        Args:
+            grasps: Complete grasps in the world.
+            first: Number of the first of them.
+        """
         hand, T = self.robot.hand, grasps.T_object_wrist
-        keep = torch.ones(len(grasps), dtype=torch.bool)
-        if self.table is not None:
-            keep = lowest_points(hand, grasps) > self.table + self.config.table_margin
-            self.dropped[BELOW_TABLE] += int((~keep).sum())
-        ahead = hand.palm_directions(T)
         way = torch.linspace(0, self.config.standoff, 5)
         line = T[:, None].repeat(1, len(way), 1, 1)
-        line[..., :3, 3] -= way[:, None] * ahead[:, None]
+        line[..., :3, 3] -= way[:, None] * hand.palm_directions(T)[:, None]
+        points = hand.points(grasps.pregrasp_joints[:, None].expand(-1, len(way), -1), line).flatten(1, 2)
         T_object_world = torch.from_numpy(np.linalg.inv(self.checker.T_world_target)).to(T)
-        points = hand.points(grasps.pregrasp_joints[:, None].expand(-1, len(way), -1), T_object_world @ line)
-        depth = -self.obj.distance_field.distances(points.flatten(1, 2))[0].amin(-1)
-        self.dropped[HITS_OBJECT] += int((keep & (depth > self.config.deepest)).sum())
-        return keep & (depth <= self.config.deepest)
+        depth = -self.obj.distance_field.distances(apply_to_cloud(T_object_world.expand(len(T), 4, 4), points))[0].amin(-1)
+        tests = [(HITS_OBSTACLE, self._obstacle_distance(points) < self.config.obstacle_margin),
+                 (HITS_OBJECT, depth > self.config.deepest)]
+        if self.table is not None:
+            tests.insert(0, (BELOW_TABLE, lowest_points(hand, grasps) <= self.table + self.config.table_margin))
+        for reason, failed in tests:
+            for row in failed.nonzero()[:, 0].tolist():
+                self.reasons.setdefault(first + row, reason)
+        return [first + row for row in range(len(grasps)) if first + row not in self.reasons]
+
+    def _obstacle_distance(self, points: Float[Tensor, "n k 3"]) -> Float[Tensor, " n"]:
+        """Distance of the nearest of some points to the obstacles [m]."""
+        nearest = torch.full(points.shape[:1], torch.inf)
+        for field in self._fields:
+            nearest = torch.minimum(nearest, field.distances(points)[0].amin(-1))
+        if self._cloud is not None:
+            apart = self._cloud.query(points.double().numpy(), distance_upper_bound=VOXEL)[0].min(-1)
+            nearest = torch.minimum(nearest, torch.from_numpy(apart).to(nearest) - VOXEL / 2)
+        return nearest
 
     def feasible(self, grasps: GraspBatch, index: int) -> Feasible | None:
-        """One grasp with configurations from standoff to lift; None, and counted, if there are none."""
+        """One grasp with configurations from standoff to lift; None, with the reason noted, if there are none."""
         postures = Postures.of(self.robot, grasps, index)
         T = grasps.T_object_wrist[index].double().numpy()
         ahead = self.robot.hand.palm_directions(grasps.T_object_wrist[index:index + 1])[0].double().numpy()
@@ -126,7 +154,7 @@ class Reachability:
                 return Feasible(index, *outcome)
             reasons.append(outcome)
         order = (OUT_OF_REACH, COLLIDES, NO_LINE, NO_LIFT)
-        self.dropped[max(reasons, key=order.index)] += 1
+        self.reasons[index] = max(reasons, key=order.index)
         return None
 
     def _ways(

@@ -20,18 +20,19 @@ def upright(
     """The same object in the same place, with a frame whose z axis points up."""
     if np.abs(T_world_object[2, :3] - (0, 0, 1)).max() < UPRIGHT:
         return obj, T_world_object
-    placed = np.eye(4)
-    placed[:3, 3] = T_world_object[:3, 3]
-    return turned(obj, T_world_object[:3, :3]), placed
+    turn, stand = np.eye(4), np.eye(4)
+    turn[:3, :3], stand[:3, 3] = T_world_object[:3, :3], T_world_object[:3, 3]
+    return moved(obj, turn), stand
 
 
-def turned(obj: ObjectModel, R: Float[np.ndarray, "3 3"]) -> ObjectModel:
-    """An object turned about the origin of its frame."""
-    cloud, normals = ((v.astype(np.float64) @ R.T).astype(np.float32) for v in (obj.cloud, obj.cloud_normals))
-    vertices = None if obj.vertices is None else obj.vertices @ R.T
+def moved(obj: ObjectModel, T: Float[np.ndarray, "4 4"]) -> ObjectModel:
+    """The same object, with coordinates in another frame."""
+    R, t = T[:3, :3], T[:3, 3]
+    cloud, normals = (obj.cloud @ R.T + t).astype(np.float32), (obj.cloud_normals @ R.T).astype(np.float32)
+    vertices = None if obj.vertices is None else obj.vertices @ R.T + t
     faces = np.zeros((0, 3), np.int32) if obj.faces is None else obj.faces
     shape = cloud if vertices is None else vertices
     return replace(
-        obj, cloud=cloud, cloud_normals=normals, vertices=vertices, centre_of_mass=R @ obj.centre_of_mass,
+        obj, cloud=cloud, cloud_normals=normals, vertices=vertices, centre_of_mass=R @ obj.centre_of_mass + t,
         inertia=R @ obj.inertia @ R.T, sha256=content_hash(shape.astype(np.float32), faces.astype(np.int32)),
-        exact_parts=None if obj.is_cloud else tuple((v @ R.T, f) for v, f in obj.parts))
+        exact_parts=None if obj.is_cloud else tuple((v @ R.T + t, f) for v, f in obj.parts))

@@ -20,8 +20,8 @@ TABLE = "table"
 """Name of the table."""
 TABLE_THICKNESS = 0.05
 """[m] (ours)"""
-VOXEL = 0.015
-"""Edge of the boxes that stand for a cloud of obstacles [m] (ours)."""
+VOXEL = 0.01
+"""Edge of the cells that a cloud of obstacles fills [m] (ours)."""
 
 
 def robot_spec(robot: Robot, protocol: Protocol, table: Table | None) -> mujoco.MjSpec:
@@ -67,8 +67,8 @@ def add_solids(scene: mujoco.MjSpec, body: mujoco.MjsBody, things: Sequence[Obje
     """Shapes of things in a body's frame: convex parts of meshes; of clouds, small boxes, or with `hull` the convex hull."""
     for i, thing in enumerate(things):
         if thing.is_cloud and not hull:
-            for centre in occupied(thing.cloud.astype(np.float64)):
-                body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[VOXEL / 2] * 3, pos=centre)
+            for centre, half in zip(*occupied(thing.cloud.astype(np.float64)), strict=True):
+                body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[VOXEL / 2, VOXEL / 2, half], pos=centre)
             continue
         corners = [thing.cloud] if thing.is_cloud else [vertices for vertices, _ in thing.parts]
         for j, vertices in enumerate(corners):
@@ -77,6 +77,9 @@ def add_solids(scene: mujoco.MjSpec, body: mujoco.MjsBody, things: Sequence[Obje
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name)
 
 
-def occupied(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
-    """Centres of the cells of size VOXEL that hold a point [m]."""
-    return (np.unique(np.floor(points / VOXEL).astype(int), axis=0) + 0.5) * VOXEL
+def occupied(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, " k"]]:
+    """Centres and half heights [m] of upright boxes that together are the cells of size VOXEL that hold a point."""
+    cells = np.unique(np.floor(points / VOXEL).astype(int), axis=0)  # sorted, so that those above each other follow
+    starts = np.flatnonzero(np.r_[True, (np.diff(cells, axis=0) != (0, 0, 1)).any(1)])
+    ends = np.r_[starts[1:], len(cells)] - 1
+    return (cells[starts] + cells[ends] + 1) * (VOXEL / 2), (ends - starts + 1) * (VOXEL / 2)
