@@ -14,8 +14,11 @@ import dro_grasp as dro
 from dro_grasp.cli.main import main
 from dro_grasp.planning import tabletop
 from dro_grasp.planning.animation import Recorder, draw_animation
-from dro_grasp.planning.attempts import Attempt, TabletopConfig, attempt, rest
-from dro_grasp.planning.depth_images import STRIDE, clusters, depth_image, fit_plane, look
+from dro_grasp.perception.scan import depth_points
+from dro_grasp.planning.attempts import Attempt, TabletopConfig, attempt
+from dro_grasp.planning.clutter import rest
+from dro_grasp.planning.depth_images import STRIDE, depth_image, thinned_intrinsics
+from dro_grasp.planning.table_scene import clusters, fit_plane, sort_out
 from dro_grasp.planning.physics import LiftScene
 from dro_grasp.planning.planner import PlanConfig
 from dro_grasp.planning.tabletop import TabletopRun, read_attempts, run_tabletop, write_attempts
@@ -36,7 +39,7 @@ def can() -> dro.ObjectModel:
 @pytest.fixture(scope="module")
 def scene(robot: dro.Robot, can: dro.ObjectModel) -> LiftScene:
     scene = LiftScene(robot, [can])
-    assert rest(scene, 0, TabletopConfig(), np.random.default_rng(0))
+    assert rest(scene, 0, TabletopConfig().region, np.random.default_rng(0))
     return scene
 
 
@@ -62,7 +65,7 @@ def test_servos_follow_a_trajectory_within_a_degree(robot: dro.Robot, can: dro.O
 
 def test_depth_is_the_distance_to_the_table_plane(scene: LiftScene, robot: dro.Robot) -> None:
     assert robot.camera is not None
-    depth, T = depth_image(scene, robot.camera, 0.0, 0), robot.camera.T_world_camera
+    (depth, _), T = depth_image(scene, robot.camera, 0.0, 0), robot.camera.T_world_camera
     row, column = np.meshgrid(np.arange(depth.shape[0]) * STRIDE, np.arange(depth.shape[1]) * STRIDE, indexing="ij")
     pixels = np.stack([column, row, np.ones_like(row)], -1)
     rays = pixels @ np.linalg.inv(robot.camera.intrinsics).T @ T[:3, :3].T
@@ -75,8 +78,9 @@ def test_depth_is_the_distance_to_the_table_plane(scene: LiftScene, robot: dro.R
 def test_a_camera_sees_the_object_where_it_is_and_nothing_of_the_table(scene: LiftScene, robot: dro.Robot) -> None:
     assert robot.camera is not None
     assert robot.table is not None
-    depth, T = depth_image(scene, robot.camera, 0.0015, 1), robot.camera.T_world_camera
-    sight = look(depth, robot.camera, robot.table)
+    (depth, mask), T = depth_image(scene, robot.camera, 0.0015, 1), robot.camera.T_world_camera
+    sight = sort_out(depth_points(depth, thinned_intrinsics(robot.camera)), T, robot.table)
+    assert len(sight.points) == pytest.approx(int(mask.sum()), rel=0.1)
     assert abs(sight.table_height) < 1e-3
     in_object = (sight.points @ T[:3, :3].T + T[:3, 3] - scene.pose(0)[:3, 3]) @ scene.pose(0)[:3, :3]
     distance = scene.objects[0].distance_field.distances(torch.from_numpy(in_object).float())[0].abs()
@@ -104,7 +108,8 @@ def test_an_empty_table_is_refused_in_words(robot: dro.Robot, can: dro.ObjectMod
     assert robot.camera is not None
     assert robot.table is not None
     with pytest.raises(dro.DroGraspError, match="nothing stands on the table"):
-        look(depth_image(scene, robot.camera, 0.0015, 0), robot.camera, robot.table)
+        depth, _ = depth_image(scene, robot.camera, 0.0015, 0)
+        sort_out(depth_points(depth, thinned_intrinsics(robot.camera)), robot.camera.T_world_camera, robot.table)
 
 
 def test_an_attempt_lifts_a_can_is_repeatable_and_becomes_an_animation(

@@ -34,6 +34,10 @@ class Tabletop:
     """Palm directions: `paper`, from above to the right side, or `all`."""
     num: int = 64
     """Grasps to choose from."""
+    clutter: int = 0
+    """Other objects, drawn from the built-in ones, that stand around the one that is asked for: 2 to 4 make a crowd."""
+    segment: Literal["cluster", "mask"] = "cluster"
+    """How the object's points are told from those of others: by distance, or by its true mask."""
     noise: float = 0.0015
     """Standard deviation of the camera's depth [m]."""
     seed: int = 0
@@ -62,7 +66,8 @@ class Tabletop:
         if self.video is not None:
             check_animation(self.video)
         config = TabletopConfig(
-            self.see, self.noise, plan=PlanConfig(self.num, directions=self.directions, order=self.order))
+            self.see, self.noise, clutter=self.clutter, segment=self.segment,
+            plan=PlanConfig(self.num, directions=self.directions, order=self.order))
         run = TabletopRun(
             self.robot, tuple(resolve_objects(list(self.objects))), self.attempts, self.seed, self.weights, config)
         done = run_tabletop(run, self.output, self.workers, None if self.json else _say)

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Float
 
-    from dro_grasp.objects.shape import ObjectModel
     from dro_grasp.planning.robot import Robot
+    from dro_grasp.planning.table_scene import PickedObject
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,8 @@ class Plan:
     robot: str
     """A robot file, or the name of a built-in robot (see `dro-grasp robot list`)."""
     object: str
-    """A cloud (PLY, NPY, PCD), a mesh, or an object's name (see `dro-grasp objects`), in the robot's world frame."""
+    """A cloud (PLY, NPY, PCD), a mesh, or an object's name (see `dro-grasp objects`), in the robot's world frame. A cloud may show
+    the table and other things too."""
     camera: Annotated[str | None, optional("JSON|robot", "the object is in the world frame")] = None
     """The object is a cloud in this camera's frame; it is cleaned and completed. A file with {"frame": "world",
     "T_frame_camera": 4x4}, or `robot` for the camera of the robot file."""
@@ -35,6 +36,9 @@ class Plan:
     """File with {"frame": "world", "T_frame_object": 4x4}: where the object stands."""
     at: Annotated[tuple[float, float] | None, optional("X Y", "as --pose says")] = None
     """Stand the object, upright in its own frame, on the table at this place [m]."""
+    near: Annotated[tuple[float, float] | None, optional("X Y", "there is only one")] = None
+    """The object is a cloud of a table with several things: take the one nearest to this place in the world [m], and keep clear
+    of the others."""
     obstacles: tuple[str, ...] = ()
     """Clouds and meshes, in the world frame, that nothing may touch."""
     num: int = 64
@@ -80,8 +84,9 @@ class Plan:
             if path is not None:
                 check_output(path)
         robot = load_robot(self.robot)
-        obj, T_world_object = self._place(robot)
         obstacles = [load_object(name) for name in self.obstacles]
+        picked, T_world_object = self._place(robot)
+        robot, obj, obstacles = picked.robot, picked.obj, [*obstacles, *picked.obstacles]
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
         made = plan(robot, obj, T_world_object, obstacles, GraspPredictor(self.weights), config, self.seed)
@@ -99,31 +104,49 @@ class Plan:
             say(line)
         return 0
 
-    def _place(self, robot: Robot) -> tuple[ObjectModel, Float[np.ndarray, "4 4"]]:
-        """The object, and where it stands in the world."""
+    def _place(self, robot: Robot) -> tuple[PickedObject, Float[np.ndarray, "4 4"]]:
+        """The object with what stands around it, and where its frame is in the world."""
         import numpy as np
 
         from dro_grasp.errors import OptionError
         from dro_grasp.files import given_path
         from dro_grasp.frames import read_motion
         from dro_grasp.objects.catalogue import load_object
+        from dro_grasp.objects.loading import read_points
         from dro_grasp.perception.scan import load_scan
+        from dro_grasp.planning.table_scene import PickedObject, pick_object, sees_table
 
         if sum(given is not None for given in (self.camera, self.pose, self.at)) > 1:
             raise OptionError("--camera, --pose and --at each say where the object is; give one of them")
-        T = np.eye(4)
-        if self.camera is not None:
-            if self.camera != "robot":
-                camera = read_motion(Path(self.camera), "T_frame_camera").T.double().numpy()
-            elif robot.camera is None:
-                raise OptionError(f"robot '{robot.name}' has no camera; state it in the robot file, or give --camera JSON")
-            else:
-                camera = robot.camera.T_world_camera
-            return load_scan(given_path(self.object), camera), T
+        if self.near is not None and (self.pose is not None or self.at is not None):
+            raise OptionError("--near picks an object of a cloud in the world's or a camera's frame; leave out --pose and --at")
+        T, path, camera = np.eye(4), given_path(self.object), self._camera(robot)
+        if camera is not None or self.near is not None:
+            points = read_points(path)
+            world = points if camera is None else points @ camera[:3, :3].T + camera[:3, 3]
+            if self.near is not None or (robot.table is not None and sees_table(world, robot.table)):
+                return pick_object(path.stem, points, robot, camera, self.near), T
+            assert camera is not None
+            return PickedObject(load_scan(path, camera), [], robot), T
         obj = load_object(self.object)
         if self.pose is not None:
             T = read_motion(self.pose, "T_frame_object").T.double().numpy()
         elif self.at is not None:
             height = 0.0 if robot.table is None else robot.table.height
             T[:3, 3] = *self.at, height - float(obj.cloud[:, 2].min())
-        return obj, T
+        elif obj.is_cloud and robot.table is not None and (obj.table is not None or sees_table(obj.cloud, robot.table)):
+            return pick_object(path.stem, read_points(path), robot), T  # a table, perhaps with several things on it
+        return PickedObject(obj, [], robot), T
+
+    def _camera(self, robot: Robot) -> Float[np.ndarray, "4 4"] | None:
+        """The camera's pose in the world; None if the object is in the world's frame."""
+        from dro_grasp.errors import OptionError
+        from dro_grasp.frames import read_motion
+
+        if self.camera is None:
+            return None
+        if self.camera != "robot":
+            return read_motion(Path(self.camera), "T_frame_camera").T.double().numpy()
+        if robot.camera is None:
+            raise OptionError(f"robot '{robot.name}' has no camera; state it in the robot file, or give --camera JSON")
+        return robot.camera.T_world_camera

@@ -12,17 +12,16 @@ import numpy as np
 from jaxtyping import Float
 
 from dro_grasp.errors import DroGraspError, OptionError
-from dro_grasp.objects.loading import cloud_object
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.perception.scan import depth_points, scanned_object
-from dro_grasp.planning.clutter import Region, other_objects, scatter
+from dro_grasp.perception.scan import depth_points
+from dro_grasp.planning.clutter import MOST_CLUTTER, Region, other_objects, scatter
 from dro_grasp.planning.depth_images import depth_image, thinned_intrinsics
 from dro_grasp.planning.motion import STAGES, MotionPlan
 from dro_grasp.planning.physics import LiftScene
 from dro_grasp.planning.planner import PlanConfig, plan
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.standing import moved
-from dro_grasp.planning.table_scene import pick_object
+from dro_grasp.planning.table_scene import PickedObject, pick_object
 from dro_grasp.predictor import GraspPredictor
 
 VERSION = 2
@@ -57,6 +56,15 @@ class TabletopConfig:
     """How long it is shaken then [s]."""
     plan: PlanConfig = field(default_factory=PlanConfig)
     """How motions are planned."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be set up.
+
+        Raises:
+            OptionError: Too many other objects, or fewer than none.
+        """
+        if not 0 <= self.clutter <= MOST_CLUTTER:
+            raise OptionError(f"clutter is {self.clutter}; give a number of other objects from 0 to {MOST_CLUTTER}")
 
     def label(self) -> str:
         """Version and every setting, as stored with results: results of other settings are not mixed."""
@@ -136,10 +144,10 @@ def attempt(
     result = replace(result, place=json.dumps(start.round(6).tolist()))
     begin, processor = time.perf_counter(), time.process_time()
     try:
-        seen, T, level, obstacles = _see(scene, config, int(draw.integers(2**31)))
+        seen, T = _see(scene, config, int(draw.integers(2**31)))
         see_seconds = time.perf_counter() - begin
         result, begin = replace(result, stage="plan", see_seconds=see_seconds), time.perf_counter()
-        made = plan(level, seen, T, obstacles, predictor, config.plan, seed + number)
+        made = plan(seen.robot, seen.obj, T, seen.obstacles, predictor, config.plan, seed + number)
     except DroGraspError as error:
         return replace(result, reason=str(error))
     notes = made.notes
@@ -184,32 +192,18 @@ def carry_out(scene: LiftScene, made: MotionPlan, config: TabletopConfig, watch:
     return "done", ""
 
 
-def _see(
-    scene: LiftScene, config: TabletopConfig, seed: int
-) -> tuple[ObjectModel, Float[np.ndarray, "4 4"], Robot, list[ObjectModel]]:
-    """The object as it is known, where its frame is, the robot with the table that was seen, and other things."""
-    robot = scene.robot
+def _see(scene: LiftScene, config: TabletopConfig, seed: int) -> tuple[PickedObject, Float[np.ndarray, "4 4"]]:
+    """The object as it is known, with other things and the table that was seen; and where its frame is."""
+    robot, T, (obj, *others) = scene.robot, scene.pose(0), scene.objects
     if config.see == "mesh":
-        return scene.objects[0], scene.pose(0), robot, [
-            moved(obj, scene.pose(i)) for i, obj in enumerate(scene.objects[1:], 1)]
-    camera, table = robot.camera, robot.table
+        return PickedObject(obj, [moved(o, scene.pose(i)) for i, o in enumerate(others, 1)], robot), T
+    camera = robot.camera
     assert camera is not None
-    assert table is not None
     depth, mask = depth_image(scene, camera, config.noise, seed)
-    T, middle = scene.pose(0), scene.objects[0].cloud.mean(0)
-    x, y = (T[:2, :3] @ middle + T[:2, 3]).tolist()
-    sight = pick_object(depth_points(depth, thinned_intrinsics(camera)), camera.T_world_camera, table, (x, y),
-                        mask[depth > 0] if config.segment == "mask" else None)
-    cloud = scanned_object(scene.objects[0].name, sight.points, camera.T_world_camera, keep_table=True)
-    level = replace(robot, table=replace(table, height=sight.table_height))
-    return above(cloud, sight.table_height), np.eye(4), level, sight.obstacles()
-
-
-def above(cloud: ObjectModel, height: float) -> ObjectModel:
-    """A bare cloud without what completion put below the table."""
-    kept = cloud.cloud[:, 2] > height
-    rows = np.concatenate([cloud.cloud, cloud.cloud_normals], 1)[kept]
-    return replace(cloud_object(cloud.name, rows, origin=cloud.name, keep_table=True), notes=cloud.notes)
+    x, y = (T[:2, :3] @ obj.cloud.mean(0) + T[:2, 3]).tolist()
+    points = depth_points(depth, thinned_intrinsics(camera))
+    known = mask[depth > 0] if config.segment == "mask" else None
+    return pick_object(obj.name, points, robot, camera.T_world_camera, (x, y), known), np.eye(4)
 
 
 def _apart(first: Float[np.ndarray, "4 4"], second: Float[np.ndarray, "4 4"]) -> float:

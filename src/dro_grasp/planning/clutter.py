@@ -26,6 +26,8 @@ PLACES = 100
 """Places that are tried until one is free (ours)."""
 APART = 0.03
 """Distance between the outlines of objects as they are put down [m] (ours)."""
+MOST_CLUTTER = 8
+"""Most other objects that there is room for (ours)."""
 AROUND = 0.10
 """Other objects stand at most this far beyond the region of the one that is asked for [m] (ours)."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -10,9 +10,11 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from dro_grasp.errors import ObjectError
+from dro_grasp.errors import ObjectError, RobotError
 from dro_grasp.objects.loading import cloud_object
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.perception.scan import scanned_object
+from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.robot_file import Table
 from dro_grasp.planning.workcell import VOXEL
 
@@ -30,6 +32,12 @@ FEWEST = 60
 """Fewest points of an object (ours)."""
 FRAGMENT = 0.05
 """Groups of fewer points than an object has, this near to the one that is wanted, are taken for parts of it [m] (ours)."""
+ABOUT = 0.03
+"""Largest difference between the table's height in the robot file and in a cloud [m] (ours)."""
+SHARE = 0.2
+"""Least share of a cloud's points on a table that is in it (ours)."""
+LARGEST_OBJECT = 0.4
+"""Something longer that lies at the table's height is the table [m] (ours)."""
 SPECK = 5
 """Groups of fewer points are noise, no obstacles (ours)."""
 
@@ -39,7 +47,7 @@ class Sight:
     """What a camera sees on a table."""
 
     points: Float[np.ndarray, "n 3"]
-    """Points of the object that is wanted, in the camera's frame [m]."""
+    """Points of the object that is wanted, in the frame in which they were given [m]."""
     others: Float[np.ndarray, "m 3"]
     """Points of other things on the table, in the world [m]."""
     table_height: float
@@ -47,33 +55,87 @@ class Sight:
     places: Float[np.ndarray, "k 2"]
     """Where things stand on the table, the one with most points first: x and y in the world [m]."""
 
-    def obstacles(self) -> list[ObjectModel]:
-        """The other things, if there are any, in the world's frame. What is below a point that was seen counts as solid."""
-        if not len(self.others):
-            return []
-        cells, column = np.unique(np.floor(self.others[:, :2] / VOXEL).astype(int), axis=0, return_inverse=True)
-        tops = np.full(len(cells), -np.inf)
-        np.maximum.at(tops, column.ravel(), self.others[:, 2])
-        heights = [np.arange(top, min(self.table_height, top - VOXEL), -VOXEL) for top in tops]
-        rows = [np.column_stack([np.tile((cell + 0.5) * VOXEL, (len(z), 1)), z])
-                for cell, z in zip(cells, heights, strict=True)]
-        return [cloud_object("other things", np.concatenate(rows), origin="other things", keep_table=True)]
+
+@dataclass(frozen=True)
+class PickedObject:
+    """One object on a table, ready for planning."""
+
+    obj: ObjectModel
+    """In the world's frame, without what its completion put below the table."""
+    obstacles: list[ObjectModel]
+    """The other things, likewise, if there are any. What is below a point that was seen counts as solid."""
+    robot: Robot
+    """With its table at the height that was seen."""
 
 
 def pick_object(
-    points: Float[np.ndarray, "n 3"], T_world_camera: Float[np.ndarray, "4 4"], table: Table,
+    name: str, points: Float[np.ndarray, "n 3"], robot: Robot, T_world_camera: Float[np.ndarray, "4 4"] | None = None,
     near: tuple[float, float] | None = None, mask: Bool[np.ndarray, " n"] | None = None,
-) -> Sight:
-    """Find the table in a camera's points, remove it, and pick one of the objects on it.
+) -> PickedObject:
+    """Find the table in a cloud, remove it, and pick one of the objects on it.
 
     Objects are told apart by distance: two that are less than 12 mm apart count as one, unless a mask is given.
 
+    Example:
+        >>> picked = pick_object("mug", points, robot, robot.camera.T_world_camera, near=(0.5, 0.1))
+        >>> made = plan(picked.robot, picked.obj, obstacles=picked.obstacles)
+
     Args:
-        points: In the camera's frame [m].
-        T_world_camera: The camera's pose [m].
-        table: Where the robot expects its table.
-        near: A place in the world near the object that is wanted [m]; the one with most points if omitted.
+        name: What to call it.
+        points: In the camera's frame, or in the world's [m]; several objects, and the table.
+        robot: With a table.
+        T_world_camera: The camera's pose [m], if the points are in its frame: the unseen side is then estimated.
+        near: A place in the world near the object that is wanted [m]; needed where there are several.
         mask: Which points belong to the object that is wanted.
+
+    Raises:
+        ObjectError: No level plane, nothing on it, or nothing within the mask; or it is not clear which object is wanted.
+        RobotError: The robot has no table.
+    """
+    if robot.table is None:
+        raise RobotError(f"robot '{robot.name}' has no table to look for in '{name}'; state it in the robot file, or give the "
+                         "object's points alone")
+    finite = np.isfinite(points).all(1)
+    points, mask = points[finite], None if mask is None else mask[finite]
+    sight = sort_out(points, np.eye(4) if T_world_camera is None else T_world_camera, robot.table, near, mask)
+    if len(sight.places) > 1 and near is None and mask is None:
+        places = ", ".join(f"({x:.2f}, {y:.2f})" for x, y in sight.places)
+        raise ObjectError(f"'{name}' has {len(sight.places)} things that stand on the table, at {places} m; say which one is "
+                          "wanted by a place near it (--near X Y), or give its points alone")
+    height = sight.table_height
+    level = replace(robot, table=replace(robot.table, height=height))
+    if T_world_camera is None:
+        return PickedObject(cloud_object(name, sight.points, origin=name, keep_table=True), _solid(sight), level)
+    whole = scanned_object(name, sight.points, T_world_camera, keep_table=True)
+    rows = np.concatenate([whole.cloud, whole.cloud_normals], 1)[whole.cloud[:, 2] > height]
+    return PickedObject(
+        replace(cloud_object(name, rows, origin=name, keep_table=True), notes=whole.notes), _solid(sight), level)
+
+
+def sees_table(world: Float[np.ndarray, "n 3"], table: Table) -> bool:
+    """Whether points are those of a table, with or without something on it, and not of one object alone."""
+    on = world[np.abs(world[:, 2] - table.height) < ABOUT]
+    return len(on) >= SHARE * len(world) and float(np.ptp(on[:, :2], axis=0).max(initial=0)) > LARGEST_OBJECT
+
+
+def _solid(sight: Sight) -> list[ObjectModel]:
+    if not len(sight.others):
+        return []
+    cells, column = np.unique(np.floor(sight.others[:, :2] / VOXEL).astype(int), axis=0, return_inverse=True)
+    tops = np.full(len(cells), -np.inf)
+    np.maximum.at(tops, column.ravel(), sight.others[:, 2])
+    heights = [np.arange(top, min(sight.table_height, top - VOXEL), -VOXEL) for top in tops]
+    rows = [np.column_stack([np.tile((cell + 0.5) * VOXEL, (len(z), 1)), z]) for cell, z in zip(cells, heights, strict=True)]
+    return [cloud_object("other things", np.concatenate(rows), origin="other things", keep_table=True)]
+
+
+def sort_out(
+    points: Float[np.ndarray, "n 3"], T_world_camera: Float[np.ndarray, "4 4"], table: Table,
+    near: tuple[float, float] | None = None, mask: Bool[np.ndarray, " n"] | None = None,
+) -> Sight:
+    """Points of a table sorted: those of one object, and those of others. Arguments as for `pick_object`.
+
+    Without `near` and `mask`, the thing with most points is taken.
 
     Raises:
         ObjectError: There is no level plane, nothing stands on it, or the mask has nothing of it.

@@ -1,0 +1,136 @@
+"""Several things on a table: told apart, avoided, and refused in words where it is not clear which is wanted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import dro_grasp as dro
+from dro_grasp.cli.main import main
+from dro_grasp.planning.attempts import TabletopConfig
+from dro_grasp.planning.clutter import APART, other_objects, scatter
+from dro_grasp.planning.collisions import CollisionChecker, open_hand
+from dro_grasp.planning.physics import LiftScene
+from dro_grasp.planning.reachability import HITS_OBSTACLE, Reachability, ReachConfig
+from dro_grasp.planning.table_scene import pick_object, sees_table, sort_out
+from dro_grasp.planning.workcell import VOXEL, occupied
+
+CUBE, BALL, RADIUS = (0.45, 0.1), (0.5, -0.1), 0.04
+
+
+@pytest.fixture(scope="module")
+def robot() -> dro.Robot:
+    return dro.load_robot("xarm7_leaphand")
+
+
+@pytest.fixture(scope="module")
+def table_cloud() -> np.ndarray:
+    """A table at z = 0 with a cube and a ball on it, in the world."""
+    random = np.random.default_rng(0)
+    table = np.column_stack([random.uniform([0.1, -0.5], [0.8, 0.5], (20_000, 2)), random.normal(0, 0.001, 20_000)])
+    cube = random.uniform(-0.03, 0.03, (3000, 3))
+    rows = np.arange(len(cube))
+    cube[rows, random.integers(3, size=len(cube))] = random.choice([-0.03, 0.03], len(cube))
+    ball = random.normal(size=(3000, 3))
+    ball *= RADIUS / np.linalg.norm(ball, axis=1, keepdims=True)
+    return np.concatenate([table, cube + (*CUBE, 0.03), ball + (*BALL, RADIUS)])
+
+
+def test_the_thing_near_a_place_is_picked_and_the_other_is_an_obstacle(table_cloud: np.ndarray, robot: dro.Robot) -> None:
+    picked = pick_object("cube", table_cloud, robot, near=(0.44, 0.13))
+    assert np.allclose(picked.obj.cloud.mean(0)[:2], CUBE, atol=2e-3)
+    assert np.allclose(np.ptp(picked.obj.cloud, axis=0), (0.06, 0.06, 0.054), atol=3e-3)
+    (other,) = picked.obstacles
+    assert np.allclose(np.ptp(other.cloud, axis=0)[:2], 2 * RADIUS, atol=2 * VOXEL)
+    assert picked.robot.table is not None
+    assert picked.robot.table.height == pytest.approx(0, abs=1e-3)
+    below = np.linalg.norm(other.cloud - (*BALL, 0.02), axis=1).min()
+    assert below < VOXEL  # only the ball's surface was given, but what is below its top is solid
+
+
+def test_a_mask_tells_apart_what_touches(table_cloud: np.ndarray, robot: dro.Robot) -> None:
+    cloud = table_cloud.copy()
+    cloud[-3000:, 1] += 0.13
+    cloud[-3000:, 0] -= 0.05
+    mask = np.arange(len(cloud)) >= len(cloud) - 3000
+    assert robot.table is not None
+    assert len(sort_out(cloud, np.eye(4), robot.table).places) == 1
+    sight = sort_out(cloud, np.eye(4), robot.table, mask=mask)
+    assert np.abs(np.linalg.norm(sight.points - (0.45, 0.03, RADIUS), axis=1) - RADIUS).max() < 1e-6
+    assert len(sight.others) == pytest.approx(2300, rel=0.1)  # less its lower side
+
+
+def test_a_cloud_of_a_table_is_known_from_one_of_an_object(table_cloud: np.ndarray, robot: dro.Robot) -> None:
+    assert robot.table is not None
+    assert sees_table(table_cloud, robot.table)
+    assert not sees_table(table_cloud[-6000:-3000], robot.table)
+
+
+@pytest.mark.parametrize(("rows", "options", "said"), [
+    (slice(None), [], "has 2 things that stand on the table, at"),
+    (slice(0, 20_000), [], "nothing stands on the table"),
+    (slice(0, 20_000), ["--near", "0.4", "0"], "nothing stands on the table"),
+    (slice(None), ["--near", "0.4", "0", "--at", "0.4", "0"], "leave out --pose and --at"),
+])
+@pytest.mark.parametrize("frame", ["world", "camera"])
+def test_a_cloud_of_which_it_is_not_clear_what_is_wanted_is_refused(
+    rows: slice, options: list[str], said: str, frame: str, table_cloud: np.ndarray, robot: dro.Robot, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    cloud, output = table_cloud[rows], tmp_path / "plan.npz"
+    if frame == "camera":
+        assert robot.camera is not None
+        T = np.linalg.inv(robot.camera.T_world_camera)
+        cloud, options = cloud @ T[:3, :3].T + T[:3, 3], [*options, "--camera", "robot"]
+        said = said if "--at" not in options else "give one of them"
+    np.save(tmp_path / "cloud.npy", cloud)
+    command = ["plan", "--robot", "xarm7_leaphand", "--object", str(tmp_path / "cloud.npy"), "--output", str(output)]
+    assert main([*command, *options]) == 2
+    assert said in capsys.readouterr().err
+    assert not output.exists()
+
+
+def test_boxes_of_a_cloud_fill_its_cells_and_nothing_else() -> None:
+    points = np.random.default_rng(0).uniform(0, 0.06, (300, 3))
+    centre, half = occupied(points)
+    cells = np.unique(np.floor(points / VOXEL).astype(int), axis=0)
+    assert (2 * half).sum() == pytest.approx(len(cells) * VOXEL)
+    size = np.column_stack([np.full((len(half), 2), VOXEL / 2), half])
+    inside = (np.abs(points[:, None] - centre) <= size + 1e-9).all(-1)
+    assert inside.any(1).all()
+
+
+def test_hands_that_would_meet_an_obstacle_are_dropped(robot: dro.Robot) -> None:
+    obj, T = dro.load_object("can"), np.eye(4)
+    T[:3, 3] = 0.5, 0.1, -float(obj.cloud[:, 2].min())
+    hand = robot.hand
+    wrist = torch.eye(4)[None].repeat(2, 1, 1)
+    wrist[:, :3, 3] = torch.tensor([[0.5, 0.1, 0.4], [0.5, 0.6, 0.4]])
+    opened = torch.from_numpy(open_hand(robot)).float()[None].repeat(2, 1)
+    grasps = dro.GraspBatch.create(hand, obj, wrist, opened).replace(pregrasp_joints=opened, squeeze_joints=opened)
+    middle = hand.points(opened[0], wrist[0]).mean(0).numpy()
+    ball = np.random.default_rng(0).normal(size=(500, 3))
+    obstacle = dro.load_object(middle + 0.03 * ball / np.linalg.norm(ball, axis=1, keepdims=True), keep_table=True)
+    for thing in (obstacle, dro.load_object("cube")):
+        checker = CollisionChecker(robot, robot.table, [thing], obj, T)
+        reach = Reachability(robot, checker, obj, [thing], None, ReachConfig(), 0)
+        assert reach.promising(grasps) == ([1] if thing is obstacle else [0, 1])
+        assert list(reach.reasons.values()) == ([HITS_OBSTACLE] if thing is obstacle else [])
+
+
+def test_clutter_stands_on_the_table_around_the_object(robot: dro.Robot) -> None:
+    can, config = dro.load_object("can"), TabletopConfig(clutter=2)
+    others = other_objects("can", 2, np.random.default_rng(0))
+    assert "can" not in {o.name for o in others}
+    scene = LiftScene(robot, [can, *others])
+    assert scatter(scene, config.region, np.random.default_rng(1))
+    clouds = [o.cloud @ scene.pose(i)[:3, :3].T + scene.pose(i)[:3, 3] for i, o in enumerate(scene.objects)]
+    for i, cloud in enumerate(clouds):
+        assert abs(cloud[:, 2].min()) < 3e-3
+        for other in clouds[:i]:
+            assert np.linalg.norm(cloud[::20, None] - other[None, ::20], axis=-1).min() > APART / 3
+    with pytest.raises(dro.DroGraspError, match="clutter is 9"):
+        TabletopConfig(clutter=9)
