@@ -36,7 +36,7 @@ def table_cloud() -> np.ndarray:
     cube[rows, random.integers(3, size=len(cube))] = random.choice([-0.03, 0.03], len(cube))
     ball = random.normal(size=(3000, 3))
     ball *= RADIUS / np.linalg.norm(ball, axis=1, keepdims=True)
-    return np.concatenate([table, cube + (*CUBE, 0.03), ball + (*BALL, RADIUS)])
+    return np.concatenate([table, cube + np.array([*CUBE, 0.03]), ball + np.array([*BALL, RADIUS])])
 
 
 def test_the_thing_near_a_place_is_picked_and_the_other_is_an_obstacle(table_cloud: np.ndarray, robot: dro.Robot) -> None:

@@ -12,15 +12,15 @@ from PIL import Image
 
 import dro_grasp as dro
 from dro_grasp.cli.main import main
+from dro_grasp.perception.scan import depth_points
 from dro_grasp.planning import tabletop
 from dro_grasp.planning.animation import Recorder, draw_animation
-from dro_grasp.perception.scan import depth_points
 from dro_grasp.planning.attempts import Attempt, TabletopConfig, attempt
 from dro_grasp.planning.clutter import rest
 from dro_grasp.planning.depth_images import STRIDE, depth_image, thinned_intrinsics
-from dro_grasp.planning.table_scene import clusters, fit_plane, sort_out
 from dro_grasp.planning.physics import LiftScene
 from dro_grasp.planning.planner import PlanConfig
+from dro_grasp.planning.table_scene import clusters, fit_plane, sort_out
 from dro_grasp.planning.tabletop import TabletopRun, read_attempts, run_tabletop, write_attempts
 
 QUICK = TabletopConfig(see="mesh", hold_seconds=0.5, shake_seconds=0.5, plan=PlanConfig(num=16))
@@ -107,9 +107,9 @@ def test_an_empty_table_is_refused_in_words(robot: dro.Robot, can: dro.ObjectMod
     scene.place(0, aside)
     assert robot.camera is not None
     assert robot.table is not None
+    points = depth_points(depth_image(scene, robot.camera, 0.0015, 0)[0], thinned_intrinsics(robot.camera))
     with pytest.raises(dro.DroGraspError, match="nothing stands on the table"):
-        depth, _ = depth_image(scene, robot.camera, 0.0015, 0)
-        sort_out(depth_points(depth, thinned_intrinsics(robot.camera)), robot.camera.T_world_camera, robot.table)
+        sort_out(points, robot.camera.T_world_camera, robot.table)
 
 
 def test_an_attempt_lifts_a_can_is_repeatable_and_becomes_an_animation(
@@ -123,7 +123,7 @@ def test_an_attempt_lifts_a_can_is_repeatable_and_becomes_an_animation(
     again = attempt(robot, can, 0, 0, predictor, QUICK)
     assert (again.stage, again.raised, again.place) == (result.stage, result.raised, result.place)
     recorder.frames = recorder.frames[::20]
-    draw_animation(robot, can, recorder, tmp_path / "lift.gif")
+    draw_animation(robot, recorder, tmp_path / "lift.gif")
     with Image.open(tmp_path / "lift.gif") as film:
         assert film.n_frames == len(recorder.frames)  # type: ignore[attr-defined]
 

@@ -27,8 +27,8 @@ class Plan:
     robot: str
     """A robot file, or the name of a built-in robot (see `dro-grasp robot list`)."""
     object: str
-    """A cloud (PLY, NPY, PCD), a mesh, or an object's name (see `dro-grasp objects`), in the robot's world frame. A cloud may show
-    the table and other things too."""
+    """A cloud (PLY, NPY, PCD), a mesh, or an object's name (see `dro-grasp objects`), in the robot's world frame. A cloud may
+    show the table and other things too."""
     camera: Annotated[str | None, optional("JSON|robot", "the object is in the world frame")] = None
     """The object is a cloud in this camera's frame; it is cleaned and completed. A file with {"frame": "world",
     "T_frame_camera": 4x4}, or `robot` for the camera of the robot file."""

@@ -23,14 +23,14 @@ MAX_PIXELS = 100_000_000
 
 @dataclass(frozen=True)
 class View:
-    """View the grasps of a file in the browser, or generate grasps there.
+    """View grasps, the plan of a lift, or attempts of an arm in the browser, or generate grasps there.
 
     Example: dro-grasp view grasps.parquet
     """
 
     file: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[FILE]")] = None
-    """Grasp file, or a folder of them. Without it, the page lets you choose a hand and an object, generate grasps, watch trials
-    and export."""
+    """Grasp file, or a folder of them; a plan; or attempts of `dro-grasp tabletop`. Without it, the page lets
+    you choose a hand and an object, generate grasps, watch trials and export."""
     hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Hand to use instead of the one named in the file."""
     object: Annotated[str | None, optional("NAME|PATH", "the names in the file")] = None
@@ -41,8 +41,12 @@ class View:
     """Port to serve on; if it is taken, the next free one."""
     host: str = "127.0.0.1"
     """Address to serve at. By default only this machine can connect; 0.0.0.0 serves the whole network."""
+    attempt: int = 0
+    """Which of the attempts in the file to run once more and show first."""
+    robot: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
+    """Robot to use instead of the one named in a plan or an attempt."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
-    """Weights for grasps generated on the page."""
+    """Weights for grasps generated on the page, and those of the attempts."""
     device: str = "cpu"
     """Device for the network and the energies of grasps generated on the page: cpu, cuda or cuda:1."""
 
@@ -53,6 +57,13 @@ class View:
 
         if self.file is None:
             serve(Studio(weights=self.weights, port=self.port, host=self.host, device=self.device))
+            return 0
+        if is_motion(self.file):
+            from dro_grasp.planning.extra import require_arm_extra
+            from dro_grasp.viewer.lift_page import lift_page
+
+            require_arm_extra()
+            serve(lift_page(self.file, self.attempt, self.robot, self.weights, self.port, self.host))
             return 0
         from dro_grasp.grasps.reading import load_grasps
         from dro_grasp.grasps.sources import hand_of
@@ -142,6 +153,21 @@ class Picture:
             raise OptionError(f"--size is {self.size[0]} {self.size[1]}; give a width and a height of 1 to {MAX_SIDE} pixels")
         if not 0 <= self.opacity <= 1:
             raise OptionError(f"--opacity is {self.opacity}; give a number from 0 to 1")
+
+
+def is_motion(file: Path) -> bool:
+    """Whether a file holds a plan or attempts of an arm, and not grasps."""
+    if file.suffix.lower() == ".npz":
+        return True
+    if file.suffix.lower() != ".parquet" or not file.is_file():
+        return False
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        return {"stage", "settings", "robot"} <= set(pq.read_schema(file).names)
+    except (OSError, pa.ArrowInvalid):
+        return False
 
 
 def of_object(grasps: GraspBatch, name: str | None, scale: float) -> tuple[ObjectModel, GraspBatch]:

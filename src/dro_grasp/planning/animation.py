@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,11 +14,13 @@ from dro_grasp.errors import OutputError
 from dro_grasp.files import check_output, replacing
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.planning.attempts import Attempt, attempt
+from dro_grasp.planning.attempts import Attempt, Watcher, attempt
+from dro_grasp.planning.motion import MotionPlan
 from dro_grasp.planning.physics import LiftScene
 from dro_grasp.planning.robot import Robot, load_robot
 from dro_grasp.planning.robot_check import robot_meshes, table_meshes
 from dro_grasp.planning.robot_file import Table
+from dro_grasp.planning.table_scene import PickedObject
 from dro_grasp.planning.tabletop import TabletopRun
 from dro_grasp.predictor import GraspPredictor
 from dro_grasp.rendering.camera import Camera
@@ -34,25 +37,37 @@ VIEW = (0.9, -1.25, 0.75)
 """Direction from the robot towards the camera, in the world."""
 OBJECT_COLOUR: Colour = (0.95, 0.62, 0.28)
 """Orange of the object."""
+OTHER_COLOUR: Colour = (0.62, 0.68, 0.55)
+"""Green of other objects on the table."""
 LAST_SECONDS = 1.0
 """How long the last frame stays [s] (ours)."""
 
 
 @dataclass
-class Recorder:
-    """Keeps what a scene looks like, RATE times a second; an instance is a `Watch` of an attempt."""
+class Recorder(Watcher):
+    """Keeps what a scene looks like, and the plan that is carried out in it."""
 
-    frames: list[tuple[Float[np.ndarray, " n_arm"], Float[np.ndarray, " n_dof"], Float[np.ndarray, "4 4"]]] = field(
+    rate: float = RATE
+    """Pictures a second."""
+    frames: list[tuple[Float[np.ndarray, " n_arm"], Float[np.ndarray, " n_dof"], Float[np.ndarray, "o 4 4"]]] = field(
         default_factory=list)
-    """Arm, hand [rad or m], and the object's pose [m]."""
-    next_time: float = 0.0
+    """Arm, hand [rad or m], and the objects' poses [m]."""
+    objects: tuple[ObjectModel, ...] = ()
+    """The objects in the scene, the one that is asked for first."""
+    plan: MotionPlan | None = None
+    next_time: float | None = None
     """Simulated time of the next frame [s]."""
 
-    def __call__(self, scene: LiftScene) -> None:
+    def planned(self, seen: PickedObject, made: MotionPlan) -> None:
+        """Keep the plan."""
+        self.plan = made
+
+    def moved(self, scene: LiftScene) -> None:
         """Look at the scene."""
-        if scene.data.time >= self.next_time:
-            self.frames.append((*scene.joints(), scene.pose(0)))
-            self.next_time = scene.data.time + 1 / RATE - scene.model.opt.timestep / 2
+        if self.next_time is None or scene.data.time >= self.next_time:
+            self.objects = scene.objects
+            self.frames.append((*scene.joints(), np.stack([scene.pose(i) for i in range(len(scene.objects))])))
+            self.next_time = scene.data.time + 1 / self.rate - scene.model.opt.timestep / 2
 
 
 def check_animation(path: Path) -> None:
@@ -66,7 +81,7 @@ def check_animation(path: Path) -> None:
         raise OutputError(f"{path} is no name of an animation; let it end in {' or '.join(FORMATS)}")
 
 
-def draw_animation(robot: Robot, obj: ObjectModel, recorder: Recorder, path: Path) -> None:
+def draw_animation(robot: Robot, recorder: Recorder, path: Path) -> None:
     """Write the animation of a recorded attempt.
 
     Raises:
@@ -76,7 +91,7 @@ def draw_animation(robot: Robot, obj: ObjectModel, recorder: Recorder, path: Pat
     if not recorder.frames:
         raise OutputError(f"no motion to draw into {path}: the attempt ended before the robot moved")
     camera = _camera(robot, recorder)
-    pictures = [Image.fromarray(_frame(robot, obj, camera, *frame)) for frame in recorder.frames]
+    pictures = [Image.fromarray(_frame(robot, recorder.objects, camera, *frame)) for frame in recorder.frames]
     seconds = [1000 // RATE] * (len(pictures) - 1) + [round(1000 * LAST_SECONDS)]
     kind = FORMATS[path.suffix.lower()]
     options = {"quality": 70, "method": 4} if kind == "WEBP" else {"optimize": True}
@@ -95,25 +110,28 @@ def draw_attempt(run: TabletopRun, path: Path) -> Attempt:
     check_animation(path)
     robot, obj, recorder = load_robot(run.robot), load_object(run.objects[0]), Recorder()
     result = attempt(robot, obj, 0, run.seed, GraspPredictor(run.weights), run.config, recorder)
-    draw_animation(robot, obj, recorder, path)
+    draw_animation(robot, recorder, path)
     return result
 
 
 def _frame(
-    robot: Robot, obj: ObjectModel, camera: Camera, arm: Float[np.ndarray, " n_arm"], hand: Float[np.ndarray, " n_dof"],
-    T_world_object: Float[np.ndarray, "4 4"],
+    robot: Robot, objects: Sequence[ObjectModel], camera: Camera, arm: Float[np.ndarray, " n_arm"],
+    hand: Float[np.ndarray, " n_dof"], poses: Float[np.ndarray, "o 4 4"],
 ) -> UInt8[np.ndarray, "height width 3"]:
-    assert obj.vertices is not None
-    assert obj.faces is not None
-    thing = Mesh(obj.vertices @ T_world_object[:3, :3].T + T_world_object[:3, 3], obj.faces, OBJECT_COLOUR)
-    return render([*table_meshes(robot.table), *robot_meshes(robot, arm, hand), thing], camera, *SIZE)
+    things = []
+    for i, (obj, T) in enumerate(zip(objects, poses, strict=True)):
+        assert obj.vertices is not None
+        assert obj.faces is not None
+        colour = OTHER_COLOUR if i else OBJECT_COLOUR
+        things.append(Mesh(obj.vertices @ T[:3, :3].T + T[:3, 3], obj.faces, colour))
+    return render([*table_meshes(robot.table), *robot_meshes(robot, arm, hand), *things], camera, *SIZE)
 
 
 def _camera(robot: Robot, recorder: Recorder) -> Camera:
     """A camera that has the whole motion in its picture, and the part of the table around it."""
     moved = [mesh.vertices for arm, hand, _ in recorder.frames[:: max(1, len(recorder.frames) // 8)]
              for mesh in robot_meshes(robot, arm, hand)]
-    places = np.stack([T[:3, 3] for _, _, T in recorder.frames])
+    places = np.stack([T[0, :3, 3] for _, _, T in recorder.frames])
     table = robot.table or Table()
     around = places[:1, :2] + 0.15 * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
     corners = np.column_stack([around, np.full(4, table.height)])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Literal
 
@@ -19,6 +18,7 @@ from dro_grasp.planning.depth_images import depth_image, thinned_intrinsics
 from dro_grasp.planning.motion import STAGES, MotionPlan
 from dro_grasp.planning.physics import LiftScene
 from dro_grasp.planning.planner import PlanConfig, plan
+from dro_grasp.planning.reachability import ReachConfig
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.standing import moved
 from dro_grasp.planning.table_scene import PickedObject, pick_object
@@ -26,6 +26,8 @@ from dro_grasp.predictor import GraspPredictor
 
 VERSION = 2
 """Goes up with every change that can change an outcome."""
+LABEL = f"tabletop/{VERSION} "
+"""Beginning of the settings of stored attempts."""
 PUSHED = 0.03
 """Farthest that the object may move before the hand closes [m] (ours)."""
 SLIPPED = 0.05
@@ -68,7 +70,24 @@ class TabletopConfig:
 
     def label(self) -> str:
         """Version and every setting, as stored with results: results of other settings are not mixed."""
-        return f"tabletop/{VERSION} " + json.dumps(asdict(self), sort_keys=True)
+        return LABEL + json.dumps(asdict(self), sort_keys=True)
+
+    @staticmethod
+    def from_label(label: str) -> TabletopConfig:
+        """The settings that a label states.
+
+        Raises:
+            OptionError: They are of another version.
+        """
+        try:
+            values = json.loads(label.removeprefix(LABEL))
+            reach = ReachConfig(**values["plan"].pop("reach"))
+            config = TabletopConfig(**values | {"plan": PlanConfig(**values["plan"], reach=reach),
+                                                "region": tuple(values["region"])})
+        except (ValueError, TypeError, KeyError) as error:
+            raise OptionError(f"the attempt was made by another version of dro-grasp ({label.split(' ')[0]}), and cannot be "
+                              "repeated; run `dro-grasp tabletop` again") from error
+        return config
 
 
 @dataclass(frozen=True)
@@ -109,15 +128,25 @@ class Attempt:
     """Duration of the planned motion [s]."""
     pushed: float = 0.0
     """Farthest that one of the other objects was moved [m]."""
+    robot_file: str = ""
+    """Name or file that the robot was loaded from."""
+    object_file: str = ""
+    """The same of the object."""
 
 
-Watch = Callable[[LiftScene], None]
-"""Called at least fifty times a second of simulated time."""
+class Watcher:
+    """Is told what happens in an attempt; does nothing with it by itself."""
+
+    def planned(self, seen: PickedObject, made: MotionPlan) -> None:
+        """There is a plan for what was seen."""
+
+    def moved(self, scene: LiftScene) -> None:
+        """Time has passed; called at least fifty times a second of simulated time."""
 
 
 def attempt(
     robot: Robot, obj: ObjectModel, number: int, seed: int, predictor: GraspPredictor, config: TabletopConfig | None = None,
-    watch: Watch | None = None,
+    watch: Watcher | None = None,
 ) -> Attempt:
     """Run one attempt from beginning to end.
 
@@ -128,7 +157,7 @@ def attempt(
         seed: Of all draws.
         predictor: Proposes grasps.
         config: How it runs.
-        watch: See `Watch`.
+        watch: Is told what happens.
 
     Raises:
         OptionError: The robot lacks a table or a camera, or the object is a bare cloud.
@@ -150,6 +179,8 @@ def attempt(
         made = plan(seen.robot, seen.obj, T, seen.obstacles, predictor, config.plan, seed + number)
     except DroGraspError as error:
         return replace(result, reason=str(error))
+    if watch is not None:
+        watch.planned(seen, made)
     notes = made.notes
     result = replace(
         result, processor_seconds=time.process_time() - processor, plan_seconds=time.perf_counter() - begin,
@@ -161,10 +192,10 @@ def attempt(
     return replace(result, stage=stage, reason=reason, success=not reason, raised=raised, pushed=pushed)
 
 
-def carry_out(scene: LiftScene, made: MotionPlan, config: TabletopConfig, watch: Watch | None = None) -> tuple[str, str]:
+def carry_out(scene: LiftScene, made: MotionPlan, config: TabletopConfig, watch: Watcher | None = None) -> tuple[str, str]:
     """Let the servos follow a plan, then hold and shake; where it ended, and why if it failed."""
     start = scene.pose(0)
-    call = None if watch is None else lambda: watch(scene)
+    call = None if watch is None else lambda: watch.moved(scene)
     for stage in STAGES:
         rows = made.part(stage)
         for i in range(rows.start + 1, rows.stop):

@@ -18,10 +18,18 @@ from dro_grasp.planning.timing import Trajectory
 
 STAGES = ("reach", "shape", "approach", "close", "lift")
 """The arm travels with the hand open; the hand takes the pregrasp; straight to the grasp; the hand closes; straight up."""
-FORMAT = 1
+FORMAT = 2
 """Version of plan files."""
+CHOSEN = "chosen"
+"""Fate of the grasp that the motion carries out."""
+READY = "could be carried out too"
+"""Fate of grasps that were given to the planner beside it."""
+WAITING = "not tried"
+"""Fate of grasps that were not looked at, since better ones sufficed."""
 COLUMNS = ("time", "stage", "arm", "arm_velocity", "arm_acceleration", "hand", "hand_velocity", "hand_acceleration")
 """Arrays of a plan file."""
+SCENE = ("points", "others", "T_world_wrist", "joints", "score")
+"""Further arrays of it, what was planned for; their names begin with `scene_`."""
 
 
 @dataclass(frozen=True)
@@ -68,10 +76,29 @@ class PlanNotes:
 
 
 @dataclass(frozen=True, eq=False)
+class PlanScene:
+    """What a motion was planned for, in the world: for pictures, and for checks by others."""
+
+    points: Float[np.ndarray, "n 3"]
+    """Of the object [m]."""
+    others: Float[np.ndarray, "m 3"]
+    """Of obstacles [m]."""
+    T_world_wrist: Float[np.ndarray, "g 4 4"]
+    """Wrist poses of all grasps that there were [m]."""
+    joints: Float[np.ndarray, "g n_dof"]
+    """Their joints [rad or m]."""
+    score: Float[np.ndarray, " g"]
+    """Their scores."""
+    fate: tuple[str, ...]
+    """CHOSEN, READY, WAITING, or why each was dropped."""
+
+
+@dataclass(frozen=True, eq=False)
 class MotionPlan:
     """Arm and hand over time, from home to the lifted object."""
 
     notes: PlanNotes
+    scene: PlanScene
     stage: Int[np.ndarray, " k"]
     """Index into STAGES of each sample."""
     arm: Trajectory
@@ -113,8 +140,9 @@ class MotionPlan:
         Raises:
             OutputError: The path cannot be written.
         """
-        header = json.dumps({"format_version": FORMAT, "stages": STAGES, **asdict(self.notes)})
+        header = json.dumps({"format_version": FORMAT, "stages": STAGES, "fate": self.scene.fate, **asdict(self.notes)})
         arrays = {"time": self.arm.time, "stage": self.stage}
+        arrays |= {f"scene_{name}": getattr(self.scene, name).astype(np.float32) for name in SCENE}
         for name, part in (("arm", self.arm), ("hand", self.hand)):
             arrays |= {name: part.position, f"{name}_velocity": part.velocity, f"{name}_acceleration": part.acceleration}
         with replacing(check_output(path), "plan") as temporary, temporary.open("wb") as file:
@@ -130,14 +158,17 @@ class MotionPlan:
         try:
             with Path(path).open("rb") as raw, np.load(raw, allow_pickle=False) as file:
                 header: dict[str, Any] = json.loads(str(file["header"]))
+                fate = tuple(header.pop("fate", ()))
                 time, stage, *rows = (file[name] for name in COLUMNS)
+                scene = [file[f"scene_{name}"] for name in SCENE] if header["format_version"] == FORMAT else []
         except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
             raise PlanError(f"{path} is no plan file ({error}); `dro-grasp plan` writes them") from error
         if header.pop("format_version", None) != FORMAT or tuple(header.pop("stages", ())) != STAGES:
             raise PlanError(f"{path} is a plan file of another version; plan again")
         for key in ("arm_joints", "hand_joints"):
             header[key] = tuple(header[key])
-        return MotionPlan(PlanNotes(**header), stage, Trajectory(time, *rows[:3]), Trajectory(time, *rows[3:]))
+        arm, hand = Trajectory(time, *rows[:3]), Trajectory(time, *rows[3:])
+        return MotionPlan(PlanNotes(**header), PlanScene(*scene, fate), stage, arm, hand)
 
 
 def dropped_in_words(grasps: int, dropped: dict[str, int]) -> str:

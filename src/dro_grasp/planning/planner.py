@@ -17,7 +17,7 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.planning.candidates import Directions, grasps_in_world
 from dro_grasp.planning.collisions import TARGET, CollisionChecker, open_hand
 from dro_grasp.planning.extra import require_arm_extra
-from dro_grasp.planning.motion import STAGES, MotionPlan, PlanNotes, dropped_in_words
+from dro_grasp.planning.motion import CHOSEN, READY, STAGES, WAITING, MotionPlan, PlanNotes, PlanScene, dropped_in_words
 from dro_grasp.planning.reachability import Feasible, Postures, Reachability, ReachConfig, carried
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.standing import upright
@@ -120,7 +120,7 @@ class _Task:
         self, robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"], obstacles: Sequence[ObjectModel],
         config: PlanConfig, seed: int,
     ) -> None:
-        self.robot, self.config, self.seed = robot, config, seed
+        self.robot, self.obstacles, self.config, self.seed = robot, obstacles, config, seed
         self.obj, self.T_world_object = upright(obj, T_world_object)
         self.watch = Stopwatch("grasps", "reach", "path", "timing")
         self.checker = CollisionChecker(robot, robot.table, obstacles, self.obj, self.T_world_object)
@@ -211,7 +211,8 @@ class _Task:
                 with self.watch("timing"):
                     made = self._timed(path.waypoints, chosen, Postures.of(self.robot, grasps, chosen.index))
                 if made is not None:
-                    return MotionPlan(self._notes(grasps, chosen.index, count), *made)
+                    scene = self._scene(grasps, chosen.index, goals)
+                    return MotionPlan(self._notes(grasps, chosen.index, count), scene, *made)
                 self.reach.reasons[chosen.index] = NO_PATH
             elif not best:
                 break
@@ -255,6 +256,15 @@ class _Task:
             self.robot.name, self.obj.name, self.robot.arm_joints, self.robot.hand_joints, "world", self.height, len(grasps),
             self.dropped, goals, index, float(grasps.score[index]), grasps.T_object_wrist[index].double().tolist(),
             self.seed, self.watch.seconds)
+
+    def _scene(self, grasps: GraspBatch, index: int, goals: list[Feasible]) -> PlanScene:
+        T, clouds = self.T_world_object, [np.zeros((0, 3), np.float32), *(thing.cloud for thing in self.obstacles)]
+        ready = {goal.index for goal in goals}
+        fate = (CHOSEN if i == index else READY if i in ready else self.reach.reasons.get(i, WAITING)
+                for i in range(len(grasps)))
+        return PlanScene(
+            self.obj.cloud @ T[:3, :3].T + T[:3, 3], np.concatenate(clouds), grasps.T_object_wrist.double().numpy(),
+            grasps.joints.double().numpy(), grasps.score.double().numpy(), tuple(fate))
 
     def _distance(self) -> float:
         """From the arm's base to the object's middle, along the ground [m]."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 
+from dro_grasp.descriptions.loader import Description
 from dro_grasp.files import check_output, replacing
 from dro_grasp.planning.collisions import CollisionChecker, open_hand
 from dro_grasp.planning.robot import Robot, load_robot
@@ -128,18 +129,36 @@ def draw_robot(robot: Robot, path: Path) -> None:
 
 def robot_meshes(robot: Robot, arm: Float[np.ndarray, " n_arm"], hand: Float[np.ndarray, " n_dof"]) -> list[Mesh]:
     """The visual shapes of arm and hand in the world."""
+    return [replace(shape, vertices=shape.vertices @ T[:3, :3].T + T[:3, 3])
+            for shape, T in zip(robot_shapes(robot), shape_poses(robot, arm, hand), strict=True)]
+
+
+def robot_shapes(robot: Robot) -> list[Mesh]:
+    """The visual shapes of arm and hand, each in its link's frame."""
     found = []
-    parts = (robot.arm, arm, robot.T_world_base), (robot.hand.description, hand, robot.T_world_wrist(arm))
-    for description, q, root in parts:
-        if description is None:
-            continue
-        poses = root @ description.tree.double.forward(torch.from_numpy(np.asarray(q, np.float64))).numpy()
+    for description in _parts(robot):
         for shape in description.geometry:
             if shape.visual:
-                T = poses[shape.link]
-                colour = HAND_COLOUR if description is not robot.arm else MOUNT_COLOUR if shape.link == 0 else ARM_COLOUR
-                found.append(Mesh(shape.vertices @ T[:3, :3].T + T[:3, 3], shape.faces, colour))
+                arm_colour = MOUNT_COLOUR if shape.link == 0 else ARM_COLOUR
+                colour = arm_colour if description is robot.arm else HAND_COLOUR
+                found.append(Mesh(shape.vertices, shape.faces, colour))
     return found
+
+
+def shape_poses(
+    robot: Robot, arm: Float[np.ndarray, " n_arm"], hand: Float[np.ndarray, " n_dof"]
+) -> Float[np.ndarray, "n 4 4"]:
+    """Where the link of each of these shapes is in the world [m]."""
+    found = []
+    for description in _parts(robot):
+        q, root = (arm, robot.T_world_base) if description is robot.arm else (hand, robot.T_world_wrist(arm))
+        poses = root @ description.tree.double.forward(torch.from_numpy(np.asarray(q, np.float64))).numpy()
+        found += [poses[shape.link] for shape in description.geometry if shape.visual]
+    return np.stack(found)
+
+
+def _parts(robot: Robot) -> list[Description]:
+    return [robot.arm, *([robot.hand.description] if robot.hand.description is not None else [])]
 
 
 def table_meshes(table: Table | None, thickness: float = 0.02) -> list[Mesh]:

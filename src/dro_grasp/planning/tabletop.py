@@ -6,7 +6,7 @@ import multiprocessing
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -104,7 +104,8 @@ def _all_attempts(run: TabletopRun, name: str, numbers: Sequence[int]) -> list[A
 def _attempts(run: TabletopRun, name: str, numbers: Sequence[int]) -> Iterator[Attempt]:
     robot, obj, predictor = load_robot(run.robot), load_object(name), GraspPredictor(run.weights)
     for number in numbers:
-        yield attempt(robot, obj, number, run.seed, predictor, run.config)
+        made = attempt(robot, obj, number, run.seed, predictor, run.config)
+        yield replace(made, robot_file=str(run.robot), object_file=str(name))
 
 
 def write_attempts(attempts: Sequence[Attempt], path: Path) -> None:

@@ -46,7 +46,7 @@ class Stage:
         self.hand: Hand | None = None
         server.scene.set_up_direction("+z")
         self._camera: Camera | None = None
-        server.on_client_connect(self._aim)
+        server.on_client_connect(self._turn)
         self._root = 0
 
     def set_pair(self, hand: Hand, obj: ObjectModel, joints: Float[Tensor, " n_dof"], T: Float[Tensor, "4 4"]) -> None:
@@ -74,15 +74,19 @@ class Stage:
         self.contacts = self.cloud("contacts", np.zeros((1, 3)), appearance.CONTACT_COLOUR, CONTACT_SIZE)
         position = (*obj.cloud.mean(0)[:2].tolist(), float(obj.cloud.min(0)[2]) - GRID_DEPTH)
         self._grid = scene.add_grid(f"{name}/grid", width=0.4, height=0.4, cell_size=0.05, section_size=0.1, position=position)
-        self._camera = camera = appearance.best_camera(hand, joints, T, obj)
+        self.aim(appearance.best_camera(hand, joints, T, obj))
+        self.show(joints, T)
+
+    def aim(self, camera: Camera) -> None:
+        """Turn all clients' cameras, also of those that connect later."""
+        self._camera = camera
         initial = self.server.initial_camera
         initial.position, initial.look_at, initial.fov = position_of(camera), camera.target, camera.field_of_view
         for client in self.server.get_clients().values():
-            self._aim(client)
-        self.show(joints, T)
+            self._turn(client)
 
-    def _aim(self, client: viser.ClientHandle) -> None:
-        """Turn a client's camera to the pair, from farther away where its window is narrow."""
+    def _turn(self, client: viser.ClientHandle) -> None:
+        """Turn a client's camera to what is shown, from farther away where its window is narrow."""
         if (camera := self._camera) is not None:
             client.camera.position = position_of(camera, client.camera.aspect)
             client.camera.look_at, client.camera.fov = camera.target, camera.field_of_view
