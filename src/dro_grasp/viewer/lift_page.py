@@ -35,8 +35,10 @@ DROPPED_COLOUR: Colour = (0.62, 0.62, 0.62)
 """Grey of grasps that were dropped."""
 WAITING_COLOUR: Colour = (0.93, 0.80, 0.35)
 """Yellow of grasps that were not tried."""
-NONE, EVERY = "none", "all"
-"""Choices of grasps to show."""
+NONE = "none"
+"""Choice of no grasps."""
+EVERY = "all"
+"""Choice of every grasp."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +62,9 @@ class Film:
         arm, hand = np.stack([p.arm for p in points]), np.stack([p.hand for p in points])
         wrist = robot.T_world_wrist(arm)
         lifting = np.array([p.stage == STAGES[-1] for p in points])
-        first = int(lifting.argmax())
+        start = robot.T_world_wrist(plan.arm.position[plan.part(STAGES[-1])][0])
         poses = np.tile(np.eye(4), (len(points), 1, 1, 1))
-        poses[lifting, 0] = np.stack([carried(T, wrist[first]) for T in wrist[lifting]])
+        poses[lifting, 0] = np.stack([carried(T, start) for T in wrist[lifting]])
         return Film(arm, hand, poses, plan)
 
     @staticmethod
@@ -125,7 +127,7 @@ class LiftPage(ServedPage):
         self.moment = gui.add_slider("Moment", 0, 1, 1, 0, disabled=True)
         self.cloud = gui.add_checkbox("Camera's cloud", True, hint="What was planned for, its unseen side estimated.")
         self.shapes = gui.add_checkbox("Objects", True, hint="As they were simulated.", disabled=not self.attempts)
-        self.grasps = gui.add_dropdown("Grasps", (NONE, EVERY), initial_value=NONE, hint="From the wrist to between the fingers.")
+        self.grasps = gui.add_dropdown("Grasps", (NONE, EVERY), initial_value=NONE, hint="Lines from wrist to fingertips.")
         self.text = gui.add_markdown("")
         self.play.on_click(lambda _: self._guarded(self._play))
         self.moment.on_update(lambda event: None if event.client is None else self.show_moment(int(self.moment.value)))
@@ -175,7 +177,8 @@ class LiftPage(ServedPage):
                                          ("others", film.plan.scene.others, DROPPED_COLOUR)):
                 if len(points):
                     self._clouds.append(scene.add_point_cloud(
-                        f"/seen/{name}", points.astype(np.float32), rgb(colour), point_size=POINT_SIZE, point_shape="circle"))
+                        f"/seen/{name}", points.astype(np.float32), rgb(colour), point_size=POINT_SIZE, point_shape="circle",
+                        precision="float32"))
             self.grasps.options = (NONE, EVERY, *dict.fromkeys(film.plan.scene.fate))
             said += film.plan.lines()
         self._said = "  \n".join(filter(None, said))
@@ -221,7 +224,7 @@ class LiftPage(ServedPage):
         colours = {CHOSEN: SUCCESS_COLOUR, READY: SOLVED_COLOUR, WAITING: WAITING_COLOUR}
         rows = np.array([rgb(colours.get(scene.fate[i], DROPPED_COLOUR)) for i in kept], np.uint8)
         self.server.scene.add_line_segments(
-            "/grasps", ends.astype(np.float32), np.repeat(rows[:, None], 2, 1), line_width=2.0)
+            "/grasps", ends.astype(np.float32), np.repeat(rows[:, None], 2, 1), thickness=2.0, thickness_units="screen")
 
     def _aim(self) -> None:
         """Look at the whole motion."""
