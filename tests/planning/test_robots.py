@@ -88,6 +88,27 @@ def test_any_arm_and_any_hand_are_one_file(
     robot = load_robot(written(values, tmp_path))
     assert len(robot.arm_joints) == count
     assert CollisionChecker(robot, robot.table).excluded
+    if "lite6" in arm:  # what its actuators state
+        assert robot.effort.tolist() == [50, 50, 32, 32, 32, 20]
+        assert np.allclose(robot.lower[[0, 2]], [-6.28319, -0.061087], atol=1e-4)
+
+
+def test_limits_of_an_mjcf_arm_are_read_and_those_that_it_cannot_state_are_asked_for(
+    values: dict[str, Any], tmp_path: Path
+) -> None:
+    arm = tmp_path / "arm.xml"
+    arm.write_text("""<mujoco><worldbody><body name="base"><geom size="0.05"/><body name="upper" pos="0 0 0.3">
+        <joint name="a" axis="0 1 0" range="-90 60"/><geom size="0.03"/><body name="tip" pos="0 0 0.3">
+        <joint name="b" axis="0 1 0" range="-45 45" actuatorfrcrange="-7 7"/><geom size="0.03"/></body></body></body>
+        </worldbody><actuator><position joint="a" kp="100" forcerange="-20 20"/></actuator></mujoco>""")
+    values |= {"arm": str(arm), "mount": {"link": "tip"}, "home": {"a": 0.0, "b": 0.0}, "limits": {"acceleration": 4.0}}
+    with pytest.raises(RobotError, match="joint 'a' of the arm has no velocity limit; state it in"):
+        load_robot(written(values, tmp_path))
+    values["limits"]["velocity"] = 1.0
+    robot = load_robot(written(values, tmp_path))
+    assert np.allclose(robot.lower, np.radians([-90, -45]))
+    assert np.allclose(robot.upper, np.radians([60, 45]))
+    assert robot.effort.tolist() == [20, 7]
 
 
 def test_an_arm_that_dips_into_the_table_collides_with_it_and_with_nothing_else(values: dict[str, Any], tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -152,8 +153,8 @@ class _Fit:
         return lower, upper
 
     def limit(self, kind: str, default: float | None = None) -> Float[np.ndarray, " n"]:
-        """One limit of each joint: the file's, or else the URDF's."""
-        given, stated = self.file.limits.get(kind), _urdf_limits(self.arm.path, kind)
+        """One limit of each joint: the file's, or else the arm's."""
+        given, stated = self.file.limits.get(kind), _stated_limits(self.arm.path, kind)
         if given is not None and not isinstance(given, dict):
             given = dict.fromkeys(self.joints, given)
         values = {**stated, **self._by_joint(kind, given or {})}
@@ -186,10 +187,25 @@ class _Fit:
         return values
 
 
-def _urdf_limits(path: Path, kind: str) -> dict[str, float]:
-    """What a URDF states of its joints; MuJoCo does not keep velocities. Zero means that nothing is known."""
+def _stated_limits(path: Path, kind: str) -> dict[str, float]:
+    """What the arm's file states of its joints. Zero means that nothing is known.
+
+    MuJoCo does not keep the velocities of a URDF, and MJCF has none; its efforts are those of joints and of their actuators.
+    """
     root = parse_xml(path)
-    if root.tag != "robot" or kind not in {"velocity", "effort"}:
+    if kind not in {"velocity", "effort"}:
         return {}
+    if root.tag != "robot":
+        return _mjcf_efforts(path) if kind == "effort" else {}
     found = {j.get("name", ""): float(limit.get(kind, 0)) for j in root.findall("joint") for limit in j.findall("limit")}
     return {name: value for name, value in found.items() if value > 0}
+
+
+def _mjcf_efforts(path: Path) -> dict[str, float]:
+    model = mujoco.MjModel.from_xml_path(str(path))
+    limited = [i for i in range(model.njnt) if model.jnt_actfrclimited[i]]
+    found = {model.joint(i).name: float(model.jnt_actfrcrange[i].max()) for i in limited}
+    for i in range(model.nu):
+        if model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT and model.actuator_forcelimited[i]:
+            found.setdefault(model.joint(model.actuator_trnid[i, 0]).name, float(model.actuator_forcerange[i].max()))
+    return found
