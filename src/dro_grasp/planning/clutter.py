@@ -76,7 +76,7 @@ def _free_place(
     base, outline = scene.robot.T_world_base[:2, 3], scene.objects[index].cloud @ T[:2, :3].T
     poses = [scene.pose(i) for i in range(index)]
     others = [obj.cloud @ T[:2, :3].T + T[:2, 3] for obj, T in zip(scene.objects, poses, strict=False)]
-    tree = KDTree(np.concatenate(others)) if others else None
+    tree, place = KDTree(np.concatenate(others)) if others else None, base
     for _ in range(PLACES):
         place = base + draw.uniform(region[:2], region[2:])
         if tree is None or tree.query(outline + place)[0].min() > APART:

@@ -160,7 +160,7 @@ class MotionPlan:
                 header: dict[str, Any] = json.loads(str(file["header"]))
                 fate = tuple(header.pop("fate", ()))
                 time, stage, *rows = (file[name] for name in COLUMNS)
-                scene = [file[f"scene_{name}"] for name in SCENE] if header["format_version"] == FORMAT else []
+                scene = {name: file[f"scene_{name}"] for name in SCENE} if header["format_version"] == FORMAT else {}
         except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
             raise PlanError(f"{path} is no plan file ({error}); `dro-grasp plan` writes them") from error
         if header.pop("format_version", None) != FORMAT or tuple(header.pop("stages", ())) != STAGES:
@@ -168,7 +168,7 @@ class MotionPlan:
         for key in ("arm_joints", "hand_joints"):
             header[key] = tuple(header[key])
         arm, hand = Trajectory(time, *rows[:3]), Trajectory(time, *rows[3:])
-        return MotionPlan(PlanNotes(**header), PlanScene(*scene, fate), stage, arm, hand)
+        return MotionPlan(PlanNotes(**header), PlanScene(**scene, fate=fate), stage, arm, hand)
 
 
 def dropped_in_words(grasps: int, dropped: dict[str, int]) -> str:
