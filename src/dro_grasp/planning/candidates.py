@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from typing import Literal
 
 import numpy as np
@@ -11,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.devices import cores, fast_products, one_thread
+from dro_grasp.devices import fast_products, side_by_side
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
@@ -71,9 +70,8 @@ def grasps_in_world(
         return scored(problem, refine(problem, proposed))
 
     obj.distance_field  # noqa: B018  (made once, before the threads share it)
-    with one_thread(), fast_products(), ThreadPoolExecutor(cores()) as threads:
-        parts = list(threads.map(made, range(len(wanted))))
-    ranked = GraspBatch.concatenate(parts).sorted_by_score()
+    with fast_products():
+        ranked = GraspBatch.concatenate(side_by_side(made, range(len(wanted)))).sorted_by_score()
     return ranked.replace(T_object_wrist=T @ ranked.T_object_wrist)
 
 

@@ -127,8 +127,8 @@ class LiftPage(ServedPage):
         self.moment = gui.add_slider("Moment", 0, 1, 1, 0, disabled=True)
         self.cloud = gui.add_checkbox("Camera's cloud", True, hint="What was planned for, its unseen side estimated.")
         self.shapes = gui.add_checkbox("Objects", True, hint="As they were simulated.", disabled=not self.attempts)
-        choices: tuple[str, ...] = (NONE, EVERY)
-        self.grasps = gui.add_dropdown("Grasps", choices, initial_value=NONE, hint="Lines from wrist to fingertips.")
+        self.grasps: viser.GuiDropdownHandle[str] = gui.add_dropdown(
+            "Grasps", [str(NONE), str(EVERY)], initial_value=NONE, hint="Lines from wrist to fingertips.")
         self.text = gui.add_markdown("")
         self.play.on_click(lambda _: self._guarded(self._play))
         self.moment.on_update(lambda event: None if event.client is None else self.show_moment(int(self.moment.value)))
