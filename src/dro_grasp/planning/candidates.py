@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -13,6 +14,7 @@ from torch import Tensor
 from dro_grasp.devices import fast_products, side_by_side
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.scenery import load_scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem
@@ -40,7 +42,7 @@ def paper_directions(count: int) -> Float[Tensor, "k 3"]:
 
 def grasps_in_world(
     predictor: GraspPredictor, hand: Hand, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"], num: int,
-    directions: Directions = "all", table: float | None = None, seed: int = 0,
+    directions: Directions = "all", table: float | None = None, seed: int = 0, obstacles: Sequence[ObjectModel] = (),
 ) -> GraspBatch:
     """Refined grasps with scores, the best first; their frame is the world's.
 
@@ -53,17 +55,22 @@ def grasps_in_world(
         directions: Which palm directions.
         table: Height of a table in the world [m], which the hand stays above.
         seed: The same seed gives the same grasps.
+        obstacles: In the world; the hand stays clear of them too.
     """
     T = torch.from_numpy(T_world_object).float()
     height = None if table is None else table - float(T[2, 3])
     wanted = [None] * min(num, PARTS) if directions == "all" else [
         (x, y, z) for x, y, z in (paper_directions(num) @ T[:3, :3]).tolist()]
+    avoid = None
+    if obstacles:
+        around = load_scene(np.concatenate([thing.cloud for thing in obstacles]), "obstacles")
+        avoid = around.moved(np.linalg.inv(T_world_object))
     seeds = np.random.default_rng(seed).integers(2**31, size=len(wanted)).tolist()
 
     # no_grad, not inference_mode: roma caches a tensor at first use, which training could then not use.
     @torch.no_grad()
     def made(i: int) -> GraspBatch:
-        problem = GraspProblem(hand, obj, predictor.device, Constraints(wanted[i], height))
+        problem = GraspProblem(hand, obj, predictor.device, Constraints(wanted[i], height, avoid=avoid))
         count = num * (i + 1) // len(wanted) - num * i // len(wanted)
         generator = torch.Generator().manual_seed(seeds[i])
         proposed = propose(problem, predictor.network, count, generator, predictor.config).grasps

@@ -105,7 +105,7 @@ def plan(
             with task.watch("grasps"):
                 grasps = grasps_in_world(
                     predictor, robot.hand, task.obj, task.T_world_object, task.config.num, task.config.directions,
-                    task.height, seed + batch * BATCH_SEED)
+                    task.height, seed + batch * BATCH_SEED, obstacles)
         assert grasps is not None
         task.add(grasps)
         if (made := task.run(last=batch == batches - 1)) is not None:
@@ -239,7 +239,9 @@ class _Task:
         approach, lift = smooth(goal.approach, *limits), smooth(goal.lift, *limits)
         start = robot.T_world_wrist(grasp)
         free = self._free(reach.position, hand.opened) and all(
+            self.checker.free(standoff, posture, 0.0) for posture in shape.position) and all(
             self.checker.free(q, hand.pregrasp, 0.0, touch=True) for q in approach.position) and all(
+            self.checker.free(grasp, posture, 0.0, touch=True) for posture in close.position) and all(
             self.checker.free(q, hand.squeeze, 0.0, carried(robot.T_world_wrist(q), start), touch=True) for q in lift.position)
         if not free:
             return None
