@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -40,9 +41,19 @@ def paper_directions(count: int) -> Float[Tensor, "k 3"]:
     return every[torch.linspace(0, len(every) - 1, min(count, len(every))).round().long()]
 
 
+@dataclass(frozen=True)
+class Around:
+    """What the hand stays clear of, in the world."""
+
+    table: float | None = None
+    """Height of a table, which the hand stays above [m]."""
+    obstacles: Sequence[ObjectModel] = ()
+    """Further things."""
+
+
 def grasps_in_world(
     predictor: GraspPredictor, hand: Hand, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"], num: int,
-    directions: Directions = "all", table: float | None = None, seed: int = 0, obstacles: Sequence[ObjectModel] = (),
+    directions: Directions = "all", around: Around = Around(), seed: int = 0,
 ) -> GraspBatch:
     """Refined grasps with scores, the best first; their frame is the world's.
 
@@ -53,18 +64,17 @@ def grasps_in_world(
         T_world_object: Where it stands [m].
         num: How many.
         directions: Which palm directions.
-        table: Height of a table in the world [m], which the hand stays above.
+        around: What the hand stays clear of.
         seed: The same seed gives the same grasps.
-        obstacles: In the world; the hand stays clear of them too.
     """
     T = torch.from_numpy(T_world_object).float()
-    height = None if table is None else table - float(T[2, 3])
+    height = None if around.table is None else around.table - float(T[2, 3])
     wanted = [None] * min(num, PARTS) if directions == "all" else [
         (x, y, z) for x, y, z in (paper_directions(num) @ T[:3, :3]).tolist()]
     avoid = None
-    if obstacles:
-        around = load_scene(np.concatenate([thing.cloud for thing in obstacles]), "obstacles")
-        avoid = around.moved(np.linalg.inv(T_world_object))
+    if around.obstacles:
+        scene = load_scene(np.concatenate([thing.cloud for thing in around.obstacles]), "obstacles")
+        avoid = scene.moved(np.linalg.inv(T_world_object))
     seeds = np.random.default_rng(seed).integers(2**31, size=len(wanted)).tolist()
 
     # no_grad, not inference_mode: roma caches a tensor at first use, which training could then not use.

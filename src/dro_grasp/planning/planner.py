@@ -14,7 +14,7 @@ from dro_grasp.devices import Stopwatch
 from dro_grasp.errors import OptionError, PlanError, RobotError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.planning.candidates import Directions, grasps_in_world
+from dro_grasp.planning.candidates import Around, Directions, grasps_in_world
 from dro_grasp.planning.collisions import TARGET, CollisionChecker, open_hand
 from dro_grasp.planning.extra import require_arm_extra
 from dro_grasp.planning.motion import CHOSEN, READY, STAGES, WAITING, MotionPlan, PlanNotes, PlanScene, dropped_in_words
@@ -105,7 +105,7 @@ def plan(
             with task.watch("grasps"):
                 grasps = grasps_in_world(
                     predictor, robot.hand, task.obj, task.T_world_object, task.config.num, task.config.directions,
-                    task.height, seed + batch * BATCH_SEED, obstacles)
+                    Around(task.height, obstacles), seed + batch * BATCH_SEED)
         assert grasps is not None
         task.add(grasps)
         if (made := task.run(last=batch == batches - 1)) is not None:
