@@ -16,7 +16,17 @@ from dro_grasp.grasps.controller import pregrasp_and_squeeze
 from dro_grasp.models.checkpoints import save_weights
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.ranking.features import FARTHEST, LENGTH, LINK_FEATURES, MOTION, NEAR, Feature, GraspFeatures, grasp_features
+from dro_grasp.ranking.features import (
+    FARTHEST,
+    GRASP_FEATURES,
+    LENGTH,
+    LINK_FEATURES,
+    MOTION,
+    NEAR,
+    Feature,
+    GraspFeatures,
+    grasp_features,
+)
 from dro_grasp.ranking.score_network import ScoreNetwork, load_score_network, save_score_network, shipped_score_network
 from tests.helpers.tiny_bundle import made_up_grasps
 from tests.helpers.toy_hand import toy_hand
@@ -49,29 +59,31 @@ def test_links_are_described_at_their_point_nearest_to_a_ball(ball: ObjectModel,
     squeeze = pregrasp_and_squeeze(HAND, grasps.T_object_wrist, grasps.joints, torch.zeros(3))[1]
     after = HAND.points(squeeze, grasps.T_object_wrist)
     links, checked = HAND.link_index.unique().tolist(), 0
-    assert found.links.shape == (6, len(links), 16)
+    widths = [feature.width for feature in LINK_FEATURES.values()]
+    assert found.links.shape == (6, len(links), sum(widths))
+    columns = dict(zip(LINK_FEATURES, found.links.split(widths, -1), strict=True))
     for i in range(len(grasps)):
         axes = grasps.T_object_wrist[i, :3, :3] @ HAND.palm_axes_wrist
         for slot, link in enumerate(links):
             own = points[i, HAND.link_index == link]
             distance = own.norm(dim=-1) - radius
             gap = float(distance.min())
-            told = found.links[i, slot]
+            told = {name: values[i, slot] for name, values in columns.items()}
             if gap < -0.02:  # near the ball's middle, where no direction is outward
                 continue
             checked += 1
-            assert float(told[0]) * MOTION == pytest.approx(max(-FARTHEST, min(gap, FARTHEST)), abs=0.0015)
+            assert float(told["gap"]) * MOTION == pytest.approx(max(-FARTHEST, min(gap, FARTHEST)), abs=0.0015)
             assert float(found.nearness[i, slot]) == pytest.approx(np.exp(-max(gap, 0) / NEAR), abs=0.2)
             # Which of two points is nearest may differ by the grid's rounding; the one told lies that near as well.
-            place = axes @ told[9:12] * LENGTH
+            place = axes @ told["position"] * LENGTH
             assert float(place.norm()) - radius == pytest.approx(gap, abs=0.002)
-            normal = axes @ told[6:9]
+            normal = axes @ told["object normal"]
             assert float(normal @ torch.nn.functional.normalize(place, dim=0)) > 0.97
             which = int((own - place).norm(dim=-1).argmin())
             closing = after[i, HAND.link_index == link][which] - own[which]
-            torch.testing.assert_close(axes @ told[12:15] * MOTION, closing, atol=1e-4, rtol=0)
-            assert float(told[3]) * MOTION == pytest.approx(-float(closing @ normal), abs=1e-4)
-            assert bool(told[4]) == (link == HAND.palm)
+            torch.testing.assert_close(axes @ told["closing vector"] * MOTION, closing, atol=1e-4, rtol=0)
+            assert float(told["closing"]) * MOTION == pytest.approx(-float(closing @ normal), abs=1e-4)
+            assert bool(told["palm"]) == (link == HAND.palm)
     assert checked > 12
 
 
@@ -93,7 +105,8 @@ def test_features_do_not_know_where_the_scene_is(ball: ObjectModel, grasps: Gras
 def test_links_are_a_set() -> None:
     torch.manual_seed(0)
     network = ScoreNetwork(2)
-    links, nearness, whole = torch.randn(5, 7, 16), torch.rand(5, 7), torch.randn(5, 8)
+    link_width, whole_width = (sum(f.width for f in features.values()) for features in (LINK_FEATURES, GRASP_FEATURES))
+    links, nearness, whole = torch.randn(5, 7, link_width), torch.rand(5, 7), torch.randn(5, whole_width)
     order = torch.randperm(7)
     whole_set = network(links, nearness, whole)
     torch.testing.assert_close(network(links[:, order], nearness[:, order], whole), whole_set)
@@ -118,5 +131,5 @@ def test_a_network_of_other_features_is_refused(tmp_path: Path, monkeypatch: pyt
         load_score_network(tmp_path / "unnamed.safetensors")
     save_score_network(ScoreNetwork(2), tmp_path / "old.safetensors")
     monkeypatch.setitem(LINK_FEATURES, "spin", Feature(1, lambda s: s.gap))
-    with pytest.raises(WeightsError, match=r"old.safetensors.*'within reach', 'energy terms'.*'within reach', 'spin'"):
+    with pytest.raises(WeightsError, match=r"old.safetensors.*'energy terms'.*'spin', 'energy terms'"):
         load_score_network(tmp_path / "old.safetensors")
