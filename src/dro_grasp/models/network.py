@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from dro_grasp.devices import fast_products
@@ -24,8 +24,8 @@ PLACE_SCALE = 10.0
 """Factor of the placed hand's coordinates, a tenth of a metre large, at the network's input [1/m]. Source: ours."""
 
 
-Choose = Callable[[Float[Tensor, "b k n 3"]], Int[Tensor, " b"]]
-"""Chooses one of k moved hands [m], in the network's frame."""
+Suitability = Callable[[Float[Tensor, "b k n 3"]], Float[Tensor, "b k"]]
+"""How well moved hands [m], in the network's frame, suit the object; higher is better."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class DistanceNetwork(nn.Module):
 
     def predict(
         self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], noise: Float[Tensor, "b k latent"],
-        choose: Choose | None = None,
+        suit: Suitability | None = None,
     ) -> Float[Tensor, "b n m"]:
         """D(R,O) [m].
 
@@ -145,22 +145,29 @@ class DistanceNetwork(nn.Module):
             hand: As in `forward`.
             obj: As in `forward`.
             noise: Draws of `sample_latent`, k for each hand, which the prior turns into z.
-            choose: Chooses one of them by the hands that they move. The first by default, and where z moves nothing.
+            suit: Judges the hands that they move; the best is taken. The first by default, and where z moves nothing.
         """
         with fast_products():
             phi_hand, phi_object = self.encode(hand, obj)
-            rows = torch.arange(len(hand), device=hand.device)
-            if self.motion is None or choose is None:
+            if self.motion is None or suit is None:
                 noise = noise[:, :1]
             z = noise
             if self.condition is not None and self.prior is not None:
                 condition = self.condition(phi_hand, phi_object, hand, obj)[:, None].expand(-1, noise.shape[1], -1)
                 z = self.prior(noise.flatten(0, 1), condition.flatten(0, 1)).unflatten(0, noise.shape[:2])
-            moves = hand[:, None] if self.motion is None else self.motion(phi_hand, hand, z)
-            best = rows.new_zeros(len(hand)) if moves.shape[1] == 1 or choose is None else choose(moves)
-            z, moved = z[rows, best], moves[rows, best]
+            z, moved = self.moved(phi_hand, hand, z, suit)
             psi_hand, psi_object = self.relate(phi_hand, phi_object, moved)
             return self._distances(psi_hand, psi_object, z, moved, obj)
+
+    def moved(
+        self, phi_hand: Float[Tensor, "b n width"], hand: Float[Tensor, "b n 3"], z: Float[Tensor, "b k latent"],
+        suit: Suitability | None,
+    ) -> tuple[Float[Tensor, "b latent"], Float[Tensor, "b n 3"]]:
+        """Of k z the one that moves the hand to suit the object best, and the moved hand [m]."""
+        moves = hand[:, None] if self.motion is None else self.motion(phi_hand, hand, z)
+        rows = torch.arange(len(hand), device=hand.device)
+        best = rows.new_zeros(len(hand)) if moves.shape[1] == 1 or suit is None else suit(moves).argmax(-1)
+        return z[rows, best], moves[rows, best]
 
     def _distances(
         self, psi_hand: Float[Tensor, "b n width"], psi_object: Float[Tensor, "b m width"], z: Float[Tensor, "b latent"],

@@ -174,10 +174,10 @@ def _distances(
         opened = network.to_frame(points, centres, axes)
         obj = network.to_frame(cloud.expand(len(points), -1, -1), centres, axes)
 
-        def choose(moves: Float[Tensor, "b k n 3"]) -> Int[Tensor, " b"]:
-            return choice_scores(hand, field, moves @ axes[:, None].mT + centre, config.choice, problem.room).argmax(-1)
+        def suit(moves: Float[Tensor, "b k n 3"]) -> Float[Tensor, "b k"]:
+            return choice_scores(hand, field, moves @ axes[:, None].mT + centre, config.choice, problem.room)
 
-        return network.predict(opened, obj, z, choose).float()
+        return network.predict(opened, obj, z, suit).float()
 
     if len(placed) <= size:  # all threads for the one part that there is
         return predict(placed, turned, noise)
