@@ -64,6 +64,7 @@ def test_the_gain_by_pretraining_is_scipys_paired_interval() -> None:
     assert paper_form.gains([], plain) == paper_form.gains(pretrained[:1], plain[1:]) == []
 
 
+@pytest.mark.slow
 def test_the_papers_form_is_trained_and_measured_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -14,6 +14,7 @@ from dro_grasp.devices import choose_device, cores, on_device, require_device, s
 from dro_grasp.energy.grasp_energy import link_spheres
 from dro_grasp.errors import OptionError
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.optimization.refinement import RefineConfig
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predictor import GraspPredictor
 from tests.helpers.claw import ball
@@ -69,6 +70,7 @@ def test_the_optimiser_s_predictions_on_a_device_are_those_of_the_cpu(
     """Those of the network: `test_predictor.py`."""
     monkeypatch.setattr("dro_grasp.predictor.OPTIMISED_PER_GRASP", 2)
     monkeypatch.setattr("dro_grasp.pipeline.stages.SynthesisConfig", functools.partial(SynthesisConfig, steps=10))
+    monkeypatch.setattr("dro_grasp.pipeline.stages.RefineConfig", functools.partial(RefineConfig, steps=10))
     weights, obj = str(untrained_weights(tmp_path)), load_object("sphere")
     here, there = (
         GraspPredictor(weights, device=place).predict(toy_hand(), obj, 2, seed=3, method="optimise")

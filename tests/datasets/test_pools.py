@@ -71,6 +71,7 @@ def test_the_parent_s_environment_stays_and_workers_have_one_thread(tmp_path, mo
     assert dict(os.environ) == before
 
 
+@pytest.mark.slow
 def test_an_idle_worker_that_dies_is_replaced():
     work = LocalPool(Job(0, EngineConfig()), 1, 60.0, engine_work.easy)
     try:

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.helpers.tiny_bundle import tiny_bundle
 
 BLOCKED = (
@@ -48,6 +50,7 @@ print(load_weights(folder / "mine.safetensors").name, sorted(set(sys.modules) & 
 '''
 
 
+@pytest.mark.slow
 def test_training_runs_on_a_bare_machine(tmp_path: Path) -> None:
     tiny_bundle(tmp_path / "bundle.safetensors")
     done = subprocess.run([sys.executable, "-c", SCRIPT, str(tmp_path)], capture_output=True, text=True)
