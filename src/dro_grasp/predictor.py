@@ -123,7 +123,7 @@ class Prediction:
 class GraspPredictor:
     """Predicts grasps of any object by any hand with one set of weights.
 
-    Example:
+    Examples:
         >>> import dro_grasp as dro
         >>> hand, obj = dro.load_hand("allegro"), dro.load_object("mug")
         >>> grasps = dro.GraspPredictor().predict(hand, obj, num=16)

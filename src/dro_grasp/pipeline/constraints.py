@@ -33,7 +33,7 @@ FEWEST_HELD = 16
 class Constraints:
     """What grasps have to respect; nothing by default. All in the object's frame.
 
-    Example:
+    Examples:
         >>> above = Constraints(direction=(0, 0, -1), cone=0.5, table=0.0, avoid=load_scene("shelf.ply"))
         >>> grasps = GraspPredictor().predict(hand, obj, constraints=above)
     """

@@ -26,7 +26,7 @@ from dro_grasp.pipeline.constraints import Constraints
 class GraspProblem:
     """What the stages derive from a hand and an object, each thing made at first use and then shared.
 
-    Example:
+    Examples:
         >>> problem = GraspProblem(load_hand("allegro"), load_object("mug"))
         >>> grasps = evaluate(problem, rank(problem, refine(problem, grasps)), "strict")
     """

@@ -76,7 +76,7 @@ def pick_object(
 
     Objects are told apart by distance: two that are less than 12 mm apart count as one, unless a mask is given.
 
-    Example:
+    Examples:
         >>> picked = pick_object("mug", points, robot, robot.camera.T_world_camera, near=(0.5, 0.1))
         >>> made = plan(picked.robot, picked.obj, obstacles=picked.obstacles)
 

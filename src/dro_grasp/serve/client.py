@@ -19,7 +19,7 @@ from dro_grasp.errors import ServerError
 class GraspClient:
     """A grasp server at an address.
 
-    Example:
+    Examples:
         >>> answer = GraspClient().predict("allegro", cloud, num=4, direction=(0, 0, -1))
         >>> answer["grasps"][0]["wrist_position"]
     """

@@ -28,7 +28,7 @@ POSTURES: tuple[Posture, ...] = get_args(Posture)
 class GraspViewer(ServedPage):
     """A running viewer; `stop()` ends it.
 
-    Example:
+    Examples:
         >>> viewer = GraspViewer(hand, obj, grasps)
         >>> viewer.show(3, "squeeze")
     """

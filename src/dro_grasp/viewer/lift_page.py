@@ -83,7 +83,7 @@ class Film:
 class LiftPage(ServedPage):
     """A running page; `stop()` ends it.
 
-    Example:
+    Examples:
         >>> page = LiftPage(robot)
         >>> page.show(Film.of_plan(robot, MotionPlan.load("plan.npz")))
     """

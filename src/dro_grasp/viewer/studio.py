@@ -35,7 +35,7 @@ MOST_CANDIDATES = 8
 class Studio(GraspPage):
     """A running page; `stop()` ends it.
 
-    Example:
+    Examples:
         >>> studio = Studio()
         >>> studio.generate("allegro", "mug", num=8)
     """
