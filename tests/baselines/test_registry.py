@@ -150,13 +150,13 @@ def test_a_method_returns_what_it_makes_unless_it_chooses() -> None:
 
 @pytest.mark.slow
 def test_a_first_look_at_all_methods_is_quick(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A sixth of what --quick measures with its defaults, in a sixth of its ten minutes; weights do not change the time."""
+    """A sixth of what --quick measures with its defaults, in a sixth of ten minutes; weights do not change the time."""
     maps, contacts = tmp_path / "maps.safetensors", tmp_path / "contacts.safetensors"
     save_weights(ContactMapNetwork(), maps)
     save_weights(ContactNetwork(), contacts)
     methods = ["dro", "synthesise", "dfc", "start", f"gendexgrasp@{maps}", f"gendexgrasp-gamma1@{maps}", f"manifm@{contacts}"]
-    begin = time.perf_counter()
+    begin = time.process_time()
     assert main(["benchmark", "--method", *methods, "--quick", "--hands", "barrett", "--objects", "can", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert [(row["grasps"], row["stage"], row["num"]) for row in rows] == [(name, "returned", 4) for name in methods]
-    assert time.perf_counter() - begin < 100
+    assert time.process_time() - begin < 200, "100 s of two cores, whatever else they do"

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ from dro_grasp.datasets.engine.pools import Outcome, Work
 from dro_grasp.datasets.engine.schedule import own_pairs, synthesize_dataset
 from dro_grasp.datasets.engine.shards import Shard, find_shards, sole_run
 from dro_grasp.datasets.engine.worker import EngineConfig, Job, Task
-from dro_grasp.errors import OptionError, OutputError
+from dro_grasp.errors import GraspFileError, OptionError, OutputError
 from dro_grasp.grasps.batch import GraspBatch
 from tests.helpers.engine_work import GRASPS, easy, slow
 
@@ -137,3 +138,13 @@ def test_a_damaged_shard_is_set_aside_whole(tmp_path: Path, where: str) -> None:
     assert path.with_name("00001.parquet.damaged").read_bytes() == damaged
     assert content(tmp_path)[Shard("a", "x", 1)] == content(tmp_path)[Shard("a", "x", 0)]
     assert len(content(tmp_path)) == 18
+
+
+def test_what_disappears_while_a_folder_is_listed_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def vanish(folder: Path, pattern: str) -> Iterator[Path]:
+        raise FileNotFoundError(2, "No such file or directory", str(folder / "gone"))
+        yield folder / pattern
+
+    monkeypatch.setattr(Path, "glob", vanish)
+    with pytest.raises(GraspFileError, match="gone disappeared while"):
+        find_shards(tmp_path)

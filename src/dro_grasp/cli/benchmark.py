@@ -84,7 +84,7 @@ class Benchmark:
         from dro_grasp.simulation.protocols import protocol
 
         if self.quick:
-            return dataclasses.replace(self, quick=False, **QUICK, objects=resolve_objects(list(self.objects))[:2]).run()
+            return dataclasses.replace(self, quick=False, **QUICK, objects=tuple(resolve_objects(list(self.objects))[:2])).run()
         GraspRequest(self.num, candidates=1, temperature=self.temperature)
         if self.views < 1:
             raise OptionError(f"--views is {self.views}; give at least 1")

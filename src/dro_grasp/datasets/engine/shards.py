@@ -150,13 +150,18 @@ def find_shards(folder: Path | str) -> list[Shard]:
     """All finished shards of a data set's folder, sorted.
 
     Raises:
-        GraspFileError: There is no such folder.
+        GraspFileError: There is no such folder, or something in it disappeared meanwhile.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise GraspFileError(f"no folder {folder}; give the folder that `dro-grasp synthesize` wrote")
+    try:
+        paths = list(folder.glob("*/*/*.parquet"))
+    except FileNotFoundError as error:
+        raise GraspFileError(f"{error.filename} disappeared while {folder} was listed; wait for what removes files there, or "
+                             f"give the folder that `dro-grasp synthesize` wrote") from error
     shards = []
-    for path in folder.glob("*/*/*.parquet"):
+    for path in paths:
         if re.fullmatch(r"\d+", path.stem):
             shards.append(Shard(unquote(path.parts[-3]), unquote(path.parts[-2]), int(path.stem)))
     return sorted(shards)
