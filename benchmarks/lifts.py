@@ -16,7 +16,7 @@ from report import emit
 from dro_grasp.evaluation.metrics import wilson_interval
 from dro_grasp.objects.catalogue import resolve_objects
 from dro_grasp.planning.attempts import Attempt, TabletopConfig
-from dro_grasp.planning.planner import PlanConfig
+from dro_grasp.planning.plan_config import PlanConfig
 from dro_grasp.planning.tabletop import TabletopRun, endings, failures, processor_seconds, run_tabletop
 
 ROWS = {

@@ -40,7 +40,8 @@ from dro_grasp.pipeline.problem import GraspProblem as GraspProblem
 from dro_grasp.pipeline.stages import complete as complete, evaluate as evaluate, rank as rank, refine as refine
 from dro_grasp.planning.attempts import Attempt as Attempt, TabletopConfig as TabletopConfig
 from dro_grasp.planning.motion import MotionPlan as MotionPlan
-from dro_grasp.planning.planner import PlanConfig as PlanConfig, plan as plan
+from dro_grasp.planning.plan_config import PlanConfig as PlanConfig
+from dro_grasp.planning.planner import plan as plan
 from dro_grasp.planning.reachability import ReachConfig as ReachConfig
 from dro_grasp.planning.robot import Robot as Robot, load_robot as load_robot
 from dro_grasp.planning.robot_check import RobotReport as RobotReport, check_robot as check_robot

@@ -21,7 +21,8 @@ from dro_grasp.planning.collisions import CollisionChecker
 from dro_grasp.planning.inverse_kinematics import WristSolver
 from dro_grasp.planning.motion import STAGES, MotionPlan
 from dro_grasp.planning.paths import find_path
-from dro_grasp.planning.planner import PlanConfig, plan
+from dro_grasp.planning.plan_config import PlanConfig
+from dro_grasp.planning.planner import plan
 from dro_grasp.planning.timing import USED, cornered, smooth
 from dro_grasp.planning.workcell import arm_addresses, robot_spec
 from dro_grasp.simulation.protocols import PROTOCOLS

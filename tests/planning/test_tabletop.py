@@ -19,7 +19,7 @@ from dro_grasp.planning.attempts import Attempt, TabletopConfig, attempt
 from dro_grasp.planning.clutter import rest
 from dro_grasp.planning.depth_images import STRIDE, depth_image, thinned_intrinsics
 from dro_grasp.planning.physics import LiftScene
-from dro_grasp.planning.planner import PlanConfig
+from dro_grasp.planning.plan_config import PlanConfig
 from dro_grasp.planning.table_scene import clusters, fit_plane, sort_out
 from dro_grasp.planning.tabletop import TabletopRun, read_attempts, run_tabletop, write_attempts
 

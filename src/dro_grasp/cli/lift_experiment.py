@@ -32,8 +32,10 @@ class Tabletop:
     """Which reachable grasps are taken: the best by score, or, as a control, any."""
     directions: Literal["paper", "all"] = "all"
     """Palm directions: `paper`, from above to the right side, or `all`."""
-    num: int = 64
-    """Grasps to choose from."""
+    num: int = 40
+    """Grasps to choose from, in each of up to three batches."""
+    rehearsals: int = 8
+    """Grasps of each batch whose lift is simulated on the object as it is known, before one is chosen; 0 for none."""
     clutter: int = 0
     """Other objects, drawn from the built-in ones, that stand around the one that is asked for: 2 to 4 make a crowd."""
     segment: Literal["cluster", "mask"] = "cluster"
@@ -59,7 +61,7 @@ class Tabletop:
         from dro_grasp.planning.animation import check_animation, draw_attempt
         from dro_grasp.planning.attempts import TabletopConfig
         from dro_grasp.planning.extra import require_arm_extra
-        from dro_grasp.planning.planner import PlanConfig
+        from dro_grasp.planning.plan_config import PlanConfig
         from dro_grasp.planning.tabletop import TabletopRun, run_tabletop
 
         require_arm_extra()
@@ -67,7 +69,7 @@ class Tabletop:
             check_animation(self.video)
         config = TabletopConfig(
             self.see, self.noise, clutter=self.clutter, segment=self.segment,
-            plan=PlanConfig(self.num, directions=self.directions, order=self.order))
+            plan=PlanConfig(self.num, directions=self.directions, order=self.order, rehearsals=self.rehearsals))
         run = TabletopRun(
             self.robot, tuple(resolve_objects(list(self.objects))), self.attempts, self.seed, self.weights, config)
         done = run_tabletop(run, self.output, self.workers, None if self.json else _say)

@@ -41,10 +41,12 @@ class Plan:
     of the others."""
     obstacles: tuple[str, ...] = ()
     """Clouds and meshes, in the world frame, that nothing may touch."""
-    num: int = 64
-    """Grasps to choose from."""
+    num: int = 40
+    """Grasps to choose from, in each of up to three batches."""
     top: int = 5
     """Reachable grasps of best score that are given to the planner at once."""
+    rehearsals: int = 8
+    """Grasps of each batch whose lift is simulated, where a table is known, on the object as it is known; 0 for none."""
     directions: Literal["paper", "all"] = "all"
     """Palm directions: `paper`, from above to the right side, or `all` that a table leaves room for."""
     planner_seconds: float = 3.0
@@ -72,14 +74,16 @@ class Plan:
         from dro_grasp.planning.extra import require_arm_extra
 
         require_arm_extra()
-        from dro_grasp.planning.planner import PlanConfig, plan
+        from dro_grasp.planning.plan_config import PlanConfig
+        from dro_grasp.planning.planner import plan
         from dro_grasp.planning.robot import load_robot
         from dro_grasp.planning.trajectory_files import trajectory_csv, trajectory_yaml
         from dro_grasp.predictor import GraspPredictor
 
         if not 0 <= self.seed < 2**31:
             raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^31 - 1")
-        config = PlanConfig(self.num, self.top, self.directions, planner_seconds=self.planner_seconds)
+        config = PlanConfig(
+            self.num, self.top, self.directions, rehearsals=self.rehearsals, planner_seconds=self.planner_seconds)
         for path in (self.output, self.trajectory, self.csv):
             if path is not None:
                 check_output(path)

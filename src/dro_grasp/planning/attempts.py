@@ -17,14 +17,15 @@ from dro_grasp.planning.clutter import MOST_CLUTTER, Region, other_objects, scat
 from dro_grasp.planning.depth_images import depth_image, thinned_intrinsics
 from dro_grasp.planning.motion import STAGES, MotionPlan
 from dro_grasp.planning.physics import LiftScene
-from dro_grasp.planning.planner import PlanConfig, plan
+from dro_grasp.planning.plan_config import PlanConfig
+from dro_grasp.planning.planner import plan
 from dro_grasp.planning.reachability import ReachConfig
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.standing import moved
 from dro_grasp.planning.table_scene import PickedObject, pick_object
 from dro_grasp.predictor import GraspPredictor
 
-VERSION = 2
+VERSION = 3
 """Goes up with every change that can change an outcome."""
 LABEL = f"tabletop/{VERSION} "
 """Beginning of the settings of stored attempts."""

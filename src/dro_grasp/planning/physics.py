@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.planning.ball_solid import add_ball_object
 from dro_grasp.planning.collisions import exclude_constant_contacts, open_hand
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.workcell import ARM, TABLE, arm_addresses, robot_spec, wxyz
@@ -66,11 +67,16 @@ class LiftScene:
         names = [self.model.actuator(i).name for i in range(self.model.nu)]
         self._arm_servos = np.array([names.index(ARM + n) for n in robot.arm_joints])
         self._hand_servos = np.array([names.index(n) for n in robot.hand_joints])
-        tree, opened = robot.hand.tree, open_hand(robot)
-        self.data.qpos[self._arm] = robot.home
-        self.data.qpos[self._hand] = (tree.coupling.double().numpy() @ opened + tree.offset.double().numpy())[moving]
-        self.command(robot.home, np.zeros(len(robot.home)), opened)
-        for i in range(len(objects)):
+        tree = robot.hand.tree
+        self._coupling, self._offset = (t.double().numpy()[moving] for t in (tree.coupling, tree.offset))
+        self.begin(robot.home, open_hand(robot))
+
+    def begin(self, arm: Float[np.ndarray, " n_arm"], hand: Float[np.ndarray, " n_dof"]) -> None:
+        """Start anew with the robot at rest in a configuration, and the objects far away."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[self._arm], self.data.qpos[self._hand] = arm, self._coupling @ hand + self._offset
+        self.command(arm, np.zeros_like(arm), hand)
+        for i in range(len(self.objects)):
             self.place(i, np.array([[1, 0, 0, ASIDE + i], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]))
 
     def place(self, index: int, T_world_object: Float[np.ndarray, "4 4"]) -> None:
@@ -138,7 +144,10 @@ class LiftScene:
 
 
 def _add_thing(scene: mujoco.MjSpec, obj: ObjectModel, index: int) -> None:
-    """An object that collides as its convex parts, and is seen as its mesh."""
+    """An object that collides as its convex parts, and is seen as its mesh; a bare cloud collides as balls."""
+    if obj.is_cloud:
+        add_ball_object(scene, obj, LIFT_PROTOCOL, f"object{index}-")
+        return
     assert obj.vertices is not None
     assert obj.faces is not None
     body = add_object(scene, obj, LIFT_PROTOCOL, f"object{index}-")

@@ -4,72 +4,33 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from dro_grasp.devices import Stopwatch
-from dro_grasp.errors import OptionError, PlanError, RobotError
+from dro_grasp.errors import PlanError, RobotError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.planning.candidates import Around, Directions, grasps_in_world
+from dro_grasp.planning.candidates import Around, grasps_in_world
 from dro_grasp.planning.collisions import TARGET, CollisionChecker, open_hand
 from dro_grasp.planning.extra import require_arm_extra
-from dro_grasp.planning.motion import CHOSEN, READY, STAGES, WAITING, MotionPlan, PlanNotes, PlanScene, dropped_in_words
-from dro_grasp.planning.reachability import Feasible, Postures, Reachability, ReachConfig, carried
+from dro_grasp.planning.motion import CHOSEN, READY, WAITING, MotionPlan, PlanNotes, PlanScene, dropped_in_words
+from dro_grasp.planning.plan_config import PlanConfig
+from dro_grasp.planning.reachability import Feasible, Postures, Reachability
+from dro_grasp.planning.rehearsal import Rehearsal
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.standing import upright
-from dro_grasp.planning.timing import Trajectory, cornered, joined, smooth, standing
+from dro_grasp.planning.timed_stages import timed_stages
 from dro_grasp.predictor import GraspPredictor
 
 BATCH_SEED = 7919
 """Between the seeds of batches of grasps (ours)."""
 NO_PATH = "without a path"
 """The planner connects none of the goals, or a timed motion would touch something."""
-TRAVEL_CLEARANCE = 0.001
-"""Distance that the timed motion keeps while it travels, off the straight edges that were planned [m] (ours)."""
 
-
-@dataclass(frozen=True)
-class PlanConfig:
-    """How a motion is planned. Values without a source are ours."""
-
-    num: int = 64
-    """Grasps to choose from."""
-    top: int = 5
-    """Reachable grasps of best score that are given to the planner at once. Source: paper, real-robot experiment."""
-    directions: Directions = "all"
-    """Palm directions: `paper`, from above to the right side, or `all` that a table leaves room for."""
-    order: Literal["score", "random"] = "score"
-    """Which reachable grasps are taken: the best by score, or any, as a control."""
-    rounds: int = 3
-    """How often the planner is asked, each time with the next `top` grasps."""
-    trusted_score: float = 1.0
-    """Log-odds of holding that the best grasp that can be carried out should have."""
-    batches: int = 3
-    """How often at most `num` grasps are made, while none of them has that, or none works."""
-    best_seconds: float = 1.0
-    """Longest time for a path to the best grasp alone, which is tried before all goals are given at once [s]."""
-    planner_seconds: float = 3.0
-    """Longest time for one path to several goals [s]."""
-    closing_seconds: float = 1.0
-    """Least time in which the hand closes [s]. Source: as in trials."""
-    grip_seconds: float = 0.5
-    """How long the hand presses before the arm lifts [s]."""
-    reach: ReachConfig = field(default_factory=ReachConfig)
-    """Approach and lift."""
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be done.
-
-        Raises:
-            OptionError: A number is not positive.
-        """
-        for name in ("num", "top", "rounds", "batches", "planner_seconds"):
-            if getattr(self, name) <= 0:
-                raise OptionError(f"{name} is {getattr(self, name)}; give a number above 0")
+LOSES = "losing the object when rehearsed"
+"""The simulated hand does not lift the object as it is known."""
 
 
 def plan(
@@ -122,7 +83,7 @@ class _Task:
     ) -> None:
         self.robot, self.obstacles, self.config, self.seed = robot, obstacles, config, seed
         self.obj, self.T_world_object = upright(obj, T_world_object)
-        self.watch = Stopwatch("grasps", "reach", "path", "timing")
+        self.watch = Stopwatch("grasps", "reach", "rehearsal", "path", "timing")
         self.checker = CollisionChecker(robot, robot.table, obstacles, self.obj, self.T_world_object)
         self.height = None if robot.table is None else robot.table.height
         self.reach = Reachability(robot, self.checker, self.obj, obstacles, self.height, config.reach, seed)
@@ -131,7 +92,13 @@ class _Task:
         """Numbers of grasps that were not tried yet, in the order of trying."""
         self.known: dict[int, Feasible] = {}
         self.goals: list[Feasible] = []
-        """Grasps that can be carried out and were not tried yet, in the same order."""
+        """Grasps that can be carried out and were not tried yet, the best first."""
+        self.share: dict[int, float] = {}
+        """Share of the rehearsals of a grasp in which it holds the object."""
+        self.lost: list[Feasible] = []
+        """Grasps that can be carried out, but lose the object when rehearsed."""
+        rehearsed = config.rehearsals > 0 and config.order == "score" and robot.table is not None
+        self.rehearsal = Rehearsal(robot, self.obj, self.T_world_object) if rehearsed else None
 
     @property
     def grasps(self) -> GraspBatch:
@@ -177,8 +144,9 @@ class _Task:
         """The plan for the best grasps that work; None if none does, or is trusted and these are not the last ones."""
         grasps = self.grasps
         for attempt in range(self.config.rounds):
-            with self.watch("reach"):
-                self._find_goals(grasps)
+            self._find_goals(grasps)
+            if last and not self.goals:
+                self._resort_to_lost()
             if not self.goals or not (last or self._trusted(grasps)):
                 break
             if (made := self._move(grasps, attempt)) is not None:
@@ -186,13 +154,40 @@ class _Task:
         return None
 
     def _find_goals(self, grasps: GraspBatch) -> None:
-        while self.waiting and len(self.goals) < self.config.top:
+        """Fill up the goals, and put those first that hold the object in most rehearsals; one that always does is enough."""
+        rehearsed = 0
+        while self.waiting and len(self.goals) < self.config.top and rehearsed < max(1, self.config.rehearsals):
             number = self.waiting.pop(0)
-            if (found := self.known.get(number) or self.reach.feasible(grasps, number)) is not None:
-                self.goals.append(found)
+            with self.watch("reach"):
+                found = self.known.get(number) or self.reach.feasible(grasps, number)
+            if found is None:
+                continue
+            if self.rehearsal is not None and number not in self.share:
+                rehearsed += 1
+                with self.watch("rehearsal"):
+                    self.share[number] = self.rehearsal.share(found, Postures.of(self.robot, grasps, number))
+            if self.share.get(number) == 0:
+                self.lost.append(found)
+                self.reach.reasons[number] = LOSES
+                continue
+            self.goals.append(found)
+            if self.share.get(number) == 1:
+                break
+        self.goals.sort(key=lambda goal: -self.share.get(goal.index, 0))
+
+    def _resort_to_lost(self) -> None:
+        """Take the best of those that lose the object when rehearsed: the object may be other than it is thought to be."""
+        score = self.grasps.score.tolist()
+        self.lost.sort(key=lambda goal: -score[goal.index])
+        self.goals, self.lost = self.lost[:self.config.top], self.lost[self.config.top:]
+        for goal in self.goals:
+            del self.reach.reasons[goal.index]
 
     def _trusted(self, grasps: GraspBatch) -> bool:
-        return self.config.order == "random" or float(grasps.score[self.goals[0].index]) >= self.config.trusted_score
+        best = self.goals[0].index
+        if self.rehearsal is not None:
+            return self.share[best] >= self.config.trusted_share
+        return self.config.order == "random" or float(grasps.score[best]) >= self.config.trusted_score
 
     def _move(self, grasps: GraspBatch, attempt: int) -> MotionPlan | None:
         """The motion to the best goal, or to the first that a path leads to; None, with the reason noted, if there is none."""
@@ -209,49 +204,17 @@ class _Task:
             if path is not None:
                 chosen = goals.pop(path.goal)
                 with self.watch("timing"):
-                    made = self._timed(path.waypoints, chosen, Postures.of(self.robot, grasps, chosen.index))
+                    postures = Postures.of(self.robot, grasps, chosen.index)
+                    made = timed_stages(self.robot, self.checker, path.waypoints, chosen, postures, self.config)
                 if made is not None:
                     scene = self._scene(grasps, chosen.index, goals)
-                    return MotionPlan(self._notes(grasps, chosen.index, count), scene, *made)
+                    return MotionPlan(self._notes(grasps, chosen.index, count), scene, made.stage, made.arm, made.hand)
                 self.reach.reasons[chosen.index] = NO_PATH
             elif not best:
                 break
             best = False
         self.reach.reasons |= dict.fromkeys((g.index for g in goals), NO_PATH)
         return None
-
-    def _timed(
-        self, waypoints: Float[np.ndarray, "k n_arm"], goal: Feasible, hand: Postures
-    ) -> tuple[Int[np.ndarray, " m"], Trajectory, Trajectory] | None:
-        """Stage of each sample, arm and hand; None if the timed motion touches something."""
-        robot = self.robot
-        limits = robot.velocity, robot.acceleration
-        n = len(hand.grasp)
-        fingers = np.full(n, robot.hand_velocity), np.full(n, robot.hand_acceleration)
-        reach = smooth(waypoints, *limits)
-        if not self._free(reach.position, hand.opened):
-            reach = cornered(waypoints, *limits)
-        standoff, grasp = goal.approach[0], goal.approach[-1]
-        shape = smooth(_between(hand.opened, hand.pregrasp), *fingers)
-        close = smooth(np.concatenate([_between(hand.pregrasp, hand.grasp), _between(hand.grasp, hand.squeeze)]), *fingers,
-                       self.config.closing_seconds)
-        close = joined([close, standing(hand.squeeze, self.config.grip_seconds)])
-        approach, lift = smooth(goal.approach, *limits), smooth(goal.lift, *limits)
-        start = robot.T_world_wrist(grasp)
-        free = self._free(reach.position, hand.opened) and all(
-            self.checker.free(standoff, posture, 0.0) for posture in shape.position) and all(
-            self.checker.free(q, hand.pregrasp, 0.0, touch=True) for q in approach.position) and all(
-            self.checker.free(grasp, posture, 0.0, touch=True) for posture in close.position) and all(
-            self.checker.free(q, hand.squeeze, 0.0, carried(robot.T_world_wrist(q), start), touch=True) for q in lift.position)
-        if not free:
-            return None
-        arms = [reach, _still(standoff, shape), approach, _still(grasp, close), lift]
-        hands = [_still(hand.opened, reach), shape, _still(hand.pregrasp, approach), close, _still(hand.squeeze, lift)]
-        lengths = [len(part.time) - (i > 0) for i, part in enumerate(arms)]
-        return np.repeat(np.arange(len(STAGES)), lengths), joined(arms), joined(hands)
-
-    def _free(self, positions: Float[np.ndarray, "k n_arm"], hand: Float[np.ndarray, " n_dof"]) -> bool:
-        return all(self.checker.free(q, hand, TRAVEL_CLEARANCE) for q in positions)
 
     def _notes(self, grasps: GraspBatch, index: int, goals: int) -> PlanNotes:
         return PlanNotes(
@@ -277,15 +240,3 @@ class _Task:
         reason = max(self.dropped, key=lambda r: self.dropped[r], default="")
         return (f"the object stands {self._distance():.2f} m from the base, and most grasps are {reason}; move the object, ask "
                 "for more grasps (--num), or for other palm directions (--directions)")
-
-
-def _between(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"], count: int = 8) -> Float[np.ndarray, "k n"]:
-    """Evenly spaced postures from one to another."""
-    return a + np.linspace(0, 1, count)[:, None] * (b - a)
-
-
-def _still(q: Float[np.ndarray, " n"], other: Trajectory) -> Trajectory:
-    """No motion at the times of another trajectory."""
-    return replace(standing(q, 0.0), time=other.time, **{
-        name: np.tile(row, (len(other.time), 1))
-        for name, row in (("position", q), ("velocity", np.zeros_like(q)), ("acceleration", np.zeros_like(q)))})

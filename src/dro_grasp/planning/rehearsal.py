@@ -1,0 +1,114 @@
+"""Rehearsals: lifts of the object as it is known, simulated before one of them is carried out.
+
+A score is that of a floating object that is pushed in six directions. On a table fingers come from above, push the object into
+it or tip it over, and then lift it: a rehearsal sees that. It needs no more than the planner has: a camera's cloud with its
+estimated side will do. Ours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.planning.physics import LiftScene
+from dro_grasp.planning.reachability import Feasible, Postures
+from dro_grasp.planning.robot import Robot
+from dro_grasp.planning.standing import moved
+from dro_grasp.planning.timed_stages import closing
+
+TICK = 0.02
+"""Time between targets of the servos [s] (ours)."""
+TIME_STEP = 0.004
+"""Time step of the simulation [s] (ours)."""
+APPROACH, HEIGHT = 3, 8
+"""Poses of the approach, and of the lift, that are rehearsed (ours): they are 1 cm apart."""
+APPROACH_SECONDS, CLOSING_SECONDS, GRIP_SECONDS, LIFT_SECONDS, HOLD_SECONDS = 0.3, 1.0, 0.3, 0.7, 0.3
+"""Durations of the parts [s] (ours)."""
+RISEN = 0.5
+"""Share of the lift that a held object rises at least (ours)."""
+SLIPPED = 0.02
+"""Farthest that it may move in the hand in the second half of the lift [m] (ours)."""
+FEWEST_LINKS = 2
+"""Links that touch the object at least, once the hand has closed (ours)."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What is different from what the planner thinks."""
+
+    shift: tuple[float, float] = (0.0, 0.0)
+    """The object stands elsewhere on the table [m]."""
+    friction: float = 1.0
+    """Factor of the friction."""
+    weight: float = 1.0
+    """Factor of the object's weight."""
+
+
+CONDITIONS = (Condition(), Condition((0.004, 0.0), 0.8, 1.3), Condition((-0.002, 0.0035), 0.8, 1.3),
+              Condition((-0.002, -0.0035), 0.8, 1.3))
+"""Conditions of the rehearsals of one grasp (ours): as it is thought to be, then shifted, slippery and heavy."""
+
+
+class Rehearsal:
+    """Lifts one object again and again."""
+
+    def __init__(self, robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"]) -> None:
+        """Build the scene; the robot has a table, and other things are left out."""
+        if obj.is_cloud and not np.array_equal(T_world_object, np.eye(4)):  # what stands on a table has its foot there
+            obj, T_world_object = moved(obj, T_world_object), np.eye(4)
+        self.scene, self.T_world_object = LiftScene(robot, [obj]), T_world_object
+        self.scene.model.opt.timestep = TIME_STEP
+        self._gravity = self.scene.model.opt.gravity.copy()
+        self._friction = self.scene.model.geom_friction.copy()
+
+    def share(self, goal: Feasible, hand: Postures) -> float:
+        """Share of the rehearsals in which the object is held; one that drops it where it is thought to be is the last."""
+        if not self.holds(goal, hand, CONDITIONS[0]):
+            return 0.0
+        return (1 + sum(self.holds(goal, hand, condition) for condition in CONDITIONS[1:])) / len(CONDITIONS)
+
+    def holds(self, goal: Feasible, hand: Postures, condition: Condition) -> bool:
+        """Approach, close, lift and hold once."""
+        scene, start = self.scene, self.T_world_object.copy()
+        start[:2, 3] += condition.shift
+        scene.model.opt.gravity[:] = condition.weight * self._gravity
+        scene.model.geom_friction[:] = condition.friction * self._friction
+        approach = goal.approach[-1 - APPROACH:]
+        scene.begin(approach[0], hand.pregrasp)
+        scene.place(0, start)
+        self._follow(approach, hand.pregrasp[None], APPROACH_SECONDS)
+        self._follow(approach[-1:], closing(hand), CLOSING_SECONDS)
+        self._follow(approach[-1:], hand.squeeze[None], GRIP_SECONDS)
+        if scene.touched(0) < FEWEST_LINKS:
+            return False
+        rows = goal.lift[:HEIGHT + 1]
+        self._follow(rows, hand.squeeze[None], LIFT_SECONDS)
+        risen, grip = scene.pose(0)[2, 3] - start[2, 3], np.linalg.inv(scene.wrist()) @ scene.pose(0)
+        if risen < RISEN * 0.01 * HEIGHT:
+            return False
+        self._follow(rows[-1:], hand.squeeze[None], HOLD_SECONDS)
+        slip = np.linalg.norm((np.linalg.inv(scene.wrist()) @ scene.pose(0) - grip)[:3, 3])
+        return bool(slip < SLIPPED) and scene.touched(0) >= FEWEST_LINKS
+
+    def _follow(self, arm: Float[np.ndarray, "k n_arm"], hand: Float[np.ndarray, "m n_dof"], seconds: float) -> None:
+        """Let the servos follow waypoints, from rest to rest."""
+        count = round(seconds / TICK)
+        for i in range(1, count + 1):
+            x = i / count
+            along, rate = x * x * (3 - 2 * x), 6 * x * (1 - x) / seconds
+            q, velocity = _at(arm, along)
+            self.scene.command(q, rate * velocity, _at(hand, along)[0])
+            self.scene.advance(TICK, every=TICK)
+
+
+def _at(rows: Float[np.ndarray, "k n"], along: float) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Place on a line through waypoints, 0 to 1, and its derivative by that."""
+    if len(rows) == 1:
+        return rows[0], np.zeros_like(rows[0])
+    place = along * (len(rows) - 1)
+    i = min(int(place), len(rows) - 2)
+    step = rows[i + 1] - rows[i]
+    return rows[i] + (place - i) * step, step * (len(rows) - 1)
