@@ -59,7 +59,8 @@ def main() -> None:
     for robot in arguments.robots:
         for kind in arguments.rows:
             run = TabletopRun(robot, objects, arguments.attempts, config=ROWS[kind])
-            done = run_tabletop(run, arguments.output / f"{Path(robot).stem}.parquet", arguments.workers)
+            done = run_tabletop(
+                run, arguments.output / f"{Path(robot).stem}.parquet", arguments.workers, plans=arguments.output / kind)
             rows.append(row(robot, kind, done))
             lost += [f"{robot}, {kind}: {text}" for text in failures(done)]
     emit(f"Lifts, {arguments.attempts} attempts on each of {len(objects)} objects", rows, COLUMNS,

@@ -32,7 +32,7 @@ class Tabletop:
     """Which reachable grasps are taken: the best by score, or, as a control, any."""
     directions: Literal["paper", "all"] = "all"
     """Palm directions: `paper`, from above to the right side, or `all`."""
-    num: int = 40
+    num: int = 24
     """Grasps to choose from, in each of up to three batches."""
     rehearsals: int = 8
     """Grasps of each batch whose lift is simulated on the object as it is known, before one is chosen; 0 for none."""
@@ -50,6 +50,8 @@ class Tabletop:
     """Processes; each takes one object after the other."""
     output: Annotated[Path | None, optional("PARQUET", "not saved")] = None
     """A row for each attempt, with stage, reason, times and seed. Attempts that it holds are not repeated."""
+    plans: Annotated[Path | None, optional("FOLDER", "not saved")] = None
+    """Folder for the plan of each attempt, ROBOT-OBJECT-NUMBER.npz."""
     video: Annotated[Path | None, optional("GIF|WEBP", "none")] = None
     """Animation of the first attempt, which is run once more for it."""
     json: Flag = False
@@ -72,7 +74,7 @@ class Tabletop:
             plan=PlanConfig(self.num, directions=self.directions, order=self.order, rehearsals=self.rehearsals))
         run = TabletopRun(
             self.robot, tuple(resolve_objects(list(self.objects))), self.attempts, self.seed, self.weights, config)
-        done = run_tabletop(run, self.output, self.workers, None if self.json else _say)
+        done = run_tabletop(run, self.output, self.workers, None if self.json else _say, self.plans)
         self._report(done)
         if self.video is not None:
             draw_attempt(run, self.video)

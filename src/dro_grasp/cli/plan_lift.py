@@ -41,7 +41,7 @@ class Plan:
     of the others."""
     obstacles: tuple[str, ...] = ()
     """Clouds and meshes, in the world frame, that nothing may touch."""
-    num: int = 40
+    num: int = 24
     """Grasps to choose from, in each of up to three batches."""
     top: int = 5
     """Reachable grasps of best score that are given to the planner at once."""

@@ -180,13 +180,13 @@ def attempt(
         made = plan(seen.robot, seen.obj, T, seen.obstacles, predictor, config.plan, seed + number)
     except DroGraspError as error:
         return replace(result, reason=str(error))
-    if watch is not None:
-        watch.planned(seen, made)
     notes = made.notes
     result = replace(
         result, processor_seconds=time.process_time() - processor, plan_seconds=time.perf_counter() - begin,
         grasp_seconds=notes.seconds["grasps"], score=notes.score, grasps=notes.grasps, dropped=json.dumps(notes.dropped),
         motion_seconds=made.seconds)
+    if watch is not None:
+        watch.planned(seen, made)
     stage, reason = carry_out(scene, made, config, watch)
     raised = float(scene.pose(0)[2, 3] - start[2, 3])
     pushed = max((_apart(scene.pose(i), T) for i, T in enumerate(others, 1)), default=0.0)

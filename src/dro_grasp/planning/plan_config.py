@@ -14,8 +14,8 @@ from dro_grasp.planning.reachability import ReachConfig
 class PlanConfig:
     """How a motion is planned. Values without a source are ours."""
 
-    num: int = 40
-    """Grasps to choose from."""
+    num: int = 24
+    """Grasps to choose from, in each of the batches."""
     top: int = 5
     """Reachable grasps of best score that are given to the planner at once. Source: paper, real-robot experiment."""
     directions: Directions = "all"

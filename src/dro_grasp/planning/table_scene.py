@@ -20,6 +20,8 @@ from dro_grasp.planning.workcell import VOXEL
 
 TRIALS = 300
 """Planes through three points that the fit tries (ours)."""
+COUNTED = 4000
+"""Points, drawn at random, that are counted near each of these planes (ours)."""
 THICKNESS = 0.006
 """Points at most this far from the plane are the table's [m]: four standard deviations of the noise (ours)."""
 STEEPEST = 0.2
@@ -172,14 +174,18 @@ def fit_plane(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"],
     Raises:
         ObjectError: There is none. Source of the scheme: RANSAC, Fischler and Bolles 1981, then least squares.
     """
-    random, best = np.random.default_rng(0), np.zeros(len(points), bool)
-    for _ in range(TRIALS if len(points) >= 3 else 0):
-        a, b, c = points[random.choice(len(points), 3, replace=False)]
+    random, plane, most = np.random.default_rng(0), None, 0
+    some = points[random.permutation(len(points))[:COUNTED]]
+    for _ in range(TRIALS if len(some) >= 3 else 0):
+        a, b, c = some[random.choice(len(some), 3, replace=False)]
         normal = np.cross(b - a, c - a)
         if abs(normal[2]) < np.cos(STEEPEST) * np.linalg.norm(normal) or not np.linalg.norm(normal):
             continue
-        near = np.abs((points - a) @ normal) < THICKNESS / 2 * np.linalg.norm(normal)
-        best = near if near.sum() > best.sum() else best
+        unit = normal / np.linalg.norm(normal)
+        count = int((np.abs(some @ unit - a @ unit) < THICKNESS / 2).sum())
+        if count > most:
+            plane, most = (unit, float(a @ unit)), count
+    best = np.zeros(len(points), bool) if plane is None else np.abs(points @ plane[0] - plane[1]) < THICKNESS / 2
     if best.sum() < FEWEST:
         raise ObjectError("the camera sees no level table; correct its pose in the robot file, or the table's place")
     normal, offset = _least_squares(points[best])

@@ -17,9 +17,11 @@ from dro_grasp.devices import one_thread
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.files import check_output, replacing
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.planning.attempts import Attempt, TabletopConfig, attempt
+from dro_grasp.planning.attempts import Attempt, TabletopConfig, Watcher, attempt
 from dro_grasp.planning.extra import require_arm_extra
+from dro_grasp.planning.motion import MotionPlan
 from dro_grasp.planning.robot import load_robot
+from dro_grasp.planning.table_scene import PickedObject
 from dro_grasp.predictor import GraspPredictor
 
 Progress = Callable[[Attempt], None]
@@ -53,8 +55,19 @@ class TabletopRun:
             raise OptionError(f"{self.attempts} attempts on {len(self.objects)} objects; ask for at least one of each")
 
 
+@dataclass
+class PlanKeeper(Watcher):
+    """Stores the plan of an attempt."""
+
+    path: Path
+
+    def planned(self, seen: PickedObject, made: MotionPlan) -> None:
+        """Write it."""
+        made.save(self.path)
+
+
 def run_tabletop(
-    run: TabletopRun, output: Path | None = None, workers: int = 1, progress: Progress | None = None
+    run: TabletopRun, output: Path | None = None, workers: int = 1, progress: Progress | None = None, plans: Path | None = None
 ) -> list[Attempt]:
     """Run all attempts that `output` does not hold yet; each is stored when it ends.
 
@@ -63,6 +76,7 @@ def run_tabletop(
         output: Parquet file; attempts of the same robot, settings and seed in it are not repeated, others stay.
         workers: Processes, which share out the objects; with several, attempts are stored object by object.
         progress: See `Progress`.
+        plans: Folder for the plan of each attempt, ROBOT-OBJECT-NUMBER.npz.
 
     Raises:
         OptionError: The extra is missing, or something cannot be attempted.
@@ -76,7 +90,9 @@ def run_tabletop(
     names = {o: load_object(o).name for o in run.objects}
     done = {(a.object, a.number): a for a in stored if (a.robot, a.settings, a.seed) == (name, label, run.seed)}
     missing = {o: [k for k in range(run.attempts) if (names[o], k) not in done] for o in run.objects}
-    for result in _results(run, {o: numbers for o, numbers in missing.items() if numbers}, workers):
+    if plans is not None:
+        plans.mkdir(parents=True, exist_ok=True)
+    for result in _results(run, {o: numbers for o, numbers in missing.items() if numbers}, workers, plans):
         stored.append(result)
         done[result.object, result.number] = result
         if output is not None:
@@ -86,25 +102,26 @@ def run_tabletop(
     return [done[names[o], k] for o in run.objects for k in range(run.attempts)]
 
 
-def _results(run: TabletopRun, missing: dict[str, list[int]], workers: int) -> Iterator[Attempt]:
+def _results(run: TabletopRun, missing: dict[str, list[int]], workers: int, plans: Path | None) -> Iterator[Attempt]:
     if workers <= 1 or len(missing) <= 1:
         for name, numbers in missing.items():
-            yield from _attempts(run, name, numbers)
+            yield from _attempts(run, name, numbers, plans)
         return
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
-        for future in as_completed([pool.submit(_all_attempts, run, *item) for item in missing.items()]):
+        for future in as_completed([pool.submit(_all_attempts, run, *item, plans) for item in missing.items()]):
             yield from future.result()
 
 
-def _all_attempts(run: TabletopRun, name: str, numbers: Sequence[int]) -> list[Attempt]:
+def _all_attempts(run: TabletopRun, name: str, numbers: Sequence[int], plans: Path | None) -> list[Attempt]:
     with one_thread():
-        return list(_attempts(run, name, numbers))
+        return list(_attempts(run, name, numbers, plans))
 
 
-def _attempts(run: TabletopRun, name: str, numbers: Sequence[int]) -> Iterator[Attempt]:
+def _attempts(run: TabletopRun, name: str, numbers: Sequence[int], plans: Path | None) -> Iterator[Attempt]:
     robot, obj, predictor = load_robot(run.robot), load_object(name), GraspPredictor(run.weights)
     for number in numbers:
-        made = attempt(robot, obj, number, run.seed, predictor, run.config)
+        keeper = None if plans is None else PlanKeeper(plans / f"{robot.name}-{obj.name}-{number}.npz")
+        made = attempt(robot, obj, number, run.seed, predictor, run.config, keeper)
         yield replace(made, robot_file=str(run.robot), object_file=str(name))
 
 

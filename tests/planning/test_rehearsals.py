@@ -1,0 +1,100 @@
+"""Rehearsals: balls stand for what a cloud shows, and a grasp that lets go is told from one that holds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+
+import dro_grasp as dro
+from dro_grasp.objects.loading import cloud_object
+from dro_grasp.planning.ball_solid import OUTSIDE, ball_solid
+from dro_grasp.planning.motion import MotionPlan
+from dro_grasp.planning.physics import LiftScene
+from dro_grasp.planning.plan_config import PlanConfig
+from dro_grasp.planning.planner import LOSES, plan
+from dro_grasp.planning.reachability import Feasible, Postures
+from dro_grasp.planning.rehearsal import CONDITIONS, Rehearsal
+
+RADIUS = 0.04
+
+
+@pytest.fixture(scope="module")
+def robot() -> dro.Robot:
+    return dro.load_robot("xarm7_leaphand")
+
+
+def cloud_of(mesh: trimesh.Trimesh, name: str) -> dro.ObjectModel:
+    points, face = trimesh.sample.sample_surface_even(mesh, 6000, seed=0)
+    return cloud_object(name, np.concatenate([points, mesh.face_normals[face]], 1), origin=name, keep_table=True)
+
+
+@pytest.fixture(scope="module")
+def ball() -> dro.ObjectModel:
+    """Stands on a table at z = 0 within reach."""
+    mesh = trimesh.creation.icosphere(4, RADIUS)
+    mesh.apply_translation((0.45, 0.0, RADIUS))
+    return cloud_of(mesh, "ball")
+
+
+def test_balls_fill_a_sphere_and_weigh_what_it_weighs(ball: dro.ObjectModel) -> None:
+    solid, centre = ball_solid(ball), np.array([0.45, 0.0, RADIUS])
+    reach = np.linalg.norm(solid.centres - centre, axis=1) + solid.radii
+    assert np.abs(reach - RADIUS).max() < OUTSIDE
+    assert solid.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.1)
+    assert np.allclose(solid.centre_of_mass, centre, atol=1e-3)
+    assert np.allclose(solid.inertia, 0.4 * solid.volume * RADIUS**2 * np.eye(3), atol=0.1 * 0.4 * solid.volume * RADIUS**2)
+
+
+def test_a_cup_stays_hollow() -> None:
+    cup = trimesh.creation.annulus(0.03, 0.036, 0.08)
+    solid = ball_solid(cloud_of(cup, "cup"))
+    assert (np.linalg.norm(solid.centres[:, :2], axis=1) - solid.radii > 0.03 - 2 * OUTSIDE).all()
+    assert (np.linalg.norm(solid.centres[:, :2], axis=1) + solid.radii < 0.036 + 2 * OUTSIDE).all()
+
+
+def test_an_estimated_object_stands_still_on_the_table(robot: dro.Robot, ball: dro.ObjectModel) -> None:
+    scene = LiftScene(robot, [ball])
+    scene.place(0, np.eye(4))
+    scene.advance(1.0)
+    assert np.abs(scene.pose(0) - np.eye(4)).max() < 2e-3
+    body = scene.model.body("object0-").id
+    touching = scene.model.geom_bodyid[scene.data.contact.geom].reshape(-1, 2)
+    assert (touching == body).any()
+    assert mujoco.mj_getTotalmass(scene.model) > scene.model.body_mass[body] == pytest.approx(500 * ball_solid(ball).volume)
+
+
+@pytest.fixture(scope="module")
+def planned(robot: dro.Robot, ball: dro.ObjectModel) -> MotionPlan:
+    return plan(robot, ball, config=PlanConfig(num=16, batches=1), seed=0)
+
+
+def test_the_chosen_grasp_holds_and_one_that_never_closes_does_not(
+    planned: MotionPlan, robot: dro.Robot, ball: dro.ObjectModel
+) -> None:
+    rows, hand = planned.part("approach"), planned.hand.position
+    chosen = Feasible(0, planned.arm.position[rows][:: max(1, (rows.stop - rows.start) // 10)], planned.arm.position[
+        planned.part("lift")][::10])
+    closed = planned.part("close")
+    postures = Postures(hand[0], hand[closed.start], hand[closed.start + 50], hand[closed.stop - 1])
+    rehearsal = Rehearsal(robot, ball, np.eye(4))
+    first = rehearsal.share(chosen, postures)
+    assert first > 0
+    assert rehearsal.share(chosen, replace(postures, grasp=postures.pregrasp, squeeze=postures.pregrasp)) == 0
+    assert rehearsal.share(chosen, postures) == first  # nothing is left from the one before
+    assert planned.notes.seconds["rehearsal"] > 0
+
+
+def test_where_none_holds_the_best_score_is_taken_all_the_same(
+    robot: dro.Robot, ball: dro.ObjectModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Rehearsal, "holds", lambda *_: False)
+    config = PlanConfig(num=8, batches=1)
+    made = plan(robot, ball, config=config, seed=0)
+    scored = plan(robot, ball, config=replace(config, rehearsals=0), seed=0)
+    assert made.notes.chosen == scored.notes.chosen
+    monkeypatch.setattr(Rehearsal, "holds", lambda *a: a[-1] is not CONDITIONS[1])
+    assert LOSES not in plan(robot, ball, config=config, seed=0).notes.dropped
