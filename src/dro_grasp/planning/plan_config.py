@@ -26,7 +26,7 @@ class PlanConfig:
     """How often the planner is asked, each time with the next `top` grasps."""
     rehearsals: int = 8
     """Grasps of each batch whose lift is simulated, where a table is known, on the object as it is known; 0 for none."""
-    trusted_share: float = 0.75
+    trusted_share: float = 0.5
     """Share of its rehearsals in which the best grasp that can be carried out should hold the object."""
     trusted_score: float = 1.0
     """Without rehearsals: log-odds of holding that it should have."""

@@ -47,9 +47,11 @@ class Condition:
     """Factor of the object's weight."""
 
 
-CONDITIONS = (Condition(), Condition((0.004, 0.0), 0.8, 1.3), Condition((-0.002, 0.0035), 0.8, 1.3),
-              Condition((-0.002, -0.0035), 0.8, 1.3))
-"""Conditions of the rehearsals of one grasp (ours): as it is thought to be, then shifted, slippery and heavy."""
+CONDITIONS = (Condition(), Condition((0.008, 0.0), 0.8, 1.3), Condition((-0.004, 0.007), 0.8, 1.3),
+              Condition((-0.004, -0.007), 0.8, 1.3))
+"""Conditions of the rehearsals of one grasp: as it is thought to be, then shifted, slippery and heavy.
+
+Ours: on training objects, half of these shifts let two of 25 grasps pass that lose the true object, and these let none."""
 
 
 class Rehearsal:
