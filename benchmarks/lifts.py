@@ -1,32 +1,50 @@
-"""Lifts with an arm: from a camera's cloud, from the true mesh, and with any reachable grasp instead of the best.
+"""Lifts with an arm: from a camera's cloud, from the true mesh, in clutter, and controls that ignore score or shape.
 
-    python benchmarks/lifts.py --output FOLDER [--robots NAME ...] [--rows cloud mesh random] [--attempts N] [--json]
+    python benchmarks/lifts.py --output FOLDER [--robots NAME ...] [--rows cloud mesh ...] [--attempts N] [--json]
 
-One row for each robot and kind of attempt on the paper's validate objects; attempts that FOLDER holds are not repeated.
-Needs the development assets and the extra `[arm]`.
+One row for each robot and kind of attempt, by default on the paper's validate objects; attempts that FOLDER holds are not
+repeated, and their plans are stored in it: `benchmarks/plan_check.py FOLDER` checks them again. Needs the extra `[arm]`; the
+default objects need the development assets, and the mean grasp a bundle of training grasps (--bundle).
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+import torch
 from report import emit
 
+from dro_grasp.baselines.controls import MeanGrasp, mean_grasp, mean_grasps
+from dro_grasp.datasets.bundle.training_file import load_bundle
 from dro_grasp.evaluation.metrics import wilson_interval
-from dro_grasp.objects.catalogue import resolve_objects
-from dro_grasp.planning.attempts import Attempt, TabletopConfig
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.objects.catalogue import load_object, resolve_objects
+from dro_grasp.pipeline.choice import ChoiceConfig
+from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.pipeline.stages import complete
+from dro_grasp.planning.attempts import Attempt, TabletopConfig, attempt
 from dro_grasp.planning.plan_config import PlanConfig
+from dro_grasp.planning.robot import load_robot
+from dro_grasp.planning.standing import upright
+from dro_grasp.planning.table_scene import PickedObject
 from dro_grasp.planning.tabletop import TabletopRun, endings, failures, processor_seconds, run_tabletop
+from dro_grasp.predictor import GraspPredictor
 
 ROWS = {
     "cloud": TabletopConfig(),
     "mesh": TabletopConfig(see="mesh"),
+    "score alone": TabletopConfig(plan=PlanConfig(rehearsals=0)),
     "random": TabletopConfig(plan=PlanConfig(order="random")),
+    "clutter": TabletopConfig(clutter=3, segment="mask"),
+    "mean grasp": TabletopConfig(plan=PlanConfig(order="random")),
 }
-"""Kinds of attempts: what is seen, and which reachable grasp is taken."""
-
-
+"""Kinds of attempts: what is seen, what stands around it, and which reachable grasp is taken."""
+MEAN_GRASPS = 64
+"""Rotations of the mean grasp, of which any is taken that the arm can carry out (ours)."""
 COLUMNS = ("robot", "row", "held", "rate [%]", "interval [%]", "planned", "ended in", "median [s]", "95 % within [s]")
 """Headings; times are of one core, from depth image to timed plan."""
 
@@ -43,24 +61,48 @@ def row(robot: str, kind: str, done: list[Attempt]) -> list[object]:
             ended, *times]
 
 
+def mean_grasp_attempts(run: TabletopRun, mean: MeanGrasp) -> Iterator[Attempt]:
+    """The same attempts with the mean training grasp at random rotations; nothing looks at the object's shape."""
+    robot, predictor = load_robot(run.robot), GraspPredictor()
+
+    def propose(seen: PickedObject, T_world_object: np.ndarray, seed: int) -> GraspBatch:
+        obj, T = upright(seen.obj, T_world_object)
+        problem = GraspProblem(robot.hand, obj)
+        grasps = complete(problem, mean_grasps(problem, mean, MEAN_GRASPS, seed, ChoiceConfig(draws=1)))
+        T = torch.from_numpy(T).float()
+        return grasps.replace(T_object_wrist=T @ grasps.T_object_wrist, score=torch.zeros(len(grasps)))
+
+    for name in run.objects:
+        obj = load_object(name)
+        for number in range(run.attempts):
+            yield replace(attempt(robot, obj, number, run.seed, predictor, run.config, proposer=propose), robot_file=run.robot)
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, required=True, help="folder of the attempts")
     parser.add_argument("--robots", nargs="+", default=["xarm7_leaphand", "ur5e_allegro"])
-    parser.add_argument("--rows", nargs="+", choices=ROWS, default=list(ROWS))
+    parser.add_argument("--rows", nargs="+", choices=ROWS, default=["cloud", "mesh", "random"])
     parser.add_argument("--objects", nargs="+", default=["assets:validate"])
     parser.add_argument("--attempts", type=int, default=10)
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--bundle", type=Path, help="training grasps, for the mean grasp")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     arguments = parser.parse_args()
+    if "mean grasp" in arguments.rows and arguments.bundle is None:
+        parser.error("the mean grasp needs training grasps: --bundle PATH")
     arguments.output.mkdir(parents=True, exist_ok=True)
     objects, rows, lost = tuple(resolve_objects(arguments.objects)), [], []
     for robot in arguments.robots:
         for kind in arguments.rows:
             run = TabletopRun(robot, objects, arguments.attempts, config=ROWS[kind])
-            done = run_tabletop(
-                run, arguments.output / f"{Path(robot).stem}.parquet", arguments.workers, plans=arguments.output / kind)
+            if kind == "mean grasp":
+                mean = mean_grasp(load_bundle(arguments.bundle), load_robot(robot).hand.name)
+                done = list(mean_grasp_attempts(run, mean))
+            else:
+                output = arguments.output / f"{Path(robot).stem}.parquet"
+                done = run_tabletop(run, output, arguments.workers, plans=arguments.output / kind)
             rows.append(row(robot, kind, done))
             lost += [f"{robot}, {kind}: {text}" for text in failures(done)]
     emit(f"Lifts, {arguments.attempts} attempts on each of {len(objects)} objects", rows, COLUMNS,

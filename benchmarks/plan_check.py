@@ -6,6 +6,8 @@ FOLDER, or a folder in it, holds plans, as `benchmarks/lifts.py` stores them. Ar
 fingers and the points of objects and other things by their distance; limits by finite differences between samples.
 """
 
+# MuJoCo 4 exports its names at run time only.
+# pyright: reportAttributeAccessIssue=false
 from __future__ import annotations
 
 import argparse

@@ -23,6 +23,7 @@ from dro_grasp.planning.motion import STAGES, MotionPlan
 from dro_grasp.planning.paths import find_path
 from dro_grasp.planning.plan_config import PlanConfig
 from dro_grasp.planning.planner import plan
+from dro_grasp.planning.robot_file import BUILTIN_ROBOTS
 from dro_grasp.planning.timing import USED, cornered, smooth
 from dro_grasp.planning.workcell import arm_addresses, robot_spec
 from dro_grasp.simulation.protocols import PROTOCOLS
@@ -265,6 +266,22 @@ def test_bad_input_is_refused_in_words_and_nothing_is_written(
     Path("squashed.json").write_text(json.dumps({"frame": "world", "T_frame_camera": squashed.tolist()}))
     before = sorted(tmp_path.iterdir())
     assert main(["plan", "--robot", "xarm7_leaphand", "--object", "can", "--output", "plan.npz", *options]) == 2
+    assert said in capsys.readouterr().err
+    assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize(("option", "said"), [("robot.yaml", "link 'link9', which the arm does not have"),
+                                              ("xarm7_leaphand", "nothing stands on the table: 0 points are left")])
+def test_a_robot_and_a_cloud_that_cannot_be_used_leave_nothing_behind(
+    option: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = (BUILTIN_ROBOTS / "xarm7_leaphand.yaml").read_text()
+    Path("robot.yaml").write_text(text.replace("link: link7", "link: link9").replace("arm: ", f"arm: {BUILTIN_ROBOTS}/"))
+    x, y = np.meshgrid(np.linspace(0, 0.9, 90), np.linspace(-0.6, 0.6, 120))
+    np.save("table.npy", np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3))
+    before = sorted(tmp_path.iterdir())
+    assert main(["plan", "--robot", option, "--object", "table.npy", "--output", "plan.npz", "--csv", "plan.csv"]) == 2
     assert said in capsys.readouterr().err
     assert sorted(tmp_path.iterdir()) == before
 

@@ -12,7 +12,7 @@ import trimesh
 import dro_grasp as dro
 from dro_grasp.objects.loading import cloud_object
 from dro_grasp.planning.ball_solid import OUTSIDE, ball_solid
-from dro_grasp.planning.motion import MotionPlan
+from dro_grasp.planning.candidates import Around, grasps_in_world
 from dro_grasp.planning.physics import LiftScene
 from dro_grasp.planning.plan_config import PlanConfig
 from dro_grasp.planning.planner import LOSES, plan
@@ -68,18 +68,19 @@ def test_an_estimated_object_stands_still_on_the_table(robot: dro.Robot, ball: d
 
 
 @pytest.fixture(scope="module")
-def planned(robot: dro.Robot, ball: dro.ObjectModel) -> MotionPlan:
-    return plan(robot, ball, config=PlanConfig(num=16, batches=1), seed=0)
+def grasps(robot: dro.Robot, ball: dro.ObjectModel) -> dro.GraspBatch:
+    return grasps_in_world(dro.GraspPredictor(), robot.hand, ball, np.eye(4), 12, around=Around(0.0))
 
 
 def test_the_chosen_grasp_holds_and_one_that_never_closes_does_not(
-    planned: MotionPlan, robot: dro.Robot, ball: dro.ObjectModel
+    robot: dro.Robot, ball: dro.ObjectModel, grasps: dro.GraspBatch
 ) -> None:
-    rows, hand = planned.part("approach"), planned.hand.position
-    chosen = Feasible(0, planned.arm.position[rows][:: max(1, (rows.stop - rows.start) // 10)], planned.arm.position[
-        planned.part("lift")][::10])
-    closed = planned.part("close")
-    postures = Postures(hand[0], hand[closed.start], hand[closed.start + 50], hand[closed.stop - 1])
+    planned = plan(robot, ball, grasps=grasps)
+    rows, closed, hand = planned.part("approach"), planned.part("close"), planned.hand.position
+    chosen = Feasible(planned.notes.chosen, planned.arm.position[rows][:: max(1, (rows.stop - rows.start) // 10)],
+                      planned.arm.position[planned.part("lift")][::10])
+    postures = Postures.of(robot, grasps, chosen.index)
+    assert np.allclose(postures.squeeze, hand[closed.stop - 1], atol=1e-6)
     rehearsal = Rehearsal(robot, ball, np.eye(4))
     first = rehearsal.share(chosen, postures)
     assert first > 0
@@ -89,12 +90,10 @@ def test_the_chosen_grasp_holds_and_one_that_never_closes_does_not(
 
 
 def test_where_none_holds_the_best_score_is_taken_all_the_same(
-    robot: dro.Robot, ball: dro.ObjectModel, monkeypatch: pytest.MonkeyPatch
+    robot: dro.Robot, ball: dro.ObjectModel, grasps: dro.GraspBatch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Rehearsal, "holds", lambda *_: False)
-    config = PlanConfig(num=8, batches=1)
-    made = plan(robot, ball, config=config, seed=0)
-    scored = plan(robot, ball, config=replace(config, rehearsals=0), seed=0)
-    assert made.notes.chosen == scored.notes.chosen
+    made = plan(robot, ball, grasps=grasps)
+    assert made.notes.chosen == plan(robot, ball, config=PlanConfig(rehearsals=0), grasps=grasps).notes.chosen
     monkeypatch.setattr(Rehearsal, "holds", lambda *a: a[-1] is not CONDITIONS[1])
-    assert LOSES not in plan(robot, ball, config=config, seed=0).notes.dropped
+    assert LOSES not in plan(robot, ball, grasps=grasps).notes.dropped

@@ -116,7 +116,7 @@ class Plan:
         from dro_grasp.files import given_path
         from dro_grasp.frames import read_motion
         from dro_grasp.objects.catalogue import load_object
-        from dro_grasp.objects.loading import read_points
+        from dro_grasp.objects.loading import read_geometry, read_points
         from dro_grasp.perception.scan import load_scan
         from dro_grasp.planning.table_scene import PickedObject, pick_object, sees_table
 
@@ -132,13 +132,17 @@ class Plan:
                 return pick_object(path.stem, points, robot, camera, self.near), T
             assert camera is not None
             return PickedObject(load_scan(path, camera), [], robot), T
+        if self.pose is None and self.at is None and robot.table is not None and path.is_file():
+            found, unit = read_geometry(path)  # a table is larger than any object that is loaded
+            if isinstance(found, np.ndarray) and found.ndim == 2 and sees_table(found[:, :3] * unit, robot.table):
+                return pick_object(path.stem, found[:, :3] * unit, robot), T
         obj = load_object(self.object)
         if self.pose is not None:
             T = read_motion(self.pose, "T_frame_object").T.double().numpy()
         elif self.at is not None:
             height = 0.0 if robot.table is None else robot.table.height
             T[:3, 3] = *self.at, height - float(obj.cloud[:, 2].min())
-        elif obj.is_cloud and robot.table is not None and (obj.table is not None or sees_table(obj.cloud, robot.table)):
+        elif obj.is_cloud and robot.table is not None and obj.table is not None:
             return pick_object(path.stem, read_points(path), robot), T  # a table, perhaps with several things on it
         return PickedObject(obj, [], robot), T
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Literal
 
@@ -11,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dro_grasp.errors import DroGraspError, OptionError
+from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.scan import depth_points
 from dro_grasp.planning.clutter import MOST_CLUTTER, Region, other_objects, scatter
@@ -135,6 +137,10 @@ class Attempt:
     """The same of the object."""
 
 
+Proposer = Callable[[PickedObject, Float[np.ndarray, "4 4"], int], GraspBatch]
+"""Complete grasps with scores, in the world, of what was seen, of the pose of its frame, and of a seed."""
+
+
 class Watcher:
     """Is told what happens in an attempt; does nothing with it by itself."""
 
@@ -147,7 +153,7 @@ class Watcher:
 
 def attempt(
     robot: Robot, obj: ObjectModel, number: int, seed: int, predictor: GraspPredictor, config: TabletopConfig | None = None,
-    watch: Watcher | None = None,
+    watch: Watcher | None = None, proposer: Proposer | None = None,
 ) -> Attempt:
     """Run one attempt from beginning to end.
 
@@ -159,6 +165,7 @@ def attempt(
         predictor: Proposes grasps.
         config: How it runs.
         watch: Is told what happens.
+        proposer: Makes the grasps instead of the predictor.
 
     Raises:
         OptionError: The robot lacks a table or a camera, or the object is a bare cloud.
@@ -177,7 +184,8 @@ def attempt(
         seen, T = _see(scene, config, int(draw.integers(2**31)))
         see_seconds = time.perf_counter() - begin
         result, begin = replace(result, stage="plan", see_seconds=see_seconds), time.perf_counter()
-        made = plan(seen.robot, seen.obj, T, seen.obstacles, predictor, config.plan, seed + number)
+        grasps = None if proposer is None else proposer(seen, T, seed + number)
+        made = plan(seen.robot, seen.obj, T, seen.obstacles, predictor, config.plan, seed + number, grasps)
     except DroGraspError as error:
         return replace(result, reason=str(error))
     notes = made.notes
