@@ -59,6 +59,8 @@ docs-pictures: setup
 	$(BIN)/dro-grasp generate --hand allegro --object rubber_duck --num 16 --seed 0 --picture docs/pictures/grasps.png
 	$(BIN)/dro-grasp tabletop --robot xarm7_leaphand --objects spray_bottle --attempts 1 --video docs/pictures/lift.webp
 	$(BIN)/dro-grasp robot check xarm7_leaphand --picture docs/pictures/robot-check.png
+	$(BIN)/dro-grasp tabletop --robot xarm7_leaphand --objects builtin:test --attempts 2 --output out/attempts.parquet --plans out/plans
+	$(BIN)/python scripts/draw_attempts.py out/attempts.parquet out/plans docs/pictures/attempts.png
 
 PAPER_HANDS := assets/barrett_multidex assets/allegro_left assets/shadowhand assets/leaphand
 OTHER_HANDS := allegro barrett gripper3 leaphand shadowhand assets/allegro_right

@@ -28,6 +28,7 @@ from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import complete
 from dro_grasp.planning.attempts import Attempt, TabletopConfig, attempt
 from dro_grasp.planning.plan_config import PlanConfig
+from dro_grasp.planning.planner import NO_PATH
 from dro_grasp.planning.robot import load_robot
 from dro_grasp.planning.standing import upright
 from dro_grasp.planning.table_scene import PickedObject
@@ -45,8 +46,10 @@ ROWS = {
 """Kinds of attempts: what is seen, what stands around it, and which reachable grasp is taken."""
 MEAN_GRASPS = 64
 """Rotations of the mean grasp, of which any is taken that the arm can carry out (ours)."""
-COLUMNS = ("robot", "row", "held", "rate [%]", "interval [%]", "planned", "ended in", "median [s]", "95 % within [s]")
-"""Headings; times are of one core, from depth image to timed plan."""
+COLUMNS = ("robot", "row", "held", "rate [%]", "interval [%]", "planned", "of reachable", "ended in", "median [s]",
+           "95 % within [s]")
+"""Headings; `of reachable` are the attempts with a grasp that the arm reaches, times are of one core, from depth image to timed
+plan."""
 
 
 def row(robot: str, kind: str, done: list[Attempt]) -> list[object]:
@@ -57,8 +60,9 @@ def row(robot: str, kind: str, done: list[Attempt]) -> list[object]:
     ended = ", ".join(f"{stage} {count}" for stage, count in endings(done).items())
     times = [None, None] if seconds is None else [round(seconds["median"], 1), round(seconds["within_95"], 1)]
     planned = sum(a.processor_seconds > 0 for a in done)
+    reachable = planned + sum(a.stage == "plan" and NO_PATH in a.reason for a in done)
     return [robot, kind, f"{held} of {len(done)}", round(100 * held / len(done)), f"{100 * low:.0f}-{100 * high:.0f}", planned,
-            ended, *times]
+            reachable, ended, *times]
 
 
 def mean_grasp_attempts(run: TabletopRun, mean: MeanGrasp) -> Iterator[Attempt]:

@@ -51,6 +51,14 @@ def test_the_thing_near_a_place_is_picked_and_the_other_is_an_obstacle(table_clo
     assert below < VOXEL  # only the ball's surface was given, but what is below its top is solid
 
 
+def test_a_speck_is_an_obstacle_too(table_cloud: np.ndarray, robot: dro.Robot) -> None:
+    speck = np.array([0.3, 0.3, 0.012]) + 0.001 * np.eye(3).repeat(2, 0)
+    picked = pick_object("cube", np.concatenate([table_cloud[:-3000], speck]), robot, near=CUBE)
+    (other,) = picked.obstacles
+    assert len(occupied(other.cloud.astype(float))[0]) == 1
+    assert np.abs(other.cloud - speck.mean(0)).max() < VOXEL
+
+
 def test_a_mask_tells_apart_what_touches(table_cloud: np.ndarray, robot: dro.Robot) -> None:
     cloud = table_cloud.copy()
     cloud[-3000:, 1] += 0.13

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from dro_grasp.errors import ObjectError, RobotError
-from dro_grasp.objects.loading import cloud_object
+from dro_grasp.objects.loading import MIN_CLOUD, cloud_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.scan import scanned_object
 from dro_grasp.planning.robot import Robot
@@ -128,7 +128,10 @@ def _solid(sight: Sight) -> list[ObjectModel]:
     np.maximum.at(tops, column.ravel(), sight.others[:, 2])
     heights = [np.arange(top, min(sight.table_height, top - VOXEL), -VOXEL) for top in tops]
     rows = [np.column_stack([np.tile((cell + 0.5) * VOXEL, (len(z), 1)), z]) for cell, z in zip(cells, heights, strict=True)]
-    return [cloud_object("other things", np.concatenate(rows), origin="other things", keep_table=True)]
+    points = np.concatenate(rows)
+    if len(points) < MIN_CLOUD:  # an obstacle all the same, in the same cells
+        points = (points[:, None] + VOXEL / 3 * (np.indices((3, 3, 3)).reshape(3, -1).T - 1)).reshape(-1, 3)
+    return [cloud_object("other things", points, origin="other things", keep_table=True)]
 
 
 def sort_out(
