@@ -52,11 +52,11 @@ def test_the_thing_near_a_place_is_picked_and_the_other_is_an_obstacle(table_clo
 
 
 def test_a_speck_is_an_obstacle_too(table_cloud: np.ndarray, robot: dro.Robot) -> None:
-    speck = np.array([0.3, 0.3, 0.012]) + 0.001 * np.eye(3).repeat(2, 0)
+    speck = np.array([0.304, 0.304, 0.014]) + 0.001 * np.eye(3).repeat(2, 0)
     picked = pick_object("cube", np.concatenate([table_cloud[:-3000], speck]), robot, near=CUBE)
     (other,) = picked.obstacles
     assert len(occupied(other.cloud.astype(float))[0]) == 1
-    assert np.abs(other.cloud - speck.mean(0)).max() < VOXEL
+    assert np.abs(other.cloud - speck.mean(0)).max() < 1.5 * VOXEL
 
 
 def test_a_mask_tells_apart_what_touches(table_cloud: np.ndarray, robot: dro.Robot) -> None:

@@ -23,8 +23,10 @@ OUTSIDE = 0.0012
 """How far a ball may reach through the surface elsewhere [m] (ours)."""
 FOOT = 0.004
 """What an estimated object has this near to its lowest point stands on the table [m] (ours)."""
-BALL_BIT, HULL_BIT = 2, 4
-"""Bits of contacts: of balls with the hand, and of the convex hull with the table (ours)."""
+BALL_BIT = 2
+"""Bit of contacts of balls with the hand (ours)."""
+HULL_BIT = 4
+"""Bit of contacts of the convex hull with the table (ours)."""
 
 
 @dataclass(frozen=True)

@@ -23,14 +23,24 @@ TICK = 0.02
 """Time between targets of the servos [s] (ours)."""
 TIME_STEP = 0.004
 """Time step of the simulation [s] (ours)."""
-APPROACH, HEIGHT = 3, 8
-"""Poses of the approach, and of the lift, that are rehearsed (ours): they are 1 cm apart."""
-APPROACH_SECONDS, CLOSING_SECONDS, GRIP_SECONDS, LIFT_SECONDS, HOLD_SECONDS = 0.3, 1.0, 0.3, 0.7, 0.3
-"""Durations of the parts [s] (ours)."""
+APPROACH = 3
+"""Steps of the approach that are rehearsed, the last ones (ours): they are 1 cm long."""
+HEIGHT = 8
+"""Steps of the lift that are rehearsed, the first ones (ours): they are 1 cm long."""
+APPROACH_SECONDS = 0.3
+"""Duration of this part of the approach [s] (ours)."""
+CLOSING_SECONDS = 1.0
+"""Duration of closing [s]. Source: as in trials."""
+GRIP_SECONDS = 0.3
+"""How long the hand presses then [s] (ours)."""
+LIFT_SECONDS = 0.7
+"""Duration of this part of the lift [s] (ours)."""
+HOLD_SECONDS = 0.3
+"""How long the object is held up then [s] (ours)."""
 RISEN = 0.5
 """Share of the lift that a held object rises at least (ours)."""
 SLIPPED = 0.02
-"""Farthest that it may move in the hand in the second half of the lift [m] (ours)."""
+"""Farthest that it may move in the hand while it is held up [m] (ours)."""
 FEWEST_LINKS = 2
 """Links that touch the object at least, once the hand has closed (ours)."""
 
