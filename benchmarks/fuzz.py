@@ -3,9 +3,10 @@
 Each case follows from the seed and its number alone: a sound file is damaged, and read as the product reads it, in a child
 process with at most 4 GB of address space. One that dies, takes more than 20 s of CPU time, runs out of memory, or raises
 another exception than a `DroGraspError` is a failure, and is printed with its number. `--only N` repeats one case with its
-traceback; `--keep FOLDER` keeps the files of what escaped.
+traceback; `--keep FOLDER` keeps the files of what escaped. `--record FILE` holds what was found so far: the same command goes on
+where it was stopped, and with more `--cases` where it ended.
 
-    python benchmarks/fuzz.py [--cases 100000] [--seed 0] [--kinds urdf mesh ...] [--only N] [--keep FOLDER] [--json]
+    python benchmarks/fuzz.py [--cases 100000] [--seed 0] [--kinds urdf mesh ...] [--record FILE] [--only N] [--keep FOLDER] [--json]
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import collections
 import json
 import os
 import random
+import re
 import resource
 import select
 import shutil
@@ -31,6 +33,7 @@ from fuzz_targets import TARGETS, attempt, make_seeds
 from report import emit
 
 from dro_grasp.errors import DroGraspError
+from dro_grasp.files import replacing
 
 LONGEST = 20.0
 """CPU time after which a case counts as a hang [s] (ours)."""
@@ -38,6 +41,8 @@ ASLEEP = 120.0
 """Time after which it does too, busy or not [s] (ours)."""
 MEMORY = 4 * 10**9
 """Address space of the process that reads [bytes] (ours)."""
+PART = 1000
+"""Cases that one process reads (ours): its memory tells of them alone, and at most so many are lost when all is stopped."""
 
 
 @dataclass
@@ -52,6 +57,39 @@ class Tally:
     """Longest CPU time [s], and its kind and number."""
     memory: int = 0
     """Largest resident set of a reading process [bytes]."""
+    seconds: float = 0.0
+    """Time that it took, in all runs together [s]."""
+
+    def write(self, record: Path, seed: int, kinds: Sequence[str]) -> None:
+        """Write what was found so far, for `read`."""
+        what = {"seed": seed, "kinds": list(kinds), "counts": self.counts, "failures": self.failures, "slowest": self.slowest,
+                "memory": self.memory, "seconds": self.seconds}
+        with replacing(record) as temporary:
+            temporary.write_text(json.dumps(what))
+
+    @classmethod
+    def read(cls, record: Path | None, seed: int, kinds: Sequence[str]) -> Tally:
+        """What a record holds of these cases; nothing without one.
+
+        Raises:
+            SystemExit: It holds other cases.
+        """
+        tally = cls()
+        if record is None or not record.exists():
+            return tally
+        found = json.loads(record.read_text())
+        if (found["seed"], found["kinds"]) != (seed, list(kinds)):
+            raise SystemExit(f"{record} holds seed {found['seed']} and kinds {' '.join(found['kinds'])}; give those, or "
+                             "another file")
+        tally.counts.update({kind: collections.Counter(counts) for kind, counts in found["counts"].items()})
+        tally.failures.update(found["failures"])
+        tally.slowest, tally.memory, tally.seconds = tuple(found["slowest"]), found["memory"], found["seconds"]
+        return tally
+
+    @property
+    def cases(self) -> int:
+        """How many there were."""
+        return sum(sum(counts.values()) for counts in self.counts.values())
 
 
 def kind_of(case: int, seed: int, kinds: Sequence[str]) -> str:
@@ -88,7 +126,8 @@ def place_of(error: BaseException) -> str:
     """An exception in one line, with the last place in dro-grasp that it passed."""
     frames = [f for f in traceback.extract_tb(error.__traceback__) if "dro_grasp" in f.filename or "fuzz" in f.filename]
     where = f"{Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else "?"
-    return f"{type(error).__name__} at {where}: {str(error).splitlines()[0][:90] if str(error) else ''}"
+    told = re.sub(r"\S*/fuzz-\w+-\d+/", "", str(error)).splitlines()
+    return f"{type(error).__name__} at {where}: {told[0][:90] if told else ''}"
 
 
 def child(cases: Sequence[int], args: argparse.Namespace, seeds: Path, pipe: int) -> None:
@@ -111,10 +150,10 @@ def child(cases: Sequence[int], args: argparse.Namespace, seeds: Path, pipe: int
 
 def run_cases(args: argparse.Namespace, seeds: Path) -> Tally:
     """All cases; a child that ends before its last case is replaced by one that begins with the next."""
-    tally, left = Tally(), list(range(args.cases))
+    tally = Tally.read(args.record, args.seed, args.kinds)
+    left = list(range(tally.cases, args.cases))
     while left:
-        # A child makes some cases only, so that its memory tells of them.
-        part = left[:5000]
+        begin, part = time.perf_counter(), left[:PART]
         reading, writing = os.pipe()
         process = os.fork()
         if process == 0:
@@ -131,6 +170,9 @@ def run_cases(args: argparse.Namespace, seeds: Path) -> Tally:
             tally.counts[kind]["hang" if how == "hang" else "crash"] += 1
             tally.failures[f"{kind}: {how}"].append(case)
         left = left[done + (ended is not None) :]
+        tally.seconds += time.perf_counter() - begin
+        if args.record is not None:
+            tally.write(args.record, args.seed, args.kinds)
         print(f"{args.cases - len(left)} cases, {sum(map(len, tally.failures.values()))} failures", file=sys.stderr, flush=True)
     return tally
 
@@ -173,11 +215,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--cases", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kinds", nargs="+", choices=list(TARGETS), default=list(TARGETS))
+    parser.add_argument("--record", type=Path)
     parser.add_argument("--only", type=int)
     parser.add_argument("--keep", type=Path)
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args(arguments)
-    begin = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="fuzz-seeds-") as name:
         seeds = Path(name)
         os.environ["DRO_GRASP_CACHE"] = str(seeds)
@@ -189,6 +231,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if args.only is not None:
             kind, folder = kind_of(args.only, args.seed, args.kinds), args.keep or seeds / "only"
             folder.mkdir(exist_ok=True)
+            resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
             attempt(TARGETS[kind].read, TARGETS[kind].write(random.Random(f"{args.seed}/{args.only}"), seeds, folder))
             return 0
         tally = run_cases(args, seeds)
@@ -197,7 +240,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rows.append(["all", *(sum(row[i] for row in rows) for i in range(1, len(outcomes) + 2))])  # type: ignore[misc]
     failed = {how: [len(cases), *cases[:5]] for how, cases in sorted(tally.failures.items(), key=lambda item: -len(item[1]))}
     values = {
-        "seed": args.seed, "seconds": time.perf_counter() - begin, "slowest": tally.slowest, "peak_bytes": tally.memory,
+        "seed": args.seed, "seconds": tally.seconds, "slowest": tally.slowest, "peak_bytes": tally.memory,
         "failures": failed, "kinds": {row[0]: dict(zip(("cases", *outcomes), row[1:], strict=True)) for row in rows}}
     emit("damaged files", rows, ["kind", "cases", *outcomes], values, args.json)
     if not args.json:

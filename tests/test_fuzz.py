@@ -50,7 +50,13 @@ def test_what_becomes_of_a_case_is_told_and_the_others_go_on(
     target = import_module("fuzz_targets").Target
     monkeypatch.setattr(fuzz, "TARGETS", {kind: target(write, read, 1) for kind, read in KINDS.items()})
     monkeypatch.setattr(fuzz, "LONGEST", 0.2)
-    tally = fuzz.run_cases(argparse.Namespace(cases=24, seed=0, kinds=list(KINDS), keep=tmp_path), tmp_path)
+    asked = {"seed": 0, "kinds": list(KINDS), "keep": tmp_path, "record": tmp_path / "record.json"}
+    part = fuzz.run_cases(argparse.Namespace(cases=9, **asked), tmp_path)
+    assert part.cases == 9
+    tally = fuzz.run_cases(argparse.Namespace(cases=24, **asked), tmp_path)
+    assert tally.cases == fuzz.Tally.read(tmp_path / "record.json", 0, list(KINDS)).cases
+    with pytest.raises(SystemExit, match="holds seed 0"):
+        fuzz.Tally.read(tmp_path / "record.json", 1, list(KINDS))
     counts = {kind: dict(counter) for kind, counter in tally.counts.items()}
     assert sum(sum(counter.values()) for counter in counts.values()) == 24
     assert {kind: list(counter) for kind, counter in counts.items()} == {

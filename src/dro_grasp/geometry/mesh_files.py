@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -16,7 +17,10 @@ MOST_BYTES = 200_000_000
 def open_mesh(path: Path, **options: Any) -> trimesh.Geometry:
     """What trimesh reads from a file, without materials and textures; each reader behind it raises its own errors."""
     check_bytes(path)
-    return trimesh.load(path, skip_materials=True, resolver=Beside(path.parent), **options)
+    # From memory: lengths that a header claims then end with the file, instead of asking for as much.
+    with io.BytesIO(path.read_bytes()) as content:
+        kind = path.suffix.lower().removeprefix(".")
+        return trimesh.load(content, kind, skip_materials=True, resolver=Beside(path.parent), **options)
 
 
 def check_bytes(path: Path) -> None:
