@@ -3,10 +3,11 @@
 Each case follows from the seed and its number alone: a sound file is damaged, and read as the product reads it, in a child
 process with at most 4 GB of address space. One that dies, takes more than 20 s of CPU time, runs out of memory, or raises
 another exception than a `DroGraspError` is a failure, and is printed with its number. `--only N` repeats one case with its
-traceback; `--keep FOLDER` keeps the files of what escaped. `--record FILE` holds what was found so far: the same command goes on
-where it was stopped, and with more `--cases` where it ended.
+traceback; `--keep FOLDER` keeps the files of what escaped. `--record FILE` holds what was found so far: the same command goes
+on where it was stopped, and with more `--cases` where it ended.
 
-    python benchmarks/fuzz.py [--cases 100000] [--seed 0] [--kinds urdf mesh ...] [--record FILE] [--only N] [--keep FOLDER] [--json]
+    python benchmarks/fuzz.py [--cases 100000] [--seed 0] [--kinds urdf mesh ...] [--record FILE] [--only N]
+        [--keep FOLDER] [--json]
 """
 
 from __future__ import annotations

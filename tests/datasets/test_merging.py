@@ -73,6 +73,31 @@ def test_merged_files_are_collections_with_their_yields(folders, tmp_path, capsy
     assert json.loads(capsys.readouterr().out) == {"total": 10, "hands": {"gripper3": {"can": 5, "sphere": 5}}}
 
 
+def test_large_sets_become_several_files_that_hold_the_same(folders, hand, tmp_path):
+    (whole,) = merge(folders, aside=tmp_path)
+    parts = list(merge(folders, aside=tmp_path, file_bytes=1))
+    assert [file_name(part.hand, part.number) for part in parts] == ["gripper3.parquet", "gripper3.2.parquet"]
+    assert [set(part.grasps.object) for part in parts] == [{"can"}, {"sphere"}]
+    for part in parts:
+        part.save(tmp_path / file_name(part.hand, part.number))
+    assert not list(tmp_path.glob(".merge-*"))
+    pairs = {p.object: p for p in read_collection(tmp_path)}
+    for name, grasps in whole.grasps.by_object():
+        torch.testing.assert_close(pairs[name].grasps.joints, grasps.joints)
+        assert pairs[name].made == whole.yields[name]
+
+
+def test_nothing_to_merge_is_told(hand, tmp_path, capsys):
+    tried(hand, "can", 2, seed=0)[[]].save(tmp_path / "none.parquet")
+    out = ["--output", str(tmp_path / "out")]
+    for name, *further in (("merge", *out), ("filter", *out), ("report",), ("info",)):
+        assert main(["dataset", name, str(tmp_path / "none.parquet"), *further]) == 2
+        assert "none.parquet holds no grasp; leave it out" in capsys.readouterr().err
+    tried(hand, "can", 2, seed=0, failed=2).save(tmp_path / "failed.parquet")
+    assert main(["dataset", "merge", str(tmp_path / "failed.parquet"), "--output", str(tmp_path / "c")]) == 0
+    assert "no grasp held in a trial" in capsys.readouterr().err
+
+
 def test_compact_numbers_mean_the_same_and_keep_the_limits(hand):
     grasps = tried(hand, "sphere", 200, seed=3)
     grasps = grasps.replace(joints=torch.where(torch.rand(200, hand.tree.n_dof) < 0.3, hand.tree.upper, grasps.joints))
@@ -111,10 +136,10 @@ def test_versions_are_not_mixed(hand, tmp_path):
     tried(hand, "sphere", 3, 0).save(tmp_path / "a.parquet")
     tried(hand, "sphere", 3, 1).replace(object_sha256=("new",) * 3).save(tmp_path / "b.parquet")
     with pytest.raises(GraspFileError, match="different versions of object 'sphere'"):
-        merge([tmp_path / "a.parquet", tmp_path / "b.parquet"])
+        list(merge([tmp_path / "a.parquet", tmp_path / "b.parquet"]))
     tried(hand, "can", 3, 1).replace(hand_sha256="new").save(tmp_path / "c.parquet")
     with pytest.raises(GraspFileError, match="different versions of hand 'gripper3'"):
-        merge([tmp_path / "a.parquet", tmp_path / "c.parquet"])
+        list(merge([tmp_path / "a.parquet", tmp_path / "c.parquet"]))
 
 
 def test_files_are_named_after_hands():

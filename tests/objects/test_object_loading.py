@@ -101,7 +101,6 @@ def test_nan_vertices_are_refused(tmp_path: Path):
      ("line.obj", "v 0 0 0\nv 0.1 0 0\nl 1 2\n", "no faces|2 distinct points"),
      ("noise.stl", "solid what\nfacet nonsense", "cannot be read|no faces"), ("noise.xyzw", "?", "cannot be read"),
      ("cut.glb", "glTF", "cannot be read"),
-     ("lies.glb", "glTF\2\0\0\0\x60\0\0\0\x7f\x7f\x7f\x7fJSON{}", "chunk was not expected length"),
      ("face.off", "OFF\n3 1 0\n0 0 0\n0.05 0 0\n0 0.05 0\n3 0 1 9\n", "cannot be read|face with vertex 9")])
 def test_files_without_a_mesh_are_refused(tmp_path: Path, name: str, text: str, message: str):
     (tmp_path / name).write_text(text)

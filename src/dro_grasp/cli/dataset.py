@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from dro_grasp.cli.dataset_import import Import
 from dro_grasp.cli.inputs import Flag, ProtocolName, optional
 from dro_grasp.cli.output import print_result, progress_bar, records, say_aside
 
@@ -35,55 +36,6 @@ class Info:
         print_result(self.json, {"total": total, "hands": counts}, f"data set {self.folder}",
                      ["hand", "objects", "grasps", "fewest"], rows, f"{total} grasps in all")
         return 0
-
-
-@dataclass(frozen=True)
-class Import:
-    """Convert grasps of other data sets into grasp files, to evaluate, filter and train on.
-
-    Example: dro-grasp dataset import cmap_dataset.pt --format cmap --hands barrett=assets/barrett_multidex --output imported
-    """
-
-    inputs: tyro.conf.Positional[tuple[Path, ...]]
-    """`cmap_dataset.pt` of the official D(R,O) release, or npy files of DexGraspNet or DexGraspBench."""
-    format: Literal["cmap", "dexgraspnet", "dexgraspbench"]
-    """Format of the files."""
-    output: Path
-    """Folder for one grasp file per hand; created if missing."""
-    hands: tuple[str, ...] = ()
-    """Names or paths of the hands; NAME_IN_FILE=NAME renames one. Files that name no hand need exactly one."""
-    object: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
-    """Object of all grasps, if the file names another or none."""
-    json: Flag = False
-    """Print one JSON object instead of a table."""
-
-    def run(self) -> int:
-        """Read all files, find hands and objects, write grasp files."""
-        from dro_grasp.datasets.collections.importing import import_grasps
-        from dro_grasp.datasets.collections.merging import file_name
-        from dro_grasp.errors import GraspFileError
-        from dro_grasp.files import check_folder, make_folder
-
-        check_folder(self.output)
-        here = {theirs: ours for theirs, _, ours in (pair.rpartition("=") for pair in self.hands)}
-        by_hand, missing = import_grasps(self.inputs, self.format, here, self.object)
-        for obj, why in missing.items():
-            say_aside(f"grasps of {obj} are left out: {why}")
-        if not (by_hand or self.json):
-            raise GraspFileError(
-                "no grasp was imported; name the object of all grasps with --object, or set DRO_GRASP_ASSETS to the folder "
-                "with the data set's objects" if missing else
-                f"no grasp was imported: {', '.join(map(str, self.inputs))} holds none; name other files")
-        folder = make_folder(self.output) if by_hand else self.output
-        rows = []
-        for grasps in by_hand.values():
-            path = folder / file_name(grasps.hand)
-            grasps.save(path)
-            rows.append([grasps.hand, len(set(grasps.object)), len(grasps), str(path)])
-        columns = ["hand", "objects", "grasps", "file"]
-        print_result(self.json, {"files": records(columns, rows), "missing": missing}, "imported", columns, rows,
-                     "`dro-grasp dataset filter` keeps those that pass a trial")
-        return 0 if rows else 2
 
 
 @dataclass(frozen=True)
@@ -137,32 +89,34 @@ class Report(DataSets):
 
 @dataclass(frozen=True)
 class Merge(DataSets):
-    """Merge data sets into one file per hand, without near-duplicates and failed grasps.
+    """Merge data sets into one file per hand, or several of about 100 MB, without near-duplicates and failed grasps.
 
     Example: dro-grasp dataset merge data more --output grasps --per-pair 150
     """
 
     output: Path
-    """Folder for the files, one per hand; created if missing."""
+    """Folder for the files; created if missing. Grasps wait in it too, as much again as the inputs, until the end."""
     per_pair: Annotated[int | None, optional("N", "all")] = None
     """Limit of grasps of a hand on an object; those that cover palm directions best are kept."""
     json: Flag = False
     """Print one JSON object instead of a table."""
 
     def run(self) -> int:
-        """Merge, and write one file per hand."""
+        """Merge, and write the files."""
         from dro_grasp.datasets.collections.merging import file_name, merge
         from dro_grasp.files import make_folder
 
         folder = make_folder(self.output)
         rows = []
-        for merged in merge(self.inputs, self.per_pair):
-            path = folder / file_name(merged.hand)
+        for merged in merge(self.inputs, self.per_pair, folder):
+            path = folder / file_name(merged.hand, merged.number)
             merged.save(path)
-            rows.append([merged.hand, len(merged.grasps), merged.duplicates, merged.surplus, path.stat().st_size])
-        columns = ["hand", "grasps", "duplicates", "surplus", "bytes"]
-        values = {"output": str(folder), "files": records(columns, rows)}
-        print_result(self.json, values, f"merged into {folder}", columns, rows, f"{sum(row[1] for row in rows)} grasps in all")
+            rows.append([merged.hand, len(merged.grasps), merged.duplicates, merged.surplus, path.stat().st_size, path.name])
+        columns = ["hand", "grasps", "duplicates", "surplus", "bytes", "file"]
+        values, total = {"output": str(folder), "files": records(columns, rows)}, sum(row[1] for row in rows)
+        print_result(self.json, values, f"merged into {folder}", columns, rows, f"{total} grasps in all")
+        if not total:
+            say_aside("no grasp held in a trial; `dro-grasp evaluate` tests grasps that had none")
         return 0
 
 

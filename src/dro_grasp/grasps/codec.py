@@ -65,7 +65,7 @@ def decode(table: pa.Table, header: dict[str, Any], path: str) -> dict[str, Any]
     n, n_dof = table.num_rows, len(header["joint_names"])
 
     def text(name: str) -> tuple[str, ...]:
-        return tuple(v or "" for v in table[name].to_pylist()) if name in table.column_names else ("",) * n
+        return tuple(v or "" for v in shared(table[name])) if name in table.column_names else ("",) * n
 
     def numbers(name: str, width: int | None) -> Float[Tensor, "n *width"]:
         if name not in table.column_names or table[name].null_count == n:
@@ -149,4 +149,17 @@ def _decode_further(column: pa.ChunkedArray) -> Any:
         lengths = {len(v) for v in column.to_pylist() if v is not None}
         if len(lengths) == 1:
             return floats(column, lengths.pop(), "extra")
-    return column.to_pylist()
+    return shared(column)
+
+
+def shared(column: pa.ChunkedArray) -> list[Any]:
+    """The values of a column, equal texts and lists once: of a million grasps most share their object and their maker."""
+    if pa.types.is_string(column.type):
+        coded = column.combine_chunks().dictionary_encode()
+        words = [*coded.dictionary.to_pylist(), None]
+        return [words[i] for i in coded.indices.fill_null(len(words) - 1).to_pylist()]
+    values = column.to_pylist()
+    if not (pa.types.is_list(column.type) and pa.types.is_string(column.type.value_type)):
+        return values
+    known: dict[tuple[Any, ...], Any] = {}
+    return [value and known.setdefault(tuple(value), value) for value in values]

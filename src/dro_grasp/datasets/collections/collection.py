@@ -52,8 +52,12 @@ def read_collection(path: Path | str, only_successful: bool = True) -> Iterator[
     else:
         raise GraspFileError(f"no grasps at {path}: expected a .parquet file, a folder of them, or a folder that "
                              "`dro-grasp synthesize` filled")
+    empty = True
     for pair in pairs:
+        empty = False
         yield replace(pair, grasps=pair.grasps[pair.grasps.success.nonzero()[:, 0]]) if only_successful else pair
+    if empty:
+        raise GraspFileError(f"{path} holds no grasp; leave it out, or generate again without --only-successful")
 
 
 def count_collection(path: Path | str) -> dict[str, dict[str, int]]:

@@ -1,17 +1,19 @@
-"""Merge data sets: near-duplicates once, an even choice of grasps for each pair, one compact file for each hand."""
+"""Merge data sets: near-duplicates once, an even choice of grasps for each pair, compact files of limited size."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from dro_grasp._version import __version__
-from dro_grasp.datasets.collections.collection import YIELDS, PairGrasps, read_collection
+from dro_grasp.datasets.collections.collection import YIELDS, read_collection
 from dro_grasp.datasets.engine.shards import Yield
 from dro_grasp.errors import GraspFileError
 from dro_grasp.geometry.rotations import roma
@@ -29,13 +31,15 @@ UNIT_STEP = 2.0**-15
 """Grid of quaternions in merged files. Ours: 0.03 mrad."""
 MANTISSA = 10
 """Bits of the mantissa of all other numbers in merged files. Ours: three digits."""
+FILE_BYTES = 100_000_000
+"""Size of a merged file from which on the next object goes into another [bytes] (ours)."""
 PLAIN_COLUMNS = ("reason", "failure")
 """Columns that are empty for successes."""
 
 
 @dataclass(frozen=True)
 class Merged:
-    """One hand's grasps out of several data sets."""
+    """Grasps of one hand out of several data sets, for one file."""
 
     hand: str
     grasps: GraspBatch
@@ -45,6 +49,8 @@ class Merged:
     """Near-duplicates that were dropped."""
     surplus: int
     """Grasps above the number asked for, dropped."""
+    number: int = 1
+    """Of the file, where the hand's grasps fill several."""
 
     def save(self, path: Path) -> None:
         """Write one grasp file with the yields in its notes.
@@ -56,49 +62,82 @@ class Merged:
         self.grasps.save(path, {YIELDS: yields, "version": __version__})
 
 
-def merge(paths: Sequence[Path | str], per_pair: int | None = None) -> list[Merged]:
-    """Merge data sets, hand by hand.
+class Waiting(NamedTuple):
+    """Grasps of a pair from one data set, in a file of their own until those of all data sets are known."""
+
+    file: Path
+    made: Yield
+
+
+def merge(
+    paths: Sequence[Path | str], per_pair: int | None = None, aside: Path | None = None, file_bytes: int = FILE_BYTES
+) -> Iterator[Merged]:
+    """Merge data sets, hand by hand and object by object; memory holds the grasps of one file.
 
     Args:
         paths: As in `read_collection`.
         per_pair: Most grasps of a pair; the choice spreads best over palm directions.
+        aside: Folder in which the grasps wait meanwhile, as much again as the data sets; by default the system's for
+            temporary files.
+        file_bytes: Size of a file from which on the next object goes into another, about.
 
     Raises:
         GraspFileError: A path holds no grasps, or data sets know different versions of a hand or object.
         HandError: A hand cannot be loaded.
+        OutputError: There is no space for the grasps that wait.
     """
-    by_hand: dict[str, dict[str, list[PairGrasps]]] = {}
-    for path in paths:
-        for pair in read_collection(path):
-            # The pair may have been requested by path.
-            name = pair.grasps.object[0] if len(pair.grasps) else pair.object
-            by_hand.setdefault(pair.grasps.hand, {}).setdefault(name, []).append(pair)
-    return [_merge_hand(hand, pairs, per_pair) for hand, pairs in sorted(by_hand.items())]
+    with tempfile.TemporaryDirectory(dir=aside, prefix=".merge-") as name:
+        for hand, pairs in sorted(_by_pair(paths, Path(name)).items()):
+            yield from _merge_hand(hand, pairs, per_pair, file_bytes)
 
 
-def file_name(hand: str) -> str:
+def file_name(hand: str, number: int = 1) -> str:
     """Name of a merged file: the hand's with its source, as hands of two sources may share a name."""
-    return f"{hand.replace('/', '-')}.parquet"
+    return f"{hand.replace('/', '-')}{'' if number == 1 else f'.{number}'}.parquet"
 
 
-def _merge_hand(name: str, pairs: dict[str, list[PairGrasps]], per_pair: int | None) -> Merged:
-    hashes = {p.grasps.hand_sha256 for group in pairs.values() for p in group}
-    if len(hashes) > 1:
-        raise GraspFileError(f"the data sets were made with different versions of hand '{name}'; merge them apart")
-    first = next(iter(pairs.values()))[0].grasps
-    hand = hand_of(first, None)
-    kept, yields, duplicates, surplus = [], {}, 0, 0
+def _by_pair(paths: Sequence[Path | str], folder: Path) -> dict[str, dict[str, list[Waiting]]]:
+    """The grasps of all data sets by hand and object, in files."""
+    pairs: dict[str, dict[str, list[Waiting]]] = {}
+    versions: dict[tuple[str, str], set[str]] = {}
+    for count, pair in enumerate(pair for path in paths for pair in read_collection(path)):
+        grasps = pair.grasps
+        # The pair may have been requested by path.
+        name = grasps.object[0] if len(grasps) else pair.object
+        for what, new in ((("hand", grasps.hand), {grasps.hand_sha256}),
+                          (("object", f"{name} of {grasps.hand}"), set(grasps.object_sha256))):
+            known = versions.setdefault(what, set())
+            known |= new
+            if len(known) > 1:
+                own = grasps.hand if what[0] == "hand" else name
+                raise GraspFileError(f"the data sets were made with different versions of {what[0]} '{own}'; merge them apart")
+        file = folder / f"{count}.parquet"
+        grasps.save(file)
+        pairs.setdefault(grasps.hand, {}).setdefault(name, []).append(Waiting(file, pair.made))
+    return pairs
+
+
+def _merge_hand(name: str, pairs: dict[str, list[Waiting]], per_pair: int | None, file_bytes: int) -> Iterator[Merged]:
+    """The hand's grasps, a file's worth at a time."""
+    hand, row_bytes, number = None, 0.0, 1
+    kept: list[GraspBatch] = []
+    yields, duplicates, surplus = {}, 0, 0
     for obj, group in sorted(pairs.items()):
-        objects = {sha for p in group for sha in p.grasps.object_sha256}
-        if len(objects) > 1:
-            raise GraspFileError(f"the data sets were made with different versions of object '{obj}'; merge them apart")
-        grasps = GraspBatch.concatenate([p.grasps for p in group])
+        grasps = GraspBatch.concatenate([GraspBatch.load(waiting.file) for waiting in group])
+        for waiting in group:
+            waiting.file.unlink()
+        hand = hand or hand_of(grasps, None)
         new = grasps[distinct(hand, grasps)] if len(group) > 1 else grasps
         chosen = new if per_pair is None else new[spread(hand, new, per_pair)]
-        yields[obj] = sum((p.made for p in group), Yield())
-        duplicates, surplus = duplicates + len(grasps) - len(new), surplus + len(new) - len(chosen)
         kept.append(compact(hand, chosen))
-    return Merged(name, GraspBatch.concatenate(kept), yields, duplicates, surplus)
+        yields[obj] = sum((waiting.made for waiting in group), Yield())
+        duplicates, surplus = duplicates + len(grasps) - len(new), surplus + len(new) - len(chosen)
+        row_bytes = row_bytes or len(kept[-1].to_bytes()) / max(1, len(chosen))
+        if row_bytes * sum(map(len, kept)) >= file_bytes:
+            yield Merged(name, GraspBatch.concatenate(kept), yields, duplicates, surplus, number)
+            kept, yields, duplicates, surplus, number = [], {}, 0, 0, number + 1
+    if kept:
+        yield Merged(name, GraspBatch.concatenate(kept), yields, duplicates, surplus, number)
 
 
 def spread(hand: Hand, grasps: GraspBatch, count: int) -> Int[Tensor, " k"]:
