@@ -12,8 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from dro_grasp.cli.main import main
-from dro_grasp.datasets.collections.collection import PairGrasps
-from dro_grasp.datasets.collections.merging import Merged
+from dro_grasp.datasets.collections.collection import YIELDS, PairGrasps
 from dro_grasp.datasets.engine.shards import Yield
 from dro_grasp.evaluation.coverage import grasp_sizes, measure_coverage, wrist_rolls
 from dro_grasp.evaluation.metrics import diversity
@@ -94,8 +93,7 @@ def test_a_hand_is_measured_object_by_object(hand, pairs):
 
 
 def test_the_page_names_everything_and_holds_its_pictures(pairs, tmp_path, capsys):
-    yields = {p.object: p.made for p in pairs}
-    Merged("barrett", pairs[0].grasps, yields, 0, 0).save(tmp_path / "barrett.parquet")
+    pairs[0].grasps.save(tmp_path / "barrett.parquet", {YIELDS: {p.object: p.made.to_dict() for p in pairs}})
     page = tmp_path / "report.html"
     assert main(["dataset", "report", str(tmp_path / "barrett.parquet"), "--output", str(page), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)

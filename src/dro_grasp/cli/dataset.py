@@ -111,7 +111,7 @@ class Merge(DataSets):
         for merged in merge(self.inputs, self.per_pair, folder):
             path = folder / file_name(merged.hand, merged.number)
             merged.save(path)
-            rows.append([merged.hand, len(merged.grasps), merged.duplicates, merged.surplus, path.stat().st_size, path.name])
+            rows.append([merged.hand, len(merged), merged.duplicates, merged.surplus, path.stat().st_size, path.name])
         columns = ["hand", "grasps", "duplicates", "surplus", "bytes", "file"]
         values, total = {"output": str(folder), "files": records(columns, rows)}, sum(row[1] for row in rows)
         print_result(self.json, values, f"merged into {folder}", columns, rows, f"{total} grasps in all")

@@ -29,7 +29,7 @@ EXPECTED = "a Parquet file that dro-grasp wrote, whole; write it again"
 """A grasp file, for messages (ours)."""
 
 
-def table_bytes(columns: dict[str, pa.Array], header: dict[str, Any]) -> bytes:
+def table_bytes(columns: dict[str, pa.Array | pa.ChunkedArray], header: dict[str, Any]) -> bytes:
     """A grasp file of Arrow arrays of equal length by name; the format version is added to the header."""
     metadata = {METADATA_KEY: json.dumps({"format_version": FORMAT_VERSION, **header}).encode()}
     table, file = pa.table(columns).replace_schema_metadata(metadata), io.BytesIO()
