@@ -20,8 +20,7 @@ from dro_grasp.simulation.closed_poses import settle
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL
 from dro_grasp.simulation.trial import record, simulate
 from dro_grasp.viewer.studio import Studio
-from tests.helpers.browser import free_port
-from tests.helpers.weights import untrained_weights
+from tests.helpers.served_studio import served_studio
 
 REQUESTS = {"num": 16, "seed": 0, "candidates": 4, "refine": True, "temperature": None, "method": "auto"}
 CONSTRAINTS = {"direction": None, "table": None, "cone": None, "avoid": None, "hold": (), "spare": (), "opening": None}
@@ -44,16 +43,13 @@ def test_a_request_has_the_same_defaults_everywhere() -> None:
 
 @pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")
 def test_the_viewer_asks_for_what_the_command_asks(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    studio = Studio("gripper3", "sphere", str(untrained_weights(tmp_path)), port=free_port())
     asked = []
-    monkeypatch.setattr(studio.predictor, "run", lambda problem, request, *_: asked.append(request) or 1 / 0)
-    try:
+    with served_studio(tmp_path) as studio:
+        monkeypatch.setattr(studio.predictor, "run", lambda problem, request, *_: asked.append(request) or 1 / 0)
         with pytest.raises(ZeroDivisionError):
             studio._generate()
         assert asked == [GraspRequest()]
         assert studio.protocol.value == DEFAULT_PROTOCOL
-    finally:
-        studio.stop()
 
 
 @pytest.mark.parametrize("function", [simulate, settle, record, evaluate, Evaluate, Studio.generate])

@@ -14,17 +14,15 @@ from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.viewer.constraint_panel import NOTHING
 from dro_grasp.viewer.studio import Studio
-from tests.helpers.browser import free_port
-from tests.helpers.weights import untrained_weights
+from tests.helpers.served_studio import served_studio
 
 pytestmark = pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")
 
 
 @pytest.fixture(scope="module")
 def studio(tmp_path_factory: pytest.TempPathFactory):
-    made = Studio("gripper3", "sphere", str(untrained_weights(tmp_path_factory.mktemp("weights"))), port=free_port())
-    yield made
-    made.stop()
+    with served_studio(tmp_path_factory.mktemp("weights")) as made:
+        yield made
 
 
 def asked(studio: Studio, monkeypatch: pytest.MonkeyPatch) -> Constraints:
@@ -47,7 +45,7 @@ def test_fields_become_constraints_and_are_drawn(studio: Studio, monkeypatch: py
         file, file_type="stl")
     studio._take_scene(viser.UploadedFile(name="shelf.stl", content=file.getvalue()))
     drawn: list[str] = []
-    scene = studio.server.scene
+    scene = studio.place.scene
     for kind in ("add_box", "add_icosphere", "add_mesh_simple"):
         monkeypatch.setattr(scene, kind, lambda name, *_, **__: drawn.append(name))
     studio._draw_constraints()

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import io
+import threading
 import time
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,19 +22,18 @@ from dro_grasp.hands.library import BUILTIN_FOLDER
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.viewer import grasp_page as module
 from dro_grasp.viewer.grasp_page import EXPORTS, chosen
-from dro_grasp.viewer.studio import Studio
+from dro_grasp.viewer.studio import Studio, StudioServer
 from dro_grasp.viewer.uploads import MAX_BYTES, store_upload
 from tests.helpers.browser import free_port, page_of
-from tests.helpers.weights import untrained_weights
+from tests.helpers.served_studio import served_studio
 
 pytestmark = pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")
 
 
 @pytest.fixture(scope="module")
 def studio(tmp_path_factory: pytest.TempPathFactory):
-    made = Studio("gripper3", "sphere", str(untrained_weights(tmp_path_factory.mktemp("weights"))), port=free_port())
-    yield made
-    made.stop()
+    with served_studio(tmp_path_factory.mktemp("weights")) as made:
+        yield made
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +45,7 @@ def made(studio: Studio) -> module.ShownGrasps:
 
 
 def test_it_starts_empty_and_for_this_machine_alone(studio: Studio) -> None:
-    assert studio.server.get_host() == "127.0.0.1"
+    assert studio.place.get_host() == "127.0.0.1"
     if studio.made is None:
         assert "gripper3 above sphere" in studio.status.content
         assert studio.stage.hand is not None, "the hand is shown at once"
@@ -155,6 +156,63 @@ def test_one_thing_at_a_time(studio: Studio) -> None:
     with studio._busy:
         studio._guarded(lambda: pytest.fail("done beside other work"))
     assert "Busy" in studio.status.content
+
+
+class Browser(viser.ClientHandle):
+    """What a page needs of a browser: a number, a camera, and controls and a scene."""
+
+    def __init__(self, number: int, server: viser.ViserServer) -> None:
+        self.client_id, self.gui, self.scene, self._server = number, server.gui, server.scene, server
+        self.camera = SimpleNamespace(aspect=1.5)
+
+    def atomic(self):
+        return self._server.atomic()
+
+
+def test_every_browser_has_a_page_and_closing_it_ends_its_work_and_its_uploads(
+    studio: Studio, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two browsers come, one leaves while it works, the other stays as it was."""
+    made: list[Studio] = []
+
+    def make(place, turn):
+        made.append(Studio(place, studio.predictor, "gripper3", "sphere", turn))
+        return made[-1]
+
+    served = StudioServer(make, free_port())
+    try:
+        clients = [Browser(number, served.server) for number in range(2)]
+        monkeypatch.setattr(served.server, "get_clients", lambda: {c.client_id: c for c in clients})
+        for client in clients:
+            served._enter(client)
+        text = (BUILTIN_FOLDER / "gripper3.urdf").read_bytes()
+        for page, name in zip(made, ("mine.urdf", "theirs.urdf"), strict=True):
+            page._guarded(lambda page=page, name=name: page._take(viser.UploadedFile(name=name, content=text), page.hand))
+        assert "mine.urdf" not in made[1].hand.options
+        assert "theirs.urdf" not in made[0].hand.options
+        folders = [Path(page.shelf._folder.name) for page in made]
+        begun, steps = threading.Event(), []
+
+        def endless(*arguments, **_):
+            begun.set()
+            for step in range(1000):
+                steps.append(step)
+                arguments[2](step, 1000)
+                time.sleep(0.01)
+
+        monkeypatch.setattr(studio.predictor, "run", endless)
+        work = threading.Thread(target=lambda: made[0]._guarded(made[0]._generate))
+        work.start()
+        assert begun.wait(20)
+        served._leave(clients[0])
+        work.join(20)
+        assert not work.is_alive()
+        assert len(steps) < 1000, "it ended at the next step"
+        assert [folder.exists() for folder in folders] == [False, True]
+        assert made[0]._turn.acquire(blocking=False), "the others may compute"
+    finally:
+        served.stop()
+    assert not any(folder.exists() for folder in folders)
 
 
 def zipped(**files: bytes) -> bytes:

@@ -12,8 +12,12 @@ from dro_grasp.cli.inputs import Flag, optional
 from dro_grasp.cli.output import say
 
 if TYPE_CHECKING:
+    from threading import Lock
+
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.objects.shape import ObjectModel
+    from dro_grasp.viewer.stage import Place
+    from dro_grasp.viewer.studio import Studio
 
 MAX_SIDE = 4096
 """Largest width and height of one picture [pixels]."""
@@ -52,11 +56,13 @@ class View:
 
     def run(self) -> int:
         """Serve the page, with the grasps of the file if there is one."""
+        from dro_grasp.predictor import GraspPredictor
         from dro_grasp.viewer.stage import serve
-        from dro_grasp.viewer.studio import Studio
+        from dro_grasp.viewer.studio import Studio, StudioServer
 
         if self.file is None:
-            serve(Studio(weights=self.weights, port=self.port, host=self.host, device=self.device))
+            predictor = GraspPredictor(self.weights, self.device)
+            serve(StudioServer(lambda place, turn: Studio(place, predictor, turn=turn), self.port, self.host))
             return 0
         if is_motion(self.file):
             from dro_grasp.planning.extra import require_arm_extra
@@ -72,10 +78,15 @@ class View:
         hand = hand_of(grasps, self.hand)
         grasps.require_hand(hand)
         obj, chosen = of_object(grasps, self.object, self.scale)
-        studio = Studio(weights=self.weights, port=self.port, host=self.host, device=self.device, preview=False)
         given = self.object is not None and self.object not in grasps.object
-        studio.open(hand, chosen if given else grasps, obj if given else None, chosen.object[0])
-        serve(studio)
+        predictor = GraspPredictor(self.weights, self.device)
+
+        def opened(place: Place, turn: Lock) -> Studio:
+            studio = Studio(place, predictor, turn=turn, preview=False)
+            studio.open(hand, chosen if given else grasps, obj if given else None, chosen.object[0])
+            return studio
+
+        serve(StudioServer(opened, self.port, self.host))
         return 0
 
 

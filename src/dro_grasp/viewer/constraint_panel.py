@@ -14,7 +14,7 @@ from dro_grasp.geometry.balls import Ball
 from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pipeline.constraints import Constraints
-from dro_grasp.viewer.stage import rgb
+from dro_grasp.viewer.stage import Place, rgb
 
 ANY: str = "any"
 """The choice of every palm direction."""
@@ -33,14 +33,14 @@ TABLE = (0.82, 0.80, 0.76)
 class ConstraintPanel:
     """A folder of controls; empty fields ask for nothing."""
 
-    def __init__(self, server: viser.ViserServer, changed: Callable[[], None]) -> None:
+    def __init__(self, place: Place, changed: Callable[[], None]) -> None:
         """Add the controls.
 
         Args:
-            server: Of the page.
+            place: The page.
             changed: Called when a control has changed.
         """
-        self.server, gui = server, server.gui
+        self.place, gui = place, place.gui
         with gui.add_folder("Constraints", expand_by_default=False):
             self.direction = gui.add_dropdown(
                 "Palm direction", (ANY, *HALF_AXES), initial_value=ANY, hint="-z grasps from above.")
@@ -77,7 +77,7 @@ class ConstraintPanel:
 
     def draw(self, constraints: Constraints, obj: ObjectModel) -> None:
         """Show table, places and scene beside the object."""
-        scene = self.server.scene
+        scene = self.place.scene
         scene.remove_by_name("/constraints")
         if constraints.table is not None:
             x, y, _ = obj.cloud.mean(0).tolist()

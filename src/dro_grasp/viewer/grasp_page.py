@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
@@ -25,7 +26,7 @@ from dro_grasp.simulation.trial import record
 from dro_grasp.viewer.app import POSTURES, Posture, describe, postures_of
 from dro_grasp.viewer.constraint_panel import ANY
 from dro_grasp.viewer.pictures import after_closing, contact_points, outcome, shows_held
-from dro_grasp.viewer.stage import ServedPage
+from dro_grasp.viewer.stage import Place, Stage
 
 FRAME_TIME = 0.04
 """Time between two pictures of a trial [s] (ours)."""
@@ -53,18 +54,24 @@ class ShownGrasps:
     """Why there are fewer than were asked for."""
 
 
-class GraspPage(ServedPage):
+class Closed(Exception):
+    """The page was closed while it worked."""
+
+
+class GraspPage:
     """A page with a folder of controls for the grasps that it shows."""
 
-    def __init__(self, port: int, host: str) -> None:
-        """Start serving; arguments as for `ServedPage`."""
+    def __init__(self, place: Place) -> None:
+        """Put scene and controls on a page."""
+        self.place, self.stage = place, Stage(place)
+        self.closed = threading.Event()
+        """Whether nobody sees the page any more."""
         self.made: ShownGrasps | None = None
         self.shown: list[int] = []
         self.film: tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames n_dof"]] | None = None
         self._busy = threading.Lock()
-        super().__init__(port, host)
         self._add_choices()
-        self.status = self.server.gui.add_markdown("")
+        self.status = place.gui.add_markdown("")
         self._add_display()
 
     def _add_choices(self) -> None:
@@ -75,7 +82,7 @@ class GraspPage(ServedPage):
         return text
 
     def _add_display(self) -> None:
-        gui = self.server.gui
+        gui = self.place.gui
         with gui.add_folder("Display"):
             self.success = gui.add_dropdown("Show", ("all", "succeeded", "failed"), initial_value="all")
             self.palm = gui.add_dropdown("Palm along", (ANY, *HALF_AXES), initial_value=ANY)
@@ -103,17 +110,25 @@ class GraspPage(ServedPage):
 
     def _guarded(self, work: Callable[[], None]) -> None:
         """Do one thing at a time, and show errors on the page."""
-        if not self._busy.acquire(blocking=False):
-            self._say("Busy; wait a moment.")
-            return
-        try:
-            work()
-        except DroGraspError as error:
-            self._say(f"**Error:** {self._plain(str(error))}")
-        finally:
-            self._busy.release()
+        with suppress(Closed):
+            if not self._busy.acquire(blocking=False):
+                self._say("Busy; wait a moment.")
+                return
+            try:
+                work()
+            except DroGraspError as error:
+                self._say(f"**Error:** {self._plain(str(error))}")
+            finally:
+                self._busy.release()
 
     def _say(self, text: str) -> None:
+        """Show a line.
+
+        Raises:
+            Closed: Nobody sees it any more; whatever goes on ends here.
+        """
+        if self.closed.is_set():
+            raise Closed
         self.status.content = text
 
     def _present(self) -> None:
@@ -159,7 +174,7 @@ class GraspPage(ServedPage):
             joints = postures_of(hand, obj, grasp)[cast(Posture, posture)][0]
         T = grasp.T_object_wrist[0].float()
         self._forget_film()
-        with self.server.atomic():
+        with self.place.atomic():
             self.stage.show(joints, T)
             self.stage.solved.visible = self.points.value
             self.stage.contacts.visible = self.contacts.value

@@ -37,16 +37,21 @@ GRID_DEPTH = 0.12
 """Distance from the object's lowest point down to the grid [m]."""
 
 
-class Stage:
-    """One hand and one object on a server; `set_pair` replaces them."""
+Place = viser.ViserServer | viser.ClientHandle
+"""Whose page it is: that of all browsers, or of one."""
 
-    def __init__(self, server: viser.ViserServer) -> None:
+
+class Stage:
+    """One hand and one object on a page; `set_pair` replaces them."""
+
+    def __init__(self, place: Place) -> None:
         """Start with an empty scene."""
-        self.server = server
+        self.place = place
         self.hand: Hand | None = None
-        server.scene.set_up_direction("+z")
+        place.scene.set_up_direction("+z")
         self._camera: Camera | None = None
-        server.on_client_connect(self._turn)
+        if isinstance(place, viser.ViserServer):
+            place.on_client_connect(self._turn)
         self._root = 0
 
     def set_pair(self, hand: Hand, obj: ObjectModel, joints: Float[Tensor, " n_dof"], T: Float[Tensor, "4 4"]) -> None:
@@ -56,7 +61,7 @@ class Stage:
             joints: Initial joints [rad or m].
             T: Initial wrist pose in the object's frame [m].
         """
-        scene, name = self.server.scene, f"/pair{self._root}"
+        scene, name = self.place.scene, f"/pair{self._root}"
         if self.hand is not None:
             scene.remove_by_name(name)
             self._root += 1
@@ -78,11 +83,14 @@ class Stage:
         self.show(joints, T)
 
     def aim(self, camera: Camera) -> None:
-        """Turn all clients' cameras, also of those that connect later."""
+        """Turn the cameras of all browsers that show the page, also of those that connect later."""
         self._camera = camera
-        initial = self.server.initial_camera
+        if isinstance(self.place, viser.ClientHandle):
+            self._turn(self.place)
+            return
+        initial = self.place.initial_camera
         initial.position, initial.look_at, initial.fov = position_of(camera), camera.target, camera.field_of_view
-        for client in self.server.get_clients().values():
+        for client in self.place.get_clients().values():
             self._turn(client)
 
     def _turn(self, client: viser.ClientHandle) -> None:
@@ -95,7 +103,7 @@ class Stage:
         self, name: str, points: Float[np.ndarray, "n 3"], colour: Colour, size: float = POINT_SIZE
     ) -> viser.PointCloudHandle:
         """Add points of a size [m], hidden at first."""
-        return self.server.scene.add_point_cloud(
+        return self.place.scene.add_point_cloud(
             f"/pair{self._root}/{name}", points.astype(np.float32), colors=rgb(colour), point_size=size,
             point_shape="circle", precision="float32", visible=False,
         )
@@ -109,7 +117,7 @@ class Stage:
             poses = (T @ self.hand.tree.forward(joints)).double().numpy()
             points = self.hand.points(joints, T).numpy()
         moved = np.eye(4) if T_object is None else T_object.double().numpy()
-        with self.server.atomic():
+        with self.place.atomic():
             for frame, pose in zip([self._object, *self.links], [moved, *poses], strict=True):
                 frame.position = pose[:3, 3]
                 frame.wxyz = viser.transforms.SO3.from_matrix(pose[:3, :3]).wxyz
@@ -121,7 +129,7 @@ class Stage:
 
     def show_shapes(self, visible: bool) -> None:
         """Show or hide the hand's shapes."""
-        with self.server.atomic():
+        with self.place.atomic():
             for frame in self.links:
                 frame.visible = visible
 

@@ -1,7 +1,11 @@
-"""The whole tool in a page: pick or upload a hand and an object, generate grasps, watch their trials, download them."""
+"""The whole tool in a page: pick or upload a hand and an object, generate grasps, watch their trials, download them.
+
+Every browser has a page of its own.
+"""
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from typing import get_args
@@ -24,43 +28,49 @@ from dro_grasp.viewer.constraint_panel import ConstraintPanel
 from dro_grasp.viewer.grasp_page import GraspPage, ShownGrasps
 from dro_grasp.viewer.pictures import protocol_name
 from dro_grasp.viewer.shelf import Shelf
-from dro_grasp.viewer.stage import HOST
+from dro_grasp.viewer.stage import HOST, Place, ServedPage
 
 LARGEST_CALL = 64
 """Most grasps of one click (ours)."""
 MOST_CANDIDATES = 8
 """Most candidates for each of them (ours)."""
+PATIENCE = 0.5
+"""Time after which a page that waits for another looks whether it is still open [s] (ours)."""
+GRACE = 5.0
+"""Time that a closed page has to end what it does before its uploads are deleted [s] (ours)."""
 
 
 class Studio(GraspPage):
-    """A running page; `stop()` ends it.
+    """The page of one browser, or of all; `close()` ends it.
 
     Examples:
-        >>> studio = Studio()
+        >>> studio = Studio(ServedPage(8080, HOST).server, GraspPredictor())
         >>> studio.generate("allegro", "mug", num=8)
     """
 
     def __init__(
-        self, hand: str = "allegro", obj: str = "rubber_duck", weights: str | None = None, port: int = 8080, host: str = HOST,
-        device: str = "cpu", preview: bool = True,
+        self, place: Place, predictor: GraspPredictor, hand: str = "allegro", obj: str = "rubber_duck",
+        turn: threading.Lock | None = None, preview: bool = True,
     ) -> None:
-        """Start serving with a hand and an object chosen.
+        """Start with a hand and an object chosen.
 
         Args:
+            place: Where the page is.
+            predictor: May be that of other pages too.
             hand: Name or path; the object likewise.
-            weights: As `GraspPredictor` takes them; the device likewise.
-            port: As `ServedPage` takes it; the host likewise.
+            turn: Held while grasps are made, for pages that share a machine.
             preview: Show hand and object at once; not needed where `open` follows.
         """
-        self.predictor = GraspPredictor(weights, device)
-        self.shelf, self._first = Shelf(), (hand, obj)
-        super().__init__(port, host)
+        self.predictor, self.shelf, self._first = predictor, Shelf(), (hand, obj)
+        self._turn = turn or threading.Lock()
+        super().__init__(place)
         if preview:
             self._guarded(self._preview)
 
-    def stop(self) -> None:
-        """Stop serving and delete the uploads."""
-        super().stop()
+    def close(self) -> None:
+        """End what the page does, and delete its uploads."""
+        self.closed.set()
+        self._busy.acquire(timeout=GRACE)  # never released: nothing is done on this page any more
         self.shelf.close()
 
     def open(self, hand: Hand, grasps: GraspBatch, obj: ObjectModel | None = None, first: str | None = None) -> None:
@@ -132,7 +142,7 @@ class Studio(GraspPage):
         return self.shelf.plain(text)
 
     def _add_choices(self) -> None:
-        (hand, obj), gui = self._first, self.server.gui
+        (hand, obj), gui = self._first, self.place.gui
         with gui.add_folder("Hand and object"):
             self.hand = gui.add_dropdown("Hand", tuple(dict.fromkeys([*hand_names(), hand])), initial_value=hand)
             hand_file = gui.add_upload_button("Upload a hand (URDF, MJCF, ZIP)", mime_type=".urdf,.xml,.zip")
@@ -152,7 +162,7 @@ class Studio(GraspPage):
                 "Diversity", 0.0, 1.0, 0.05, 1.0, disabled=True, hint="0: the likeliest grasp of each placement.")
             self.protocol = gui.add_dropdown("Trial", tuple(PROTOCOLS), initial_value=DEFAULT_PROTOCOL)
             self.button = gui.add_button("Generate", color="green")
-        self.panel = panel = ConstraintPanel(self.server, lambda: self._guarded(self._draw_constraints))
+        self.panel = panel = ConstraintPanel(self.place, lambda: self._guarded(self._draw_constraints))
         hand_file.on_upload(lambda _: self._guarded(lambda: self._take(hand_file.value, self.hand)))
         object_file.on_upload(lambda _: self._guarded(lambda: self._take(object_file.value, self.object)))
         panel.upload.on_upload(lambda _: self._guarded(lambda: self._take_scene(panel.upload.value)))
@@ -192,6 +202,14 @@ class Studio(GraspPage):
         return lambda done, total: self._say(f"{what}: {done} of {total}")
 
     def _generate(self) -> None:
+        while not self._turn.acquire(timeout=PATIENCE):
+            self._say("Grasps of another page are made; these are next.")
+        try:
+            self._generate_now()
+        finally:
+            self._turn.release()
+
+    def _generate_now(self) -> None:
         self._say("Generating ...")
         begin = time.perf_counter()
         temperature = None if self.usual.value else float(self.temperature.value)
@@ -203,3 +221,44 @@ class Studio(GraspPage):
         short = [] if made.shortage is None else [made.shortage]
         lines = [f"{len(made.refined)} grasps{held}; {time.perf_counter() - begin:.1f} s", *short, *diagnose(made.refined)]
         self._say("  \n".join(lines))
+
+
+class StudioServer(ServedPage):
+    """A server that gives every browser a page of its own; `stop()` ends it.
+
+    Examples:
+        >>> server = StudioServer(lambda place, turn: Studio(place, predictor, turn=turn))
+    """
+
+    def __init__(self, make: Callable[[Place, threading.Lock], Studio], port: int = 8080, host: str = HOST) -> None:
+        """Start serving.
+
+        Args:
+            make: Makes the page of a browser; its second argument is the same for all.
+            port: As `ServedPage` takes it; the host likewise.
+        """
+        super().__init__(port, host)
+        self._make, self._turn = make, threading.Lock()
+        self.studios: dict[int, Studio] = {}
+        """Pages that are open, by the browser's number."""
+        self.server.on_client_connect(self._enter)
+        self.server.on_client_disconnect(self._leave)
+
+    def stop(self) -> None:
+        """Stop serving; all pages end."""
+        super().stop()
+        for number in list(self.studios):
+            self._close(number)
+
+    def _enter(self, client: viser.ClientHandle) -> None:
+        self.studios[client.client_id] = self._make(client, self._turn)
+        if client.client_id not in self.server.get_clients():  # it left meanwhile
+            self._close(client.client_id)
+
+    def _leave(self, client: viser.ClientHandle) -> None:
+        self._close(client.client_id)
+
+    def _close(self, number: int) -> None:
+        studio = self.studios.pop(number, None)
+        if studio is not None:
+            studio.close()

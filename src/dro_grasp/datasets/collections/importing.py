@@ -7,8 +7,10 @@ axes), the readme of DexGraspBench.
 
 from __future__ import annotations
 
+import io
 import math
 import pickle
+import pickletools
 import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -183,7 +185,12 @@ def read_npy(path: Path) -> Shaped[np.ndarray, "..."]:
         shape, _, dtype = read(file)
         if not dtype.hasobject:
             raise ValueError(f"it is an array of {dtype}, not of grasps")
-        loaded = _Harmless(file).load()
+        data = file.read()
+    # Objects are numbered, and the reader makes room for the highest number that is stated.
+    if any(operation.name in {"PUT", "LONG_BINPUT"} and int(number or 0) > len(data)
+           for operation, number, _ in pickletools.genops(data)):
+        raise ValueError("it numbers more objects than it can hold")
+    loaded = _Harmless(io.BytesIO(data)).load()
     return np.asarray(loaded, dtype=object).reshape(shape)
 
 
