@@ -61,6 +61,7 @@ docs-pictures: setup
 	$(BIN)/dro-grasp robot check xarm7_leaphand --picture docs/pictures/robot-check.png
 	$(BIN)/dro-grasp tabletop --robot xarm7_leaphand --objects builtin:test --attempts 2 --output out/attempts.parquet --plans out/plans
 	$(BIN)/python scripts/draw_attempts.py out/attempts.parquet out/plans docs/pictures/attempts.png
+	$(BIN)/python -m scripts.draw_studio docs/pictures/studio.png
 
 PAPER_HANDS := assets/barrett_multidex assets/allegro_left assets/shadowhand assets/leaphand
 OTHER_HANDS := allegro barrett gripper3 leaphand shadowhand assets/allegro_right

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 
 
@@ -10,8 +11,12 @@ def run() -> int:
     try:
         from dro_grasp.cli.main import main
 
-        return main()
+        code = main()
+        # All is written: while Python ends, Ctrl-C would kill it as if it were not.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        return code
     except KeyboardInterrupt:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
         print("stopped", file=sys.stderr)
         return 130
 

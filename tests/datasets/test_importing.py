@@ -222,3 +222,12 @@ def test_files_of_nothing_are_told(content: bytes, tmp_path: Path) -> None:
     for kind in ("cmap", "dexgraspnet", "dexgraspbench"):
         with pytest.raises(GraspFileError, match=f"cannot be read .*expected a {kind} file"):
             read_foreign(tmp_path / "a", kind)  # type: ignore[arg-type]
+
+
+def test_a_pickle_that_asks_for_room_for_more_objects_than_it_can_hold_is_refused(tmp_path):
+    np.save(tmp_path / "a.npy", np.array([1], dtype=object), allow_pickle=True)
+    whole = (tmp_path / "a.npy").read_bytes()
+    header = whole[: whole.index(b"\n") + 1]
+    (tmp_path / "a.npy").write_bytes(header + b"\x80\x02]r\xff\xff\xff\x3f.")  # a list, as number 2^30 - 1
+    with pytest.raises(GraspFileError, match="numbers more objects than it can hold"):
+        read_foreign(tmp_path / "a.npy", "dexgraspnet")

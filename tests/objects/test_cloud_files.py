@@ -164,3 +164,9 @@ def test_npy_headers_that_lie_are_refused_without_the_memory_that_they_ask_for(t
     (tmp_path / "c.npy").write_bytes(b"\x93NUMPY\x01\x00" + size + header.encode() + b"\n" + bytes(99))
     with pytest.raises(ObjectError, match="expected a plain NPY array"):
         load_file(tmp_path / "c.npy")
+
+
+def test_a_header_that_claims_to_be_longer_than_the_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    (tmp_path / "long.npy").write_bytes(b"\x93NUMPY\x02\x00" + (2**32 - 1).to_bytes(4, "little") + b"{}")
+    with pytest.raises(ObjectError, match="its header claims 4294967295 bytes"):
+        load_file(tmp_path / "long.npy")

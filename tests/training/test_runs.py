@@ -22,7 +22,7 @@ from dro_grasp.errors import OptionError, OutputError, TrainingError
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.training import loop, losses, pretraining
 from dro_grasp.training.config import ScheduleConfig
-from dro_grasp.training.run_folder import CHECKPOINT, LOG
+from dro_grasp.training.run_folder import CHECKPOINT, LOG, RunFolder
 from dro_grasp.training.runs import TrainingRun, check_schedule, learning_rate_share
 from tests.helpers.tiny_bundle import TINY
 from tests.helpers.training_stages import SCHEDULE, SHARDED, STAGES, curve, quiet, run_stage
@@ -134,13 +134,21 @@ def damage(path: Path, how: str) -> None:
 
 
 @pytest.mark.parametrize("how", ["truncated", "empty", "foreign", "incomplete"])
-def test_a_damaged_checkpoint_is_refused(bundle: Bundle, finished: dict[str, Path], tmp_path: Path, how: str) -> None:
+def test_a_damaged_checkpoint_is_set_aside_and_the_run_begins_anew(
+    finished: dict[str, Path], tmp_path: Path, how: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "run").mkdir()
     path = tmp_path / "run" / CHECKPOINT
     path.write_bytes((finished["train"] / CHECKPOINT).read_bytes())
     damage(path, how)
-    with pytest.raises(TrainingError, match=r"checkpoint\.pt does not fit this training"):
-        run_stage("train", bundle, tmp_path / "run")
+    folder = RunFolder(tmp_path / "run")
+    assert folder.read_checkpoint({"steps": 10}) is None
+    assert f"{path} is damaged" in (told := capsys.readouterr().err)
+    assert "set aside as checkpoint.pt.damaged; the training begins anew" in told
+    assert not path.exists()
+    assert path.with_name("checkpoint.pt.damaged").exists()
+    assert folder.read_checkpoint({"steps": 10}) is None
+    assert capsys.readouterr().err == ""
 
 
 def test_a_checkpoint_of_another_training_is_refused(bundle: Bundle, finished: dict[str, Path]) -> None:

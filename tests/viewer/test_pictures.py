@@ -92,6 +92,13 @@ def test_object_and_every_finger_are_seen(hand, obj, grasps) -> None:
         assert (whole != without).any(-1).sum() > 30, colour
 
 
+def test_over_a_table_it_is_seen_from_above(hand, obj, grasps) -> None:
+    for grasp in grasps:
+        camera = best_camera(hand, grasp.joints[0], grasp.T_object_wrist[0], obj, from_above=True)
+        start, target = np.asarray(camera.position), np.asarray(camera.target)
+        assert (start - target)[2] / np.linalg.norm(start - target) > 0.29
+
+
 def test_the_palm_is_not_in_the_way(hand, obj) -> None:
     # Laid on its side, so that the view from behind the palm is one of those to choose from.
     T = torch.eye(4)

@@ -22,6 +22,7 @@ def read_cloud(path: Path) -> Float[np.ndarray, "..."]:
     if path.suffix.lower() == ".npy":
         with reading(path, ObjectError, "a plain NPY array; save it with numpy.save as floats"):
             check_bytes(path)
+            _check_npy(path)
             # A mapped file is never larger than it is, whatever its header says.
             mapped = np.load(path, mmap_mode="r", allow_pickle=False)
             if mapped.size > path.stat().st_size:  # entries of no size
@@ -30,6 +31,19 @@ def read_cloud(path: Path) -> Float[np.ndarray, "..."]:
     with reading(path, ObjectError, "a PCD file with x y z and all its points; it is damaged"):
         check_bytes(path)
         return _read_pcd(path)
+
+
+def _check_npy(path: Path) -> None:
+    """Refuse a header that claims to be longer than the file, before as much memory is asked for.
+
+    Raises:
+        ValueError: It does.
+    """
+    with path.open("rb") as file:
+        version, length = np.lib.format.read_magic(file), file.read(4)
+    claimed = int.from_bytes(length[: 2 if version[0] == 1 else 4], "little")
+    if claimed > path.stat().st_size:
+        raise ValueError(f"its header claims {claimed} bytes")
 
 
 def _read_pcd(path: Path) -> Float[np.ndarray, "n columns"]:

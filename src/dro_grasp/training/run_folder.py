@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -41,8 +42,10 @@ class RunFolder:
     def read_checkpoint(self, plan: dict[str, Any]) -> dict[str, Any] | None:
         """The checkpoint, which must have the same plan; None where there is none.
 
+        A damaged one is set aside, and the run begins anew: there is nothing else to go on from.
+
         Raises:
-            TrainingError: The checkpoint is damaged, or of a run with another plan.
+            TrainingError: The checkpoint is of a run with another plan.
         """
         path = self.path / CHECKPOINT
         if not path.is_file():
@@ -52,7 +55,10 @@ class RunFolder:
             found, _ = dict(state["plan"]), [state[key] for key in ENTRIES]
             state["step"], state["seconds"] = int(state["step"]), float(state["seconds"])
         except Exception as error:  # PyTorch's reader raises what its parts do
-            raise self.misfit(error) from error
+            aside = path.replace(path.with_name(f"{path.name}.damaged"))
+            print(f"{path} is damaged ({type(error).__name__}) and set aside as {aside.name}; the training begins anew",
+                  file=sys.stderr)
+            return None
         for name, asked in plan.items():
             if found.get(name) != asked:
                 raise TrainingError(f"{path} belongs to a run with {name} {found.get(name)}, {asked} was asked for; use the "

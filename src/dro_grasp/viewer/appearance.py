@@ -43,6 +43,8 @@ VIEWPOINTS = 48
 """Half the number of viewpoints spread over the sphere."""
 LOWEST_VIEW = -0.5
 """Smallest height of a camera on the unit sphere, so that none points straight up."""
+LOWEST_OVER_TABLE = 0.3
+"""The same where a table would hide the object from below (ours)."""
 HIGHEST_VIEW = 0.85
 """Largest height of a camera on the unit sphere, so that none points straight down."""
 
@@ -107,15 +109,17 @@ def waiting_pose(hand: Hand, obj: ObjectModel) -> Float[Tensor, "4 4"]:
 
 
 def best_camera(
-    hand: Hand, joints: Float[Tensor, " n_dof"], T_object_wrist: Float[Tensor, "4 4"], obj: ObjectModel, aspect: float = 4 / 3
+    hand: Hand, joints: Float[Tensor, " n_dof"], T_object_wrist: Float[Tensor, "4 4"], obj: ObjectModel, aspect: float = 4 / 3,
+    from_above: bool = False,
 ) -> Camera:
-    """The camera, out of many around a grasp, that shows most of the object and of the fingers."""
+    """The camera, out of many around a grasp, or above it, that shows most of the object and of the fingers."""
     of_hand = hand.points(joints, T_object_wrist).double().numpy()
     finger = (hand.finger_of_link[hand.link_index] != PALM).numpy()
     of_object = obj.cloud[:: max(1, len(obj.cloud) // 1024)].astype(float)
     points = np.concatenate([of_hand, of_object])
     owner = np.concatenate([finger.astype(int), np.full(len(of_object), 2)])
-    rated = [(_clarity(points, owner, direction), direction) for direction in _directions()]
+    lowest = LOWEST_OVER_TABLE if from_above else LOWEST_VIEW
+    rated = [(_clarity(points, owner, direction), direction) for direction in _directions() if direction[2] > lowest]
     return Camera.around(points, max(rated)[1], field_of_view=0.5, aspect=aspect)
 
 

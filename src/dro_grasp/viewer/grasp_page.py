@@ -52,6 +52,8 @@ class ShownGrasps:
     """Protocol of the trials."""
     shortage: str | None = None
     """Why there are fewer than were asked for."""
+    on_table: bool = False
+    """Whether a table is shown below them."""
 
 
 class Closed(Exception):
@@ -136,7 +138,8 @@ class GraspPage:
         assert self.made is not None
         first = self.made.refined
         if len(first):
-            self.stage.set_pair(self.made.hand, self.made.obj, first.joints[0].float(), first.T_object_wrist[0].float())
+            joints, T = first.joints[0].float(), first.T_object_wrist[0].float()
+            self.stage.set_pair(self.made.hand, self.made.obj, joints, T, self.made.on_table)
         self._filter()
 
     def _filter(self) -> None:

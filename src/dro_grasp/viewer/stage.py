@@ -54,12 +54,15 @@ class Stage:
             place.on_client_connect(self._turn)
         self._root = 0
 
-    def set_pair(self, hand: Hand, obj: ObjectModel, joints: Float[Tensor, " n_dof"], T: Float[Tensor, "4 4"]) -> None:
+    def set_pair(
+        self, hand: Hand, obj: ObjectModel, joints: Float[Tensor, " n_dof"], T: Float[Tensor, "4 4"], on_table: bool = False
+    ) -> None:
         """Replace hand and object, and move the camera to the best viewpoint.
 
         Args:
             joints: Initial joints [rad or m].
             T: Initial wrist pose in the object's frame [m].
+            on_table: Look from above.
         """
         scene, name = self.place.scene, f"/pair{self._root}"
         if self.hand is not None:
@@ -79,7 +82,7 @@ class Stage:
         self.contacts = self.cloud("contacts", np.zeros((1, 3)), appearance.CONTACT_COLOUR, CONTACT_SIZE)
         position = (*obj.cloud.mean(0)[:2].tolist(), float(obj.cloud.min(0)[2]) - GRID_DEPTH)
         self._grid = scene.add_grid(f"{name}/grid", width=0.4, height=0.4, cell_size=0.05, section_size=0.1, position=position)
-        self.aim(appearance.best_camera(hand, joints, T, obj))
+        self.aim(appearance.best_camera(hand, joints, T, obj, from_above=on_table))
         self.show(joints, T)
 
     def aim(self, camera: Camera) -> None:

@@ -111,7 +111,7 @@ class Studio(GraspPage):
         raw, refined = found.proposed, found.grasps
         if not problem.obj.is_cloud:
             raw, refined = (evaluate(problem, grasps, protocol, self._counting("evaluating")) for grasps in (raw, refined))
-        self.made = ShownGrasps(problem.hand, problem.obj, raw, refined, protocol, found.shortage)
+        self.made = ShownGrasps(problem.hand, problem.obj, raw, refined, protocol, found.shortage, wanted.table is not None)
         self._present()
         self.panel.draw(wanted, problem.obj)
         return self.made
