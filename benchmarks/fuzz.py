@@ -39,7 +39,9 @@ from dro_grasp.files import replacing
 LONGEST = 20.0
 """CPU time after which a case counts as a hang [s] (ours)."""
 ASLEEP = 120.0
-"""Time after which it does too, busy or not [s] (ours)."""
+"""Time after which it does too if it computed for less than IDLE [s] (ours): it waits for something that never comes."""
+IDLE = 1.0
+"""CPU time that even a starved process gets in that time [s] (ours)."""
 MEMORY = 4 * 10**9
 """Address space of the process that reads [bytes] (ours)."""
 PART = 1000
@@ -183,7 +185,8 @@ def follow(reading: int, process: int, tally: Tally) -> tuple[int, tuple[int, st
     done, current, buffer, used, since = 0, None, b"", 0.0, time.monotonic()
     while True:
         if not select.select([reading], [], [], 1.0)[0]:
-            if cpu_seconds(process) - used > LONGEST or time.monotonic() - since > ASLEEP:
+            spent = cpu_seconds(process) - used
+            if spent > LONGEST or (spent < IDLE and time.monotonic() - since > ASLEEP):
                 os.kill(process, signal.SIGKILL)
                 return done, (*current, "hang") if current else None
             continue

@@ -21,7 +21,7 @@ def main(path: Path) -> None:
         page.get_by_role("button", name="Generate", exact=True).click(timeout=60_000)
         page.get_by_text("held under").wait_for(timeout=400_000)
         time.sleep(8)
-        page.screenshot(path=path)
+        page.screenshot(path=path, timeout=300_000)
 
 
 if __name__ == "__main__":
