@@ -17,7 +17,7 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.viewer.app import GraspViewer, describe
 from dro_grasp.viewer.appearance import success_colour
-from dro_grasp.viewer.stage import HOST, ServedPage, position_of
+from dro_grasp.viewer.stage import HOST, ServedPage, viewpoint
 from tests.helpers.browser import free_port, page_of
 from tests.helpers.loaded_hands import loaded_hand
 
@@ -105,10 +105,17 @@ def test_text_says_what_is_known(grasps: GraspBatch) -> None:
     assert describe(several, 0).endswith("robustness 75.00 %  \nfingers in contact 3")
 
 
-def test_narrow_windows_are_seen_from_farther_away() -> None:
+def test_narrow_windows_are_seen_from_farther_away_and_above_the_panel() -> None:
     camera = Camera((0.3, 0.4, 0.0), (0.0, 0.0, 0.0))
-    wide, phone = (np.linalg.norm(position_of(camera, aspect)) for aspect in (16 / 9, 390 / 844))
-    assert wide == pytest.approx(np.linalg.norm(position_of(camera)))
+    apart = []
+    for aspect in (4 / 3, 16 / 9, 390 / 844):
+        position, target = map(np.asarray, viewpoint(camera, aspect))
+        apart.append(np.linalg.norm(position - target))
+        # What the picture has in its middle, in the window: 0 is the middle, 0.5 the upper edge.
+        raised = -target[2] / (2 * apart[-1] * np.tan(camera.field_of_view / 2))
+        assert raised == pytest.approx(0.27 if aspect < 1 else 0.0)
+    wide, wider, phone = apart
+    assert wide == wider
     # The horizontal half-angle of the narrow window sees what that of the picture sees.
     assert phone / wide == pytest.approx((4 / 3) / (390 / 844))
 

@@ -45,6 +45,7 @@ def made(studio: Studio) -> module.ShownGrasps:
 
 
 def test_it_starts_empty_and_for_this_machine_alone(studio: Studio) -> None:
+    assert isinstance(studio.place, viser.ViserServer)
     assert studio.place.get_host() == "127.0.0.1"
     if studio.made is None:
         assert "gripper3 above sphere" in studio.status.content
@@ -163,7 +164,7 @@ class Browser(viser.ClientHandle):
 
     def __init__(self, number: int, server: viser.ViserServer) -> None:
         self.client_id, self.gui, self.scene, self._server = number, server.gui, server.scene, server
-        self.camera = SimpleNamespace(aspect=1.5)
+        self.camera = SimpleNamespace(aspect=1.5)  # type: ignore[assignment]
 
     def atomic(self):
         return self._server.atomic()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import socket
 import sys
 
@@ -33,10 +34,16 @@ CAMERA_DISTANCE = 1.15
 """Initial camera distance, as a multiple of that of a picture."""
 ASPECT = 4 / 3
 """Width over height of a window from which on nothing is cut off."""
+NARROW = 1.0
+"""Width over height of a window below which the panel covers its lower half, as on a phone."""
+RAISED = 0.27
+"""Share of its height by which hand and object then stand above the middle (ours)."""
 GRID_DEPTH = 0.12
 """Distance from the object's lowest point down to the grid [m]."""
 
 
+Point = tuple[float, float, float]
+"""A place [m]."""
 Place = viser.ViserServer | viser.ClientHandle
 """Whose page it is: that of all browsers, or of one."""
 
@@ -92,15 +99,15 @@ class Stage:
             self._turn(self.place)
             return
         initial = self.place.initial_camera
-        initial.position, initial.look_at, initial.fov = position_of(camera), camera.target, camera.field_of_view
+        (initial.position, initial.look_at), initial.fov = viewpoint(camera), camera.field_of_view
         for client in self.place.get_clients().values():
             self._turn(client)
 
     def _turn(self, client: viser.ClientHandle) -> None:
         """Turn a client's camera to what is shown, from farther away where its window is narrow."""
         if (camera := self._camera) is not None:
-            client.camera.position = position_of(camera, client.camera.aspect)
-            client.camera.look_at, client.camera.fov = camera.target, camera.field_of_view
+            client.camera.position, client.camera.look_at = viewpoint(camera, client.camera.aspect)
+            client.camera.fov = camera.field_of_view
 
     def cloud(
         self, name: str, points: Float[np.ndarray, "n 3"], colour: Colour, size: float = POINT_SIZE
@@ -137,10 +144,19 @@ class Stage:
                 frame.visible = visible
 
 
-def position_of(camera: Camera, aspect: float = ASPECT) -> tuple[float, float, float]:
-    """Where a camera stands so that a window of this width over height shows all that a picture shows [m]."""
+def viewpoint(camera: Camera, aspect: float = ASPECT) -> tuple[Point, Point]:
+    """Where a camera stands, and where it looks, so that a window of this width over height shows all of a picture [m]."""
     start, target = np.asarray(camera.position), np.asarray(camera.target)
-    x, y, z = (target + CAMERA_DISTANCE * max(1.0, ASPECT / aspect) * (start - target)).tolist()
+    position = target + CAMERA_DISTANCE * max(1.0, ASPECT / aspect) * (start - target)
+    if aspect < NARROW:
+        height = 2 * float(np.linalg.norm(position - target)) * math.tan(camera.field_of_view / 2)
+        down = -RAISED * height * camera.axes()[1]
+        position, target = position + down, target + down
+    return _point(position), _point(target)
+
+
+def _point(place: Float[np.ndarray, "3"]) -> Point:
+    x, y, z = place.tolist()
     return x, y, z
 
 
