@@ -35,6 +35,8 @@ ROLLING = 0.002
 """Rolling friction of the table, as of a cloth: balls come to rest [m] (ours)."""
 ASIDE = 10.0
 """Where objects wait until they are placed, a metre apart [m]."""
+MEMORY = 2**28
+"""Memory for contacts [bytes]; what is not needed is never touched. Ours: by itself MuJoCo has room for some 300 contacts."""
 SHAPE_GROUP = 4
 """Group of the geoms that only cameras see: the objects' true meshes."""
 PART_GROUP = 3
@@ -48,6 +50,7 @@ class LiftScene:
         """Build the scene, with the robot at home and the objects far away; the table is the robot's."""
         self.robot, self.objects = robot, tuple(objects)
         scene = robot_spec(robot, LIFT_PROTOCOL, robot.table)
+        scene.memory = MEMORY
         for body in list(scene.bodies)[1:]:
             body.gravcomp = 1.0  # a robot's controller holds its own weight
         _add_arm_servos(scene, robot)
