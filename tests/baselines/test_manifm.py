@@ -93,12 +93,12 @@ def test_losses_fall(bundle) -> None:
     totals = []
     for _ in range(15):
         optimiser.zero_grad()
-        losses = contact_losses(true, network(obj, told, true, noise), SMALL, 0.0)
+        losses = contact_losses((true, network(obj, told, true, noise)), SMALL, 0.0)
         losses["total"].backward()
         optimiser.step()
         totals.append(float(losses["total"].detach()))
     assert totals[-1] < 0.5 * totals[0]
-    end = contact_losses(true, network(obj, told, true, noise), SMALL, 1.0)
+    end = contact_losses((true, network(obj, told, true, noise)), SMALL, 1.0)
     rest = float((end["heat"] + 100 * end["force"]).detach())
     nats = float(end["nats"].detach())
     assert float(end["total"].detach()) == pytest.approx(rest + 0.05 * ((1 + nats**2) ** 0.5 - 1), rel=1e-4)

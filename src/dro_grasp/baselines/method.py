@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
+from dro_grasp.devices import Stopwatch
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
@@ -37,6 +38,13 @@ class Method(ABC):
             num: How many; it may return fewer.
             seed: The same seed gives the same grasps.
         """
+
+    def timed(self, problem: GraspProblem, num: int, seed: int) -> tuple[GraspBatch, dict[str, float]]:
+        """Grasps as `make` has them, and the time that their parts took [s]."""
+        watch = Stopwatch()
+        with watch("make"):
+            grasps = self.make(problem, num, seed)
+        return grasps, watch.seconds
 
     def best(self, problem: GraspProblem, num: int, seed: int) -> Made:
         """Grasps as the method returns them to a user; as it makes them, unless it chooses."""

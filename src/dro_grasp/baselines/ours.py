@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from dro_grasp.baselines.method import Made, Method, finished
+from dro_grasp.devices import Stopwatch
 from dro_grasp.energy.contact_candidates import ContactConfig
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.optimization.starts import StartConfig
@@ -23,18 +24,22 @@ DESCENT_STEPS = 1200
 class DistanceMethod(Method):
     """The D(R,O) network; it returns what `generate` does, with the optimiser's help where the score asks for it."""
 
-    def __init__(self, predictor: GraspPredictor, name: str = "dro") -> None:
-        self.predictor, self.name = predictor, name
+    def __init__(self, predictor: GraspPredictor, name: str = "dro", candidates: int = CANDIDATES) -> None:
+        self.predictor, self.name, self.candidates = predictor, name, candidates
 
-    @torch.no_grad()
     def make(self, problem: GraspProblem, num: int, seed: int) -> GraspBatch:
         """Grasps of the network alone."""
-        generator = torch.Generator().manual_seed(seed)
-        return propose(problem, self.predictor.network, num, generator, self.predictor.config).grasps
+        return self.timed(problem, num, seed)[0]
+
+    @torch.no_grad()
+    def timed(self, problem: GraspProblem, num: int, seed: int) -> tuple[GraspBatch, dict[str, float]]:
+        """Grasps of the network alone, and the time of network and decoding."""
+        generator, watch = torch.Generator().manual_seed(seed), Stopwatch()
+        return propose(problem, self.predictor.network, num, generator, self.predictor.config, watch).grasps, watch.seconds
 
     def best(self, problem: GraspProblem, num: int, seed: int) -> Made:
         """Grasps as `generate` returns them."""
-        made = self.predictor.run(problem, GraspRequest(num, seed, candidates=CANDIDATES))
+        made = self.predictor.run(problem, GraspRequest(num, seed, candidates=self.candidates))
         return Made(made.grasps, made.candidates)
 
 
@@ -43,14 +48,17 @@ class SynthesisMethod(Method):
 
     name = "synthesise"
 
+    def __init__(self, candidates: int = CANDIDATES) -> None:
+        self.candidates = candidates
+
     def make(self, problem: GraspProblem, num: int, seed: int) -> GraspBatch:
         """The data engine's candidates: of several descents, those of lowest energy."""
         return optimise(problem, num, seed)
 
     def best(self, problem: GraspProblem, num: int, seed: int) -> Made:
         """The best of refined, settled candidates by score."""
-        grasps = finished(problem, self.make(problem, CANDIDATES * num, seed), num)
-        return Made(grasps.sorted_by_score()[:num], CANDIDATES * num)
+        grasps = finished(problem, self.make(problem, self.candidates * num, seed), num)
+        return Made(grasps.sorted_by_score()[:num], self.candidates * num)
 
 
 class DescentMethod(Method):

@@ -9,7 +9,7 @@ import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 from dro_grasp.baselines.method import Method
 from dro_grasp.evaluation.equal_time import equal_time, finished_maker
@@ -46,7 +46,6 @@ RETURNED = "returned"
 the optimiser."""
 EQUAL_TIME = "equal-time"
 """Stage: the best that each method returns with the CPU time of the first method's best quarter."""
-Result = TypeVar("Result")
 KEPT = 0.25
 """Share of the grasps of a pair that ranking keeps, before any trial."""
 
@@ -132,23 +131,19 @@ def _measured(
     _ = problem.field  # what methods share is prepared before a clock runs
     for method in methods:
         if set(config.stages) & set(STAGES):
-            grasps, seconds = _timed(lambda method=method: method.make(problem, num, seed), num)
+            grasps, parts = method.timed(problem, num, seed)
+            seconds = {name: total / num for name, total in parts.items()}
             yield from _stages(_Source(method.name, problem, grasps, seconds), obj, config)
         if RETURNED in config.stages:
-            made, seconds = _timed(lambda method=method: method.best(problem, keep, seed), keep)
+            begin = time.perf_counter()
+            made = method.best(problem, keep, seed)
+            seconds = {"make": (time.perf_counter() - begin) / keep}
             yield method.name, RETURNED, _evaluated(hand, obj, made.grasps, config, seconds, made.candidates)
     if EQUAL_TIME in config.stages and methods:
         makers = {method.name: finished_maker(problem, method, keep) for method in methods}
         for name, best in equal_time(makers, num, keep, seed).items():
             seconds = {"CPU": best.seconds / max(1, len(best.grasps))}
             yield name, EQUAL_TIME, _evaluated(hand, obj, best.grasps, config, seconds, best.candidates)
-
-
-def _timed(work: Callable[[], Result], num: int) -> tuple[Result, dict[str, float]]:
-    """The result of some work, and the time of each of `num` grasps [s]."""
-    begin = time.perf_counter()
-    result = work()
-    return result, {"make": (time.perf_counter() - begin) / num}
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from dro_grasp.baselines.point_autoencoder import each, layer
+
 LATENT = 128
 """Numbers in z. Source: GenDexGrasp."""
 
@@ -27,15 +29,15 @@ class ContactMapNetwork(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.encoder = nn.Sequential(*_layer(4, 64), *_layer(64, 128), *_layer(128, 512))
+        self.encoder = nn.Sequential(*layer(4, 64), *layer(64, 128), *layer(128, 512))
         self.moments = nn.Linear(512, 2 * LATENT)
-        self.local = nn.Sequential(*_layer(3, 64), *_layer(64, 64))
-        self.whole = nn.Sequential(*_layer(64, 128), *_layer(128, 512))
+        self.local = nn.Sequential(*layer(3, 64), *layer(64, 64))
+        self.whole = nn.Sequential(*layer(64, 128), *layer(128, 512))
         # The head's first layer sees local features, global feature and z together; the last two are alike for all points
         # of an object, so they are multiplied once and not once a point.
         self.head_local = nn.Linear(64, 512)
         self.head_shared = nn.Linear(512 + LATENT, 512, bias=False)
-        self.head = nn.Sequential(nn.BatchNorm1d(512), nn.ReLU(), *_layer(512, 64), *_layer(64, 64), nn.Linear(64, 1),
+        self.head = nn.Sequential(nn.BatchNorm1d(512), nn.ReLU(), *layer(512, 64), *layer(64, 64), nn.Linear(64, 1),
                                   nn.BatchNorm1d(1), nn.Sigmoid())
 
     def forward(
@@ -48,22 +50,13 @@ class ContactMapNetwork(nn.Module):
             contact: Its true map.
             noise: Draws of N(0, 1).
         """
-        features = _each(self.encoder, torch.cat([points, contact[..., None]], -1)).amax(1)
+        features = each(self.encoder, torch.cat([points, contact[..., None]], -1)).amax(1)
         mean, log_variance = self.moments(features).chunk(2, -1)
         return MapOutput(self.decode(points, mean + (0.5 * log_variance).exp() * noise), mean, log_variance)
 
     def decode(self, points: Float[Tensor, "b m 3"], z: Float[Tensor, "b latent"]) -> Float[Tensor, "b m"]:
         """The map that z stands for on each object."""
-        local = _each(self.local, points)
-        whole = _each(self.whole, local).amax(1)
+        local = each(self.local, points)
+        whole = each(self.whole, local).amax(1)
         shared = self.head_shared(torch.cat([whole, z], -1))
-        return _each(self.head, self.head_local(local) + shared[:, None])[..., 0]
-
-
-def _layer(inputs: int, outputs: int) -> tuple[nn.Module, ...]:
-    return nn.Linear(inputs, outputs), nn.BatchNorm1d(outputs), nn.ReLU()
-
-
-def _each(layers: nn.Sequential, values: Float[Tensor, "b m c"]) -> Float[Tensor, "b m d"]:
-    """Layers applied to every point alike; BatchNorm counts points of all objects."""
-    return layers(values.flatten(0, 1)).unflatten(0, values.shape[:2])
+        return each(self.head, self.head_local(local) + shared[:, None])[..., 0]

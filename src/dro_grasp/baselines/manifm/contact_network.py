@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from dro_grasp.baselines.manifm.fingertip_contacts import ContactMaps
+from dro_grasp.baselines.point_autoencoder import each, layer
 
 LATENT = 64
 """Numbers in z. Source: ManiFM."""
@@ -34,14 +35,14 @@ class ContactNetwork(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.hand = nn.Sequential(*_layer(6, 32), *_layer(32, HAND))
-        self.encoder = nn.Sequential(*_layer(10, 64), *_layer(64, 128))
+        self.hand = nn.Sequential(*layer(6, 32), *layer(32, HAND))
+        self.encoder = nn.Sequential(*layer(10, 64), *layer(64, 128))
         self.moments = nn.Linear(128 + HAND, 2 * LATENT)
-        self.local = nn.Sequential(*_layer(6, 64), *_layer(64, 64))
-        self.whole = nn.Sequential(*_layer(64, 128), *_layer(128, 128))
+        self.local = nn.Sequential(*layer(6, 64), *layer(64, 64))
+        self.whole = nn.Sequential(*layer(64, 128), *layer(128, 128))
         self.mix_local = nn.Linear(64, 128)
         self.mix_shared = nn.Linear(128 + HAND + LATENT, 128, bias=False)
-        self.head = nn.Sequential(nn.BatchNorm1d(128), nn.ReLU(), *_layer(128, 64), nn.Linear(64, 4))
+        self.head = nn.Sequential(nn.BatchNorm1d(128), nn.ReLU(), *layer(128, 64), nn.Linear(64, 4))
 
     def forward(
         self, obj: Float[Tensor, "b m 6"], hand: Float[Tensor, "b n 6"], true: ContactMaps, noise: Float[Tensor, "b latent"]
@@ -54,25 +55,17 @@ class ContactNetwork(nn.Module):
             true: True contacts.
             noise: Draws of N(0, 1).
         """
-        features = _each(self.encoder, torch.cat([obj, true.heat[..., None], true.force], -1)).amax(1)
-        told = _each(self.hand, hand).amax(1)
+        features = each(self.encoder, torch.cat([obj, true.heat[..., None], true.force], -1)).amax(1)
+        told = each(self.hand, hand).amax(1)
         mean, log_variance = self.moments(torch.cat([features, told], -1)).chunk(2, -1)
         return ContactOutput(self._decode(obj, told, mean + (0.5 * log_variance).exp() * noise), mean, log_variance)
 
     def decode(self, obj: Float[Tensor, "b m 6"], hand: Float[Tensor, "b n 6"], z: Float[Tensor, "b latent"]) -> ContactMaps:
         """The contacts that z stands for."""
-        return self._decode(obj, _each(self.hand, hand).amax(1), z)
+        return self._decode(obj, each(self.hand, hand).amax(1), z)
 
     def _decode(self, obj: Float[Tensor, "b m 6"], told: Float[Tensor, "b h"], z: Float[Tensor, "b latent"]) -> ContactMaps:
-        local = _each(self.local, obj)
-        shared = self.mix_shared(torch.cat([_each(self.whole, local).amax(1), told, z], -1))
-        values = _each(self.head, self.mix_local(local) + shared[:, None])
+        local = each(self.local, obj)
+        shared = self.mix_shared(torch.cat([each(self.whole, local).amax(1), told, z], -1))
+        values = each(self.head, self.mix_local(local) + shared[:, None])
         return ContactMaps(values[..., 0].sigmoid(), values[..., 1:])
-
-
-def _layer(inputs: int, outputs: int) -> tuple[nn.Module, ...]:
-    return nn.Linear(inputs, outputs), nn.BatchNorm1d(outputs), nn.ReLU()
-
-
-def _each(layers: nn.Module, values: Float[Tensor, "b m c"]) -> Float[Tensor, "b m d"]:
-    return layers(values.flatten(0, 1)).unflatten(0, values.shape[:2])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -13,28 +13,22 @@ from torch import Tensor
 from dro_grasp.baselines.bundle_draws import BundleDraws
 from dro_grasp.baselines.manifm.contact_network import LATENT, ContactNetwork, ContactOutput
 from dro_grasp.baselines.manifm.fingertip_contacts import ContactMaps, contact_maps
+from dro_grasp.baselines.point_autoencoder import AutoencoderConfig, divergence, train_autoencoder
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.hands.hand import Hand
-from dro_grasp.training.config import ScheduleConfig
 from dro_grasp.training.reports import Report, console_report
-from dro_grasp.training.runs import Losses, TrainingRun, begin, recalibrate
+from dro_grasp.training.runs import Losses
 
 HAND_POINTS = 64
 """Points of the open hand that the network is told (ours)."""
 
 
 @dataclass(frozen=True)
-class ContactTrainingConfig:
+class ContactTrainingConfig(AutoencoderConfig):
     """Settings; the numbers are ManiFM's, unless stated otherwise."""
 
-    schedule: ScheduleConfig = field(default_factory=lambda: ScheduleConfig(steps=10_000))
-    """Differs from ManiFM: 1e-3 and a cosine instead of 1e-4 and steps, better at equal time on a CPU."""
     batch: int = 64
     """Grasps in a step."""
-    points: int = 256
-    """Object points (ManiFM: 2,048)."""
-    hand_points: int = 256
-    """Points of a hand among which contacts are found (ours)."""
     force: float = 100.0
     """Weight of the squared error of forces, beside that of the heat."""
     divergence: tuple[float, float] = (1e-7, 0.05)
@@ -44,32 +38,17 @@ class ContactTrainingConfig:
 def train_contacts(
     bundle: Bundle, config: ContactTrainingConfig, folder: Path, report: Report | None = None
 ) -> ContactNetwork:
-    """Train on a bundle; a checkpoint in the folder is resumed.
+    """See `train_autoencoder`."""
+    return train_autoencoder(
+        ContactNetwork, bundle, config, folder, _forward, contact_losses, report or console_report("contacts"))
 
-    Returns:
-        The moving average of the weights, on the CPU, in evaluation mode.
 
-    Raises:
-        BundleError: The bundle holds no grasps.
-        OptionError: The schedule cannot be carried out here.
-        TrainingError: A loss is not finite.
-    """
-    processes, device = begin(config.schedule)
-    torch.manual_seed(config.schedule.seed)
-    model = ContactNetwork().to(device)
-    generator, draws = torch.Generator(device), BundleDraws(bundle, config.hand_points, device)
-    run = TrainingRun(folder, model, config.schedule, generator, processes)
-    model.train()
-
-    def forward() -> tuple[ContactMaps, ContactOutput]:
-        obj, told, true = draw_contacts(draws, config, generator)
-        return true, model(obj, told, true, torch.randn(len(obj), LATENT, generator=generator, device=device))
-
-    run.train(lambda: contact_losses(*forward(), config, run.progress), report or console_report("contacts"))
-    model.load_state_dict(run.average.module.state_dict())
-    run.seed_shard()
-    recalibrate(model, forward, config.schedule.recalibration)
-    return model.cpu().eval()
+def _forward(
+    model: ContactNetwork, draws: BundleDraws, config: ContactTrainingConfig, generator: torch.Generator
+) -> tuple[ContactMaps, ContactOutput]:
+    """True contacts of a batch, and the network's."""
+    obj, told, true = draw_contacts(draws, config, generator)
+    return true, model(obj, told, true, torch.randn(len(obj), LATENT, generator=generator, device=generator.device))
 
 
 def draw_contacts(
@@ -94,12 +73,12 @@ def open_hand(hand: Hand) -> Float[Tensor, "n 6"]:
     return told[torch.arange(HAND_POINTS, device=told.device) % len(told)]
 
 
-def contact_losses(true: ContactMaps, output: ContactOutput, config: ContactTrainingConfig, progress: float) -> Losses:
+def contact_losses(passed: tuple[ContactMaps, ContactOutput], config: ContactTrainingConfig, progress: float) -> Losses:
     """Losses of one batch; `progress` is the share of the schedule that is done."""
+    true, output = passed
     heat = (output.maps.heat - true.heat).square().mean()
     force = (output.maps.force - true.force).square().mean()
-    mean, log_variance = output.mean, output.log_variance
-    nats = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(-1).mean()
+    nats = divergence(output.mean, output.log_variance)
     first, last = config.divergence
     weight = first * math.exp(progress * math.log(last / first))
     total = heat + config.force * force + weight * ((1 + nats.square()).sqrt() - 1)
