@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from argparse import Namespace
 from importlib import import_module
 from pathlib import Path
 
@@ -14,8 +15,11 @@ import torch
 from scipy.spatial.transform import Rotation
 from scipy.stats import ttest_rel
 
+from dro_grasp.baselines.ours import CANDIDATES
 from dro_grasp.datasets.bundle.training_file import write_bundle
+from dro_grasp.datasets.collections.importing import read_foreign
 from dro_grasp.models.presets import PRESETS
+from dro_grasp.objects.catalogue import load_object
 from dro_grasp.training import loop, pretraining
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.tiny_bundle import SEMIAXES, TINY, ellipsoid, made_up_grasps
@@ -87,3 +91,26 @@ def test_the_papers_form_is_trained_and_measured_once(
     found = json.loads(capsys.readouterr().out)
     assert [(r["row"], r["seed"], len(r["rows"])) for name in ("pretrained", "not pretrained") for r in found[name]] == [
         ("pretrained", 0, 3), ("not pretrained", 0, 3)]
+
+
+def test_a_row_of_the_comparison_says_candidates_and_number() -> None:
+    source, options = import_module("comparison").Source, Namespace(bundle=None, num=7)
+    rows = [source.of(name, options) for name in ("start:raw=3", "synthesise:16=2", "synthesise", "start")]
+    assert [(row.name, row.raw, row.num) for row in rows] == [
+        ("start:raw", True, 3), ("synthesise:16", False, 2), ("synthesise", False, 7), ("start", False, 7)]
+    assert [row.method.candidates for row in rows[1:3]] == [16, CANDIDATES]
+
+
+def test_grasps_go_to_dexgraspbench_as_its_own_come_from_it(tmp_path: Path) -> None:
+    hand, official = loaded_hand("shadowhand"), import_module("dexgraspbench_official")
+    grasps = made_up_grasps(hand, count=3)
+    closed = grasps.replace(pregrasp_joints=0.8 * grasps.joints, squeeze_joints=1.1 * grasps.joints)
+    back = []
+    for i, entry in enumerate(official.entries(hand, closed, "some/object", 0.1)):
+        np.save(tmp_path / f"{i}.npy", np.array(entry, dtype=object), allow_pickle=True)
+        back += read_foreign(tmp_path / f"{i}.npy", "dexgraspbench")
+    made = import_module("dexgraspbench").as_batch(hand, load_object("sphere"), back)
+    assert [grasp.scale for grasp in back] == [0.1] * 3
+    assert torch.allclose(made.T_object_wrist, closed.T_object_wrist, atol=1e-6)
+    for posture in ("joints", "pregrasp_joints", "squeeze_joints"):
+        assert torch.allclose(getattr(made, posture), getattr(closed, posture), atol=1e-6)

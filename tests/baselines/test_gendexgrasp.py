@@ -13,7 +13,7 @@ import torch
 
 from dro_grasp.baselines import registry
 from dro_grasp.baselines.bundle_draws import BundleDraws
-from dro_grasp.baselines.gendexgrasp import map_training
+from dro_grasp.baselines.gendexgrasp import contact_maps, map_training
 from dro_grasp.baselines.gendexgrasp.contact_maps import contact_map, sharpened
 from dro_grasp.baselines.gendexgrasp.map_fitting import FittingConfig, MapTarget, fit, map_energy
 from dro_grasp.baselines.gendexgrasp.map_network import LATENT, ContactMapNetwork
@@ -55,6 +55,15 @@ def test_a_map_is_what_loops_say(gamma: float) -> None:
                 apart.append(d * math.exp(gamma * (1 - cosine)))
             x = 10 * math.sqrt(min(apart))
             assert float(found[b, i]) == pytest.approx(1 - 2 * (1 / (1 + math.exp(-x)) - 0.5), abs=2e-4)
+
+
+def test_hands_in_parts_have_the_map_of_all_hands_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    points, normals = cloud(12)
+    hands = 0.3 + 0.05 * torch.randn(5, 9, 3, generator=torch.Generator().manual_seed(1))
+    together = contact_map(points, normals, hands, 2.0)
+    monkeypatch.setattr(contact_maps, "CACHED_PAIRS", 2 * 12 * 9)
+    assert torch.equal(contact_map(points, normals, hands, 2.0), together)
+    assert torch.equal(contact_map(points, normals, hands[3], 2.0), together[3])
 
 
 def test_a_hand_beside_a_point_counts_as_farther_than_one_above_it() -> None:
