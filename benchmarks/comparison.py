@@ -131,7 +131,7 @@ def measured(source: Source, hand: Hand, objects: Sequence[str], options: argpar
         stem = f"{source.name} {hand.name} {obj_name} {source.num}".replace("/", "_").replace(" ", "_")
         stored = options.work and options.work / f"{stem}.parquet"
         known = stored and stored.is_file()
-        notes = json.loads(stored.with_suffix(".json").read_text()) if known else {"held": {}}
+        notes: dict[str, Any] = json.loads(stored.with_suffix(".json").read_text()) if known else {"held": {}}
         missing = {name: TRIALS[name] for name in ("dro", *options.trials) if name not in notes["held"]}
         if known and not missing:
             yield Measured(GraspBatch.load(stored), **notes)

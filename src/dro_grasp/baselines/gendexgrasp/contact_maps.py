@@ -49,10 +49,10 @@ def aligned_nearest(
 ) -> Int[Tensor, "*b m"]:
     """Which hand point has the least aligned distance to each object point."""
     batch, pairs = torch.broadcast_shapes(points.shape[:-2], hand.shape[:-2]), points.shape[-2] * hand.shape[-2]
-    each = [x.expand(*batch, *x.shape[-2:]).reshape(-1, *x.shape[-2:]) for x in (points, normals, hand)]
-    size = max(1, (CACHED_PAIRS if hand.device.type == "cpu" else len(each[0]) * pairs) // pairs)
-    parts = zip(*(x.split(size) for x in each), strict=True)
-    return torch.cat([_nearest(*part, gamma) for part in parts]).unflatten(0, batch) if batch else _nearest(*each, gamma)[0]
+    points, normals, hand = (x.expand(*batch, *x.shape[-2:]).reshape(-1, *x.shape[-2:]) for x in (points, normals, hand))
+    size = max(1, CACHED_PAIRS // pairs) if hand.device.type == "cpu" else len(hand)
+    parts = zip(points.split(size), normals.split(size), hand.split(size), strict=True)
+    return torch.cat([_nearest(*part, gamma) for part in parts]).reshape(*batch, -1)
 
 
 def _nearest(
