@@ -2,8 +2,9 @@
 
 The paper-size network has random weights. Its distances fit no grasp, so the joint solver needs more steps and its times are
 an upper bound. `multi` are the shipped weights. Each number is the median over hands and repetitions, after one prediction
-that is not counted. Loading of hands, objects and weights is not counted either. All is measured twice: alone, as far as the
-machine is, and beside two processes that compute all the time. Threads wait as the commands let them, asleep.
+that is not counted. Loading of hands, objects and weights is not counted either. Single grasps, and with --full all, are
+measured twice: alone, as far as the machine is, and beside two processes that compute all the time. Threads wait as the
+commands let them, asleep.
 
     python benchmarks/inference.py [--json] [--full] [--threads N] [--seed 0]
 """
@@ -84,7 +85,7 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--full", action="store_true", help=f"{FULL} runs a hand instead of {RUNS}")
+    parser.add_argument("--full", action="store_true", help=f"{FULL} runs a hand, not {RUNS}; 16 grasps busy too")
     parser.add_argument("--threads", type=int, default=cores())
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
@@ -95,7 +96,7 @@ def main() -> None:
         predictors = {"paper": GraspPredictor(str(paper_size(Path(folder), options.seed))), "multi": GraspPredictor()}
     for load, others in OTHERS.items():
         for size, predictor in predictors.items():
-            for num in (1, 16):
+            for num in (1, 16) if options.full or not others else (1,):
                 with busy(others):
                     times = measure(predictor, num, runs, options.seed)
                 median = {key: statistics.median(values) for key, values in times.items()}

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 MAX_SIDE = 4096
 """Largest width and height of one picture [pixels]."""
-MAX_PIXELS = 100_000_000
+MAX_PIXELS = 50_000_000
 """Most pixels of all pictures on a sheet together."""
 
 

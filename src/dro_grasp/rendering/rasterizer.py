@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,6 +15,8 @@ from dro_grasp.rendering.meshes import Colour, Mesh, corner_normals, unit
 
 ROWS_AT_ONCE = 200_000
 """Rows of pixels, of all triangles, that are drawn together (ours): bounds the memory."""
+SAMPLES_AT_ONCE = 500_000
+"""Samples that are shaded together (ours); likewise."""
 SLIVER = 1e-9
 """Twice the area of a triangle below which it is not drawn [pixels^2] (ours)."""
 WHITE = (1.0, 1.0, 1.0)
@@ -104,7 +107,9 @@ def render(
         depth = (1 / canvas.inverse).astype(np.float32)
     picture *= outlines(depth.reshape(canvas.height, canvas.width), oversampling, style)[..., None]
     steps = range(oversampling)
-    mean = np.mean([picture[i::oversampling, j::oversampling] for i in steps for j in steps], axis=0)
+    mean = np.zeros((height, width, 3), np.float32)
+    for i, j in itertools.product(steps, steps):
+        mean += picture[i::oversampling, j::oversampling] / oversampling**2
     return (mean.clip(0, 1) * 255 + 0.5).astype(np.uint8)
 
 
@@ -164,14 +169,19 @@ def _draw(rows: Int[np.ndarray, "rows 2"], triangles: _Triangles, canvas: _Canva
 def _shaded(triangles: _Triangles, canvas: _Canvas, background: Colour, style: Style) -> Float[np.ndarray, "samples 3"]:
     """The colour of every sample."""
     colours = np.broadcast_to(np.asarray(background, np.float32), (len(canvas.face), 3)).copy()
-    pixel = canvas.inverse.nonzero()[0]
-    face, inverse = canvas.face[pixel], canvas.inverse[pixel]
-    y, x = np.divmod(pixel, canvas.width)
-    of_x, of_y, constant = triangles.shares[..., face]
-    share = (of_x * (x + 0.5) + of_y * (y + 0.5) + constant) * triangles.screen[..., 2].T[:, face] / inverse
-    points, normals = (np.einsum("kp,pkc->pc", share.astype(np.float32), of.astype(np.float32)[face])
-                       for of in (triangles.corners, triangles.normals))
-    colours[pixel] = shade(points, normals, triangles.colours.astype(np.float32)[face], style)
+    shares = triangles.shares
+    corners, normals_of, colours_of = (
+        values.astype(np.float32) for values in (triangles.corners, triangles.normals, triangles.colours))
+    drawn = canvas.inverse.nonzero()[0]
+    for start in range(0, len(drawn), SAMPLES_AT_ONCE):
+        pixel = drawn[start : start + SAMPLES_AT_ONCE]
+        face, inverse = canvas.face[pixel], canvas.inverse[pixel]
+        y, x = np.divmod(pixel, canvas.width)
+        of_x, of_y, constant = shares[..., face]
+        share = (of_x * (x + 0.5) + of_y * (y + 0.5) + constant) * triangles.screen[..., 2].T[:, face] / inverse
+        points, normals = (
+            np.einsum("kp,pkc->pc", share.astype(np.float32), of[face]) for of in (corners, normals_of))
+        colours[pixel] = shade(points, normals, colours_of[face], style)
     return colours
 
 

@@ -35,6 +35,8 @@ MAX_PICTURES = 16
 """Default limit of grasps on one sheet."""
 COLUMNS = 4
 """Default number of pictures side by side."""
+PIXELS_AT_ONCE = 2048 * 2048
+"""Pixels that are drawn side by side (ours): bounds the memory."""
 CONTACT_DISTANCE = 0.002
 """Hand points closer than this to the object's surface count as contacts [m]."""
 CONTACT_RADIUS = 0.0022
@@ -111,7 +113,8 @@ def _tiles(
 ) -> tuple[list[UInt8[np.ndarray, "height width 3"]], list[tuple[str, bool | None]]]:
     """Pictures of grasps of one object, and their captions."""
     drawn = after_closing(hand, obj, grasps) if shows_held(hand, obj, style) else grasps
-    with ThreadPoolExecutor(cores()) as threads:
+    width, height = (style or PictureStyle()).size
+    with ThreadPoolExecutor(max(1, min(cores(), PIXELS_AT_ONCE // (width * height)))) as threads:
         tiles = list(threads.map(lambda i: draw_grasp(hand, obj, drawn, i, style), range(len(grasps))))
     return tiles, [caption(grasps, i) for i in range(len(grasps))]
 
@@ -161,12 +164,15 @@ def draw_grasp(
         fingers = hand_meshes(hand, joints, T, above_palm=False)
         camera = best_camera(hand, joints, T, obj, aspect=style.size[0] / style.size[1])
         contacts = contact_points(hand, obj, joints, T) if style.contacts else np.zeros((0, 3))
-    whole = render([*object_meshes(obj), *fingers], camera, *style.size)
+    # Of a picture this large nobody sees single pixels, and smooth edges would take four times the memory.
+    oversampling = 2 if style.size[0] * style.size[1] <= PIXELS_AT_ONCE else 1
+    whole = render([*object_meshes(obj), *fingers], camera, *style.size, oversampling=oversampling)
     if style.opacity < 1:
-        behind = render(fingers, camera, *style.size)
+        behind = render(fingers, camera, *style.size, oversampling=oversampling)
         whole = (style.opacity * whole + (1 - style.opacity) * behind + 0.5).astype(np.uint8)
     if len(contacts):
-        marks = render([dots(contacts, CONTACT_COLOUR, CONTACT_RADIUS)], camera, *style.size)
+        dotted = [dots(contacts, CONTACT_COLOUR, CONTACT_RADIUS)]
+        marks = render(dotted, camera, *style.size, oversampling=oversampling)
         whole = np.where((marks < 250).any(-1, keepdims=True), marks, whole)
     return whole
 
