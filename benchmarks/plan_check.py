@@ -29,13 +29,15 @@ from dro_grasp.simulation.scene import joint_addresses
 
 FINER = 10
 """Configurations that are checked for each sample of a plan (ours)."""
+NEAR = 0.01
+"""Farther away, distances to things are not measured [m] (ours)."""
 TOUCH = 0.001
 """Distance of a point of the hand's surface to a point of a cloud that counts as contact [m] (ours)."""
 SLACK = 1.001
 """Factor within which speeds and joints may exceed a limit by rounding (ours)."""
 SLOPE = 1.1
 """The same of accelerations, which differences of differences state roughly (ours)."""
-COLUMNS = ("robot", "plans", "configurations", "in collision", "beyond a limit", "nearest to a thing, travelling [mm]")
+COLUMNS = ("robot", "plans", "configurations", "in collision", "beyond a limit", "nearest thing, travelling [mm, at most 10]")
 """Headings."""
 
 
@@ -84,7 +86,7 @@ def nearest(made: MotionPlan, robot: Robot, arm: np.ndarray, hand: np.ndarray, s
     """Least distance of the travelling hand to points of the object, and of the hand at any time to those of others [m]."""
     points = robot.hand.points(torch.from_numpy(hand).float(), torch.from_numpy(robot.T_world_wrist(arm)).float()).numpy()
     travelling = points[stage <= STAGES.index("shape")].reshape(-1, 3)
-    least = 0.05
+    least = NEAR
     for cloud, mine in ((made.scene.points, travelling), (made.scene.others, points.reshape(-1, 3))):
         if len(cloud):
             least = min(least, float(KDTree(cloud).query(mine, distance_upper_bound=least)[0].min()))
