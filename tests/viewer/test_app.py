@@ -136,7 +136,7 @@ def test_a_browser_shows_the_grasp(grasps: GraspBatch, tmp_path: Path) -> None:
         page.get_by_text("success under dro/1").wait_for(timeout=60_000)
         page.get_by_text("Hand points").click(timeout=60_000)
         time.sleep(4)
-        page.screenshot(path=str(tmp_path / "viewer.png"))
+        page.screenshot(path=str(tmp_path / "viewer.png"), timeout=300_000)
     from PIL import Image
 
     with Image.open(tmp_path / "viewer.png") as file_:

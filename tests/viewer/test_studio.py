@@ -274,6 +274,6 @@ def test_a_browser_goes_all_the_way(tmp_path: Path) -> None:
         saved = tmp_path / "taken.parquet"
         download.value.save_as(saved)
         time.sleep(3)
-        page.screenshot(path=tmp_path / "page.png")
+        page.screenshot(path=tmp_path / "page.png", timeout=300_000)
     assert len(GraspBatch.load(saved)) == 16
     assert (tmp_path / "page.png").stat().st_size > 20_000
