@@ -19,7 +19,7 @@ from dro_grasp.baselines.manifm.contact_method import ContactMethod
 from dro_grasp.baselines.method import Method
 from dro_grasp.baselines.ours import DescentMethod, DistanceMethod, SynthesisMethod
 from dro_grasp.datasets.bundle.training_file import Bundle
-from dro_grasp.errors import OptionError, WeightsError
+from dro_grasp.errors import OptionError
 from dro_grasp.models.checkpoints import SHIPPED_FOLDER
 from dro_grasp.predictor import GraspPredictor, PredictorConfig
 
@@ -58,19 +58,8 @@ def _contacts(options: MethodOptions) -> Method:
 
 
 def baseline_weights(name: str, given: str | None) -> Path:
-    """The weights of a method beside D(R,O): those given, or those that ship.
-
-    Raises:
-        WeightsError: None are given, and none ship.
-    """
-    if given is not None:
-        return Path(given)
-    path = SHIPPED_FOLDER / "baselines" / f"{name}.safetensors"
-    if not path.is_file():
-        raise WeightsError(f"the weights of {name} do not ship; train them (`dro-grasp train --method {name} --bundle "
-                           f"BUNDLE --run-folder runs/{name} --output {name}.safetensors`), and give them as "
-                           f"{name}@{name}.safetensors")
-    return path
+    """The weights of a method beside D(R,O): those given, or those that ship."""
+    return SHIPPED_FOLDER / "baselines" / f"{name}.safetensors" if given is None else Path(given)
 
 
 METHODS: dict[str, Callable[[MethodOptions], Method]] = {

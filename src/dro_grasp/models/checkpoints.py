@@ -32,8 +32,8 @@ PICKLES = (b"PK", b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")
 """First two bytes of zipped and of bare pickles."""
 CHECKSUMS = "SHA256SUMS"
 """File beside the shipped weights with their checksums, as `sha256sum` writes it."""
-SMALL = ("completion/surface", "ranking/quality", "ranking/holding")
-"""Networks that ship beside those that predict grasps."""
+SMALL = ("completion/surface", "ranking/quality", "ranking/holding", "baselines/gendexgrasp", "baselines/manifm")
+"""Networks that ship beside those that predict D(R,O)."""
 DEFAULT = "multi"
 """Name of the default weights."""
 
