@@ -54,7 +54,7 @@ PAPER = {
 }
 """Success [%], diversity [rad] and seconds on Barrett, Allegro and Shadow hand. Source: paper, table of the overall comparison,
 in Isaac Gym; DFC took more than the seconds stated."""
-METHODS = ("dro:raw", "dro", "synthesise", "dfc=4", "gendexgrasp=4", "gendexgrasp-gamma1=4", "manifm=4", "start")
+METHODS = ("dro:raw=4", "dro", "synthesise=4", "dfc=4", "gendexgrasp=2", "gendexgrasp-gamma1=1", "manifm=4", "start=4")
 """Rows by default."""
 
 
@@ -205,8 +205,8 @@ def draw(found: dict[str, dict[str, list[Measured]]], path: Path) -> None:
     for name, (success, _, seconds) in PAPER.items():
         x, y = np.nanmean(seconds), np.nanmean(success)
         axes[0].plot(x, y, "x", color="grey")
-        axes[0].annotate(f" {name}, paper", (x, y), xytext=(0, -14), textcoords="offset points", ha="center", color="grey")
-    axes[0].set(ylabel="success [%]", xlim=(None, 2e4))
+        axes[0].annotate(f"{name}, paper", (x, y), xytext=(6, -4), textcoords="offset points", color="grey")
+    axes[0].set(ylabel="success [%]", xlim=(None, 1e5))
     axes[0].legend(loc="lower left")
     figure.savefig(path, dpi=110)
 
