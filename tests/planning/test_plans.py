@@ -23,7 +23,9 @@ from dro_grasp.planning.motion import STAGES, MotionPlan
 from dro_grasp.planning.paths import find_path
 from dro_grasp.planning.plan_config import PlanConfig
 from dro_grasp.planning.planner import plan
+from dro_grasp.planning.reachability import Postures
 from dro_grasp.planning.robot_file import BUILTIN_ROBOTS
+from dro_grasp.planning.timed_stages import closing
 from dro_grasp.planning.timing import USED, cornered, smooth
 from dro_grasp.planning.workcell import arm_addresses, robot_spec
 from dro_grasp.simulation.protocols import PROTOCOLS
@@ -242,6 +244,18 @@ def test_corners_are_stops_and_nothing_leaves_the_lines() -> None:
     made = cornered(corners, np.ones(2), np.ones(2))
     assert np.abs(made.position - made.position.clip(0, 1)).max() < 1e-9
     assert np.minimum(np.abs(made.position[:, 1]), np.abs(made.position[:, 0] - 1)).max() < 1e-9
+    slow = cornered(corners, np.ones(2), np.ones(2), 20.0)
+    assert slow.seconds == pytest.approx(20.0, abs=0.05)
+    assert np.abs(slow.position[np.abs(slow.time - 10.0).argmin()] - corners[1]).max() < 1e-3
+
+
+def test_a_closing_hand_stays_between_its_postures() -> None:
+    """A spline through them overshoots: a finger that stops at the end of its range would leave it."""
+    hand = Postures(np.zeros(2), np.array([0.2, 0.1]), np.array([1.0, 0.4]), np.array([1.0, 0.9]))
+    limits = np.full(2, 2.0), np.full(2, 10.0)
+    made, spline = cornered(closing(hand), *limits, 1.0), smooth(closing(hand), *limits, 1.0)
+    assert made.position.max(0) == pytest.approx(hand.squeeze, abs=1e-9)
+    assert spline.position[:, 0].max() > 1.001
 
 
 BAD = {

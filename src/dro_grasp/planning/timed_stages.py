@@ -41,7 +41,8 @@ def timed_stages(
         reach = cornered(waypoints, *limits)
     standoff, grasp = goal.approach[0], goal.approach[-1]
     shape = smooth(between(hand.opened, hand.pregrasp), *fingers)
-    close = joined([smooth(closing(hand), *fingers, config.closing_seconds), standing(hand.squeeze, config.grip_seconds)])
+    # A spline through pregrasp, grasp and squeeze would swing beyond them, and out of the joints' range.
+    close = joined([cornered(closing(hand), *fingers, config.closing_seconds), standing(hand.squeeze, config.grip_seconds)])
     approach, lift = smooth(goal.approach, *limits), smooth(goal.lift, *limits)
     start = robot.T_world_wrist(grasp)
     free = _clear(checker, reach.position, hand.opened) and all(

@@ -80,15 +80,18 @@ def smooth(
 
 
 def cornered(
-    waypoints: Float[np.ndarray, "k n"], velocity: Float[np.ndarray, " n"], acceleration: Float[np.ndarray, " n"]
+    waypoints: Float[np.ndarray, "k n"], velocity: Float[np.ndarray, " n"], acceleration: Float[np.ndarray, " n"],
+    least: float = 0.0,
 ) -> Trajectory:
-    """The same along straight lines, with a stop at each corner: slow, and never off the path."""
+    """The same along straight lines, with a stop at each corner: slow, and never off the path or beyond its ends."""
     steps = np.diff(waypoints, axis=0)
     unit = steps / np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-12)
     turns = [i for i in range(1, len(steps)) if float(unit[i] @ unit[i - 1]) < 1 - 1e-9]
     corners = waypoints[[0, *turns, -1]]
-    parts = [smooth(np.stack([a, b]), velocity, acceleration) for a, b in pairwise(corners)]
-    return joined(parts)
+    lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    share = lengths / max(float(lengths.sum()), 1e-12)
+    legs = zip(pairwise(corners), share, strict=True)
+    return joined([smooth(np.stack(leg), velocity, acceleration, least * part) for leg, part in legs])
 
 
 def standing(q: Float[np.ndarray, " n"], seconds: float) -> Trajectory:
