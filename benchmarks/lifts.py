@@ -47,9 +47,9 @@ ROWS = {
 MEAN_GRASPS = 64
 """Rotations of the mean grasp, of which any is taken that the arm can carry out (ours)."""
 COLUMNS = ("robot", "row", "held", "rate [%]", "interval [%]", "planned", "of reachable", "ended in", "median [s]",
-           "95 % within [s]")
+           "95 % within [s]", "grasps [%]")
 """Headings; `of reachable` are the attempts with a grasp that the arm reaches, times are of one core, from depth image to timed
-plan."""
+plan, and `grasps` is the share of planning in which grasps are made: network, refinement and ranking."""
 
 
 def row(robot: str, kind: str, done: list[Attempt]) -> list[object]:
@@ -61,8 +61,9 @@ def row(robot: str, kind: str, done: list[Attempt]) -> list[object]:
     times = [None, None] if seconds is None else [round(seconds["median"], 1), round(seconds["within_95"], 1)]
     planned = sum(a.processor_seconds > 0 for a in done)
     reachable = planned + sum(a.stage == "plan" and NO_PATH in a.reason for a in done)
+    shares = [a.grasp_seconds / a.plan_seconds for a in done if a.plan_seconds > 0]
     return [robot, kind, f"{held} of {len(done)}", round(100 * held / len(done)), f"{100 * low:.0f}-{100 * high:.0f}", planned,
-            reachable, ended, *times]
+            reachable, ended, *times, round(100 * float(np.median(shares))) if shares else None]
 
 
 def mean_grasp_attempts(run: TabletopRun, mean: MeanGrasp) -> Iterator[Attempt]:
