@@ -92,4 +92,5 @@ def test_nothing_escapes_the_readers() -> None:
     for kind in ("urdf", "mjcf", "mesh", "cloud", "grasps", "weights", "bundle", "checkpoint", "foreign", "frame"):
         # Sound files, and some damaged ones, must be read: otherwise nothing behind the first check is tested.
         assert kinds[kind]["read"] > 0
-        assert kinds[kind]["refused"] > kinds[kind]["cases"] / 4
+        if kind != "checkpoint":  # a damaged one is set aside, and the training begins anew
+            assert kinds[kind]["refused"] > kinds[kind]["cases"] / 4
