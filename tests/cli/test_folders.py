@@ -17,6 +17,7 @@ from dro_grasp.grasps.sources import with_own_files
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.viewer.pictures import CAPTION, HEADER, TILE
+from dro_grasp.viewer.studio import StudioServer
 from tests.helpers.browser import free_port
 
 
@@ -57,11 +58,11 @@ def test_picture_takes_a_folder(folder: Path, tmp_path: Path, more: list[str], t
 
 @pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")
 def test_view_takes_a_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pages = []
-    monkeypatch.setattr("dro_grasp.viewer.stage.serve", pages.append)
+    servers: list[StudioServer] = []
+    monkeypatch.setattr("dro_grasp.viewer.stage.serve", servers.append)
     for more in ([], ["--object", "sphere"]):
         assert main(["view", str(folder), "--port", str(free_port()), *more]) == 0
-    first, second = pages
+    first, second = pages = [server._make(server.server, server._turn) for server in servers]  # as for a browser
     try:
         assert (first.made.obj.name, len(first.made.refined)) == ("can", 2)
         assert (second.made.obj.name, len(second.made.refined)) == ("sphere", 3)
@@ -72,8 +73,9 @@ def test_view_takes_a_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> N
         assert len(first.made.refined) == 3, "the other object's grasps can be picked"
         assert "not evaluated" in first.status.content
     finally:
-        for page in pages:
-            page.stop()
+        for page, server in zip(pages, servers, strict=True):
+            page.close()
+            server.stop()
 
 
 def test_objects_of_the_same_name_are_told_apart(tmp_path: Path) -> None:
