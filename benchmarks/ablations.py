@@ -71,7 +71,7 @@ class Ablation:
     fine_tuned: bool = False
     """The shipped weights are trained further, instead of new ones."""
     grasps: int | None = None
-    """Grasps of the hand, over all objects, that are trained on; all by default."""
+    """Grasps of each hand, over all objects, that are trained on; all by default."""
     share: float = 1.0
     """Share of the steps of the other rows."""
     view: View = "whole"
@@ -92,6 +92,11 @@ ROWS = {
     "z: flow": Ablation(network={"prior": "flow"}, losses=LossConfig(divergence=0.0003)),
     "z: motion, flow": Ablation(network={"prior": "flow", **MOTION}, losses=LossConfig(divergence=0.0003)),
     "z: motion, flow, 0.001": Ablation(network={"prior": "flow", **MOTION}, losses=LossConfig(divergence=0.001)),
+    **{
+        f"z: motion, flow, {count} grasps a hand": Ablation(
+            network={"prior": "flow", **MOTION}, losses=LossConfig(divergence=0.0003), grasps=count)
+        for count in (10, 40, 160, 640)
+    },
     "ten hands, wrist axes": Ablation(hands=(*HANDS, *OTHERS), evaluated=HELD_OUT, network={"frame": "wrist"}),
     "ten hands, palm axes": Ablation(hands=(*HANDS, *OTHERS), evaluated=HELD_OUT),
     **{
@@ -113,11 +118,11 @@ def bundle_of(ablation: Ablation, folder: Path) -> Bundle:
     bundle = load_bundle(path)
     if ablation.grasps is None:
         return bundle
-    (name,) = bundle.grasps
-    known = bundle.grasps[name]
-    kept = torch.randperm(len(known.joints), generator=torch.Generator().manual_seed(0))[: ablation.grasps]
-    fewer = type(known)(known.T_object_wrist[kept], known.joints[kept], known.object_index[kept])
-    return Bundle(bundle.hands, bundle.objects, {name: fewer})
+    fewer = {}
+    for hand, known in bundle.grasps.items():
+        kept = torch.randperm(len(known.joints), generator=torch.Generator().manual_seed(0))[: ablation.grasps]
+        fewer[hand] = type(known)(known.T_object_wrist[kept], known.joints[kept], known.object_index[kept])
+    return Bundle(bundle.hands, bundle.objects, fewer)
 
 
 def trained(name: str, ablation: Ablation, folder: Path, steps: int) -> tuple[DistanceNetwork, float]:

@@ -6,6 +6,7 @@ Run it as `python benchmarks/data_card.py [data/grasps] [--pictures docs/picture
 from __future__ import annotations
 
 import argparse
+import math
 from collections import Counter
 from pathlib import Path
 
@@ -14,12 +15,13 @@ from report import ROOT
 from dro_grasp.datasets.collections.collection import read_collection
 from dro_grasp.datasets.engine.shards import Yield
 from dro_grasp.evaluation.coverage import measure_coverage
+from dro_grasp.evaluation.rows import finger_contact
 from dro_grasp.viewer.dataset_pages import charts, grasps_drawn
 
 PICTURED = "assets-shadowhand.parquet"
 """The hand of the pictures."""
 COLUMNS = ("hand", "grasps", "train", "few_shot", "validate", "objects", "fewest", "without", "valid of evaluated [%]",
-           "per CPU-hour", "diversity", "wrist", "joints", "all six half-axes [%]", "kB")
+           "per CPU-hour", "diversity", "wrist", "joints", "all six half-axes [%]", "fingers [%]", "all fingers [%]", "kB")
 """Headings of the table."""
 
 
@@ -29,10 +31,12 @@ def row(path: Path) -> list[str]:
     made: Yield = hand.yields
     counts = [p.grasps for p in hand.pairs]
     splits = Counter(hand.grasps.split)
+    touching = finger_contact(hand.grasps.fingers_in_contact, len(hand.hand.fingers))
     cells = [hand.grasps.hand, len(hand.grasps), splits["train"], splits["few_shot"], splits["validate"], len(counts),
              min(counts), sum(c == 0 for c in counts), f"{100 * made.valid / max(1, made.evaluated):.0f}",
              f"{made.per_cpu_hour:,.0f}", *(f"{v:.3f}" for v in hand.diversity.values()),
-             f"{100 * sum(min(p.half_axes) > 0 for p in hand.pairs) / len(hand.pairs):.0f}", path.stat().st_size // 1000]
+             f"{100 * sum(min(p.half_axes) > 0 for p in hand.pairs) / len(hand.pairs):.0f}",
+             *("-" if math.isnan(touching[0]) else f"{100 * share:.0f}" for share in touching), path.stat().st_size // 1000]
     return [f"{c:,}" if isinstance(c, int) else c for c in cells]
 
 

@@ -5,8 +5,9 @@
 
 CLONE is a clone of DexGraspBench with its example grasps and its submodule, PYTHON an interpreter with its requirements, and
 FOLDER that of `dexgraspbench.py --own HAND --hand CLONE/assets/hand/shadow/right_hand.xml`, which has made and evaluated the
-grasps. Every K-th of each pair of object and scale goes to the benchmark's `src/main.py`, as files in CLONE/output. What it
-has evaluated before is not evaluated again. HAND has the benchmark's Shadow hand's fingers in its order.
+grasps. Ours, and every K-th of the official ones of each pair of object and scale, go to the benchmark's `src/main.py`, as
+files in CLONE/output. What it has evaluated before is not evaluated again. HAND has the fingers of the benchmark's Shadow hand
+in its order.
 """
 
 from __future__ import annotations
@@ -46,22 +47,28 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True, help="folder of dexgraspbench.py")
     parser.add_argument("--own", default="shadowhand", help="hand of our grasps")
     parser.add_argument("--friction", type=float, nargs="+", default=[0.6, 0.4], help="coefficients; the benchmark's is 0.6")
-    parser.add_argument("--every", type=int, default=1, help="take every K-th grasp of each object and scale")
+    parser.add_argument("--every", type=int, default=1, help="take every K-th official grasp of each object and scale")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     torch.set_num_threads(1)
     rows, found = [], {}
     for source, hand_name in ((OFFICIAL, str(options.clone / "assets/hand/shadow/right_hand.xml")), (OURS, options.own)):
         hand = load_hand(hand_name)
-        pairs = {name: GraspBatch.load(path)[:: options.every] for name, path in stored(options.work, source, hand).items()}
+        files, step = stored(options.work, source, hand), every(source, options)
+        pairs = {name: GraspBatch.load(path)[::step] for name, path in files.items()}
         for friction in options.friction:
             held = here(options.clone, hand, pairs, friction)
             theirs = there(options, source, hand, pairs, friction)
             same = [a == b for a, b in zip(held, theirs, strict=True)]
             rows.append([source, friction, len(held), rate(theirs), rate(held), rate(same)])
             found[f"{source}, {friction:g}"] = {"n": len(held), "official": sum(theirs), "here": sum(held), "same": sum(same)}
-    emit(f"every {options.every}. grasp of each object and scale", rows,
+    emit(f"every {options.every}. official grasp of each object and scale, and ours", rows,
          ["grasps", "friction", "n", "official [%]", "here [%]", "same verdict [%]"], found, options.json)
+
+
+def every(source: str, options: argparse.Namespace) -> int:
+    """Step between the grasps of a source that are taken."""
+    return options.every if source == OFFICIAL else 1
 
 
 def stored(work: Path, source: str, hand: Hand) -> dict[str, Path]:
@@ -91,7 +98,7 @@ def there(options: argparse.Namespace, source: str, hand: Hand, pairs: dict[str,
         (folder / pair).mkdir(parents=True, exist_ok=True)
         made = entries(hand, grasps, str(folders[obj].relative_to(options.clone)), float(scale))
         for i, (entry, original) in enumerate(zip(made, grasps.provenance, strict=True)):
-            files.append(folder / pair / f"{i * options.every}.npy")
+            files.append(folder / pair / f"{i * every(source, options)}.npy")
             if source == OFFICIAL:  # as it is: its wrist moves between the postures, which our grasps do not have
                 shutil.copyfile(options.clone / original, files[-1])
             else:
