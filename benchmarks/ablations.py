@@ -1,10 +1,12 @@
 """Ablations of training: the slim network, trained anew for every row on equally many samples, then evaluated.
 
-    python benchmarks/ablations.py --output FOLDER [--rows ROW ...] [--steps N] [--num N] [--objects NAME ...] [--json]
+    python benchmarks/ablations.py --output FOLDER [--rows ROW ...] [--steps N] [--num N] [--objects NAME ...]
+        [--picture FILE.png] [--json]
 
 Rows are trained in turn and stored in the folder. A rerun, with more rows or after an interruption, does only the missing
 ones; two runs with different rows may share a folder. Every pair of a hand and an object gets the same number of grasps.
-`--objects builtin:test` evaluates on objects by which no configuration was chosen. Needs the development assets.
+`--objects builtin:test` evaluates on objects by which no configuration was chosen. `--picture` draws success against the number
+of training grasps, of those of the rows that have one. Needs the development assets.
 """
 
 from __future__ import annotations
@@ -18,6 +20,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import matplotlib.pyplot as plt
+import numpy as np
 import torch
 from report import ROOT, emit
 from synthesis import HANDS
@@ -26,6 +30,7 @@ from dro_grasp.baselines.ours import DistanceMethod
 from dro_grasp.cli.main import main as command
 from dro_grasp.datasets.bundle.training_file import HELD_OUT_HANDS, Bundle, load_bundle
 from dro_grasp.evaluation.distance_error import distance_errors
+from dro_grasp.evaluation.metrics import wilson_interval
 from dro_grasp.evaluation.rows import ALL
 from dro_grasp.evaluation.success_rates import RAW, REFINED, BenchmarkConfig, benchmark
 from dro_grasp.hands.library import load_hand
@@ -187,6 +192,27 @@ def cells(result: dict[str, Any]) -> list[list[object]]:
     return lines
 
 
+def draw(results: list[dict[str, Any]], folder: Path, path: Path) -> None:
+    """Success against the number of training grasps, over all hands of a row, with 95 % intervals."""
+    figure, ax = plt.subplots(figsize=(6.4, 4.2), layout="constrained")
+    counts = [sum(map(len, (g.joints for g in bundle_of(ROWS[r["row"]], folder).grasps.values()))) for r in results]
+    for stage, style in ((RAW, "--"), (REFINED, "-")):
+        for name, colour in zip(("dro", "strict"), ("tab:blue", "tab:orange"), strict=True):
+            points = []
+            for count, result in sorted(zip(counts, results, strict=True), key=lambda pair: pair[0]):
+                rows = [r for r in result["rows"] if r["stage"] == stage and r["hand"] != ALL]
+                n = sum(r["num"] for r in rows)
+                held = sum(rate[0] * r["num"] for r in rows for label, rate in r["success"].items() if label.startswith(name))
+                points.append((count, *(100 * share for share in (held / n, *wilson_interval(round(held), n)))))
+            x, share, low, high = np.array(points).T
+            ax.errorbar(x, share, (share - low, high - share), fmt=f"o{style}", color=colour, capsize=3,
+                        label=f"{stage}, {name}")
+    ax.set(xscale="log", xlabel="training grasps, over three hands", ylabel="success [%]", ylim=(0, 100))
+    ax.grid(alpha=0.3)
+    ax.legend(loc="upper left")
+    figure.savefig(path, dpi=110)
+
+
 def main(argv: Sequence[str] | None = None) -> None:
     """Train, evaluate and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -195,6 +221,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--steps", type=int, default=800, help="training steps of 16 samples")
     parser.add_argument("--num", type=int, default=10, help="grasps of each hand on each object")
     parser.add_argument("--objects", nargs="+", default=["assets:validate"], help="objects of the trials, such as builtin:test")
+    parser.add_argument("--picture", type=Path, help="draw success against the number of training grasps")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(argv)
     torch.set_num_threads(1)
@@ -207,6 +234,8 @@ def main(argv: Sequence[str] | None = None) -> None:
             result = measured(name, ROWS[name], options.output, options.steps, options.num, options.objects)
             stored.write_text(json.dumps(result))
         results.append(json.loads(stored.read_text()))
+    if options.picture is not None:
+        draw(results, options.output, options.picture)
     columns = ["row", "hand", "n", "dro raw", "strict raw", "dro refined", "strict refined", "diversity", "posterior [mm]",
                "prior [mm]", "nats", "minutes"]
     emit(f"{options.steps} steps of 16 samples, {options.num} grasps of each hand on each of {' '.join(options.objects)}",
