@@ -77,6 +77,8 @@ class Ablation:
     """The shipped weights are trained further, instead of new ones."""
     grasps: int | None = None
     """Grasps of each hand, over all objects, that are trained on; all by default."""
+    pretrained_as: str | None = None
+    """Row whose pretrained encoder and motion are taken; they saw hands in all grasps' postures, without objects."""
     share: float = 1.0
     """Share of the steps of the other rows."""
     view: View = "whole"
@@ -99,7 +101,8 @@ ROWS = {
     "z: motion, flow, 0.001": Ablation(network={"prior": "flow", **MOTION}, losses=LossConfig(divergence=0.001)),
     **{
         f"z: motion, flow, {count} grasps a hand": Ablation(
-            network={"prior": "flow", **MOTION}, losses=LossConfig(divergence=0.0003), grasps=count)
+            network={"prior": "flow", **MOTION}, losses=LossConfig(divergence=0.0003), grasps=count,
+            pretrained_as="z: motion, flow")
         for count in (10, 40, 160, 640)
     },
     "ten hands, wrist axes": Ablation(hands=(*HANDS, *OTHERS), evaluated=HELD_OUT, network={"frame": "wrist"}),
@@ -141,10 +144,12 @@ def trained(name: str, ablation: Ablation, folder: Path, steps: int) -> tuple[Di
     history = [] if initial is None else history_of(locate_weights())
     first = None
     if ablation.pretrained and initial is None:
-        first = pretrain(bundle, network, PretrainConfig(ScheduleConfig(steps=PRETRAINING_STEPS)), folder / f"{place.name}_pre")
+        whole = bundle_of(dataclasses.replace(ablation, grasps=None), folder)
+        stem = (ablation.pretrained_as or name).replace(" ", "_")
+        first = pretrain(whole, network, PretrainConfig(ScheduleConfig(steps=PRETRAINING_STEPS)), folder / f"{stem}_pre")
         if network.latent_form == "motion":
             config = MotionConfig(ScheduleConfig(steps=MOTION_STEPS))
-            first = pretrain_motion(first, bundle, config, folder / f"{place.name}_motion")
+            first = pretrain_motion(first, whole, config, folder / f"{stem}_motion")
     rate = 1e-3 if initial is None else 3e-4
     config = TrainConfig(
         ScheduleConfig(steps=round(ablation.share * steps), learning_rate=rate), ablation.losses,
