@@ -105,10 +105,16 @@ def test_boxes_of_a_cloud_fill_its_cells_and_nothing_else() -> None:
     points = np.random.default_rng(0).uniform(0, 0.06, (300, 3))
     centre, half = occupied(points)
     cells = np.unique(np.floor(points / VOXEL).astype(int), axis=0)
-    assert (2 * half).sum() == pytest.approx(len(cells) * VOXEL)
-    size = np.column_stack([np.full((len(half), 2), VOXEL / 2), half])
-    beyond = (np.abs(points[:, None] - centre) - size).max(-1)
+    assert (2 * half).prod(1).sum() == pytest.approx(len(cells) * VOXEL**3)
+    beyond = (np.abs(points[:, None] - centre) - half).max(-1)
     assert beyond.min(1).max() < 1e-9
+
+
+def test_boxes_of_a_plate_are_one() -> None:
+    x, y = np.meshgrid(np.arange(0.005, 0.3, 0.01), np.arange(0.005, 0.2, 0.01))
+    centre, half = occupied(np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.005)]))
+    np.testing.assert_allclose(centre, [[0.15, 0.1, 0.005]])
+    np.testing.assert_allclose(half, [[0.15, 0.1, 0.005]])
 
 
 def test_hands_that_would_meet_an_obstacle_are_dropped(robot: dro.Robot) -> None:

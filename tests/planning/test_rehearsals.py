@@ -12,7 +12,7 @@ import trimesh
 import dro_grasp as dro
 from dro_grasp.objects.loading import cloud_object
 from dro_grasp.planning.ball_solid import OUTSIDE, ball_solid
-from dro_grasp.planning.candidates import Around, grasps_in_world
+from dro_grasp.planning.candidates import grasps_in_world
 from dro_grasp.planning.physics import MEMORY, LiftScene
 from dro_grasp.planning.plan_config import PlanConfig
 from dro_grasp.planning.planner import LOSES, plan
@@ -70,7 +70,7 @@ def test_an_estimated_object_stands_still_on_the_table(robot: dro.Robot, ball: d
 
 @pytest.fixture(scope="module")
 def grasps(robot: dro.Robot, ball: dro.ObjectModel) -> dro.GraspBatch:
-    return grasps_in_world(dro.GraspPredictor(), robot.hand, ball, np.eye(4), 12, around=Around(0.0))
+    return grasps_in_world(dro.GraspPredictor(), robot.hand, ball, np.eye(4), 12, dro.Constraints(table=0.0))
 
 
 def test_the_chosen_grasp_holds_and_one_that_never_closes_does_not(

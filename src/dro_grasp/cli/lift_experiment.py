@@ -32,6 +32,12 @@ class Tabletop:
     """Which reachable grasps are taken: the best by score, or, as a control, any."""
     directions: Literal["paper", "all"] = "all"
     """Palm directions: `paper`, from above to the right side, or `all`."""
+    direction: Annotated[tuple[float, float, float] | None, optional("X Y Z", "any direction")] = None
+    """Palm direction in the world frame: 0 0 -1 grasps from above. Palms tilt towards the table as far as hands need room."""
+    cone: Annotated[float | None, optional("RAD", "roughly along the direction")] = None
+    """Largest angle [rad] between palm direction and --direction; palms are spread evenly within it."""
+    opening: Annotated[float | None, optional("M", "a quarter of what is left")] = None
+    """Least distance [m] between the object and every link that closes, in pregrasp."""
     num: int = 24
     """Grasps to choose from, in each of up to three batches."""
     rehearsals: int = 8
@@ -60,6 +66,7 @@ class Tabletop:
     def run(self) -> int:
         """Run what is missing, store and print."""
         from dro_grasp.objects.catalogue import resolve_objects
+        from dro_grasp.pipeline.constraints import Constraints
         from dro_grasp.planning.animation import check_animation, draw_attempt
         from dro_grasp.planning.attempts import TabletopConfig
         from dro_grasp.planning.extra import require_arm_extra
@@ -71,7 +78,9 @@ class Tabletop:
             check_animation(self.video)
         config = TabletopConfig(
             self.see, self.noise, clutter=self.clutter, segment=self.segment,
-            plan=PlanConfig(self.num, directions=self.directions, order=self.order, rehearsals=self.rehearsals))
+            plan=PlanConfig(
+                self.num, directions=self.directions, order=self.order, rehearsals=self.rehearsals,
+                constraints=Constraints(self.direction, cone=self.cone, opening=self.opening)))
         run = TabletopRun(
             self.robot, tuple(resolve_objects(list(self.objects))), self.attempts, self.seed, self.weights, config)
         done = run_tabletop(run, self.output, self.workers, None if self.json else _say, self.plans)

@@ -19,7 +19,7 @@ from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.objects.in_memory import ObjectSource, geometry_in_memory
 from dro_grasp.objects.loading import FARTHEST, read_geometry
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.objects.surface_distances import banded_values, signed_distances
+from dro_grasp.objects.surface_distances import banded_values, search_tree, signed_distances
 
 SPACING = 0.005
 """Spacing of the grid of distances to a scene [m] (ours)."""
@@ -133,13 +133,20 @@ def load_scene(source: ObjectSource, name: str | None = None, scale: float = 1.0
         raise ObjectError(f"{origin} has coordinates of up to {np.abs(points).max():.3g} m; divide millimetres by 1000 "
                           f"(scale), and leave out what is farther away than {FARTHEST:g} m")
     if faces is None:
-        points = points[np.unique(np.floor(points / CELL).astype(np.int64), axis=0, return_index=True)[1]]
+        points = points[one_per_cell(points, CELL)]
     return Scene(label, points, faces)
+
+
+def one_per_cell(points: Float[np.ndarray, "n 3"], edge: float) -> Int[np.ndarray, " k"]:
+    """Which of some points to keep so that each cube of this edge [m] keeps one."""
+    cells = np.floor(points / edge).astype(np.int64)
+    cells -= cells.min(0)
+    return np.unique(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(0) + 1)), return_index=True)[1]
 
 
 def _ball_distances(points: Float[np.ndarray, "n 3"]) -> Any:
     """Distances to balls around points; they overlap those of their neighbours."""
-    tree = KDTree(points)
+    tree = search_tree(points)
     apart = tree.query(points, k=min(4, len(points)))[0][:, -1] if len(points) > 1 else np.zeros(1)
     radius = min(float(np.median(apart)) / 2, MARGIN / 3)
     return lambda places: tree.query(places)[0] - radius

@@ -26,6 +26,8 @@ SURE = 0.003
 """Distance from a cloud up to which the disc around the nearest point tells inside from outside [m] (ours)."""
 MOSTLY_INSIDE = 0.4
 """Winding number above which a place farther away is inside (ours): 1/2 where a side of the object is missing."""
+LEAF = 32
+"""Points of a leaf of a search tree (ours): half the time that 10 take."""
 DISC_NEIGHBOURS = 7
 """Points of a bare cloud within the disc around each point, itself included (ours)."""
 
@@ -76,6 +78,15 @@ def _places(low: Float[np.ndarray, "3"], counts: Int[np.ndarray, "3"], spacing: 
     return low + spacing * np.indices(tuple(counts)).reshape(3, -1).T
 
 
+def search_tree(points: Float[np.ndarray, "n 3"]) -> KDTree:
+    """For the nearest of some points, from places that may be far from all of them.
+
+    Nodes keep the whole of their cells: those that shrink to their points lie alike far before a flat surface, and the search
+    visits most of them, which takes ten times as long.
+    """
+    return KDTree(points, leafsize=LEAF, compact_nodes=False)
+
+
 def cloud_distances(
     cloud: Float[np.ndarray, "m 3"], normals: Float[np.ndarray, "m 3"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, " n"]:
@@ -83,7 +94,7 @@ def cloud_distances(
 
     Discs are perpendicular to the normals and extend to the neighbours: they close the surface and leave its rims open.
     """
-    tree = KDTree(cloud)
+    tree = search_tree(cloud)
     some = cloud[:: max(1, len(cloud) // 256)]
     reach = float(np.median(tree.query(some, k=min(DISC_NEIGHBOURS, len(cloud)))[0][:, -1]))
     index = tree.query(points)[1]

@@ -50,8 +50,8 @@ def permitted(problem: GraspProblem, grasps: GraspBatch) -> Bool[Tensor, " n"]:
     kept = torch.ones(len(grasps), dtype=torch.bool)
     if not len(grasps):
         return kept
-    for faults in _faults(problem, grasps, apart=False).values():
-        kept &= ~faults
+    for wrong in faults(problem, grasps, apart=False).values():
+        kept &= ~wrong
     return kept
 
 
@@ -61,14 +61,14 @@ def reasons_against(problem: GraspProblem, grasps: GraspBatch) -> Counter[str]:
     left = torch.ones(len(grasps), dtype=torch.bool)
     if not len(grasps):
         return counted
-    for reason, faults in _faults(problem, grasps, apart=True).items():
-        counted[reason] += int((faults & left).sum())
-        left &= ~faults
+    for reason, wrong in faults(problem, grasps).items():
+        counted[reason] += int((wrong & left).sum())
+        left &= ~wrong
     return +counted
 
 
-def _faults(problem: GraspProblem, grasps: GraspBatch, apart: bool) -> dict[str, Bool[Tensor, " n"]]:
-    """Which grasps violate what; with `apart`, table, scene and spared places one by one."""
+def faults(problem: GraspProblem, grasps: GraspBatch, apart: bool = True) -> dict[str, Bool[Tensor, " n"]]:
+    """Which complete grasps do not respect the constraints, by reason; with `apart`, table, scene and spared places apart."""
     found, constraints = {}, problem.constraints
     if problem.surroundings is not None:
         parts = problem.surroundings.parts if apart else {"obstacles": problem.surroundings}

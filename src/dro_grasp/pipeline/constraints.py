@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
+import numpy as np
 import torch
+from jaxtyping import Float
 
 from dro_grasp.energy.grasp_energy import Room
 from dro_grasp.energy.surroundings import Surroundings
@@ -21,6 +23,8 @@ UPRIGHT = math.cos(math.radians(5.0))
 """Least cosine between z and the normal of a table whose height along z is given (ours)."""
 SIDEWAYS = 0.1
 """Least such cosine of a plane that has a height at all (ours)."""
+TILTED = 1e-6
+"""Largest deviation of a z axis that points upwards (ours)."""
 LARGEST_OPENING = 0.2
 """Largest opening that is accepted [m] (ours)."""
 MOST_BALLS = 1000
@@ -80,6 +84,22 @@ class Constraints:
             raise OptionError(f"opening is {self.opening}; give metres, above 0 and at most {LARGEST_OPENING:g}: 0.01 for 1 cm")
         for name, balls in (("hold", self.hold), ("spare", self.spare)):
             _check_balls(name, balls)
+
+    def moved(self, T: Float[np.ndarray, "4 4"]) -> Constraints:
+        """The same in another frame, of which T is the motion from this one's coordinates to its own [m].
+
+        Raises:
+            OptionError: There is a table, and the other frame's z axis points elsewhere.
+        """
+        R, t = T[:3, :3], T[:3, 3]
+        if self.table is not None and abs(T[2, 2] - 1) > TILTED:
+            raise OptionError("table is a height along z, and the other frame's z axis points elsewhere; leave out table, or "
+                              "turn the frame")
+        hold, spare = (tuple((*(R @ ball[:3] + t).tolist(), ball[3]) for ball in balls) for balls in (self.hold, self.spare))
+        return replace(
+            self, direction=None if self.direction is None else tuple((R @ self.direction).tolist()),
+            table=None if self.table is None else self.table + float(t[2]),
+            avoid=None if self.avoid is None else self.avoid.moved(T), hold=hold, spare=spare)
 
     def require_fit(self, obj: ObjectModel) -> None:
         """Refuse what leaves nothing of this object to grasp.

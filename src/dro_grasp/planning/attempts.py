@@ -15,6 +15,7 @@ from dro_grasp.errors import DroGraspError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.scan import depth_points
+from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.planning.clutter import MOST_CLUTTER, Region, other_objects, scatter
 from dro_grasp.planning.depth_images import depth_image, thinned_intrinsics
 from dro_grasp.planning.motion import STAGES, MotionPlan
@@ -66,14 +67,21 @@ class TabletopConfig:
         """Refuse what cannot be set up.
 
         Raises:
-            OptionError: Too many other objects, or fewer than none.
+            OptionError: Too many other objects, or fewer than none, or constraints on places.
         """
+        wanted = self.plan.constraints
+        if wanted.avoid is not None or wanted.hold or wanted.spare:
+            raise OptionError("objects of attempts come to rest anywhere, so that avoid, hold and spare say nothing there; "
+                              "leave them out, or use dro_grasp.plan for one object in its place")
         if not 0 <= self.clutter <= MOST_CLUTTER:
             raise OptionError(f"clutter is {self.clutter}; give a number of other objects from 0 to {MOST_CLUTTER}")
 
     def label(self) -> str:
         """Version and every setting, as stored with results: results of other settings are not mixed."""
-        return LABEL + json.dumps(asdict(self), sort_keys=True)
+        values = asdict(self)
+        if self.plan.constraints == Constraints():
+            del values["plan"]["constraints"]  # results from before there were any are of the same settings
+        return LABEL + json.dumps(values, sort_keys=True)
 
     @staticmethod
     def from_label(label: str) -> TabletopConfig:
@@ -85,7 +93,11 @@ class TabletopConfig:
         try:
             values = json.loads(label.removeprefix(LABEL))
             reach = ReachConfig(**values["plan"].pop("reach"))
-            config = TabletopConfig(**values | {"plan": PlanConfig(**values["plan"], reach=reach),
+            wanted = values["plan"].pop("constraints", {})
+            direction = wanted.get("direction")
+            constraints = Constraints(
+                None if direction is None else tuple(direction), cone=wanted.get("cone"), opening=wanted.get("opening"))
+            config = TabletopConfig(**values | {"plan": PlanConfig(**values["plan"], reach=reach, constraints=constraints),
                                                 "region": tuple(values["region"])})
         except (ValueError, TypeError, KeyError) as error:
             raise OptionError(f"the attempt was made by another version of dro-grasp ({label.split(' ')[0]}), and cannot be "

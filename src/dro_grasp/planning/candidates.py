@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -15,7 +14,6 @@ from torch import Tensor
 from dro_grasp.devices import fast_products, side_by_side
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
-from dro_grasp.objects.scenery import load_scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem
@@ -41,19 +39,9 @@ def paper_directions(count: int) -> Float[Tensor, "k 3"]:
     return every[torch.linspace(0, len(every) - 1, min(count, len(every))).round().long()]
 
 
-@dataclass(frozen=True)
-class Around:
-    """What the hand stays clear of, in the world."""
-
-    table: float | None = None
-    """Height of a table, which the hand stays above [m]."""
-    obstacles: Sequence[ObjectModel] = ()
-    """Further things."""
-
-
 def grasps_in_world(
     predictor: GraspPredictor, hand: Hand, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"], num: int,
-    directions: Directions = "all", around: Around = Around(), seed: int = 0,
+    wanted: Constraints, directions: Directions = "all", seed: int = 0,
 ) -> GraspBatch:
     """Refined grasps with scores, the best first; their frame is the world's.
 
@@ -63,32 +51,30 @@ def grasps_in_world(
         obj: What is grasped; its z axis points up.
         T_world_object: Where it stands [m].
         num: How many.
-        directions: Which palm directions.
-        around: What the hand stays clear of.
+        wanted: What they have to respect, in the world's frame.
+        directions: Which palm directions, where none is wanted.
         seed: The same seed gives the same grasps.
     """
     T = torch.from_numpy(T_world_object).float()
-    height = None if around.table is None else around.table - float(T[2, 3])
-    wanted = [None] * min(num, PARTS) if directions == "all" else [
-        (x, y, z) for x, y, z in (paper_directions(num) @ T[:3, :3]).tolist()]
-    avoid = None
-    if around.obstacles:
-        scene = load_scene(np.concatenate([thing.cloud for thing in around.obstacles]), "obstacles")
-        avoid = scene.moved(np.linalg.inv(T_world_object))
-    seeds = np.random.default_rng(seed).integers(2**31, size=len(wanted)).tolist()
+    wanted = wanted.moved(np.linalg.inv(T_world_object))
+    problem = GraspProblem(hand, obj, predictor.device, wanted)
+    problem.field  # noqa: B018  (made once, with what is to be avoided, before the threads share it)
+    parts = [problem] * min(num, PARTS) if directions == "all" else [
+        replace(problem, constraints=replace(wanted, direction=(x, y, z)))
+        for x, y, z in (paper_directions(num) @ T[:3, :3]).tolist()]
+    seeds = np.random.default_rng(seed).integers(2**31, size=len(parts)).tolist()
 
     # no_grad, not inference_mode: roma caches a tensor at first use, which training could then not use.
     @torch.no_grad()
     def made(i: int) -> GraspBatch:
-        problem = GraspProblem(hand, obj, predictor.device, Constraints(wanted[i], height, avoid=avoid))
-        count = num * (i + 1) // len(wanted) - num * i // len(wanted)
+        problem = parts[i]
+        count = num * (i + 1) // len(parts) - num * i // len(parts)
         generator = torch.Generator().manual_seed(seeds[i])
         proposed = propose(problem, predictor.network, count, generator, predictor.config).grasps
         return scored(problem, refine(problem, proposed))
 
-    obj.distance_field  # noqa: B018  (made once, before the threads share it)
     with fast_products():
-        ranked = GraspBatch.concatenate(side_by_side(made, range(len(wanted)))).sorted_by_score()
+        ranked = GraspBatch.concatenate(side_by_side(made, range(len(parts)))).sorted_by_score()
     return ranked.replace(T_object_wrist=T @ ranked.T_object_wrist)
 
 

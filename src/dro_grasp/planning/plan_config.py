@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from dro_grasp.errors import OptionError
+from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.planning.candidates import Directions
 from dro_grasp.planning.reachability import ReachConfig
 
@@ -20,6 +21,8 @@ class PlanConfig:
     """Reachable grasps of best score that are given to the planner at once. Source: paper, real-robot experiment."""
     directions: Directions = "all"
     """Palm directions: `paper`, from above to the right side, or `all` that a table leaves room for."""
+    constraints: Constraints = field(default_factory=Constraints)
+    """What grasps have to respect, in the world's frame; the scene to avoid, the arm too. The table is the robot's."""
     order: Literal["score", "random"] = "score"
     """Which reachable grasps are taken: the best by score, or any, as a control."""
     rounds: int = 3
@@ -47,8 +50,12 @@ class PlanConfig:
         """Refuse what cannot be done.
 
         Raises:
-            OptionError: A number is not positive.
+            OptionError: A number is not positive, or something is stated twice.
         """
+        if self.constraints.table is not None:
+            raise OptionError("the table is the robot's: state its height in the robot file, and not in constraints")
+        if self.constraints.direction is not None and self.directions != "all":
+            raise OptionError(f"both direction and directions '{self.directions}' say whence to grasp; leave out one of them")
         for name in ("num", "top", "rounds", "batches", "planner_seconds"):
             if getattr(self, name) <= 0:
                 raise OptionError(f"{name} is {getattr(self, name)}; give a number above 0")

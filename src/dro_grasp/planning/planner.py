@@ -4,23 +4,30 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from dro_grasp.devices import Stopwatch
 from dro_grasp.errors import PlanError, RobotError
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.objects.scenery import load_scene
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.planning.candidates import Around, grasps_in_world
-from dro_grasp.planning.collisions import TARGET, CollisionChecker, open_hand
+from dro_grasp.pipeline.admission import BESIDE, NARROW, SPARED, TURNED, faults
+from dro_grasp.pipeline.constraints import Constraints
+from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.planning.candidates import grasps_in_world
+from dro_grasp.planning.collisions import OBSTACLE, TARGET, CollisionChecker, open_hand
 from dro_grasp.planning.extra import require_arm_extra
 from dro_grasp.planning.motion import CHOSEN, READY, WAITING, MotionPlan, PlanNotes, PlanScene, dropped_in_words
 from dro_grasp.planning.plan_config import PlanConfig
 from dro_grasp.planning.reachability import Feasible, Postures, Reachability
 from dro_grasp.planning.rehearsal import Rehearsal
 from dro_grasp.planning.robot import Robot
-from dro_grasp.planning.standing import upright
+from dro_grasp.planning.scene_solids import scene_solid
+from dro_grasp.planning.standing import moved, upright
 from dro_grasp.planning.timed_stages import timed_stages
 from dro_grasp.predictor import GraspPredictor
 
@@ -44,7 +51,7 @@ def plan(
         robot: Arm, hand and table.
         obj: A mesh, or a camera's cloud.
         T_world_object: Where it stands [m]; its frame is the world's by default.
-        obstacles: Further things, in the world's frame.
+        obstacles: Further things, in the world's frame, that nothing may touch.
         predictor: Proposes grasps; the default weights if omitted.
         config: How to plan.
         seed: Of grasps, inverse kinematics and planner; where the planner's time suffices, the same seed gives the same plan.
@@ -54,7 +61,7 @@ def plan(
         PlanError: The object collides with the robot, lies below the table, or no grasp can be carried out; the message
             counts what was dropped where.
         RobotError: The robot collides at home.
-        OptionError: The extra `[arm]` is not installed.
+        OptionError: The extra `[arm]` is not installed, or the constraints leave nothing of the object.
     """
     require_arm_extra()
     task = _Task(robot, obj, np.eye(4) if T_world_object is None else T_world_object, obstacles, config or PlanConfig(), seed)
@@ -65,8 +72,8 @@ def plan(
         if predictor is not None:
             with task.watch("grasps"):
                 grasps = grasps_in_world(
-                    predictor, robot.hand, task.obj, task.T_world_object, task.config.num, task.config.directions,
-                    Around(task.height, obstacles), seed + batch * BATCH_SEED)
+                    predictor, robot.hand, task.obj, task.T_world_object, task.config.num, task.wanted(),
+                    task.config.directions, seed + batch * BATCH_SEED)
         assert grasps is not None
         task.add(grasps)
         if (made := task.run(last=batch == batches - 1)) is not None:
@@ -81,8 +88,12 @@ class _Task:
         self, robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"], obstacles: Sequence[ObjectModel],
         config: PlanConfig, seed: int,
     ) -> None:
-        self.robot, self.obstacles, self.config, self.seed = robot, obstacles, config, seed
+        self.robot, self.config, self.seed = robot, config, seed
         self.obj, self.T_world_object = upright(obj, T_world_object)
+        avoid, self.constraints = config.constraints.avoid, replace(config.constraints, avoid=None)
+        base = robot.T_world_base[:3, 3]
+        obstacles = [*obstacles, *(scene_solid(avoid, base, robot.longest_reach) if avoid is not None else ())]
+        self.obstacles = obstacles
         self.watch = Stopwatch("grasps", "reach", "rehearsal", "path", "timing")
         self.checker = CollisionChecker(robot, robot.table, obstacles, self.obj, self.T_world_object)
         self.height = None if robot.table is None else robot.table.height
@@ -111,7 +122,9 @@ class _Task:
         return dict(Counter(self.reach.reasons.values()))
 
     def check_start(self) -> None:
-        """Refuse a robot or an object that stands in the way of each other from the start."""
+        """Refuse robot and object that are in each other's way from the start, and constraints that leave nothing to grasp."""
+        if self.config.constraints != Constraints():
+            self.config.constraints.require_fit(moved(self.obj, self.T_world_object))
         top = float((self.obj.cloud @ self.T_world_object[2, :3]).max() + self.T_world_object[2, 3])
         if self.height is not None and top <= self.height:
             raise PlanError(f"object '{self.obj.name}' ends at z = {top:.3f} m, below the table at {self.height:.3f} m; give "
@@ -127,11 +140,18 @@ class _Task:
             raise RobotError(f"robot '{self.robot.name}' collides at home: {contact.first} and {contact.second}, by "
                              f"{-1e3 * contact.distance:.1f} mm; `dro-grasp robot check` shows it")
 
+    def wanted(self) -> Constraints:
+        """What grasps have to respect, in the world's frame: constraints, table and obstacles."""
+        clouds = [thing.cloud for thing in self.obstacles]
+        scene = load_scene(np.concatenate(clouds), OBSTACLE) if clouds else None
+        return replace(self.constraints, table=self.height, avoid=scene)
+
     def add(self, grasps: GraspBatch) -> None:
         """Further grasps to choose from."""
         first = sum(len(part) for part in self.parts)
         self.parts.append(grasps)
         with self.watch("reach"):
+            self._drop_forbidden(grasps, first)
             self.waiting += self.reach.promising(grasps, first) + [goal.index for goal in self.goals]
         self.known, self.goals = {goal.index: goal for goal in self.goals}, []
         if self.config.order == "random":
@@ -139,6 +159,17 @@ class _Task:
         else:
             score = self.grasps.score.tolist()
             self.waiting.sort(key=lambda i: -score[i])
+
+    def _drop_forbidden(self, grasps: GraspBatch, first: int) -> None:
+        """Drop those that do not respect the constraints; table and obstacles are the arm's affair."""
+        if self.constraints == Constraints():
+            return
+        T = np.linalg.inv(self.T_world_object)
+        problem = GraspProblem(self.robot.hand, self.obj, constraints=self.constraints.moved(T))
+        there = grasps.replace(T_object_wrist=torch.from_numpy(T).float() @ grasps.T_object_wrist)
+        for reason, wrong in faults(problem, there).items():
+            for row in wrong.nonzero()[:, 0].tolist():
+                self.reach.reasons.setdefault(first + row, reason)
 
     def run(self, last: bool) -> MotionPlan | None:
         """The plan for the best grasps that work; None if none does, or is trusted and these are not the last ones."""
@@ -238,5 +269,7 @@ class _Task:
 
     def advice(self) -> str:
         reason = max(self.dropped, key=lambda r: self.dropped[r], default="")
+        if reason in (TURNED, SPARED, BESIDE, NARROW):
+            return f"most grasps are {reason}; relax cone, hold, spare or opening, or ask for more grasps (--num)"
         return (f"the object stands {self._distance():.2f} m from the base, and most grasps are {reason}; move the object, ask "
                 "for more grasps (--num), or for other palm directions (--directions)")

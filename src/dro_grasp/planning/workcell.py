@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 
+from dro_grasp.objects.scenery import one_per_cell
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.robot_file import Table
@@ -68,7 +69,7 @@ def add_solids(scene: mujoco.MjSpec, body: mujoco.MjsBody, things: Sequence[Obje
     for i, thing in enumerate(things):
         if thing.is_cloud and not hull:
             for centre, half in zip(*occupied(thing.cloud.astype(np.float64)), strict=True):
-                body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[VOXEL / 2, VOXEL / 2, half], pos=centre)
+                body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=half, pos=centre)
             continue
         corners = [thing.cloud] if thing.is_cloud else [vertices for vertices, _ in thing.parts]
         for j, vertices in enumerate(corners):
@@ -77,9 +78,16 @@ def add_solids(scene: mujoco.MjSpec, body: mujoco.MjsBody, things: Sequence[Obje
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name)
 
 
-def occupied(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, " k"]]:
-    """Centres and half heights [m] of upright boxes that together are the cells of size VOXEL that hold a point."""
-    cells = np.unique(np.floor(points / VOXEL).astype(int), axis=0)  # sorted, so that those above each other follow
-    starts = np.flatnonzero(np.r_[True, (np.diff(cells, axis=0) != (0, 0, 1)).any(1)])
-    ends = np.r_[starts[1:], len(cells)] - 1
-    return (cells[starts] + cells[ends] + 1) * (VOXEL / 2), (ends - starts + 1) * (VOXEL / 2)
+def occupied(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
+    """Centres and half edges [m] of boxes that together are the cells of size VOXEL that hold a point."""
+    low = np.floor(points[one_per_cell(points, VOXEL)] / VOXEL).astype(int)
+    high = low + 1
+    for axis in (2, 1, 0):  # boxes next to each other along an axis, and alike in the others, become one
+        alike = np.delete(np.concatenate([low, high], 1), (axis, axis + 3), axis=1)
+        order = np.lexsort((low[:, axis], *alike.T))
+        low, high, alike = low[order], high[order], alike[order]
+        apart = (alike[1:] != alike[:-1]).any(1) | (low[1:, axis] != high[:-1, axis])
+        first = np.flatnonzero(np.r_[True, apart])
+        last = np.r_[first[1:], len(low)] - 1
+        low, high = low[first], np.where(np.arange(3) == axis, high[last], high[first])
+    return (low + high) * (VOXEL / 2), (high - low) * (VOXEL / 2)
