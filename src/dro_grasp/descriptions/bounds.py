@@ -26,6 +26,8 @@ MOST_BYTES = 20_000_000
 """Largest description [bytes] (ours)."""
 MOST_PIXELS = 10_000
 """Most pixels of a generated texture along each side (ours)."""
+MOST_DIVISIONS = 200.0
+"""Most divisions of a generated mesh in each direction (ours); 10,000 would take a minute and 7 GB."""
 UNUSED = {"composite", "flexcomp", "flex", "hfield", "skin", "plugin"}
 """Elements of MJCF that no rigid hand has, and that can grow without limit (ours)."""
 LONGEST = 10.0
@@ -64,6 +66,9 @@ def check_elements(root: ET.Element, path: Path) -> None:
             raise HandError(f"{path} has <{element.tag}>, which is no part of a rigid hand; remove it")
         if element.tag == "texture" and max(_whole(element, "width"), _whole(element, "height")) > MOST_PIXELS:
             raise HandError(f"{path} has a <texture> wider or higher than {MOST_PIXELS} pixels; remove it")
+        if element.tag == "mesh" and "builtin" in element.attrib and not _largest(element, "params") <= MOST_DIVISIONS:
+            raise HandError(f"{path} has a built-in <mesh> of params=\"{element.get('params', '')[:40]}\"; expected numbers of at "
+                            f"most {MOST_DIVISIONS:g}; divide it less, or give a file")
         times *= max(1, _whole(element, "count")) if element.tag == "replicate" else 1
         waiting.extend((child, depth + 1, times) for child in element)
 
@@ -74,6 +79,14 @@ def _whole(element: ET.Element, attribute: str) -> int:
         return int(element.get(attribute, "0"))
     except ValueError:
         return 0
+
+
+def _largest(element: ET.Element, attribute: str) -> float:
+    """The largest number in an attribute; 0 where there is none, which is left to MuJoCo."""
+    try:
+        return max(map(float, element.get(attribute, "").split()), default=0.0)
+    except ValueError:
+        return 0.0
 
 
 def check_numbers(model: mujoco.MjModel, path: Path) -> None:
