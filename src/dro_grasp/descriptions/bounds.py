@@ -67,8 +67,8 @@ def check_elements(root: ET.Element, path: Path) -> None:
         if element.tag == "texture" and max(_whole(element, "width"), _whole(element, "height")) > MOST_PIXELS:
             raise HandError(f"{path} has a <texture> wider or higher than {MOST_PIXELS} pixels; remove it")
         if element.tag == "mesh" and "builtin" in element.attrib and not _largest(element, "params") <= MOST_DIVISIONS:
-            raise HandError(f"{path} has a built-in <mesh> of params=\"{element.get('params', '')[:40]}\"; expected numbers of at "
-                            f"most {MOST_DIVISIONS:g}; divide it less, or give a file")
+            raise HandError(f"{path} has a built-in <mesh> of params=\"{element.get('params', '')[:40]}\"; expected numbers "
+                            f"of at most {MOST_DIVISIONS:g}; divide it less, or give a file")
         times *= max(1, _whole(element, "count")) if element.tag == "replicate" else 1
         waiting.extend((child, depth + 1, times) for child in element)
 
