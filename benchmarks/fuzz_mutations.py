@@ -56,6 +56,8 @@ ELEMENTS = (
 
 NESTED = "nested"
 """Tag of an element in whose place others are nested deeply (ours)."""
+LONGEST_TEXT = 10**8
+"""Most characters that the repetitions of a line may have (ours); readers refuse files of twice that."""
 
 
 def damage_bytes(rng: random.Random, data: bytes) -> bytes:
@@ -95,7 +97,7 @@ def damage_text(rng: random.Random, text: str) -> str:
             text = text[:start] + rng.choice(NUMBERS + NAMES) + text[end:]
         elif lines and len(text) < 10**6:
             i = rng.randrange(len(lines))
-            lines[i : i + 1] = [] if kind == 4 else [lines[i]] * rng.choice((2, 20, 1000))
+            lines[i : i + 1] = [] if kind == 4 else [lines[i]] * min(rng.choice((2, 20, 1000)), LONGEST_TEXT // len(lines[i]))
             text = "".join(lines)
     return text
 
