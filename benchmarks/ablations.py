@@ -133,7 +133,7 @@ def bundle_of(ablation: Ablation, folder: Path) -> Bundle:
     return Bundle(bundle.hands, bundle.objects, fewer)
 
 
-def trained(name: str, ablation: Ablation, folder: Path, steps: int) -> tuple[DistanceNetwork, float]:
+def trained(name: str, ablation: Ablation, folder: Path, steps: int, mixed: bool) -> tuple[DistanceNetwork, float]:
     """The row's network and the seconds that its training took; its run folder lets it resume after an interruption."""
     begin = time.perf_counter()
     if ablation.grasps == 0:
@@ -152,7 +152,7 @@ def trained(name: str, ablation: Ablation, folder: Path, steps: int) -> tuple[Di
             first = pretrain_motion(first, whole, config, folder / f"{stem}_motion")
     rate = 1e-3 if initial is None else 3e-4
     config = TrainConfig(
-        ScheduleConfig(steps=round(ablation.share * steps), learning_rate=rate), ablation.losses,
+        ScheduleConfig(steps=round(ablation.share * steps), learning_rate=rate, mixed=mixed), ablation.losses,
         AugmentationConfig(partial=ablation.partial))
     network = network if initial is None else initial.config
     model = train(bundle, network, config, place, first, name=name, initial=initial)
@@ -161,12 +161,13 @@ def trained(name: str, ablation: Ablation, folder: Path, steps: int) -> tuple[Di
     return model, time.perf_counter() - begin
 
 
-def measured(name: str, ablation: Ablation, folder: Path, steps: int, num: int, object_names: list[str]) -> dict[str, Any]:
+def measured(name: str, options: argparse.Namespace) -> dict[str, Any]:
     """Train and evaluate one row."""
-    model, seconds = trained(name, ablation, folder, steps)
+    ablation, folder = ROWS[name], options.output
+    model, seconds = trained(name, ablation, folder, options.steps, options.mixed)
     predictor = GraspPredictor(str(folder / f"{name.replace(' ', '_')}.safetensors"))
-    objects = [load_object(o) for o in resolve_objects(object_names)]
-    config = BenchmarkConfig(num, (RAW, REFINED), (protocol("dro"), protocol("strict")), view=ablation.view)
+    objects = [load_object(o) for o in resolve_objects(options.objects)]
+    config = BenchmarkConfig(options.num, (RAW, REFINED), (protocol("dro"), protocol("strict")), view=ablation.view)
     rows = benchmark([load_hand(h) for h in ablation.evaluated], objects, [DistanceMethod(predictor)], config)
     errors = []
     if set(ablation.evaluated) <= set(HANDS):
@@ -226,6 +227,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--steps", type=int, default=800, help="training steps of 16 samples")
     parser.add_argument("--num", type=int, default=10, help="grasps of each hand on each object")
     parser.add_argument("--objects", nargs="+", default=["assets:validate"], help="objects of the trials, such as builtin:test")
+    parser.add_argument("--mixed", action="store_true", help="train with bfloat16 products, where the processor has them")
     parser.add_argument("--picture", type=Path, help="draw success against the number of training grasps")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(argv)
@@ -236,7 +238,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         where = "" if options.objects == ["assets:validate"] else f" on {' '.join(options.objects)}"
         stored = options.output / f"{f'{name}{where}'.replace(' ', '_')}.json"
         if not stored.exists():
-            result = measured(name, ROWS[name], options.output, options.steps, options.num, options.objects)
+            result = measured(name, options)
             stored.write_text(json.dumps(result))
         results.append(json.loads(stored.read_text()))
     if options.picture is not None:
