@@ -19,6 +19,7 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.viewer.pictures import CAPTION, HEADER, TILE
 from dro_grasp.viewer.studio import StudioServer
 from tests.helpers.browser import free_port
+from tests.helpers.served_studio import visited
 
 
 @pytest.fixture(scope="module")
@@ -62,8 +63,10 @@ def test_view_takes_a_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr("dro_grasp.viewer.stage.serve", servers.append)
     for more in ([], ["--object", "sphere"]):
         assert main(["view", str(folder), "--port", str(free_port()), *more]) == 0
-    first, second = pages = [server._make(server.server, server._turn) for server in servers]  # as for a browser
     try:
+        for server in servers:
+            visited(server, 1)
+        first, second = (server.studios[0] for server in servers)
         assert (first.made.obj.name, len(first.made.refined)) == ("can", 2)
         assert (second.made.obj.name, len(second.made.refined)) == ("sphere", 3)
         assert {"can", "sphere"} <= set(first.object.options)
@@ -73,8 +76,7 @@ def test_view_takes_a_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> N
         assert len(first.made.refined) == 3, "the other object's grasps can be picked"
         assert "not evaluated" in first.status.content
     finally:
-        for page, server in zip(pages, servers, strict=True):
-            page.close()
+        for server in servers:
             server.stop()
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dro_grasp.geometry.table_plane import THICKNESS, above_plane, table_plane
+from dro_grasp.geometry.table_plane import THICKNESS, above_plane, largest_plane, table_plane
 from dro_grasp.objects.catalogue import load_object
 
 
@@ -57,3 +57,19 @@ def test_too_little_is_no_table() -> None:
     rng = np.random.default_rng(0)
     flat = np.column_stack([rng.uniform(-0.2, 0.2, (500, 2)), np.zeros(500)])
     assert table_plane(flat) is None, "nothing stands on it"
+
+
+def test_the_largest_plane_is_level_where_that_is_asked() -> None:
+    rng = np.random.default_rng(0)
+    wall = np.column_stack([rng.normal(0.3, 0.001, 2000), rng.uniform(-0.5, 0.5, (2000, 2))])
+    tilted = np.column_stack([rng.uniform(-0.5, 0.5, (1000, 2)), rng.normal(0, 0.001, 1000)])
+    tilted[:, 2] += 0.1 + 0.1 * tilted[:, 1]
+    points = np.concatenate([wall, tilted])
+    by_hand = np.linalg.lstsq(np.c_[tilted[:, :2], np.ones(1000)], tilted[:, 2], rcond=None)[0]
+    expected = np.array([-by_hand[0], -by_hand[1], 1, by_hand[2]]) / np.linalg.norm([*by_hand[:2], 1])
+    upright, level = largest_plane(points, 0.005), largest_plane(points, 0.005, steepest=0.2)
+    assert upright is not None
+    assert level is not None
+    assert np.abs(upright[:3]) @ [1, 0, 0] > 0.9999
+    assert np.allclose(level, expected, atol=1e-3)
+    assert largest_plane(np.zeros((2, 3)), 0.005) is None

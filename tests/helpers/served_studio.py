@@ -1,14 +1,17 @@
-"""The page that makes grasps, without a browser."""
+"""The page that makes grasps, without a browser, or with what a page needs of one."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
+
+import viser
 
 from dro_grasp.predictor import GraspPredictor
 from dro_grasp.viewer.stage import HOST, ServedPage
-from dro_grasp.viewer.studio import Studio
+from dro_grasp.viewer.studio import Studio, StudioServer
 from tests.helpers.browser import free_port
 from tests.helpers.weights import untrained_weights
 
@@ -23,3 +26,23 @@ def served_studio(folder: Path) -> Iterator[Studio]:
     finally:
         studio.close()
         served.stop()
+
+
+class Browser(viser.ClientHandle):
+    """What a page needs of a browser: a number, a camera, and controls and a scene."""
+
+    def __init__(self, number: int, server: viser.ViserServer) -> None:
+        self.client_id, self.gui, self.scene, self._server = number, server.gui, server.scene, server
+        self.camera = SimpleNamespace(aspect=1.5)  # type: ignore[assignment]
+
+    def atomic(self):
+        return self._server.atomic()
+
+
+def visited(served: StudioServer, count: int) -> list[Browser]:
+    """Browsers that have opened their pages."""
+    browsers = [Browser(number, served.server) for number in range(count)]
+    served.server.get_clients = lambda: {b.client_id: b for b in browsers}  # type: ignore[method-assign]
+    for browser in browsers:
+        served.enter(browser)
+    return browsers

@@ -11,6 +11,7 @@ import trimesh
 
 import dro_grasp as dro
 from dro_grasp.objects.loading import cloud_object
+from dro_grasp.planning import rehearsal as rehearsal_module
 from dro_grasp.planning.ball_solid import OUTSIDE, ball_solid
 from dro_grasp.planning.candidates import grasps_in_world
 from dro_grasp.planning.physics import MEMORY, LiftScene
@@ -73,8 +74,16 @@ def grasps(robot: dro.Robot, ball: dro.ObjectModel) -> dro.GraspBatch:
     return grasps_in_world(dro.GraspPredictor(), robot.hand, ball, np.eye(4), 12, dro.Constraints(table=0.0))
 
 
+def evenly(robot: dro.Robot, rows: np.ndarray, distance: float) -> np.ndarray:
+    """Configurations along the same line whose wrists are this far apart [m]."""
+    places = robot.T_world_wrist(rows)[:, :3, 3]
+    way = np.linalg.norm(places - places[0], axis=1)
+    wanted = np.linspace(0, way[-1], round(float(way[-1]) / distance) + 1)
+    return np.stack([np.interp(wanted, way, column) for column in rows.T], 1)
+
+
 def test_the_chosen_grasp_holds_and_one_that_never_closes_does_not(
-    robot: dro.Robot, ball: dro.ObjectModel, grasps: dro.GraspBatch
+    robot: dro.Robot, ball: dro.ObjectModel, grasps: dro.GraspBatch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     planned = plan(robot, ball, grasps=grasps)
     rows, closed, hand = planned.part("approach"), planned.part("close"), planned.hand.position
@@ -88,6 +97,20 @@ def test_the_chosen_grasp_holds_and_one_that_never_closes_does_not(
     assert rehearsal.share(chosen, replace(postures, grasp=postures.pregrasp, squeeze=postures.pregrasp)) == 0
     assert rehearsal.share(chosen, postures) == first  # nothing is left from the one before
     assert planned.notes.seconds["rehearsal"] > 0
+    for distance in (0.005, 0.02):  # between the poses that were solved; nothing depends on it
+        line = replace(chosen, approach=evenly(robot, chosen.approach, distance), lift=evenly(robot, chosen.lift, distance))
+        assert rehearsal.holds(line, postures, CONDITIONS[0])
+    seen, scene = [], rehearsal.scene
+    monkeypatch.setattr(rehearsal_module, "FEW_CONTACTS", 12)
+    honest = scene.advance
+
+    def advance(*arguments: float, **options: float) -> None:
+        seen.append((scene.data.ncon > 12, scene.model.opt.noslip_iterations == 0))
+        honest(*arguments, **options)
+
+    monkeypatch.setattr(scene, "advance", advance)
+    rehearsal.holds(chosen, postures, CONDITIONS[0])
+    assert set(seen) == {(False, False), (True, True)}  # many contacts cost no more than in proportion
 
 
 def test_where_none_holds_the_best_score_is_taken_all_the_same(

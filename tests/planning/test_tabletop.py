@@ -92,9 +92,8 @@ def test_a_plane_is_found_under_noise_and_clutter_and_a_wall_is_none() -> None:
     random = np.random.default_rng(0)
     flat = np.column_stack([random.uniform(-1, 1, (800, 2)), random.normal(0.1, 0.001, 800)])
     things = random.uniform([-0.2, -0.2, 0.12], [0.2, 0.2, 0.3], (300, 3))
-    normal, offset = fit_plane(np.concatenate([flat, things]))
-    assert np.allclose(normal, [0, 0, 1], atol=5e-3)
-    assert offset == pytest.approx(0.1, abs=1e-3)
+    plane = fit_plane(np.concatenate([flat, things]))
+    assert np.allclose(plane, [0, 0, 1, 0.1], atol=(5e-3, 5e-3, 5e-3, 1e-3))
     with pytest.raises(dro.DroGraspError, match="no level table"):
         fit_plane(flat[:, [2, 0, 1]])
     assert len(set(clusters(np.array([[0, 0, 0], [0, 0, 0.01], [0, 0, 0.1]], float)).tolist())) == 2

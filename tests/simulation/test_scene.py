@@ -14,7 +14,7 @@ from dro_grasp.hands.library import ASSET_FILES, load_hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.contacts import measure_penetration
 from dro_grasp.simulation.protocols import protocol
-from dro_grasp.simulation.scene import CACHED_SCENES, Scene, build_scene, cached_scene
+from dro_grasp.simulation.scene import CACHED_SCENES, Scene, attach, build_scene, cached_scene
 from tests.helpers.claw import ball, claw, grasps_of, wrist_below
 
 GRIPPER = """<mujoco><worldbody><body name="base"><geom type="box" size="0.06 0.02 0.01" mass="0.3"/>
@@ -198,3 +198,13 @@ def test_every_link_collides_and_the_hand_closes(name: str, assets_folder: Path)
     assert np.median(np.abs(data.qpos - expected)[addresses]) < 0.03
     held = [n for n, m in zip(hand.tree.joint_names, hand.movable, strict=True) if not m]
     assert not any(f"hand/{n}" == scene.model.actuator(i).name for n in held for i in range(scene.model.nu))
+
+
+def test_what_is_attached_with_options_of_its_own_takes_the_scenes_without_a_warning() -> None:
+    scene, part = mujoco.MjSpec(), mujoco.MjSpec.from_string(
+        '<mujoco><option timestep="0.001" integrator="RK4"/><size memory="1M"/><visual><map znear="0.2"/></visual><worldbody>'
+        '<body name="base"><joint name="a"/><geom size="0.05"/></body></worldbody></mujoco>')
+    scene.option.timestep, scene.memory = 0.004, 2**21
+    attach(scene, part, scene.worldbody.add_frame())
+    model = scene.compile()  # a warning of MuJoCo would be raised here
+    assert (model.opt.timestep, model.opt.integrator, model.narena) == (0.004, mujoco.mjtIntegrator.mjINT_EULER, 2**21)

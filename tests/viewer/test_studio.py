@@ -7,7 +7,6 @@ import threading
 import time
 import zipfile
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,7 +24,7 @@ from dro_grasp.viewer.grasp_page import EXPORTS, chosen
 from dro_grasp.viewer.studio import Studio, StudioServer
 from dro_grasp.viewer.uploads import MAX_BYTES, store_upload
 from tests.helpers.browser import free_port, page_of
-from tests.helpers.served_studio import served_studio
+from tests.helpers.served_studio import served_studio, visited
 
 pytestmark = pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")
 
@@ -159,17 +158,6 @@ def test_one_thing_at_a_time(studio: Studio) -> None:
     assert "Busy" in studio.status.content
 
 
-class Browser(viser.ClientHandle):
-    """What a page needs of a browser: a number, a camera, and controls and a scene."""
-
-    def __init__(self, number: int, server: viser.ViserServer) -> None:
-        self.client_id, self.gui, self.scene, self._server = number, server.gui, server.scene, server
-        self.camera = SimpleNamespace(aspect=1.5)  # type: ignore[assignment]
-
-    def atomic(self):
-        return self._server.atomic()
-
-
 def test_every_browser_has_a_page_and_closing_it_ends_its_work_and_its_uploads(
     studio: Studio, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -182,10 +170,7 @@ def test_every_browser_has_a_page_and_closing_it_ends_its_work_and_its_uploads(
 
     served = StudioServer(make, free_port())
     try:
-        clients = [Browser(number, served.server) for number in range(2)]
-        monkeypatch.setattr(served.server, "get_clients", lambda: {c.client_id: c for c in clients})
-        for client in clients:
-            served._enter(client)
+        clients = visited(served, 2)
         text = (BUILTIN_FOLDER / "gripper3.urdf").read_bytes()
         for page, name in zip(made, ("mine.urdf", "theirs.urdf"), strict=True):
             page._guarded(lambda page=page, name=name: page._take(viser.UploadedFile(name=name, content=text), page.hand))
@@ -205,7 +190,7 @@ def test_every_browser_has_a_page_and_closing_it_ends_its_work_and_its_uploads(
         work = threading.Thread(target=lambda: made[0]._guarded(made[0]._generate))
         work.start()
         assert begun.wait(20)
-        served._leave(clients[0])
+        served.leave(clients[0])
         work.join(20)
         assert not work.is_alive()
         assert len(steps) < 1000, "it ended at the next step"

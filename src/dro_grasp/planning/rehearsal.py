@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.planning.physics import LiftScene
+from dro_grasp.planning.physics import LIFT_PROTOCOL, LiftScene
 from dro_grasp.planning.reachability import Feasible, Postures
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.standing import moved
@@ -23,10 +23,10 @@ TICK = 0.02
 """Time between targets of the servos [s] (ours)."""
 TIME_STEP = 0.004
 """Time step of the simulation [s] (ours)."""
-APPROACH = 3
-"""Steps of the approach that are rehearsed, the last ones (ours): they are 1 cm long."""
-HEIGHT = 8
-"""Steps of the lift that are rehearsed, the first ones (ours): they are 1 cm long."""
+APPROACH = 0.03
+"""Length of the part of the approach that is rehearsed, its end [m] (ours)."""
+HEIGHT = 0.08
+"""Length of the part of the lift that is rehearsed, its start [m] (ours)."""
 APPROACH_SECONDS = 0.3
 """Duration of this part of the approach [s] (ours)."""
 CLOSING_SECONDS = 1.0
@@ -38,11 +38,15 @@ LIFT_SECONDS = 0.7
 HOLD_SECONDS = 0.3
 """How long the object is held up then [s] (ours)."""
 RISEN = 0.5
-"""Share of the lift that a held object rises at least (ours)."""
+"""Share of this height that a held object rises at least (ours)."""
 SLIPPED = 0.02
 """Farthest that it may move in the hand while it is held up [m] (ours)."""
 FEWEST_LINKS = 2
 """Links that touch the object at least, once the hand has closed (ours)."""
+
+FEW_CONTACTS = 100
+"""Contacts up to which the solver against slip runs (ours): its time grows with their square, and a hand that holds an object
+has some 20."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +92,7 @@ class Rehearsal:
         start[:2, 3] += condition.shift
         scene.model.opt.gravity[:] = condition.weight * self._gravity
         scene.model.geom_friction[:] = condition.friction * self._friction
-        approach = goal.approach[-1 - APPROACH:]
+        approach = self._within(goal.approach[::-1], APPROACH)[::-1]
         scene.begin(approach[0], hand.pregrasp)
         scene.place(0, start)
         self._follow(approach, hand.pregrasp[None], APPROACH_SECONDS)
@@ -96,14 +100,23 @@ class Rehearsal:
         self._follow(approach[-1:], hand.squeeze[None], GRIP_SECONDS)
         if scene.touched(0) < FEWEST_LINKS:
             return False
-        rows = goal.lift[:HEIGHT + 1]
+        rows = self._within(goal.lift, HEIGHT)
         self._follow(rows, hand.squeeze[None], LIFT_SECONDS)
         risen, grip = scene.pose(0)[2, 3] - start[2, 3], np.linalg.inv(scene.wrist()) @ scene.pose(0)
-        if risen < RISEN * 0.01 * HEIGHT:
+        if risen < RISEN * self._lengths(rows)[-1]:
             return False
         self._follow(rows[-1:], hand.squeeze[None], HOLD_SECONDS)
         slip = np.linalg.norm((np.linalg.inv(scene.wrist()) @ scene.pose(0) - grip)[:3, 3])
         return bool(slip < SLIPPED) and scene.touched(0) >= FEWEST_LINKS
+
+    def _within(self, rows: Float[np.ndarray, "k n_arm"], length: float) -> Float[np.ndarray, "m n_arm"]:
+        """The first configurations of a straight line, and one step of it at least."""
+        return rows[:1 + max(1, int(np.abs(self._lengths(rows) - length).argmin()))]
+
+    def _lengths(self, rows: Float[np.ndarray, "k n_arm"]) -> Float[np.ndarray, " k"]:
+        """How far the wrist of each configuration is from that of the first [m]."""
+        places = self.scene.robot.T_world_wrist(rows)[:, :3, 3]
+        return np.linalg.norm(places - places[0], axis=1)
 
     def _follow(self, arm: Float[np.ndarray, "k n_arm"], hand: Float[np.ndarray, "m n_dof"], seconds: float) -> None:
         """Let the servos follow waypoints, from rest to rest."""
@@ -113,6 +126,8 @@ class Rehearsal:
             along, rate = x * x * (3 - 2 * x), 6 * x * (1 - x) / seconds
             q, velocity = _at(arm, along)
             self.scene.command(q, rate * velocity, _at(hand, along)[0])
+            few = self.scene.data.ncon <= FEW_CONTACTS
+            self.scene.model.opt.noslip_iterations = LIFT_PROTOCOL.noslip if few else 0
             self.scene.advance(TICK, every=TICK)
 
 

@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from dro_grasp.errors import ObjectError, RobotError
+from dro_grasp.geometry.table_plane import largest_plane
 from dro_grasp.objects.loading import MIN_CLOUD, cloud_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.scan import scanned_object
@@ -18,10 +19,6 @@ from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.robot_file import Table
 from dro_grasp.planning.workcell import VOXEL
 
-TRIALS = 300
-"""Planes through three points that the fit tries (ours)."""
-COUNTED = 4000
-"""Points, drawn at random, that are counted near each of these planes (ours)."""
 THICKNESS = 0.006
 """Points at most this far from the plane are the table's [m]: four standard deviations of the noise (ours)."""
 STEEPEST = 0.2
@@ -147,10 +144,10 @@ def sort_out(
     """
     world = points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
     inside = (np.abs(world[:, :2] - table.centre) < np.array(table.size) / 2).all(1)
-    normal, offset = fit_plane(world[inside])
-    height = world @ normal - offset
+    plane = fit_plane(world[inside])
+    height = world @ plane[:3] - plane[3]
     kept = inside & (height > THICKNESS) & (height < HIGHEST)
-    middle = (offset - normal[:2] @ np.array(table.centre)) / normal[2]
+    middle = (plane[3] - plane[:2] @ np.array(table.centre)) / plane[2]
     points, world, group = points[kept], world[kept], clusters(world[kept])
     sizes = np.bincount(group) if len(group) else np.zeros(1, int)
     if sizes.max() < FEWEST:
@@ -171,37 +168,16 @@ def sort_out(
     return Sight(points[wanted], world[others], float(middle), places)
 
 
-def fit_plane(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], float]:
-    """Upward unit normal, and offset along it, of the level plane that most points lie on [m].
+def fit_plane(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4"]:
+    """Upward unit normal of the level plane that most points lie on, and its height along the normal [m].
 
     Raises:
-        ObjectError: There is none. Source of the scheme: RANSAC, Fischler and Bolles 1981, then least squares.
+        ObjectError: There is none.
     """
-    random, plane, most = np.random.default_rng(0), None, 0
-    some = points[random.permutation(len(points))[:COUNTED]]
-    for _ in range(TRIALS if len(some) >= 3 else 0):
-        a, b, c = some[random.choice(len(some), 3, replace=False)]
-        normal = np.cross(b - a, c - a)
-        if abs(normal[2]) < np.cos(STEEPEST) * np.linalg.norm(normal) or not np.linalg.norm(normal):
-            continue
-        unit = normal / np.linalg.norm(normal)
-        count = int((np.abs(some @ unit - a @ unit) < THICKNESS / 2).sum())
-        if count > most:
-            plane, most = (unit, float(a @ unit)), count
-    best = np.zeros(len(points), bool) if plane is None else np.abs(points @ plane[0] - plane[1]) < THICKNESS / 2
-    if best.sum() < FEWEST:
+    plane = largest_plane(points, THICKNESS / 2, STEEPEST, fits=3)
+    if plane is None or (np.abs(points @ plane[:3] - plane[3]) < THICKNESS / 2).sum() < FEWEST:
         raise ObjectError("the camera sees no level table; correct its pose in the robot file, or the table's place")
-    normal, offset = _least_squares(points[best])
-    for _ in range(2):
-        normal, offset = _least_squares(points[np.abs(points @ normal - offset) < THICKNESS / 2])
-    return normal, offset
-
-
-def _least_squares(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], float]:
-    middle = points.mean(0)
-    normal = np.linalg.svd(points - middle, full_matrices=False)[2][2]
-    normal = normal * np.sign(normal[2])
-    return normal, float(normal @ middle)
+    return plane
 
 
 def clusters(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:

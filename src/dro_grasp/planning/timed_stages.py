@@ -40,8 +40,8 @@ def timed_stages(
     if not _clear(checker, reach.position, hand.opened):
         reach = cornered(waypoints, *limits)
     standoff, grasp = goal.approach[0], goal.approach[-1]
-    shape = smooth(between(hand.opened, hand.pregrasp), *fingers)
-    # A spline through pregrasp, grasp and squeeze would swing beyond them, and out of the joints' range.
+    shape = smooth(np.stack([hand.opened, hand.pregrasp]), *fingers)
+    # A spline through these would swing beyond them, and out of the joints' range.
     close = joined([cornered(closing(hand), *fingers, config.closing_seconds), standing(hand.squeeze, config.grip_seconds)])
     approach, lift = smooth(goal.approach, *limits), smooth(goal.lift, *limits)
     start = robot.T_world_wrist(grasp)
@@ -58,14 +58,9 @@ def timed_stages(
     return TimedStages(np.repeat(np.arange(len(STAGES)), lengths), joined(arms), joined(hands))
 
 
-def closing(hand: Postures) -> Float[np.ndarray, "k n_dof"]:
+def closing(hand: Postures) -> Float[np.ndarray, "3 n_dof"]:
     """Postures while the hand closes: pregrasp, grasp, squeeze [rad or m]."""
-    return np.concatenate([between(hand.pregrasp, hand.grasp), between(hand.grasp, hand.squeeze)])
-
-
-def between(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"], count: int = 8) -> Float[np.ndarray, "k n"]:
-    """Evenly spaced postures from one to another."""
-    return a + np.linspace(0, 1, count)[:, None] * (b - a)
+    return np.stack([hand.pregrasp, hand.grasp, hand.squeeze])
 
 
 def _clear(checker: CollisionChecker, positions: Float[np.ndarray, "k n_arm"], hand: Float[np.ndarray, " n_dof"]) -> bool:

@@ -165,7 +165,8 @@ def hand_spec(hand: Hand, protocol: Protocol) -> mujoco.MjSpec:
 
 
 def attach(scene: mujoco.MjSpec, part: mujoco.MjSpec, frame: mujoco.MjsFrame, prefix: str = PREFIX) -> None:
-    """Fix the root of a hand, or of an arm, to a frame of the scene."""
+    """Fix the root of a hand, or of an arm, to a frame of the scene, whose options are those of all."""
+    part.option, part.visual, part.memory = scene.option, scene.visual, scene.memory  # MuJoCo warns where they differ
     # Where some meshes live in memory, MuJoCo 4.0.0 puts the prefix into the file names of the others as well.
     on_disk = {prefix + mesh.name: mesh.file for mesh in part.meshes if mesh.file and mesh.file not in part.assets}
     scene.attach(part, prefix=prefix, frame=frame)

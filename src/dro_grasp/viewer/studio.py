@@ -241,8 +241,8 @@ class StudioServer(ServedPage):
         self._make, self._turn = make, threading.Lock()
         self.studios: dict[int, Studio] = {}
         """Pages that are open, by the browser's number."""
-        self.server.on_client_connect(self._enter)
-        self.server.on_client_disconnect(self._leave)
+        self.server.on_client_connect(self.enter)
+        self.server.on_client_disconnect(self.leave)
 
     def stop(self) -> None:
         """Stop serving; all pages end."""
@@ -250,12 +250,14 @@ class StudioServer(ServedPage):
         for number in list(self.studios):
             self._close(number)
 
-    def _enter(self, client: viser.ClientHandle) -> None:
+    def enter(self, client: viser.ClientHandle) -> None:
+        """A browser has come: it gets its page."""
         self.studios[client.client_id] = self._make(client, self._turn)
         if client.client_id not in self.server.get_clients():  # it left meanwhile
             self._close(client.client_id)
 
-    def _leave(self, client: viser.ClientHandle) -> None:
+    def leave(self, client: viser.ClientHandle) -> None:
+        """A browser has gone: its page ends."""
         self._close(client.client_id)
 
     def _close(self, number: int) -> None:
