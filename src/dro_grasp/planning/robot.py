@@ -85,7 +85,8 @@ class Robot:
     def T_world_wrist(self, arm: Float[np.ndarray, "*batch n_arm"]) -> Float[np.ndarray, "*batch 4 4"]:
         """Pose of the hand's root link [m]."""
         tree = self.arm.tree.double
-        mount = tree.forward(torch.from_numpy(np.ascontiguousarray(arm, np.float64)))[..., tree.link_names.index(self.mount_link), :, :]
+        links = tree.forward(torch.from_numpy(np.ascontiguousarray(arm, np.float64)))
+        mount = links[..., tree.link_names.index(self.mount_link), :, :]
         return self.T_world_base @ mount.numpy() @ self.T_link_wrist
 
 
