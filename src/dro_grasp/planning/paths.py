@@ -13,8 +13,8 @@ from ompl import base as ob, geometric as og, util as ou
 
 RESOLUTION = 0.03
 """Largest change of a joint between two configurations that are checked on an edge [rad or m] (ours)."""
-SIMPLIFY_SECONDS = 0.5
-"""Longest time spent on shortening a path [s] (ours)."""
+SIMPLIFY_SECONDS = 3.0
+"""Longest time spent on shortening a path [s] (ours): it ends by itself long before, but on a busy machine."""
 SPACING = 0.08
 """Largest change of a joint between the waypoints of a path that is returned [rad or m] (ours)."""
 RANGE = 0.6
