@@ -23,7 +23,8 @@ from dro_grasp.planning.plan_config import PlanConfig
 from dro_grasp.planning.table_scene import clusters, fit_plane, sort_out
 from dro_grasp.planning.tabletop import TabletopRun, read_attempts, run_tabletop, write_attempts
 
-QUICK = TabletopConfig(see="mesh", hold_seconds=0.5, shake_seconds=0.5, plan=PlanConfig(num=8, best_seconds=30, planner_seconds=30))
+QUICK = TabletopConfig(
+    see="mesh", hold_seconds=0.5, shake_seconds=0.5, plan=PlanConfig(num=8, best_seconds=30, planner_seconds=30))
 
 
 @pytest.fixture(scope="module")
