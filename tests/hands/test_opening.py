@@ -16,7 +16,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import hand_names
 from dro_grasp.optimization.starts import StartConfig, start_joints
 from tests.helpers.bracket_hand import bracket_urdf
-from tests.helpers.claw_urdf import joint, link, written
+from tests.helpers.claw_urdf import LIMIT, claw, joint, link, written
 from tests.helpers.folding_hands import folding_bracket, folding_claw
 from tests.helpers.loaded_hands import loaded_hand
 
@@ -175,3 +175,13 @@ def test_a_tiny_fingertip_keeps_points(tmp_path: Path) -> None:
     assert all(int((hand.link_index == tip).sum()) > 0 for tip in hand.tips)
     assert hand.n_points == 64
     assert bool((hand.link_index.diff() >= 0).all())
+
+
+def test_a_finger_that_only_follows_a_held_joint_stays_as_it_is(tmp_path: Path) -> None:
+    text = claw(
+        links=link("left") + link("right") + link("tip"),
+        joints=joint("a", "palm", "left", "-0.035 0 0.01") + joint("b", "left", "right", "0.035 0 0.01", "0 -1 0")
+        + joint("c", "left", "tip", "0 0 0.06", more=LIMIT + '<mimic joint="a" multiplier="0.5" offset="0.1"/>'))
+    hand = dro.load_hand(written(tmp_path, text))
+    assert [hand.tree.joint_names[j] for j in hand.movable.nonzero()[:, 0]] == ["b"]
+    assert bool(hand.opening_signs.isfinite().all())

@@ -174,6 +174,8 @@ class ClosingFinder:
         """
         for finger in self.fingers:
             joints = (self.tree.moves[finger.tip] & self.movable & ~abduction).nonzero()[:, 0]
+            if not len(joints):  # it only spreads
+                continue
             choices = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * len(joints)).reshape(-1, len(joints))
             tried = signs.repeat(len(choices), 1)
             tried[:, joints] = choices
