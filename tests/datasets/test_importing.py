@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -231,3 +232,13 @@ def test_a_pickle_that_asks_for_room_for_more_objects_than_it_can_hold_is_refuse
     (tmp_path / "a.npy").write_bytes(header + b"\x80\x02]r\xff\xff\xff\x3f.")  # a list, as number 2^30 - 1
     with pytest.raises(GraspFileError, match="numbers more objects than it can hold"):
         read_foreign(tmp_path / "a.npy", "dexgraspnet")
+
+
+def test_a_header_that_states_two_gigabytes_gets_no_room_for_them(tmp_path: Path) -> None:
+    (tmp_path / "a.npy").write_bytes(b"\x93NUMPY\x01" + 30 * b"\x7f")
+    tracemalloc.start()
+    with pytest.raises(GraspFileError, match="cannot be read"):
+        read_foreign(tmp_path / "a.npy", "dexgraspnet")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1e8

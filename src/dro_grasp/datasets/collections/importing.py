@@ -179,13 +179,13 @@ class _Harmless(pickle.Unpickler):
 
 def read_npy(path: Path) -> Shaped[np.ndarray, "..."]:
     """An array of objects from a npy file."""
-    with path.open("rb") as file:
-        version = np.lib.format.read_magic(file)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, _, dtype = read(file)
-        if not dtype.hasobject:
-            raise ValueError(f"it is an array of {dtype}, not of grasps")
-        data = file.read()
+    file = io.BytesIO(path.read_bytes())  # a file makes room for the length of a header that it does not have
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(file)
+    if not dtype.hasobject:
+        raise ValueError(f"it is an array of {dtype}, not of grasps")
+    data = file.read()
     # Objects are numbered, and the reader makes room for the highest number that is stated.
     if any(operation.name in {"PUT", "LONG_BINPUT"} and int(number or 0) > len(data)
            for operation, number, _ in pickletools.genops(data)):
