@@ -64,6 +64,7 @@ def test_synthesis_on_a_device_gives_the_grasps_of_the_cpu(device: str) -> None:
     torch.testing.assert_close(there.T_object_wrist, here.T_object_wrist, **NEARLY)
 
 
+@pytest.mark.slow
 def test_the_optimiser_s_predictions_on_a_device_are_those_of_the_cpu(
     device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -104,6 +104,7 @@ def test_losses_fall(bundle) -> None:
     assert float(end["total"].detach()) == pytest.approx(rest + 0.05 * ((1 + nats**2) ** 0.5 - 1), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_the_command_trains_a_method_that_the_benchmark_takes(
     bundle, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -17,9 +17,12 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.fixture
 def generate(weights: str, capsys: pytest.CaptureFixture[str]):
-    def run(*arguments: str, num: int = 3, name: str = "sphere", method: str = "network") -> dict:
-        base = ["generate", "--hand", "gripper3", "--object", name, "--weights", weights, "--num", str(num), "--json"]
-        assert main([*base, "--method", method, *arguments]) == 0
+    def run(
+        *arguments: str, num: int = 3, name: str = "sphere", method: str = "network", candidates: int = 1
+    ) -> dict:
+        base = ["generate", "--hand", "gripper3", "--object", name, "--weights", weights, "--num", str(num), "--json",
+                "--method", method, "--candidates", str(candidates)]
+        assert main([*base, *arguments]) == 0
         return json.loads(capsys.readouterr().out)
 
     return run

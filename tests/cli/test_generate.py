@@ -38,7 +38,7 @@ def test_outputs_are_checked_before_the_work(monkeypatch: pytest.MonkeyPatch, ca
 
 def test_generate_reports_and_saves_what_it_counts(generate, tmp_path: Path) -> None:
     path = tmp_path / "grasps.parquet"
-    report = generate("--output", str(path), method="auto")
+    report = generate("--output", str(path), method="auto", candidates=4)
     assert report.keys() >= KEYS
     assert set(report["seconds"]) == {
         "start", "load", "network", "decode", "optimise", "refine", "settle", "rank", "trial", "files", "total"}

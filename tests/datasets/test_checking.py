@@ -27,7 +27,7 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("stored") / "barrett.parquet"
     for name in ("can", "sphere"):
         obj = load_object(name)
-        grasps = synthesize(hand, obj, 24, 0, SynthesisConfig(steps=80, batch_size=24))
+        grasps = synthesize(hand, obj, 12, 0, SynthesisConfig(steps=80, batch_size=12))
         grasps.save(path)
         grasps = GraspBatch.load(path)  # files round rotations, and a grasp on the edge could tip over
         batches.append(grasps.with_trial(simulate(hand, obj, grasps, "dro")))
@@ -39,21 +39,21 @@ def test_the_same_trial_agrees_and_a_lie_is_found(stored, tmp_path):
     pairs = list(read_collection(stored, only_successful=False))
     found = check(pairs, 1000, changed("dro"))
     grasps = GraspBatch.load(stored)
-    assert found.evaluated == found.agreed == 48
+    assert found.evaluated == found.agreed == 24
     assert found.succeeded == int(grasps.success.sum())
-    assert found.hands == {"barrett": (48, found.succeeded)}
+    assert found.hands == {"barrett": (24, found.succeeded)}
     assert not found.reasons
     failures = int((~grasps.success).sum())
     assert failures > 0
-    grasps.replace(success=torch.ones(48, dtype=torch.bool)).save(tmp_path / "lie.parquet")
+    grasps.replace(success=torch.ones(24, dtype=torch.bool)).save(tmp_path / "lie.parquet")
     lie = check(read_collection(tmp_path / "lie.parquet"), 1000, changed("dro"))
     assert lie.evaluated - lie.agreed == failures == lie.reasons.total()
 
 
 def test_a_sample_is_a_sample_and_repeats(stored):
     pairs = list(read_collection(stored))
-    one, again, other = (check(pairs, 10, changed("dro"), seed) for seed in (1, 1, 2))
-    assert one.evaluated == other.evaluated == 10
+    one, again, other = (check(pairs, 6, changed("dro"), seed) for seed in (1, 1, 2))
+    assert one.evaluated == other.evaluated == 6
     assert one == again
     with pytest.raises(OptionError, match="at least one"):
         check(pairs, 0, changed("dro"))
@@ -79,7 +79,7 @@ def test_filter_keeps_what_passes_with_its_new_numbers(stored):
         again = simulate(load_hand("barrett"), load_object(pair.object), pair.grasps, "strict")
         assert torch.equal(passed.joints, pair.grasps.joints[again.success])
         assert set(passed.protocol or ()) <= {"strict/1"}
-    assert 0 < sum(len(passed) for _, passed in kept) < 48
+    assert 0 < sum(len(passed) for _, passed in kept) < 24
 
 
 def test_fingers_are_closed_where_the_grasp_holds_and_touches_with_more(stored, tmp_path):
@@ -103,7 +103,7 @@ def test_fingers_are_closed_where_the_grasp_holds_and_touches_with_more(stored, 
         assert had.keys() <= has.keys()
         assert all(has[key] >= count for key, count in had.items())
         gained += sum(count > had.get(key, 0) for key, count in has.items())
-    assert gained > 3
+    assert gained > 1
 
 
 def test_commands(stored, tmp_path, capsys):
@@ -116,7 +116,7 @@ def test_commands(stored, tmp_path, capsys):
     assert main(["dataset", "filter", str(stored), "--output", str(tmp_path / "kept"), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     kept = GraspBatch.load(tmp_path / "kept" / "barrett.parquet")
-    assert told["grasps"] == 48
+    assert told["grasps"] == 24
     assert told["kept"] == len(kept) == sum(pair["kept"] for pair in told["pairs"])
     assert main(["dataset", "check", str(tmp_path / "none")]) == 2
     assert "no grasps at" in capsys.readouterr().err

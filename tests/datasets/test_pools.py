@@ -150,6 +150,7 @@ def test_a_killed_parent_leaves_whole_shards_and_no_process_and_a_rerun_finishes
     assert report.grasps == whole(folder) == 160
 
 
+@pytest.mark.slow
 def test_a_second_run_into_a_folder_is_refused_and_the_first_goes_on(tmp_path):
     with (
         sole_run(tmp_path),

@@ -232,6 +232,7 @@ def test_real_shards_hold_valid_grasps_repeat_and_add_up(tmp_path):
     assert torch.equal(again.joints, GraspBatch.load(Shard("barrett", "can", 0).path(tmp_path)).joints)
 
 
+@pytest.mark.slow
 def test_the_same_command_makes_the_same_grasps_however_many_work(tmp_path):
     """In this process, and in two others."""
     found = []

@@ -44,6 +44,7 @@ def test_errors_are_those_of_the_network(bundle: Bundle) -> None:
 
 
 @pytest.mark.usefixtures("quick_statistics")
+@pytest.mark.slow
 def test_training_reports_them_of_grasps_it_has_not_seen(
     bundle: Bundle, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -51,14 +51,13 @@ from tests.helpers.weights import untrained_weights
 
 DRO, START, SYNTHESISED = "dro", StartMethod.name, SynthesisMethod.name
 HANDS = ("gripper3", "barrett")
-OBJECTS = ("sphere", "can")
+OBJECT = "can"
 CONFIG = BenchmarkConfig(num=6, protocols=(protocol("dro"), protocol("strict")))
 
 
 @pytest.fixture(scope="module")
 def rows() -> list[Row]:
-    hands, objects = [loaded_hand(n) for n in HANDS], [load_object(n) for n in OBJECTS]
-    return benchmark(hands, objects, every(GraspPredictor()), CONFIG)
+    return benchmark([loaded_hand(n) for n in HANDS], [load_object(OBJECT)], every(GraspPredictor())[:2], CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -78,52 +77,43 @@ def find(rows: list[Row], grasps: str, stage: str, hand: str) -> Row:
 
 def test_every_source_has_its_stages_for_every_hand_and_on_average(rows: list[Row]) -> None:
     names = {(r.grasps, r.stage) for r in rows}
-    assert names == {(source, stage) for source in (DRO, START, SYNTHESISED) for stage in STAGES}
+    assert names == {(source, stage) for source in (DRO, START) for stage in STAGES}
     assert len(rows) == len(names) * 3
-    assert {r.num for r in rows if r.stage in {RAW, REFINED, SETTLED} and r.hand != ALL} == {12}
-    assert {r.num for r in rows if r.stage in {RANKED, BEST, SETTLED_BEST} and r.hand != ALL} == {4}
+    assert {r.num for r in rows if r.stage in {RAW, REFINED, SETTLED} and r.hand != ALL} == {6}
+    assert {r.num for r in rows if r.stage in {RANKED, BEST, SETTLED_BEST} and r.hand != ALL} == {2}
     assert {(r.stage, r.num) for r in rows if r.stage in TOP and r.hand != ALL} == {
-        ("refined, top 5", 10), ("refined, top 1", 2)}
+        ("refined, top 5", 5), ("refined, top 1", 1)}
 
 
 def test_raw_and_ranked_rows_are_what_single_trials_say(rows: list[Row]) -> None:
-    hand, predictor = loaded_hand("gripper3"), GraspPredictor()
+    hand, obj, predictor = loaded_hand("gripper3"), load_object(OBJECT), GraspPredictor()
+    problem = GraspProblem(hand, obj)
+    made = predictor.predict(
+        hand, obj, num=6, seed=pair_seed(0, hand, obj), candidates=1, refine=False, method="network")
     for stage, best in ((RAW, RANKED), (REFINED, BEST), (SETTLED, SETTLED_BEST)):
-        passed, passed_best, passed_first, held, fingers = [], [], [], [], []
-        for name in OBJECTS:
-            obj = load_object(name)
-            seed = pair_seed(0, hand, obj)
-            grasps = predictor.predict(hand, obj, num=6, seed=seed, candidates=1, refine=False, method="network")
-            problem = GraspProblem(hand, obj)
-            if stage != RAW:
-                grasps = refine(problem, grasps)
-            held_still = torch.ones(len(grasps), dtype=torch.bool)
-            if stage == SETTLED:
-                grasps, held_still, _ = settled(problem, grasps)
-            strict = simulate(hand, obj, grasps, "strict")
-            passed.append(strict.success)
-            fingers.append(strict.fingers_in_contact)
-            order = torch.where(held_still, scored(problem, grasps).score, -9.0).argsort(descending=True)[:2]
-            passed_best.append(strict.success[order])
-            passed_first.append(strict.success[order[:1]])
-            first = simulate(hand, obj, grasps, "dro")
-            held.append(first.displacement[first.success, -1])
-        share, share_best, share_first = (float(torch.cat(x).double().mean()) for x in (passed, passed_best, passed_first))
+        grasps, held_still = made if stage == RAW else refine(problem, made), torch.ones(len(made), dtype=torch.bool)
+        if stage == SETTLED:
+            grasps, held_still, _ = settled(problem, grasps)
+        strict, first = simulate(hand, obj, grasps, "strict"), simulate(hand, obj, grasps, "dro")
+        order = torch.where(held_still, scored(problem, grasps).score, -9.0).argsort(descending=True)
+        share, share_best, share_first = (
+            float(strict.success[some].double().mean()) for some in (slice(None), order[:2], order[:1]))
         assert find(rows, DRO, stage, "gripper3").success["strict/1"][0] == pytest.approx(share)
         assert find(rows, DRO, best, "gripper3").success["strict/1"][0] == pytest.approx(share_best)
-        counts = torch.cat(fingers)
+        counts = strict.fingers_in_contact
         assert find(rows, DRO, stage, "gripper3").fingers["strict/1"] == pytest.approx(
             (float(counts.float().mean()) / 3, float((counts == 3).float().mean())))
         if stage == REFINED:
             alone = find(rows, DRO, "refined, top 1", "gripper3").success["strict/1"][0]
             assert alone == pytest.approx(share_first)
-        assert find(rows, DRO, stage, "gripper3").displacement == pytest.approx(float(torch.cat(held).mean()))
+        displacement = float(first.displacement[first.success, -1].mean())
+        assert find(rows, DRO, stage, "gripper3").displacement == pytest.approx(displacement)
 
 
 def test_pairs_share_no_random_numbers() -> None:
-    hands, objects = [loaded_hand(n) for n in HANDS], [load_object(n) for n in OBJECTS]
+    hands, objects = [loaded_hand(n) for n in HANDS], [load_object(n) for n in ("sphere", "can")]
     seeds = {pair_seed(7, hand, obj) for hand in hands for obj in objects}
-    assert len(seeds) == len(HANDS) * len(OBJECTS)
+    assert len(seeds) == 4
     assert seeds == {pair_seed(6, hand, obj) + 1 for hand in hands for obj in objects}
 
 
@@ -163,7 +153,7 @@ def test_the_average_is_over_hands(rows: list[Row]) -> None:
         whole = find(rows, DRO, stage, ALL)
         mean, low, high = whole.success["dro/1"]
         assert mean == pytest.approx(sum(p.success["dro/1"][0] for p in parts) / 2)
-        assert low <= mean <= high
+        assert low - 1e-9 < mean < high + 1e-9
         for i in range(2):
             assert whole.fingers["dro/1"][i] == pytest.approx(sum(p.fingers["dro/1"][i] for p in parts) / 2)
         assert whole.trials_held == {}
@@ -175,10 +165,11 @@ def test_the_average_is_over_hands(rows: list[Row]) -> None:
 def test_refined_grasps_cost_time_and_controls_say_what_they_are(rows: list[Row]) -> None:
     assert "refine" not in find(rows, DRO, RAW, ALL).seconds
     assert find(rows, DRO, REFINED, ALL).seconds["refine"] > 0
-    assert find(rows, SYNTHESISED, RAW, ALL).seconds["make"] > 0
+    assert find(rows, START, RAW, ALL).seconds["make"] > 0
     assert find(rows, START, RAW, ALL).success["strict/1"][0] < find(rows, DRO, REFINED, ALL).success["strict/1"][0]
 
 
+@pytest.mark.slow
 def test_what_generate_returns_and_what_controls_return_in_the_networks_time(
     quick_synthesis: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -40,7 +40,8 @@ def postures(grasps: GraspBatch, row: int) -> list[Tensor]:
     return [joints[row].float() for joints in (grasps.pregrasp_joints, grasps.joints, grasps.squeeze_joints)]
 
 
-@pytest.mark.parametrize(("name", "direction"), [("gripper3", (0.0, 0.0, -1.0)), ("allegro", (1.0, 0.0, 0.0))])
+@pytest.mark.parametrize(("name", "direction"), [
+    ("gripper3", (0.0, 0.0, -1.0)), pytest.param("allegro", (1.0, 0.0, 0.0), marks=pytest.mark.slow)])
 def test_a_low_object_on_a_table_is_grasped(name: str, direction: tuple[float, float, float]) -> None:
     hand = loaded_hand(name)
     problem = GraspProblem(hand, SOAP, constraints=Constraints(direction, TABLE))

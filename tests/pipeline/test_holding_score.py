@@ -41,6 +41,7 @@ def test_the_ranking_networks_score_counts() -> None:
     assert holding_features(torch.tensor([1.0]), held()).shape == (1, FEATURES)
 
 
+@pytest.mark.slow
 def test_it_tells_better_than_geometry_alone_which_settled_grasps_hold() -> None:
     hand, obj = loaded_hand("gripper3"), load_object("hammer")
     problem = GraspProblem(hand, obj)

@@ -60,7 +60,7 @@ run_stage(stage, load_bundle(folder / "bundle.safetensors"), folder / "killed", 
 """
 
 
-@pytest.mark.parametrize(("stage", "moment"), [("train", "before"), ("pretrain", "during")])
+@pytest.mark.parametrize(("stage", "moment"), [pytest.param("train", "before", marks=pytest.mark.slow), ("pretrain", "during")])
 def test_a_killed_run_goes_on_to_the_same_curve(
     home: Path, bundle: Bundle, finished: dict[str, Path], results: dict[str, DistanceNetwork], tmp_path: Path, stage: str,
     moment: str,
@@ -233,6 +233,7 @@ def test_learning_rate_warms_up_and_falls_to_zero() -> None:
     assert learning_rate_share(20, 0.5, schedule) == pytest.approx(0.5), "time may be further on than steps"
 
 
+@pytest.mark.slow
 def test_two_processes_descend_the_curve_of_one(
     home: Path, bundle: Bundle, finished: dict[str, Path], tmp_path: Path
 ) -> None:
