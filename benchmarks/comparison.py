@@ -54,7 +54,8 @@ PAPER = {
 }
 """Success [%], diversity [rad] and seconds on Barrett, Allegro and Shadow hand. Source: paper, table of the overall comparison,
 in Isaac Gym; DFC took more than the seconds stated."""
-METHODS = ("dro:raw=4", "dro", "synthesise=4", "dfc=4", "gendexgrasp=2", "gendexgrasp-gamma1=1", "manifm=4", "start=4")
+METHODS = ("dro:raw=4", "dro:1=4", "dro", "synthesise:1=4", "synthesise=4", "dfc=4", "gendexgrasp=2",
+           "gendexgrasp-gamma1=1", "manifm=4", "start=4")
 """Rows by default."""
 
 
@@ -191,7 +192,7 @@ def rate(held: np.ndarray) -> str:
 
 def draw(found: dict[str, dict[str, list[Measured]]], path: Path) -> None:
     """Success against time for a grasp, all methods in one picture for each of two trials, the paper's figures in grey."""
-    figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), sharey=True, layout="constrained")
+    figure, axes = plt.subplots(1, 2, figsize=(13, 4.2), sharey=True, layout="constrained")
     for ax, trial in zip(axes, ("friction 3", "strict"), strict=True):
         for name, per_hand in found.items():
             parts = [p for of_hand in per_hand.values() for p in of_hand]
@@ -207,7 +208,7 @@ def draw(found: dict[str, dict[str, list[Measured]]], path: Path) -> None:
         axes[0].plot(x, y, "x", color="grey")
         axes[0].annotate(f"{name}, paper", (x, y), xytext=(6, -4), textcoords="offset points", color="grey")
     axes[0].set(ylabel="success [%]", xlim=(None, 1e5))
-    axes[0].legend(loc="lower left")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center")
     figure.savefig(path, dpi=110)
 
 
