@@ -13,9 +13,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import jaxtyping
 import pytest
 
-import tests.helpers.typecheck  # noqa: F401  (must be imported before the hook is installed)
+import tests.helpers.typecheck
 
 jaxtyping.install_import_hook("dro_grasp", "tests.helpers.typecheck.check")
+
+
+def pytest_runtest_setup() -> None:
+    tests.helpers.typecheck.check_anew()
 
 
 @pytest.fixture(scope="session")
