@@ -176,7 +176,7 @@ def small_disk(tmp_path):
 @pytest.mark.slow
 def test_a_full_disk_ends_the_run_clearly_and_loses_nothing(small_disk):
     folder, enlarge = small_disk
-    with pytest.raises(OutputError, match=r"No space left on device.*free some space"):
+    with pytest.raises(OutputError, match=r"No space left on device.*free some space.*the same command goes on"):
         synthesize_dataset(["a"], ["x", "y", "z"], 50, folder, progress=lambda _: None, workers=pool(engine_work.easy))
     before = whole(folder)
     assert before > 0

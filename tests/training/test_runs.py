@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import errno
+import json
 import math
 import os
 import signal
@@ -194,9 +196,28 @@ def test_a_full_disk_is_told_and_leaves_the_old_checkpoint(tmp_path: Path, file:
     run.save()
     before = (run.folder.path / CHECKPOINT).read_bytes()
     (run.folder.path / file).symlink_to("/dev/full")
-    with pytest.raises(OutputError, match="cannot write into"):
+    told = rf"cannot write .*{file.removesuffix('.part')}: No space left on device; .* resumes from its last checkpoint"
+    with pytest.raises(OutputError, match=told):
         run.train(lambda: {"total": model.weight.square().sum()}, quiet)
     assert (run.folder.path / CHECKPOINT).read_bytes() == before
+
+
+def test_a_log_that_cannot_be_cut_on_a_full_disk_stays_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path, text: str) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    folder = RunFolder(tmp_path)
+    for step in (1, 2):
+        folder.append_to_log({"step": step})
+    before = (tmp_path / LOG).read_bytes()
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OutputError, match=r"cannot write the log to .*: No space left on device"):
+        folder.cut_log(1)
+    assert [path.name for path in tmp_path.iterdir()] == [LOG]
+    assert (tmp_path / LOG).read_bytes() == before
+    monkeypatch.undo()
+    folder.cut_log(1)
+    assert (tmp_path / LOG).read_text() == json.dumps({"step": 1}) + "\n"
 
 
 def test_the_average_is_the_moving_average_of_the_weights(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import sys
@@ -14,6 +15,7 @@ from typing import Any
 import torch
 
 from dro_grasp.errors import OutputError, TrainingError
+from dro_grasp.files import replacing
 
 CHECKPOINT = "checkpoint.pt"
 """File with everything that a run needs to resume."""
@@ -31,10 +33,11 @@ class RunFolder:
 
     def write_checkpoint(self, state: dict[str, Any]) -> None:
         """Replace the checkpoint, whole or not at all."""
-        path, temporary = self.path / CHECKPOINT, self.path / f"{CHECKPOINT}.part"
+        path, temporary, content = self.path / CHECKPOINT, self.path / f"{CHECKPOINT}.part", io.BytesIO()
+        torch.save(state, content)  # its own writer says of a full disk that a position was not expected
         try:
-            with writing_into(self.path):
-                torch.save(state, temporary)
+            with self._writing(path):
+                temporary.write_bytes(content.getbuffer())
                 os.replace(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)
@@ -73,7 +76,7 @@ class RunFolder:
 
     def append_to_log(self, line: dict[str, float]) -> None:
         """Write one line of the log."""
-        with writing_into(self.path), (self.path / LOG).open("a") as file:
+        with self._writing(self.path / LOG), (self.path / LOG).open("a") as file:
             file.write(json.dumps(line) + "\n")
 
     def cut_log(self, step: int) -> None:
@@ -88,19 +91,21 @@ class RunFolder:
                     kept.append(line)
             except (ValueError, LookupError, TypeError, RecursionError):
                 break
-        log.write_text("".join(line + "\n" for line in kept))
+        with replacing(log, "the log") as temporary:
+            temporary.write_text("".join(line + "\n" for line in kept))
+
+    @contextmanager
+    def _writing(self, path: Path) -> Iterator[None]:
+        """Explain a full disk or a missing permission, and what is left."""
+        try:
+            yield
+        except OSError as error:
+            there = (self.path / CHECKPOINT).is_file()
+            left = "the run resumes from its last checkpoint" if there else "there is no checkpoint yet, so the run begins anew"
+            raise OutputError(f"cannot write {path}: {error.strerror or error}; free some space, or make it writable, and "
+                              f"start again: {left}") from error
 
 
 def last_logged(folder: Path) -> dict[str, float]:
     """The last line of a run's log: steps, seconds and losses at its end."""
     return json.loads((folder / LOG).read_text().splitlines()[-1])
-
-
-@contextmanager
-def writing_into(folder: Path) -> Iterator[None]:
-    """Explain a full disk or a missing permission; PyTorch's writer raises RuntimeError for both."""
-    try:
-        yield
-    except (OSError, RuntimeError) as error:
-        raise OutputError(f"cannot write into {folder}: {error}; free some space, or make it writable, and start again: the "
-                          "run resumes from its last checkpoint") from error

@@ -137,8 +137,12 @@ class Shard:
         except OSError as error:
             raise OutputError(f"cannot make {path.parent}: {error.strerror}; free some space or choose another "
                               "folder") from error
-        with replacing(path) as temporary:
-            temporary.write_bytes(payload)
+        try:
+            with replacing(path) as temporary:
+                temporary.write_bytes(payload)
+        except OutputError as error:
+            raise OutputError(f"{error}. The shards that are there are whole; in the same folder, the same command goes on "
+                              "from them") from error
 
 
 def notes_of(result: Yield) -> dict[str, Any]:
