@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections import Counter
 from collections.abc import Callable
@@ -90,6 +91,8 @@ class PredictorConfig(ProposalConfig):
     """How often at most the network is asked again when constraints reject candidates."""
     least_yield: float = 0.2
     """Share of the candidates below which it is not asked again."""
+    reserve: float = 1.5
+    """How many times as many candidates it is asked for again as the share that was rejected suggests."""
 
 
 @dataclass(frozen=True)
@@ -206,10 +209,13 @@ class GraspPredictor:
         request = pool.request
         wanted, generator = request.num * request.candidates, torch.Generator().manual_seed(request.seed)
         config = self.config if request.temperature is None else replace(self.config, temperature=request.temperature)
+        count = wanted
         for _ in range(config.rounds):
-            pool.add(propose(pool.problem, self.network, wanted, generator, config, pool.watch, progress), wanted)
+            pool.add(propose(pool.problem, self.network, count, generator, config, pool.watch, progress), wanted)
             if len(pool) >= wanted or len(pool) < config.least_yield * pool.made:
                 break
+            lacking = (wanted - len(pool)) * pool.made / len(pool)
+            count = min(wanted, math.ceil(config.reserve * lacking))
         pool.settle()
 
     def _ask_optimiser(self, pool: _Pool, progress: Progress | None) -> None:

@@ -117,8 +117,10 @@ class Onboarded:
         before, after = (f"{self.rate(step, REFINED, STRICT):.0%}" for step in ("before", "after"))
         lines = []
         if not self.gained:
+            better = "No more than all can hold" if self.rate("before", REFINED, STRICT) == 1 else (
+                "To gain, try more --minutes or more --objects")
             lines.append(f"Fine-tuning gained nothing: {before} of the refined grasps hold under {STRICT} before, {after} "
-                         "after. Keep the weights from before. To gain, try more --minutes or more --objects.")
+                         f"after. Keep the weights from before. {better}.")
         if self.without_grasps:
             lines.append(f"No training grasps of {', '.join(self.without_grasps)}: try --objects of a size that suits the "
                          "hand, and look at its picture for a wrong palm side or opening.")
