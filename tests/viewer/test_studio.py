@@ -11,20 +11,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 import viser
 import yaml
 
-from dro_grasp.errors import OptionError
+from dro_grasp.cli.view import View
+from dro_grasp.errors import HandError, OptionError
 from dro_grasp.frames import HALF_AXES, half_axis_direction
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import BUILTIN_FOLDER
+from dro_grasp.objects.builtin import BUILTIN
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.viewer import grasp_page as module
 from dro_grasp.viewer.grasp_page import EXPORTS, chosen
+from dro_grasp.viewer.stage import HOST, ServedPage
 from dro_grasp.viewer.studio import Studio, StudioServer
 from dro_grasp.viewer.uploads import MAX_BYTES, store_upload
 from tests.helpers.browser import free_port, page_of
 from tests.helpers.served_studio import served_studio, visited
+from tests.helpers.weights import untrained_weights
 
 pytestmark = pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")
 
@@ -150,6 +155,26 @@ def test_uploads_are_picked_and_errors_are_shown(studio: Studio) -> None:
     assert "bad.urdf" in studio.status.content
     assert "/" not in studio.status.content.split("bad.urdf")[0], "no path of a temporary folder"
     studio.hand.value = "gripper3"
+
+
+def test_the_page_starts_with_the_hand_and_the_mesh_that_the_command_names(tmp_path: Path) -> None:
+    (tmp_path / "my claw.urdf").write_bytes((BUILTIN_FOLDER / "gripper3.urdf").read_bytes())
+    trimesh.creation.icosphere(radius=30.0).export(tmp_path / "my egg.stl")
+    named = View(hand=str(tmp_path / "my claw.urdf"), object=str(tmp_path / "my egg.stl"), scale=0.001,
+                 weights=str(untrained_weights(tmp_path)))
+    served = ServedPage(free_port(), HOST)
+    studio = named._picked()(served.server, threading.Lock())
+    try:
+        assert (studio.hand.value, studio.object.value) == ("my claw", "my egg")
+        assert "my claw above my egg" in studio.status.content
+        assert float(np.ptp(studio.shelf.obj("my egg").cloud, axis=0).max()) == pytest.approx(0.06, abs=1e-3)
+        assert studio.object.options[0] == "my egg"
+        assert set(BUILTIN) <= set(studio.object.options)
+    finally:
+        studio.close()
+        served.stop()
+    with pytest.raises(HandError, match="nowhere"):
+        View(hand="nowhere.urdf")._picked()
 
 
 def test_one_thing_at_a_time(studio: Studio) -> None:

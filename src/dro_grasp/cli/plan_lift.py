@@ -116,7 +116,7 @@ class Plan:
         for path, text in ((self.trajectory, trajectory_yaml), (self.csv, trajectory_csv)):
             if path is not None:
                 with replacing(path, "trajectory") as temporary:
-                    temporary.write_text(text(made))
+                    temporary.write_text(text(made), encoding="utf-8")
         written = {k: str(p) for k, p in (("plan", self.output), ("trajectory", self.trajectory), ("csv", self.csv)) if p}
         if self.json:
             print_json({**asdict(made.notes), "motion_seconds": made.seconds, **written})

@@ -12,6 +12,7 @@ from dro_grasp.cli.inputs import Flag, optional
 from dro_grasp.cli.output import say
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from threading import Lock
 
     from dro_grasp.grasps.batch import GraspBatch
@@ -36,9 +37,9 @@ class View:
     """Grasp file, or a folder of them; a plan; or attempts of `dro-grasp tabletop`. Without it, the page lets
     you choose a hand and an object, generate grasps, watch trials and export."""
     hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
-    """Hand to use instead of the one named in the file."""
+    """Hand to use instead of the one named in the file, or, without a file, to pick first."""
     object: Annotated[str | None, optional("NAME|PATH", "the names in the file")] = None
-    """Object to show first: a name in the file, or a mesh to use for the file's only object."""
+    """Object to show first: a name in the file, or a mesh to use for the file's only object; without a file, any object."""
     scale: float = 1.0
     """Factor for the coordinates of the mesh given with --object."""
     port: int = 8080
@@ -61,8 +62,7 @@ class View:
         from dro_grasp.viewer.studio import Studio, StudioServer
 
         if self.file is None:
-            predictor = GraspPredictor(self.weights, self.device)
-            serve(StudioServer(lambda place, turn: Studio(place, predictor, turn=turn), self.port, self.host))
+            serve(StudioServer(self._picked(), self.port, self.host))
             return 0
         if is_motion(self.file):
             from dro_grasp.planning.extra import require_arm_extra
@@ -88,6 +88,25 @@ class View:
 
         serve(StudioServer(opened, self.port, self.host))
         return 0
+
+    def _picked(self) -> Callable[[Place, Lock], Studio]:
+        """A page without a file: the hand and the object that are named are picked."""
+        from dro_grasp.hands.library import load_hand
+        from dro_grasp.objects.catalogue import load_object
+        from dro_grasp.predictor import GraspPredictor
+        from dro_grasp.viewer.studio import Studio
+
+        hand = None if self.hand is None else load_hand(self.hand)
+        obj = None if self.object is None else load_object(self.object, scale=self.scale)
+        predictor = GraspPredictor(self.weights, self.device)
+
+        def opened(place: Place, turn: Lock) -> Studio:
+            studio = Studio(place, predictor, turn=turn, preview=hand is None and obj is None)
+            if hand is not None or obj is not None:
+                studio.offer(hand, obj)
+            return studio
+
+        return opened
 
 
 @dataclass(frozen=True)

@@ -98,7 +98,7 @@ def plain(values: Float[Tensor, " k"]) -> list[float]:
 
 def yaml_text(content: Any) -> str:
     """YAML in the order given, leaves on one line."""
-    return yaml.dump(content, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=120)
+    return yaml.dump(content, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
 
 
 class _Dumper(yaml.SafeDumper):

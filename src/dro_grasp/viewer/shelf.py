@@ -49,12 +49,16 @@ class Shelf:
             kept.pop(label, None)
         return label
 
-    def put(self, hand: Hand, grasps: GraspBatch, obj: ObjectModel | None = None) -> None:
-        """Add the hand, the grasps and the objects of a file; an object, if given, is that of all its grasps."""
-        self._hands[hand.name] = hand
-        self.batches |= dict(grasps.by_object()) if obj is None else {obj.name: grasps}
+    def put(
+        self, hand: Hand | None = None, grasps: GraspBatch | None = None, obj: ObjectModel | None = None
+    ) -> None:
+        """Add a hand, an object, or the grasps and the objects of a file; an object, if given, is that of all its grasps."""
+        if hand is not None:
+            self._hands[hand.name] = hand
         if obj is not None:
             self._objects[obj.name] = obj
+        if grasps is not None:
+            self.batches |= dict(grasps.by_object()) if obj is None else {obj.name: grasps}
 
     def hand_names(self) -> tuple[str, ...]:
         """Names of hands, those of a file first."""
@@ -62,7 +66,7 @@ class Shelf:
 
     def object_names(self) -> tuple[str, ...]:
         """Names of objects, those of a file first."""
-        return tuple(dict.fromkeys([*self.batches, *object_names()]))
+        return tuple(dict.fromkeys([*self.batches, *self._objects, *object_names()]))
 
     def hand(self, name: str) -> Hand:
         """The hand of a name.

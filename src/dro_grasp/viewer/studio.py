@@ -88,6 +88,14 @@ class Studio(GraspPage):
         self.object.value = obj.name if obj is not None else first or grasps.object[0]
         self._guarded(self._pick_object)
 
+    def offer(self, hand: Hand | None, obj: ObjectModel | None) -> None:
+        """Pick a hand, an object or both, which may be the user's own; None leaves what is picked."""
+        self.shelf.put(hand, obj=obj)
+        self.hand.options, self.object.options = self.shelf.hand_names(), self.shelf.object_names()
+        self.hand.value = self.hand.value if hand is None else hand.name
+        self.object.value = self.object.value if obj is None else obj.name
+        self._guarded(self._preview)
+
     def generate(
         self, hand: str, obj: str, num: int = GraspRequest.num, constraints: Constraints | None = None,
         temperature: float | None = None, protocol: str = DEFAULT_PROTOCOL, candidates: int = GraspRequest.candidates,
