@@ -215,7 +215,7 @@ def draw(results: list[dict[str, Any]], folder: Path, path: Path) -> None:
                         label=f"{stage}, {name}")
     ax.set(xscale="log", xlabel="training grasps, over three hands", ylabel="success [%]", ylim=(0, 100))
     ax.grid(alpha=0.3)
-    ax.legend(loc="upper left")
+    ax.legend(loc="lower left", ncols=2)
     figure.savefig(path, dpi=110)
 
 
