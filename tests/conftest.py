@@ -13,13 +13,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import jaxtyping
 import pytest
 
-import tests.helpers.typecheck
+import tests.helpers.typecheck  # noqa: F401  (must be imported before the hook is installed)
 
 jaxtyping.install_import_hook("dro_grasp", "tests.helpers.typecheck.check")
-
-
-def pytest_runtest_setup() -> None:
-    tests.helpers.typecheck.check_anew()
 
 
 @pytest.fixture(scope="session")

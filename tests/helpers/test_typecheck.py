@@ -7,8 +7,6 @@ import torch
 from jaxtyping import Float, TypeCheckError, jaxtyped
 from torch import Tensor
 
-from dro_grasp.geometry.se3 import rotate
-from tests.helpers import typecheck
 from tests.helpers.typecheck import check
 
 
@@ -42,18 +40,3 @@ def test_results_are_refused_also_for_sizes_that_only_the_arguments_tell() -> No
         repeated(torch.zeros(4), 2, wrong=1)
     with pytest.raises(TypeCheckError, match=r"return value of .*shown"):
         shown(torch.zeros(3), "done")
-
-
-def test_each_function_is_checked_in_its_first_calls_of_a_test() -> None:
-    typecheck.check_anew()
-    good, bad = (torch.eye(3), torch.zeros(5, 3)), (torch.eye(3), [1.0, 2.0, 3.0])
-    for _ in range(typecheck.CALLS - 1):
-        rotate(*good)
-    with pytest.raises(TypeCheckError):
-        rotate(*bad)
-    with pytest.raises(TypeError, match="list indices") as raised:
-        rotate(*bad)
-    assert raised.type is TypeError, "of the operation itself"
-    typecheck.check_anew()
-    with pytest.raises(TypeCheckError):
-        rotate(*bad)
