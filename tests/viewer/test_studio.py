@@ -6,6 +6,7 @@ import io
 import threading
 import time
 import zipfile
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -146,15 +147,62 @@ def test_what_is_taken_away_is_what_is_shown(studio: Studio, made: module.ShownG
 
 def test_uploads_are_picked_and_errors_are_shown(studio: Studio) -> None:
     text = (BUILTIN_FOLDER / "gripper3.urdf").read_bytes()
-    studio._guarded(lambda: studio._take(viser.UploadedFile(name="../mine.urdf", content=text), studio.hand))
+    studio._take(viser.UploadedFile(name="../mine.urdf", content=text), studio.hand)
     assert studio.hand.value == "mine.urdf", "no path of a temporary folder"
     assert studio.stage.hand is not None
     assert studio.stage.hand.name == "mine", "the uploaded hand is shown at once"
-    studio._guarded(lambda: studio._take(viser.UploadedFile(name="bad.urdf", content=b"<robot"), studio.hand))
+    studio._take(viser.UploadedFile(name="bad.urdf", content=b"<robot"), studio.hand)
     assert studio.status.content.startswith("**Error:**")
     assert "bad.urdf" in studio.status.content
     assert "/" not in studio.status.content.split("bad.urdf")[0], "no path of a temporary folder"
     studio.hand.value = "gripper3"
+
+
+def test_an_upload_waits_for_other_work_and_is_never_lost(studio: Studio, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (BUILTIN_FOLDER / "gripper3.urdf").read_bytes()
+
+    def upload(name: str) -> threading.Thread:
+        thread = threading.Thread(target=lambda: studio._take(viser.UploadedFile(name=name, content=text), studio.hand))
+        thread.start()
+        return thread
+
+    with studio._busy:
+        waiting = upload("early.urdf")
+        time.sleep(0.2)
+        assert waiting.is_alive()
+        assert studio.hand.value == "gripper3"
+    waiting.join(20)
+    assert studio.hand.value == "early.urdf"
+    assert "early.urdf is picked" in studio.status.content
+    studio.hand.value = "gripper3"
+    monkeypatch.setattr("dro_grasp.viewer.studio.UPLOAD_PATIENCE", 0.1)
+    with studio._busy:
+        upload("late.urdf").join(20)
+    assert studio.hand.value == "gripper3"
+    assert "late.urdf" in studio.hand.options
+    assert "late.urdf is stored; pick it" in studio.status.content
+
+
+def test_no_control_is_sent_before_all_are_connected(studio: Studio, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A browser must not be able to upload a file that nothing takes."""
+    within: list[str] = []
+    honest = studio.place.atomic
+
+    @contextmanager
+    def atomic():
+        with honest():
+            within.append("held back")
+            yield
+            within.append("sent")
+
+    class Watched(Studio):
+        def _add_display(self) -> None:
+            within.append("last controls")
+            super()._add_display()
+
+    monkeypatch.setattr(studio.place, "atomic", atomic)
+    Watched(studio.place, studio.predictor, "gripper3", "sphere", preview=False).close()
+    assert within[:3] == ["held back", "last controls", "sent"]
 
 
 def test_the_page_starts_with_the_hand_and_the_mesh_that_the_command_names(tmp_path: Path) -> None:
@@ -198,7 +246,7 @@ def test_every_browser_has_a_page_and_closing_it_ends_its_work_and_its_uploads(
         clients = visited(served, 2)
         text = (BUILTIN_FOLDER / "gripper3.urdf").read_bytes()
         for page, name in zip(made, ("mine.urdf", "theirs.urdf"), strict=True):
-            page._guarded(lambda page=page, name=name: page._take(viser.UploadedFile(name=name, content=text), page.hand))
+            page._take(viser.UploadedFile(name=name, content=text), page.hand)
         assert "mine.urdf" not in made[1].hand.options
         assert "theirs.urdf" not in made[0].hand.options
         folders = [Path(page.shelf._folder.name) for page in made]

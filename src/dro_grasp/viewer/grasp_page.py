@@ -72,9 +72,10 @@ class GraspPage:
         self.shown: list[int] = []
         self.film: tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames n_dof"]] | None = None
         self._busy = threading.Lock()
-        self._add_choices()
-        self.status = place.gui.add_markdown("")
-        self._add_display()
+        with place.atomic():  # the browser gets no control before all are connected
+            self._add_choices()
+            self.status = place.gui.add_markdown("")
+            self._add_display()
 
     def _add_choices(self) -> None:
         """Controls above those of the grasps: none."""
@@ -110,18 +111,28 @@ class GraspPage:
         self.play.on_click(lambda _: self._guarded(self._play))
         self.download.on_click(lambda event: self._guarded(lambda: self._send(event)))
 
-    def _guarded(self, work: Callable[[], None]) -> None:
-        """Do one thing at a time, and show errors on the page."""
+    def _guarded(self, work: Callable[[], None], patience: float = 0.0, otherwise: str = "Busy; wait a moment.") -> None:
+        """Do one thing at a time, and show errors on the page.
+
+        Args:
+            work: What to do.
+            patience: Time to wait for the end of other work [s].
+            otherwise: What is said if it does not end.
+        """
         with suppress(Closed):
-            if not self._busy.acquire(blocking=False):
-                self._say("Busy; wait a moment.")
+            if not self._busy.acquire(timeout=patience):
+                self._say(otherwise)
                 return
             try:
                 work()
             except DroGraspError as error:
-                self._say(f"**Error:** {self._plain(str(error))}")
+                self._complain(error)
             finally:
                 self._busy.release()
+
+    def _complain(self, error: DroGraspError) -> None:
+        """Show an error."""
+        self._say(f"**Error:** {self._plain(str(error))}")
 
     def _say(self, text: str) -> None:
         """Show a line.

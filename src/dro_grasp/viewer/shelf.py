@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tempfile
+from itertools import count
 from pathlib import Path
 
 from dro_grasp.grasps.batch import GraspBatch
@@ -21,7 +22,7 @@ class Shelf:
 
     def __init__(self) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="dro-grasp-")
-        self._uploads = 0
+        self._numbers = count(1)
         self._paths: dict[str, Path] = {}
         self._hands: dict[str, Hand] = {}
         self._objects: dict[str, ObjectModel] = {}
@@ -39,8 +40,7 @@ class Shelf:
         Raises:
             OptionError: The upload is refused.
         """
-        self._uploads += 1
-        folder = Path(self._folder.name) / str(self._uploads)
+        folder = Path(self._folder.name) / str(next(self._numbers))
         folder.mkdir()
         path = store_upload(name, content, folder)
         label = path.name

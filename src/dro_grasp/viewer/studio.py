@@ -12,6 +12,7 @@ from typing import get_args
 
 import viser
 
+from dro_grasp.errors import DroGraspError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import hand_names
@@ -36,6 +37,8 @@ MOST_CANDIDATES = 8
 """Most candidates for each of them (ours)."""
 PATIENCE = 0.5
 """Time after which a page that waits for another looks whether it is still open [s] (ours)."""
+UPLOAD_PATIENCE = 10.0
+"""Time that an upload waits to be picked while the page does other work, such as loading its first pair [s] (ours)."""
 GRACE = 5.0
 """Time that a closed page has to end what it does before its uploads are deleted [s] (ours)."""
 
@@ -171,8 +174,8 @@ class Studio(GraspPage):
             self.protocol = gui.add_dropdown("Trial", tuple(PROTOCOLS), initial_value=DEFAULT_PROTOCOL)
             self.button = gui.add_button("Generate", color="green")
         self.panel = panel = ConstraintPanel(self.place, lambda: self._guarded(self._draw_constraints))
-        hand_file.on_upload(lambda _: self._guarded(lambda: self._take(hand_file.value, self.hand)))
-        object_file.on_upload(lambda _: self._guarded(lambda: self._take(object_file.value, self.object)))
+        hand_file.on_upload(lambda _: self._take(hand_file.value, self.hand))
+        object_file.on_upload(lambda _: self._take(object_file.value, self.object))
         panel.upload.on_upload(lambda _: self._guarded(lambda: self._take_scene(panel.upload.value)))
         panel.under.on_click(lambda _: self._guarded(self._table_under))
         self.button.on_click(lambda _: self._guarded(self._generate))
@@ -181,9 +184,20 @@ class Studio(GraspPage):
         self.usual.on_update(lambda _: setattr(self.temperature, "disabled", self.usual.value))
 
     def _take(self, upload: viser.UploadedFile, choice: viser.GuiDropdownHandle[str]) -> None:
-        """Store an upload and pick it."""
-        label = self.shelf.take(upload.name, upload.content)
+        """Store an upload and pick it; where other work takes long, it can be picked later."""
+        if self.closed.is_set():
+            return
+        try:
+            label = self.shelf.take(upload.name, upload.content)
+        except DroGraspError as error:
+            self._complain(error)
+            return
         choice.options = tuple(dict.fromkeys([*choice.options, label]))
+        later = f"Busy. {label} is stored; pick it afterwards."
+        self._guarded(lambda: self._pick_upload(label, choice), UPLOAD_PATIENCE, later)
+
+    def _pick_upload(self, label: str, choice: viser.GuiDropdownHandle[str]) -> None:
+        """Pick an upload."""
         choice.value = label
         self._preview()
         self._say(f"{label} is picked. {self.status.content}")
