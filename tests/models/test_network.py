@@ -203,16 +203,30 @@ def test_a_latent_that_moves_the_hand_moves_its_points_apart() -> None:
     assert network(hand, obj, grasp, torch.Generator()).flow_error.min() > 0
 
 
+@pytest.mark.parametrize(
+    "changes", [{}, {"prior": "learned"}, {"latent_form": "motion", "prior": "flow", "frame": "wrist"}],
+    ids=["paper", "learned", "ours"])
+def test_a_drawn_z_predicts_in_training_what_it_does_at_inference(changes: dict, monkeypatch: pytest.MonkeyPatch) -> None:
+    hand, obj, grasp = torch.randn(3, 2, 40, 3, generator=torch.Generator().manual_seed(0)) * 0.1
+    network = untrained_network(dataclasses.replace(SMALL, **changes), seed=3).eval()
+    assert network(hand, obj, grasp, torch.Generator(), columns=20).drawn is None
+    drawn, honest = [], torch.randn
+    monkeypatch.setattr(torch, "randn", lambda *a, **k: drawn.append(honest(*a, **k)) or drawn[-1])
+    found = network(hand, obj, grasp, torch.Generator().manual_seed(1), columns=20, draw=True).drawn
+    expected = network.predict(hand, obj, drawn[-1][:, None])[:, :, :20]
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.parametrize("changes", [{}, {"latent_form": "motion", "prior": "flow", "frame": "wrist"}], ids=["paper", "ours"])
 def test_all_randomness_comes_from_the_generator(changes: dict) -> None:
     hand, obj, grasp = torch.randn(3, 2, 40, 3, generator=torch.Generator().manual_seed(0)) * 0.1
     network = untrained_network(dataclasses.replace(SMALL, **changes), seed=3).eval()
     state = torch.get_rng_state()
     again = untrained_network(network.config, seed=3).eval()
-    first = network(hand, obj, grasp, torch.Generator().manual_seed(1))
+    first = network(hand, obj, grasp, torch.Generator().manual_seed(1), draw=True)
     assert torch.equal(torch.get_rng_state(), state), "the global generator is left alone"
     torch.manual_seed(99)
-    second = again(hand, obj, grasp, torch.Generator().manual_seed(1))
+    second = again(hand, obj, grasp, torch.Generator().manual_seed(1), draw=True)
     for name, value in vars(first).items():
         assert torch.equal(value, getattr(second, name)), name
     other = network(hand, obj, grasp, torch.Generator().manual_seed(2))

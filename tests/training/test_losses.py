@@ -7,11 +7,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.distributions import Normal, kl_divergence
 
 from dro_grasp.training.losses import (
+    contact_loss,
     contrastive_loss,
     distance_loss,
     divergence,
@@ -90,6 +92,24 @@ def test_penetration_equals_a_loop() -> None:
             depth += max(0.0, -float((point - obj[b, j]) @ normals[b, j]))
         expected.append(depth / 7)
     np.testing.assert_allclose(penetration_loss(hand, obj, normals), expected, rtol=1e-5)
+
+
+def test_contact_equals_a_loop_over_fingers() -> None:
+    hand, obj = torch.randn(2, 12, 3), torch.randn(2, 30, 3)
+    finger = torch.tensor([-1, 0, 0, 2, 2, 2, 1, -1, 1, 0, 2, 1])
+    expected = []
+    for b in range(2):
+        distance, _ = cKDTree(obj[b].numpy()).query(hand[b].numpy())
+        fingers = np.array([distance[finger.numpy() == i].min() for i in range(3)])
+        expected.append(np.minimum(np.maximum(fingers - 0.3, 0), 0.9 - 0.3).mean())
+    np.testing.assert_allclose(contact_loss(hand, finger, obj, 0.3, 0.9), expected, rtol=1e-5)
+
+
+def test_contact_draws_a_near_finger_and_neither_a_far_one_nor_one_that_touches() -> None:
+    hand = torch.tensor([[[0.01, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.001, 0.0]]], requires_grad=True)
+    contact_loss(hand, torch.arange(3), torch.zeros(1, 4, 3), 0.006, 0.03).sum().backward()
+    assert hand.grad is not None
+    np.testing.assert_allclose(hand.grad[0], [[1 / 3, 0, 0], [0, 0, 0], [0, 0, 0]], atol=1e-6)
 
 
 def test_divergence_equals_pytorchs() -> None:

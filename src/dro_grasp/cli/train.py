@@ -165,6 +165,8 @@ class Train(Stage):
     """Share of the schedule over which the KL weight grows from zero."""
     free_bits: float = 0.0
     """KL of each latent dimension that costs nothing [nat]."""
+    drawn: float = 0.0
+    """Weight of penetration and contact of hands that a drawn z gives, as at inference; half of the steps draw one."""
     samples_per_hand: int = 4
     """Grasps of each of the four hands in a shard."""
     columns: int = 48
@@ -197,7 +199,8 @@ class Train(Stage):
         pretrained, initial = (None if name is None else load_weights(name) for name in (self.pretrained, self.initial))
         network = network_config(
             self.preset, initial, latent=self.latent, prior=self.prior, latent_form=self.latent_form)
-        losses = dataclasses.replace(LOSSES[self.losses], divergence_warmup=self.divergence_warmup, free_bits=self.free_bits)
+        losses = dataclasses.replace(LOSSES[self.losses], divergence_warmup=self.divergence_warmup, free_bits=self.free_bits,
+                                     drawn=self.drawn)
         if self.divergence is not None:
             losses = dataclasses.replace(losses, divergence=self.divergence)
         config = TrainConfig(

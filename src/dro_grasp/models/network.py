@@ -46,6 +46,8 @@ class NetworkOutput:
     """Squared velocity error of the flow to z; zero without a flow."""
     moved: Float[Tensor, "b n 3"]
     """The placed hand, moved by z if z moves it [m]."""
+    drawn: Float[Tensor, "b n columns"] | None
+    """D(R,O) of a z that was drawn from its prior [m]; None if none was asked for."""
     hand_feature: Float[Tensor, "b width"]
     """Mean feature of the open hand, for the placement prior."""
 
@@ -99,7 +101,7 @@ class DistanceNetwork(nn.Module):
 
     def forward(
         self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], grasp: Float[Tensor, "b n 3"],
-        generator: torch.Generator, columns: int | None = None,
+        generator: torch.Generator, columns: int | None = None, draw: bool = False,
     ) -> NetworkOutput:
         """One training pass: z comes from the true grasp.
 
@@ -109,31 +111,42 @@ class DistanceNetwork(nn.Module):
             grasp: The hand in the grasp pose, in the same frame [m].
             generator: Source of the draws of z, on the clouds' device.
             columns: Compute distances to this many leading object points only; the order must be random.
+            draw: Also predict with a z that is drawn as at inference.
         """
         phi_hand, phi_object = self.encode(hand, obj)
+        moved, psi = hand, None
         if self.motion is not None:
             mean, log_variance = self.motion.encode(phi_hand, hand, grasp)
             z = latent.sample_posterior(mean, log_variance, generator)
             moved = self.motion(phi_hand, hand, z[:, None])[:, 0]
-            psi_hand, psi_object = self.relate(phi_hand, phi_object, moved)
         else:
-            psi_hand, psi_object = self.relate(phi_hand, phi_object, hand)
+            psi = self.relate(phi_hand, phi_object, hand)
             assert self.latent_encoder is not None
             with self._products(hand):
-                mean, log_variance = self.latent_encoder(
-                    torch.cat([grasp, obj], 1), torch.cat([psi_hand, psi_object], 1))
+                mean, log_variance = self.latent_encoder(torch.cat([grasp, obj], 1), torch.cat(psi, 1))
             mean, log_variance = mean.float(), log_variance.float()
-            z, moved = latent.sample_posterior(mean, log_variance, generator), hand
-        distances = self._distances(psi_hand, psi_object[:, :columns], z, moved, obj[:, :columns])
+            z = latent.sample_posterior(mean, log_variance, generator)
+
+        def predicted(z: Float[Tensor, "b latent"], moved: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n columns"]:
+            psi_hand, psi_object = psi or self.relate(phi_hand, phi_object, moved)
+            return self._distances(psi_hand, psi_object[:, :columns], z, moved, obj[:, :columns])
+
+        distances = predicted(z, moved)
         prior_mean, prior_log_variance, flow_error = torch.zeros_like(z), torch.zeros_like(z), z.new_zeros(len(z))
-        if self.condition is not None:
-            condition = self.condition(phi_hand, phi_object, hand, obj)
+        condition = None if self.condition is None else self.condition(phi_hand, phi_object, hand, obj)
+        if condition is not None:
             if isinstance(self.prior, latent.FlowPrior):
                 flow_error = self.prior.loss(z, condition, generator)
             elif self.prior is not None:
                 prior_mean, prior_log_variance = self.prior.moments(condition)
+        drawn = None
+        if draw:
+            other = torch.randn(z.shape, generator=generator, device=z.device)
+            if condition is not None and self.prior is not None:
+                other = self.prior(other, condition)
+            drawn = predicted(other, hand if self.motion is None else self.motion(phi_hand, hand, other[:, None])[:, 0])
         return NetworkOutput(
-            distances, mean, log_variance, prior_mean, prior_log_variance, flow_error, moved, phi_hand.mean(1))
+            distances, mean, log_variance, prior_mean, prior_log_variance, flow_error, moved, drawn, phi_hand.mean(1))
 
     def predict(
         self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], noise: Float[Tensor, "b k latent"],

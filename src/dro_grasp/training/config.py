@@ -45,6 +45,14 @@ class LossConfig:
     """Weight of the mean distance between the hand as z moves it and the true grasp; for latent_form `motion`."""
     flow: float = 0.01
     """Weight of the flow's loss; for prior `flow`."""
+    drawn: float = 0.0
+    """Weight of penetration and contact of the hands that a z drawn from its prior gives, as at inference. Source: ours."""
+    drawn_share: float = 0.5
+    """Share of the steps that draw one."""
+    touching: float = 0.006
+    """Distance between points of hand and object that counts as contact, half of that between an object's points [m]."""
+    reach: float = 0.03
+    """Fingers farther away from the object are not drawn to it [m]."""
     placement: float = 0.01
     """Weight of the placement prior's loss; it shares no parameter with the rest."""
 

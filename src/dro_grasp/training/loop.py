@@ -5,13 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from dro_grasp import distance_matrix
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.errors import WeightsError
 from dro_grasp.geometry.se3 import apply
+from dro_grasp.hands.hand import Hand
 from dro_grasp.models.network import DistanceNetwork, NetworkOutput, untrained_network
 from dro_grasp.models.placement import PlacementPrior
 from dro_grasp.models.presets import NetworkConfig
@@ -131,21 +132,28 @@ def step_losses(
     The model is in training mode; `progress` is the share of the schedule that is done.
     """
     placed, obj, grasp = _clouds(groups)
-    output = model(placed, obj, grasp, generator, columns=config.columns)
+    draw = config.losses.drawn > 0 and bool(
+        torch.rand((), generator=generator, device=generator.device) < config.losses.drawn_share)
+    output = model(placed, obj, grasp, generator, columns=config.columns, draw=draw)
     anchors = obj[:, : config.columns]
     parts = {"distance": losses.distance_loss(output.distances, distance_matrix.build(grasp, anchors))}
-    poses, penetrations = [], []
+    poses, penetrations, drawn = [], [], []
     start = 0
     for group in groups:
         rows = slice(start, start + len(group.placed))
-        decoded = distance_matrix.decode(group.hand, output.distances[rows], anchors[rows])
-        poses.append(losses.pose_loss(decoded.T_world_link, group.T_frame_link, decoded.valid))
-        kept = decoded.valid[group.hand.link_index]
-        posed = apply(decoded.T_world_link[:, group.hand.link_index[kept]], group.hand.link_points[kept])
+        links, posed, _ = _posed(group.hand, output.distances[rows], anchors[rows])
+        poses.append(losses.pose_loss(links.T_world_link, group.T_frame_link, links.valid))
         penetrations.append(losses.penetration_loss(posed, group.obj, group.normals))
+        if output.drawn is not None:
+            _, posed, finger = _posed(group.hand, output.drawn[rows], anchors[rows])
+            inside = losses.penetration_loss(posed, group.obj, group.normals)
+            apart = losses.contact_loss(posed, finger, group.obj, config.losses.touching, config.losses.reach)
+            drawn.append(config.losses.penetration * inside + apart)
         start = rows.stop
     parts["pose"] = torch.cat(poses).mean()
     parts["penetration"] = torch.cat(penetrations).mean()
+    if config.losses.drawn > 0:
+        parts["drawn"] = torch.cat(drawn).mean() if drawn else output.distances.new_zeros(())
     nats = losses.divergence(output.mean, output.log_variance, output.prior_mean, output.prior_log_variance)
     parts["divergence"] = losses.divergence_loss(nats, config.losses.divergence_form, config.losses.free_bits)
     if model.motion is not None:
@@ -158,6 +166,16 @@ def step_losses(
         weights["divergence"] *= progress / config.losses.divergence_warmup
     total = torch.stack([weights[name] * value for name, value in parts.items()]).sum()
     return {"total": total, **parts, "nats": nats.sum(-1).mean()}
+
+
+def _posed(
+    hand: Hand, distances: Float[Tensor, "b n columns"], anchors: Float[Tensor, "b columns 3"]
+) -> tuple[distance_matrix.LinkPoses, Float[Tensor, "b k 3"], Int[Tensor, " k"]]:
+    """Link poses of predicted distances, the points of links that have one [m], and the finger of each point."""
+    links = distance_matrix.decode(hand, distances, anchors)
+    kept = links.valid[hand.link_index]
+    index = hand.link_index[kept]
+    return links, apply(links.T_world_link[:, index], hand.link_points[kept]), hand.finger_of_link[index]
 
 
 def _clouds(groups: list[HandSamples]) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b m 3"], Float[Tensor, "b n 3"]]:

@@ -5,9 +5,12 @@ from __future__ import annotations
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
+
+EXACT = "donot_use_mm_for_euclid_dist"
+"""Mode of `torch.cdist`: the gradient of the matrix-product form is not finite where points meet."""
 
 
 def distance_loss(predicted: Float[Tensor, "b n m"], true: Float[Tensor, "b n m"]) -> Float[Tensor, ""]:
@@ -51,6 +54,23 @@ def penetration_loss(
         nearest = torch.cdist(hand, obj).argmin(-1)[..., None].expand(-1, -1, 3)
     signed = ((hand - obj.gather(1, nearest)) * normals.gather(1, nearest)).sum(-1)
     return functional.relu(-signed).mean(-1)
+
+
+def contact_loss(
+    hand: Float[Tensor, "b n 3"], finger: Int[Tensor, " n"], obj: Float[Tensor, "b m 3"], touching: float, reach: float
+) -> Float[Tensor, " b"]:
+    """Mean over fingers of how far each is from touching the object [m]; those out of reach cost the same everywhere. Ours.
+
+    Args:
+        hand: Points of the hand [m].
+        finger: Finger of each point; negative for the palm, whose points do not count.
+        obj: Points of the object [m].
+        touching: Distance between points of the two that counts as contact [m].
+        reach: Distance beyond which a finger is not drawn near [m].
+    """
+    offset = torch.cdist(hand, obj, compute_mode=EXACT).amin(-1)
+    nearest = torch.stack([offset[:, finger == i].amin(1) for i in finger[finger >= 0].unique().tolist()], 1)
+    return (nearest.clamp(touching, reach) - touching).mean(1)
 
 
 def divergence(
