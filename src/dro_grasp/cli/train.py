@@ -169,6 +169,8 @@ class Train(Stage):
     """Weight of penetration and contact of hands that a drawn z gives, as at inference; half of the steps draw one."""
     samples_per_hand: int = 4
     """Grasps of each of the four hands in a shard."""
+    by_count: float = 0.0
+    """Draw hands in proportion to the number of their grasps to this power; 0: each as often as any other."""
     columns: int = 48
     """Object points to which a step predicts distances; a GPU affords 128."""
     mixed: Flag = False
@@ -205,7 +207,7 @@ class Train(Stage):
             losses = dataclasses.replace(losses, divergence=self.divergence)
         config = TrainConfig(
             schedule=self.schedule(steps=self.steps, learning_rate=self.learning_rate, mixed=self.mixed),
-            samples_per_hand=self.samples_per_hand, columns=self.columns, losses=losses,
+            samples_per_hand=self.samples_per_hand, by_count=self.by_count, columns=self.columns, losses=losses,
             augmentation=AugmentationConfig(partial=self.partial),
         )
         bundle = load_bundle(self.bundle)

@@ -106,6 +106,8 @@ class TrainConfig:
     """Different hands in one step."""
     samples_per_hand: int = 4
     """Grasps of each of these hands."""
+    by_count: float = 0.0
+    """Hands are drawn in proportion to the number of their grasps to this power; at 0 each as often as any other."""
     columns: int = 48
     """Object points to which a step predicts distances; inference uses all."""
     freeze_hand_encoder: bool = True

@@ -65,7 +65,7 @@ def train(
         model.hand_encoder.eval()
 
     def draw() -> list[HandSamples]:
-        names = source.draw_hands(config.hands_per_step, generator)
+        names = source.draw_hands(config.hands_per_step, generator, config.by_count)
         return [source.draw(hand, config.samples_per_hand, generator) for hand in names]
 
     run.train(lambda: step_losses(model, draw(), config, generator, run.progress), report or console_report("training"))

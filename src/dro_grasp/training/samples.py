@@ -63,9 +63,20 @@ class SampleSource:
         self.normals = torch.stack([cloud.normals for cloud in bundle.objects.values()]).to(device)
         self.centres = self.points.mean(1)
 
-    def draw_hands(self, count: int, generator: torch.Generator) -> list[str]:
-        """Names of the hands of one step, each as often as any other in the long run."""
-        order = torch.randperm(len(self.names), generator=generator, device=generator.device).tolist()
+    def draw_hands(self, count: int, generator: torch.Generator, by_count: float = 0.0) -> list[str]:
+        """Names of the hands of one step.
+
+        Args:
+            count: How many; none comes twice where there are enough.
+            generator: Source of randomness.
+            by_count: A hand is drawn in proportion to the number of its grasps to this power; at 0 as often as any other.
+        """
+        device = generator.device
+        if by_count == 0:
+            order = torch.randperm(len(self.names), generator=generator, device=device).tolist()
+        else:
+            counts = torch.tensor([float(len(self.grasps[name].joints)) for name in self.names], device=device)
+            order = torch.multinomial(counts**by_count, len(counts), generator=generator).tolist()
         return [self.names[order[i % len(order)]] for i in range(count)]
 
     def draw(self, name: str, count: int, generator: torch.Generator) -> HandSamples:
