@@ -13,6 +13,7 @@ from torch import Tensor
 
 from dro_grasp.geometry.mirrored_sides import SideConfig, choose_sides
 from dro_grasp.geometry.multilateration import MultilaterationConfig, distance_misfit, multilaterate
+from dro_grasp.geometry.point_clouds import point_distances
 from dro_grasp.geometry.registration import register
 from dro_grasp.geometry.se3 import apply, apply_to_cloud
 from dro_grasp.hands.hand import Hand
@@ -63,8 +64,7 @@ class _Segments:
 
 def build(hand_points: Float[Tensor, "*b n 3"], object_points: Float[Tensor, "*b m 3"]) -> Float[Tensor, "*b n m"]:
     """D(R,O) of a posed hand and an object [m]."""
-    # The matrix-product form of cdist loses half of the significant digits.
-    return torch.cdist(hand_points, object_points, compute_mode="donot_use_mm_for_euclid_dist")
+    return point_distances(hand_points, object_points)
 
 
 def decode(

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial.distance import cdist
 
-from dro_grasp.geometry.point_clouds import enclosed_volume, farthest_points, random_half, sample_surface
+from dro_grasp.geometry.point_clouds import enclosed_volume, farthest_points, point_distances, random_half, sample_surface
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -95,3 +96,13 @@ def test_volumes_are_those_of_formulas_wherever_the_surface_is(mesh: trimesh.Tri
     triangles = np.asarray(mesh.triangles) + np.array([0.3, -2.0, 0.7])
     assert enclosed_volume(triangles) == pytest.approx(volume, rel=2e-3)
     assert enclosed_volume(triangles[:, ::-1]) == pytest.approx(-volume, rel=2e-3)
+
+
+def test_distances_keep_their_digits_far_from_the_origin_and_have_a_gradient_where_points_meet() -> None:
+    a = (torch.randn(30, 3, generator=torch.Generator().manual_seed(0)) * 0.05 + 10).requires_grad_()
+    b = torch.cat([a.detach()[:5], torch.randn(30, 3, generator=torch.Generator().manual_seed(1)) * 0.05 + 10])
+    found = point_distances(a, b)
+    np.testing.assert_allclose(found.detach(), cdist(a.detach().double(), b.double()), atol=1e-6)
+    found.sum().backward()
+    assert a.grad is not None
+    assert bool(a.grad.isfinite().all())

@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dro_grasp.geometry.point_clouds import point_distances
+
 Ball = tuple[float, float, float, float]
 """Centre and radius [m]."""
 
@@ -30,7 +32,7 @@ class Balls:
 
     def distances(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
         """Distance to the surface of the nearest ball, negative inside [m], and its gradient."""
-        apart = torch.cdist(points, self.centres.to(points), compute_mode="donot_use_mm_for_euclid_dist")
+        apart = point_distances(points, self.centres.to(points))
         distance, index = (apart - self.radii.to(points)).min(-1)
         offset = points - self.centres.to(points)[index]
         return distance, torch.nn.functional.normalize(offset, dim=-1)

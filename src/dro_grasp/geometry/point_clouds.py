@@ -10,6 +10,14 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 
+def point_distances(a: Float[Tensor, "*b n 3"], b: Float[Tensor, "*b m 3"]) -> Float[Tensor, "*b n m"]:
+    """Distance of each point of one cloud to each of another [m], as their coordinates give it.
+
+    PyTorch's form by a matrix product loses half of the digits, and its gradient is not finite where points meet.
+    """
+    return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
+
+
 def enclosed_volume(triangles: Float[np.ndarray, "n 3 3"]) -> float:
     """Signed volume inside a closed surface [m^3], by the divergence theorem; positive if corners run counter-clockwise."""
     a, b, c = triangles.transpose(1, 0, 2)

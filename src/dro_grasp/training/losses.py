@@ -9,8 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-EXACT = "donot_use_mm_for_euclid_dist"
-"""Mode of `torch.cdist`: the gradient of the matrix-product form is not finite where points meet."""
+from dro_grasp.geometry.point_clouds import point_distances
 
 
 def distance_loss(predicted: Float[Tensor, "b n m"], true: Float[Tensor, "b n m"]) -> Float[Tensor, ""]:
@@ -68,7 +67,7 @@ def contact_loss(
         touching: Distance between points of the two that counts as contact [m].
         reach: Distance beyond which a finger is not drawn near [m].
     """
-    offset = torch.cdist(hand, obj, compute_mode=EXACT).amin(-1)
+    offset = point_distances(hand, obj).amin(-1)
     nearest = torch.stack([offset[:, finger == i].amin(1) for i in finger[finger >= 0].unique().tolist()], 1)
     return (nearest.clamp(touching, reach) - touching).mean(1)
 
