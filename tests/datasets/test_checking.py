@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from dro_grasp.cli.main import main
+from dro_grasp.datasets.collections import checking
 from dro_grasp.datasets.collections.checking import check, keep_passing
-from dro_grasp.datasets.collections.collection import read_collection
+from dro_grasp.datasets.collections.collection import PairGrasps, read_collection
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand
@@ -82,16 +84,22 @@ def test_filter_keeps_what_passes_with_its_new_numbers(stored):
     assert 0 < sum(len(passed) for _, passed in kept) < 24
 
 
-def test_fingers_are_closed_where_the_grasp_holds_and_touches_with_more(stored, tmp_path):
+@pytest.fixture(scope="module")
+def lazy(stored: Path) -> list[PairGrasps]:
+    """The grasps that held, with one finger opened, and the others."""
     hand, grasps = load_hand("barrett"), GraspBatch.load(stored)
     joints = grasps.joints.clone()
     bends = hand.tree.moves[list(hand.fingers[0].links)].any(0) & ~hand.abduction
     joints[:, bends] = hand.open_ends[bends]
     joints = torch.where(grasps.success[:, None], joints, grasps.joints)
-    lazy = grasps.moved_to(grasps.T_object_wrist, joints)
-    lazy.save(tmp_path / "lazy.parquet")
-    pairs = list(read_collection(tmp_path / "lazy.parquet", only_successful=False))
-    plain, closed = (keep_passing(pairs, changed("dro"), close_fingers=close) for close in (False, True))
+    opened = grasps.moved_to(grasps.T_object_wrist, joints)
+    opened.save(stored.with_name("lazy.parquet"))
+    return list(read_collection(stored.with_name("lazy.parquet"), only_successful=False))
+
+
+def test_fingers_are_closed_where_the_grasp_holds_and_touches_with_more(lazy):
+    hand = load_hand("barrett")
+    plain, closed = (keep_passing(lazy, changed("dro"), close_fingers=close) for close in (False, True))
     gained = 0
     for (pair, before), (_, after) in zip(plain, closed, strict=True):
         again = simulate(hand, load_object(pair.object), after, "dro")
@@ -104,6 +112,22 @@ def test_fingers_are_closed_where_the_grasp_holds_and_touches_with_more(stored, 
         assert all(has[key] >= count for key, count in had.items())
         gained += sum(count > had.get(key, 0) for key, count in has.items())
     assert gained > 1
+
+
+def test_closed_fingers_are_not_kept_where_one_link_alone_touches(lazy, monkeypatch):
+    trials = []
+
+    def few(hand, obj, grasps, rules):
+        found = simulate(hand, obj, grasps, rules)
+        if trials:  # the first is that of the grasps as they are stored
+            found = replace(found, contact_links=tuple(names[:1] for names in found.contact_links))
+        trials.append(found)
+        return found
+
+    monkeypatch.setattr(checking, "simulate", few)
+    ((pair, kept),) = keep_passing(lazy[:1], changed("dro"), close_fingers=True)
+    assert int((trials[1].success & (trials[1].contacts == 1)).sum()) > 1
+    assert torch.equal(kept.joints, pair.grasps.joints[trials[0].success])
 
 
 def test_commands(stored, tmp_path, capsys):

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from dro_grasp.datasets.collections.collection import PairGrasps
+from dro_grasp.datasets.engine.worker import EngineConfig
 from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
@@ -96,8 +97,8 @@ def keep_passing(
         pairs: The data set.
         rules: The trial.
         progress: Called with (grasps evaluated, grasps in all).
-        close_fingers: Also evaluate grasps with their idle fingers closed, and keep these instead where they pass and no
-            fewer fingers touch.
+        close_fingers: Also evaluate grasps with their idle fingers closed, and keep these instead where they pass, no fewer
+            fingers touch, and as many links as a synthesised grasp must touch with.
 
     Raises:
         GraspFileError: A hand or an object is not the one the grasps were made for.
@@ -113,16 +114,17 @@ def keep_passing(
 
 
 def _closed_where_it_holds(hand: Hand, obj: ObjectModel, evaluated: GraspBatch, rules: Protocol) -> GraspBatch:
-    """Evaluated grasps; those with closed fingers instead, where these pass and no fewer fingers touch."""
+    """Evaluated grasps; those with closed fingers instead, where these pass, no fewer fingers touch, and enough links."""
     closed = close_idle_fingers(GraspEnergy.of_object(hand, obj, EnergyConfig(hand_points=hand.n_points)), evaluated)
     rows = (closed.joints != evaluated.joints).any(1).nonzero()[:, 0]
     if not len(rows):
         return evaluated
-    tried = closed[rows].with_trial(simulate(hand, obj, closed[rows], rules))
-    better = tried.success & (tried.fingers_in_contact >= evaluated.fingers_in_contact[rows])
+    trial = simulate(hand, obj, closed[rows], rules)
+    better = trial.success & (trial.contacts >= EngineConfig.min_contact_links)
+    better &= trial.fingers_in_contact >= evaluated.fingers_in_contact[rows]
     order = torch.arange(len(evaluated))
     order[rows[better]] = len(evaluated) + better.nonzero()[:, 0]
-    return GraspBatch.concatenate([evaluated, tried])[order]
+    return GraspBatch.concatenate([evaluated, closed[rows].with_trial(trial)])[order]
 
 
 def _loaded(parts: Sequence[GraspBatch], progress: Progress | None) -> Iterator[tuple[Hand, ObjectModel]]:
