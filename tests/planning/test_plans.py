@@ -247,6 +247,7 @@ def test_corners_are_stops_and_nothing_leaves_the_lines() -> None:
     slow = cornered(corners, np.ones(2), np.ones(2), 20.0)
     assert slow.seconds == pytest.approx(20.0, abs=0.05)
     assert np.abs(slow.position[np.abs(slow.time - 10.0).argmin()] - corners[1]).max() < 1e-3
+    assert cornered(corners[[0, 0]], np.ones(2), np.ones(2), 0.5).seconds == pytest.approx(0.5)
 
 
 def test_a_closing_hand_stays_between_its_postures() -> None:

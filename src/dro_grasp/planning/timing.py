@@ -45,7 +45,7 @@ class Trajectory:
 
 def smooth(
     waypoints: Float[np.ndarray, "k n"], velocity: Float[np.ndarray, " n"], acceleration: Float[np.ndarray, " n"],
-    least: float = 0.0,
+    least_seconds: float = 0.0,
 ) -> Trajectory:
     """The quickest motion along a cubic spline through the waypoints.
 
@@ -53,12 +53,12 @@ def smooth(
         waypoints: Neighbours are close together [rad or m].
         velocity: Limits [rad/s or m/s].
         acceleration: Limits [rad/s^2 or m/s^2].
-        least: A quicker motion is slowed down to this duration [s].
+        least_seconds: A quicker motion is slowed down to this duration [s].
     """
     kept = [0, *(i for i in range(1, len(waypoints)) if np.abs(waypoints[i] - waypoints[i - 1]).max() > SAME)]
     points = waypoints[kept]
     if len(points) == 1:
-        return standing(points[0], least)
+        return standing(points[0], least_seconds)
     along = np.concatenate([[0.0], np.linalg.norm(np.diff(points, axis=0), axis=1).cumsum()])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -74,24 +74,31 @@ def smooth(
     if timed is None:
         raise RuntimeError("a path through its own waypoints has no timing within positive limits")
     fine = np.linspace(0, timed.duration, 4 * GRID)
-    excess = [1.0, least / timed.duration, float(np.abs(timed(fine, 1) / velocity).max()),
+    excess = [1.0, least_seconds / timed.duration, float(np.abs(timed(fine, 1) / velocity).max()),
               float(np.abs(timed(fine, 2) / acceleration).max()) ** 0.5]
     return _sampled(timed, max(excess))
 
 
 def cornered(
     waypoints: Float[np.ndarray, "k n"], velocity: Float[np.ndarray, " n"], acceleration: Float[np.ndarray, " n"],
-    least: float = 0.0,
+    least_seconds: float = 0.0,
 ) -> Trajectory:
-    """The same along straight lines, with a stop at each corner: slow, and never off the path or beyond its ends."""
+    """The same along straight lines, with a stop at each corner: slow, and never off the path or beyond its ends.
+
+    Args:
+        waypoints: Ends and corners, and any points between them [rad or m].
+        velocity: Limits [rad/s or m/s].
+        acceleration: Limits [rad/s^2 or m/s^2].
+        least_seconds: A quicker motion is slowed down to this duration [s]; each line gets its share by length.
+    """
     steps = np.diff(waypoints, axis=0)
     unit = steps / np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-12)
     turns = [i for i in range(1, len(steps)) if float(unit[i] @ unit[i - 1]) < 1 - 1e-9]
     corners = waypoints[[0, *turns, -1]]
     lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
-    share = lengths / max(float(lengths.sum()), 1e-12)
+    share = (lengths + 1e-12) / (lengths + 1e-12).sum()  # without any way to go, the time passes all the same
     legs = zip(pairwise(corners), share, strict=True)
-    return joined([smooth(np.stack(leg), velocity, acceleration, least * part) for leg, part in legs])
+    return joined([smooth(np.stack(leg), velocity, acceleration, least_seconds * part) for leg, part in legs])
 
 
 def standing(q: Float[np.ndarray, " n"], seconds: float) -> Trajectory:
