@@ -116,19 +116,23 @@ ROWS = {
 
 
 def bundle_of(ablation: Ablation, folder: Path) -> Bundle:
-    """Training grasps of the row's hands, made once for all rows that share it."""
+    """All training grasps of the row's hands, made once for all rows that share them."""
     split = "few_shot" if set(ablation.hands) <= set(HELD_OUT) else "train"
     path = folder / f"{'+'.join(name.replace('/', '-') for name in ablation.hands)}.safetensors"
     if not path.exists():
         code = command(["dataset", "bundle", str(ROOT / "data" / "grasps"), "--split", split, "--hands", *ablation.hands,
                         "--per-pair", str(PER_PAIR), "--output", str(path), "--json"])
         assert code == 0, "the bundle could not be made"
-    bundle = load_bundle(path)
-    if ablation.grasps is None:
+    return load_bundle(path)
+
+
+def thinned(bundle: Bundle, grasps: int | None) -> Bundle:
+    """The bundle with this many grasps of each hand; None for all."""
+    if grasps is None:
         return bundle
     fewer = {}
     for hand, known in bundle.grasps.items():
-        kept = torch.randperm(len(known.joints), generator=torch.Generator().manual_seed(0))[: ablation.grasps]
+        kept = torch.randperm(len(known.joints), generator=torch.Generator().manual_seed(0))[:grasps]
         fewer[hand] = type(known)(known.T_object_wrist[kept], known.joints[kept], known.object_index[kept])
     return Bundle(bundle.hands, bundle.objects, fewer)
 
@@ -138,13 +142,13 @@ def trained(name: str, ablation: Ablation, folder: Path, steps: int, mixed: bool
     begin = time.perf_counter()
     if ablation.grasps == 0:
         return load_weights(), 0.0
-    bundle, place = bundle_of(ablation, folder), folder / name.replace(" ", "_")
+    whole, place = bundle_of(ablation, folder), folder / name.replace(" ", "_")
+    bundle = thinned(whole, ablation.grasps)
     network = dataclasses.replace(NetworkConfig.preset("slim"), **ablation.network)
     initial = load_weights() if ablation.fine_tuned else None
     history = [] if initial is None else history_of(locate_weights())
     first = None
     if ablation.pretrained and initial is None:
-        whole = bundle_of(dataclasses.replace(ablation, grasps=None), folder)
         stem = (ablation.pretrained_as or name).replace(" ", "_")
         first = pretrain(whole, network, PretrainConfig(ScheduleConfig(steps=PRETRAINING_STEPS)), folder / f"{stem}_pre")
         if network.latent_form == "motion":
@@ -201,7 +205,8 @@ def cells(result: dict[str, Any]) -> list[list[object]]:
 def draw(results: list[dict[str, Any]], folder: Path, path: Path) -> None:
     """Success against the number of training grasps, over all hands of a row, with 95 % intervals."""
     figure, ax = plt.subplots(figsize=(6.4, 4.2), layout="constrained")
-    counts = [sum(map(len, (g.joints for g in bundle_of(ROWS[r["row"]], folder).grasps.values()))) for r in results]
+    trainings = [ROWS[r["row"]] for r in results]
+    counts = [sum(len(g.joints) for g in thinned(bundle_of(t, folder), t.grasps).grasps.values()) for t in trainings]
     for stage, style in ((RAW, "--"), (REFINED, "-")):
         for name, colour in zip(("dro", "strict"), ("tab:blue", "tab:orange"), strict=True):
             points = []
