@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from dro_grasp.cli.constraint_options import ConstraintOptions
 from dro_grasp.cli.evaluate import Evaluate
 from dro_grasp.cli.generate import Generate
 from dro_grasp.cli.main import PATIENCE, THREADS, main
@@ -34,8 +35,10 @@ def test_a_request_has_the_same_defaults_everywhere() -> None:
     for name, value in REQUESTS.items():
         assert getattr(GraspRequest(), name) == value
         assert default(Generate, name) == value, f"generate --{name}"
+    fields = inspect.signature(ConstraintOptions).parameters
     for name, value in CONSTRAINTS.items():
-        assert getattr(Constraints(), name) == default(Generate, name) == value, name
+        option = default(ConstraintOptions if name in fields else Generate, name)
+        assert getattr(Constraints(), name) == option == value, name
     assert {default(GraspPredictor.predict, name) == REQUESTS[name] for name in ("num", "seed")} == {True}
     for name in ("num", "candidates", "temperature", "method"):
         assert default(Studio.generate, name) == REQUESTS[name], name

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from dro_grasp.cli.inputs import Ball, Flag, ProtocolName, optional
+from dro_grasp.cli.constraint_options import ConstraintOptions
+from dro_grasp.cli.inputs import Flag, ProtocolName, optional
 from dro_grasp.cli.output import print_json, print_table, progress_bar, say, say_aside
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 
@@ -45,22 +46,13 @@ class Generate:
     """Candidates proposed for each grasp kept; the best by score are kept. 1 is quickest."""
     seed: int = 0
     """The same seed gives the same grasps."""
-    direction: Annotated[tuple[float, float, float] | None, optional("X Y Z", "any direction")] = None
-    """Palm direction in the object's frame: 0 0 -1 grasps from above. Over a table, palms tilt towards it as far as the hand
-    needs room."""
+    constraints: ConstraintOptions = field(default_factory=ConstraintOptions)
+    """In the object's frame, or in the one that --camera names."""
     table: Annotated[float | None, optional("Z", "no table")] = None
     """Height [m] of a table in the object's frame; the whole hand stays above it."""
-    cone: Annotated[float | None, optional("RAD", "roughly along the direction")] = None
-    """Largest angle [rad] between palm direction and --direction; palms are spread evenly within it."""
     avoid: Annotated[Path | None, optional("MESH|CLOUD", "nothing")] = None
     """Mesh or cloud of what stands around the object, in its frame and unit and without it. The hand stays clear of it: open,
     10 cm back; straight from there in pregrasp; in grasp and squeeze."""
-    hold: Annotated[tuple[Ball, ...], optional("X Y Z RADIUS", "anywhere")] = ()
-    """Balls [m]: in the grasp, the hand touches the object nowhere else. Four numbers for each ball."""
-    spare: Annotated[tuple[Ball, ...], optional("X Y Z RADIUS", "nothing")] = ()
-    """Balls [m] that the hand stays out of."""
-    opening: Annotated[float | None, optional("M", "a quarter of what is left")] = None
-    """Least distance [m] between the object and every link that closes, in pregrasp."""
     camera: Annotated[Path | None, optional("JSON", "the object's own frame")] = None
     """File with {"frame": "base", "T_frame_camera": 4x4}: the object is a cloud in that camera's frame; it is cleaned. Grasps,
     direction and table are in the named frame."""
@@ -103,12 +95,11 @@ class Generate:
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.catalogue import resolve_objects
         from dro_grasp.objects.scenery import load_scene
-        from dro_grasp.pipeline.constraints import Constraints
         from dro_grasp.predictor import GraspPredictor, GraspRequest
 
         request = GraspRequest(
             self.num, self.seed, self.candidates, self.refine, self.temperature, self.method)
-        constraints = Constraints(self.direction, self.table, self.cone, None, self.hold, self.spare, self.opening)
+        constraints = self.constraints.constraints(self.table)
         names = resolve_objects([self.object])
         several = names != [self.object]
         outputs = paths_per_object(self.output, names, several, ".parquet")

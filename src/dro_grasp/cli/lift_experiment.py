@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+from dro_grasp.cli.constraint_options import PalmOptions
 from dro_grasp.cli.inputs import Flag, optional
 from dro_grasp.cli.output import print_json, print_table, say, say_aside
 
@@ -32,12 +33,8 @@ class Tabletop:
     """Which reachable grasps are taken: the best by score, or, as a control, any."""
     directions: Literal["paper", "all"] = "all"
     """Palm directions: `paper`, from above to the right side, or `all`."""
-    direction: Annotated[tuple[float, float, float] | None, optional("X Y Z", "any direction")] = None
-    """Palm direction in the world frame: 0 0 -1 grasps from above. Palms tilt towards the table as far as hands need room."""
-    cone: Annotated[float | None, optional("RAD", "roughly along the direction")] = None
-    """Largest angle [rad] between palm direction and --direction; palms are spread evenly within it."""
-    opening: Annotated[float | None, optional("M", "a quarter of what is left")] = None
-    """Least distance [m] between the object and every link that closes, in pregrasp."""
+    constraints: PalmOptions = field(default_factory=PalmOptions)
+    """In the world frame."""
     num: int = 24
     """Grasps to choose from, in each of up to three batches."""
     rehearsals: int = 8
@@ -66,7 +63,6 @@ class Tabletop:
     def run(self) -> int:
         """Run what is missing, store and print."""
         from dro_grasp.objects.catalogue import resolve_objects
-        from dro_grasp.pipeline.constraints import Constraints
         from dro_grasp.planning.animation import check_animation, draw_attempt
         from dro_grasp.planning.attempts import TabletopConfig
         from dro_grasp.planning.extra import require_arm_extra
@@ -80,7 +76,7 @@ class Tabletop:
             self.see, self.noise, clutter=self.clutter, segment=self.segment,
             plan=PlanConfig(
                 self.num, directions=self.directions, order=self.order, rehearsals=self.rehearsals,
-                constraints=Constraints(self.direction, cone=self.cone, opening=self.opening)))
+                constraints=self.constraints.constraints()))
         run = TabletopRun(
             self.robot, tuple(resolve_objects(list(self.objects))), self.attempts, self.seed, self.weights, config)
         done = run_tabletop(run, self.output, self.workers, None if self.json else _say, self.plans)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from dro_grasp.cli.inputs import Ball, Flag, optional
+from dro_grasp.cli.constraint_options import ConstraintOptions
+from dro_grasp.cli.inputs import Flag, optional
 from dro_grasp.cli.output import print_json, say, say_aside
 
 if TYPE_CHECKING:
@@ -44,16 +45,8 @@ class Plan:
     avoid: Annotated[Path | None, optional("MESH|CLOUD", "nothing")] = None
     """Mesh or cloud of what stands around, of any size, in the world frame and without object and robot: hand and arm stay
     clear of it."""
-    direction: Annotated[tuple[float, float, float] | None, optional("X Y Z", "any direction")] = None
-    """Palm direction in the world frame: 0 0 -1 grasps from above. Palms tilt towards the table as far as hands need room."""
-    cone: Annotated[float | None, optional("RAD", "roughly along the direction")] = None
-    """Largest angle [rad] between palm direction and --direction; palms are spread evenly within it."""
-    hold: Annotated[tuple[Ball, ...], optional("X Y Z RADIUS", "anywhere")] = ()
-    """Balls [m] in the world frame: in the grasp, the hand touches the object nowhere else. Four numbers for each ball."""
-    spare: Annotated[tuple[Ball, ...], optional("X Y Z RADIUS", "nothing")] = ()
-    """Balls [m] in the world frame that the hand stays out of."""
-    opening: Annotated[float | None, optional("M", "a quarter of what is left")] = None
-    """Least distance [m] between the object and every link that closes, in pregrasp."""
+    constraints: ConstraintOptions = field(default_factory=ConstraintOptions)
+    """In the world frame."""
     num: int = 24
     """Grasps to choose from, in each of up to three batches."""
     top: int = 5
@@ -85,7 +78,6 @@ class Plan:
         from dro_grasp.files import check_output, replacing
         from dro_grasp.objects.catalogue import load_object
         from dro_grasp.objects.scenery import load_scene
-        from dro_grasp.pipeline.constraints import Constraints
         from dro_grasp.planning.extra import require_arm_extra
 
         require_arm_extra()
@@ -98,7 +90,7 @@ class Plan:
         if not 0 <= self.seed < 2**31:
             raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^31 - 1")
         avoid = None if self.avoid is None else load_scene(self.avoid)
-        constraints = Constraints(self.direction, None, self.cone, avoid, self.hold, self.spare, self.opening)
+        constraints = self.constraints.constraints(avoid=avoid)
         config = PlanConfig(
             self.num, self.top, self.directions, constraints, rehearsals=self.rehearsals, planner_seconds=self.planner_seconds)
         for path in (self.output, self.trajectory, self.csv):
