@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
@@ -67,12 +68,14 @@ class TabletopConfig:
         """Refuse what cannot be set up.
 
         Raises:
-            OptionError: Too many other objects, or fewer than none, or constraints on places.
+            OptionError: Too many other objects, or fewer than none, noise that is none, or constraints on places.
         """
         wanted = self.plan.constraints
         if wanted.avoid is not None or wanted.hold or wanted.spare:
             raise OptionError("objects of attempts come to rest anywhere, so that avoid, hold and spare say nothing there; "
                               "leave them out, or use dro_grasp.plan for one object in its place")
+        if not 0 <= self.noise < math.inf:
+            raise OptionError(f"noise is {self.noise}; give a standard deviation in metres from 0 on, for example 0.0015")
         if not 0 <= self.clutter <= MOST_CLUTTER:
             raise OptionError(f"clutter is {self.clutter}; give a number of other objects from 0 to {MOST_CLUTTER}")
 

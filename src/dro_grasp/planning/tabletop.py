@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 
 from dro_grasp.devices import one_thread
 from dro_grasp.errors import GraspFileError, OptionError
-from dro_grasp.files import check_output, replacing
+from dro_grasp.files import check_output, make_folder, replacing
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.planning.attempts import Attempt, TabletopConfig, Watcher, attempt
 from dro_grasp.planning.extra import require_arm_extra
@@ -49,8 +49,10 @@ class TabletopRun:
         """Refuse what cannot be run.
 
         Raises:
-            OptionError: No attempts, or no objects.
+            OptionError: No attempts, or no objects, or a seed that is none.
         """
+        if not 0 <= self.seed < 2**31:
+            raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^31 - 1")
         if self.attempts < 1 or not self.objects:
             raise OptionError(f"{self.attempts} attempts on {len(self.objects)} objects; ask for at least one of each")
 
@@ -83,6 +85,7 @@ def run_tabletop(
         RobotError: The robot cannot be used.
         ObjectError: An object cannot be used.
         GraspFileError: `output` is there and is no such file.
+        OutputError: `output` or `plans` cannot be written.
     """
     require_arm_extra()
     stored = read_attempts(output) if output is not None and check_output(output).exists() else []
@@ -91,7 +94,7 @@ def run_tabletop(
     done = {(a.object, a.number): a for a in stored if (a.robot, a.settings, a.seed) == (name, label, run.seed)}
     missing = {o: [k for k in range(run.attempts) if (names[o], k) not in done] for o in run.objects}
     if plans is not None:
-        plans.mkdir(parents=True, exist_ok=True)
+        make_folder(plans)
     for result in _results(run, {o: numbers for o, numbers in missing.items() if numbers}, workers, plans):
         stored.append(result)
         done[result.object, result.number] = result
