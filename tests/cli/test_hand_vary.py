@@ -1,0 +1,51 @@
+"""`hand vary`: what it writes, says and refuses; variants themselves are tested where they are made."""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dro_grasp.cli.main import main
+from dro_grasp.hands.library import BUILTIN_FOLDER
+
+
+def places(path: Path) -> np.ndarray:
+    """Where the file puts each joint in the frame of the link above [m]."""
+    joints = ET.parse(path).getroot().findall("joint")
+    return np.array([joint.find("origin").get("xyz").split() for joint in joints], float)  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("options", [["--scale", "2"], ["--mirrored"], ["--mirrored", "--scale", "0.5"]], ids=" ".join)
+def test_the_file_holds_the_variant_that_is_told(
+    options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output, mirrored = tmp_path / "other.urdf", "--mirrored" in options
+    assert main(["hand", "vary", "gripper3", *options, "--output", str(output), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    factor = float(options[-1]) if "--scale" in options else 1.0
+    assert told == {"hand": "gripper3", "mirrored": mirrored, "scale": factor, "output": str(output)}
+    original = places(BUILTIN_FOLDER / "gripper3.urdf")
+    assert np.abs(original[:, 1]).max() > 0.01
+    np.testing.assert_allclose(places(output), factor * original * [1, -1 if mirrored else 1, 1], atol=1e-8)
+    assert main(["hand", "vary", "gripper3", *options, "--output", str(output)]) == 0
+    said = capsys.readouterr().out
+    assert said == f"{output}; see it with: dro-grasp hand check {output} --picture hand.png\n"
+
+
+@pytest.mark.parametrize(("options", "said"), [
+    (["--output", "same.urdf"], "give --mirrored, --scale, or both"),
+    (["--mirrored", "--output", "left.xml"], "left.xml: the description is a URDF; give a name that ends in .urdf"),
+    (["--mirrored", "--output", "nowhere/left.urdf"], "create it first"),
+    (["--scale", "-1", "--output", "left.urdf"], "factor is -1.0; give a positive number"),
+])
+def test_what_cannot_be_written_is_refused_in_words(
+    options: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["hand", "vary", "gripper3", *options]) == 2
+    assert said in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

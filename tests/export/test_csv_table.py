@@ -1,0 +1,61 @@
+"""The table of grasps, read back with the csv module."""
+
+from __future__ import annotations
+
+import csv
+import io
+
+import pytest
+import torch
+
+from dro_grasp.export.contents import Frame
+from dro_grasp.export.csv_table import csv_table
+from dro_grasp.grasps.batch import GraspBatch
+from tests.helpers.tiny_bundle import made_up_grasps
+from tests.helpers.toy_hand import toy_hand
+
+NAME = 'a "large" mug, #2'
+
+
+@pytest.fixture(scope="module")
+def grasps() -> GraspBatch:
+    """Three grasps: one that held, one that failed, and one without a trial of which only the energy is known."""
+    made = made_up_grasps(
+        toy_hand(), NAME, 3, score=torch.tensor([1.5, -2.0, torch.nan]), energy=torch.tensor([torch.nan, 0.25, 3.0]),
+        success=torch.tensor([True, False, False]), protocol=("robust/1", "robust/1", ""))
+    return made.replace(
+        pregrasp_joints=made.joints - 0.1, squeeze_joints=made.joints + 0.2,
+        robustness=torch.tensor([0.875, 0.125, torch.nan]), fingers_in_contact=torch.tensor([3.0, 1.0, torch.nan]))
+
+
+def rows(text: str) -> list[dict[str, str]]:
+    comments, table = text.splitlines()[:3], text.splitlines()[3:]
+    assert all(line.startswith("# ") for line in comments)
+    return list(csv.DictReader(io.StringIO("\n".join(table)), strict=True))
+
+
+def test_every_value_is_read_back(grasps: GraspBatch) -> None:
+    found = rows(csv_table(grasps, Frame()))
+    assert [row["object"] for row in found] == [NAME] * 3
+    for name in ("score", "energy", "robustness", "fingers_in_contact"):
+        cells, values = [row[name] for row in found], getattr(grasps, name).tolist()
+        assert [cell == "" for cell in cells] == [value != value for value in values], f"{name} is empty where unknown"
+        assert [float(cell) for cell in cells if cell] == pytest.approx([v for v in values if v == v], abs=1e-6)
+    assert [(row["success"], row["protocol"]) for row in found] == [("1", "robust/1"), ("0", "robust/1"), ("", "")]
+    for posture in ("pregrasp_joints", "joints", "squeeze_joints"):
+        column = posture.removesuffix("_joints") if posture != "joints" else "grasp"
+        values = [[float(row[f"{column}:{joint}"]) for joint in grasps.joint_names] for row in found]
+        torch.testing.assert_close(torch.tensor(values), getattr(grasps, posture), atol=1e-6, rtol=0)
+
+
+def test_poses_are_those_of_the_frame(grasps: GraspBatch) -> None:
+    T = torch.tensor([[0.0, -1, 0, 0.3], [1, 0, 0, 0], [0, 0, 1, -0.2], [0, 0, 0, 1]])
+    for i, row in enumerate(rows(csv_table(grasps, Frame("camera", T)))):
+        w, *xyz = (float(row[f"q{k}"]) for k in "wxyz")
+        expected = T @ grasps.T_object_wrist[i]
+        for point in torch.eye(3):  # v + 2 w (u x v) + 2 u x (u x v)
+            u = torch.tensor(xyz)
+            turned = point + 2 * w * torch.linalg.cross(u, point) + 2 * torch.linalg.cross(u, torch.linalg.cross(u, point))
+            torch.testing.assert_close(turned, expected[:3, :3] @ point, atol=1e-5, rtol=0)
+        torch.testing.assert_close(torch.tensor([float(row[k]) for k in "xyz"]), expected[:3, 3], atol=1e-6, rtol=0)
+        assert w >= 0
