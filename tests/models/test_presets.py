@@ -22,7 +22,8 @@ def test_paper_preset_is_the_papers_network() -> None:
         "attention_hidden": 1024, "latent": 64, "latent_widths": (64, 64, 128, 256), "latent_head": (512, 256),
         "latent_neighbours": 20, "frame": "object", "latent_form": "kernel", "prior": "standard", "kernel_hidden": (300, 100),
         # Ours: where an untrained kernel begins, and the placement prior, which the paper's network does not have.
-        "initial_distance": 0.1, "placement_width": 128, "placement_components": 8, "placement_temperature": 0.7,
+        "initial_distance": 0.1, "placement_hand": "features", "placement_width": 128, "placement_components": 8,
+        "placement_temperature": 0.7,
     }
     assert not paper.placed
     network = DistanceNetwork(paper)
@@ -38,7 +39,8 @@ def test_multi_preset_is_the_network_of_the_shipped_weights() -> None:
         stored = json.loads(file.metadata()[KEY])["config"]
     kept = {f.name for f in dataclasses.fields(NetworkConfig)}
     assert set(stored) - kept == {"placed", "residual", "latent_temperature"}, "settings of before, which are implied now"
-    assert NetworkConfig.from_dict({k: stored[k] for k in kept}) == shipped
+    assert kept - set(stored) == {"placement_hand"}, "a setting of later, which was features then"
+    assert NetworkConfig.from_dict({k: stored[k] for k in kept & set(stored)}) == shipped
 
 
 def test_presets_differ_in_what_they_are_named_for() -> None:

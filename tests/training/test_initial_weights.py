@@ -11,8 +11,10 @@ import torch
 from dro_grasp.cli.main import main
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.errors import WeightsError
+from dro_grasp.hands.proportions import proportions
 from dro_grasp.models.checkpoints import describe_weights, load_weights, save_weights
 from dro_grasp.models.network import DistanceNetwork, untrained_network
+from dro_grasp.models.placement import PROPORTIONS
 from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.training.config import TrainConfig
 from dro_grasp.training.loop import train
@@ -76,6 +78,24 @@ def test_weights_of_another_configuration_are_refused(bundle: Bundle, tmp_path: 
     refused(r"hold a pretrained motion, but z does not move the hand", TINY, pretrained=MOVING)
     refused(r"code\.4\.weight has shape", dataclasses.replace(MOVING, latent=6), pretrained=MOVING)
     assert not (tmp_path / "run").exists()
+
+
+def test_a_placement_prior_of_another_form_begins_anew_and_all_else_is_taken(bundle: Bundle, tmp_path: Path) -> None:
+    given = untrained_network(TINY, seed=5)
+    config = TrainConfig(dataclasses.replace(SCHEDULE, steps=1, learning_rate=1e-9), hands_per_step=1, columns=24)
+    form = dataclasses.replace(TINY, placement_hand="proportions")
+    tuned = train(bundle, form, config, tmp_path / "run", report=quiet, initial=given)
+    assert tuned.placement is not None
+    for name, value in tuned.state_dict().items():
+        if "running" not in name and "tracked" not in name and not name.startswith("placement."):
+            torch.testing.assert_close(value, given.state_dict()[name], msg=name)
+    hand = bundle.hands["toy"].with_points(TINY.n_hand)
+    torch.testing.assert_close(tuned.placement.standardised.mean, proportions(hand, torch.eye(3)))
+    assert tuned.placement.hand.weight.shape[1] == PROPORTIONS
+    other = untrained_network(form, seed=6)
+    again = train(bundle, form, config, tmp_path / "again", report=quiet, initial=other)
+    assert again.placement is not None
+    assert bool((again.placement.standardised.mean == 0).all()), "fine-tuning keeps what the numbers are relative to"
 
 
 def test_tuned_weights_say_what_they_come_from(command: list[str], tmp_path: Path) -> None:

@@ -144,6 +144,24 @@ def test_a_learned_prior_learns(bundle: Bundle) -> None:
     assert model.motion.last.weight.grad.abs().max() > 0
 
 
+def test_a_placement_prior_learns_from_proportions(bundle: Bundle) -> None:
+    torch.manual_seed(0)
+    network = dataclasses.replace(TINY, placement_hand="proportions")
+    source, generator = SampleSource(bundle, network, AugmentationConfig()), torch.Generator().manual_seed(0)
+    model = DistanceNetwork(network)
+    loop.measure_hands(model, source)
+    state = torch.get_rng_state()
+    loop.step_losses(model, [source.draw("toy", 3, generator)], TrainConfig(columns=24), generator)["total"].backward()
+    assert torch.equal(torch.get_rng_state(), state)
+    assert model.placement.hand.weight.grad.abs().max() > 0, "noise tells a single hand's rows apart"
+    assert all(p.grad is None or not p.grad.any() for name, p in model.hand_encoder.named_parameters() if "place" in name)
+    turns = torch.linalg.qr(torch.randn(9, 3, 3, generator=generator))[0]
+    hand, obj = source.draw("toy", 1, generator).placed[0], source.points[0]
+    placed = [model.sample_placements(hand, obj, turns, 9, torch.Generator().manual_seed(1), shape)[1]
+              for shape in (source.proportions["toy"], source.proportions["toy"] + 0.1)]
+    assert not torch.equal(*placed)
+
+
 def test_a_motion_is_learned_before_objects_are_seen(bundle: Bundle, tmp_path: Path) -> None:
     network = dataclasses.replace(TINY, prior="flow", latent_form="motion", latent=8)
     fresh = DistanceNetwork(network)

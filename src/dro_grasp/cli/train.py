@@ -157,6 +157,9 @@ class Train(Stage):
     prior: Annotated[
         Literal["standard", "learned", "flow"] | None, optional("{standard,learned,flow}", "the preset's")] = None
     """Distribution of z: standard (N(0, I), the paper's form), or a Gaussian or a flow learned from hand and object."""
+    placement_hand: Annotated[
+        Literal["features", "proportions"] | None, optional("{features,proportions}", "the preset's")] = None
+    """What the placement prior knows of a hand: the encoder's features, or proportions, which serve hands never seen better."""
     losses: Literal["ours", "release"] = "ours"
     """Weights of the losses and form of the KL divergence: ours, or those of the official release."""
     divergence: Annotated[float | None, optional("WEIGHT", "0.01")] = None
@@ -200,7 +203,8 @@ class Train(Stage):
         given = [name for name in (self.initial, self.pretrained) if name is not None]
         pretrained, initial = (None if name is None else load_weights(name) for name in (self.pretrained, self.initial))
         network = network_config(
-            self.preset, initial, latent=self.latent, prior=self.prior, latent_form=self.latent_form)
+            self.preset, initial, latent=self.latent, prior=self.prior, latent_form=self.latent_form,
+            placement_hand=self.placement_hand)
         losses = dataclasses.replace(LOSSES[self.losses], divergence_warmup=self.divergence_warmup, free_bits=self.free_bits,
                                      drawn=self.drawn)
         if self.divergence is not None:

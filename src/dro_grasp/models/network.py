@@ -75,7 +75,9 @@ class DistanceNetwork(nn.Module):
             else latent.GaussianPrior(c.latent, latent_width) if c.prior == "learned" else None)
         self.head = DistanceHead(c.width + c.latent, c.kernel_hidden, c.initial_distance)
         self.place = nn.Linear(3, c.width) if c.placed else None
-        self.placement = PlacementPrior(c.width, c.placement_width, c.placement_components) if c.placed else None
+        self.placement = PlacementPrior(
+            None if c.placement_hand == "proportions" else c.width, c.placement_width, c.placement_components,
+        ) if c.placed else None
 
     def encode(
         self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"]
@@ -214,7 +216,7 @@ class DistanceNetwork(nn.Module):
 
     def sample_placements(
         self, hand: Float[Tensor, "n 3"], obj: Float[Tensor, "m 3"], rotations: Float[Tensor, "r 3 3"], num: int,
-        generator: torch.Generator,
+        generator: torch.Generator, proportions: Float[Tensor, " f"] | None = None,
     ) -> tuple[Float[Tensor, "num 3 3"], Float[Tensor, "num 3"]]:
         """Rotations of the hand's axes, and positions of the grasp centre in them about the object's centre [m].
 
@@ -225,10 +227,17 @@ class DistanceNetwork(nn.Module):
             hand: The open hand in its axes (`NetworkConfig.axes`) [m].
             obj: The object's cloud in its own frame [m].
             rotations: Candidate rotations of these axes, in random order.
+            num: How many.
+            generator: Source of randomness, on the CPU.
+            proportions: Of the hand in these axes; for networks whose prior takes them.
         """
         if self.placement is None:
             return rotations[:num], rotations.new_zeros(num, 3)
-        feature = self.hand_encoder((hand - hand.mean(0))[None]).mean(1)[0]
+        if self.config.placement_hand == "proportions":
+            assert proportions is not None
+            feature = proportions
+        else:
+            feature = self.hand_encoder((hand - hand.mean(0))[None]).mean(1)[0]
         return self.placement.sample(
             obj - obj.mean(0), feature, rotations, num, generator, self.config.placement_temperature
         )

@@ -23,15 +23,52 @@ COLDEST = 1e-3
 """Lower temperatures choose components as this one does: the heaviest. Source: ours."""
 
 
+PROPORTIONS = 72
+"""Numbers of a hand's proportions (`dro_grasp.hands.proportions`)."""
+LEAST_SPREAD = 0.05
+"""Smallest spread of a proportion over hands: less tells hands apart by chance. Source: ours."""
+FARTHEST = 3.0
+"""Largest distance of a proportion from the mean hand's, in spreads. Source: ours."""
+
+
+class Standardised(nn.Module):
+    """Proportions of hands relative to those of the hands in training."""
+
+    mean: Float[Tensor, " f"]
+    spread: Float[Tensor, " f"]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(PROPORTIONS))
+        self.register_buffer("spread", torch.ones(PROPORTIONS))
+
+    def measure(self, hands: Float[Tensor, "hands f"]) -> None:
+        """Take the mean and spread of these hands."""
+        self.mean.copy_(hands.mean(0))
+        self.spread.copy_(hands.std(0, unbiased=False).clamp_min(LEAST_SPREAD))
+
+    def forward(self, hand: Float[Tensor, "*b f"]) -> Float[Tensor, "*b f"]:
+        """In spreads from the mean."""
+        return ((hand - self.mean) / self.spread).clamp(-FARTHEST, FARTHEST)
+
+
 class PlacementPrior(nn.Module):
     """A point network over the object in wrist axes, with a hand feature, to a mixture density and a rotation score."""
 
-    def __init__(self, hand_features: int, width: int, components: int) -> None:
+    def __init__(self, hand_features: int | None, width: int, components: int) -> None:
+        """Untrained.
+
+        Args:
+            hand_features: Width of the encoder's features; None takes proportions.
+            width: Of hidden layers.
+            components: Of the mixture.
+        """
         super().__init__()
         self.components = components
+        self.standardised = Standardised() if hand_features is None else nn.Identity()
         self.points = nn.Sequential(nn.Linear(3, width // 2), nn.ReLU(), nn.Linear(width // 2, width), nn.ReLU(),
                                     nn.Linear(width, 2 * width))
-        self.hand = nn.Linear(hand_features, width)
+        self.hand = nn.Linear(hand_features or PROPORTIONS, width)
         self.head = nn.Sequential(nn.Linear(3 * width, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(),
                                   nn.Linear(width, components * 7 + 1))
 
@@ -42,9 +79,9 @@ class PlacementPrior(nn.Module):
 
         Args:
             obj: Object points in wrist axes about the object's centre [m].
-            hand: Mean feature of the open hand's points.
+            hand: Mean feature of the open hand's points, or its proportions.
         """
-        x = torch.cat([self.points(obj * (1 / LENGTH)).amax(1), self.hand(hand)], -1)
+        x = torch.cat([self.points(obj * (1 / LENGTH)).amax(1), self.hand(self.standardised(hand))], -1)
         out = self.head(x)
         logits, mean, scale = out[:, :-1].split([self.components, 3 * self.components, 3 * self.components], -1)
         mean = mean.unflatten(-1, (self.components, 3)) * LENGTH
@@ -67,7 +104,7 @@ class PlacementPrior(nn.Module):
 
         Args:
             obj: Object points about the object's centre, in the object's axes [m].
-            hand: Mean feature of the open hand's points.
+            hand: As in `forward`.
             rotations: Candidate wrist rotations in the object's axes.
             num: How many to choose, without repetition.
             temperature: Scales the spread of the drawn positions.

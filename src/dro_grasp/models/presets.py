@@ -59,6 +59,8 @@ class NetworkConfig:
     """Hidden layers of the kernel."""
     initial_distance: float = 0.1
     """Distance that an untrained kernel predicts [m]; softplus alone starts at 0.69."""
+    placement_hand: Literal["features", "proportions"] = "features"
+    """What the placement prior knows of the hand: the encoder's mean feature, or its proportions."""
     placement_width: int = 128
     """Width of the placement prior."""
     placement_components: int = 8

@@ -21,6 +21,7 @@ from dro_grasp.errors import OptionError
 from dro_grasp.geometry.se3 import apply_to_cloud, compose, rotate
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.proportions import proportions
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.optimization.starts import CHOICES, CLEAR, Spread, lack_of_room, wrist_rotations
 from dro_grasp.pipeline.choice import ChoiceConfig, choice_scores
@@ -145,7 +146,8 @@ def _placements(
     count = num * (config.rotations_per_grasp if direction is None else config.rolls_per_grasp)
     rotations = wrist_rotations(hand, max(count, offered), direction, spread, generator, up)
     opened = hand.points(hand.canonical_joints())
-    rotation, position = network.sample_placements(opened @ axes, cloud, rotations @ axes, offered, generator)
+    shape = proportions(hand, axes) if network.config.placement_hand == "proportions" else None
+    rotation, position = network.sample_placements(opened @ axes, cloud, rotations @ axes, offered, generator, shape)
     offset = cloud.mean(0) + rotate(rotation, position - hand.grasp_centre_wrist @ axes)
     placed = compose(rotation @ axes.mT, offset)
     if surroundings is None:

@@ -22,6 +22,9 @@ class AugmentationConfig:
     """For networks that do not know the placement, the largest angle by which the open hand is turned from the grasp's wrist
     rotation, about an axis perpendicular to the direction from the wrist to the object [rad]. Source: the official
     release."""
+    proportions: float = 0.1
+    """Standard deviation of the noise on a hand's proportions, in their spreads over hands; for placement priors that take
+    them: a few dozen hands are few. Source: ours."""
     partial: float = 0.0
     """Share of samples in which half of the object is seen. Source: appendix."""
 

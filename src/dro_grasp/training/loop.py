@@ -13,8 +13,8 @@ from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.errors import WeightsError
 from dro_grasp.geometry.se3 import apply
 from dro_grasp.hands.hand import Hand
-from dro_grasp.models.network import DistanceNetwork, NetworkOutput, untrained_network
-from dro_grasp.models.placement import PlacementPrior
+from dro_grasp.models.network import DistanceNetwork, untrained_network
+from dro_grasp.models.placement import PlacementPrior, Standardised
 from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.training import losses
 from dro_grasp.training.config import TrainConfig
@@ -58,6 +58,8 @@ def train(
     model.mixed = config.schedule.mixed
     generator = torch.Generator(device)
     source = SampleSource(bundle, network, config.augmentation, device)
+    if initial is None or initial.config.placement_hand != network.placement_hand:
+        measure_hands(model, source)
     run = TrainingRun(folder, model, config.schedule, generator, processes)
     model.train()
     if frozen:
@@ -76,17 +78,29 @@ def train(
     return model.cpu().eval()
 
 
+def measure_hands(model: DistanceNetwork, source: SampleSource) -> None:
+    """Let a placement prior that takes proportions know those of the hands in training."""
+    if model.placement is not None and isinstance(model.placement.standardised, Standardised):
+        model.placement.standardised.measure(torch.stack([source.proportions[name] for name in source.names]))
+
+
 def take_initial(model: DistanceNetwork, initial: DistanceNetwork) -> None:
-    """Copy all weights of a network of the same configuration.
+    """Copy all weights of a network of the same configuration; a placement prior that knows hands in another form begins anew.
 
     Raises:
         WeightsError: The configurations differ. Settings such as the frame change what the weights mean, but no shape.
     """
-    if other := model.config.differences(initial.config):
+    other = model.config.differences(initial.config)
+    fresh = other.pop("placement_hand", None) is not None
+    if other:
         told = ", ".join(f"{name} {mine} instead of {theirs}" for name, (mine, theirs) in other.items())
         raise WeightsError(f"the initial weights '{initial.name}' have another configuration than is asked for: {told}; train "
                            "with theirs, which `train --initial` does without --preset and the options of the latent")
-    model.load_state_dict(initial.state_dict())
+    given = initial.state_dict()
+    if fresh and model.placement is not None:
+        own = {f"placement.{name}": value for name, value in model.placement.state_dict().items()}
+        given = {name: value for name, value in given.items() if not name.startswith("placement.")} | own
+    model.load_state_dict(given)
 
 
 def take_weights(model: nn.Module, given: nn.Module, name: str) -> None:
@@ -160,7 +174,8 @@ def step_losses(
         parts["motion"] = (output.moved - grasp).norm(dim=-1).mean()
     parts["flow"] = output.flow_error.mean()
     if model.placement is not None:
-        parts["placement"] = _placement(model.placement, groups, output)
+        noise = config.augmentation.proportions
+        parts["placement"] = _placement(model.placement, groups, output.hand_feature, noise, generator)
     weights = {name: getattr(config.losses, name) for name in parts}
     if progress < config.losses.divergence_warmup:
         weights["divergence"] *= progress / config.losses.divergence_warmup
@@ -184,11 +199,26 @@ def _clouds(groups: list[HandSamples]) -> tuple[Float[Tensor, "b n 3"], Float[Te
     return placed, obj, grasp
 
 
-def _placement(prior: PlacementPrior, groups: list[HandSamples], output: NetworkOutput) -> Float[Tensor, ""]:
-    feature = output.hand_feature.detach()
+def _placement(
+    prior: PlacementPrior, groups: list[HandSamples], features: Float[Tensor, "b width"], noise: float,
+    generator: torch.Generator,
+) -> Float[Tensor, ""]:
+    """The placement prior's loss.
+
+    Args:
+        prior: Takes features or proportions.
+        groups: Samples.
+        features: Mean feature of each open hand.
+        noise: Standard deviation of the noise on proportions, in their spreads.
+        generator: Source of the noise.
+    """
+    hand = features.detach()
+    if isinstance(prior.standardised, Standardised):
+        rows = torch.cat([group.proportions.expand(len(group.placed), -1) for group in groups])
+        hand = rows + noise * prior.standardised.spread * torch.randn(rows.shape, generator=generator, device=rows.device)
     obj, other, position = (
         torch.cat([getattr(g, n) for g in groups]) for n in ("obj_hand", "obj_random", "position")
     )
-    density, score = prior.log_density(obj, feature, position)
-    other_score = prior(other, feature)[3]
+    density, score = prior.log_density(obj, hand, position)
+    other_score = prior(other, hand)[3]
     return losses.placement_loss(density, score, other_score)

@@ -14,6 +14,7 @@ from dro_grasp.geometry.point_clouds import nearer_half
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.geometry.se3 import compose, invert, random_rotations, rotate
 from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.proportions import proportions
 from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.training.config import AugmentationConfig
 
@@ -40,6 +41,8 @@ class HandSamples:
     """The object in the axes of a random hand [m], for the placement prior."""
     position: Float[Tensor, "b 3"]
     """True position of the grasp centre in the hand's axes [m]."""
+    proportions: Float[Tensor, " f"]
+    """The hand's proportions, for the placement prior."""
 
 
 class SampleSource:
@@ -58,6 +61,9 @@ class SampleSource:
             raise BundleError("the bundle holds no grasps; synthesise some first")
         self.hands = {name: hand.with_points(network.n_hand).to(device) for name, hand in bundle.hands.items()}
         self.grasps = {name: grasps.to(device) for name, grasps in bundle.grasps.items()}
+        self.proportions = {
+            name: proportions(hand, network.axes(hand.palm_axes_wrist)) for name, hand in self.hands.items()}
+        """Proportions of each hand, in the network's axes."""
         self.names = [name for name, grasps in bundle.grasps.items() if len(grasps.joints)]
         self.points = torch.stack([cloud.points for cloud in bundle.objects.values()]).to(device)
         self.normals = torch.stack([cloud.normals for cloud in bundle.objects.values()]).to(device)
@@ -101,6 +107,7 @@ class SampleSource:
             obj_hand=about_centre @ (T[:, :3, :3] @ own),
             obj_random=about_centre @ random_rotations(count, generator),
             position=((hand.grasp_centres(T) - centre)[:, None] @ (T[:, :3, :3] @ own))[:, 0],
+            proportions=self.proportions[name],
         )
 
     def draw_motions(
