@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 import dro_grasp as dro
+from dro_grasp import predictor
 from dro_grasp.cli.main import main
 from dro_grasp.planning import planner
 from dro_grasp.planning.motion import CHOSEN, STAGES, PlanNotes, PlanScene
@@ -32,11 +33,12 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, Any]:
     scene = PlanScene(np.zeros((1, 3)), np.zeros((0, 3)), wrist, np.zeros((1, 1)), np.zeros(1), (CHOSEN,))
     made = dro.MotionPlan(NOTES, scene, np.array([0, 0, 1, 2, 3, 4]), still, still)
 
-    def plan(robot: Any, obj: Any, T: Any, obstacles: Any, predictor: Any, config: Any, seed: int) -> dro.MotionPlan:
-        asked.update(robot=robot, obj=obj, T=T, obstacles=obstacles, config=config, seed=seed)
+    def plan(robot: Any, obj: Any, T: Any, obstacles: Any, weights: Any, config: Any, seed: int) -> dro.MotionPlan:
+        asked.update(robot=robot, obj=obj, T=T, obstacles=obstacles, weights=weights, config=config, seed=seed)
         return made
 
     monkeypatch.setattr(planner, "plan", plan)
+    monkeypatch.setattr(predictor, "GraspPredictor", lambda weights: weights)
     monkeypatch.chdir(tmp_path)
     return asked
 
@@ -50,14 +52,15 @@ def test_every_option_reaches_the_planner_and_every_file_is_written(
 ) -> None:
     palm = ["--direction", "0", "0", "-1", "--cone", "0.6", "--opening", "0.012"]
     places = ["--hold", "0.5", "0.1", "0.2", "0.03", "--spare", "0", "0", "1", "0.1", "0", "0", "2", "0.2"]
-    numbers = ["--num", "9", "--top", "2", "--rehearsals", "4", "--planner-seconds", "2.5", "--seed", "7"]
+    numbers = ["--num", "9", "--top", "2", "--rehearsals", "4", "--planner-seconds", "2.5", "--seed", "7", "--weights", "mine"]
     files = ["--output", "plan.npz", "--trajectory", "plan.yaml", "--csv", "plan.csv"]
     where = ["--at", "0.5", "0.1", "--obstacles", "cube"]
     assert planned(small_robot, *where, *palm, *places, *numbers, *files, "--json") == 0
     hold, spare = ((0.5, 0.1, 0.2, 0.03),), ((0, 0, 1, 0.1), (0, 0, 2, 0.2))
     constraints = dro.Constraints((0, 0, -1), None, 0.6, None, hold, spare, 0.012)
     assert asked["config"] == dro.PlanConfig(9, 2, constraints=constraints, rehearsals=4, planner_seconds=2.5)
-    assert (asked["seed"], asked["obj"].name, [o.name for o in asked["obstacles"]]) == (7, "can", ["cube"])
+    assert (asked["seed"], asked["weights"]) == (7, "mine")
+    assert (asked["obj"].name, [o.name for o in asked["obstacles"]]) == ("can", ["cube"])
     stands = np.asarray(asked["obj"].vertices) @ asked["T"][:3, :3].T + asked["T"][:3, 3]
     assert stands[:, 2].min() == pytest.approx(asked["robot"].table.height, abs=1e-3)
     assert asked["T"][:2, 3] == pytest.approx([0.5, 0.1])
@@ -87,7 +90,6 @@ def test_the_pose_in_a_file_is_the_objects_and_people_are_told_in_words(
 @pytest.mark.parametrize(("options", "said"), [
     (["--seed", "-1"], "seed is -1; give an integer from 0"),
     (["--cone", "0.5"], "give both, for example --direction 0 0 -1"),
-    (["--at", "0.5", "0", "--near", "0.5", "0"], "leave out --pose and --at"),
     (["--output", "nowhere/plan.npz"], "create it first"),
     (["--camera", "robot"], "has no camera; state it in the robot file, or give --camera JSON"),
 ])
