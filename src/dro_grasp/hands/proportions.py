@@ -16,8 +16,10 @@ OPENNESS = (0.9, 0.5, 0.2)
 """Shares of the way from closed to open at which a hand is measured (ours)."""
 UNIT = 0.1
 """Unit of length, about the size of a palm [m] (ours)."""
-FINGERS, JOINTS = 5.0, 20.0
-"""Units of the numbers of fingers and joints: those of a human-like hand (ours)."""
+FINGERS = 5.0
+"""Unit of the number of fingers: those of a human-like hand (ours)."""
+JOINTS = 20.0
+"""Unit of the number of joints, about those of a human-like hand (ours)."""
 
 
 def proportions(hand: Hand, axes: Float[Tensor, "3 3"]) -> Float[Tensor, " f"]:
@@ -32,7 +34,7 @@ def proportions(hand: Hand, axes: Float[Tensor, "3 3"]) -> Float[Tensor, " f"]:
         axes: Those of the numbers, as columns in the wrist frame.
     """
     owner = hand.finger_of_link[hand.link_index]
-    found: list[Tensor] = []
+    found: list[Float[Tensor, " k"]] = []
     for openness in OPENNESS:
         tips, points = (_about(hand, axes, x) for x in _posed(hand, openness))
         thumb = torch.zeros_like(tips[0]) if hand.thumb is None else tips[hand.thumb]
@@ -54,8 +56,8 @@ def _about(hand: Hand, axes: Float[Tensor, "3 3"], points: Float[Tensor, "n 3"])
     return (points - hand.grasp_centre_wrist) @ axes / UNIT
 
 
-def _moments(points: Float[Tensor, "n 3"]) -> list[Tensor]:
+def _moments(points: Float[Tensor, "n 3"]) -> Float[Tensor, "2 3"]:
     """Mean and standard deviation; zeros of no points, as a palm without a surface has."""
     if not len(points):
-        return [points.new_zeros(3), points.new_zeros(3)]
-    return [points.mean(0), points.std(0, unbiased=False)]
+        return points.new_zeros(2, 3)
+    return torch.stack([points.mean(0), points.std(0, unbiased=False)])
