@@ -10,15 +10,15 @@ import pytest
 import trimesh
 
 import dro_grasp as dro
-from dro_grasp.objects.loading import cloud_object
+from dro_grasp.objects.ball_solid import solid_of
 from dro_grasp.planning import rehearsal as rehearsal_module
-from dro_grasp.planning.ball_solid import OUTSIDE, ball_solid
 from dro_grasp.planning.candidates import grasps_in_world
 from dro_grasp.planning.physics import MEMORY, LiftScene
 from dro_grasp.planning.plan_config import PlanConfig
 from dro_grasp.planning.planner import LOSES, plan
 from dro_grasp.planning.reachability import Feasible, Postures
 from dro_grasp.planning.rehearsal import CONDITIONS, Rehearsal
+from tests.helpers.clouds import cloud_of
 
 RADIUS = 0.04
 
@@ -28,33 +28,12 @@ def robot() -> dro.Robot:
     return dro.load_robot("xarm7_leaphand")
 
 
-def cloud_of(mesh: trimesh.Trimesh, name: str) -> dro.ObjectModel:
-    points, face = trimesh.sample.sample_surface_even(mesh, 6000, seed=0)
-    return cloud_object(name, np.concatenate([points, mesh.face_normals[face]], 1), origin=name, keep_table=True)
-
-
 @pytest.fixture(scope="module")
 def ball() -> dro.ObjectModel:
     """Stands on a table at z = 0 within reach."""
     mesh = trimesh.creation.icosphere(4, RADIUS)
     mesh.apply_translation((0.45, 0.0, RADIUS))
     return cloud_of(mesh, "ball")
-
-
-def test_balls_fill_a_sphere_and_weigh_what_it_weighs(ball: dro.ObjectModel) -> None:
-    solid, centre = ball_solid(ball), np.array([0.45, 0.0, RADIUS])
-    reach = np.linalg.norm(solid.centres - centre, axis=1) + solid.radii
-    assert np.abs(reach - RADIUS).max() < OUTSIDE
-    assert solid.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.1)
-    assert np.allclose(solid.centre_of_mass, centre, atol=1e-3)
-    assert np.allclose(solid.inertia, 0.4 * solid.volume * RADIUS**2 * np.eye(3), atol=0.1 * 0.4 * solid.volume * RADIUS**2)
-
-
-def test_a_cup_stays_hollow() -> None:
-    cup = trimesh.creation.annulus(0.03, 0.036, 0.08)
-    solid = ball_solid(cloud_of(cup, "cup"))
-    assert (np.linalg.norm(solid.centres[:, :2], axis=1) - solid.radii > 0.03 - 2 * OUTSIDE).all()
-    assert (np.linalg.norm(solid.centres[:, :2], axis=1) + solid.radii < 0.036 + 2 * OUTSIDE).all()
 
 
 def test_an_estimated_object_stands_still_on_the_table(robot: dro.Robot, ball: dro.ObjectModel) -> None:
@@ -66,7 +45,7 @@ def test_an_estimated_object_stands_still_on_the_table(robot: dro.Robot, ball: d
     body = scene.model.body("object0-").id
     touching = scene.model.geom_bodyid[scene.data.contact.geom].reshape(-1, 2)
     assert (touching == body).any()
-    assert mujoco.mj_getTotalmass(scene.model) > scene.model.body_mass[body] == pytest.approx(500 * ball_solid(ball).volume)
+    assert mujoco.mj_getTotalmass(scene.model) > scene.model.body_mass[body] == pytest.approx(500 * solid_of(ball).volume)
 
 
 @pytest.fixture(scope="module")

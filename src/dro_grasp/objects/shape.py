@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dro_grasp.errors import ObjectError
+from dro_grasp.geometry.balls import Balls
 from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.geometry.point_clouds import random_half
 from dro_grasp.objects.cache import cached_arrays
@@ -53,7 +54,8 @@ class ObjectModel:
     """`train`, `validate`, `test`, or None for a user's object."""
     exact_parts: tuple[Part, ...] | None = None
     """Convex parts known by construction or from a file; None computes them."""
-
+    balls: Balls | None = None
+    """What a bare cloud collides as where hands close on it; see `solid_of`."""
     file: str | None = None
     """The file it was loaded from, if it is a user's own."""
     scale: float = 1.0

@@ -10,16 +10,17 @@ import mujoco
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial import ConvexHull
 
 from dro_grasp.geometry.rotations import roma
+from dro_grasp.objects.ball_solid import solid_of
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.planning.ball_solid import add_ball_object
 from dro_grasp.planning.collisions import exclude_constant_contacts, open_hand
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.workcell import ARM, TABLE, arm_addresses, robot_spec, wxyz
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.rollout import quiet
-from dro_grasp.simulation.scene import PREFIX, add_object, add_servos, joint_addresses
+from dro_grasp.simulation.scene import HULL_VERTICES, PREFIX, add_object, add_servos, joint_addresses
 
 LIFT_PROTOCOL = replace(PROTOCOLS["dro"], name="tabletop", timestep=0.002, force_limit=3.0, noslip=3)
 """Contacts and servos of the hand: friction 1, density 500 kg/m^3 and the servos' gains as in trials; at most 3 Nm (ours).
@@ -41,6 +42,12 @@ SHAPE_GROUP = 4
 """Group of the geoms that only cameras see: the objects' true meshes."""
 PART_GROUP = 3
 """Group of the convex parts, with which objects collide."""
+FOOT = 0.004
+"""What an estimated object has this near to its lowest point stands on the table [m] (ours)."""
+BALL_BIT = 2
+"""Bit of contacts of an estimated object's balls with the hand (ours)."""
+HULL_BIT = 4
+"""Bit of contacts of its convex hull with the table (ours)."""
 
 
 class LiftScene:
@@ -149,7 +156,7 @@ class LiftScene:
 def _add_thing(scene: mujoco.MjSpec, obj: ObjectModel, index: int) -> None:
     """An object that collides as its convex parts, and is seen as its mesh; a bare cloud collides as balls."""
     if obj.is_cloud:
-        add_ball_object(scene, obj, LIFT_PROTOCOL, f"object{index}-")
+        _add_estimate(scene, obj, index)
         return
     assert obj.vertices is not None
     assert obj.faces is not None
@@ -161,6 +168,24 @@ def _add_thing(scene: mujoco.MjSpec, obj: ObjectModel, index: int) -> None:
     shape.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
     body.add_geom(
         type=mujoco.mjtGeom.mjGEOM_MESH, meshname=shape.name, contype=0, conaffinity=0, group=SHAPE_GROUP, mass=0.0)
+
+
+def _add_estimate(scene: mujoco.MjSpec, obj: ObjectModel, index: int) -> None:
+    """A bare cloud: the hand touches its balls; its hull stands on the table with a flat foot, so that the object stays put."""
+    body, board = add_object(scene, solid_of(obj), LIFT_PROTOCOL, f"object{index}-"), scene.geom(TABLE)
+    for ball in body.geoms:
+        ball.contype = ball.conaffinity = BALL_BIT
+    cloud, height = obj.cloud.astype(float), float(board.pos[2] + board.size[2])
+    foot = cloud[cloud[:, 2] < cloud[:, 2].min() + FOOT] * (1, 1, 0) + (0, 0, height)
+    corners = np.concatenate([cloud, foot])
+    mesh = scene.add_mesh(name=f"hull{index}", uservert=corners[ConvexHull(corners).vertices].ravel())
+    mesh.maxhullvert = HULL_VERTICES
+    body.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, condim=4, mass=0.0, contype=HULL_BIT, conaffinity=HULL_BIT,
+        friction=[LIFT_PROTOCOL.friction, LIFT_PROTOCOL.torsional_friction, 1e-4])
+    hand = [geom for geom in scene.geoms if geom.parent is not None and geom.parent.name.startswith(PREFIX) and geom.contype]
+    for geom, bit in [*((geom, BALL_BIT) for geom in hand), (board, HULL_BIT)]:
+        geom.contype, geom.conaffinity = geom.contype | bit, geom.conaffinity | bit
 
 
 def _add_arm_servos(scene: mujoco.MjSpec, robot: Robot) -> None:

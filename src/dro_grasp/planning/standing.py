@@ -35,4 +35,4 @@ def moved(obj: ObjectModel, T: Float[np.ndarray, "4 4"]) -> ObjectModel:
     return replace(
         obj, cloud=cloud, cloud_normals=normals, vertices=vertices, centre_of_mass=R @ obj.centre_of_mass + t,
         inertia=R @ obj.inertia @ R.T, sha256=content_hash(shape.astype(np.float32), faces.astype(np.int32)),
-        exact_parts=None if obj.is_cloud else tuple((v @ R.T + t, f) for v, f in obj.parts))
+        balls=None, exact_parts=None if obj.is_cloud else tuple((v @ R.T + t, f) for v, f in obj.parts))

@@ -28,7 +28,7 @@ def settle(
     outcomes are dropped.
 
     Raises:
-        ObjectError: The object is a bare point cloud.
+        ObjectError: The object is a bare point cloud, without balls that stand for it.
         HandError: The hand came without its description.
         GraspFileError: The grasps are of another hand.
         OptionError: The protocol does not exist.

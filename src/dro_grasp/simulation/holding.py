@@ -88,13 +88,13 @@ def holding(
 
     Args:
         hand: The hand of the grasps.
-        obj: Their object; it needs a mesh.
+        obj: Their object, with a mesh or with balls.
         grasps: The controller makes each pregrasp and squeeze that a grasp does not state.
         protocol: Its closing, friction and servos.
         workers: Threads; all cores by default. The result does not depend on it.
 
     Raises:
-        ObjectError: The object is a bare point cloud.
+        ObjectError: The object is a bare point cloud, without balls that stand for it.
         HandError: The hand came without its description.
         GraspFileError: The grasps are of another hand.
         OptionError: The protocol does not exist.

@@ -97,7 +97,7 @@ def cached_scene(hand: Hand, obj: ObjectModel, protocol: Protocol) -> Scene:
     """The scene of a pair; the process keeps the last few, least recently used first to go.
 
     Raises:
-        ObjectError: The object is a bare point cloud.
+        ObjectError: The object is a bare point cloud, without balls that stand for it.
         HandError: The hand came without its description.
     """
     return _build_once(SceneKey(hand.sha256, obj.sha256, protocol, hand, obj))
@@ -112,10 +112,10 @@ def build_scene(hand: Hand, obj: ObjectModel, protocol: Protocol) -> Scene:
     """Put a hand and an object into one model.
 
     Raises:
-        ObjectError: The object is a bare point cloud.
+        ObjectError: The object is a bare point cloud, without balls that stand for it.
         HandError: The hand came without its description.
     """
-    if obj.is_cloud:
+    if obj.is_cloud and obj.balls is None:
         raise ObjectError(f"object '{obj.name}' is a bare point cloud; a trial needs a mesh (use --protocol none)")
     if hand.description is None:
         raise HandError(f"hand '{hand.name}' carries no description; load it by name or file to simulate it")
@@ -216,17 +216,20 @@ def _hold_joints(spec: mujoco.MjSpec, hand: Hand) -> None:
 
 
 def add_object(scene: mujoco.MjSpec, obj: ObjectModel, protocol: Protocol, name: str = "object") -> mujoco.MjsBody:
-    """The object as its convex parts, with the mass and inertia of its mesh; body and free joint have the name."""
+    """The object as its convex parts, or as its balls, with its mass and inertia; body and free joint have the name."""
     body = scene.worldbody.add_body(name=name, pos=FAR_AWAY)
     body.add_freejoint(name=name)
-    for i, (vertices, faces) in enumerate(obj.parts):
+    touch = {"condim": 4, "mass": 0.0, "friction": [protocol.friction, protocol.torsional_friction, 1e-4]}
+    if obj.balls is not None:
+        for centre, radius in zip(obj.balls.centres.tolist(), obj.balls.radii.tolist(), strict=True):
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], pos=centre, **touch)
+    for i, (vertices, faces) in enumerate(obj.parts if obj.balls is None else ()):
         mesh = scene.add_mesh(name=f"{name}{i}", uservert=np.asarray(vertices, float).ravel(),
                               userface=np.asarray(faces, np.int32).ravel())
         mesh.maxhullvert = HULL_VERTICES
         # A part's own inertia plays no role, and thin parts would be refused for it.
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, condim=4, mass=0.0,
-                      friction=[protocol.friction, protocol.torsional_friction, 1e-4])
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, **touch)
     mass = object_mass(obj, protocol)
     inertia = obj.inertia / obj.volume * mass
     body.explicitinertial, body.mass, body.ipos = True, mass, obj.centre_of_mass
