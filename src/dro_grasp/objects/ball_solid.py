@@ -40,11 +40,13 @@ def solid_of(obj: ObjectModel) -> ObjectModel:
 
 
 def _enclosed(obj: ObjectModel) -> tuple[float, Float[np.ndarray, "n 3"]]:
-    """Volume [m^3] and middles [m] of the cells inside a cloud; the cloud itself if it encloses none."""
+    """Volume [m^3] and middles [m] of the cells inside a cloud; of those with points if it encloses none."""
     field = obj.distance_field
     nodes = np.indices(field.shape).reshape(3, -1).T[field.slopes[:, 0].numpy() < 0]
     inside = nodes * field.spacing + field.origin.numpy()
-    return field.spacing**3, inside if len(inside) else obj.cloud.astype(float)
+    if not len(inside):
+        inside = (np.unique(np.floor(obj.cloud / field.spacing), axis=0) + 0.5) * field.spacing
+    return field.spacing**3, inside.astype(float)
 
 
 def _balls(obj: ObjectModel) -> Balls:
