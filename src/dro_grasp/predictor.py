@@ -263,7 +263,7 @@ class _Pool:
         self.proposals.append(proposal[kept])
 
     def settle(self) -> None:
-        """Settle the better half of what is not, and leave out the rest; without a mesh, everything stays as it is."""
+        """Settle the better half of what is not, and leave out the rest; without the hand's description, everything stays."""
         fresh = slice(self.settled, None)
         if self.request.refine and can_settle(self.problem) and self.grasps[fresh]:
             with self.watch("settle"):

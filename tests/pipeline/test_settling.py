@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 
+from dro_grasp.errors import ObjectError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.catalogue import load_object
@@ -14,7 +17,7 @@ from dro_grasp.perception.partial_views import partial_view
 from dro_grasp.pipeline import settling
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.settling import ESCAPED_SCORE, Settled, best_settled, can_settle, motion, settled
-from dro_grasp.pipeline.stages import refine, scored
+from dro_grasp.pipeline.stages import evaluate, refine, scored
 from dro_grasp.simulation.holding import Holding, holding
 from dro_grasp.simulation.outcome import Failure
 from dro_grasp.simulation.trial import simulate
@@ -93,6 +96,25 @@ def test_only_the_better_half_is_settled_and_escapes_score_low(
     assert len(best_settled(PROBLEM, known, 9)[0]) == 5
 
 
-def test_a_bare_cloud_cannot_settle() -> None:
+def test_a_hand_without_description_cannot_settle() -> None:
     assert can_settle(PROBLEM)
-    assert not can_settle(GraspProblem(HAND, partial_view(CAN, "cloud", 0)))
+    assert can_settle(GraspProblem(HAND, partial_view(CAN, "cloud", 0)))
+    assert not can_settle(GraspProblem(dataclasses.replace(HAND, description=None), CAN))
+
+
+def test_on_a_bare_cloud_grasps_settle_where_they_do_on_the_mesh_and_get_no_trial() -> None:
+    sphere = load_object("sphere")
+    whole, bare = GraspProblem(HAND, sphere), GraspProblem(HAND, partial_view(sphere, "cloud", 0))
+    some = refine(whole, synthesize(HAND, sphere, 6, 2, SynthesisConfig(batch_size=6, steps=20)))
+    on_mesh, on_balls = settled(whole, some), settled(bare, some)
+    both = on_mesh.held & on_balls.held
+    assert both.sum() > 3
+    shift, turn = motion(HAND, on_mesh.grasps[both], on_balls.grasps[both])
+    assert shift.median() < 0.002
+    assert turn.median() < 0.1
+    gap = [p.field.distances(HAND.points(g.joints, g.T_object_wrist))[0].amin(1) for p, (g, _, _) in (
+        (whole, on_mesh), (whole, on_balls))]
+    assert (gap[0] - gap[1])[both].abs().max() < 0.003  # balls are some 1 mm low
+    for _ in range(2):  # nothing that settling has built is found instead
+        with pytest.raises(ObjectError, match="is a bare point cloud; a trial needs a mesh"):
+            evaluate(bare, on_balls.grasps)

@@ -17,6 +17,7 @@ from dro_grasp.geometry.balls import Balls
 from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.ball_solid import solid_of
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.starts import APPROACH
 from dro_grasp.pipeline.constraints import Constraints
@@ -71,6 +72,11 @@ class GraspProblem:
             return None
         cloud = torch.from_numpy(self.obj.cloud)
         return cloud[place.distances(cloud)[0] <= 0]
+
+    @cached_property
+    def solid(self) -> ObjectModel:
+        """The object as closing is simulated on it: balls stand for a bare cloud."""
+        return solid_of(self.obj)
 
     @cached_property
     def centre(self) -> Float[Tensor, "3"]:

@@ -1,7 +1,7 @@
 """Settling: the closing of the hand is simulated until it leaves the object where it is.
 
 In contact simulation, fingers and object find the places that geometry alone gets wrong by millimetres. No force is tried on
-the object, so this is no trial; it needs the mesh and the hand's description. Ours.
+the object, so this is no trial; it needs the hand's description. Balls stand for a bare cloud. Ours.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ class Settled(NamedTuple):
 
 
 def can_settle(problem: GraspProblem) -> bool:
-    """Whether the closing can be simulated: on a mesh, with a hand that has its description."""
-    return problem.hand.description is not None and not problem.obj.is_cloud
+    """Whether the closing can be simulated: with a hand that has its description."""
+    return problem.hand.description is not None
 
 
 def best_settled(problem: GraspProblem, grasps: GraspBatch, least: int) -> tuple[Int[Tensor, " k"], GraspBatch]:
@@ -97,10 +97,9 @@ def settled(problem: GraspProblem, grasps: GraspBatch, config: SettleConfig | No
         config: Limits.
 
     Raises:
-        ObjectError: The object is a bare point cloud.
         HandError: The hand came without its description.
     """
-    config, hand, obj = config or SettleConfig(), problem.hand, problem.obj
+    config, hand, obj = config or SettleConfig(), problem.hand, problem.solid
     grasps = complete(problem, grasps.without("score"))
     closed = settle(hand, obj, grasps)
     moved, _ = motion(hand, grasps, closed)
