@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 
-def point_distances(a: Float[Tensor, "*b n 3"], b: Float[Tensor, "*b m 3"]) -> Float[Tensor, "*b n m"]:
+def point_distances(a: Float[Tensor, "*#b n 3"], b: Float[Tensor, "*#b m 3"]) -> Float[Tensor, "*#b n m"]:
     """Distance of each point of one cloud to each of another [m], as their coordinates give it.
 
     PyTorch's form by a matrix product loses half of the digits, and its gradient is not finite where points meet.
