@@ -68,6 +68,17 @@ def test_a_cup_stays_hollow() -> None:
     assert (np.linalg.norm(centres[:, :2], axis=1) + radii < 0.036 + 2 * OUTSIDE).all()
 
 
+def test_a_large_thing_has_larger_balls_and_not_more_of_them(sphere: ObjectModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a thing of 30 cm is for the usual number of balls, a small one is for fewer."""
+    usual = len(balls_of(sphere)[1])
+    monkeypatch.setattr("dro_grasp.objects.ball_solid.MOST", usual // 4)
+    centres, radii = balls_of(sphere)
+    assert usual // 8 < len(radii) <= usual // 4
+    assert radii.max() > 1.5 * RADII[0]
+    reach = np.linalg.norm(centres - CENTRE, axis=1) + radii
+    assert np.abs(reach - RADIUS).max() < OUTSIDE
+
+
 def test_a_plate_thinner_than_the_grid_has_a_small_mass_all_the_same() -> None:
     x, y, z = (a.ravel() for a in np.meshgrid(np.linspace(0, 0.03, 31), np.linspace(0, 0.03, 31), (-0.0005, 0.0005)))
     points = np.stack([x, y, z, 0 * x, 0 * x, np.sign(z)], 1)

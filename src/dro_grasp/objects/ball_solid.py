@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from dro_grasp.geometry.balls import Balls
 from dro_grasp.objects.cache import content_hash
@@ -16,6 +16,10 @@ RADII = (0.008, 0.006, 0.004, 0.003, 0.002)
 """Radii of balls [m]; each point gets the largest that stays inside, or else the smallest (ours)."""
 SPACING = 0.008
 """Distance between the points that are touched [m] (ours): between the largest balls the surface is 1 mm low."""
+MOST = 2000
+"""Balls of a solid at most (ours): larger things get larger balls, farther apart. Hands take in a few hundred."""
+COARSER = 1.25
+"""Factor of the spacing, until there are few enough (ours)."""
 OUTSIDE = 0.0012
 """How far a ball may reach through the surface elsewhere [m] (ours)."""
 ROUND = 1e-12
@@ -49,12 +53,19 @@ def _enclosed(obj: ObjectModel) -> tuple[float, Float[np.ndarray, "n 3"]]:
     return field.spacing**3, inside.astype(float)
 
 
+def _spread(cloud: Float[np.ndarray, "m 3"], spacing: float) -> Int[np.ndarray, " k"]:
+    """Rows of points about this far apart [m]: the one nearest to the middle of each cell of a grid."""
+    cells = np.floor(cloud / spacing)
+    order = np.linalg.norm(cloud / spacing - cells - 0.5, axis=1).argsort(kind="stable")
+    return order[np.unique(cells[order], axis=0, return_index=True)[1]]
+
+
 def _balls(obj: ObjectModel) -> Balls:
     """Balls that touch a cloud with normals from inside."""
-    cloud, radii = obj.cloud.astype(float), np.array(RADII)
-    cells = np.floor(cloud / SPACING)
-    order = np.linalg.norm(cloud / SPACING - cells - 0.5, axis=1).argsort(kind="stable")
-    rows = order[np.unique(cells[order], axis=0, return_index=True)[1]]  # the point nearest to the middle of each cell
+    cloud, radii, spacing = obj.cloud.astype(float), np.array(RADII), SPACING
+    while len(rows := _spread(cloud, spacing)) > MOST:
+        spacing *= COARSER
+        radii = np.array([RADII[0] * spacing / SPACING, *RADII])
     centres = cloud[rows] - radii[:, None, None] * obj.cloud_normals[rows]
     depth = -obj.distance_field.distances(torch.from_numpy(centres).float())[0].numpy()
     fits = depth > radii[:, None] - OUTSIDE
