@@ -81,7 +81,8 @@ def test_placements_put_the_grasp_centre_where_the_prior_says(
     offset = torch.tensor([0.01, -0.02, 0.03])
     given: list[torch.Tensor] = []
 
-    def sample(opened, points, rotations, num, generator):  # type: ignore[no-untyped-def]
+    def sample(opened, points, rotations, num, generator, proportions):  # type: ignore[no-untyped-def]
+        assert proportions is None, "the prior takes features"
         given.append(opened)
         return rotations[:num], offset.expand(num, 3)
 

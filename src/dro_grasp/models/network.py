@@ -46,10 +46,10 @@ class NetworkOutput:
     """Squared velocity error of the flow to z; zero without a flow."""
     moved: Float[Tensor, "b n 3"]
     """The placed hand, moved by z if z moves it [m]."""
-    drawn: Float[Tensor, "b n columns"] | None
-    """D(R,O) of a z that was drawn from its prior [m]; None if none was asked for."""
     hand_feature: Float[Tensor, "b width"]
     """Mean feature of the open hand, for the placement prior."""
+    drawn: Float[Tensor, "b n columns"] | None = None
+    """D(R,O) of a z that was drawn from its prior [m]; None if none was asked for."""
 
 
 class DistanceNetwork(nn.Module):
@@ -148,7 +148,7 @@ class DistanceNetwork(nn.Module):
                 other = self.prior(other, condition)
             drawn = predicted(other, hand if self.motion is None else self.motion(phi_hand, hand, other[:, None])[:, 0])
         return NetworkOutput(
-            distances, mean, log_variance, prior_mean, prior_log_variance, flow_error, moved, drawn, phi_hand.mean(1))
+            distances, mean, log_variance, prior_mean, prior_log_variance, flow_error, moved, phi_hand.mean(1), drawn)
 
     def predict(
         self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], noise: Float[Tensor, "b k latent"],
