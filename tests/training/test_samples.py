@@ -8,6 +8,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from dro_grasp.errors import OptionError
+from dro_grasp.training.config import LossConfig, TrainConfig
 from dro_grasp.training.samples import SampleSource
 
 
@@ -32,3 +34,12 @@ def test_a_step_has_different_hands_and_repeats_them_only_where_there_are_too_fe
     for _ in range(20):
         assert len(set(source.draw_hands(3, generator, by_count))) == 3
         assert sorted(Counter(source.draw_hands(5, generator, by_count)).values()) == [1, 2, 2]
+
+
+@pytest.mark.parametrize("value", [-0.1, 1.5, float("inf"), float("nan")])
+def test_powers_and_weights_that_say_nothing_are_refused(value: float) -> None:
+    with pytest.raises(OptionError, match="by_count is"):
+        TrainConfig(by_count=value)
+    if value != 1.5:
+        with pytest.raises(OptionError, match="drawn is"):
+            TrainConfig(losses=LossConfig(drawn=value))

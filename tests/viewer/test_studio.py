@@ -147,11 +147,11 @@ def test_what_is_taken_away_is_what_is_shown(studio: Studio, made: module.ShownG
 
 def test_uploads_are_picked_and_errors_are_shown(studio: Studio) -> None:
     text = (BUILTIN_FOLDER / "gripper3.urdf").read_bytes()
-    studio._take(viser.UploadedFile(name="../mine.urdf", content=text), studio.hand)
+    studio._take(viser.UploadedFile(name="../mine.urdf", content=text), studio.hand, studio._preview)
     assert studio.hand.value == "mine.urdf", "no path of a temporary folder"
     assert studio.stage.hand is not None
     assert studio.stage.hand.name == "mine", "the uploaded hand is shown at once"
-    studio._take(viser.UploadedFile(name="bad.urdf", content=b"<robot"), studio.hand)
+    studio._take(viser.UploadedFile(name="bad.urdf", content=b"<robot"), studio.hand, studio._preview)
     assert studio.status.content.startswith("**Error:**")
     assert "bad.urdf" in studio.status.content
     assert "/" not in studio.status.content.split("bad.urdf")[0], "no path of a temporary folder"
@@ -162,7 +162,8 @@ def test_an_upload_waits_for_other_work_and_is_never_lost(studio: Studio, monkey
     text = (BUILTIN_FOLDER / "gripper3.urdf").read_bytes()
 
     def upload(name: str) -> threading.Thread:
-        thread = threading.Thread(target=lambda: studio._take(viser.UploadedFile(name=name, content=text), studio.hand))
+        file = viser.UploadedFile(name=name, content=text)
+        thread = threading.Thread(target=lambda: studio._take(file, studio.hand, studio._preview))
         thread.start()
         return thread
 
@@ -246,7 +247,7 @@ def test_every_browser_has_a_page_and_closing_it_ends_its_work_and_its_uploads(
         clients = visited(served, 2)
         text = (BUILTIN_FOLDER / "gripper3.urdf").read_bytes()
         for page, name in zip(made, ("mine.urdf", "theirs.urdf"), strict=True):
-            page._take(viser.UploadedFile(name=name, content=text), page.hand)
+            page._take(viser.UploadedFile(name=name, content=text), page.hand, page._preview)
         assert "mine.urdf" not in made[1].hand.options
         assert "theirs.urdf" not in made[0].hand.options
         folders = [Path(page.shelf._folder.name) for page in made]

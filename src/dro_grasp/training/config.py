@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from dro_grasp.errors import OptionError
+
 
 @dataclass(frozen=True)
 class AugmentationConfig:
@@ -115,6 +117,18 @@ class TrainConfig:
     """Object points to which a step predicts distances; inference uses all."""
     freeze_hand_encoder: bool = True
     """Keep a pretrained or given hand encoder as it is. Source: paper section III-C."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be drawn or weighed.
+
+        Raises:
+            OptionError: `by_count` is not between 0 and 1, or the weight of drawn hands is negative or not finite.
+        """
+        if not 0 <= self.by_count <= 1:
+            raise OptionError(f"by_count is {self.by_count}; give 0 to draw all hands equally often, 1 to draw them by their "
+                              "grasps, or a number between")
+        if not 0 <= self.losses.drawn < math.inf:
+            raise OptionError(f"drawn is {self.losses.drawn}; give a weight from 0 on, for example 1")
 
 
 @dataclass(frozen=True)

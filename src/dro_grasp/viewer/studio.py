@@ -8,6 +8,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import get_args
 
 import viser
@@ -26,7 +27,7 @@ from dro_grasp.simulation.diagnosis import diagnose
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 from dro_grasp.viewer.appearance import waiting_pose
 from dro_grasp.viewer.constraint_panel import ConstraintPanel
-from dro_grasp.viewer.grasp_page import GraspPage, ShownGrasps
+from dro_grasp.viewer.grasp_page import Closed, GraspPage, ShownGrasps
 from dro_grasp.viewer.pictures import protocol_name
 from dro_grasp.viewer.shelf import Shelf
 from dro_grasp.viewer.stage import HOST, Place, ServedPage
@@ -174,40 +175,34 @@ class Studio(GraspPage):
             self.protocol = gui.add_dropdown("Trial", tuple(PROTOCOLS), initial_value=DEFAULT_PROTOCOL)
             self.button = gui.add_button("Generate", color="green")
         self.panel = panel = ConstraintPanel(self.place, lambda: self._guarded(self._draw_constraints))
-        hand_file.on_upload(lambda _: self._take(hand_file.value, self.hand))
-        object_file.on_upload(lambda _: self._take(object_file.value, self.object))
-        panel.upload.on_upload(lambda _: self._guarded(lambda: self._take_scene(panel.upload.value)))
+        hand_file.on_upload(lambda _: self._take(hand_file.value, self.hand, self._preview))
+        object_file.on_upload(lambda _: self._take(object_file.value, self.object, self._preview))
+        panel.upload.on_upload(lambda _: self._take(panel.upload.value, panel.avoid, self._draw_constraints))
         panel.under.on_click(lambda _: self._guarded(self._table_under))
         self.button.on_click(lambda _: self._guarded(self._generate))
         for choice in (self.hand, self.object):
             choice.on_update(lambda event: None if event.client is None else self._guarded(self._pick_object))
         self.usual.on_update(lambda _: setattr(self.temperature, "disabled", self.usual.value))
 
-    def _take(self, upload: viser.UploadedFile, choice: viser.GuiDropdownHandle[str]) -> None:
-        """Store an upload and pick it; where other work takes long, it can be picked later."""
-        if self.closed.is_set():
-            return
-        try:
-            label = self.shelf.take(upload.name, upload.content)
-        except DroGraspError as error:
-            self._complain(error)
-            return
-        choice.options = tuple(dict.fromkeys([*choice.options, label]))
-        later = f"Busy. {label} is stored; pick it afterwards."
-        self._guarded(lambda: self._pick_upload(label, choice), UPLOAD_PATIENCE, later)
+    def _take(self, upload: viser.UploadedFile, choice: viser.GuiDropdownHandle[str], show: Callable[[], None]) -> None:
+        """Store an upload, pick it and show it; where other work takes long, it can be picked later."""
+        with suppress(Closed):
+            if self.closed.is_set():
+                return
+            try:
+                label = self.shelf.take(upload.name, upload.content)
+            except DroGraspError as error:
+                self._complain(error)
+                return
+            choice.options = tuple(dict.fromkeys([*choice.options, label]))
+            later = f"Busy. {label} is stored; pick it afterwards."
+            self._guarded(lambda: self._pick_upload(label, choice, show), UPLOAD_PATIENCE, later)
 
-    def _pick_upload(self, label: str, choice: viser.GuiDropdownHandle[str]) -> None:
-        """Pick an upload."""
+    def _pick_upload(self, label: str, choice: viser.GuiDropdownHandle[str], show: Callable[[], None]) -> None:
+        """Pick an upload and show it."""
         choice.value = label
-        self._preview()
+        show()
         self._say(f"{label} is picked. {self.status.content}")
-
-    def _take_scene(self, upload: viser.UploadedFile) -> None:
-        """Store a scene, pick it and show it."""
-        label = self.shelf.take(upload.name, upload.content)
-        self.panel.avoid.options = tuple(dict.fromkeys([*self.panel.avoid.options, label]))
-        self.panel.avoid.value = label
-        self._draw_constraints()
 
     def _table_under(self) -> None:
         """Put the table under the chosen object."""
