@@ -27,7 +27,7 @@ from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.proposal import Proposal, ProposalConfig, check_temperature, propose
 from dro_grasp.pipeline.settling import best_settled, can_settle
 from dro_grasp.pipeline.shortage import shortage_in_words
-from dro_grasp.pipeline.stages import complete, optimise, refine, scored
+from dro_grasp.pipeline.stages import complete, eased, optimise, refine, scored
 
 LARGEST_CALL = 100_000
 """Most candidates of one call; more do not fit memory."""
@@ -292,6 +292,7 @@ class _Pool:
         best = (-grasps.score).argsort(stable=True)[: self.request.num]
         chosen = Proposal.concatenate(self.proposals)[best]
         proposed = complete(self.problem, chosen.grasps)
-        grasps = with_own_files(grasps[best], self.problem.hand, self.problem.obj)
+        given = eased(self.problem, grasps[best]) if self.request.refine else grasps[best]
+        grasps = with_own_files(given, self.problem.hand, self.problem.obj)
         return Prediction(
             grasps, proposed, chosen.points, self.made, dict(self.dropped), self.watch.seconds, shortage)

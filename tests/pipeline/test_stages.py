@@ -13,8 +13,10 @@ from dro_grasp.errors import GraspFileError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize, synthesize_with
+from dro_grasp.perception.partial_views import partial_view
+from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.stages import complete, evaluate, optimise, rank, refine, scored
+from dro_grasp.pipeline.stages import complete, eased, evaluate, optimise, rank, refine, scored
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.toy_hand import toy_hand
 
@@ -54,6 +56,21 @@ def test_stages_return_new_grasps_and_leave_the_given_ones(grasps: GraspBatch) -
     assert ranked.score.tolist() == sorted(scored(PROBLEM, moved).score.tolist(), reverse=True)
     assert not moved.evaluated.any()
     assert bool(evaluate(PROBLEM, ranked[:2], workers=1).evaluated.all())
+
+
+def test_fingers_leave_room_on_a_bare_cloud_where_the_constraints_let_them(grasps: GraspBatch) -> None:
+    whole = complete(PROBLEM, grasps)
+    assert eased(PROBLEM, whole) is whole, "a mesh is known"
+    cloud = GraspProblem(HAND, partial_view(CAN, "cloud", 0))
+    given = whole.replace(score=torch.arange(6.0))
+    apart = eased(cloud, given)
+    for name in ("T_object_wrist", "pregrasp_joints", "squeeze_joints", "score"):
+        assert torch.equal(getattr(apart, name), getattr(given, name))
+    clear = [CAN.distance_field.distances(HAND.points(g.joints, g.T_object_wrist))[0].amin(-1) for g in (given, apart)]
+    assert float((clear[1] - clear[0]).max()) > 0.002
+    assert float((clear[1] - clear[0]).min()) > -1e-4
+    below = GraspProblem(HAND, cloud.obj, constraints=Constraints(cone=0.01, direction=(0.0, 0.0, 1.0)))
+    assert torch.equal(eased(below, given).joints, given.joints), "none of these grasps is permitted"
 
 
 def test_a_stopwatch_adds_up_and_lists_what_never_ran() -> None:

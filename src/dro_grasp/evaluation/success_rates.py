@@ -20,7 +20,7 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.partial_views import View, partial_view
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.settling import best_settled, can_settle
-from dro_grasp.pipeline.stages import refine, scored
+from dro_grasp.pipeline.stages import eased, refine, scored
 from dro_grasp.simulation.contact_quality import with_contacts
 from dro_grasp.simulation.protocols import Protocol
 from dro_grasp.simulation.trial import simulate
@@ -187,7 +187,8 @@ def _stages(source: _Source, obj: ObjectModel, config: BenchmarkConfig) -> Itera
             continue
         if grasps.score.isnan().any():
             grasps = scored(problem, grasps)
-        evaluated = _evaluated(problem.hand, obj, grasps, config, seconds, config.num)
+        given = grasps if step.make is None else eased(problem, grasps)
+        evaluated = _evaluated(problem.hand, obj, given, config, seconds, config.num)
         if step.stage in asked:
             yield source.name, step.stage, evaluated
         for stage, count in step.best.items():

@@ -70,7 +70,7 @@ class _Closer:
     def close(self, q: Float[Tensor, "n n_dof"]) -> Float[Tensor, "n n_dof"]:
         """Joints with idle fingers closed."""
         hand, config = self.energy.hand, self.config
-        bends = _bending(hand)
+        bends = bending(hand)
         idle = self.distances(q) > config.idle
         opened = torch.where(bends.any(0), hand.canonical_joints(config.openness), q)
         for start, moving in ((q, bends), (opened, bends), (opened, _first(hand, bends))):
@@ -111,12 +111,7 @@ class _Closer:
 
     def distances(self, q: Float[Tensor, "n n_dof"]) -> Float[Tensor, "n n_tips"]:
         """Distance of each finger's nearest point to the object [m]."""
-        energy, hand = self.energy, self.energy.hand
-        points = energy.body.place(self.T[:, None] @ hand.tree.forward(q))
-        distance = energy.field.distances(points)[0]
-        finger = hand.finger_of_link[energy.body.members.argmax(-1)]
-        return torch.stack([
-            torch.where(finger == index, distance, torch.inf).amin(-1) for index in range(len(hand.fingers))], -1)
+        return finger_distances(self.energy, self.T, q)
 
     def overlap(self, q: Float[Tensor, "n n_dof"]) -> Float[Tensor, " n"]:
         """Self-penetration [m]."""
@@ -125,7 +120,18 @@ class _Closer:
         return energies.self_penetration(centres, energy.spheres.radii, energy.spheres.pairs).value.sum(-1)
 
 
-def _bending(hand: Hand) -> Bool[Tensor, "n_tips n_dof"]:
+def finger_distances(
+    energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"]
+) -> Float[Tensor, "n n_tips"]:
+    """Signed distance of each finger's nearest surface point to the object, for wrist poses and joints on its device [m]."""
+    hand = energy.hand
+    points = energy.body.place(T[:, None] @ hand.tree.forward(q))
+    distance = energy.field.distances(points)[0]
+    finger = hand.finger_of_link[energy.body.members.argmax(-1)]
+    return torch.stack([torch.where(finger == index, distance, torch.inf).amin(-1) for index in range(len(hand.fingers))], -1)
+
+
+def bending(hand: Hand) -> Bool[Tensor, "n_tips n_dof"]:
     """The joints that bend each finger and no other."""
     moves = torch.stack([hand.tree.moves[list(finger.links)].any(0) for finger in hand.fingers])
     return moves & (moves.sum(0) == 1) & hand.movable & ~hand.abduction

@@ -5,15 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import torch
+
 from dro_grasp.devices import one_thread
+from dro_grasp.energy.grasp_energy import EnergyConfig
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import completed
 from dro_grasp.optimization.finger_closing import close_idle_fingers
+from dro_grasp.optimization.finger_easing import ease_fingers
 from dro_grasp.optimization.grip import gripping
 from dro_grasp.optimization.refinement import RefineConfig, refine_grasps
 from dro_grasp.optimization.starts import StartConfig
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize_with
-from dro_grasp.pipeline.admission import facing, opened_wide
+from dro_grasp.pipeline.admission import facing, opened_wide, permitted
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.ranking.score import ScoreConfig, score_grasps
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
@@ -60,6 +64,20 @@ def refine(problem: GraspProblem, grasps: GraspBatch, config: RefineConfig | Non
 def grip(problem: GraspProblem, grasps: GraspBatch, config: RefineConfig) -> GraspBatch:
     """The same grasps with a pregrasp as the problem asks, and a squeeze that balances the contacts' forces."""
     return opened_wide(problem, gripping(problem.energy(config.energy), grasps, config.grip))
+
+
+def eased(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
+    """Complete grasps as they are given away: on a bare cloud, fingers leave room; those on a mesh stay.
+
+    It comes last. Score and energy judge grasps whose fingers touch, and are kept. Where the constraints forbid the room, as a
+    table does, a grasp stays.
+    """
+    if not problem.obj.is_cloud:
+        return grasps
+    with one_thread():
+        apart = ease_fingers(problem.energy(EnergyConfig()), grasps)
+    allowed = permitted(problem, apart)
+    return grasps.replace(joints=torch.where(allowed[:, None], apart.joints, grasps.joints))
 
 
 def rank(problem: GraspProblem, grasps: GraspBatch, config: ScoreConfig | None = None) -> GraspBatch:
