@@ -22,7 +22,8 @@ class EasingConfig:
     """How much room fingers leave (ours)."""
 
     clearance: float = 0.004
-    """Distance from which on a finger stands clear [m]: about the error of a completed surface; 6 mm cost a little on exact ones."""
+    """Distance from which on a finger stands clear [m]: about the error of a completed surface; 6 mm cost a little where the
+    cloud is whole."""
     steps: int = 11
     """Samples of the way from the grasp to the pregrasp."""
     batch_size: int = 64
