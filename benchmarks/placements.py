@@ -49,8 +49,8 @@ SHIPPED = "features, as shipped"
 """The row of the shipped prior."""
 
 
-class Trial:
-    """One prior that replaces that of a network, and what it knows of a hand."""
+class Variant:
+    """A network with another placement prior, and what that knows of a hand."""
 
     def __init__(self, network: DistanceNetwork, prior: PlacementPrior) -> None:
         self.network, self.prior = network, prior
@@ -64,7 +64,7 @@ class Trial:
         opened = hand.points(hand.canonical_joints()) @ axes
         return self.network.hand_encoder((opened - opened.mean(0))[None]).mean(1)[0]
 
-    def fit(self, sources: list[SampleSource], steps: int, noise: float) -> Trial:
+    def fit(self, sources: list[SampleSource], steps: int, noise: float) -> Variant:
         """Train it on one bundle, or on two in turn."""
         told = {name: self.describe(source.hands[name]) for source in sources for name in source.names}
         standard = self.prior.standardised
@@ -138,24 +138,24 @@ def main() -> None:
     def source(path: Path) -> SampleSource:
         return SampleSource(load_bundle(path), config, AugmentationConfig())
 
-    def fresh(features: int | None) -> Trial:
-        return Trial(network, PlacementPrior(features, config.placement_width, config.placement_components))
+    def fresh(features: int | None) -> Variant:
+        return Variant(network, PlacementPrior(features, config.placement_width, config.placement_components))
 
     bundle, unseen = source(options.bundle), source(options.held_out)
     shipped = network.placement
     assert shipped is not None
-    trials = {SHIPPED: Trial(network, shipped), "proportions": fresh(None).fit([bundle], options.steps, noise)}
+    variants = {SHIPPED: Variant(network, shipped), "proportions": fresh(None).fit([bundle], options.steps, noise)}
     if options.more is not None:
         both = [bundle, source(options.more)]
-        trials |= {"features, more hands": fresh(config.width).fit(both, options.steps, noise),
+        variants |= {"features, more hands": fresh(config.width).fit(both, options.steps, noise),
                    "proportions, more hands": fresh(None).fit(both, options.steps, noise)}
     rows, values = [], {}
-    for label, trial in trials.items():
-        found = trial.errors(unseen, options.samples)
+    for label, variant in variants.items():
+        found = variant.errors(unseen, options.samples)
         distance, density = (sum(column) / len(found) for column in zip(*found.values(), strict=True))
         cells = [f"{median:.1f}" for median, _ in found.values()]
         pairs = [(load_hand(hand), name) for hand in options.hands for name in resolve_objects(options.objects)]
-        held = [trial.held(hand, name, options.num) for hand, name in pairs]
+        held = [variant.held(hand, name, options.num) for hand, name in pairs]
         rates = [rate(column) for column in torch.cat(held).T] if held else []
         rows.append([label, *cells, f"{distance:.1f}", f"{density:.2f}", *rates])
         values[label] = {"distances": found, "distance": distance, "log_density": density, "held": rates}

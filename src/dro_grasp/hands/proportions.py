@@ -35,12 +35,12 @@ def proportions(hand: Hand, axes: Float[Tensor, "3 3"]) -> Float[Tensor, " f"]:
     """
     owner = hand.finger_of_link[hand.link_index]
     found: list[Float[Tensor, " k"]] = []
-    for openness in OPENNESS:
-        tips, points = (_about(hand, axes, x) for x in _posed(hand, openness))
+    poses = [[_about(hand, axes, x) for x in _posed(hand, openness)] for openness in OPENNESS]
+    for tips, points in poses:
         thumb = torch.zeros_like(tips[0]) if hand.thumb is None else tips[hand.thumb]
         found += [*_moments(tips), tips.amin(0), tips.amax(0), *_moments(points[owner >= 0]), thumb]
-    _, points = _posed(hand, OPENNESS[0])
-    found += _moments(_about(hand, axes, points)[owner < 0])
+    _, opened = poses[0]
+    found += _moments(opened[owner < 0])
     found.append(axes.new_tensor([len(hand.fingers) / FINGERS, float(hand.thumb is not None), hand.tree.n_dof / JOINTS]))
     return torch.cat(found)
 
