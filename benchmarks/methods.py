@@ -1,6 +1,6 @@
 """Grasps as `generate` returns them, with candidates from the network, from the optimiser, or from both, at any cost in time.
 
-    python benchmarks/methods.py [--hands HAND ...] [--objects NAME ...] [--num N] [--json]
+    python benchmarks/methods.py [--hands HAND ...] [--objects NAME ...] [--num N] [--weights NAME] [--json]
 
 The best by score of each source are evaluated on the mesh; the seconds count everything but the trial. The row
 `network, first z` decodes the first z that is drawn, without a choice by geometry. Needs the development assets by default.
@@ -41,11 +41,12 @@ def main() -> None:
     parser.add_argument("--objects", nargs="+", default=["builtin:test"], help="objects")
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS), help="rows")
     parser.add_argument("--num", type=int, default=16, help="grasps of each hand on each object")
+    parser.add_argument("--weights", help="weights of the network; the default ones without")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    predictor = GraspPredictor()
-    first = GraspPredictor(config=PredictorConfig(choice=ChoiceConfig(draws=1)))
+    predictor = GraspPredictor(options.weights)
+    first = GraspPredictor(options.weights, config=PredictorConfig(choice=ChoiceConfig(draws=1)))
     found: dict[tuple[str, str], list[np.ndarray]] = {}
     for hand in map(load_hand, options.hands):
         for obj in map(load_object, resolve_objects(options.objects)):
