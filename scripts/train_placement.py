@@ -17,6 +17,7 @@ from typing import Any
 import torch
 
 from dro_grasp.datasets.bundle.training_file import load_bundle
+from dro_grasp.files import check_output
 from dro_grasp.models.checkpoints import history_of, load_weights, locate_weights, save_weights
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.models.placement import Standardised
@@ -42,7 +43,8 @@ def train(network: DistanceNetwork, source: SampleSource, steps: int, rate: floa
     assert isinstance(standard, Standardised)
     prior.train().requires_grad_(True)
     optimiser = torch.optim.AdamW(prior.parameters(), lr=rate, weight_decay=DECAY)
-    generator, reached, sums = torch.Generator().manual_seed(seed), {}, torch.zeros(2)
+    generator, sums = torch.Generator().manual_seed(seed), torch.zeros(2)
+    reached: dict[str, float] = {}
     for step in range(steps):
         for group in optimiser.param_groups:
             group["lr"] = rate * min(1.0, (step + 1) / WARMUP) * 0.5 * (1 + math.cos(math.pi * step / steps))
@@ -78,6 +80,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--partial", type=float, default=0.25, help="share of samples with half of the object cut away")
     parser.add_argument("--seed", type=int, default=7)
     options = parser.parse_args(argv)
+    if options.steps < 1:
+        parser.error(f"--steps is {options.steps}; give at least 1")
+    check_output(options.output)
     torch.set_num_threads(1)
     network, bundle = load_weights(options.weights).eval(), load_bundle(options.bundle)
     if network.config.placement_hand != "proportions":
