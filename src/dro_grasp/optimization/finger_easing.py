@@ -1,7 +1,7 @@
 """Fingers stand clear of a surface that is an estimate: each opens alone until it leaves room, and closes with the squeeze.
 
 A camera sees one side of an object. The other side is a guess that errs by some millimetres, and fingers that rest on the guess
-end up inside the object. How a hand closes, from pregrasp to squeeze, stays the same. Ours.
+end up inside the object. Wrist, pregrasp and squeeze stay. Ours.
 """
 
 from __future__ import annotations
