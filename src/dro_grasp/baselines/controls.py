@@ -50,7 +50,7 @@ class MeanGraspMethod(Method):
 
     def knows(self, hand: Hand) -> bool:
         """Hands with training grasps."""
-        return hand.name in self.bundle.grasps
+        return hand.name in self.bundle.grasps and len(self.bundle.grasps[hand.name].joints) > 0
 
     def make(self, problem: GraspProblem, num: int, seed: int) -> GraspBatch:
         """See `mean_grasps`."""

@@ -221,6 +221,8 @@ class BundleCommand(DataSets):
     """Hands to include; by default all."""
     per_pair: Annotated[int | None, optional("N", "all")] = None
     """Limit of grasps of a hand on an object; those that cover palm directions best are kept."""
+    more_hands: tuple[str, ...] = ()
+    """Names or URDF files of hands without grasps, such as those of `hand make`: `pretrain` needs their kinematics alone."""
     json: Flag = False
     """Print one JSON object instead of a table."""
 
@@ -228,9 +230,11 @@ class BundleCommand(DataSets):
         """Select the grasps of the split, find their hands and objects, write the bundle."""
         from dro_grasp.datasets.collections.bundling import make_bundle
         from dro_grasp.files import check_output
+        from dro_grasp.hands.library import load_hand
 
         check_output(self.output)
-        bundle, left_out = make_bundle(self.inputs, self.output, self.split, self.hands, self.per_pair)
+        more = [load_hand(name) for name in self.more_hands]
+        bundle, left_out = make_bundle(self.inputs, self.output, self.split, self.hands, self.per_pair, more)
         if left_out:
             say_aside(f"{left_out} grasps outside split '{self.split}' are left out")
         report = {"output": str(self.output), "bytes": self.output.stat().st_size, **bundle.summary()}

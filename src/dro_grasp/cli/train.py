@@ -36,6 +36,10 @@ class Stage:
     """Numbers in z."""
     latent_form: Annotated[Literal["kernel", "motion"] | None, optional("{kernel,motion}", "the preset's")] = None
     """kernel: z enters the kernel alone, the paper's form; motion: z also moves the open hand, as pretraining taught it."""
+    initial: Annotated[str | None, optional("NAME|PATH", "none")] = None
+    """Weights to begin with. They decide the network; `train` keeps their hand encoder as it is."""
+    learning_rate: float = 1e-3
+    """Peak of the learning rate."""
     minutes: Annotated[float | None, optional("MINUTES", "no limit")] = None
     """Time limit (of each part of pretraining); the learning rate follows steps or time, whichever is further on."""
     shards: int = 1
@@ -104,29 +108,30 @@ class Pretrain(Stage):
         from dro_grasp.datasets.bundle.training_file import load_bundle
         from dro_grasp.evaluation.correspondence import matching_rank
         from dro_grasp.files import check_output
-        from dro_grasp.models.checkpoints import save_weights
+        from dro_grasp.models.checkpoints import history_of, load_weights, locate_weights, save_weights
         from dro_grasp.training.config import AugmentationConfig, MotionConfig, PretrainConfig
         from dro_grasp.training.pretraining import pretrain, pretrain_motion
         from dro_grasp.training.processes import is_first
         from dro_grasp.training.samples import SampleSource
 
         check_output(self.output)
-        network = network_config(self.preset, latent=self.latent, latent_form=self.latent_form)
-        schedule = self.schedule(steps=self.steps)
+        initial = None if self.initial is None else load_weights(self.initial)
+        network = network_config(self.preset, initial, latent=self.latent, latent_form=self.latent_form)
+        schedule = self.schedule(steps=self.steps, learning_rate=self.learning_rate)
         bundle = load_bundle(self.bundle)
         config = PretrainConfig(schedule)
         motion = MotionConfig(dataclasses.replace(schedule, steps=self.motion_steps))
-        model = pretrain(bundle, network, config, self.run_folder)
+        model = pretrain(bundle, network, config, self.run_folder, initial=initial)
         if network.latent_form == "motion":
             model = pretrain_motion(model, bundle, motion, self.run_folder / "motion")
         if not is_first():
             return 0
         settings = {"encoder": config} | ({"motion": motion} if network.latent_form == "motion" else {})
         about = how_long(self.run_folder) | {
-            "stage": "pretraining", "data": bundle.summary(),
+            "stage": "pretraining", "initial": self.initial, "data": bundle.summary(),
             "settings": {name: dataclasses.asdict(part) for name, part in settings.items()},
         }
-        save_weights(model, self.output, about)
+        save_weights(model, self.output, about, [] if self.initial is None else history_of(locate_weights(self.initial)))
         source = SampleSource(bundle, network, AugmentationConfig())
         ranks = matching_rank(model.hand_encoder, source, torch.Generator().manual_seed(1))
         report = {"output": str(self.output), "steps": about["steps"], "mean_rank": ranks, "chance": network.n_hand / 2}
@@ -148,12 +153,8 @@ class Train(Stage):
     output, steps, minutes, learning rate, device and seed apply."""
     pretrained: Annotated[str | None, optional("PATH", "none")] = None
     """Weights from `dro-grasp pretrain`; without them, and without --initial, the hand encoder is trained along."""
-    initial: Annotated[str | None, optional("NAME|PATH", "none")] = None
-    """Weights to fine-tune on the bundle. They decide the network; their hand encoder stays as it is."""
     steps: int = 10_000
     """Optimiser steps."""
-    learning_rate: float = 1e-3
-    """Peak of the learning rate."""
     prior: Annotated[
         Literal["standard", "learned", "flow"] | None, optional("{standard,learned,flow}", "the preset's")] = None
     """Distribution of z: standard (N(0, I), the paper's form), or a Gaussian or a flow learned from hand and object."""

@@ -15,6 +15,7 @@ from dro_grasp.models.latent import HandMotion, sample_posterior
 from dro_grasp.models.network import DistanceNetwork, untrained_network
 from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.training.config import AugmentationConfig, MotionConfig, PretrainConfig
+from dro_grasp.training.given_weights import take_initial
 from dro_grasp.training.losses import contrastive_loss, divergence
 from dro_grasp.training.reports import Report, console_report
 from dro_grasp.training.runs import Losses, TrainingRun, begin, recalibrate
@@ -22,23 +23,29 @@ from dro_grasp.training.samples import SampleSource, random_turns
 
 
 def pretrain(
-    bundle: Bundle, network: NetworkConfig, config: PretrainConfig, folder: Path, report: Report | None = None
+    bundle: Bundle, network: NetworkConfig, config: PretrainConfig, folder: Path, report: Report | None = None,
+    initial: DistanceNetwork | None = None,
 ) -> DistanceNetwork:
-    """Pretrain the hand encoder on the bundle's grasps.
+    """Pretrain the hand encoder on the bundle's hands: on their grasps, and on any pose of those without.
 
     Args:
         folder: Run folder; a checkpoint in it is resumed.
         report: Called every few steps; the console by default.
+        initial: Weights to begin with; `network` must be their configuration.
 
     Returns:
-        A network with a trained hand encoder and otherwise untrained, on the CPU, in evaluation mode.
+        A network with a trained hand encoder and otherwise as it began, on the CPU, in evaluation mode.
 
     Raises:
         OptionError: The schedule cannot be carried out here.
         TrainingError: A loss is not finite.
+        WeightsError: `initial` does not fit the network.
     """
     processes, device = begin(config.schedule)
-    whole = untrained_network(network, config.schedule.seed, "pretrained").to(device)
+    whole = untrained_network(network, config.schedule.seed, "pretrained")
+    if initial is not None:
+        take_initial(whole, initial)
+    whole.to(device)
     generator = torch.Generator(device)
     source = SampleSource(bundle, network, AugmentationConfig(), device)
     encoder = whole.hand_encoder
@@ -93,7 +100,7 @@ def motion_losses(
     motion: HandMotion, encoder: StaticGraphEncoder, source: SampleSource, config: MotionConfig, generator: torch.Generator
 ) -> Losses:
     """Mean distance between moved points and their targets [m], and the divergence [nat]."""
-    names = source.draw_hands(config.hands_per_step, generator)
+    names = source.draw_kinematics(config.hands_per_step, generator)
     drawn = [source.draw_motions(name, config.samples_per_hand, generator) for name in names]
     hand, goal = (torch.cat(clouds) for clouds in zip(*drawn, strict=True))
     with torch.no_grad():
@@ -110,20 +117,21 @@ def contrastive_step(
 ) -> Float[Tensor, ""]:
     """Loss of one batch: grasps (cloud A) against the open hand (cloud B) with a similar wrist rotation.
 
+    A hand without grasps takes any joint values instead.
+
     A network that does not know the placement gets both as in its training: the grasp as it is stored, the open hand tilted.
     """
     grasp_clouds, open_clouds = [], []
-    for name in source.draw_hands(config.hands_per_step, generator):
-        hand, grasps = source.hands[name], source.grasps[name]
-        chosen = torch.randint(len(grasps.joints), (config.samples_per_hand,), generator=generator, device=generator.device)
+    for name in source.draw_kinematics(config.hands_per_step, generator):
+        hand = source.hands[name]
+        T, joints, centre = source.draw_wrists(name, config.samples_per_hand, generator)
         if source.network.placed:
-            opened = source.network.axes(hand.palm_axes_wrist).mT.expand(len(chosen), 3, 3)
-            grasping = opened @ random_turns(len(chosen), config.rotation, generator)
+            opened = source.network.axes(hand.palm_axes_wrist).mT.expand(len(T), 3, 3)
+            grasping = opened @ random_turns(len(T), config.rotation, generator)
         else:
-            T = grasps.T_object_wrist[chosen]
-            opened, grasping = source.tilted(T, source.centres[grasps.object_index[chosen]], generator), T[:, :3, :3]
-        grasp_clouds.append(hand.points(grasps.joints[chosen]) @ grasping.mT)
-        open_clouds.append(hand.points(hand.random_open_joints(len(chosen), generator)) @ opened.mT)
+            opened, grasping = source.tilted(T, centre, generator), T[:, :3, :3]
+        grasp_clouds.append(hand.points(joints) @ grasping.mT)
+        open_clouds.append(hand.points(hand.random_open_joints(len(T), generator)) @ opened.mT)
     a, b = (torch.cat(c) for c in (grasp_clouds, open_clouds))
     features = encoder(torch.cat([c - c.mean(1, keepdim=True) for c in (a, b)]))
     features_a, features_b = features.chunk(2)

@@ -61,10 +61,13 @@ class SampleSource:
             raise BundleError("the bundle holds no grasps; synthesise some first")
         self.hands = {name: hand.with_points(network.n_hand).to(device) for name, hand in bundle.hands.items()}
         self.grasps = {name: grasps.to(device) for name, grasps in bundle.grasps.items()}
-        self.proportions = {
-            name: proportions(hand, network.axes(hand.palm_axes_wrist)) for name, hand in self.hands.items()}
-        """Proportions of each hand, in the network's axes."""
         self.names = [name for name, grasps in bundle.grasps.items() if len(grasps.joints)]
+        """Hands with grasps."""
+        self.without = [name for name in bundle.hands if name not in self.names]
+        """Hands without, for pretraining."""
+        self.proportions = {
+            name: proportions(self.hands[name], network.axes(self.hands[name].palm_axes_wrist)) for name in self.names}
+        """Proportions of each hand with grasps, in the network's axes."""
         self.points = torch.stack([cloud.points for cloud in bundle.objects.values()]).to(device)
         self.normals = torch.stack([cloud.normals for cloud in bundle.objects.values()]).to(device)
         self.centres = self.points.mean(1)
@@ -84,6 +87,24 @@ class SampleSource:
             counts = torch.tensor([float(len(self.grasps[name].joints)) for name in self.names], device=device)
             order = torch.multinomial(counts**by_count, len(counts), generator=generator).tolist()
         return [self.names[order[i % len(order)]] for i in range(count)]
+
+    def draw_kinematics(self, count: int, generator: torch.Generator) -> list[str]:
+        """Names of the hands of one step of pretraining: half of them without grasps, where the bundle has any."""
+        extra = count // 2 if self.without else 0
+        order = torch.randperm(len(self.without), generator=generator, device=generator.device).tolist() if extra else []
+        return self.draw_hands(count - extra, generator) + [self.without[order[i % len(order)]] for i in range(extra)]
+
+    def draw_wrists(
+        self, name: str, count: int, generator: torch.Generator
+    ) -> tuple[Float[Tensor, "b 4 4"], Float[Tensor, "b n_dof"], Float[Tensor, "b 3"]]:
+        """Wrist poses, joints, and centres of the objects [m] of random grasps; for a hand without, anything within limits."""
+        hand, grasps = self.hands[name], self.grasps[name]
+        if not len(grasps.joints):
+            T = compose(random_rotations(count, generator), hand.grasp_centre_wrist.new_zeros(count, 3))
+            return T, hand.random_joints(count, generator), hand.grasp_centres(T)
+        chosen = torch.randint(len(grasps.joints), (count,), generator=generator, device=generator.device)
+        T = grasps.T_object_wrist[chosen]
+        return T, grasps.joints[chosen], self.centres[grasps.object_index[chosen]]
 
     def draw(self, name: str, count: int, generator: torch.Generator) -> HandSamples:
         """Samples of one hand."""
@@ -118,11 +139,11 @@ class SampleSource:
         Half of the joint values are those of grasps, the others are uniform within the limits. Axes are the network's, which
         knows the placement.
         """
-        hand, grasps = self.hands[name], self.grasps[name]
-        chosen = torch.randint(len(grasps.joints), (count,), generator=generator, device=generator.device)
+        hand = self.hands[name]
+        _, grasping, _ = self.draw_wrists(name, count, generator)
         drawn = hand.random_joints(count, generator)
         known = torch.rand(count, 1, generator=generator, device=generator.device) < 0.5
-        q = torch.where(known, grasps.joints[chosen], drawn)
+        q = torch.where(known, grasping, drawn)
         turn = self.network.axes(hand.palm_axes_wrist).mT.expand(count, 3, 3)
         wrist = compose(turn, turn.new_zeros(3))
         near = self._placements(hand, torch.eye(4, device=generator.device).repeat(count, 1, 1), generator)

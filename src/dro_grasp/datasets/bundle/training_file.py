@@ -7,6 +7,7 @@ simulator nor a mesh library.
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,7 +81,7 @@ class Bundle:
     hands: dict[str, Hand]
     objects: dict[str, ObjectCloud]
     grasps: dict[str, HandGrasps]
-    """By hand name."""
+    """By hand name. A hand may have none: pretraining needs its kinematics alone."""
 
     @property
     def object_names(self) -> tuple[str, ...]:
@@ -102,12 +103,21 @@ class Bundle:
 
 def write_bundle(
     path: Path | str, hands: Sequence[Hand], objects: Mapping[str, ObjectCloud], grasps: Sequence[GraspBatch],
-    splits: Set[str] = TRAINING,
+    splits: Set[str] = TRAINING, more_hands: Sequence[Hand] = (),
 ) -> Bundle:
     """Write a training bundle of grasps of some splits, by these hands on objects with these clouds.
 
+    Args:
+        path: File to write.
+        hands: Hands of the grasps.
+        objects: Clouds by name.
+        grasps: At least one grasp of each of these hands.
+        splits: Splits that the grasps may be of.
+        more_hands: Hands without grasps, for pretraining.
+
     Raises:
-        BundleError: A grasp is of another split, its hand or object is missing, or the file grows too large.
+        BundleError: A grasp is of another split, its hand or object is missing, two hands share a name, or the file grows
+            too large.
         OutputError: The file cannot be written.
     """
     strangers = {b.hand for b in grasps if b.hand_sha256 not in {h.sha256 for h in hands}}
@@ -116,6 +126,10 @@ def write_bundle(
                           "them; pass the hands they were made for")
     if not grasps:
         raise BundleError("no grasps were given; synthesise some on objects for training first")
+    called = Counter(hand.name for hand in (*hands, *more_hands))
+    if double := sorted(name for name, count in called.items() if count > 1):
+        raise BundleError(f"{', '.join(double[:5])} is the name of more than one hand; rename them, or leave out those that "
+                          "have grasps already")
     names = list(objects)
     tensors: Tensors = {}
     header: dict[str, Any] = {"format_version": FORMAT_VERSION, "objects": names, "hands": []}
@@ -124,6 +138,9 @@ def write_bundle(
     for i, hand in enumerate(hands):
         header["hands"].append(_pack_hand(f"hand.{i}", hand, tensors))
         tensors |= _pack_grasps(f"grasps.{i}", hand, [b for b in grasps if b.hand_sha256 == hand.sha256], names, splits)
+    for i, hand in enumerate(more_hands, len(hands)):
+        header["hands"].append(_pack_hand(f"hand.{i}", hand, tensors))
+        tensors |= _pack_joints(f"grasps.{i}", torch.zeros(0, 4, 4), torch.zeros(0, hand.tree.n_dof), [])
     size = sum(t.numel() * t.element_size() for t in tensors.values())
     if size > MAX_BYTES:
         raise BundleError(f"the bundle would have {size / 1e6:.1f} MB, at most {MAX_BYTES / 1e6:.0f} MB are allowed; take "
@@ -228,16 +245,22 @@ def _pack_grasps(key: str, hand: Hand, batches: list[GraspBatch], names: list[st
         missing = set(batch.object) - set(known)
         if missing:
             raise BundleError(f"no cloud was given for objects {', '.join(sorted(missing)[:5])}")
-    T = torch.cat([b.T_object_wrist for b in batches])
+    T, joints = torch.cat([b.T_object_wrist for b in batches]), torch.cat([b.joints for b in batches])
+    return _pack_joints(key, T, joints, [known[o] for b in batches for o in b.object])
+
+
+def _pack_joints(key: str, T: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"], objects: list[int]) -> Tensors:
+    """Grasps of one hand, or none."""
+    quaternion = roma.rotmat_to_unitquat(T[:, :3, :3]) if len(T) else T.new_zeros(0, 4)
     return {
-        f"{key}.position": T[:, :3, 3].contiguous(),
-        f"{key}.quaternion_wxyz": roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(T[:, :3, :3])).contiguous(),
-        f"{key}.joints": torch.cat([b.joints for b in batches]).contiguous(),
-        f"{key}.object": torch.tensor([known[o] for b in batches for o in b.object], dtype=torch.int32),
+        f"{key}.position": T[:, :3, 3].contiguous(), f"{key}.quaternion_wxyz": roma.quat_xyzw_to_wxyz(quaternion).contiguous(),
+        f"{key}.joints": joints.contiguous(), f"{key}.object": torch.tensor(objects, dtype=torch.int32),
     }
 
 
 def _unpack_grasps(key: str, tensors: Tensors) -> HandGrasps:
     quaternion = roma.quat_wxyz_to_xyzw(tensors[f"{key}.quaternion_wxyz"])
+    if not len(quaternion):
+        return HandGrasps(torch.zeros(0, 4, 4), tensors[f"{key}.joints"], tensors[f"{key}.object"].long())
     rotation = roma.unitquat_to_rotmat(torch.nn.functional.normalize(quaternion, dim=-1))
     return HandGrasps(compose(rotation, tensors[f"{key}.position"]), tensors[f"{key}.joints"], tensors[f"{key}.object"].long())
