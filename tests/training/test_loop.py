@@ -17,6 +17,7 @@ from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.training import loop
 from dro_grasp.training.config import AugmentationConfig, LossConfig, MotionConfig, PretrainConfig, TrainConfig
 from dro_grasp.training.loop import train
+from dro_grasp.training.placement_training import measure_hands
 from dro_grasp.training.pretraining import contrastive_step, pretrain_motion
 from dro_grasp.training.runs import recalibrate
 from dro_grasp.training.samples import SampleSource
@@ -149,7 +150,7 @@ def test_a_placement_prior_learns_from_proportions(bundle: Bundle) -> None:
     network = dataclasses.replace(TINY, placement_hand="proportions")
     source, generator = SampleSource(bundle, network, AugmentationConfig()), torch.Generator().manual_seed(0)
     model = DistanceNetwork(network)
-    loop.measure_hands(model, source)
+    measure_hands(model, source)
     state = torch.get_rng_state()
     loop.step_losses(model, [source.draw("toy", 3, generator)], TrainConfig(columns=24), generator)["total"].backward()
     assert torch.equal(torch.get_rng_state(), state)

@@ -151,9 +151,12 @@ class Train(Stage):
     method: Literal["dro", "gendexgrasp", "manifm"] = "dro"
     """What is trained: the D(R,O) network, or that of GenDexGrasp or in the style of ManiFM, to which only bundle, folder,
     output, steps, minutes, learning rate, device and seed apply."""
+    part: Literal["all", "placement"] = "all"
+    """placement: train the placement prior of --initial further, alone: it shares nothing with the rest, and wants more
+    grasps (steps of 96). Options of z, losses and columns do not apply."""
     pretrained: Annotated[str | None, optional("PATH", "none")] = None
     """Weights from `dro-grasp pretrain`; without them, and without --initial, the hand encoder is trained along."""
-    steps: int = 10_000
+    steps: Annotated[int | None, optional("N", "10000, or 1300 of the placement prior")] = None
     """Optimiser steps."""
     prior: Annotated[
         Literal["standard", "learned", "flow"] | None, optional("{standard,learned,flow}", "the preset's")] = None
@@ -186,21 +189,33 @@ class Train(Stage):
     validation_samples: int = 400
     """Validation grasps of each hand."""
 
+    @property
+    def all_steps(self) -> int:
+        """Optimiser steps, given or not."""
+        from dro_grasp.training.config import PlacementConfig, ScheduleConfig
+
+        usual = PlacementConfig().schedule if self.part == "placement" else ScheduleConfig()
+        return usual.steps if self.steps is None else self.steps
+
     def run(self) -> int:
         """Train and save."""
         import dataclasses
 
         from dro_grasp.datasets.bundle.training_file import load_bundle
+        from dro_grasp.errors import OptionError
         from dro_grasp.evaluation.distance_error import distance_errors
         from dro_grasp.files import check_output
         from dro_grasp.models.checkpoints import history_of, load_weights, locate_weights, save_weights
-        from dro_grasp.training.config import LOSSES, AugmentationConfig, TrainConfig
+        from dro_grasp.training.config import LOSSES, AugmentationConfig, PlacementConfig, TrainConfig
         from dro_grasp.training.loop import train
+        from dro_grasp.training.placement_training import train_placement
         from dro_grasp.training.processes import is_first
 
         check_output(self.output)
         if self.method != "dro":
             return self._baseline()
+        if self.part == "placement" and self.initial is None:
+            raise OptionError("--part placement trains the placement prior of given weights further; name them with --initial")
         given = [name for name in (self.initial, self.pretrained) if name is not None]
         pretrained, initial = (None if name is None else load_weights(name) for name in (self.pretrained, self.initial))
         network = network_config(
@@ -210,19 +225,24 @@ class Train(Stage):
                                      drawn=self.drawn)
         if self.divergence is not None:
             losses = dataclasses.replace(losses, divergence=self.divergence)
-        config = TrainConfig(
-            schedule=self.schedule(steps=self.steps, learning_rate=self.learning_rate, mixed=self.mixed),
+        config: Any = TrainConfig(
+            schedule=self.schedule(steps=self.all_steps, learning_rate=self.learning_rate, mixed=self.mixed),
             samples_per_hand=self.samples_per_hand, by_count=self.by_count, columns=self.columns, losses=losses,
             augmentation=AugmentationConfig(partial=self.partial),
         )
         bundle = load_bundle(self.bundle)
         validation = None if self.validation is None else load_bundle(self.validation)
-        model = train(bundle, network, config, self.run_folder, pretrained, name=self.output.stem, initial=initial)
+        if self.part == "placement":
+            assert initial is not None
+            config = PlacementConfig(config.schedule, config.augmentation)
+            model = train_placement(bundle, network, config, self.run_folder, initial, name=self.output.stem)
+        else:
+            model = train(bundle, network, config, self.run_folder, pretrained, name=self.output.stem, initial=initial)
         if not is_first():
             return 0
         about = how_long(self.run_folder) | {
-            "stage": "training", "pretrained": self.pretrained is not None, "initial": self.initial, "data": bundle.summary(),
-            "settings": dataclasses.asdict(config),
+            "stage": "training" if self.part == "all" else self.part, "pretrained": self.pretrained is not None,
+            "initial": self.initial, "data": bundle.summary(), "settings": dataclasses.asdict(config),
         }
         save_weights(model, self.output, about, [entry for name in given for entry in history_of(locate_weights(name))])
         errors = [] if validation is None else distance_errors(load_weights(self.output), validation, self.validation_samples)
@@ -244,7 +264,7 @@ class Train(Stage):
         from dro_grasp.datasets.bundle.training_file import load_bundle
         from dro_grasp.models.checkpoints import save_weights
 
-        schedule, bundle = self.schedule(steps=self.steps, learning_rate=self.learning_rate), load_bundle(self.bundle)
+        schedule, bundle = self.schedule(steps=self.all_steps, learning_rate=self.learning_rate), load_bundle(self.bundle)
         if self.method == "manifm":
             config: Any = ContactTrainingConfig(schedule)
             model: Any = train_contacts(bundle, config, self.run_folder)

@@ -65,7 +65,8 @@ class PlacementPrior(nn.Module):
         """
         super().__init__()
         self.components = components
-        self.standardised = Standardised() if hand_features is None else nn.Identity()
+        self.standardised = Standardised() if hand_features is None else None
+        """Of proportions; None where features are taken."""
         self.points = nn.Sequential(nn.Linear(3, width // 2), nn.ReLU(), nn.Linear(width // 2, width), nn.ReLU(),
                                     nn.Linear(width, 2 * width))
         self.hand = nn.Linear(hand_features or PROPORTIONS, width)
@@ -81,7 +82,9 @@ class PlacementPrior(nn.Module):
             obj: Object points in wrist axes about the object's centre [m].
             hand: Mean feature of the open hand's points, or its proportions.
         """
-        x = torch.cat([self.points(obj * (1 / LENGTH)).amax(1), self.hand(self.standardised(hand))], -1)
+        if self.standardised is not None:
+            hand = self.standardised(hand)
+        x = torch.cat([self.points(obj * (1 / LENGTH)).amax(1), self.hand(hand)], -1)
         out = self.head(x)
         logits, mean, scale = out[:, :-1].split([self.components, 3 * self.components, 3 * self.components], -1)
         mean = mean.unflatten(-1, (self.components, 3)) * LENGTH

@@ -132,6 +132,18 @@ class TrainConfig:
 
 
 @dataclass(frozen=True)
+class PlacementConfig:
+    """Training of the placement prior alone. Source: ours."""
+
+    schedule: ScheduleConfig = ScheduleConfig(steps=1_300)
+    augmentation: AugmentationConfig = AugmentationConfig()
+    hands_per_step: int = 8
+    samples_per_hand: int = 12
+    by_count: float = 0.5
+    """As in main training."""
+
+
+@dataclass(frozen=True)
 class PretrainConfig:
     """Configuration-invariant pretraining of the hand encoder."""
 

@@ -13,11 +13,11 @@ from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.geometry.se3 import apply
 from dro_grasp.hands.hand import Hand
 from dro_grasp.models.network import DistanceNetwork, untrained_network
-from dro_grasp.models.placement import PlacementPrior, Standardised
 from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.training import losses
 from dro_grasp.training.config import TrainConfig
 from dro_grasp.training.given_weights import take_initial, take_pretrained
+from dro_grasp.training.placement_training import measure_hands, placement_losses
 from dro_grasp.training.reports import Report, console_report
 from dro_grasp.training.runs import Losses, TrainingRun, begin, recalibrate
 from dro_grasp.training.samples import HandSamples, SampleSource
@@ -75,12 +75,6 @@ def train(
     return model.cpu().eval()
 
 
-def measure_hands(model: DistanceNetwork, source: SampleSource) -> None:
-    """Let a placement prior that takes proportions know those of the hands in training."""
-    if model.placement is not None and isinstance(model.placement.standardised, Standardised):
-        model.placement.standardised.measure(torch.stack([source.proportions[name] for name in source.names]))
-
-
 def step_losses(
     model: DistanceNetwork, groups: list[HandSamples], config: TrainConfig, generator: torch.Generator, progress: float = 1.0
 ) -> Losses:
@@ -118,7 +112,7 @@ def step_losses(
     parts["flow"] = output.flow_error.mean()
     if model.placement is not None:
         noise = config.augmentation.proportions
-        parts["placement"] = _placement(model.placement, groups, output.hand_feature, noise, generator)
+        parts["placement"] = placement_losses(model.placement, groups, output.hand_feature, noise, generator)["total"]
     weights = {name: getattr(config.losses, name) for name in parts}
     if progress < config.losses.divergence_warmup:
         weights["divergence"] *= progress / config.losses.divergence_warmup
@@ -140,28 +134,3 @@ def _clouds(groups: list[HandSamples]) -> tuple[Float[Tensor, "b n 3"], Float[Te
     """The network's inputs: open hands, objects, grasps [m]."""
     placed, obj, grasp = (torch.cat([getattr(g, n) for g in groups]) for n in ("placed", "obj", "grasp"))
     return placed, obj, grasp
-
-
-def _placement(
-    prior: PlacementPrior, groups: list[HandSamples], features: Float[Tensor, "b width"], noise: float,
-    generator: torch.Generator,
-) -> Float[Tensor, ""]:
-    """The placement prior's loss.
-
-    Args:
-        prior: Takes features or proportions.
-        groups: Samples.
-        features: Mean feature of each open hand.
-        noise: Standard deviation of the noise on proportions, in their spreads.
-        generator: Source of the noise.
-    """
-    hand = features.detach()
-    if isinstance(prior.standardised, Standardised):
-        rows = torch.cat([group.proportions.expand(len(group.placed), -1) for group in groups])
-        hand = rows + noise * prior.standardised.spread * torch.randn(rows.shape, generator=generator, device=rows.device)
-    obj, other, position = (
-        torch.cat([getattr(g, n) for g in groups]) for n in ("obj_hand", "obj_random", "position")
-    )
-    density, score = prior.log_density(obj, hand, position)
-    other_score = prior(other, hand)[3]
-    return losses.placement_loss(density, score, other_score)

@@ -1,0 +1,106 @@
+"""The placement prior: its loss in main training, and its training alone, since it shares no parameter with the rest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dro_grasp.datasets.bundle.training_file import Bundle
+from dro_grasp.errors import TrainingError
+from dro_grasp.models.network import DistanceNetwork, untrained_network
+from dro_grasp.models.placement import PlacementPrior
+from dro_grasp.models.presets import NetworkConfig
+from dro_grasp.training import losses
+from dro_grasp.training.config import PlacementConfig
+from dro_grasp.training.given_weights import take_initial
+from dro_grasp.training.reports import Report, console_report
+from dro_grasp.training.runs import Losses, TrainingRun, begin
+from dro_grasp.training.samples import HandSamples, SampleSource
+
+
+def train_placement(
+    bundle: Bundle, network: NetworkConfig, config: PlacementConfig, folder: Path, initial: DistanceNetwork,
+    report: Report | None = None, name: str = "trained",
+) -> DistanceNetwork:
+    """Train the placement prior of given weights, and nothing else.
+
+    Args:
+        folder: Run folder; a checkpoint in it is resumed.
+        initial: Weights to begin with; `network` must be their configuration, but for what the prior knows of a hand. If that
+            is another, the prior begins anew.
+        report: Called every few steps; the console by default.
+
+    Returns:
+        The weights with the moving average of the prior's, on the CPU, in evaluation mode.
+
+    Raises:
+        OptionError: The schedule cannot be carried out here.
+        TrainingError: A loss is not finite, or the network has no placement prior.
+        WeightsError: `initial` does not fit the network.
+    """
+    processes, device = begin(config.schedule)
+    model = untrained_network(network, config.schedule.seed, name)
+    take_initial(model, initial)
+    model.to(device).eval()
+    prior, generator = model.placement, torch.Generator(device)
+    if prior is None:
+        raise TrainingError(
+            f"'{initial.name}' has no placement prior: in frame '{network.frame}' the network knows no placement")
+    source = SampleSource(bundle, network, config.augmentation, device)
+    if initial.config.placement_hand != network.placement_hand:
+        measure_hands(model, source)
+    run = TrainingRun(folder, prior, config.schedule, generator, processes)
+
+    def step() -> Losses:
+        names = source.draw_hands(config.hands_per_step, generator, config.by_count)
+        groups = [source.draw(hand, config.samples_per_hand, generator) for hand in names]
+        return placement_losses(prior, groups, mean_features(model, groups), config.augmentation.proportions, generator)
+
+    run.train(step, report or console_report("placement"))
+    prior.load_state_dict(run.average.module.state_dict())
+    return model.cpu().eval()
+
+
+def measure_hands(model: DistanceNetwork, source: SampleSource) -> None:
+    """Let a placement prior that takes proportions know those of the hands in training."""
+    if model.placement is not None and model.placement.standardised is not None:
+        model.placement.standardised.measure(torch.stack([source.proportions[name] for name in source.names]))
+
+
+@torch.no_grad()
+def mean_features(model: DistanceNetwork, groups: list[HandSamples]) -> Float[Tensor, "b width"]:
+    """Mean feature of each open hand."""
+    placed = torch.cat([group.placed for group in groups])
+    return model.hand_encoder(placed - placed.mean(1, keepdim=True)).mean(1)
+
+
+def placement_losses(
+    prior: PlacementPrior, groups: list[HandSamples], features: Float[Tensor, "b width"], noise: float,
+    generator: torch.Generator,
+) -> Losses:
+    """The prior's loss as `total`, and what it has learned.
+
+    `log_density` is that of true positions [nat], `preferred` the share of pairs of a true and a random rotation in which the
+    true one has the higher score.
+
+    Args:
+        prior: Takes features or proportions.
+        groups: Samples.
+        features: Mean feature of each open hand; no gradient reaches them.
+        noise: Standard deviation of the noise on proportions, in their spreads.
+        generator: Source of the noise.
+    """
+    hand = features.detach()
+    if prior.standardised is not None:
+        rows = torch.cat([group.proportions.expand(len(group.placed), -1) for group in groups])
+        hand = rows + noise * prior.standardised.spread * torch.randn(rows.shape, generator=generator, device=rows.device)
+    obj, other, position = (
+        torch.cat([getattr(g, n) for g in groups]) for n in ("obj_hand", "obj_random", "position")
+    )
+    density, score = prior.log_density(obj, hand, position)
+    other_score = prior(other, hand)[3]
+    preferred = (score[:, None] > other_score).float().mean()
+    return {"total": losses.placement_loss(density, score, other_score), "log_density": density.mean(), "preferred": preferred}
