@@ -17,7 +17,7 @@ from dro_grasp.hands.library import hand_names
 from dro_grasp.optimization.starts import StartConfig, start_joints
 from tests.helpers.bracket_hand import bracket_urdf
 from tests.helpers.claw_urdf import LIMIT, claw, joint, link, written
-from tests.helpers.folding_hands import folding_bracket, folding_claw
+from tests.helpers.folding_hands import folding_bracket, folding_claw, swinging_ring
 from tests.helpers.loaded_hands import loaded_hand
 
 
@@ -54,6 +54,23 @@ def test_one_joint_that_folds_its_finger_back_is_cut(tmp_path: Path) -> None:
     assert hand.open_ends.tolist() == pytest.approx([0.0] * 7, abs=0.05)
 
 
+def test_fingers_that_swing_around_the_palm_open_outwards_and_alike(tmp_path: Path) -> None:
+    """Bent outwards by 90 degrees at the knuckle they lie flat; swinging closes nothing, and more bending rolls them up."""
+    hand = load(tmp_path, swinging_ring(1.57))
+    names = hand.tree.joint_names
+    assert [name for name, spreads in zip(names, hand.abduction, strict=True) if spreads] == ["swing0", "swing1", "swing2"]
+    opened = dict(zip(names, hand.open_ends.tolist(), strict=True))
+    assert [opened[f"knuckle{i}"] for i in range(3)] == pytest.approx([1.57] * 3, abs=0.1)
+    assert [opened[f"bend{i}"] for i in range(3)] == pytest.approx([0.0] * 3, abs=0.1)
+    assert [hand.canonical_joints()[names.index(f"swing{i}")] for i in range(3)] == pytest.approx([0.0] * 3, abs=0.06)
+    assert float(hand.palm_direction_wrist[2]) > 0.99
+
+
+def test_fingers_that_swing_but_do_not_roll_up_open_to_their_limits(tmp_path: Path) -> None:
+    hand = load(tmp_path, swinging_ring(0.6))
+    assert torch.equal(hand.open_ends, hand.open_limits)
+
+
 def test_a_little_more_than_straight_is_kept(tmp_path: Path) -> None:
     """As many hands have it: 0.2 rad in each joint."""
     hand = load(tmp_path, folding_bracket(0.2))
@@ -68,10 +85,23 @@ def test_built_in_hands_open_to_their_limits(name: str) -> None:
 
 
 @pytest.mark.assets
-@pytest.mark.parametrize("name", ["allegro_left", "shadowhand", "leaphand", "inspire", "ability", "dclaw", "orca", "ezgripper"])
+@pytest.mark.parametrize("name", ["allegro_left", "shadowhand", "leaphand", "inspire", "ability", "orca", "ezgripper"])
 def test_real_hands_open_to_their_limits(assets_folder: Path, name: str) -> None:
     hand = loaded_hand(f"assets/{name}")
     assert torch.equal(hand.open_ends, hand.open_limits)
+
+
+@pytest.mark.assets
+def test_the_three_fingers_of_dclaw_open_alike(assets_folder: Path) -> None:
+    """Seen from above they point outwards, 120 degrees apart; their first joints swing them around the palm."""
+    hand = loaded_hand("assets/dclaw")
+    assert [n for n, spreads in zip(hand.tree.joint_names, hand.abduction, strict=True) if spreads] == [
+        "joint_f1_0", "joint_f2_0", "joint_f3_0"]
+    opened = torch.where(hand.abduction, 0.0, hand.open_ends)
+    tips = hand.tree.forward(opened)[list(hand.tips), :2, 3]
+    angles = torch.atan2(tips[:, 1], tips[:, 0]).sort().values
+    assert torch.rad2deg(angles.diff()).tolist() == pytest.approx([120, 120], abs=5)
+    assert tips.norm(dim=-1).tolist() == pytest.approx([float(tips.norm(dim=-1).mean())] * 3, rel=0.05)
 
 
 def test_open_closed_and_random_joints_stay_in_front_of_the_palm(tmp_path: Path) -> None:

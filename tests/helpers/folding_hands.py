@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 from tests.helpers.bracket_hand import bracket_urdf
-from tests.helpers.claw_urdf import claw, joint
+from tests.helpers.claw_urdf import claw, joint, link
 
 
 def limit(lower: float, upper: float) -> str:
@@ -26,3 +27,19 @@ def folding_bracket(back: float, side: float = 1.0, pattern: str = "base|knuckle
         return match[0].replace('lower="0"', f'lower="{-back}"')
 
     return re.sub(rf'<joint name="({pattern})\d".*?</joint>', widened, bracket_urdf(side))
+
+
+def swinging_ring(back: float) -> str:
+    """Three upright fingers about a palm; each swings around it, and bends at two joints, outwards by this angle [rad].
+
+    The second bend turns the other way than the first; of one finger, the swing reaches farther to the other side.
+    """
+    links, joints = [], []
+    for i, swing in enumerate([limit(-1.3, 0.5), limit(-0.5, 1.3), limit(-1.3, 0.5)]):
+        angle = 2 * math.pi * i / 3
+        place = f'{0.03 * math.cos(angle):.6f} {0.03 * math.sin(angle):.6f} 0.01" rpy="0 0 {angle:.6f}'
+        links += [link(f"base{i}", '<box size="0.02 0.02 0.04"/>'), link(f"middle{i}"), link(f"tip{i}")]
+        joints += [joint(f"swing{i}", "palm", f"base{i}", place, "1 0 0", swing),
+                   joint(f"knuckle{i}", f"base{i}", f"middle{i}", "0 0 0.03", "0 1 0", limit(-1.57, back)),
+                   joint(f"bend{i}", f"middle{i}", f"tip{i}", "0 0 0.06", "0 -1 0", limit(-back, 1.57))]
+    return claw(links="".join(links), joints="".join(joints))

@@ -146,7 +146,8 @@ class HandBuilder:
     @cached_property
     def closing(self) -> Closing:
         """From where and to where the joints close, and the palm."""
-        finder = ClosingFinder(self.tree, self.fingers, self.coarse, self.on_palm, self.rest, self.movable, self.stated)
+        finder = ClosingFinder(self.tree, self.fingers, self.coarse, self.on_palm, self.rest, self.movable, self.stated,
+                               torch.zeros_like(self.movable))
         try:
             return finder.find()
         except HandError as error:

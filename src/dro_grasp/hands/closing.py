@@ -28,8 +28,16 @@ REFINEMENTS = 3
 AT_LIMIT = 0.1
 """Distance to a limit, as a share of the range, within which a joint is at this limit (ours)."""
 ROLLED_UP = 0.15
-"""Share of its reach at the widest spread below which a finger that opens farther is rolled up (ours). 15 hands keep 0.34 to 1
-at the limits of their ranges; D'Claw, whose fingers bend as far back as forth, keeps 0.19."""
+"""Share of its reach at the widest spread below which a finger that opens farther is rolled up (ours). At the limits of their
+ranges, 16 hands keep 0.19 to 1."""
+ALL_ROLLED_UP = 0.5
+"""The same for hands all of whose fingers roll up, once joints that move fingers sideways are still (ours). D'Claw, whose
+fingers bend as far back as forth, keeps 0.36 at most; of 15 other hands some finger keeps 0.65 or more."""
+ALIKE, ACROSS = 0.9, 0.3
+"""Cosines between the ways of a fingertip from which on two joints bend their finger alike, and up to which one moves it
+across that way (ours)."""
+STILL = 5e-3
+"""Slower fingertips do not move with a joint [m/rad or m/m] (ours)."""
 PATH = 65
 """Postures on the way from closed to open at which a hand is examined (ours)."""
 
@@ -66,20 +74,45 @@ class ClosingFinder:
     """As in `Hand`."""
     stated: Float[Tensor, " n_dof"]
     """The open posture that the hand's file states [rad or m]; NaN for joints of which it says nothing."""
+    sideways: Bool[Tensor, " n_dof"]
+    """Joints that are taken to spread the fingers, whatever their axes."""
 
     def find(self) -> Closing:
         """The closing between the limits, or from the widest posture of fingers that fold back beyond it."""
         found = self.between_limits()
-        # The palm itself may have been found on the wrong side, so the second test takes none.
-        ends = torch.where(self.movable & ~found.abduction, found.open_ends, self.spread)
+        if bool((self.folded(found) | (self.kept_of_spread(found) < ROLLED_UP)).any()):
+            return self.from_widest()
+        other = dataclasses.replace(self, sideways=self.moving_sideways(found.palm))
+        return other.unrolled(found) if bool((other.kept_of_spread(found) < ALL_ROLLED_UP).all()) else found
+
+    def kept_of_spread(self, found: Closing) -> Float[Tensor, " n_tips"]:
+        """Least share of each finger's reach at the widest spread that it keeps on the way from there to its open ends."""
+        # The palm itself may have been found on the wrong side, so this takes none.
+        ends = torch.where(self.movable & ~found.abduction & ~self.sideways, found.open_ends, self.spread)
         beyond = torch.stack([self.spread + share * (ends - self.spread) for share in torch.linspace(0, 1, PATH)])
-        rolled_up = self.motion.kept(beyond, self.movable).amin(0) < ROLLED_UP
-        return self.from_widest() if bool((self.folded(found) | rolled_up).any()) else found
+        return self.motion.kept(beyond, self.movable).amin(0)
+
+    def moving_sideways(self, palm: Palm) -> Bool[Tensor, " n_dof"]:
+        """Joints that, with the hand at rest, move their fingertips across the way in which the finger's other joints bend it.
+
+        Two joints at least must bend it alike, and the palm must not come nearer.
+        """
+        axis, velocity = _tensor(palm.direction), self.motion.velocities(self.rest)
+        sideways, speed = torch.zeros_like(self.movable), velocity.norm(dim=1)
+        for row, finger in enumerate(self.fingers):
+            joints = (self.tree.moves[finger.tip] & self.movable & (speed[row] > STILL)).nonzero()[:, 0].tolist()
+            ways = torch.nn.functional.normalize(velocity[row][:, joints], dim=0)
+            for joint, way in zip(joints, ways.T, strict=True):
+                others = ways[:, [j != joint for j in joints]]
+                bends = main_axis(others.T) if others.shape[1] > 1 else way
+                alike = bool((others.T @ bends).abs().min() > ALIKE) if others.shape[1] > 1 else False
+                sideways[joint] |= alike and bool(max((way @ bends).abs(), (way @ axis).abs()) < ACROSS)
+        return sideways
 
     @cached_property
     def spread(self) -> Float[Tensor, " n_dof"]:
         """The posture whose fingertips are farthest from the palm's middle [rad or m]."""
-        return self.motion.widest(self._from_middle, self.start, self.movable & self.stated.isnan())
+        return self.motion.widest(self._from_middle, self.start, self.movable & self.stated.isnan() & ~self.sideways)
 
     @cached_property
     def start(self) -> Float[Tensor, " n_dof"]:
@@ -118,19 +151,34 @@ class ClosingFinder:
         tree = self.tree
         signs, palm = self.better_side(self.spread)
         abduction = self.out_of_palm(self.spread, signs, palm) & self.movable
-        axis = Line(_tensor(palm.centre), _tensor(palm.direction))
-        widest = self.motion.widest(axis.span, self.start, self.movable & ~abduction & self.stated.isnan())
+        widest = self.widest_about(palm, abduction)
         centre = _tensor(palm.grasp_centre)
         for _ in range(REFINEMENTS):
             signs = self.signs_at_limits(signs, abduction, abduction, centre)
         at_limits = Closing(signs, self.opened(signs), abduction, palm)
         folded = tree.moves[self.motion.links][self.folded(at_limits)].any(0) & ~abduction
-        signs = torch.where(folded, self.signs_from(widest, signs, abduction, centre), signs)
-        lower = torch.where(folded & (signs < 0), widest, tree.lower)
-        upper = torch.where(folded & (signs > 0), widest, tree.upper)
-        narrowed = dataclasses.replace(tree, lower=lower, upper=upper)
-        stated = torch.where(folded, widest, self.stated)
-        return dataclasses.replace(self, tree=narrowed, stated=stated).between_limits()
+        return self.narrowed(folded, widest, torch.where(folded, self.signs_from(widest, signs, abduction, centre), signs))
+
+    def unrolled(self, found: Closing) -> Closing:
+        """The closing of fingers that start from their widest span about the palm that was found, and all of which roll up."""
+        abduction = (found.abduction | self.sideways) & self.movable
+        widest = self.widest_about(found.palm, abduction)
+        signs = self.signs_from(widest, found.opening_signs, abduction, _tensor(found.palm.grasp_centre))
+        return self.narrowed(self.movable & ~abduction, widest, signs)
+
+    def widest_about(self, palm: Palm, abduction: Bool[Tensor, " n_dof"]) -> Float[Tensor, " n_dof"]:
+        """The posture whose fingertips are farthest from the palm's axis [rad or m]."""
+        axis = Line(_tensor(palm.centre), _tensor(palm.direction))
+        return self.motion.widest(axis.span, self.start, self.movable & ~abduction & self.stated.isnan())
+
+    def narrowed(
+        self, cut: Bool[Tensor, " n_dof"], widest: Float[Tensor, " n_dof"], signs: Float[Tensor, " n_dof"]
+    ) -> Closing:
+        """The closing of a hand some of whose joints do not open beyond the widest posture."""
+        lower = torch.where(cut & (signs < 0), widest, self.tree.lower)
+        upper = torch.where(cut & (signs > 0), widest, self.tree.upper)
+        tree = dataclasses.replace(self.tree, lower=lower, upper=upper)
+        return dataclasses.replace(self, tree=tree, stated=torch.where(cut, widest, self.stated)).between_limits()
 
     def better_side(self, spread: Float[Tensor, " n_dof"]) -> tuple[Float[Tensor, " n_dof"], Palm]:
         """Opening signs of a hand that closes from here to the better side, and the palm there.
@@ -238,10 +286,10 @@ class ClosingFinder:
     def out_of_palm(
         self, opened: Float[Tensor, " n_dof"], signs: Float[Tensor, " n_dof"], palm: Palm
     ) -> Bool[Tensor, " n_dof"]:
-        """Joints whose axes point out of the palm, at rest and with bent fingers alike."""
+        """Joints whose axes point out of the palm, at rest and with bent fingers alike, and those that move sideways."""
         bent = self.posture(opened, signs, torch.zeros_like(self.movable), 0.5)
         direction = _tensor(palm.direction)
-        return axes_along(self.tree, self.rest, direction) & axes_along(self.tree, bent, direction)
+        return (axes_along(self.tree, self.rest, direction) & axes_along(self.tree, bent, direction)) | self.sideways
 
     def examine(
         self, opened: Float[Tensor, " n_dof"], signs: Float[Tensor, " n_dof"], abduction: Bool[Tensor, " n_dof"]
