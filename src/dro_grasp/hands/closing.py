@@ -33,11 +33,6 @@ ranges, 16 hands keep 0.19 to 1."""
 ALL_ROLLED_UP = 0.5
 """The same for hands all of whose fingers roll up, once joints that move fingers sideways are still (ours). D'Claw, whose
 fingers bend as far back as forth, keeps 0.36 at most; of 15 other hands some finger keeps 0.65 or more."""
-ALIKE, ACROSS = 0.9, 0.3
-"""Cosines between the ways of a fingertip from which on two joints bend their finger alike, and up to which one moves it
-across that way (ours)."""
-STILL = 5e-3
-"""Slower fingertips do not move with a joint [m/rad or m/m] (ours)."""
 PATH = 65
 """Postures on the way from closed to open at which a hand is examined (ours)."""
 
@@ -82,7 +77,7 @@ class ClosingFinder:
         found = self.between_limits()
         if bool((self.folded(found) | (self.kept_of_spread(found) < ROLLED_UP)).any()):
             return self.from_widest()
-        other = dataclasses.replace(self, sideways=self.moving_sideways(found.palm))
+        other = dataclasses.replace(self, sideways=self.motion.sideways(self.rest, self.movable, _tensor(found.palm.direction)))
         return other.unrolled(found) if bool((other.kept_of_spread(found) < ALL_ROLLED_UP).all()) else found
 
     def kept_of_spread(self, found: Closing) -> Float[Tensor, " n_tips"]:
@@ -91,23 +86,6 @@ class ClosingFinder:
         ends = torch.where(self.movable & ~found.abduction & ~self.sideways, found.open_ends, self.spread)
         beyond = torch.stack([self.spread + share * (ends - self.spread) for share in torch.linspace(0, 1, PATH)])
         return self.motion.kept(beyond, self.movable).amin(0)
-
-    def moving_sideways(self, palm: Palm) -> Bool[Tensor, " n_dof"]:
-        """Joints that, with the hand at rest, move their fingertips across the way in which the finger's other joints bend it.
-
-        Two joints at least must bend it alike, and the palm must not come nearer.
-        """
-        axis, velocity = _tensor(palm.direction), self.motion.velocities(self.rest)
-        sideways, speed = torch.zeros_like(self.movable), velocity.norm(dim=1)
-        for row, finger in enumerate(self.fingers):
-            joints = (self.tree.moves[finger.tip] & self.movable & (speed[row] > STILL)).nonzero()[:, 0].tolist()
-            ways = torch.nn.functional.normalize(velocity[row][:, joints], dim=0)
-            for joint, way in zip(joints, ways.T, strict=True):
-                others = ways[:, [j != joint for j in joints]]
-                bends = main_axis(others.T) if others.shape[1] > 1 else way
-                alike = bool((others.T @ bends).abs().min() > ALIKE) if others.shape[1] > 1 else False
-                sideways[joint] |= alike and bool(max((way @ bends).abs(), (way @ axis).abs()) < ACROSS)
-        return sideways
 
     @cached_property
     def spread(self) -> Float[Tensor, " n_dof"]:

@@ -33,6 +33,13 @@ LEAST_REACH = 0.35
 """Share of its widest reach below which a finger that opens farther folds back (ours). At the limits of their ranges, 16 hands
 that open as they should keep 0.44 to 1; a finger that points straight back behind its knuckle keeps 0 or less."""
 
+ALIKE = 0.9
+"""Cosine between the ways in which two joints move a fingertip from which on they bend the finger alike (ours)."""
+ACROSS = 0.3
+"""Cosine up to which a joint moves a fingertip across such a way (ours)."""
+STILL = 5e-3
+"""Slower fingertips do not move with a joint [m/rad or m/m] (ours)."""
+
 
 @dataclass(frozen=True)
 class Line:
@@ -87,6 +94,29 @@ class FingerMotion:
         """Motion of each fingertip per motion of each joint [m/rad or m/m]."""
         poses = self.tree.forward(q)
         return self.tree.point_jacobian(poses, self.tips(q), torch.tensor(self.links))
+
+    def sideways(
+        self, q: Float[Tensor, " n_dof"], bends: Bool[Tensor, " n_dof"], palm_direction: Float[Tensor, "3"]
+    ) -> Bool[Tensor, " n_dof"]:
+        """Joints that move a fingertip across the way in which all other joints of its finger bend it, and not to the palm.
+
+        Args:
+            q: Joints [rad or m].
+            bends: The joints that are looked at; two others at least must bend a finger alike.
+            palm_direction: Unit vector.
+        """
+        found, velocity = torch.zeros_like(bends), self.velocities(q)
+        for row, finger in enumerate(self.fingers):
+            joints = (self.tree.moves[finger.tip] & bends & (velocity[row].norm(dim=0) > STILL)).nonzero()[:, 0]
+            ways = torch.nn.functional.normalize(velocity[row][:, joints], dim=0).T
+            for i, joint in enumerate(joints.tolist()):
+                others = ways[torch.arange(len(ways)) != i]
+                if len(others) < 2:
+                    continue
+                bending = main_axis(others)
+                alike = bool((others @ bending).abs().min() > ALIKE)
+                found[joint] |= alike and bool(torch.stack([bending, palm_direction]).mv(ways[i]).abs().max() < ACROSS)
+        return found
 
     def reaches(self, q: Float[Tensor, "*batch n_dof"], bends: Bool[Tensor, " n_dof"]) -> Float[Tensor, "*batch n_tips 3"]:
         """From the knuckle of each finger to its tip [m]."""
