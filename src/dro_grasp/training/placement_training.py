@@ -57,7 +57,8 @@ def train_placement(
     def step() -> Losses:
         names = source.draw_hands(config.hands_per_step, generator, config.by_count)
         groups = [source.draw(hand, config.samples_per_hand, generator) for hand in names]
-        return placement_losses(prior, groups, mean_features(model, groups), config.augmentation.proportions, generator)
+        features = mean_features(model, groups) if prior.standardised is None else None
+        return placement_losses(prior, groups, features, config.augmentation.proportions, generator)
 
     run.train(step, report or console_report("placement"))
     prior.load_state_dict(run.average.module.state_dict())
@@ -78,7 +79,7 @@ def mean_features(model: DistanceNetwork, groups: list[HandSamples]) -> Float[Te
 
 
 def placement_losses(
-    prior: PlacementPrior, groups: list[HandSamples], features: Float[Tensor, "b width"], noise: float,
+    prior: PlacementPrior, groups: list[HandSamples], features: Float[Tensor, "b width"] | None, noise: float,
     generator: torch.Generator,
 ) -> Losses:
     """The prior's loss as `total`, and what it has learned.
@@ -89,12 +90,14 @@ def placement_losses(
     Args:
         prior: Takes features or proportions.
         groups: Samples.
-        features: Mean feature of each open hand; no gradient reaches them.
+        features: Mean feature of each open hand; no gradient reaches them. A prior that takes proportions needs none.
         noise: Standard deviation of the noise on proportions, in their spreads.
         generator: Source of the noise.
     """
-    hand = features.detach()
-    if prior.standardised is not None:
+    if prior.standardised is None:
+        assert features is not None
+        hand = features.detach()
+    else:
         rows = torch.cat([group.proportions.expand(len(group.placed), -1) for group in groups])
         hand = rows + noise * prior.standardised.spread * torch.randn(rows.shape, generator=generator, device=rows.device)
     obj, other, position = (
