@@ -105,7 +105,7 @@ def main() -> None:
     parser.add_argument("--more", type=Path, help="grasps of these and further hands, for two rows more")
     parser.add_argument("--held-out", required=True, type=Path, help="grasps of hands that were not trained on")
     parser.add_argument("--weights", help="network whose prior is trained anew; the default weights")
-    parser.add_argument("--steps", type=int, default=3000, help="training steps of 96 grasps")
+    parser.add_argument("--steps", type=int, default=2000, help="training steps of 96 grasps")
     parser.add_argument("--samples", type=int, default=300, help="stored grasps of each hand")
     parser.add_argument("--hands", nargs="+", default=[], help="hands to propose grasps for")
     parser.add_argument("--objects", nargs="+", default=["jar", "rod", "vase", "brick", "egg", "cone"], help="their objects")
