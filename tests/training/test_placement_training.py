@@ -84,7 +84,8 @@ def test_the_command_trains_the_placement_alone(
     command = ["train", "--part", "placement", "--bundle", str(home / "bundle.safetensors"), "--run-folder",
                str(tmp_path / "run"), "--output", str(output), "--steps", "3"]
     assert main(command) == 2
-    assert "--initial" in capsys.readouterr().err
+    assert main([*command, "--initial", str(first), "--pretrained", str(first)]) == 2
+    assert capsys.readouterr().err.count("name them with --initial") == 2
     assert not (tmp_path / "run").exists()
     assert main([*command, "--initial", str(first), "--placement-hand", "proportions"]) == 0
     assert load_weights(output).config.placement_hand == "proportions"

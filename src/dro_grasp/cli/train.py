@@ -153,7 +153,7 @@ class Train(Stage):
     output, steps, minutes, learning rate, device and seed apply."""
     part: Literal["all", "placement"] = "all"
     """placement: train the placement prior of --initial further, alone: it shares nothing with the rest, and wants more
-    grasps (steps of 96). Options of z, losses and columns do not apply."""
+    grasps (steps of 96, hands by the square root of their grasps). Options of z, losses, samples and columns do not apply."""
     pretrained: Annotated[str | None, optional("PATH", "none")] = None
     """Weights from `dro-grasp pretrain`; without them, and without --initial, the hand encoder is trained along."""
     steps: Annotated[int | None, optional("N", "10000, or 1300 of the placement prior")] = None
@@ -214,8 +214,9 @@ class Train(Stage):
         check_output(self.output)
         if self.method != "dro":
             return self._baseline()
-        if self.part == "placement" and self.initial is None:
-            raise OptionError("--part placement trains the placement prior of given weights further; name them with --initial")
+        if self.part == "placement" and (self.initial is None or self.pretrained is not None):
+            raise OptionError("--part placement trains the placement prior of given weights further: name them with --initial, "
+                              "and leave out --pretrained")
         given = [name for name in (self.initial, self.pretrained) if name is not None]
         pretrained, initial = (None if name is None else load_weights(name) for name in (self.pretrained, self.initial))
         network = network_config(
