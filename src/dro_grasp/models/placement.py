@@ -13,12 +13,16 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dro_grasp.devices import side_by_side
+
 MIN_SCALE = 0.003
 """Smallest standard deviation of a mixture component [m]. Source: ours."""
 LENGTH = 0.1
 """Unit of length inside the network, about the size of an object [m]. Source: ours."""
 SCALE = 0.03
 """Unit of the components' standard deviations inside the network [m]. Source: ours."""
+ROTATIONS_PER_PART = 16
+"""Rotations whose hidden layers exist at a time: those of more do not fit a processor's cache. Source: ours, timed."""
 COLDEST = 1e-3
 """Lower temperatures choose components as this one does: the heaviest. Source: ours."""
 
@@ -115,8 +119,9 @@ class PlacementPrior(nn.Module):
         Returns:
             Rotations, and positions in wrist axes about the object's centre [m].
         """
-        turned = obj @ rotations
-        logits, mean, scale, score = self(turned, hand.expand(len(rotations), -1))
+        parts = side_by_side(
+            lambda some: self(obj @ some, hand.expand(len(some), -1)), rotations.split(ROTATIONS_PER_PART))
+        logits, mean, scale, score = (torch.cat(values) for values in zip(*parts, strict=True))
         # The largest of (log-probability + Gumbel noise) is a draw from the distribution; the n largest, n without repetition.
         chosen = (score + gumbel(score.shape, generator).to(score)).topk(num).indices
         noise = gumbel(torch.Size([num, self.components]), generator).to(score)
