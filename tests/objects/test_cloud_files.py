@@ -29,6 +29,21 @@ def test_cloud_from_npy(tmp_path: Path):
     assert "normals were estimated" in obj.notes[0]
 
 
+def test_one_side_alone_is_asked_about(tmp_path: Path):
+    ball = 0.04 * directions(3000)
+    box = 0.04 * np.random.default_rng(2).uniform(-1, 1, (3000, 3))
+    box[np.arange(3000), np.arange(3000) % 3] = 0.04 * np.sign(box[np.arange(3000), np.arange(3000) % 3])
+    for whole in (ball, box):
+        corner = whole @ np.ones(3) / np.sqrt(3)
+        for points, asked in ((whole, False), (whole[corner > 0.01], True)):
+            np.save(tmp_path / "c.npy", points)
+            notes = load_file(tmp_path / "c.npy").notes
+            assert any("--camera" in note for note in notes) == asked
+    seen = ball[ball[:, 2] > 0]
+    np.save(tmp_path / "c.npy", np.concatenate([seen, seen], 1))
+    assert not any("--camera" in note for note in load_file(tmp_path / "c.npy").notes), "its normals were given"
+
+
 def test_given_normals_are_kept_and_not_scaled(tmp_path: Path):
     normals = directions(500, 1)
     np.save(tmp_path / "c.npy", np.concatenate([40 * directions(500), 3 * normals], 1))
