@@ -1,7 +1,7 @@
 """Time of one grasp, and of one of sixteen, from loaded hand and object to joints, pregrasp and score.
 
 The paper-size network has random weights. Its distances fit no grasp, so the joint solver needs more steps and its times are
-an upper bound. `multi` are the shipped weights. Each number is the median over hands and repetitions, after one prediction
+an upper bound. "default" are the shipped weights that `generate` takes. Each number is the median over hands and repetitions, after one prediction
 that is not counted. Loading of hands, objects and weights is not counted either. Single grasps, and with --full all, are
 measured twice: alone, as far as the machine is, and beside two processes that compute all the time. Threads wait as the
 commands let them, asleep.
@@ -93,7 +93,7 @@ def main() -> None:
     runs = FULL if options.full else RUNS
     rows, seconds, slowest = [], {}, {}
     with tempfile.TemporaryDirectory() as folder:
-        predictors = {"paper": GraspPredictor(str(paper_size(Path(folder), options.seed))), "multi": GraspPredictor()}
+        predictors = {"paper": GraspPredictor(str(paper_size(Path(folder), options.seed))), "default": GraspPredictor()}
     for load, others in OTHERS.items():
         for size, predictor in predictors.items():
             for num in (1, 16) if options.full or not others else (1,):
@@ -109,9 +109,9 @@ def main() -> None:
         f"thread(s), seed {options.seed}; times per grasp",
         rows, ["network", "machine", "grasps", "whole [ms]", *(f"{part} [ms]" for part in PARTS), "slowest [ms]"],
         {
-            "latency_paper": seconds["quiet", "paper", 1], "latency_multi": seconds["quiet", "multi", 1],
+            "latency_paper": seconds["quiet", "paper", 1], "latency_default": seconds["quiet", "default", 1],
             "batch16_per_grasp_paper": seconds["quiet", "paper", 16] / 16,
-            "batch16_per_grasp_multi": seconds["quiet", "multi", 16] / 16,
+            "batch16_per_grasp_default": seconds["quiet", "default", 16] / 16,
             "busy_over_quiet": {f"{size} {num}": value / seconds["quiet", size, num]
                                 for (load, size, num), value in seconds.items() if load == "busy"},
             "busy_longest_over_median": {f"{size} {num}": slowest[load, size, num] / value

@@ -17,6 +17,7 @@ from dro_grasp.errors import OutputError, WeightsError
 from dro_grasp.models import checkpoints
 from dro_grasp.models.checkpoints import (
     CHECKSUMS,
+    DEFAULT,
     KEY,
     SHIPPED_FOLDER,
     SMALL,
@@ -184,10 +185,11 @@ def test_weights_remember_every_training_before(path: Path, network: DistanceNet
 
 
 def test_shipped_weights_load() -> None:
-    assert "multi" in weights_names()
-    assert locate_weights(None) == locate_weights("multi") == SHIPPED_FOLDER / "multi.safetensors"
-    assert load_weights().name == "multi"
-    assert all(bool(v.isfinite().all()) for v in load_weights("multi").state_dict().values())
+    assert {"multi", DEFAULT} <= set(weights_names())
+    assert locate_weights(None) == locate_weights(DEFAULT) == SHIPPED_FOLDER / f"{DEFAULT}.safetensors"
+    assert load_weights().name == DEFAULT
+    for name in weights_names():
+        assert all(bool(v.isfinite().all()) for v in load_weights(name).state_dict().values())
 
 
 def test_shipped_weights_are_as_they_were_shipped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ class Stage:
         Literal["slim", "paper", "paper-slim", "multi"] | None,
         tyro.conf.arg(aliases=["--size"], metavar="{slim,paper,paper-slim,multi}", help_behavior_hint="(default: slim)"),
     ] = None
-    """Network: slim (narrow, told the placement), paper, paper-slim (the paper's, narrow), or multi (the shipped weights')."""
+    """Network: slim (narrow, told the placement), paper, paper-slim (the paper's, narrow), or multi (the default weights')."""
     latent: Annotated[int | None, optional("N", "the preset's")] = None
     """Numbers in z."""
     latent_form: Annotated[Literal["kernel", "motion"] | None, optional("{kernel,motion}", "the preset's")] = None

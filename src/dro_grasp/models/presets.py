@@ -101,7 +101,7 @@ class NetworkConfig:
 
         Args:
             name: `paper` (14 M parameters), `paper-slim`, the same form as narrow as `slim`, `slim`, or `multi`, that of the
-                shipped weights (1.5 M).
+                default weights (1.5 M).
 
         Raises:
             OptionError: No configuration has the name.
@@ -153,6 +153,6 @@ PRESETS = {
     "paper": NetworkConfig(),
     "paper-slim": dataclasses.replace(SLIM, frame="object"),
     "slim": SLIM,
-    "multi": dataclasses.replace(SLIM, latent=32, latent_form="motion", prior="flow"),
+    "multi": dataclasses.replace(SLIM, latent=32, latent_form="motion", prior="flow", placement_hand="proportions"),
 }
 """Configurations by name (`NetworkConfig.preset`)."""
