@@ -1,10 +1,10 @@
 """Time of one grasp, and of one of sixteen, from loaded hand and object to joints, pregrasp and score.
 
 The paper-size network has random weights. Its distances fit no grasp, so the joint solver needs more steps and its times are
-an upper bound. "default" are the shipped weights that `generate` takes. Each number is the median over hands and repetitions, after one prediction
-that is not counted. Loading of hands, objects and weights is not counted either. Single grasps, and with --full all, are
-measured twice: alone, as far as the machine is, and beside two processes that compute all the time. Threads wait as the
-commands let them, asleep.
+an upper bound. "default" are the weights that `generate` takes. Each number is the median over hands and repetitions, after
+one prediction that is not counted. Loading of hands, objects and weights is not counted either. Single grasps, and with
+--full all, are measured twice: alone, as far as the machine is, and beside two processes that compute all the time. Threads
+wait as the commands let them, asleep.
 
     python benchmarks/inference.py [--json] [--full] [--threads N] [--seed 0]
 """
