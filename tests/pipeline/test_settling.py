@@ -38,14 +38,16 @@ def shifted(grasps: GraspBatch, distances: list[float]) -> GraspBatch:
     return grasps.without("pregrasp_joints", "squeeze_joints").replace(T_object_wrist=T)
 
 
-def test_still_grasps_squeeze_anew_others_are_refined_and_what_then_moves_stays_as_it_was(
-    grasps: GraspBatch, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("deep", [0.0, 0.006])
+def test_still_grasps_squeeze_anew_others_are_refined_and_what_then_moves_or_is_deep_stays_as_it_was(
+    grasps: GraspBatch, monkeypatch: pytest.MonkeyPatch, deep: float
 ) -> None:
     moved, seen = [0.001, 0.01, 0.002, 0.01, 0.3], []
 
     def state(shift: list[float], turn: list[float]) -> Holding:
         n = len(shift)
-        return Holding(torch.tensor(shift), torch.tensor(turn), *(torch.arange(float(n)) for _ in range(6)), torch.zeros(n, 2))
+        return Holding(torch.tensor(shift), torch.tensor(turn), *(torch.arange(float(n)) for _ in range(6)),
+                       deepest=torch.tensor([deep, 0.0, 0.0, 0.004])[:n], unanswered=torch.zeros(n, 2))
 
     def close_again(hand: Hand, obj: ObjectModel, some: GraspBatch) -> Holding:
         seen.append(some)
@@ -54,9 +56,12 @@ def test_still_grasps_squeeze_anew_others_are_refined_and_what_then_moves_stays_
     monkeypatch.setattr(settling, "settle", lambda hand, obj, some: shifted(some, moved))
     monkeypatch.setattr(settling, "holding", close_again)
     found, held, kept = settled(PROBLEM, grasps)
-    assert held.tolist() == [True, False, False, True, False]
-    assert kept.speed.tolist() == [0.0, 3.0]
+    assert held.tolist() == [not deep, False, False, True, False]
+    assert kept.speed.tolist() == ([3.0] if deep else [0.0, 3.0])
     T = grasps.T_object_wrist
+    if deep:
+        torch.testing.assert_close(found.T_object_wrist[0], T[0])
+        return
     assert float(found.T_object_wrist[0, 2, 3] - T[0, 2, 3]) == pytest.approx(0.001, abs=1e-6)
     assert (found.squeeze_joints[0] - grasps.squeeze_joints[0]).abs().max() > 1e-4
     expected = refine(PROBLEM, shifted(grasps, moved)[[1, 3]])

@@ -28,7 +28,7 @@ from dro_grasp.simulation.holding import Holding, holding
 SHARE = 0.5
 """Share of scored candidates that are settled, the best ones (ours)."""
 ESCAPED_SCORE = -4.0
-"""Highest score of a grasp that loses the object when its closing is simulated [log-odds of holding] (ours)."""
+"""Highest score of a grasp that does not hold still when its closing is simulated [log-odds of holding] (ours)."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,8 @@ class SettleConfig:
     """How far it may move the second time [m]."""
     largest_turn: float = math.radians(30)
     """How far it may turn then [rad]."""
+    deepest: float = 0.005
+    """How deep the hand may be in the object, and its links in each other [m]; fingers that cross hold nothing."""
     refinement: RefineConfig = field(default_factory=RefineConfig)
     """How grasps are refined between the two closings, and how settled ones squeeze."""
 
@@ -53,7 +55,7 @@ class Settled(NamedTuple):
     grasps: GraspBatch
     """All of them, in their order."""
     held: Bool[Tensor, " n"]
-    """Which ones hold still."""
+    """Which ones hold still, with no link too deep in the object or in another."""
     holding: Holding
     """How these m hold the object."""
 
@@ -66,7 +68,7 @@ def can_settle(problem: GraspProblem) -> bool:
 def best_settled(problem: GraspProblem, grasps: GraspBatch, least: int) -> tuple[Int[Tensor, " k"], GraspBatch]:
     """The better half of scored grasps, settled and scored again, in their order; which rows they are comes first.
 
-    The score counts how the object is held then. A grasp that loses the object when it closes, or ends where the problem's
+    The score counts how the object is held then. A grasp that does not hold still, or ends where the problem's
     constraints forbid, stays as it was and scores at most ESCAPED_SCORE.
 
     Args:
@@ -88,8 +90,8 @@ def settled(problem: GraspProblem, grasps: GraspBatch, config: SettleConfig | No
     """Grasps where closing leaves them, and which of them hold still.
 
     Each hand closes twice. Where the object hardly moves the first time, the grasp that comes out squeezes with balanced
-    forces; where it moves, the grasp is refined there. A grasp that then still moves the object, or loses it at once, is
-    returned as it was.
+    forces; where it moves, the grasp is refined there. A grasp that then still moves the object, loses it at once, or lets links penetrate
+    too deep is returned as it was.
 
     Args:
         problem: Hand and object; see `can_settle`.
@@ -108,7 +110,7 @@ def settled(problem: GraspProblem, grasps: GraspBatch, config: SettleConfig | No
     better = replaced(closed, still, grip(problem, closed[still], config.refinement))
     better = replaced(better, again, refine(problem, closed[again], config.refinement))[rows]
     state = holding(hand, obj, better)
-    holds = (state.shift < config.farthest) & (state.turn < config.largest_turn)
+    holds = (state.shift < config.farthest) & (state.turn < config.largest_turn) & (state.deepest < config.deepest)
     held = torch.zeros_like(still).index_fill(0, rows[holds], True)
     return Settled(replaced(grasps, held, better[holds]), held, state.rows(holds))
 
