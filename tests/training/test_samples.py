@@ -66,13 +66,13 @@ def mixed(tmp_path: Path) -> SampleSource:
 
 def test_a_hand_without_grasps_takes_any_pose_within_its_limits(mixed: SampleSource) -> None:
     hand, generator = mixed.hands["more"], torch.Generator().manual_seed(0)
-    T, joints, centre = mixed.draw_wrists("more", 2000, generator)
+    T, joints, centre = mixed.draw_postures("more", 2000, generator)
     low, high = hand.tree.lower, hand.tree.upper
     share = ((joints - low) / (high - low)).numpy()
     assert min(kstest(column, "uniform").pvalue for column in share.T) > 1e-3
     torch.testing.assert_close(torch.linalg.inv(T)[:, :3, 3] + (T[:, :3, :3].mT @ centre[..., None])[..., 0],
                                hand.grasp_centre_wrist.expand(2000, 3), atol=1e-5, rtol=0)
-    _, held, _ = mixed.draw_wrists("toy", 50, generator)
+    _, held, _ = mixed.draw_postures("toy", 50, generator)
     stored = mixed.grasps["toy"].joints
     assert bool((held[:, None] == stored).all(-1).any(-1).all()), "a hand with grasps takes theirs"
 

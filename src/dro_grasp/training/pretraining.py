@@ -124,7 +124,7 @@ def contrastive_step(
     grasp_clouds, open_clouds = [], []
     for name in source.draw_kinematics(config.hands_per_step, generator):
         hand = source.hands[name]
-        T, joints, centre = source.draw_wrists(name, config.samples_per_hand, generator)
+        T, joints, centre = source.draw_postures(name, config.samples_per_hand, generator)
         if source.network.placed:
             opened = source.network.axes(hand.palm_axes_wrist).mT.expand(len(T), 3, 3)
             grasping = opened @ random_turns(len(T), config.rotation, generator)

@@ -94,7 +94,7 @@ class SampleSource:
         order = torch.randperm(len(self.without), generator=generator, device=generator.device).tolist() if extra else []
         return self.draw_hands(count - extra, generator) + [self.without[order[i % len(order)]] for i in range(extra)]
 
-    def draw_wrists(
+    def draw_postures(
         self, name: str, count: int, generator: torch.Generator
     ) -> tuple[Float[Tensor, "b 4 4"], Float[Tensor, "b n_dof"], Float[Tensor, "b 3"]]:
         """Wrist poses, joints, and centres of the objects [m] of random grasps; for a hand without, anything within limits."""
@@ -140,7 +140,7 @@ class SampleSource:
         knows the placement.
         """
         hand = self.hands[name]
-        _, grasping, _ = self.draw_wrists(name, count, generator)
+        _, grasping, _ = self.draw_postures(name, count, generator)
         drawn = hand.random_joints(count, generator)
         known = torch.rand(count, 1, generator=generator, device=generator.device) < 0.5
         q = torch.where(known, grasping, drawn)

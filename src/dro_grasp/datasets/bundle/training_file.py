@@ -140,7 +140,7 @@ def write_bundle(
         tensors |= _pack_grasps(f"grasps.{i}", hand, [b for b in grasps if b.hand_sha256 == hand.sha256], names, splits)
     for i, hand in enumerate(more_hands, len(hands)):
         header["hands"].append(_pack_hand(f"hand.{i}", hand, tensors))
-        tensors |= _pack_joints(f"grasps.{i}", torch.zeros(0, 4, 4), torch.zeros(0, hand.tree.n_dof), [])
+        tensors |= _grasp_tensors(f"grasps.{i}", torch.zeros(0, 4, 4), torch.zeros(0, hand.tree.n_dof), [])
     size = sum(t.numel() * t.element_size() for t in tensors.values())
     if size > MAX_BYTES:
         raise BundleError(f"the bundle would have {size / 1e6:.1f} MB, at most {MAX_BYTES / 1e6:.0f} MB are allowed; take "
@@ -246,10 +246,10 @@ def _pack_grasps(key: str, hand: Hand, batches: list[GraspBatch], names: list[st
         if missing:
             raise BundleError(f"no cloud was given for objects {', '.join(sorted(missing)[:5])}")
     T, joints = torch.cat([b.T_object_wrist for b in batches]), torch.cat([b.joints for b in batches])
-    return _pack_joints(key, T, joints, [known[o] for b in batches for o in b.object])
+    return _grasp_tensors(key, T, joints, [known[o] for b in batches for o in b.object])
 
 
-def _pack_joints(key: str, T: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"], objects: list[int]) -> Tensors:
+def _grasp_tensors(key: str, T: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"], objects: list[int]) -> Tensors:
     """Grasps of one hand, or none."""
     quaternion = roma.rotmat_to_unitquat(T[:, :3, :3]) if len(T) else T.new_zeros(0, 4)
     return {
