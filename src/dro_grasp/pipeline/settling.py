@@ -90,8 +90,8 @@ def settled(problem: GraspProblem, grasps: GraspBatch, config: SettleConfig | No
     """Grasps where closing leaves them, and which of them hold still.
 
     Each hand closes twice. Where the object hardly moves the first time, the grasp that comes out squeezes with balanced
-    forces; where it moves, the grasp is refined there. A grasp that then still moves the object, loses it at once, or lets links penetrate
-    too deep is returned as it was.
+    forces; where it moves, the grasp is refined there. A grasp that then still moves the object, loses it at once, or lets
+    links penetrate too deep is returned as it was.
 
     Args:
         problem: Hand and object; see `can_settle`.

@@ -61,7 +61,7 @@ class Holding:
     slip: Float[Tensor, " n"]
     """Largest ratio of tangential to normal force at a contact that bears."""
     deepest: Float[Tensor, " n"]
-    """Deepest penetration of hand and object, or of the hand's links, in the grasp that closes [m]; see `measure_penetration`."""
+    """Penetration of hand and object, or of the hand's links, the deeper one, before closing [m]; see `measure_penetration`."""
     unanswered: Float[Tensor, "n 2"]
     """What is missing for contacts near their present forces to answer a push: for the worst direction, and on average."""
 
