@@ -36,8 +36,7 @@ NEIGHBOURS = 16
 """Neighbours that estimate the normals of a bare cloud (ours)."""
 ONE_SIDED = 0.3
 """Length of the mean of estimated normals above which a cloud looks like one side of an object (ours): over closed surfaces
-normals add up to nothing, and over half a ball they have a mean of 0.5. Of 102 objects seen from everywhere two are above it, a
-bowl and a door knob; of depth images of the same objects most."""
+normals add up to nothing, and over half a ball they have a mean of 0.5. A bowl seen from everywhere is above it, too."""
 
 
 def load_file(path: Path, *, scale: float = 1.0, keep_table: bool = False) -> ObjectModel:
