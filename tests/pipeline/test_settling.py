@@ -16,7 +16,7 @@ from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
 from dro_grasp.perception.partial_views import partial_view
 from dro_grasp.pipeline import settling
 from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.settling import ESCAPED_SCORE, Settled, best_settled, can_settle, motion, settled
+from dro_grasp.pipeline.settling import UNHELD_SCORE, Settled, best_settled, can_settle, motion, settled
 from dro_grasp.pipeline.stages import evaluate, refine, scored
 from dro_grasp.simulation.holding import Holding, holding
 from dro_grasp.simulation.outcome import Failure
@@ -85,7 +85,7 @@ def test_settled_grasps_hardly_push_the_object_away(grasps: GraspBatch) -> None:
     assert after.failure.count(Failure.PUSHED_AWAY) <= 1
 
 
-def test_only_the_better_half_is_settled_and_escapes_score_low(
+def test_only_the_better_half_is_settled_and_what_is_not_held_scores_low(
     grasps: GraspBatch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def none_held(problem: GraspProblem, some: GraspBatch) -> Settled:
@@ -95,7 +95,7 @@ def test_only_the_better_half_is_settled_and_escapes_score_low(
     known = scored(PROBLEM, grasps).replace(score=torch.tensor([0.0, 3.0, 1.0, 2.0, -1.0]))
     rows, found = best_settled(PROBLEM, known, 1)
     assert rows.tolist() == [1, 3]
-    assert found.score.amax() <= ESCAPED_SCORE
+    assert found.score.amax() <= UNHELD_SCORE
     torch.testing.assert_close(found.T_object_wrist, known.T_object_wrist[[1, 3]])
     assert len(best_settled(PROBLEM, known, 4)[0]) == 4
     assert len(best_settled(PROBLEM, known, 9)[0]) == 5

@@ -27,7 +27,7 @@ from dro_grasp.simulation.holding import Holding, holding
 
 SHARE = 0.5
 """Share of scored candidates that are settled, the best ones (ours)."""
-ESCAPED_SCORE = -4.0
+UNHELD_SCORE = -4.0
 """Highest score of a grasp that does not hold still when its closing is simulated [log-odds of holding] (ours)."""
 
 
@@ -69,7 +69,7 @@ def best_settled(problem: GraspProblem, grasps: GraspBatch, least: int) -> tuple
     """The better half of scored grasps, settled and scored again, in their order; which rows they are comes first.
 
     The score counts how the object is held then. A grasp that does not hold still, or ends where the problem's
-    constraints forbid, stays as it was and scores at most ESCAPED_SCORE.
+    constraints forbid, stays as it was and scores at most UNHELD_SCORE.
 
     Args:
         problem: Hand and object; see `can_settle`.
@@ -83,7 +83,7 @@ def best_settled(problem: GraspProblem, grasps: GraspBatch, least: int) -> tuple
     closed = replaced(closed, wrong, grasps[best[wrong]])
     score = scored(problem, closed).score
     score[held] = holding_score(score[held], state)
-    return best, closed.replace(score=torch.where(held & ~wrong, score, score.clamp_max(ESCAPED_SCORE)))
+    return best, closed.replace(score=torch.where(held & ~wrong, score, score.clamp_max(UNHELD_SCORE)))
 
 
 def settled(problem: GraspProblem, grasps: GraspBatch, config: SettleConfig | None = None) -> Settled:
