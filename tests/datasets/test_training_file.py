@@ -97,13 +97,13 @@ def test_what_training_may_not_have_is_refused(path: Path) -> None:
 
 def test_hands_without_grasps_come_back(path: Path) -> None:
     more = dataclasses.replace(HAND, name="more", sha256="more")
-    bundle = write_bundle(path, [HAND], BALL, [made_up_grasps(HAND)], more_hands=[more])
+    bundle = write_bundle(path, [HAND], BALL, [made_up_grasps(HAND)], without_grasps=[more])
     assert bundle.summary()["hands"] == {"toy": 24, "more": 0}
     joints = HAND.canonical_joints(0.7)
     assert torch.equal(bundle.hands["more"].points(joints), HAND.points(joints))
     assert bundle.grasps["more"].T_object_wrist.shape == (0, 4, 4)
     with pytest.raises(BundleError, match="toy is the name of more than one hand"):
-        write_bundle(path, [HAND], BALL, [made_up_grasps(HAND)], more_hands=[dataclasses.replace(HAND, sha256="other")])
+        write_bundle(path, [HAND], BALL, [made_up_grasps(HAND)], without_grasps=[dataclasses.replace(HAND, sha256="other")])
 
 
 def test_too_large_is_refused_before_writing(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -47,7 +47,7 @@ def test_still_grasps_squeeze_anew_others_are_refined_and_what_then_moves_or_is_
     def state(shift: list[float], turn: list[float]) -> Holding:
         n = len(shift)
         return Holding(torch.tensor(shift), torch.tensor(turn), *(torch.arange(float(n)) for _ in range(6)),
-                       deepest=torch.tensor([deep, 0.0, 0.0, 0.004])[:n], unanswered=torch.zeros(n, 2))
+                       unanswered=torch.zeros(n, 2))
 
     def close_again(hand: Hand, obj: ObjectModel, some: GraspBatch) -> Holding:
         seen.append(some)
@@ -55,6 +55,8 @@ def test_still_grasps_squeeze_anew_others_are_refined_and_what_then_moves_or_is_
 
     monkeypatch.setattr(settling, "settle", lambda hand, obj, some: shifted(some, moved))
     monkeypatch.setattr(settling, "holding", close_again)
+    depths = torch.tensor([deep, 0.0, 0.0, 0.004])
+    monkeypatch.setattr(settling, "deepest_penetration", lambda hand, obj, some: depths[:len(some)])
     found, held, kept = settled(PROBLEM, grasps)
     assert held.tolist() == [not deep, False, False, True, False]
     assert kept.speed.tolist() == ([3.0] if deep else [0.0, 3.0])

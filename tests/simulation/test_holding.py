@@ -82,11 +82,6 @@ def test_motion_and_contacts_are_those_of_a_trial(hand: Hand, obj: ObjectModel) 
     assert found.links.tolist() == [len(links) for links in trial.contact_links]
     assert (found.contacts >= found.links).all()
     assert (found.pressure > 0.1).all()
-    T[1, 2, 3] += 0.02
-    deeper = grasps.replace(T_object_wrist=T)
-    found, trial = holding(hand, obj, deeper), simulate(hand, obj, deeper, "strict")
-    torch.testing.assert_close(found.deepest, torch.maximum(trial.penetration, trial.self_penetration))
-    assert float(found.deepest[1]) == pytest.approx(0.008, abs=1e-4), "the palm stood 2 mm off the ball and came 10 mm nearer"
 
 
 def test_an_open_hand_holds_nothing(hand: Hand, obj: ObjectModel) -> None:

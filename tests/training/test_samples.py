@@ -60,7 +60,7 @@ def mixed(tmp_path: Path) -> SampleSource:
     hand = toy_hand()
     more = dataclasses.replace(hand, name="more", sha256="more")
     bundle = write_bundle(tmp_path / "mixed.safetensors", [hand], {"ball": ellipsoid(SEMIAXES["ball"])}, [made_up_grasps(hand)],
-                          more_hands=[more])
+                          without_grasps=[more])
     return SampleSource(bundle, TINY, AugmentationConfig())
 
 

@@ -221,8 +221,8 @@ class BundleCommand(DataSets):
     """Hands to include; by default all."""
     per_pair: Annotated[int | None, optional("N", "all")] = None
     """Limit of grasps of a hand on an object; those that cover palm directions best are kept."""
-    more_hands: tuple[str, ...] = ()
-    """Names or URDF files of hands without grasps, such as those of `hand make`: `pretrain` needs their kinematics alone."""
+    hands_without_grasps: tuple[str, ...] = ()
+    """Names or URDF files of further hands, such as those of `hand make`: `pretrain` needs their kinematics alone."""
     json: Flag = False
     """Print one JSON object instead of a table."""
 
@@ -233,8 +233,8 @@ class BundleCommand(DataSets):
         from dro_grasp.hands.library import load_hand
 
         check_output(self.output)
-        more = [load_hand(name) for name in self.more_hands]
-        bundle, left_out = make_bundle(self.inputs, self.output, self.split, self.hands, self.per_pair, more)
+        further = [load_hand(name) for name in self.hands_without_grasps]
+        bundle, left_out = make_bundle(self.inputs, self.output, self.split, self.hands, self.per_pair, further)
         if left_out:
             say_aside(f"{left_out} grasps outside split '{self.split}' are left out")
         report = {"output": str(self.output), "bytes": self.output.stat().st_size, **bundle.summary()}

@@ -23,6 +23,7 @@ from dro_grasp.pipeline.holding_score import holding_score
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import complete, grip, refine, scored
 from dro_grasp.simulation.closed_poses import settle
+from dro_grasp.simulation.contacts import deepest_penetration
 from dro_grasp.simulation.holding import Holding, holding
 
 SHARE = 0.5
@@ -44,7 +45,7 @@ class SettleConfig:
     largest_turn: float = math.radians(30)
     """How far it may turn then [rad]."""
     deepest: float = 0.005
-    """How deep the hand may be in the object, and its links in each other [m]; fingers that cross hold nothing."""
+    """How deep the hand may be, before it closes, in the object or in itself [m]; fingers that cross hold nothing."""
     refinement: RefineConfig = field(default_factory=RefineConfig)
     """How grasps are refined between the two closings, and how settled ones squeeze."""
 
@@ -109,8 +110,8 @@ def settled(problem: GraspProblem, grasps: GraspBatch, config: SettleConfig | No
     again, rows = near & ~still, near.nonzero()[:, 0]
     better = replaced(closed, still, grip(problem, closed[still], config.refinement))
     better = replaced(better, again, refine(problem, closed[again], config.refinement))[rows]
-    state = holding(hand, obj, better)
-    holds = (state.shift < config.farthest) & (state.turn < config.largest_turn) & (state.deepest < config.deepest)
+    state, depth = holding(hand, obj, better), deepest_penetration(hand, obj, better)
+    holds = (state.shift < config.farthest) & (state.turn < config.largest_turn) & (depth < config.deepest)
     held = torch.zeros_like(still).index_fill(0, rows[holds], True)
     return Settled(replaced(grasps, held, better[holds]), held, state.rows(holds))
 

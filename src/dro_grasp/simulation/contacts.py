@@ -12,8 +12,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
-from dro_grasp.simulation.scene import PREFIX, Scene
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol, protocol as find_protocol
+from dro_grasp.simulation.scene import PREFIX, Scene, cached_scene
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,29 @@ def measure_penetration(scene: Scene, grasps: GraspBatch) -> Penetration:
             deepest[a, b] = max(deepest.get((a, b), 0.0), float(d))
         own[i] = sum(deepest.values())
     return Penetration(depth, own)
+
+
+def deepest_penetration(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL
+) -> Float[Tensor, " n"]:
+    """Penetration of hand and object, or summed over pairs of the hand's links, the deeper one, in the labelled pose [m].
+
+    Args:
+        hand: The hand of the grasps.
+        obj: Their object, with a mesh or with balls.
+        grasps: Any; pregrasp and squeeze play no role.
+        protocol: Of the scene; its forces play no role.
+
+    Raises:
+        ObjectError: The object is a bare point cloud, without balls that stand for it.
+        HandError: The hand came without its description.
+        GraspFileError: The grasps are of another hand.
+        OptionError: The protocol does not exist.
+    """
+    require_pair(hand, obj)
+    grasps.require_hand(hand)
+    found = measure_penetration(cached_scene(hand, obj, find_protocol(protocol)), grasps)
+    return torch.as_tensor(np.maximum(found.object, found.own), dtype=torch.float32)
 
 
 def find_contact_links(scene: Scene, qpos: Float[np.ndarray, "n nq"]) -> tuple[tuple[str, ...], ...]:

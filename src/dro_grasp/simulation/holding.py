@@ -17,7 +17,6 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.grip import friction_cone, nonnegative_least_squares
-from dro_grasp.simulation.contacts import measure_penetration
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
 from dro_grasp.simulation.rollout import FORCES, Rollout, quiet, rollouts, scene_of
 from dro_grasp.simulation.scene import Scene
@@ -60,8 +59,6 @@ class Holding:
     """Sum of the normal forces [N]."""
     slip: Float[Tensor, " n"]
     """Largest ratio of tangential to normal force at a contact that bears."""
-    deepest: Float[Tensor, " n"]
-    """Penetration of hand and object, or of the hand's links, the deeper one, before closing [m]; see `measure_penetration`."""
     unanswered: Float[Tensor, "n 2"]
     """What is missing for contacts near their present forces to answer a push: for the worst direction, and on average."""
 
@@ -104,13 +101,13 @@ def holding(
     """
     scene = scene_of(hand, obj, grasps, protocol)
     parts = [Holding(**{f.name: torch.zeros(0, 2) if f.name == "unanswered" else torch.zeros(0) for f in fields(Holding)})]
-    parts += [_observed(scene, grasp, rollout) for grasp, rollout in rollouts(scene, hand, grasps, workers)]
+    parts += [_observed(scene, rollout) for _, rollout in rollouts(scene, hand, grasps, workers)]
     return Holding(**{f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Holding)})
 
 
-def _observed(scene: Scene, grasps: GraspBatch, rollout: Rollout) -> Holding:
-    """Close the hands of a rollout, which starts from these grasps."""
-    penetration, closed = measure_penetration(scene, grasps), rollout.close()
+def _observed(scene: Scene, rollout: Rollout) -> Holding:
+    """Close the hands of a rollout."""
+    closed = rollout.close()
     first = int(scene.model.body_dofadr[scene.object_body])
     velocity = np.nan_to_num(np.array(rollout.batch.bind("qvel"))[:, first:first + 6])
     found = _contacts(scene, rollout)
@@ -120,7 +117,6 @@ def _observed(scene: Scene, grasps: GraspBatch, rollout: Rollout) -> Holding:
         "speed": np.linalg.norm(velocity[:, :3], axis=1), "spin": np.linalg.norm(velocity[:, 3:], axis=1),
         "contacts": [len(c.pressure) for c in found], "links": [c.links for c in found],
         "pressure": [c.pressure.sum() for c in found],
-        "deepest": np.maximum(penetration.object, penetration.own),
         "slip": [ratio.max(initial=0.0) if len(ratio) else NO_ANSWER for ratio in bearing],
     }
     friction = FRICTION * rollout.scene.protocol.friction

@@ -103,7 +103,7 @@ class Bundle:
 
 def write_bundle(
     path: Path | str, hands: Sequence[Hand], objects: Mapping[str, ObjectCloud], grasps: Sequence[GraspBatch],
-    splits: Set[str] = TRAINING, more_hands: Sequence[Hand] = (),
+    splits: Set[str] = TRAINING, without_grasps: Sequence[Hand] = (),
 ) -> Bundle:
     """Write a training bundle of grasps of some splits, by these hands on objects with these clouds.
 
@@ -113,7 +113,7 @@ def write_bundle(
         objects: Clouds by name.
         grasps: At least one grasp of each of these hands.
         splits: Splits that the grasps may be of.
-        more_hands: Hands without grasps, for pretraining.
+        without_grasps: Hands without grasps, for pretraining.
 
     Raises:
         BundleError: A grasp is of another split, its hand or object is missing, two hands share a name, or the file grows
@@ -126,7 +126,7 @@ def write_bundle(
                           "them; pass the hands they were made for")
     if not grasps:
         raise BundleError("no grasps were given; synthesise some on objects for training first")
-    called = Counter(hand.name for hand in (*hands, *more_hands))
+    called = Counter(hand.name for hand in (*hands, *without_grasps))
     if double := sorted(name for name, count in called.items() if count > 1):
         raise BundleError(f"{', '.join(double[:5])} is the name of more than one hand; rename them, or leave out those that "
                           "have grasps already")
@@ -138,7 +138,7 @@ def write_bundle(
     for i, hand in enumerate(hands):
         header["hands"].append(_pack_hand(f"hand.{i}", hand, tensors))
         tensors |= _pack_grasps(f"grasps.{i}", hand, [b for b in grasps if b.hand_sha256 == hand.sha256], names, splits)
-    for i, hand in enumerate(more_hands, len(hands)):
+    for i, hand in enumerate(without_grasps, len(hands)):
         header["hands"].append(_pack_hand(f"hand.{i}", hand, tensors))
         tensors |= _grasp_tensors(f"grasps.{i}", torch.zeros(0, 4, 4), torch.zeros(0, hand.tree.n_dof), [])
     size = sum(t.numel() * t.element_size() for t in tensors.values())

@@ -20,7 +20,7 @@ from dro_grasp.objects.shape import ObjectModel
 
 def make_bundle(
     inputs: Sequence[Path], output: Path, split: str = "train", hands: Sequence[str] = (), per_pair: int | None = None,
-    more_hands: Sequence[Hand] = (),
+    without_grasps: Sequence[Hand] = (),
 ) -> tuple[Bundle, int]:
     """Write the bundle of a split's grasps; returns it, and how many grasps of other splits were left out.
 
@@ -29,7 +29,7 @@ def make_bundle(
         split: One of SPLITS.
         hands: Only these; all when none is named.
         per_pair: As in `merge`.
-        more_hands: As in `write_bundle`.
+        without_grasps: As in `write_bundle`.
 
     Raises:
         BundleError: It cannot be made of these grasps.
@@ -54,7 +54,7 @@ def make_bundle(
     if per_pair is not None:
         by_hash = {hand.sha256: hand for hand in found}
         kept = [grasps[spread(by_hash[grasps.hand_sha256], grasps, per_pair)] for grasps in kept]
-    return write_bundle(output, found, clouds, kept, allowed, more_hands), left_out
+    return write_bundle(output, found, clouds, kept, allowed, without_grasps), left_out
 
 
 def _why_none(split: str, seen: Counter[str], hands: Sequence[str], hands_seen: Set[str]) -> str:
