@@ -123,6 +123,17 @@ def test_our_fault_is_status_1(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     assert "Traceback" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("arguments", ["hands", "--help", "objects --json", "--version"])
+def test_nobody_reads_the_output(arguments: str) -> None:
+    """As in `dro-grasp hands | head -1`: silence, and the exit code of programs that SIGPIPE ends."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        [sys.executable, "-m", "dro_grasp", *arguments.split()], stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
 def test_evaluate_and_view_take_the_file_that_generate_wrote(generate, tmp_path: Path, capsys) -> None:
     grasps, tried, picture = tmp_path / "a.parquet", tmp_path / "b.parquet", tmp_path / "a.png"
     generate("--output", str(grasps), "--protocol", "none", num=2)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+import select
 import signal
 import sys
 import threading
 import traceback
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Annotated, Any
 
 import tyro
@@ -39,6 +40,8 @@ BAD_INPUT = 2
 """Exit code after invalid input."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C: 128 plus the number of SIGINT, as shells have it."""
+READER_LEFT = 141
+"""Exit code when nobody reads the output any more, as in `dro-grasp hands | head -1`: 128 plus the number of SIGPIPE."""
 INSISTENCE = 5.0
 """Time after which Ctrl-C is repeated if the command still runs [s] (ours); workers stop in less."""
 PATIENCE = ("OMP_WAIT_POLICY", "PASSIVE")
@@ -127,18 +130,48 @@ def insistent_interrupts() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command, and return its exit code: 0 for success, 2 for invalid input, 1 for an internal error."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
+def run(arguments: Sequence[str]) -> int:
+    """Run one command, and return its exit code, unless it raises."""
     if arguments in (["--version"], ["-V"]):
         print(f"dro-grasp {__version__}")
         return DONE
+    return parse(without_threads(arguments)).run()
+
+
+def reader_left() -> bool:
+    """Whether nobody reads the output any more; what is still to be written is dropped then."""
+    if sys.stdout is None:
+        return False
+    with suppress(BrokenPipeError):  # the data is lost, and flushing again would not tell
+        sys.stdout.flush()
+    try:
+        output = sys.stdout.fileno()
+    except OSError:  # no file: somebody has replaced it
+        return False
+    poll = select.poll()
+    poll.register(output, 0)
+    if not any(event & select.POLLERR for _, event in poll.poll(0)):
+        return False
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, output)
+    os.close(nowhere)
+    return True
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command, and return its exit code: 0 for success, 2 for invalid input, 1 for an internal error."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
     verbose = "--verbose" in arguments
     arguments = [a for a in arguments if a != "--verbose"] or ["--help"]
     os.environ.setdefault(*PATIENCE)
     try:
         with insistent_interrupts():
-            return parse(without_threads(arguments)).run()
+            code = run(arguments)
+        return READER_LEFT if reader_left() else code
+    except SystemExit as end:  # 1 is rich's, which ends the program when nobody reads; others are `parse`'s
+        if end.code == 1 or (not end.code and reader_left()):
+            return READER_LEFT
+        raise
     except DroGraspError as error:
         if verbose:
             traceback.print_exc()
@@ -148,6 +181,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("stopped", file=sys.stderr)
         return INTERRUPTED
     except Exception as error:
+        if reader_left():
+            return READER_LEFT
         if verbose:
             traceback.print_exc()
         else:
