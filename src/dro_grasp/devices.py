@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -89,20 +90,35 @@ def fast_products() -> Iterator[None]:
 
     The setting "medium" lets PyTorch choose another library, which is 2-4 times as fast on some processors at the same
     accuracy. On others it rounds to half precision: a test product decides, once. It is never used where CUDA is
-    present, whose products it would round. The caller's setting comes back at the end.
+    present, whose products it would round. The caller's setting comes back at the end, of blocks in several threads
+    with the last one.
     """
-    with nullcontext() if torch.cuda.is_available() or not quick_path_is_accurate() else _quick_path():
+    with nullcontext() if torch.cuda.is_available() or not quick_path_is_accurate() else _QUICK_PATH:
         yield
 
 
-@contextmanager
-def _quick_path() -> Iterator[None]:
-    before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("medium")
-    try:
-        yield
-    finally:
-        torch.set_float32_matmul_precision(before)
+class _QuickPath:
+    """The setting, which is the process's: the first block that begins sets it, the last that ends gives the caller's back."""
+
+    def __init__(self) -> None:
+        self._lock, self._blocks, self._before = threading.Lock(), 0, ""
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._blocks == 0:
+                self._before = torch.get_float32_matmul_precision()
+                torch.set_float32_matmul_precision("medium")
+            self._blocks += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._blocks -= 1
+            if self._blocks == 0:
+                torch.set_float32_matmul_precision(self._before)
+
+
+_QUICK_PATH = _QuickPath()
+"""The only one."""
 
 
 @cache
@@ -110,7 +126,7 @@ def quick_path_is_accurate() -> bool:
     """Whether a product on the quick path agrees with double precision."""
     generator = torch.Generator().manual_seed(0)
     a, b = torch.randn(2, PROBE_SIZE, PROBE_SIZE, generator=generator)
-    with _quick_path():
+    with _QUICK_PATH:
         product = a @ b
     exact = a.double() @ b.double()
     return bool((product - exact).abs().max() <= LARGEST_DEVIATION * exact.abs().max())

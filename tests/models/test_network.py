@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import threading
 
 import pytest
 import torch
@@ -265,6 +266,27 @@ def test_caller_keeps_the_precision_setting(monkeypatch: pytest.MonkeyPatch) -> 
 
     with pytest.raises(KeyError), fast_products():
         fail()
+    assert inside == ["medium"]
+    assert torch.get_float32_matmul_precision() == before
+
+
+def test_the_setting_holds_until_the_last_thread_has_left_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(devices, "quick_path_is_accurate", lambda: True)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    before, entered, left, inside = torch.get_float32_matmul_precision(), threading.Event(), threading.Event(), []
+
+    def early() -> None:
+        with fast_products():
+            entered.wait(10)
+        left.set()
+
+    thread = threading.Thread(target=early)
+    thread.start()
+    with fast_products():
+        entered.set()
+        left.wait(10)
+        inside.append(torch.get_float32_matmul_precision())
+    thread.join()
     assert inside == ["medium"]
     assert torch.get_float32_matmul_precision() == before
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -18,6 +19,7 @@ from dro_grasp.planning.plan_config import PlanConfig
 from dro_grasp.planning.planner import LOSES, plan
 from dro_grasp.planning.reachability import Feasible, Postures
 from dro_grasp.planning.rehearsal import CONDITIONS, Rehearsal
+from tests.helpers.claw import claw_xml
 from tests.helpers.clouds import cloud_of
 
 RADIUS = 0.04
@@ -46,6 +48,25 @@ def test_an_estimated_object_stands_still_on_the_table(robot: dro.Robot, ball: d
     touching = scene.model.geom_bodyid[scene.data.contact.geom].reshape(-1, 2)
     assert (touching == body).any()
     assert mujoco.mj_getTotalmass(scene.model) > scene.model.body_mass[body] == pytest.approx(500 * solid_of(ball).volume)
+
+
+@pytest.mark.parametrize("limits", ["-30 30", "10 40"], ids=["at zero", "away from zero"])
+def test_joints_above_the_palm_stay_and_the_others_follow(robot: dro.Robot, tmp_path: Path, limits: str) -> None:
+    """As the two of the wrist of a Shadow hand; those at zero are no joints of the scene."""
+    file = tmp_path / "wrist.xml"
+    forearm = '<body name="forearm"><geom type="box" size="0.03 0.03 0.03" mass="0.3" pos="0 0 -0.1"/><body name="palm">'
+    xml = claw_xml().replace('<body name="palm">', f'{forearm}<joint name="wrist" axis="0 1 0" range="{limits}"/>')
+    file.write_text(xml.replace("</worldbody>", "</body></worldbody>"))
+    hand = dro.load_hand(file)
+    assert hand.movable.tolist() == [False, *8 * [True]]
+    scene, arm = LiftScene(replace(robot, hand=hand), []), robot.home
+    before = scene.joints()[1]
+    wanted = hand.canonical_joints(0.9).double().numpy()
+    scene.command(arm, np.zeros_like(arm), wanted)
+    scene.advance(1.0)
+    np.testing.assert_allclose(scene.joints()[1], wanted, atol=0.03)
+    assert scene.joints()[1][0] == pytest.approx(float(hand.rest[0]), abs=5e-3)
+    assert (np.abs(wanted - before)[1:] > 0.1).all()
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.workcell import ARM, TABLE, arm_addresses, robot_spec, wxyz
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.rollout import quiet
-from dro_grasp.simulation.scene import HULL_VERTICES, PREFIX, add_object, add_servos, joint_addresses
+from dro_grasp.simulation.scene import HULL_VERTICES, PREFIX, add_object, add_servos, joint_addresses, servo_joints
 
 LIFT_PROTOCOL = replace(PROTOCOLS["dro"], name="tabletop", timestep=0.002, force_limit=3.0, noslip=3)
 """Contacts and servos of the hand: friction 1, density 500 kg/m^3 and the servos' gains as in trials; at most 3 Nm (ours).
@@ -76,7 +76,7 @@ class LiftScene:
         self._objects = [int(self.model.jnt_qposadr[self.model.joint(f"object{i}-").id]) for i in range(len(objects))]
         names = [self.model.actuator(i).name for i in range(self.model.nu)]
         self._arm_servos = np.array([names.index(ARM + n) for n in robot.arm_joints])
-        self._hand_servos = np.array([names.index(n) for n in robot.hand_joints])
+        self._hand_servos, self._driven = servo_joints(self.model, robot.hand)
         tree = robot.hand.tree
         self._coupling, self._offset = (t.double().numpy()[moving] for t in (tree.coupling, tree.offset))
         self.begin(robot.home, open_hand(robot))
@@ -129,9 +129,9 @@ class LiftScene:
     def command(
         self, arm: Float[np.ndarray, " n_arm"], velocity: Float[np.ndarray, " n_arm"], hand: Float[np.ndarray, " n_dof"]
     ) -> None:
-        """Set the targets of all servos."""
+        """Set the targets of all servos; joints above the palm stay where they are held."""
         self.data.ctrl[self._arm_servos] = arm + DAMPING_TIME * velocity
-        self.data.ctrl[self._hand_servos] = hand
+        self.data.ctrl[self._hand_servos] = hand[self._driven]
 
     def advance(self, seconds: float, watch: Callable[[], None] | None = None, every: float = 0.02) -> None:
         """Let time pass; `watch` is called at intervals of `every` seconds."""

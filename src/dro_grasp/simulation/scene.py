@@ -65,8 +65,7 @@ class Scene:
     @cached_property
     def actuated(self) -> Int[np.ndarray, " n_servos"]:
         """Index into the independent joints of each actuator."""
-        names = [self.model.actuator(i).name.removeprefix(PREFIX) for i in range(self.model.nu)]
-        return np.array([self.hand.tree.joint_names.index(n) for n in names])
+        return servo_joints(self.model, self.hand)[1]
 
     def qpos(self, T_object_wrist: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"]) -> Float[np.ndarray, "n nq"]:
         """Configurations of the hand at these joints and the object at its pose in the wrist frame."""
@@ -270,6 +269,16 @@ def joint_addresses(model: mujoco.MjModel, hand: Hand) -> tuple[Int[np.ndarray, 
     """Addresses in qpos, and indices into the tree's moving joints, of the hand's joints in a scene."""
     names = {model.joint(j).name: int(model.jnt_qposadr[j]) for j in range(model.njnt)}
     pairs = [(names[PREFIX + n], i) for i, n in enumerate(hand.tree.moving_names) if PREFIX + n in names]
+    return np.array([a for a, _ in pairs], int), np.array([i for _, i in pairs], int)
+
+
+def servo_joints(model: mujoco.MjModel, hand: Hand) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """Indices of the hand's servos among the actuators of a scene, and of the independent joints that they drive.
+
+    Joints above the palm that were removed, since they are held, have none.
+    """
+    joints = {name: i for i, name in enumerate(hand.tree.joint_names)}
+    pairs = [(i, joints[name]) for i in range(model.nu) if (name := model.actuator(i).name) in joints]
     return np.array([a for a, _ in pairs], int), np.array([i for _, i in pairs], int)
 
 
