@@ -115,6 +115,15 @@ def test_the_folder_of_another_hand_is_refused(home: Path, capsys: pytest.Captur
     assert "belongs to hand 'mine'" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("more", "word"), [(["--weights", "multi"], "was begun with weights"), (["--seed", "7"], "with seed")])
+def test_a_folder_that_was_begun_otherwise_is_refused(
+    home: Path, more: list[str], word: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its finished steps would be given for those that were asked for."""
+    assert main([*command(home), *more]) == 2
+    assert word in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("more", "word"), [(["--objects", "can"], "can would be trained on"), (["--minutes", "0"], "minutes is 0.0")])
 def test_what_makes_no_sense_is_refused(

@@ -23,7 +23,7 @@ from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.errors import OptionError, OutputError, TrainingError
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.training import loop, losses, pretraining
-from dro_grasp.training.config import ScheduleConfig
+from dro_grasp.training.config import AugmentationConfig, LossConfig, ScheduleConfig, TrainConfig
 from dro_grasp.training.run_folder import CHECKPOINT, LOG, RunFolder
 from dro_grasp.training.runs import TrainingRun, check_schedule, learning_rate_share
 from tests.helpers.tiny_bundle import TINY
@@ -153,10 +153,31 @@ def test_a_damaged_checkpoint_is_set_aside_and_the_run_begins_anew(
     assert capsys.readouterr().err == ""
 
 
+def test_a_finished_run_with_other_settings_data_or_weights_is_refused(
+    bundle: Bundle, finished: dict[str, Path], results: dict[str, DistanceNetwork]
+) -> None:
+    """It would make no step, and give the weights of before for those that were asked for."""
+    config = TrainConfig(SCHEDULE, hands_per_step=1, columns=24)
+    fewer = {name: dataclasses.replace(g, joints=g.joints + 0.01) for name, g in bundle.grasps.items()}
+    other = Bundle(bundle.hands, bundle.objects, fewer)
+    cases: list[tuple[str, Bundle, TrainConfig, DistanceNetwork | None]] = [
+        ("losses.divergence", bundle, dataclasses.replace(config, losses=LossConfig(divergence=0.1)), None),
+        ("augmentation.partial", bundle, dataclasses.replace(config, augmentation=AugmentationConfig(partial=0.5)), None),
+        ("warmup_steps", bundle, dataclasses.replace(config, schedule=dataclasses.replace(SCHEDULE, warmup_steps=4)), None),
+        ("bundle", other, config, None),
+        ("pretrained", bundle, config, results["pretrain"]),
+    ]
+    for name, data, asked, given in cases:
+        with pytest.raises(TrainingError, match=rf"belongs to a run with {name} .* was asked for"):
+            loop.train(data, TINY, asked, finished["train"], given, quiet)
+    longer = dataclasses.replace(config, schedule=dataclasses.replace(SCHEDULE, minutes=5.0, log_every=5))
+    loop.train(bundle, TINY, longer, finished["train"], report=quiet)
+
+
 def test_a_checkpoint_of_another_training_is_refused(bundle: Bundle, finished: dict[str, Path]) -> None:
     with pytest.raises(TrainingError, match="a run with steps 10, 12 was asked for"):
         run_stage("train", bundle, finished["train"], dataclasses.replace(SCHEDULE, steps=12))
-    with pytest.raises(TrainingError, match="does not fit this training"):
+    with pytest.raises(TrainingError, match=rf"a run with network.width {TINY.width}, 20 was asked for"):
         run_stage("train", bundle, finished["train"], network=dataclasses.replace(TINY, width=20))
     with pytest.raises(TrainingError, match="does not fit this training"):
         run_stage("train", bundle, finished["pretrain"])
@@ -292,12 +313,12 @@ def test_tensorboard_that_is_not_installed_is_told_before_any_work(
     stage: str, bundle: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    with pytest.raises(OptionError, match=r"pip install 'dro-grasp\[tensorboard\]'"):
+    with pytest.raises(OptionError, match=r"pip install '\.\[tensorboard\]' in the folder"):
         run_stage(stage, bundle, tmp_path / "run", dataclasses.replace(SCHEDULE, tensorboard=True))
     # The command asks before it so much as reads the bundle, which does not exist.
     command = [stage, "--bundle", "none", "--run-folder", str(tmp_path / "run"), "--output", str(tmp_path / "w.safetensors")]
     assert main([*command, "--tensorboard"]) == 2
-    assert "dro-grasp[tensorboard]" in capsys.readouterr().err
+    assert "'.[tensorboard]'" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 

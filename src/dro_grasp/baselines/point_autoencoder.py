@@ -15,6 +15,7 @@ from dro_grasp.baselines.bundle_draws import BundleDraws
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.training.config import ScheduleConfig
 from dro_grasp.training.reports import Report
+from dro_grasp.training.run_plan import run_plan
 from dro_grasp.training.runs import Losses, TrainingRun, begin, recalibrate
 
 Network = TypeVar("Network", bound=nn.Module)
@@ -75,10 +76,11 @@ def train_autoencoder(
         TrainingError: A loss is not finite.
     """
     processes, device = begin(config.schedule)
-    torch.manual_seed(config.schedule.seed)
-    model = made().to(device)
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(config.schedule.seed)
+        model = made().to(device)
     generator, draws = torch.Generator(device), BundleDraws(bundle, config.hand_points, device)
-    run = TrainingRun(folder, model, config.schedule, generator, processes)
+    run = TrainingRun(folder, model, config.schedule, generator, processes, run_plan(config, bundle))
     model.train()
     run.train(lambda: losses(forward(model, draws, config, generator), config, run.progress), report)
     model.load_state_dict(run.average.module.state_dict())

@@ -126,8 +126,12 @@ class Pretrain(Stage):
             model = pretrain_motion(model, bundle, motion, self.run_folder / "motion")
         if not is_first():
             return 0
-        settings = {"encoder": config} | ({"motion": motion} if network.latent_form == "motion" else {})
-        about = how_long(self.run_folder) | {
+        settings: dict[str, Any] = {"encoder": config}
+        took = how_long(self.run_folder)
+        if network.latent_form == "motion":
+            settings["motion"] = motion
+            took["seconds"] += how_long(self.run_folder / "motion")["seconds"]
+        about = took | {
             "stage": "pretraining", "initial": self.initial, "data": bundle.summary(),
             "settings": {name: dataclasses.asdict(part) for name, part in settings.items()},
         }
@@ -264,6 +268,7 @@ class Train(Stage):
         from dro_grasp.baselines.manifm.contact_training import ContactTrainingConfig, train_contacts
         from dro_grasp.datasets.bundle.training_file import load_bundle
         from dro_grasp.models.checkpoints import save_weights
+        from dro_grasp.training.processes import is_first
 
         schedule, bundle = self.schedule(steps=self.all_steps, learning_rate=self.learning_rate), load_bundle(self.bundle)
         if self.method == "manifm":
@@ -272,6 +277,8 @@ class Train(Stage):
         else:
             config = MapTrainingConfig(schedule)
             model = train_contact_maps(bundle, config, self.run_folder)
+        if not is_first():
+            return 0
         about = how_long(self.run_folder) | {
             "stage": self.method, "data": bundle.summary(), "settings": dataclasses.asdict(config)}
         save_weights(model, self.output, about)

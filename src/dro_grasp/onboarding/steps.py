@@ -24,7 +24,7 @@ from dro_grasp.evaluation.success_rates import BEST, RAW, REFINED, RETURNED, Ben
 from dro_grasp.files import check_folder, make_folder, replacing
 from dro_grasp.hands.check import check_hand, picture
 from dro_grasp.hands.library import load_hand
-from dro_grasp.models.checkpoints import history_of, load_weights, locate_weights, save_weights
+from dro_grasp.models.checkpoints import DEFAULT, history_of, load_weights, locate_weights, save_weights
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.optimization.synthesis import SynthesisConfig
 from dro_grasp.predictor import GraspPredictor
@@ -154,7 +154,7 @@ def onboard(
         ObjectError: An object does not exist.
         WeightsError: No weights have the name.
         OutputError: The folder cannot be made or written, or another run is filling it.
-        OptionError: Training and held-out objects overlap, or the folder is another hand's.
+        OptionError: Training and held-out objects overlap, or the folder is another hand's or was begun otherwise.
         BundleError: No grasp of the hand holds, so there is nothing to train on.
     """
     config = config or OnboardingConfig()
@@ -187,6 +187,10 @@ class _Onboarding:
             if known["sha256"] != self.hand.sha256:
                 raise OptionError(f"{folder} belongs to hand '{known['hand']}', whose description differs; name another "
                                   "folder, or restore that description")
+            for name, asked in self._asked().items():
+                if known["asked"].get(name, asked) != asked:  # earlier versions stored none
+                    raise OptionError(f"{folder} was begun with {name} {known['asked'][name]}, {asked} was asked for; use the "
+                                      "same to resume, or name another folder")
             # A benchmark of an earlier version, which does not tell what `generate` returns, is made again.
             self.steps = {name: step for name, step in known["steps"].items()
                           if "rows" not in step or any(row["stage"] == RETURNED for row in step["rows"])}
@@ -195,11 +199,17 @@ class _Onboarding:
         """What a run before has stored; a damaged file is set aside, and its steps are made again."""
         try:
             known = json.loads(state.read_text())
-            return {name: dict(known[name]) if name == "steps" else str(known[name]) for name in ("hand", "sha256", "steps")}
+            return {"hand": str(known["hand"]), "sha256": str(known["sha256"]), "steps": dict(known["steps"]),
+                    "asked": dict(known.get("asked", {}))}
         except (ValueError, LookupError, TypeError) as error:
             aside = state.replace(state.with_name(f"{state.name}.damaged"))
             self.say(f"{state} is damaged ({type(error).__name__}) and set aside as {aside.name}; its steps are made again")
             return None
+
+    def _asked(self) -> dict[str, Any]:
+        """What decides on the results, beside the hand and the time."""
+        return {"weights": self.config.weights or DEFAULT, "objects": self.objects, "held_out": self.held_out,
+                "num": self.config.num, "learning_rate": self.config.learning_rate, "seed": self.config.seed}
 
     def run(self) -> None:
         """Run every step that is not finished."""
@@ -217,7 +227,7 @@ class _Onboarding:
         begin = time.perf_counter()
         result = work()
         self.steps[name] = {**result, "seconds": time.perf_counter() - begin}
-        content = {"hand": self.hand.name, "sha256": self.hand.sha256, "steps": self.steps}
+        content = {"hand": self.hand.name, "sha256": self.hand.sha256, "asked": self._asked(), "steps": self.steps}
         with replacing(self.folder / STATE) as temporary:
             temporary.write_text(json.dumps(content))
         self.say(f"{name}: {result['said']} ({self.steps[name]['seconds']:.0f} s)")

@@ -19,6 +19,7 @@ from dro_grasp.training.config import TrainConfig
 from dro_grasp.training.given_weights import take_initial, take_pretrained
 from dro_grasp.training.placement_training import measure_hands, placement_losses
 from dro_grasp.training.reports import Report, console_report
+from dro_grasp.training.run_plan import run_plan
 from dro_grasp.training.runs import Losses, TrainingRun, begin, recalibrate
 from dro_grasp.training.samples import HandSamples, SampleSource
 
@@ -57,7 +58,8 @@ def train(
     source = SampleSource(bundle, network, config.augmentation, device)
     if initial is None or initial.config.placement_hand != network.placement_hand:
         measure_hands(model, source)
-    run = TrainingRun(folder, model, config.schedule, generator, processes)
+    plan = run_plan(config, bundle, network, initial=initial, pretrained=pretrained)
+    run = TrainingRun(folder, model, config.schedule, generator, processes, plan)
     model.train()
     if frozen:
         # train() would put the frozen encoder's BatchNorm back into training mode.

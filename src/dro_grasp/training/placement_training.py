@@ -17,6 +17,7 @@ from dro_grasp.training import losses
 from dro_grasp.training.config import PlacementConfig
 from dro_grasp.training.given_weights import take_initial
 from dro_grasp.training.reports import Report, console_report
+from dro_grasp.training.run_plan import run_plan
 from dro_grasp.training.runs import Losses, TrainingRun, begin
 from dro_grasp.training.samples import HandSamples, SampleSource
 
@@ -52,7 +53,8 @@ def train_placement(
     source = SampleSource(bundle, network, config.augmentation, device)
     if initial.config.placement_hand != network.placement_hand:
         measure_hands(model, source)
-    run = TrainingRun(folder, prior, config.schedule, generator, processes)
+    plan = run_plan(config, bundle, network, initial=initial)
+    run = TrainingRun(folder, prior, config.schedule, generator, processes, plan)
 
     def step() -> Losses:
         names = source.draw_hands(config.hands_per_step, generator, config.by_count)

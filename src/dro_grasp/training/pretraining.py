@@ -18,6 +18,7 @@ from dro_grasp.training.config import AugmentationConfig, MotionConfig, Pretrain
 from dro_grasp.training.given_weights import take_initial
 from dro_grasp.training.losses import contrastive_loss, divergence
 from dro_grasp.training.reports import Report, console_report
+from dro_grasp.training.run_plan import run_plan
 from dro_grasp.training.runs import Losses, TrainingRun, begin, recalibrate
 from dro_grasp.training.samples import SampleSource, random_turns
 
@@ -49,7 +50,8 @@ def pretrain(
     generator = torch.Generator(device)
     source = SampleSource(bundle, network, AugmentationConfig(), device)
     encoder = whole.hand_encoder
-    run = TrainingRun(folder, encoder, config.schedule, generator, processes)
+    plan = run_plan(config, bundle, network, initial=initial)
+    run = TrainingRun(folder, encoder, config.schedule, generator, processes, plan)
     encoder.train()
 
     def losses() -> Losses:
@@ -85,7 +87,8 @@ def pretrain_motion(
     motion, encoder = model.motion.to(device), model.hand_encoder.to(device).eval()
     generator = torch.Generator(device)
     source = SampleSource(bundle, model.config, config.augmentation, device)
-    run = TrainingRun(folder, motion, config.schedule, generator, processes)
+    plan = run_plan(config, bundle, model.config)
+    run = TrainingRun(folder, motion, config.schedule, generator, processes, plan)
     motion.train()
 
     def losses() -> Losses:

@@ -53,8 +53,8 @@ def require_tensorboard() -> None:
     try:
         from torch.utils.tensorboard import SummaryWriter  # noqa: F401
     except ImportError as error:
-        raise OptionError("--tensorboard needs TensorBoard, which is not installed; install it with pip install "
-                          "'dro-grasp[tensorboard]', or leave the option out: log.jsonl holds the same numbers") from error
+        raise OptionError("--tensorboard needs TensorBoard, which is not installed; run pip install '.[tensorboard]' "
+                          "in the folder of the clone, or leave the option out: log.jsonl holds the same numbers") from error
 
 
 def tensorboard_report(folder: Path) -> Report:

@@ -63,9 +63,9 @@ class RunFolder:
                   file=sys.stderr)
             return None
         for name, asked in plan.items():
-            if found.get(name) != asked:
-                raise TrainingError(f"{path} belongs to a run with {name} {found.get(name)}, {asked} was asked for; use the "
-                                    "same to resume, or another folder")
+            if found.get(name, asked) != asked:  # earlier versions stored less
+                raise TrainingError(f"{path} belongs to a run with {name} {found[name]}, {asked} was asked for; use the same to "
+                                    "resume, or another folder")
         return state
 
     def misfit(self, error: Exception) -> TrainingError:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -34,7 +35,7 @@ class TrainingRun:
 
     def __init__(
         self, folder: Path, model: nn.Module, schedule: ScheduleConfig, generator: torch.Generator,
-        processes: Processes | None = None,
+        processes: Processes | None = None, plan: Mapping[str, Any] | None = None,
     ) -> None:
         """Prepare optimiser and averaged weights; nothing is read or written before `train`.
 
@@ -42,9 +43,12 @@ class TrainingRun:
             model: What is trained, on its device; parameters that require no gradient stay as they are.
             generator: Source of all random numbers of the losses, on the model's device.
             processes: Those that train together; this one alone by default.
+            plan: What determines the curve beside the schedule (see `run_plan`): a checkpoint resumes only with the same.
         """
         self.folder, self.model, self.schedule, self.generator = RunFolder(folder), model, schedule, generator
         self.processes = processes or Processes()
+        self.plan = {"steps": schedule.steps, "learning_rate": schedule.learning_rate, "seed": schedule.seed,
+                     "shards": schedule.shards, **(plan or {})}
         self.optimiser = Adam(self._trained(), lr=schedule.learning_rate)
         self.average = AveragedModel(
             model, multi_avg_fn=get_ema_multi_avg_fn(schedule.average_decay), use_buffers=True)
@@ -88,16 +92,11 @@ class TrainingRun:
         if self.processes.first:
             self.folder.write_checkpoint({
                 "step": self.step, "seconds": self.seconds, "model": self.model.state_dict(),
-                "average": self.average.state_dict(), "optimiser": self.optimiser.state_dict(), "plan": self._plan(),
+                "average": self.average.state_dict(), "optimiser": self.optimiser.state_dict(), "plan": self.plan,
             })
 
-    def _plan(self) -> dict[str, float]:
-        """What determines a run's curve, beside model and data; a checkpoint resumes only with the same."""
-        s = self.schedule
-        return {"steps": s.steps, "learning_rate": s.learning_rate, "seed": s.seed, "shards": s.shards}
-
     def _resume(self) -> None:
-        state = self.folder.read_checkpoint(self._plan()) if self.processes.first else None
+        state = self.folder.read_checkpoint(self.plan) if self.processes.first else None
         state = self.processes.from_first(state)
         if state is not None:
             try:

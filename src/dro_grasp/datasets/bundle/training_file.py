@@ -10,6 +10,8 @@ import json
 from collections import Counter
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
+from functools import cached_property
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +94,20 @@ class Bundle:
     def n_grasps(self) -> int:
         """Grasps of all hands."""
         return sum(len(g.joints) for g in self.grasps.values())
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Twelve digits that tell bundles with other hands, objects or grasps apart."""
+        digest = sha256()
+        for name, hand in self.hands.items():
+            digest.update(f"{name} {hand.sha256}".encode())
+        for name in self.objects:
+            digest.update(name.encode())
+        clouds = [tensor for cloud in self.objects.values() for tensor in (cloud.points, cloud.normals)]
+        grasps = [tensor for g in self.grasps.values() for tensor in (g.T_object_wrist, g.joints, g.object_index)]
+        for tensor in (*clouds, *grasps):
+            digest.update(tensor.cpu().contiguous().numpy().tobytes())
+        return digest.hexdigest()[:12]
 
     def summary(self) -> dict[str, Any]:
         """Counts of hands, objects and grasps."""

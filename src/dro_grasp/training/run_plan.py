@@ -1,0 +1,40 @@
+"""What determines the curve of a training run: a run folder resumes only with the same."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from dro_grasp.datasets.bundle.training_file import Bundle
+from dro_grasp.models.network import DistanceNetwork
+from dro_grasp.models.presets import NetworkConfig
+
+BOOKKEEPING = frozenset({"minutes", "device", "log_every", "checkpoint_seconds", "tensorboard"})
+"""Settings of a schedule that a resumed run may change: how long it goes on, where, and what it tells."""
+
+
+def run_plan(
+    config: Any, bundle: Bundle, network: NetworkConfig | None = None, **given: DistanceNetwork | None
+) -> dict[str, Any]:
+    """Settings, data and given weights of a run, by name; what is nested has dots in its name.
+
+    Args:
+        config: Settings of the stage, a dataclass with a `schedule`.
+        bundle: Training data, of which the content counts, not the file.
+        network: Configuration of the network in training.
+        given: Weights that the run begins with or takes parts of, by role; their names count.
+    """
+    settings = {name: value for name, value in _flat(config).items() if name.removeprefix("schedule.") not in BOOKKEEPING}
+    names = {role: None if weights is None else weights.name for role, weights in given.items()}
+    about = {} if network is None else _flat(network, "network.")
+    return {name.removeprefix("schedule."): value for name, value in settings.items()} | about | names | {
+        "bundle": bundle.fingerprint}
+
+
+def _flat(record: Any, prefix: str = "") -> dict[str, Any]:
+    """The values of a dataclass and of those in it."""
+    values: dict[str, Any] = {}
+    for field in dataclasses.fields(record):
+        value = getattr(record, field.name)
+        values |= _flat(value, f"{prefix}{field.name}.") if dataclasses.is_dataclass(value) else {f"{prefix}{field.name}": value}
+    return values
