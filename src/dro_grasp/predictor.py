@@ -171,7 +171,8 @@ class GraspPredictor:
                 refine, temperature, method.
 
         Raises:
-            OptionError: An argument is out of range, or no grasp was found.
+            ObjectError: The scene to avoid contains the object.
+            OptionError: An argument is out of range, the table is above the object, or no grasp was found.
         """
         names = {f.name for f in fields(Constraints)} & set(options)
         constraints = replace(constraints or Constraints(), **{name: options.pop(name) for name in names})
@@ -194,7 +195,7 @@ class GraspPredictor:
             progress: See `Progress`.
 
         Raises:
-            OptionError: The table is above the object, or no grasp was found.
+            OptionError: No grasp was found.
         """
         watch = Stopwatch("network", "decode", "optimise", "refine", "settle", "rank")
         pool = _Pool(problem, request, watch)
@@ -212,7 +213,7 @@ class GraspPredictor:
         count = wanted
         for _ in range(config.rounds):
             pool.add(propose(pool.problem, self.network, count, generator, config, pool.watch, progress), wanted)
-            if len(pool) >= wanted or len(pool) < config.least_yield * pool.made:
+            if len(pool) >= wanted or len(pool) <= config.least_yield * pool.made:
                 break
             lacking = (wanted - len(pool)) * pool.made / len(pool)
             count = min(wanted, math.ceil(config.reserve * lacking))

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy.optimize
 import torch
 from torch import Tensor
 
@@ -15,7 +14,7 @@ from dro_grasp.energy.grasp_energy import GraspEnergy
 from dro_grasp.energy.nearest_points import NearestPoints
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
-from dro_grasp.optimization.grip import GripConfig, contact_forces, gripping, nonnegative_least_squares
+from dro_grasp.optimization.grip import GripConfig, contact_forces, gripping
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.claw import ball, claw, grasps_of, power_grasp, wrist_below
 from tests.helpers.toy_hand import toy_hand
@@ -30,17 +29,6 @@ def contacts(*places: tuple[float, float, float], gap: float = 0.0) -> tuple[Nea
     near = NearestPoints(
         torch.arange(n), torch.zeros(1, n, dtype=torch.int64), 0.03 * outward, -outward, torch.full((1, n), gap), outward)
     return near, torch.ones(1, n, dtype=torch.bool), torch.eye(n, dtype=torch.bool)
-
-
-def test_least_squares_as_in_scipy() -> None:
-    generator = np.random.default_rng(0)
-    a, b = generator.normal(size=(20, 9, 14)), generator.normal(size=(20, 9))
-    found = nonnegative_least_squares(torch.from_numpy(a), torch.from_numpy(b), 0.01, 3000).numpy()
-    for one, matrix, target in zip(found, a, b, strict=True):
-        rows = np.concatenate([matrix, 0.1 * np.eye(14)])
-        exact = scipy.optimize.nnls(rows, np.concatenate([target, np.zeros(14)]))[0]
-        np.testing.assert_allclose(one, exact, atol=2e-3)
-    assert (found == 0).mean() > 0.2
 
 
 def test_a_thumb_presses_as_hard_as_two_fingers_against_it() -> None:

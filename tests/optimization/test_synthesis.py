@@ -15,7 +15,7 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.starts import StartConfig, starts
-from dro_grasp.optimization.synthesis import SynthesisConfig, depth, optimise, synthesize
+from dro_grasp.optimization.synthesis import SynthesisConfig, depth, descend, synthesize
 from tests.helpers.toy_hand import toy_hand
 
 SHORT = SynthesisConfig(steps=60, batch_size=32)
@@ -71,8 +71,8 @@ def test_energy_falls_and_limits_hold(ball):
     energy, surface = GraspEnergy.of_object(hand, ball, SHORT.energy, SHORT.contacts), torch.from_numpy(ball.cloud)
     generator = torch.Generator().manual_seed(0)
     start = starts(hand, energy.field, surface, energy.centre, 32, SHORT.starts, generator)
-    before = optimise(energy, *start, SynthesisConfig(steps=1), generator)
-    after = optimise(energy, *start, SHORT, generator)
+    before = descend(energy, *start, SynthesisConfig(steps=1), generator)
+    after = descend(energy, *start, SHORT, generator)
     assert after.result.total.median() < 0.4 * before.result.total.median()
     assert (after.q >= hand.tree.lower).all()
     assert (after.q <= hand.tree.upper).all()

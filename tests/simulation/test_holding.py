@@ -13,7 +13,7 @@ from dro_grasp.grasps.controller import completed
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation import holding as module
-from dro_grasp.simulation.holding import CHANGE, LENGTH, NO_ANSWER, PUSH, ContactForces, holding, unanswered
+from dro_grasp.simulation.holding import CHANGE, LEVER, NO_ANSWER, PUSH, ContactForces, holding, unanswered
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.claw import ball, claw, power_grasp
 
@@ -47,7 +47,7 @@ def plain(c: ContactForces, mass: float, friction: float) -> list[float]:
             for angle in np.arange(6) * math.pi / 3:
                 f = n + friction * (math.cos(angle) * side + math.sin(angle) * np.cross(n, side))
                 same = CHANGE * (np.arange(len(c.pressure)) == k)
-                columns.append(np.concatenate([p / (10 * mass) * np.concatenate([f, np.cross(r / LENGTH, f)]), same]))
+                columns.append(np.concatenate([p / (10 * mass) * np.concatenate([f, np.cross(r / LEVER, f)]), same]))
         goal = np.concatenate([-axis * PUSH / 10, np.zeros(3), np.full(len(c.pressure), CHANGE)])
         found.append(nnls(np.array(columns).T, goal)[1])
     return found

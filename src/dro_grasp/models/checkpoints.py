@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import torch
 from jaxtyping import Float, Num
 from safetensors import safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from dro_grasp.errors import WeightsError
@@ -109,8 +109,12 @@ def load_into(network: Network, path: Path) -> Network:
 
 
 def load_small(path: Path) -> dict[str, Float[Tensor, "..."]]:
-    """The tensors of a small network's file in single precision."""
-    return {name: value.float() for name, value in load_file(path).items()}
+    """The tensors of a small network's file in single precision.
+
+    Raises:
+        WeightsError: The file is missing, truncated or foreign.
+    """
+    return {name: value.float() for name, value in _read(path)[1].items()}
 
 
 def history_of(path: Path) -> list[dict[str, Any]]:

@@ -126,7 +126,7 @@ def synthesize_with(
     for begin in range(0, num, config.batch_size):
         size = min(config.batch_size, num - begin)
         start = starts(hand, obj.distance_field, surface, centre, size, config.starts, generator, surroundings)
-        end = optimise(energy, *start, config, generator)
+        end = descend(energy, *start, config, generator)
         parts.append([x.cpu() for x in (end.T, end.q, end.result.terms, end.result.total, depth(energy, end))])
         if progress is not None:
             progress(begin + size, num)
@@ -143,7 +143,7 @@ def depth(energy: GraspEnergy, state: State) -> Float[Tensor, " n"]:
     return -energy.field.distances(points)[0].amin(-1).clamp_max(0)
 
 
-def optimise(
+def descend(
     energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], config: SynthesisConfig,
     generator: torch.Generator,
 ) -> State:

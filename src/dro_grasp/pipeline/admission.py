@@ -76,7 +76,7 @@ def faults(problem: GraspProblem, grasps: GraspBatch, apart: bool = True) -> dic
     if constraints.cone is not None:
         found[TURNED] = ~facing(problem, grasps)
     if constraints.hold:
-        found[BESIDE] = ~holding(problem, grasps)
+        found[BESIDE] = ~holds_in_place(problem, grasps)
     if constraints.opening is not None:
         found[NARROW] = finger_gap(problem, grasps.T_object_wrist, grasps.pregrasp_joints) < constraints.opening
     return found
@@ -115,7 +115,7 @@ def clear(problem: GraspProblem, grasps: GraspBatch, surroundings: Surroundings)
     return closest > LEAST_CLEARANCE
 
 
-def holding(problem: GraspProblem, grasps: GraspBatch) -> Bool[Tensor, " n"]:
+def holds_in_place(problem: GraspProblem, grasps: GraspBatch) -> Bool[Tensor, " n"]:
     """Which grasps touch the object in the place to hold alone, with two fingers at least."""
     place, hand = problem.room.hold, problem.hand.to(problem.device)
     assert place is not None

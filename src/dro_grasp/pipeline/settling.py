@@ -11,18 +11,16 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
-from dro_grasp.geometry.rotations import roma
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.hands.hand import Hand
 from dro_grasp.optimization.refinement import RefineConfig
 from dro_grasp.pipeline.admission import permitted
-from dro_grasp.pipeline.holding_score import holding_score
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import complete, grip, refine, scored
-from dro_grasp.simulation.closed_poses import settle
+from dro_grasp.ranking.holding_score import holding_score
+from dro_grasp.simulation.closed_poses import hand_shift, settle
 from dro_grasp.simulation.contacts import deepest_penetration
 from dro_grasp.simulation.holding import Holding, holding
 
@@ -105,7 +103,7 @@ def settled(problem: GraspProblem, grasps: GraspBatch, config: SettleConfig | No
     config, hand, obj = config or SettleConfig(), problem.hand, problem.solid
     grasps = complete(problem, grasps.without("score"))
     closed = settle(hand, obj, grasps)
-    moved, _ = motion(hand, grasps, closed)
+    moved = hand_shift(hand, grasps, closed)
     still, near = moved < config.still, moved < config.lost
     again, rows = near & ~still, near.nonzero()[:, 0]
     better = replaced(closed, still, grip(problem, closed[still], config.refinement))
@@ -123,10 +121,3 @@ def replaced(grasps: GraspBatch, rows: Bool[Tensor, " n"], others: GraspBatch) -
         values[name] = getattr(grasps, name).clone()
         values[name][rows] = getattr(others, name)
     return grasps.bare().replace(**values)
-
-
-def motion(hand: Hand, before: GraspBatch, after: GraspBatch) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-    """How far the hand moved relative to the object [m], at the grasp centre, and turned [rad]."""
-    T, new = before.T_object_wrist, after.T_object_wrist
-    shift = (hand.grasp_centres(new) - hand.grasp_centres(T)).norm(dim=-1)
-    return shift, torch.as_tensor(roma.rotmat_geodesic_distance(T[:, :3, :3], new[:, :3, :3]))

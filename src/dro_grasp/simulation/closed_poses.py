@@ -44,6 +44,11 @@ def settle(
     return unsettled.replace(T_object_wrist=torch.cat(poses), joints=torch.cat(joints))
 
 
+def hand_shift(hand: Hand, before: GraspBatch, after: GraspBatch) -> Float[Tensor, " n"]:
+    """How far each hand moved relative to the object, at its grasp centre [m]."""
+    return (hand.grasp_centres(after.T_object_wrist) - hand.grasp_centres(before.T_object_wrist)).norm(dim=-1)
+
+
 def held(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *, workers: int | None = None
 ) -> GraspBatch:

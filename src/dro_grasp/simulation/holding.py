@@ -13,30 +13,35 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from dro_grasp.geometry.contact_forces import friction_cone, nonnegative_least_squares
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimization.grip import friction_cone, nonnegative_least_squares
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
 from dro_grasp.simulation.rollout import FORCES, Rollout, quiet, rollouts, scene_of
-from dro_grasp.simulation.scene import Scene
 
 CONTACTS = 16
 """Most contacts of a grasp that are weighed, those that press hardest (ours)."""
 PUSH = 5.0
 """Acceleration of the object that the contacts are asked to answer, along each axis and against it [m/s^2] (ours)."""
-FRICTION = 0.5
+FRICTION_SHARE = 0.5
 """Share of the friction that the answer may use (ours)."""
-LENGTH = 0.05
+LEVER = 0.05
 """Lever that makes a torque comparable with a force [m] (ours)."""
 CHANGE = 0.3
-"""Cost of doubling or dropping the force of a contact, beside an unanswered push of ten m/s^2 (ours)."""
+"""Cost of doubling or dropping the force of a contact, beside an unanswered push of UNIT (ours)."""
+UNIT = 10.0
+"""Acceleration of the object by which pushes and the forces of contacts are measured [m/s^2] (ours)."""
+BEARS = 0.05
+"""Normal force of a contact above which its slip counts [N] (ours)."""
+EDGES = 6
+"""Edges of a friction cone (ours)."""
 RIDGE = 1e-4
 """Weight of the squared forces in the solver (ours)."""
 STEPS = 80
 """Steps of the solver (ours)."""
 NO_ANSWER = 3.0
-"""Largest value of `unanswered`, and its value without contacts (ours)."""
+"""Largest value of `unanswered`; its value without contacts, and that of `slip` without any that bears (ours)."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +63,7 @@ class Holding:
     pressure: Float[Tensor, " n"]
     """Sum of the normal forces [N]."""
     slip: Float[Tensor, " n"]
-    """Largest ratio of tangential to normal force at a contact that bears."""
+    """Largest ratio of tangential to normal force at a contact that bears; NO_ANSWER without one."""
     unanswered: Float[Tensor, "n 2"]
     """What is missing for contacts near their present forces to answer a push: for the worst direction, and on average."""
 
@@ -79,6 +84,13 @@ class ContactForces:
     tangential: Float[np.ndarray, " k"]
     """Tangential force [N]."""
     links: int
+    """Number of links that they are on."""
+
+    @property
+    def slip(self) -> float:
+        """As in `Holding`."""
+        bears = self.pressure > BEARS
+        return float((self.tangential[bears] / self.pressure[bears]).max()) if bears.any() else NO_ANSWER
 
 
 def holding(
@@ -101,32 +113,32 @@ def holding(
     """
     scene = scene_of(hand, obj, grasps, protocol)
     parts = [Holding(**{f.name: torch.zeros(0, 2) if f.name == "unanswered" else torch.zeros(0) for f in fields(Holding)})]
-    parts += [_observed(scene, rollout) for _, rollout in rollouts(scene, hand, grasps, workers)]
+    parts += [_observed(rollout) for _, rollout in rollouts(scene, hand, grasps, workers)]
     return Holding(**{f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Holding)})
 
 
-def _observed(scene: Scene, rollout: Rollout) -> Holding:
+def _observed(rollout: Rollout) -> Holding:
     """Close the hands of a rollout."""
-    closed = rollout.close()
+    scene, closed = rollout.scene, rollout.close()
     first = int(scene.model.body_dofadr[scene.object_body])
     velocity = np.nan_to_num(np.array(rollout.batch.bind("qvel"))[:, first:first + 6])
-    found = _contacts(scene, rollout)
-    bearing = [c.tangential[c.pressure > 0.05] / c.pressure[c.pressure > 0.05] for c in found]
+    found = _contacts(rollout)
     columns = {
         "shift": closed.shift(rollout.start), "turn": closed.turn(rollout.start),
         "speed": np.linalg.norm(velocity[:, :3], axis=1), "spin": np.linalg.norm(velocity[:, 3:], axis=1),
         "contacts": [len(c.pressure) for c in found], "links": [c.links for c in found],
         "pressure": [c.pressure.sum() for c in found],
-        "slip": [ratio.max(initial=0.0) if len(ratio) else NO_ANSWER for ratio in bearing],
+        "slip": [c.slip for c in found],
     }
-    friction = FRICTION * rollout.scene.protocol.friction
+    friction = FRICTION_SHARE * scene.protocol.friction
     values = {name: torch.as_tensor(np.array(column), dtype=torch.float32) for name, column in columns.items()}
     return Holding(**values, unanswered=unanswered(found, torch.as_tensor(rollout.mass, dtype=torch.float32), friction))
 
 
-def _contacts(scene: Scene, rollout: Rollout) -> list[ContactForces]:
+def _contacts(rollout: Rollout) -> list[ContactForces]:
     """The contacts with the object in each simulation, with the forces that they bear now."""
-    model, data, force = scene.model, mujoco.MjData(scene.model), np.zeros(6)
+    scene, force = rollout.scene, np.zeros(6)
+    model, data = scene.model, mujoco.MjData(scene.model)
     names = ("qpos", "qvel", "ctrl", "qacc_warmstart")
     state = {name: np.nan_to_num(np.array(rollout.batch.bind(name))) for name in names}
     found = []
@@ -155,7 +167,7 @@ def unanswered(contacts: list[ContactForces], mass: Float[Tensor, " n"], frictio
     Each contact may change its force within its friction cone; a change relative to its present pressure costs as much as a
     share of the push that stays unanswered.
     """
-    n, edges = len(contacts), 6
+    n = len(contacts)
     normal, arm = torch.zeros(n, CONTACTS, 3), torch.zeros(n, CONTACTS, 3)
     normal[..., 2], pressure = 1.0, torch.zeros(n, CONTACTS)
     for i, c in enumerate(contacts):
@@ -163,12 +175,12 @@ def unanswered(contacts: list[ContactForces], mass: Float[Tensor, " n"], frictio
         for table, values in ((normal, c.normal), (arm, c.arm), (pressure, c.pressure)):
             table[i, :len(kept)] = torch.as_tensor(values[kept], dtype=torch.float32)
     on = (pressure > 0).float()
-    cone = friction_cone(normal, friction, edges)
-    scale = (pressure / (10 * mass[:, None]))[..., None, None]
-    wrench = torch.cat([cone, torch.linalg.cross(arm[..., None, :].expand_as(cone) / LENGTH, cone)], -1) * scale
-    same = CHANGE * torch.eye(CONTACTS).repeat_interleave(edges, 1) * on.repeat_interleave(edges, 1)[:, None]
+    cone = friction_cone(normal, friction, EDGES)
+    scale = (pressure / (UNIT * mass[:, None]))[..., None, None]
+    wrench = torch.cat([cone, torch.linalg.cross(arm[..., None, :].expand_as(cone) / LEVER, cone)], -1) * scale
+    same = CHANGE * torch.eye(CONTACTS).repeat_interleave(EDGES, 1) * on.repeat_interleave(EDGES, 1)[:, None]
     matrix = torch.cat([wrench.flatten(1, 2).mT, same], 1)
-    push = torch.as_tensor(FORCES, dtype=torch.float32) * PUSH / 10
+    push = torch.as_tensor(FORCES, dtype=torch.float32) * PUSH / UNIT
     answer = torch.cat([-push, torch.zeros(6, 3)], 1).expand(n, 6, 6)
     goal = torch.cat([answer, (CHANGE * on)[:, None].expand(n, 6, CONTACTS)], -1).flatten(0, 1)
     matrix = matrix.repeat_interleave(6, 0)

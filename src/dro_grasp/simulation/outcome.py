@@ -45,10 +45,10 @@ class TrialResult:
 
     success: Bool[Tensor, " n"]
     displacement: Float[Tensor, "n 6"]
-    """Displacement of the object's centre of mass after each force, relative to its place after closing [m]; a lost
-    object keeps its last value."""
+    """Displacement of the object's centre of mass after each force, relative to its place after closing, or to that in the
+    labelled grasp under a protocol that resets it [m]; a lost object keeps its last value."""
     rotation: Float[Tensor, "n 6"]
-    """Rotation of the object after each force, relative to its orientation after closing [rad]; likewise."""
+    """Rotation of the object after each force, likewise [rad]."""
     closing_shift: Float[Tensor, " n"]
     """Displacement of the object while the hand closes [m]."""
     closing_rotation: Float[Tensor, " n"]

@@ -21,7 +21,7 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
-from dro_grasp.simulation.closed_poses import settle
+from dro_grasp.simulation.closed_poses import hand_shift, settle
 from dro_grasp.simulation.trial import simulate
 
 LOOSE = "held by too few links"
@@ -154,7 +154,7 @@ def valid_grasps(
     made = Yield(candidates=count, ranked_out=count - len(ranked), deep=len(ranked) - len(grasps))
     if config.settle and len(grasps):
         closed = settle(hand, obj, grasps, config.protocol, workers=1)
-        shift = (hand.grasp_centres(closed.T_object_wrist) - hand.grasp_centres(grasps.T_object_wrist)).norm(dim=-1)
+        shift = hand_shift(hand, grasps, closed)
         made = dataclasses.replace(made, moved=int((shift >= config.max_shift).sum()))
         grasps = closed[shift < config.max_shift]
     trial = simulate(hand, obj, grasps, config.protocol, workers=1)

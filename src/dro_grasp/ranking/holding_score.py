@@ -7,13 +7,18 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from dro_grasp.errors import WeightsError
+from dro_grasp.files import reading
 from dro_grasp.models.checkpoints import SHIPPED_FOLDER, load_small
-from dro_grasp.simulation.holding import Holding
+
+if TYPE_CHECKING:
+    from dro_grasp.simulation.holding import Holding
 
 SHIPPED = SHIPPED_FOLDER / "ranking" / "holding.safetensors"
 """The model that ships."""
@@ -78,8 +83,9 @@ def load_holding_score(path: Path) -> HoldingScore:
         WeightsError: There is no such file, or it is no such model.
     """
     tensors = load_small(path)
-    model = HoldingScore(len(tensors["layers.2.bias"]), len(tensors["layers.0.bias"]))
-    model.load_state_dict(tensors)
+    with reading(path, WeightsError, "a score of settled grasps; train it again (scripts/train_holding_score.py)"):
+        model = HoldingScore(len(tensors["layers.2.bias"]), len(tensors["layers.0.bias"]))
+        model.load_state_dict(tensors)
     return model.eval().requires_grad_(False)
 
 

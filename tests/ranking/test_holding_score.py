@@ -8,10 +8,10 @@ import torch
 from dro_grasp.evaluation.metrics import roc_area
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import synthesize
-from dro_grasp.pipeline.holding_score import FEATURES, holding_features, holding_score
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.settling import settled
 from dro_grasp.pipeline.stages import refine, scored
+from dro_grasp.ranking.holding_score import FEATURES, holding_features, holding_score
 from dro_grasp.simulation.holding import Holding
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.loaded_hands import loaded_hand
