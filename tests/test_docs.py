@@ -64,7 +64,7 @@ def test_commands_are_understood(command: str) -> None:
         assert (ROOT / words[0]).stat().st_mode & 0o100, "not executable"
         assert variables.keys() <= set(re.findall(r"^#   ([A-Z]+) ", (ROOT / words[0]).read_text(), re.MULTILINE))
     else:
-        assert words[0] in {"git", "cd", "pip"}, command
+        assert words[0] in {"git", "cd", "pip", "source"}, command
 
 
 def assert_folders_exist(command: object) -> None:
@@ -119,7 +119,7 @@ def test_json_example_has_the_keys_of_generate() -> None:
     source = (ROOT / "src" / "dro_grasp" / "cli" / "generate.py").read_text()
     assert all(f'"{key}":' in source for key in example)
     assert list(example["seconds"]) == [
-        "start", "load", "network", "decode", "optimise", "refine", "rank", "trial", "files", "total"]
+        "start", "load", "network", "decode", "optimise", "refine", "settle", "rank", "trial", "files", "total"]
 
 
 @pytest.mark.parametrize(("document", "key"), [("export.md", "T_frame_object"), ("own-object.md", "T_frame_camera")])

@@ -95,5 +95,5 @@ def test_without_the_extra_it_says_what_to_install(
 ) -> None:
     monkeypatch.setattr(extra, "find_spec", lambda name: None)
     assert lifted() == 2
-    assert "pip install 'dro-grasp[arm]'" in capsys.readouterr().err
+    assert "pip install '.[arm]' in the folder of the clone" in capsys.readouterr().err
     assert not done

@@ -21,8 +21,8 @@ import trimesh
 import dro_grasp as dro
 from tests.helpers.weights import untrained_weights
 
-pytest.importorskip("fastapi", reason="needs the extra [serve]: pip install 'dro-grasp[serve]'")
-pytest.importorskip("uvicorn", reason="needs the extra [serve]: pip install 'dro-grasp[serve]'")
+pytest.importorskip("fastapi", reason="needs the extra [serve]: pip install '.[serve]'")
+pytest.importorskip("uvicorn", reason="needs the extra [serve]: pip install '.[serve]'")
 
 pytestmark = pytest.mark.slow
 

@@ -18,4 +18,4 @@ def require_arm_extra() -> None:
     """
     if missing := [name for name in PACKAGES if find_spec(name) is None]:
         raise OptionError(f"planning needs packages that are not installed: {', '.join(missing)}; run "
-                          "pip install 'dro-grasp[arm]'")
+                          "pip install '.[arm]' in the folder of the clone")

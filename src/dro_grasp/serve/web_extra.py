@@ -18,4 +18,4 @@ def require_serve_extra() -> None:
     """
     if missing := [name for name in PACKAGES if find_spec(name) is None]:
         raise OptionError(f"serving needs packages that are not installed: {', '.join(missing)}; run "
-                          "pip install 'dro-grasp[serve]'")
+                          "pip install '.[serve]' in the folder of the clone")
