@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from dro_grasp import predictor as predictor_module
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
@@ -70,6 +71,16 @@ def test_grasps_do_not_depend_on_the_batch_size(
     other = GraspPredictor(weights, config=config).predict(HAND, ball, num=7, seed=3, candidates=1, method="network")
     for name in ("T_object_wrist", "joints", "pregrasp_joints", "squeeze_joints", "score"):
         torch.testing.assert_close(getattr(other, name), getattr(grasps, name), atol=1e-4, rtol=1e-4)
+
+
+def test_nothing_is_found_where_constraints_reject_everything(
+    weights: str, ball: ObjectModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also with a share of zero, below which no share is."""
+    monkeypatch.setattr(predictor_module, "permitted", lambda problem, grasps: torch.zeros(len(grasps), dtype=torch.bool))
+    strict = GraspPredictor(weights, config=PredictorConfig(least_yield=0.0))
+    with pytest.raises(OptionError, match="only 0 of 2 candidates"):
+        strict.predict(HAND, ball, num=2, candidates=1, method="network", table=-0.2)
 
 
 def test_grasps_are_complete_valid_and_sorted(

@@ -90,7 +90,7 @@ class PredictorConfig(ProposalConfig):
     rounds: int = 4
     """How often at most the network is asked again when constraints reject candidates."""
     least_yield: float = 0.2
-    """Share of the candidates below which it is not asked again."""
+    """Share of the candidates up to which it is not asked again."""
     reserve: float = 1.5
     """How many times as many candidates it is asked for again as the share that was rejected suggests."""
 

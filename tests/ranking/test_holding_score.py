@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 
+from dro_grasp.errors import WeightsError
 from dro_grasp.evaluation.metrics import roc_area
+from dro_grasp.models.checkpoints import save_weights
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import synthesize
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.settling import settled
 from dro_grasp.pipeline.stages import refine, scored
-from dro_grasp.ranking.holding_score import FEATURES, holding_features, holding_score
+from dro_grasp.ranking.holding_score import FEATURES, SHIPPED, holding_features, holding_score, load_holding_score
 from dro_grasp.simulation.holding import Holding
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.loaded_hands import loaded_hand
@@ -39,6 +43,17 @@ def test_the_ranking_networks_score_counts() -> None:
     low, high = (float(holding_score(torch.tensor([s]), held())) for s in (-2.0, 2.0))
     assert low < high - 0.5
     assert holding_features(torch.tensor([1.0]), held()).shape == (1, FEATURES)
+
+
+@pytest.mark.parametrize("content", ["missing", "cut short", "another network"])
+def test_a_file_that_holds_no_such_score_is_refused(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "score.safetensors"
+    if content == "cut short":
+        path.write_bytes(SHIPPED.read_bytes()[:200])
+    elif content == "another network":
+        save_weights(torch.nn.Linear(2, 1), path)
+    with pytest.raises(WeightsError, match=r"score.safetensors cannot be read"):
+        load_holding_score(path)
 
 
 @pytest.mark.slow

@@ -8,6 +8,8 @@ import mujoco
 from jaxtyping import Float
 from torch import Tensor
 
+from dro_grasp.descriptions.collision import collide
+
 if TYPE_CHECKING:
     from dro_grasp.descriptions.loader import Description
 
@@ -24,9 +26,7 @@ def self_penetration(description: Description, q: Float[Tensor, " n_dof"]) -> di
     angles = (tree.coupling @ q.double().to(tree.coupling) + tree.offset).tolist()
     for name, angle in zip(tree.moving_names, angles, strict=True):
         data.qpos[model.joint(name).qposadr[0]] = angle
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    mujoco.mj_collision(model, data)
+    collide(model, data)
     depths: dict[tuple[str, str], float] = {}
     for contact in data.contact:
         first, second = sorted(int(model.geom_bodyid[g]) for g in contact.geom)

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
+from dro_grasp.descriptions.collision import collide
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.robot_file import Table
@@ -135,9 +136,7 @@ class CollisionChecker:
         if self._target_qpos.stop:
             T = self.T_world_target if moved is None else moved @ self.T_world_target
             data.qpos[self._target_qpos] = self._standing if moved is None else [*T[:3, 3], *wxyz(T[:3, :3])]
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_collision(model, data)
+        collide(model, data)
         return data.contact.geom.copy(), data.contact.dist.copy()
 
     def _bad(
@@ -180,9 +179,7 @@ def exclude_constant_contacts(scene: mujoco.MjSpec, robot: Robot) -> tuple[tuple
     count: dict[tuple[str, str], int] = {}
     for i, q in enumerate([robot.home, *draws]):
         data.qpos[arm], data.qpos[hand] = q, opened
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_collision(model, data)
+        collide(model, data)
         touching = data.contact.geom[data.contact.dist < 0].tolist()
         for pair in {_robot_pair(model, a, b) for a, b in touching}:
             if pair is not None and pair[0] != pair[1]:

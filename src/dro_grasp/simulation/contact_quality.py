@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from dro_grasp.descriptions.collision import collide
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
@@ -107,9 +108,7 @@ def _near_contacts(scene: Scene, grasps: GraspBatch) -> list[_Contacts]:
     data, found = mujoco.MjData(model), []
     for q in scene.qpos(grasps.T_object_wrist, grasps.joints):
         data.qpos[:] = np.nan_to_num(q)
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_collision(model, data)
+        collide(model, data)
         bodies = model.geom_bodyid[data.contact.geom].reshape(-1, 2)
         found.append(_Contacts(bodies, data.contact.dist.copy(), data.contact.pos.copy(), data.contact.frame[:, :3].copy()))
     return found

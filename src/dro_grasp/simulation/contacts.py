@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dro_grasp.descriptions.collision import collide
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
@@ -103,7 +104,5 @@ def _contacts(
     data = mujoco.MjData(scene.model)
     for q in qpos:
         data.qpos[:] = np.nan_to_num(q)
-        mujoco.mj_kinematics(scene.model, data)
-        mujoco.mj_comPos(scene.model, data)
-        mujoco.mj_collision(scene.model, data)
+        collide(scene.model, data)
         yield scene.model.geom_bodyid[data.contact.geom].reshape(-1, 2), data.contact.dist.copy()

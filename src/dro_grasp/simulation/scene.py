@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from dro_grasp.descriptions.collision import collide
 from dro_grasp.errors import HandError, ObjectError
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.hands.hand import Hand
@@ -253,9 +254,7 @@ def _exclude_resting_contacts(scene: mujoco.MjSpec, hand: Hand) -> None:
     for openness in (0.75, 1.0):
         q = hand.canonical_joints(openness)
         data.qpos[addresses] = (hand.tree.coupling @ q + hand.tree.offset).numpy()[moving]
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_collision(model, data)
+        collide(model, data)
         pairs |= {_pair(model, int(a), int(b)) for a, b in data.contact.geom}
     for body in range(1, model.nbody):
         parent = int(model.body_parentid[body])
