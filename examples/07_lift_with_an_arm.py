@@ -1,4 +1,4 @@
-"""Plan a lift with an arm, and send it to a robot: here a fake one that listens at a socket. Needs `dro-grasp[arm]`."""
+"""Plan a lift with an arm, and send it to a robot: here a fake one that listens at a socket. Needs the extra `arm`."""
 
 import json
 import socket

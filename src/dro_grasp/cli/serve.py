@@ -15,7 +15,7 @@ TOKEN = "DRO_GRASP_TOKEN"
 
 @dataclass(frozen=True)
 class Serve:
-    """Answer requests for grasps over HTTP, without the seconds that every start costs. Needs `dro-grasp[serve]`.
+    """Answer requests for grasps over HTTP, without the seconds that every start costs. Needs the extra `serve`.
 
     Example: dro-grasp serve --hand my_hand.urdf --port 8090
     """
