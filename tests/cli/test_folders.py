@@ -12,11 +12,13 @@ from PIL import Image
 from dro_grasp.baselines.controls import palm_facing_starts
 from dro_grasp.cli.main import main
 from dro_grasp.errors import GraspFileError
+from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.reading import load_grasps
 from dro_grasp.grasps.sources import with_own_files
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.viewer.pictures import CAPTION, HEADER, TILE
+from dro_grasp.viewer.shelf import Shelf
 from dro_grasp.viewer.studio import StudioServer
 from tests.helpers.browser import free_port
 from tests.helpers.served_studio import visited
@@ -90,6 +92,36 @@ def test_objects_of_the_same_name_are_told_apart(tmp_path: Path) -> None:
     grasps = load_grasps(tmp_path)
     assert dict(zip(grasps.object, grasps.object_sha256, strict=True)) == expected
     assert main(["evaluate", str(tmp_path)]) == 0
+
+
+def test_objects_of_one_name_in_one_file_are_told_apart_by_every_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hand, batches, objects = load_hand("gripper3"), [], []
+    for folder, side, num in (("003", 0.05, 1), ("004", 0.06, 2)):
+        (tmp_path / folder).mkdir()
+        trimesh.creation.box((side, side, 0.08)).export(tmp_path / folder / "textured.obj")
+        obj = load_object(tmp_path / folder / "textured.obj")
+        batches.append(with_own_files(palm_facing_starts(hand, obj, num=num, seed=0), hand, obj))
+        objects.append(obj)
+    file, sheet = tmp_path / "both.parquet", tmp_path / "sheet.png"
+    GraspBatch.concatenate(batches).save(file)
+    assert main(["evaluate", str(file), "--json"]) == 0
+    said = capsys.readouterr()
+    assert "were made for another" not in said.err
+    assert {name: entry["num"] for name, entry in json.loads(said.out)["objects"].items()} == {"textured": 1, "textured (2)": 2}
+    assert main(["export", str(file), "--format", "csv", "--output", str(tmp_path / "out")]) == 0
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["textured (2).csv", "textured.csv"]
+    drawn: list[list[tuple[str, int]]] = []
+    monkeypatch.setattr("dro_grasp.viewer.pictures.draw_sheet", lambda hand, pairs, *_: drawn.append(
+        [(obj.sha256, len(own)) for obj, own in pairs]))
+    for more in ([], ["--object", "textured (2)"]):
+        assert main(["picture", str(file), "--output", str(sheet), *more]) == 0
+    assert drawn == [[(objects[0].sha256, 1), (objects[1].sha256, 2)], [(objects[1].sha256, 2)]]
+    shelf = Shelf()
+    shelf.put(hand, GraspBatch.load(file))
+    assert [shelf.obj(name).sha256 for name in ("textured", "textured (2)")] == [obj.sha256 for obj in objects]
+    shelf.close()
 
 
 def test_folders_of_several_hands_or_of_no_grasp_are_refused(folder: Path, tmp_path: Path) -> None:

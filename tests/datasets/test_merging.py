@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from dro_grasp.cli.main import main
-from dro_grasp.datasets.collections.collection import read_collection
+from dro_grasp.datasets.collections.collection import count_collection, read_collection
 from dro_grasp.datasets.collections.merging import ANGLE_STEP, POSITION_STEP, Merged, compact, file_name, merge, spread
 from dro_grasp.datasets.engine.shards import Shard, Yield, notes_of
 from dro_grasp.errors import GraspFileError
@@ -139,14 +139,29 @@ def test_the_choice_covers_the_sphere_better_than_chance(hand):
     assert spread(hand, grasps, 400).tolist() == list(range(400))
 
 
-def test_versions_are_not_mixed(hand, tmp_path):
+def test_what_has_one_name_and_differs_is_not_mixed(hand, tmp_path):
     tried(hand, "sphere", 3, 0).save(tmp_path / "a.parquet")
-    tried(hand, "sphere", 3, 1).replace(object_sha256=("new",) * 3).save(tmp_path / "b.parquet")
-    with pytest.raises(GraspFileError, match="different versions of object 'sphere'"):
+    other = tried(hand, "sphere", 3, 1).replace(object_sha256=("new",) * 3)
+    other.save(tmp_path / "b.parquet")
+    reason = r"object 'sphere' .* not the same everywhere .*hashes new, sphere.*: another object of this name, or another "
+    with pytest.raises(GraspFileError, match=reason):
         list(merge([tmp_path / "a.parquet", tmp_path / "b.parquet"]))
+    GraspBatch.concatenate([tried(hand, "sphere", 3, 0), other]).save(tmp_path / "both.parquet")
+    with pytest.raises(GraspFileError, match=reason):
+        list(merge([tmp_path / "both.parquet"]))
     tried(hand, "can", 3, 1).replace(hand_sha256="new").save(tmp_path / "c.parquet")
-    with pytest.raises(GraspFileError, match="different versions of hand 'gripper3'"):
+    with pytest.raises(GraspFileError, match=r"hand 'gripper3' .*: another hand of this name, or another version"):
         list(merge([tmp_path / "a.parquet", tmp_path / "c.parquet"]))
+
+
+def test_objects_of_one_name_are_counted_apart_in_a_file_and_together_in_a_folder(hand, tmp_path):
+    first, other = tried(hand, "sphere", 3, 0), tried(hand, "sphere", 2, 1).replace(object_sha256=("new",) * 2)
+    for name, batch in (("a", first), ("b", other)):
+        (tmp_path / "folder").mkdir(exist_ok=True)
+        batch.save(tmp_path / "folder" / f"{name}.parquet")
+    assert count_collection(tmp_path / "folder") == {"gripper3": {"sphere": 5}}
+    GraspBatch.concatenate([first, other]).save(tmp_path / "both.parquet")
+    assert count_collection(tmp_path / "both.parquet") == {"gripper3": {"sphere": 3, "sphere (2)": 2}}
 
 
 def test_files_are_named_after_hands():

@@ -201,6 +201,17 @@ def test_grasps_come_apart_by_object_in_their_order():
     assert list(make(0).by_object()) == []
 
 
+def test_objects_of_one_name_come_apart_by_their_hashes():
+    other, third = (SimpleNamespace(name="ball", sha256=h * 64, split=None) for h in "de")
+    named = SimpleNamespace(name="ball (2)", sha256="f" * 64, split=None)
+    unknown = SimpleNamespace(name="ball", sha256="", split=None)
+    mixed = GraspBatch.concatenate([
+        make(1, obj=obj, seed=i) for i, obj in enumerate((unknown, BALL, other, named, third, BALL, other))])
+    assert [(label, part.seed.tolist()) for label, part in mixed.by_object()] == [
+        ("ball", [0, 1, 5]), ("ball (3)", [2, 6]), ("ball (2)", [3]), ("ball (4)", [4])]
+    assert [label for label, _ in make(2, obj=unknown).by_object()] == ["ball"]
+
+
 def test_closing_is_stated_by_a_pregrasp_and_a_squeeze():
     rows = torch.zeros(4, 2)
     pregrasps, squeezes = rows.clone(), rows.clone()

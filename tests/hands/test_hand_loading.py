@@ -12,7 +12,7 @@ import torch
 import trimesh
 
 import dro_grasp as dro
-from dro_grasp.errors import HandError
+from dro_grasp.errors import HandError, OptionError
 from tests.helpers.claw_urdf import LIMIT, claw, joint, link, meshed, written
 
 
@@ -187,3 +187,17 @@ def test_a_description_that_cannot_be_fetched_is_told(monkeypatch: pytest.Monkey
     monkeypatch.setattr("dro_grasp.hands.library.importlib.import_module", fail)
     with pytest.raises(HandError, match=r"could not fetch 'panda' .*could not resolve host.*connect to the network"):
         dro.load_hand("panda")
+
+
+@pytest.mark.parametrize("n_points", [0, -1, 11, 1537, 100_000])
+def test_numbers_of_points_that_a_hand_cannot_have_are_refused(tmp_path: Path, n_points: int) -> None:
+    path = written(tmp_path, claw())
+    with pytest.raises(OptionError, match=f"n_points is {n_points}; give an integer from 12 to 1536"):
+        dro.load_hand(path, n_points=n_points)
+
+
+@pytest.mark.parametrize("n_points", [12, 1536])
+def test_numbers_of_points_at_both_ends_give_a_hand_with_fingertips(tmp_path: Path, n_points: int) -> None:
+    hand = dro.load_hand(written(tmp_path, claw()), n_points=n_points)
+    assert hand.n_points == n_points
+    assert all(bool((hand.link_index == tip).any()) for tip in hand.tips)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -76,3 +77,47 @@ def test_a_table_above_the_object_is_refused() -> None:
         GraspProblem(loaded_hand("gripper3"), SOAP, constraints=Constraints(table=0.1))
     with pytest.raises(OptionError, match="table is nan"):
         Constraints(table=math.nan)
+
+
+def given(**values: object) -> Constraints:
+    """Constraints as a user's program makes them, without the check of annotations that tests install."""
+    made = object.__new__(Constraints)
+    for field in dataclasses.fields(Constraints):
+        object.__setattr__(made, field.name, values.get(field.name, field.default))
+    made.__post_init__()
+    return made
+
+
+def test_vectors_of_any_kind_become_plain_numbers() -> None:
+    plain = Constraints((0.0, 0.0, -1.0), hold=((0.0, 0.0, 0.1, 0.03),), spare=((0.1, 0.0, 0.0, 0.02),))
+    for make in (np.array, torch.tensor, list):
+        made = given(direction=make([0, 0, -1]), hold=make([[0.0, 0.0, 0.1, 0.03]]), spare=make([[0.1, 0.0, 0.0, 0.02]]))
+        numbers = [*made.direction, *(number for ball in (*made.hold, *made.spare) for number in ball)]
+        assert all(type(number) is float for number in numbers)
+        if make is not torch.tensor:  # which rounds to single precision
+            assert repr(made) == repr(plain)
+            assert made == plain
+        assert made != Constraints()
+        assert len({made, Constraints()}) == 2
+    for nothing in ([], np.zeros((0, 4))):
+        assert given(hold=nothing, spare=nothing) == Constraints()
+
+
+@pytest.mark.parametrize("direction", [(0, -1), (0, 0, -1, 0), (), 3.0, "up", (0, 0, "x"), np.eye(3), torch.eye(3)])
+def test_a_direction_that_is_no_vector_is_refused(direction: object) -> None:
+    with pytest.raises(OptionError, match=r"direction is .*; give three numbers, .*--direction 0 0 -1"):
+        given(direction=direction)
+
+
+@pytest.mark.parametrize("direction", [(0, 0, 0), np.zeros(3), (0, math.nan, 1), torch.tensor([0, 0, math.inf])])
+def test_a_vector_without_a_direction_is_refused(direction: object) -> None:
+    with pytest.raises(OptionError, match=r"direction \(0.0, .* has no direction"):
+        given(direction=direction)
+
+
+@pytest.mark.parametrize("name", ["hold", "spare"])
+@pytest.mark.parametrize("balls", [
+    (0, 0, 0.1, 0.03), 1.0, np.zeros(4), [(0, 0, "x", 1)], ["ball"], [(0, 0, 0.1)], [(0, 0, math.nan, 1)], [(0, 0, 0, 0)]])
+def test_balls_that_are_none_are_refused(name: str, balls: object) -> None:
+    with pytest.raises(OptionError, match=f"{name} .*; give .*x, y, z and a radius above 0 in metres, .*--{name} 0 0 0.1"):
+        given(**{name: balls})

@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 import io
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -16,6 +18,7 @@ import yaml
 
 import dro_grasp as dro
 from dro_grasp.cli.main import main
+from dro_grasp.errors import PlanError
 from dro_grasp.planning import extra
 from dro_grasp.planning.collisions import CollisionChecker
 from dro_grasp.planning.inverse_kinematics import WristSolver
@@ -176,8 +179,27 @@ def test_a_plan_file_gives_the_plan_back_and_other_files_are_refused(planned: Mo
     (tmp_path / "half.npz").write_bytes(path.read_bytes()[:5000])
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     for name in ("half.npz", "other.npz", "none.npz"):
-        with pytest.raises(dro.DroGraspError, match=f"{name} is no plan file"):
+        with pytest.raises(PlanError, match=f"{name} cannot be read .* expected a plan file"):
             MotionPlan.load(tmp_path / name)
+
+
+@pytest.mark.parametrize(("change", "told"), [
+    (lambda header: [], "cannot be read .*expected a plan file"), (lambda header: 3, "cannot be read .*expected a plan file"),
+    (lambda header: {k: v for k, v in header.items() if k != "arm_joints"}, "'arm_joints'"),
+    (lambda header: {k: v for k, v in header.items() if k != "seed"}, "'seed'"),
+    (lambda header: header | {"unknown": 1}, "'unknown'"), (lambda header: header | {"hand_joints": 3}, "'int'"),
+    (lambda header: header | {"format_version": 1}, "another version; plan again"), (lambda header: {}, "another version"),
+], ids=str)
+def test_a_plan_file_with_another_header_is_refused(
+    planned: MotionPlan, tmp_path: Path, change: Callable[[dict[str, Any]], Any], told: str
+) -> None:
+    planned.save(tmp_path / "plan.npz")
+    with np.load(tmp_path / "plan.npz") as file:
+        arrays = dict(file)
+    arrays["header"] = np.array(json.dumps(change(json.loads(str(arrays["header"])))))
+    np.savez(tmp_path / "changed.npz", **arrays)
+    with pytest.raises(PlanError, match=rf"changed\.npz .*{told}"):
+        MotionPlan.load(tmp_path / "changed.npz")
 
 
 def test_drivers_get_every_target_and_controllers_the_same_motion(planned: MotionPlan) -> None:
@@ -306,7 +328,7 @@ def test_without_the_extra_planning_says_what_to_install(
 ) -> None:
     monkeypatch.setattr(extra, "find_spec", lambda name: None if name == "ompl" else object())
     assert main(["plan", "--robot", "xarm7_leaphand", "--object", "can"]) == 2
-    assert "ompl; run pip install 'dro-grasp[arm]'" in capsys.readouterr().err
+    assert "ompl; run pip install '.[arm]' in the folder of the clone" in capsys.readouterr().err
 
 
 def test_every_other_command_works_without_the_extra() -> None:

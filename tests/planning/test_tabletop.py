@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
 
 import dro_grasp as dro
 from dro_grasp.cli.main import main
+from dro_grasp.errors import OptionError
 from dro_grasp.perception.scan import depth_points
 from dro_grasp.planning import tabletop
 from dro_grasp.planning.animation import Recorder, draw_animation
@@ -154,6 +156,32 @@ def test_attempts_are_stored_and_not_repeated(tmp_path: Path, monkeypatch: pytes
     (tmp_path / "other.parquet").write_bytes(b"not this")
     with pytest.raises(dro.DroGraspError, match="holds no attempts"):
         run_tabletop(run, tmp_path / "other.parquet")
+
+
+def test_two_objects_of_one_name_are_refused_and_one_object_counts_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ended(robot: dro.Robot, obj: dro.ObjectModel, number: int, seed: int, *others: object) -> Attempt:
+        return Attempt(robot.name, obj.name, number, seed, QUICK.label(), True, "done")
+
+    monkeypatch.setattr(tabletop, "attempt", ended)
+    for folder, side in (("003", 0.05), ("004", 0.06)):
+        (tmp_path / folder).mkdir()
+        trimesh.creation.box((side, side, 0.08)).export(tmp_path / folder / "textured.obj")
+    box, other = (str(tmp_path / folder / "textured.obj") for folder in ("003", "004"))
+    output = tmp_path / "results.parquet"
+    refusal = rf"'{box}' and '{other}' are different objects of the name 'textured'.*rename one"
+    with pytest.raises(OptionError, match=refusal):
+        run_tabletop(TabletopRun("xarm7_leaphand", (box, other), attempts=1, config=QUICK), output)
+    assert not output.exists()
+    again = str(tmp_path / "004" / ".." / "003" / "textured.obj")
+    (done,) = run_tabletop(TabletopRun("xarm7_leaphand", (box, again), attempts=1, config=QUICK), output)
+    assert (done.object, done.object_file) == ("textured", box)
+    with pytest.raises(OptionError, match=rf"'{other}' and '{box}' are different .*--output"):
+        run_tabletop(TabletopRun("xarm7_leaphand", (other,), attempts=1, config=QUICK), output)
+    (tmp_path / "003" / "textured.obj").unlink()
+    (kept,) = run_tabletop(TabletopRun("xarm7_leaphand", (other,), attempts=1, config=QUICK), output)
+    assert kept.object_file == box, "nobody can tell any more"
 
 
 def test_the_command_prints_rates_and_refuses_what_cannot_be(

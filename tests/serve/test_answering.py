@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,11 @@ import torch
 import trimesh
 
 import dro_grasp as dro
+from dro_grasp.errors import OptionError
+from tests.helpers.claw_urdf import claw, written
 from tests.helpers.weights import untrained_weights
 
-pytest.importorskip("pydantic", reason="needs the extra [serve]: pip install 'dro-grasp[serve]'")
+pytest.importorskip("pydantic", reason="needs the extra [serve]: pip install '.[serve]'")
 
 from dro_grasp.serve.answering import Answerer, Kept, Stock
 from dro_grasp.serve.client import sent_file
@@ -83,6 +86,21 @@ def test_what_was_sent_or_named_once_stays_loaded(answerer: Answerer) -> None:
     assert answerer.hand("gripper3") is answerer.hand("gripper3")
     assert answerer.hand("barrett") is answerer.hand("barrett")
     assert "own_tube" in answerer.object_names()
+
+
+def test_hands_and_objects_that_could_not_be_told_apart_are_refused(tmp_path: Path) -> None:
+    weights = str(untrained_weights(tmp_path))
+    for folder in ("003", "004"):
+        (tmp_path / folder).mkdir()
+        TUBE.export(tmp_path / folder / "textured.stl")
+        written(tmp_path / folder, claw())
+    first, second = (str(tmp_path / folder / "textured.stl") for folder in ("003", "004"))
+    with pytest.raises(OptionError, match=f"objects '{first}' and '{second}' .* by the name 'textured'; rename one"):
+        Answerer(Stock(weights, objects=(first, second)))
+    with pytest.raises(OptionError, match=r"hands '.*003/claw.urdf' and '.*004/claw.urdf' .* by the name 'claw'; rename one"):
+        Answerer(Stock(weights, hands=tuple(str(tmp_path / folder / "claw.urdf") for folder in ("003", "004"))))
+    once = Answerer(Stock(weights, hands=("gripper3", "gripper3"), objects=(first, str(tmp_path / "003"))))
+    assert (list(once.own_hands), list(once.own_objects)) == (["gripper3"], ["textured"])
 
 
 def test_only_the_values_used_last_are_kept() -> None:

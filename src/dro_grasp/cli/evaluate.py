@@ -70,8 +70,8 @@ class Evaluate:
         hand = hand_of(grasps, self.hand)
         rows, evaluated = [], []
         parts = dict(grasps.by_object())
-        if self.object is not None and len(parts) > 1:
-            raise OptionError(f"{self.file} holds grasps of {len(parts)} objects; --object fits a file with one")
+        if self.object is not None and len(names := set(grasps.object)) > 1:
+            raise OptionError(f"{self.file} holds grasps of {len(names)} objects; --object fits a file with one")
         with progress_bar("evaluating", self.json) as progress:
             for name, part in parts.items():
                 obj = object_of(part, self.object, self.scale)

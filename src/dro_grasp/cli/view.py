@@ -78,12 +78,12 @@ class View:
         hand = hand_of(grasps, self.hand)
         grasps.require_hand(hand)
         obj, chosen = of_object(grasps, self.object, self.scale)
-        given = self.object is not None and self.object not in grasps.object
+        given = self.object is not None and self.object not in dict(grasps.by_object())
         predictor = GraspPredictor(self.weights, self.device)
 
         def opened(place: Place, turn: Lock) -> Studio:
             studio = Studio(place, predictor, turn=turn, preview=False)
-            studio.open(hand, chosen if given else grasps, obj if given else None, chosen.object[0])
+            studio.open(hand, chosen if given else grasps, obj if given else None, self.object)
             return studio
 
         serve(StudioServer(opened, self.port, self.host))
@@ -157,7 +157,7 @@ class Picture:
             if not bool(grasps.success.any()):
                 raise GraspFileError(f"no grasp in {self.file} has passed a trial; leave out --only-successful")
             grasps = grasps[grasps.success]
-        names = list(dict.fromkeys(grasps.object)) if self.object is None else [self.object]
+        names = list(dict(grasps.by_object())) if self.object is None else [self.object]
         share = max(1, self.count // len(names))
         pairs = [of_object(grasps, name, self.scale) for name in names[: self.count]]
         pairs = [(obj, own[:share]) for obj, own in pairs]
@@ -208,6 +208,6 @@ def of_object(grasps: GraspBatch, name: str | None, scale: float) -> tuple[Objec
     """
     from dro_grasp.grasps.sources import object_of
 
-    own = name if name in grasps.object else grasps.object[0]
-    chosen = dict(grasps.by_object())[own]
-    return object_of(chosen, None if name in {None, own} else name, scale), chosen
+    parts = dict(grasps.by_object())
+    own = name if name in parts else grasps.object[0]
+    return object_of(parts[own], None if name in {None, own} else name, scale), parts[own]

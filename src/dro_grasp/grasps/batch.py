@@ -149,8 +149,8 @@ class GraspBatch:
         return self.replace(**fields, extra={name: columns.taken(column, rows) for name, column in self.extra.items()})
 
     def by_object(self) -> Iterator[tuple[str, GraspBatch]]:
-        """Each object's name with its grasps, in the order in which the objects first appear."""
-        return ((name, self[rows]) for name, rows in columns.places(self.object).items())
+        """Each object's name with its grasps, as the objects appear; a second one of its name, by the hash, is `NAME (2)`."""
+        return ((name, self[rows]) for name, rows in columns.places(self.object, self.object_sha256).items())
 
     def replace(self, **changes: Any) -> GraspBatch:
         """The same batch with other values for some fields."""

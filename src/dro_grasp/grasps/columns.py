@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import count
 from typing import Any
 
 import torch
@@ -81,11 +82,22 @@ def require_outcomes(batch: Any) -> None:
                           "grasps = dro_grasp.evaluate(dro_grasp.GraspProblem(hand, obj), grasps)")
 
 
-def places(column: Sequence[str]) -> dict[str, list[int]]:
-    """The rows of each value, in the order in which the values first appear."""
+def places(objects: Sequence[str], hashes: Sequence[str]) -> dict[str, list[int]]:
+    """The rows of each object, in the order in which the objects first appear.
+
+    Objects of one name and several hashes are several: the first has the name, the others have a number after it. Where a
+    hash is unknown, the object is the first of its name.
+    """
+    first = {name: sha256 for name, sha256 in zip(reversed(objects), reversed(hashes), strict=True) if sha256}
+    taken_names, labels = set(objects), dict[tuple[str, str], str]()
     rows: dict[str, list[int]] = {}
-    for i, value in enumerate(column):
-        rows.setdefault(value, []).append(i)
+    for i, (name, sha256) in enumerate(zip(objects, hashes, strict=True)):
+        key = name, sha256 or first.get(name, "")
+        if key not in labels:
+            numbered = (f"{name} ({number})" for number in count(2))
+            labels[key] = name if name not in rows else next(label for label in numbered if label not in taken_names)
+            taken_names.add(labels[key])
+        rows.setdefault(labels[key], []).append(i)
     return rows
 
 

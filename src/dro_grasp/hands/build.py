@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dro_grasp.descriptions.loader import Description
-from dro_grasp.errors import HandError
+from dro_grasp.errors import HandError, OptionError
 from dro_grasp.geometry.point_clouds import farthest_points
 from dro_grasp.hands.anatomy import Finger, find_fingers, find_palm_link, find_tips, fixed_below, path_to, rigid_groups
 from dro_grasp.hands.closing import Closing, ClosingFinder
@@ -36,11 +36,17 @@ def build_hand(description: Description, *, name: str | None = None, seed: int =
     Args:
         name: Name of the hand in files and tables; the file's stem by default.
         seed: Seed of the point sampling.
+        n_points: Surface points to keep: enough for the fingertips, and no more than are sampled (SAMPLES_PER_LINK on a link).
 
     Raises:
         HandError: The description has no finger, no link with a surface, or a size that no hand has.
+        OptionError: So many points cannot be kept.
     """
     hand = HandBuilder(description, seed).build(name or description.name)
+    fewest = POINTS_PER_LINK * len(hand.tips)
+    if not fewest <= n_points <= hand.n_points:
+        raise OptionError(f"n_points is {n_points}; give an integer from {fewest} to {hand.n_points}, the points that hand "
+                          f"'{hand.name}' can have, or leave it out")
     keep = farthest_points(hand.points(hand.canonical_joints()), n_points)
     # A fingertip that is small beside the rest may have been left out.
     missing = [tip for tip in hand.tips if not bool((hand.link_index[keep] == tip).any())]

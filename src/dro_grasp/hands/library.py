@@ -39,8 +39,14 @@ def load_hand(name: str | Path, *, seed: int = 0, n_points: int = 512) -> Hand:
     A bare name is a built-in hand first, then one of the development assets (folder `DRO_GRASP_ASSETS`), then a
     `robot_descriptions` module; `assets/NAME` forces the asset.
 
+    Args:
+        name: Name or file.
+        seed: Seed of the point sampling.
+        n_points: Surface points to keep.
+
     Raises:
         HandError: No such hand, or its description cannot be used.
+        OptionError: The hand cannot have so many points, or so few.
     """
     path, label = locate_hand(name)
     return build_hand(load_description(path), name=label, seed=seed, n_points=n_points)

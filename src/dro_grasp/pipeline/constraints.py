@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ from jaxtyping import Float
 from dro_grasp.energy.grasp_energy import Room
 from dro_grasp.energy.surroundings import Surroundings
 from dro_grasp.errors import OptionError
+from dro_grasp.files import TOLD
 from dro_grasp.geometry.balls import Ball, Balls
 from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
@@ -67,8 +69,12 @@ class Constraints:
         """Refuse what cannot be done, before any work.
 
         Raises:
-            OptionError: A number is out of range, the direction is zero, or a cone has no direction.
+            OptionError: A number is out of range, the direction is no vector or zero, or a cone has no direction.
         """
+        if self.direction is not None:
+            object.__setattr__(self, "direction", _vector(self.direction))
+        for name, balls in (("hold", self.hold), ("spare", self.spare)):
+            object.__setattr__(self, name, _balls(name, balls))
         if self.direction is not None and not 1e-9 <= math.hypot(*self.direction) < math.inf:
             raise OptionError(f"direction {self.direction} has no direction; give the palm direction in the object's frame, "
                               "for example --direction 0 0 -1 to grasp from above")
@@ -82,8 +88,6 @@ class Constraints:
                               "--cone 0.5")
         if self.opening is not None and not 0 < self.opening <= LARGEST_OPENING:
             raise OptionError(f"opening is {self.opening}; give metres, above 0 and at most {LARGEST_OPENING:g}: 0.01 for 1 cm")
-        for name, balls in (("hold", self.hold), ("spare", self.spare)):
-            _check_balls(name, balls)
 
     def moved(self, T: Float[np.ndarray, "4 4"]) -> Constraints:
         """The same in another frame, of which T is the motion from this one's coordinates to its own [m].
@@ -158,15 +162,41 @@ class Constraints:
         return Room(surroundings, Balls.of(self.hold))
 
 
-def _check_balls(name: str, balls: tuple[Ball, ...]) -> None:
-    """Refuse balls that are none.
+def _vector(given: Any) -> Direction:
+    """A direction as plain numbers, from any kind of vector.
+
+    Raises:
+        OptionError: It is none of three numbers.
+    """
+    try:
+        x, y, z = map(float, given)
+    except (TypeError, ValueError, RuntimeError) as error:  # PyTorch raises the last one
+        raise OptionError(f"direction is {_shortly(given)}; give three numbers, the palm direction in the object's frame, for "
+                          "example --direction 0 0 -1 to grasp from above") from error
+    return x, y, z
+
+
+def _balls(name: str, given: Any) -> tuple[Ball, ...]:
+    """Balls as plain numbers, from any kind of rows.
 
     Raises:
         OptionError: One has no four numbers, or no radius; or there are too many.
     """
-    if len(balls) > MOST_BALLS:
-        raise OptionError(f"{name} has {len(balls)} balls; give at most {MOST_BALLS}, with a larger radius")
-    for ball in balls:
-        if len(ball) != 4 or not all(map(math.isfinite, ball)) or not ball[3] > 0:
-            raise OptionError(f"{name} has the ball {tuple(ball)}; give x, y, z and a radius above 0 in metres, for example "
-                              f"--{name} 0 0 0.1 0.03")
+    example = f"x, y, z and a radius above 0 in metres, for example --{name} 0 0 0.1 0.03"
+    try:
+        rows = [tuple(map(float, ball)) for ball in given]
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise OptionError(f"{name} is {_shortly(given)}; give a list of balls, each of {example}") from error
+    if len(rows) > MOST_BALLS:
+        raise OptionError(f"{name} has {len(rows)} balls; give at most {MOST_BALLS}, with a larger radius")
+    balls: list[Ball] = []
+    for row in rows:
+        if len(row) != 4 or not all(map(math.isfinite, row)) or not row[3] > 0:
+            raise OptionError(f"{name} has the ball {row}; give {example}")
+        balls.append(row)
+    return tuple(balls)
+
+
+def _shortly(given: Any) -> str:
+    """What was given, in one line."""
+    return " ".join(str(given).split())[:TOLD]

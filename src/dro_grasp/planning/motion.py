@@ -7,13 +7,12 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from dro_grasp.errors import PlanError
-from dro_grasp.files import check_output, replacing
+from dro_grasp.files import check_output, reading, replacing
 from dro_grasp.planning.timing import Trajectory
 
 STAGES = ("reach", "shape", "approach", "close", "lift")
@@ -26,6 +25,8 @@ READY = "could be carried out too"
 """Fate of grasps that were given to the planner beside it."""
 WAITING = "not tried"
 """Fate of grasps that were not looked at, since better ones sufficed."""
+EXPECTED = "a plan file (.npz), as `dro-grasp plan` writes it"
+"""What a file that is read as a plan must be."""
 COLUMNS = ("time", "stage", "arm", "arm_velocity", "arm_acceleration", "hand", "hand_velocity", "hand_acceleration")
 """Arrays of a plan file."""
 SCENE = ("points", "others", "T_world_wrist", "joints", "score")
@@ -155,20 +156,16 @@ class MotionPlan:
         Raises:
             PlanError: No such file, or a truncated or foreign one, or one of another version.
         """
-        try:
-            with Path(path).open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-                header: dict[str, Any] = json.loads(str(file["header"]))
-                fate = tuple(header.pop("fate", ()))
-                time, stage, *rows = (file[name] for name in COLUMNS)
-                scene = {name: file[f"scene_{name}"] for name in SCENE} if header["format_version"] == FORMAT else {}
-        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
-            raise PlanError(f"{path} is no plan file ({error}); `dro-grasp plan` writes them") from error
-        if header.pop("format_version", None) != FORMAT or tuple(header.pop("stages", ())) != STAGES:
-            raise PlanError(f"{path} is a plan file of another version; plan again")
-        for key in ("arm_joints", "hand_joints"):
-            header[key] = tuple(header[key])
-        arm, hand = Trajectory(time, *rows[:3]), Trajectory(time, *rows[3:])
-        return MotionPlan(PlanNotes(**header), PlanScene(**scene, fate=fate), stage, arm, hand)
+        with reading(path, PlanError, EXPECTED), Path(path).open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+            header: dict[str, Any] = json.loads(str(file["header"]))
+            if header.pop("format_version", None) != FORMAT or tuple(header.pop("stages", ())) != STAGES:
+                raise PlanError(f"{path} is a plan file of another version; plan again")
+            time, stage, *rows = (file[name] for name in COLUMNS)
+            scene = PlanScene(**{name: file[f"scene_{name}"] for name in SCENE}, fate=tuple(header.pop("fate", ())))
+            for name in ("arm_joints", "hand_joints"):
+                header[name] = tuple(header[name])
+            arm, hand = Trajectory(time, *rows[:3]), Trajectory(time, *rows[3:])
+            return MotionPlan(PlanNotes(**header), scene, stage, arm, hand)
 
 
 def dropped_in_words(grasps: int, dropped: dict[str, int]) -> str:

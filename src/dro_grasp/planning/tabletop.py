@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import multiprocessing
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from dro_grasp.devices import one_thread
-from dro_grasp.errors import GraspFileError, OptionError
+from dro_grasp.errors import GraspFileError, ObjectError, OptionError
 from dro_grasp.files import check_output, make_folder, replacing
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.planning.attempts import Attempt, TabletopConfig, Watcher, attempt
@@ -81,7 +82,7 @@ def run_tabletop(
         plans: Folder for the plan of each attempt, ROBOT-OBJECT-NUMBER.npz.
 
     Raises:
-        OptionError: The extra is missing, or something cannot be attempted.
+        OptionError: The extra is missing, something cannot be attempted, or two objects have one name.
         RobotError: The robot cannot be used.
         ObjectError: An object cannot be used.
         GraspFileError: `output` is there and is no such file.
@@ -90,9 +91,9 @@ def run_tabletop(
     require_arm_extra()
     stored = read_attempts(output) if output is not None and check_output(output).exists() else []
     name, label = load_robot(run.robot).name, run.config.label()
-    names = {o: load_object(o).name for o in run.objects}
     done = {(a.object, a.number): a for a in stored if (a.robot, a.settings, a.seed) == (name, label, run.seed)}
-    missing = {o: [k for k in range(run.attempts) if (names[o], k) not in done] for o in run.objects}
+    names = _names(run.objects, done.values())
+    missing = {o: [k for k in range(run.attempts) if (n, k) not in done] for o, n in names.items()}
     if plans is not None:
         make_folder(plans)
     for result in _results(run, {o: numbers for o, numbers in missing.items() if numbers}, workers, plans):
@@ -102,7 +103,32 @@ def run_tabletop(
             write_attempts(stored, output)
         if progress is not None:
             progress(result)
-    return [done[names[o], k] for o in run.objects for k in range(run.attempts)]
+    return [done[n, k] for n in names.values() for k in range(run.attempts)]
+
+
+def _names(given: Sequence[str], done: Iterable[Attempt]) -> dict[str, str]:
+    """The name of each object that is given, once each.
+
+    Raises:
+        OptionError: Two of them differ and have one name, or attempts with another object of the name are done.
+    """
+    found: dict[str, tuple[str, str]] = {}
+
+    def refuse_another(source: str) -> None:
+        obj = load_object(source)
+        first, sha256 = found.setdefault(obj.name, (source, obj.sha256))
+        if obj.sha256 != sha256:
+            raise OptionError(f"'{first}' and '{source}' are different objects of the name '{obj.name}', under which attempts "
+                              "and plans are stored; rename one of the files, or attempt them apart, each with its own "
+                              "--output and --plans")
+
+    for source in dict.fromkeys(given):
+        refuse_another(source)
+    for name, source in sorted({(a.object, a.object_file) for a in done}):
+        if name in found and source not in {"", *given}:
+            with suppress(ObjectError):  # the file may be gone
+                refuse_another(source)
+    return {source: name for name, (source, _) in found.items()}
 
 
 def _results(run: TabletopRun, missing: dict[str, list[int]], workers: int, plans: Path | None) -> Iterator[Attempt]:

@@ -6,7 +6,7 @@ import hashlib
 import tempfile
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.errors import DroGraspError, HandError, ObjectError, OptionError
+from dro_grasp.files import given_path
 from dro_grasp.frames import motion_fault
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
@@ -89,11 +90,15 @@ class Answerer:
         """Load the weights and the hands.
 
         Raises:
+            OptionError: Two files of hands or of objects have one name.
             DroGraspError: Something cannot be used.
         """
+        objects = [(Path(source).stem, source) for source in resolve_objects(list(stock.objects))]
+        self.own_objects = by_name("objects", objects)
+        hands = {source: load_hand(source) for source in stock.hands}
+        sources = by_name("hands", [(hand.name, source) for source, hand in hands.items()])
+        self.own_hands = {name: hands[source] for name, source in sources.items()}
         self.predictor = GraspPredictor(stock.weights, stock.device)
-        self.own_hands = {hand.name: hand for hand in map(load_hand, stock.hands)}
-        self.own_objects = {Path(name).stem: name for name in resolve_objects(list(stock.objects))}
         self.hands: Kept[Hand] = Kept(KEPT_HANDS)
         self.objects: Kept[ObjectModel] = Kept(KEPT_OBJECTS)
         self.scenes: Kept[Scene] = Kept(KEPT_SCENES)
@@ -194,6 +199,21 @@ class Answerer:
             T, named = camera_pose(camera), isinstance(source, Path)
             points = read_points(source) if named else source
             return scanned_object(source.stem if named else "cloud", points * sent.scale, T.numpy(), keep_table=sent.keep_table)
+
+
+def by_name(kind: str, named: Sequence[tuple[str, str]]) -> dict[str, str]:
+    """The names or files of hands or objects by the names under which they can be asked for.
+
+    Raises:
+        OptionError: Two have one name.
+    """
+    found: dict[str, str] = {}
+    for name, source in named:
+        first = found.setdefault(name, source)
+        if given_path(first).resolve() != given_path(source).resolve():
+            raise OptionError(f"{kind} '{first}' and '{source}' would both be asked for by the name '{name}'; rename one of "
+                              "the files, or leave one out")
+    return found
 
 
 def content_key(sent: SentObject, camera: SentCamera | None) -> bytes:

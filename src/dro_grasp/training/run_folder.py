@@ -64,8 +64,8 @@ class RunFolder:
             return None
         for name, asked in plan.items():
             if found.get(name, asked) != asked:  # earlier versions stored less
-                raise TrainingError(f"{path} belongs to a run with {name} {found[name]}, {asked} was asked for; use the same to "
-                                    "resume, or another folder")
+                raise TrainingError(f"{path} belongs to a run with {name} {found[name]}, {asked} was asked for; use the "
+                                    "same to resume, or another folder")
         return state
 
     def misfit(self, error: Exception) -> TrainingError:

@@ -36,5 +36,6 @@ def _flat(record: Any, prefix: str = "") -> dict[str, Any]:
     values: dict[str, Any] = {}
     for field in dataclasses.fields(record):
         value = getattr(record, field.name)
-        values |= _flat(value, f"{prefix}{field.name}.") if dataclasses.is_dataclass(value) else {f"{prefix}{field.name}": value}
+        name = f"{prefix}{field.name}"
+        values |= _flat(value, f"{name}.") if dataclasses.is_dataclass(value) else {name: value}
     return values

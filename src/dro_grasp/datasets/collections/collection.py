@@ -24,7 +24,7 @@ class PairGrasps:
     hand: str
     """Name of the hand, or the path under which it was requested."""
     object: str
-    """Likewise."""
+    """Likewise; numbered where a file has several objects of the name (see `GraspBatch.by_object`)."""
     grasps: GraspBatch
     """May be empty."""
     made: Yield
@@ -74,7 +74,8 @@ def count_collection(path: Path | str) -> dict[str, dict[str, int]]:
             of_hand[shard.object] = of_hand.get(shard.object, 0) + read_yield(path, shard).valid
         return counts
     for pair in read_collection(path, only_successful=False):
-        counts.setdefault(pair.hand, {})[pair.object] = len(pair.grasps)
+        of_hand = counts.setdefault(pair.hand, {})
+        of_hand[pair.object] = of_hand.get(pair.object, 0) + len(pair.grasps)
     return counts
 
 

@@ -99,7 +99,7 @@ def merge(
         file_bytes: Size of a file from which on the next object goes into another, about.
 
     Raises:
-        GraspFileError: A path holds no grasps, or data sets know different versions of a hand or object.
+        GraspFileError: A path holds no grasps, or a hand or object is not the same in all data sets.
         HandError: A hand cannot be loaded.
         OutputError: There is no space for the grasps that wait.
     """
@@ -117,7 +117,7 @@ def _by_pair(paths: Sequence[Path | str], folder: Path) -> dict[str, dict[str, l
     """The grasps of all data sets by hand and object, in files."""
     pairs: dict[str, dict[str, list[Waiting]]] = {}
     versions: dict[tuple[str, str], set[str]] = {}
-    for count, pair in enumerate(pair for path in paths for pair in read_collection(path)):
+    for count, (source, pair) in enumerate((path, pair) for path in paths for pair in read_collection(path)):
         grasps = pair.grasps
         # The pair may have been requested by path.
         name = grasps.object[0] if len(grasps) else pair.object
@@ -126,8 +126,11 @@ def _by_pair(paths: Sequence[Path | str], folder: Path) -> dict[str, dict[str, l
             known = versions.setdefault(what, set())
             known |= new
             if len(known) > 1:
-                own = grasps.hand if what[0] == "hand" else name
-                raise GraspFileError(f"the data sets were made with different versions of {what[0]} '{own}'; merge them apart")
+                kind, own = what[0], grasps.hand if what[0] == "hand" else name
+                hashes = ", ".join(sha256[:12] or "unknown" for sha256 in sorted(known))
+                raise GraspFileError(f"{kind} '{own}' in {source} is not the same everywhere in the data sets (hashes "
+                                     f"{hashes}): another {kind} of this name, or another version of it. Merge them apart, or "
+                                     "rename one file and make its grasps again")
         file = folder / f"{count}.parquet"
         grasps.save(file)
         pairs.setdefault(grasps.hand, {}).setdefault(name, []).append(Waiting(file, pair.made))
