@@ -189,7 +189,7 @@ def test_a_plan_file_gives_the_plan_back_and_other_files_are_refused(planned: Mo
     (lambda header: {k: v for k, v in header.items() if k != "seed"}, "'seed'"),
     (lambda header: header | {"unknown": 1}, "'unknown'"), (lambda header: header | {"hand_joints": 3}, "'int'"),
     (lambda header: header | {"format_version": 1}, "another version; plan again"), (lambda header: {}, "another version"),
-], ids=str)
+], ids=["list", "number", "no arm_joints", "no seed", "unknown entry", "joints of no list", "version 1", "empty"])
 def test_a_plan_file_with_another_header_is_refused(
     planned: MotionPlan, tmp_path: Path, change: Callable[[dict[str, Any]], Any], told: str
 ) -> None:
