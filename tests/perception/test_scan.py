@@ -111,6 +111,23 @@ def test_few_points_are_refused() -> None:
         scanned_object("crumbs", np.random.default_rng(0).normal(size=(3, 3)))
 
 
+@pytest.mark.parametrize("fault", ["transposed", "mirrored", "millimetres"])
+def test_a_pose_that_is_none_is_refused(depth: np.ndarray, T_object_camera: np.ndarray, fault: str) -> None:
+    """It would mirror the object, or leave it where the camera is."""
+    T = {"transposed": T_object_camera.T, "mirrored": np.diag([1.0, 1, -1, 1]), "millimetres": np.eye(4)}[fault].copy()
+    if fault == "millimetres":
+        T[:3, 3] = [400.0, 0, 800.0]
+    with pytest.raises(OptionError, match="T_frame_camera is not the camera's pose"):
+        scanned_object("mug", depth_points(depth, INTRINSICS), T)
+
+
+@pytest.mark.parametrize("scale", [-1.0, 0.0, float("nan")])
+def test_a_scan_of_no_scale_is_refused(depth: np.ndarray, tmp_path: Path, scale: float) -> None:
+    np.save(tmp_path / "scan.npy", depth_points(depth, INTRINSICS))
+    with pytest.raises(ObjectError, match="scale is"):
+        load_scan(tmp_path / "scan.npy", np.eye(4), scale)
+
+
 def test_a_plane_loses_no_points_but_strays() -> None:
     plane = np.stack([*np.meshgrid(np.linspace(0, 0.1, 20), np.linspace(0, 0.1, 20)), np.zeros((20, 20))], -1).reshape(-1, 3)
     cleaned = without_outliers(np.concatenate([plane, [[0.05, 0.05, 0.08]]]))
@@ -163,6 +180,11 @@ def test_a_file_remembers_the_frame_and_where_the_camera_stood(
         target = tmp_path / f"out.{ending}"
         assert main(["export", str(file), "--format", form, "--output", str(target)]) == 0
         assert "in frame 'base'" in target.read_text().splitlines()[0]
+    assert main(["export", str(file), "--format", "dexgraspbench", "--output", str(tmp_path / "bench")]) == 0
+    position, wxyz = np.split(np.load(tmp_path / "bench" / "0.npy", allow_pickle=True).item()["obj_pose"], [3])
+    np.testing.assert_allclose(position, T_object_camera[:3, 3], atol=1e-6)
+    turn = Rotation.from_quat(wxyz, scalar_first=True).as_matrix()
+    np.testing.assert_allclose(turn, T_object_camera[:3, :3], atol=1e-6)  # of the file, which is in the camera's frame
     assert "object_frame_link: base" in (tmp_path / "out.yaml").read_text()
     assert "frame_id: base" in (tmp_path / "out.moveit.yaml").read_text()
 

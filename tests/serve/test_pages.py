@@ -93,7 +93,8 @@ def test_a_request_is_answered_and_a_page_describes_it() -> None:
     (PLAIN | {"nim": 2}, "nim: Extra inputs"), ({"hand": "claw"}, "object: Field required"), (PLAIN | {"num": "x"}, "num: "),
     (PLAIN | {"object": {"name": "can", "points": [[0, 0, 0]]}}, "one of name, file and points"),
     (PLAIN | {"object": {}}, "one of name, file and points"), (PLAIN | {"object": {"points": [[0, 0]]}}, "object.points.0.2"),
-    (PLAIN | {"object": {"file": {"name": "a.stl", "content": "?"}}}, "object.file.content"), ([], "the request"),
+    (PLAIN | {"object": {"file": {"name": "a.stl", "content": "?"}}}, "object.file.content"),
+    (PLAIN | {"object": {"file": {"name": "a.stl", "content": None}}}, "content is no text"), ([], "the request"),
     (PLAIN | {"id": "../x"}, "id: "), (PLAIN | {"camera": {"frame": "base", "T_frame_camera": [[1]]}}, "camera.T_frame_camera"),
 ])
 def test_a_request_that_is_none_is_told_why(body: Any, told: str) -> None:

@@ -43,7 +43,8 @@ def test_fields_become_constraints_and_are_drawn(studio: Studio, monkeypatch: py
     file = io.BytesIO()
     trimesh.creation.box(extents=(0.2, 0.2, 0.02), transform=trimesh.transformations.translation_matrix([0.2, 0, 0])).export(
         file, file_type="stl")
-    studio._take(viser.UploadedFile(name="shelf.stl", content=file.getvalue()), studio.panel.avoid, studio._draw_constraints)
+    upload = viser.UploadedFile(name="shelf.stl", content=file.getvalue())
+    studio._take(upload, "scene", studio.panel.avoid, studio._draw_constraints)
     drawn: list[str] = []
     scene = studio.place.scene
     for kind in ("add_box", "add_icosphere", "add_mesh_simple"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from dro_grasp.cli import view
 from dro_grasp.cli.main import main
 from dro_grasp.errors import OutputError
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.check import picture
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
@@ -149,6 +151,24 @@ def test_captions_and_heading_tell_what_was_tried(hand, obj, grasps) -> None:
     assert heading(hand, obj, grasps) == "gripper3 on sphere: 3 grasps, 1 of 2 succeeded (dro/1)"
     untried = grasps.without_trial()
     assert heading(hand, obj, untried) == "gripper3 on sphere: 3 grasps"
+
+
+def test_a_picture_that_cannot_be_finished_leaves_the_old_one(
+    hand, obj, grasps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(image: Image.Image, file: str | Path, **options: object) -> None:
+        Path(file).write_bytes(b"half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    path = tmp_path / "a.png"
+    path.write_bytes(b"the old one")
+    monkeypatch.setattr(Image.Image, "save", full)
+    with pytest.raises(OutputError, match="No space left"):
+        draw_grasps(hand, obj, grasps, path, count=1)
+    with pytest.raises(OutputError, match="No space left"):
+        picture(hand, path)
+    assert path.read_bytes() == b"the old one"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
 
 
 def test_unwritable_path_and_no_grasps_are_refused(hand, obj, grasps, tmp_path: Path) -> None:

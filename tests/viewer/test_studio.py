@@ -25,6 +25,7 @@ from dro_grasp.objects.builtin import BUILTIN
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.viewer import grasp_page as module
 from dro_grasp.viewer.grasp_page import EXPORTS, chosen
+from dro_grasp.viewer.shelf import Shelf
 from dro_grasp.viewer.stage import HOST, ServedPage
 from dro_grasp.viewer.studio import Studio, StudioServer
 from dro_grasp.viewer.uploads import MAX_BYTES, store_upload
@@ -147,11 +148,11 @@ def test_what_is_taken_away_is_what_is_shown(studio: Studio, made: module.ShownG
 
 def test_uploads_are_picked_and_errors_are_shown(studio: Studio) -> None:
     text = (BUILTIN_FOLDER / "gripper3.urdf").read_bytes()
-    studio._take(viser.UploadedFile(name="../mine.urdf", content=text), studio.hand, studio._preview)
+    studio._take(viser.UploadedFile(name="../mine.urdf", content=text), "hand", studio.hand, studio._preview)
     assert studio.hand.value == "mine.urdf", "no path of a temporary folder"
     assert studio.stage.hand is not None
     assert studio.stage.hand.name == "mine", "the uploaded hand is shown at once"
-    studio._take(viser.UploadedFile(name="bad.urdf", content=b"<robot"), studio.hand, studio._preview)
+    studio._take(viser.UploadedFile(name="bad.urdf", content=b"<robot"), "hand", studio.hand, studio._preview)
     assert studio.status.content.startswith("**Error:**")
     assert "bad.urdf" in studio.status.content
     assert "/" not in studio.status.content.split("bad.urdf")[0], "no path of a temporary folder"
@@ -163,7 +164,7 @@ def test_an_upload_waits_for_other_work_and_is_never_lost(studio: Studio, monkey
 
     def upload(name: str) -> threading.Thread:
         file = viser.UploadedFile(name=name, content=text)
-        thread = threading.Thread(target=lambda: studio._take(file, studio.hand, studio._preview))
+        thread = threading.Thread(target=lambda: studio._take(file, "hand", studio.hand, studio._preview))
         thread.start()
         return thread
 
@@ -247,7 +248,7 @@ def test_every_browser_has_a_page_and_closing_it_ends_its_work_and_its_uploads(
         clients = visited(served, 2)
         text = (BUILTIN_FOLDER / "gripper3.urdf").read_bytes()
         for page, name in zip(made, ("mine.urdf", "theirs.urdf"), strict=True):
-            page._take(viser.UploadedFile(name=name, content=text), page.hand, page._preview)
+            page._take(viser.UploadedFile(name=name, content=text), "hand", page.hand, page._preview)
         assert "mine.urdf" not in made[1].hand.options
         assert "theirs.urdf" not in made[0].hand.options
         folders = [Path(page.shelf._folder.name) for page in made]
@@ -289,10 +290,25 @@ def test_a_zip_file_is_unpacked_and_its_description_found(tmp_path: Path) -> Non
     assert (tmp_path / "hand" / "meshes" / "a.stl").read_bytes() == b"1"
 
 
+def test_a_scene_does_not_take_the_place_of_an_object_of_its_file_name() -> None:
+    def box(*size: float) -> bytes:
+        return trimesh.creation.box(size).export(file_type="stl")
+
+    shelf = Shelf()
+    assert shelf.take("part.stl", box(0.05, 0.05, 0.05), "object") == "part.stl"
+    assert shelf.take("part.stl", box(0.5, 0.5, 0.02), "scene") == "part (2).stl"
+    assert np.ptp(shelf.obj("part.stl").vertices, axis=0) == pytest.approx([0.05] * 3)
+    assert shelf.scene("part (2).stl") is not None
+    assert shelf.take("part.stl", box(0.06, 0.06, 0.06), "object") == "part.stl"
+    assert np.ptp(shelf.obj("part.stl").vertices, axis=0) == pytest.approx([0.06] * 3), "the newer one of its kind"
+    shelf.close()
+
+
 @pytest.mark.parametrize(
     ("name", "content", "word"),
     [
         ("a.urdf", b"x" * (MAX_BYTES + 1), "limit is 20"), ("..", b"", "not a file name"),
+        ("a\0b.stl", b"", "not a file name"), ("\u00e9" * 101 + ".stl", b"", "of 1 to 200 bytes"),
         ("a.zip", b"no zip", "expected a ZIP file"), ("a.zip", zipped(**{"../evil.urdf": b"x"}), "outside the archive"),
         ("a.zip", zipped(**{"/evil.urdf": b"x"}), "outside the archive"),
         ("a.zip", zipped(**{"a.stl": b"x"}), "no URDF or MJCF"),

@@ -12,18 +12,21 @@ from dro_grasp.export.contents import Frame, postures
 from dro_grasp.export.formats import ExportJob
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.sources import camera_pose
 
 
 def dexgraspbench(grasps: GraspBatch, frame: Frame, object_path: str, scale: float) -> list[dict[str, Any]]:
     """One dictionary per grasp, as DexGraspBench reads it from a npy file.
 
-    Postures are wrist pose (x y z, qw qx qy qz) and joints in one row; `obj_pose` is the object's pose in their frame, WXYZ
-    as well.
+    Postures are wrist pose (x y z, qw qx qy qz) and joints in one row; `obj_pose` is the pose of the object's file in their
+    frame, WXYZ as well.
     """
     position, quaternion = frame.place(grasps)
     joints = postures(grasps)
-    turn = roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(frame.T_frame_object[:3, :3].double()))
-    pose = torch.cat([frame.T_frame_object[:3, 3].double(), turn])
+    camera = camera_pose(grasps)  # the file of a camera's cloud is in the camera's frame
+    T = frame.T_frame_object.double() if camera is None else frame.T_frame_object.double() @ camera.double()
+    turn = roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(roma.special_procrustes(T[:3, :3])))
+    pose = torch.cat([T[:3, 3], turn])
     found = []
     for i in range(len(grasps)):
         wrist = torch.cat([position[i], quaternion[i]])

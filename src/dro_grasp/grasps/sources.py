@@ -5,6 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from jaxtyping import Float
+from torch import Tensor
+
 from dro_grasp.errors import GraspFileError, HandError, ObjectError, OptionError
 from dro_grasp.files import given_path
 from dro_grasp.grasps.columns import CAMERA, FRAME, HAND_FILE, OBJECT_FILE, OBJECT_SCALE
@@ -124,6 +127,12 @@ def object_source(grasps: GraspBatch, scale: float = 1.0) -> tuple[str, float]:
 def frame_of(grasps: GraspBatch) -> str | None:
     """Name of the frame of grasps on a camera's cloud; None for grasps in the object's own frame."""
     return _recorded(grasps, FRAME)
+
+
+def camera_pose(grasps: GraspBatch) -> Float[Tensor, "4 4"] | None:
+    """Pose of the camera in the frame of grasps on its cloud [m]; None for grasps in the object's own frame."""
+    frame = frame_of(grasps)
+    return None if frame is None else grasps.extra[CAMERA][grasps.extra[FRAME].index(frame)].reshape(4, 4)
 
 
 def require_same(grasps: GraspBatch, hand: Hand, obj: ObjectModel) -> None:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from dro_grasp.descriptions.loader import Description
 from dro_grasp.descriptions.notes import Note
+from dro_grasp.files import replacing
 from dro_grasp.geometry import se3
 from dro_grasp.geometry.point_clouds import enclosed_volume
 from dro_grasp.hands.anatomy import Finger
@@ -211,7 +212,8 @@ def picture(hand: Hand, path: Path | str) -> None:
     if not torch.equal(hand.open_ends, hand.open_limits):
         legend += "   purple: left out"
     pen.text((12, height + TEXT + 6), legend, fill=(90, 90, 90), font=font)
-    sheet.save(path, format="PNG")
+    with replacing(Path(path), "picture") as temporary:
+        sheet.save(temporary, format="PNG")
 
 
 def _camera(hand: Hand) -> Camera:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Num
 from scipy.spatial import KDTree
 
-from dro_grasp.errors import ObjectError
+from dro_grasp.errors import ObjectError, OptionError
+from dro_grasp.frames import motion_fault
 from dro_grasp.geometry.table_plane import above_plane, table_plane
 from dro_grasp.objects.loading import check_extent, cloud_object, estimate_normals, read_points, table_note
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
@@ -58,8 +61,11 @@ def load_scan(
     """The object in a cloud file (PLY, NPY, PCD) in the camera's frame, times `scale`; see `scanned_object`.
 
     Raises:
-        ObjectError: The file holds no cloud, or none of an object's size.
+        ObjectError: The file holds no cloud, or none of an object's size, or `scale` is not positive.
+        OptionError: The pose is no rigid motion.
     """
+    if not (math.isfinite(scale) and scale > 0):
+        raise ObjectError(f"scale is {scale}; give a positive number, for example --scale 0.001 for millimetres")
     return scanned_object(path.stem, read_points(path) * scale, T_frame_camera, keep_table=keep_table)
 
 
@@ -80,7 +86,10 @@ def scanned_object(
 
     Raises:
         ObjectError: Too few points are left, they are not in metres, or some lie behind the camera.
+        OptionError: The pose is no rigid motion.
     """
+    if T_frame_camera is not None and (fault := motion_fault(torch.as_tensor(T_frame_camera).float())) is not None:
+        raise OptionError(f"T_frame_camera is not the camera's pose in the wanted frame, in metres: {fault}")
     kept = np.asarray(points, np.float64)
     kept, camera = kept[np.isfinite(kept).all(1)], np.zeros(3)
     total, table = len(kept), None if keep_table else table_plane(kept, camera)

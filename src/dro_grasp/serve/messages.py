@@ -49,6 +49,8 @@ class SentFile(Message):
     @field_validator("content", mode="before")
     @classmethod
     def _decoded(cls, given: Any) -> bytes:
+        if not isinstance(given, str | bytes):
+            raise ValueError("content is no text; give the file's bytes in base64")
         return base64.b64decode(given, validate=True)
 
 

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from dro_grasp.devices import cores
 from dro_grasp.errors import OutputError
+from dro_grasp.files import replacing
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import require_pair
 from dro_grasp.grasps.summary import percent
@@ -126,10 +127,8 @@ def _save(
     if not tiles:
         raise OutputError(f"no grasp to draw into {path}; ask for at least one")
     sheet = contact_sheet(tiles, captions, title, columns)
-    try:
-        sheet.save(path, format="PNG")
-    except OSError as error:
-        raise OutputError(f"cannot write picture {path}: {error.strerror or error}; choose another path") from error
+    with replacing(Path(path), "picture") as temporary:
+        sheet.save(temporary, format="PNG")
 
 
 def shows_held(hand: Hand, obj: ObjectModel, style: PictureStyle | None) -> bool:

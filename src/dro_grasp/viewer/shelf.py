@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tempfile
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 
 from dro_grasp.grasps.batch import GraspBatch
@@ -24,6 +24,7 @@ class Shelf:
         self._folder = tempfile.TemporaryDirectory(prefix="dro-grasp-")
         self._numbers = count(1)
         self._paths: dict[str, Path] = {}
+        self._kinds: dict[str, str] = {}
         self._hands: dict[str, Hand] = {}
         self._objects: dict[str, ObjectModel] = {}
         self._scenes: dict[str, Scene] = {}
@@ -34,8 +35,15 @@ class Shelf:
         """Delete the uploads."""
         self._folder.cleanup()
 
-    def take(self, name: str, content: bytes) -> str:
+    def take(self, name: str, content: bytes, kind: str) -> str:
         """Store an upload, and return the name under which it can be picked.
+
+        An upload replaces the one before of its name and kind; names that another kind has taken get a number.
+
+        Args:
+            name: Of the file.
+            content: Of the file.
+            kind: What it is to be used as: hand, object or scene.
 
         Raises:
             OptionError: The upload is refused.
@@ -43,8 +51,9 @@ class Shelf:
         folder = Path(self._folder.name) / str(next(self._numbers))
         folder.mkdir()
         path = store_upload(name, content, folder)
-        label = path.name
-        self._paths[label] = path
+        numbered = (f"{path.stem} ({number}){path.suffix}" for number in count(2))
+        label = next(name for name in chain([path.name], numbered) if self._kinds.get(name, kind) == kind)
+        self._paths[label], self._kinds[label] = path, kind
         for kept in (self._hands, self._objects, self._scenes, self.batches):
             kept.pop(label, None)
         return label

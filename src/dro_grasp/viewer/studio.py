@@ -175,22 +175,24 @@ class Studio(GraspPage):
             self.protocol = gui.add_dropdown("Trial", tuple(PROTOCOLS), initial_value=DEFAULT_PROTOCOL)
             self.button = gui.add_button("Generate", color="green")
         self.panel = panel = ConstraintPanel(self.place, lambda: self._guarded(self._draw_constraints))
-        hand_file.on_upload(lambda _: self._take(hand_file.value, self.hand, self._preview))
-        object_file.on_upload(lambda _: self._take(object_file.value, self.object, self._preview))
-        panel.upload.on_upload(lambda _: self._take(panel.upload.value, panel.avoid, self._draw_constraints))
+        hand_file.on_upload(lambda _: self._take(hand_file.value, "hand", self.hand, self._preview))
+        object_file.on_upload(lambda _: self._take(object_file.value, "object", self.object, self._preview))
+        panel.upload.on_upload(lambda _: self._take(panel.upload.value, "scene", panel.avoid, self._draw_constraints))
         panel.under.on_click(lambda _: self._guarded(self._table_under))
         self.button.on_click(lambda _: self._guarded(self._generate))
         for choice in (self.hand, self.object):
             choice.on_update(lambda event: None if event.client is None else self._guarded(self._pick_object))
         self.usual.on_update(lambda _: setattr(self.temperature, "disabled", self.usual.value))
 
-    def _take(self, upload: viser.UploadedFile, choice: viser.GuiDropdownHandle[str], show: Callable[[], None]) -> None:
+    def _take(
+        self, upload: viser.UploadedFile, kind: str, choice: viser.GuiDropdownHandle[str], show: Callable[[], None]
+    ) -> None:
         """Store an upload, pick it and show it; where other work takes long, it can be picked later."""
         with suppress(Closed):
             if self.closed.is_set():
                 return
             try:
-                label = self.shelf.take(upload.name, upload.content)
+                label = self.shelf.take(upload.name, upload.content, kind)
             except DroGraspError as error:
                 self._complain(error)
                 return

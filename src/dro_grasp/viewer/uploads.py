@@ -15,6 +15,8 @@ MAX_BYTES = 20_000_000
 """Largest upload [bytes]."""
 MAX_UNPACKED = 100_000_000
 """Largest unpacked content of a ZIP file [bytes]."""
+LONGEST_NAME = 200
+"""Longest file name [bytes]; file systems take 255, and some is left for what is made beside a file."""
 MAX_FILES = 1_000
 """Most files in a ZIP file."""
 DESCRIPTIONS = (".urdf", ".xml", ".mjcf")
@@ -33,8 +35,8 @@ def store_upload(name: str, content: bytes, folder: Path) -> Path:
         HandError: A description is not valid XML.
     """
     plain = PurePosixPath(name.replace("\\", "/")).name
-    if not plain or plain in {".", ".."}:
-        raise OptionError(f"'{name}' is not a file name")
+    if not plain or plain in {".", ".."} or "\0" in plain or len(plain.encode()) > LONGEST_NAME:
+        raise OptionError(f"'{plain[:80]}' is not a file name; give one of 1 to {LONGEST_NAME} bytes")
     if len(content) > MAX_BYTES:
         raise OptionError(f"{plain} has {len(content) / 1e6:.0f} MB, the limit is {MAX_BYTES / 1e6:.0f} MB; use the command "
                           "line for larger files")
