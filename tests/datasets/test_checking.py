@@ -150,3 +150,18 @@ def test_a_changed_hand_is_refused(stored, tmp_path):
     GraspBatch.load(stored).replace(hand_sha256="0123456789abcdef").save(tmp_path / "old.parquet")
     with pytest.raises(GraspFileError, match="another version of hand 'barrett'"):
         check(read_collection(tmp_path / "old.parquet"), 5, changed("dro"))
+
+
+def test_two_hands_of_one_name_are_refused_before_any_trial(stored, tmp_path, capsys, monkeypatch):
+    def none(*_):
+        raise AssertionError("a trial")
+
+    monkeypatch.setattr(checking, "simulate", none)
+    monkeypatch.setattr(checking, "hand_of", none)
+    GraspBatch.load(stored).replace(hand_sha256="0123456789abcdef").save(tmp_path / "other.parquet")
+    output = tmp_path / "kept"
+    assert main(["dataset", "filter", str(stored), str(tmp_path / "other.parquet"), "--output", str(output)]) == 2
+    said = capsys.readouterr().err
+    for words in (f"in {stored} ", f"in {tmp_path / 'other.parquet'} ", "hash 0123456789ab", "Rename one file and make its"):
+        assert words in said
+    assert not any(output.glob("*"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,11 @@ from scipy.spatial.transform import Rotation
 from dro_grasp.cli.main import main
 from dro_grasp.datasets.collections.collection import YIELDS, PairGrasps
 from dro_grasp.datasets.engine.shards import Yield
+from dro_grasp.errors import GraspFileError
 from dro_grasp.evaluation.coverage import grasp_sizes, measure_coverage, wrist_rolls
 from dro_grasp.evaluation.metrics import diversity
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import HAND_FILE
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.catalogue import load_object
 from tests.helpers.loaded_hands import loaded_hand
@@ -90,6 +93,23 @@ def test_a_hand_is_measured_object_by_object(hand, pairs):
     assert found.yields.candidates == 464
     assert found.diversity == diversity(pairs[0].grasps.T_object_wrist, pairs[0].grasps.joints)
     assert measure_coverage([]) == []
+
+
+def test_two_hands_of_one_name_are_refused(pairs, tmp_path, capsys):
+    can = pairs[0].grasps
+    other = can.replace(hand_sha256="new", extra=can.extra | {HAND_FILE: ("right/barrett.urdf",) * len(can)})
+    reason = (rf"grasps on can are of a hand 'barrett' \(right/barrett\.urdf, hash new\), not that of the grasps on can "
+              rf"\(barrett, hash {can.hand_sha256[:12]}\): .*Rename one file .*or handle them apart")
+    with pytest.raises(GraspFileError, match=reason):
+        measure_coverage([pairs[0], replace(pairs[0], grasps=other)])
+    with pytest.raises(GraspFileError, match=r"\(barrett, hash unknown\)"):
+        measure_coverage([pairs[0], replace(pairs[1], grasps=pairs[1].grasps.replace(hand_sha256=""))])
+    can.save(tmp_path / "a.parquet")
+    other.save(tmp_path / "b.parquet")
+    assert main(["dataset", "report", str(tmp_path / "a.parquet"), str(tmp_path / "b.parquet")]) == 2
+    said = capsys.readouterr().err
+    for words in ("on can in", "a.parquet", "b.parquet", "right/barrett.urdf", "Rename one file and make its grasps again"):
+        assert words in said
 
 
 def test_the_page_names_everything_and_holds_its_pictures(pairs, tmp_path, capsys):

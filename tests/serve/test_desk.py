@@ -71,6 +71,39 @@ def test_a_full_queue_and_a_second_request_of_one_id_are_refused(desk: Desk) -> 
     assert [r.reply.result(5).status for r in (first, *others)] == [409, 200, 200]
 
 
+def test_what_is_cancelled_in_the_queue_leaves_its_place_and_its_id_at_once(desk: Desk) -> None:
+    wait_for_idle(desk)
+    before, waited = desk.tally.replies[409], desk.tally.waiting_seconds
+    running = submitted(desk, "running", "sleep")
+    queued = [desk.submit(call(name)) for name in "bc"]
+    time.sleep(0.02)
+    assert [desk.cancel(name) for name in "bc"] == [True, True]
+    assert [r.reply.result(0).status for r in queued] == [409, 409]
+    assert not desk.cancel("b")
+    assert (desk.waiting, desk.tally.replies[409]) == (0, before + 2)
+    assert desk.tally.waiting_seconds > waited + 0.03
+    again = [desk.submit(call(name)) for name in "cb"]
+    assert not running.reply.done()
+    assert desk.cancel("running")
+    assert [r.reply.result(5) for r in again] == [(200, b"c"), (200, b"b")]
+    assert running.reply.result(0).status == 409
+
+
+def test_what_is_cancelled_in_the_middle_of_the_queue_leaves_the_order_of_the_others(desk: Desk) -> None:
+    wait_for_idle(desk)
+    submitted(desk, "running", "sleep")
+    order: list[str] = []
+    first = desk.submit(call("first"))
+    desk.submit(call("middle"))
+    desk.cancel("middle")
+    last = desk.submit(call("last"))
+    for request in (first, last):
+        request.reply.add_done_callback(lambda reply: order.append(reply.result().body.decode()))
+    desk.cancel("running")
+    last.reply.result(5)
+    assert order == ["first", "last"]
+
+
 @pytest.mark.parametrize(("what", "status", "told"), [("die", 500, b"the process died"), ("hang", 504, b"longer than 1 s")])
 def test_the_request_after_a_fatal_one_is_computed(desk: Desk, what: str, status: int, told: bytes) -> None:
     wait_for_idle(desk)

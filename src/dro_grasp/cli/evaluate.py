@@ -16,6 +16,7 @@ from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL
 if TYPE_CHECKING:
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.hands.hand import Hand
+    from dro_grasp.objects.shape import ObjectModel
 
 SHARES = {"trials_held": "held", "fingers_in_contact": "fingers", "all_fingers_in_contact": "all fingers"}
 """Shares beside the success rate, in the JSON object, and their columns in the table."""
@@ -44,7 +45,7 @@ class Evaluate:
     """Also measure penetration, contact distance and force closure of the grasps as they are, without any motion: the analytic
     metrics of DexGraspBench, with the protocol's friction."""
     output: Annotated[Path | None, optional("PATH", "not saved")] = None
-    """Save the grasps with their results."""
+    """Save the grasps with their results, which must be those of the hand and the object that they were made for."""
     json: Flag = False
     """Print one JSON object instead of a table."""
 
@@ -68,15 +69,17 @@ class Evaluate:
         begin = time.perf_counter()
         grasps = load_grasps(self.file)
         hand = hand_of(grasps, self.hand)
-        rows, evaluated = [], []
-        parts = dict(grasps.by_object())
+        compare("hand", grasps.hand, grasps.hand_sha256, hand, self.output)
+        rows, evaluated, problems = [], [], []
         if self.object is not None and len(names := set(grasps.object)) > 1:
             raise OptionError(f"{self.file} holds grasps of {len(names)} objects; --object fits a file with one")
+        for name, part in grasps.by_object():
+            obj = object_of(part, self.object, self.scale)
+            compare("object", name, part.object_sha256[0], obj, self.output)
+            problems.append((name, part, obj))
         with progress_bar("evaluating", self.json) as progress:
-            for name, part in parts.items():
-                obj = object_of(part, self.object, self.scale)
-                if part.object_sha256[0] not in {"", obj.sha256}:
-                    say_aside(f"the grasps were made for another '{name}' than the given {obj.name}")
+            while problems:  # what an object gathers in its trials goes with it
+                name, part, obj = problems.pop(0)
                 done = evaluate(GraspProblem(hand, obj), part, rules, progress)
                 evaluated.append(with_contacts(hand, obj, done, rules) if self.contact_quality else done)
                 success = int(done.success.sum())
@@ -104,6 +107,23 @@ class Evaluate:
         notes = [note, *([f"means: {means} (lengths in m)"] if means else []), *diagnose(done)]
         print_result(self.json, report, f"{hand.name}, protocol {rules.label}", columns, rows, *notes)
         return 0
+
+
+def compare(kind: str, name: str, stored: str, given: Hand | ObjectModel, output: Path | None) -> None:
+    """Tell of a hand or an object that is not the one that the grasps were made for; it is unknown of some imported ones.
+
+    Raises:
+        OptionError: Outcomes with it are to be saved, where they would pass for those with the grasps' own.
+    """
+    from dro_grasp.errors import OptionError
+
+    if stored in {"", given.sha256}:
+        return
+    if output is not None:
+        raise OptionError(f"the grasps were made for another {kind} '{name}' than the given {given.name} (hash {stored[:12]}, "
+                          f"given {given.sha256[:12]}), and outcomes in {output} would pass for outcomes with their own; leave "
+                          f"out --output, or generate grasps for this {kind} anew")
+    say_aside(f"the grasps were made for another '{name}' than the given {given.name}")
 
 
 def shares(grasps: GraspBatch, hand: Hand) -> dict[str, float]:

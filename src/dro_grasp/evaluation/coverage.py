@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -13,10 +14,12 @@ from torch import Tensor
 
 from dro_grasp.datasets.collections.collection import PairGrasps
 from dro_grasp.datasets.engine.shards import Yield
+from dro_grasp.errors import GraspFileError
 from dro_grasp.evaluation.metrics import diversity
 from dro_grasp.frames import HALF_AXES, half_axis
 from dro_grasp.geometry import se3
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import HAND_FILE
 from dro_grasp.grasps.sources import hand_of
 from dro_grasp.hands.hand import Hand
 
@@ -81,12 +84,41 @@ def measure_coverage(pairs: Iterable[PairGrasps]) -> list[HandCoverage]:
     """Coverage of each hand of a data set.
 
     Raises:
+        GraspFileError: Two hands share a name, or a hand has changed between its grasps.
         HandError: A hand cannot be loaded.
     """
     by_hand: dict[str, list[PairGrasps]] = {}
-    for pair in pairs:
+    for pair in of_one_version((None, pair) for pair in pairs):
         by_hand.setdefault(pair.grasps.hand, []).append(pair)
     return [_of_hand(group) for _, group in sorted(by_hand.items())]
+
+
+def of_one_version(pairs: Iterable[tuple[Path | None, PairGrasps]]) -> Iterator[PairGrasps]:
+    """The pairs as they come; each name must stand for one hand in all of them.
+
+    Args:
+        pairs: Each with the data set that it is from, for messages; None for grasps in memory.
+
+    Raises:
+        GraspFileError: Two hands share a name, or a hand has changed between its grasps.
+    """
+    known: dict[str, tuple[Path | None, PairGrasps]] = {}
+    for path, pair in pairs:
+        new, old = pair.grasps, known.setdefault(pair.grasps.hand, (path, pair))
+        if (new.hand_sha256, new.joint_names) != (old[1].grasps.hand_sha256, old[1].grasps.joint_names):
+            (place, hand), (old_place, old_hand) = _told(path, pair), _told(*old)
+            raise GraspFileError(f"{place} are of a hand '{new.hand}' ({hand}), not that of {old_place} ({old_hand}): another "
+                                 "hand of this name, or another version of it. Rename one file and make its grasps again, or "
+                                 "handle them apart")
+        yield pair
+
+
+def _told(path: Path | None, pair: PairGrasps) -> tuple[str, str]:
+    """Where grasps are, and which hand's: its file or name, with its hash."""
+    grasps = pair.grasps
+    file = next((file for file in grasps.extra.get(HAND_FILE, ()) if file), pair.hand)
+    place = f"the grasps on {pair.object}" if path is None else f"the grasps on {pair.object} in {path}"
+    return place, f"{file}, hash {grasps.hand_sha256[:12] or 'unknown'}"
 
 
 def _of_hand(pairs: list[PairGrasps]) -> HandCoverage:

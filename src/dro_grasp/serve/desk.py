@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import multiprocessing
-import queue
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
@@ -27,7 +26,7 @@ PAGE = 4096
 """Bytes of a page of memory, as /proc counts."""
 
 
-@dataclass
+@dataclass(eq=False)
 class Request:
     """A request on its way."""
 
@@ -74,9 +73,11 @@ class Desk:
             raise OptionError(f"the queue is {longest_queue} long and the time limit {time_limit} s; give at least 1, and a "
                               "positive time")
         self.stock, self.time_limit, self.work, self.tally = stock, time_limit, work, Tally()
-        self._queue: queue.Queue[Request | None] = queue.Queue(longest_queue)
+        self.longest_queue = longest_queue
+        self._queue: deque[Request] = deque()
         self._known: dict[str, Request] = {}
         self._lock = threading.Lock()
+        self._news = threading.Condition(self._lock)
         self.computing = self.closed = False
         self._start()
         self._thread = threading.Thread(target=self._work, name="desk", daemon=True)
@@ -85,7 +86,7 @@ class Desk:
     @property
     def waiting(self) -> int:
         """Requests in the queue."""
-        return self._queue.qsize()
+        return len(self._queue)
 
     @property
     def memory(self) -> int:
@@ -106,20 +107,29 @@ class Desk:
                 raise ServerError("the server is stopping; ask another one")
             if call.id in self._known:
                 raise ServerError(f"a request '{call.id}' is under way; give each its own id")
-            try:
-                self._queue.put_nowait(request)
-            except queue.Full:
-                raise ServerError(f"{self.waiting} requests are waiting already; ask again later") from None
+            if self.waiting >= self.longest_queue:
+                raise ServerError(f"{self.waiting} requests are waiting already; ask again later")
+            self._queue.append(request)
             self._known[call.id] = request
+            self._news.notify()
         return request
 
     def cancel(self, name: str) -> bool:
-        """End a request, in the queue or under way; whether there is one of this id."""
+        """End a request, in the queue or under way; whether there is one of this id.
+
+        One in the queue is replied to at once, and leaves its place and its id to others.
+        """
         with self._lock:
             request = self._known.get(name)
             if request is None:
                 return False
             request.ended = request.ended or time.monotonic()
+            if request not in self._queue:
+                return True
+            self._queue.remove(request)
+            self.tally.waiting_seconds += time.monotonic() - request.since
+            self._forget(request, cancelled := _cancelled())
+        request.reply.set_result(cancelled)
         return True
 
     def close(self) -> None:
@@ -128,39 +138,38 @@ class Desk:
             self.closed = True
             for request in self._known.values():
                 request.ended = request.ended or time.monotonic() - GRACE
-        with suppress(queue.Full):
-            self._queue.put_nowait(None)
+            self._news.notify()
         self._thread.join()
         self._end()
 
     def _work(self) -> None:
         """Reply to one request after the other."""
         while True:
-            try:
-                request = self._queue.get(timeout=TICK)
-            except queue.Empty:
-                if self.closed:
-                    return
-                continue
-            if request is None:
-                return
-            begin = time.monotonic()
-            self.tally.waiting_seconds += begin - request.since
-            reply = self._reply(request)
-            self.tally.computing_seconds += time.monotonic() - begin
-            self.tally.replies[int(reply.status)] += 1
             with self._lock:
-                del self._known[request.call.id]
+                self._news.wait_for(lambda: self._queue or self.closed)
+                if not self._queue:
+                    return
+                request = self._queue.popleft()
+                begin = time.monotonic()
+                self.tally.waiting_seconds += begin - request.since
+            reply = self._reply(request)
+            with self._lock:
+                self.tally.computing_seconds += time.monotonic() - begin
+                self._forget(request, reply)
             request.reply.set_result(reply)
             if not self._process.is_alive():
                 with suppress(OptionError):  # the next request tells
                     self._start()
 
+    def _forget(self, request: Request, reply: Reply) -> None:
+        """Count the reply to a request that is neither in the queue nor under way any more; the lock is held."""
+        self.tally.replies[int(reply.status)] += 1
+        del self._known[request.call.id]
+
     def _reply(self, request: Request) -> Reply:
         """Have a request computed, for as long as it is wanted and within the limit."""
-        cancelled = refused(HTTPStatus.CONFLICT, "the request was cancelled")
         if request.ended is not None:
-            return cancelled
+            return _cancelled()
         self.computing = True
         try:
             if not self._process.is_alive():
@@ -175,7 +184,7 @@ class Desk:
                                                                "ended; ask for fewer grasps or candidates")
                 if request.ended is not None and now > request.ended + GRACE:
                     self._end()
-                    return cancelled
+                    return _cancelled()
                 if request.ended is not None and not told:
                     told = True
                     self._pipe.send(None)
@@ -214,3 +223,7 @@ class Desk:
         self._process.kill()
         self._process.join()
         self._pipe.close()
+
+
+def _cancelled() -> Reply:
+    return refused(HTTPStatus.CONFLICT, "the request was cancelled")
