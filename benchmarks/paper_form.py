@@ -159,7 +159,8 @@ def gains(pretrained: Sequence[dict[str, Any]], plain: Sequence[dict[str, Any]])
         points = [100 * (a[stage, name] - b[stage, name]) for a, b in pairs]
         middle, margin = mean_and_margin(points)
         each = ", ".join(f"{value:+.1f}" for value in points)
-        lines.append(f"pretraining adds under {name}, {stage}: {middle:+.1f} +- {margin:.1f} points (by seed {each})")
+        sure = f"+- {margin:.1f} points (by seed {each})" if len(points) > 1 else "points (one seed)"
+        lines.append(f"pretraining adds under {name}, {stage}: {middle:+.1f} {sure}")
     return lines
 
 
