@@ -55,13 +55,13 @@ def first_page(monkeypatch: pytest.MonkeyPatch):
 def test_view_shows_grasps_with_a_hand_of_the_same_joints_and_says_that_it_is_another(both: GraspBatch, first_page) -> None:
     Path("variant.urdf").write_text(URDF.replace('radius="0.04"', 'radius="0.041"'))
     note = "made for another 'gripper3' than the given variant"
-    for more, noted in ((["--object", "mug"], True), ([], True), (["--object", "sphere"], True)):
-        both[both.object.index("mug")].save("mug.parquet")
+    both[0].save("mug.parquet")
+    for more in (["--object", "sphere"], []):
         page = first_page("mug.parquet", "--hand", "variant.urdf", *more)
         assert page.made is not None, page.status.content
         assert page.made.hand.name == "variant"
         assert len(page.shown) == 1
-        assert (note in page.status.content) == noted
+        assert note in page.status.content
     page.hand.value = "barrett"
     page._pick_object()
     assert page.made is None, "another hand has no grasps"
@@ -91,10 +91,12 @@ def test_a_hand_of_other_joints_is_refused(both: GraspBatch, command: str, capsy
     assert [path.name for path in Path().iterdir()] == ["both.parquet"]
 
 
+@pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")
 @pytest.mark.parametrize("command", ["view", "picture"])
 def test_a_mesh_does_not_replace_one_of_several_objects(
-    both: GraspBatch, command: str, capsys: pytest.CaptureFixture[str]
+    both: GraspBatch, command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("dro_grasp.viewer.stage.serve", StudioServer.stop)
     name, *more = COMMANDS[command]
     assert main([name, "both.parquet", "--object", "sphere", *more]) == 2
     assert "--object is 'sphere', but the grasps are of 2 objects (mug, can)" in capsys.readouterr().err

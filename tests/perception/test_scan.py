@@ -13,12 +13,13 @@ from scipy.spatial.transform import Rotation
 
 from dro_grasp.cli.main import main
 from dro_grasp.errors import ObjectError, OptionError
-from dro_grasp.frames import read_motion
+from dro_grasp.frames import NamedMotion, read_motion
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.sources import object_of
+from dro_grasp.grasps.sources import object_of, with_sources
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.scan import depth_points, load_scan, scanned_object, without_outliers
+from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.weights import untrained_weights
 
 INTRINSICS = np.array([[300.0, 0, 79.5], [0, 310.0, 59.5], [0, 0, 1]])
@@ -258,3 +259,26 @@ def test_a_cloud_file_loses_its_table(
     assert "but the table in the cloud is where" in told
     assert main([*command, "--table", "-1.0", "--keep-table"]) == 0
     assert "counts along the z axis of the cloud" in capsys.readouterr().err
+
+
+def test_a_kept_table_is_there_when_the_grasps_are_read_again(
+    tmp_path: Path, depth: np.ndarray, T_object_camera: np.ndarray
+) -> None:
+    points, path = on_a_table(depth_points(depth, INTRINSICS), T_object_camera), tmp_path / "scene.npy"
+    np.save(path, points * 1000)
+    hand, camera = loaded_hand("gripper3"), NamedMotion("base", torch.from_numpy(T_object_camera).float())
+    for keep_table in (False, True):
+        for obj, pose in (
+            (load_object(path, scale=0.001, keep_table=keep_table), None),
+            (load_scan(path, T_object_camera.astype(np.float32).astype(float), 0.001, keep_table), camera),
+        ):
+            file = tmp_path / "grasps.parquet"
+            bare = GraspBatch.create(hand, [obj], torch.eye(4)[None], hand.canonical_joints()[None])
+            with_sources(bare, "gripper3", str(path), 0.001, pose).save(file)
+            again = object_of(GraspBatch.load(file), None, 1.0)
+            assert (again.sha256, again.notes) == (obj.sha256, obj.notes)
+            assert (again.table is None) == keep_table
+            if pose is None and keep_table:
+                stranger = GraspBatch.load(file).replace(object_sha256=("0" * 64,))
+                unknown = stranger.replace(object_sha256=("",))
+                assert all(object_of(one, None, 1.0).table is not None for one in (stranger, unknown))

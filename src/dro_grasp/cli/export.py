@@ -89,6 +89,8 @@ class Export:
 
         stated = bool(grasps.states_closing.all())
         hand = hand_of(grasps, self.hand) if FORMATS[self.format].needs_hand or not stated else None
+        if hand is not None:
+            grasps.require_hand(hand)
         if hand is not None and not stated:
             centre = torch.as_tensor(object_of(grasps, self.object, 1.0).centre_of_mass, dtype=grasps.joints.dtype)
             grasps = completed(hand, grasps, centre)

@@ -24,6 +24,8 @@ MAX_SIDE = 4096
 """Largest width and height of one picture [pixels]."""
 MAX_PIXELS = 50_000_000
 """Most pixels of all pictures on a sheet together."""
+LISTED = 8
+"""Most objects that an error names."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,7 @@ class Picture:
 
     def run(self) -> int:
         """Load the file and draw."""
-        from dro_grasp.errors import GraspFileError, OptionError
+        from dro_grasp.errors import OptionError
         from dro_grasp.files import check_output
         from dro_grasp.grasps.reading import load_grasps
         from dro_grasp.grasps.sources import hand_of
@@ -153,14 +155,8 @@ class Picture:
         check_output(self.output)
         grasps = load_grasps(self.file)
         hand = hand_of(grasps, self.hand)
-        if self.only_successful:
-            if not bool(grasps.success.any()):
-                raise GraspFileError(f"no grasp in {self.file} has passed a trial; leave out --only-successful")
-            grasps = grasps[grasps.success]
-        names = list(dict(grasps.by_object())) if self.object is None else [self.object]
-        share = max(1, self.count // len(names))
-        pairs = [of_object(grasps, name, self.scale) for name in names[: self.count]]
-        pairs = [(obj, own[:share]) for obj, own in pairs]
+        grasps.require_hand(hand)
+        pairs = self._pairs(grasps)
         shown = sum(len(own) for _, own in pairs)
         if (pixels := shown * self.size[0] * self.size[1]) > MAX_PIXELS:
             raise OptionError(f"{shown} pictures of {self.size[0]} x {self.size[1]} are {pixels / 1e6:.0f} million pixels; a "
@@ -169,6 +165,23 @@ class Picture:
         draw_sheet(hand, pairs, self.output, self.columns, style)
         say(f"picture: {self.output}")
         return 0
+
+    def _pairs(self, grasps: GraspBatch) -> list[tuple[ObjectModel, GraspBatch]]:
+        """Objects on the sheet, each with those of its grasps that are drawn."""
+        from dro_grasp.errors import GraspFileError
+
+        def wanted(own: GraspBatch) -> GraspBatch:
+            return own if not self.only_successful else own[own.success.nonzero()[:, 0]]
+
+        names = [self.object] if self.object is not None else [
+            name for name, own in grasps.by_object() if len(wanted(own))]
+        share = max(1, self.count // max(1, len(names)))
+        pairs = [of_object(grasps, name, self.scale) for name in names[: self.count]]
+        pairs = [(obj, wanted(own)[:share]) for obj, own in pairs]
+        if self.only_successful and not any(len(own) for _, own in pairs):
+            of = "" if self.object is None else f" of {self.object}"
+            raise GraspFileError(f"no grasp{of} in {self.file} has passed a trial; leave out --only-successful")
+        return pairs
 
     def _check_options(self) -> None:
         """Refuse invalid options by name."""
@@ -201,13 +214,19 @@ def is_motion(file: Path) -> bool:
 
 
 def of_object(grasps: GraspBatch, name: str | None, scale: float) -> tuple[ObjectModel, GraspBatch]:
-    """An object and its grasps: one that the grasps name, or a mesh to use for their first object, which is the default.
+    """An object and its grasps: one that the grasps name, or a mesh to use for their only object. By default their first.
 
     Raises:
         DroGraspError: The object cannot be loaded.
+        OptionError: The grasps name no such object, and they have several.
     """
+    from dro_grasp.errors import OptionError
     from dro_grasp.grasps.sources import object_of
 
     parts = dict(grasps.by_object())
+    if name is not None and name not in parts and len(parts) > 1:
+        listed = ", ".join(list(parts)[:LISTED]) + (", ..." if len(parts) > LISTED else "")
+        raise OptionError(f"--object is '{name}', but the grasps are of {len(parts)} objects ({listed}); give one of these "
+                          "names: another object fits only a file of one object")
     own = name if name in parts else grasps.object[0]
     return object_of(parts[own], None if name in {None, own} else name, scale), parts[own]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -90,7 +91,7 @@ def hand_of(grasps: GraspBatch, given: str | None) -> Hand:
 
 
 def object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectModel:
-    """The object of grasps of one object, or the given one instead.
+    """The object of grasps of one object, or the given one instead; a table in its cloud is kept if the grasps kept it.
 
     Args:
         given: Name or path that replaces the one in the file.
@@ -106,10 +107,19 @@ def object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectMode
         return load_object(given, scale=scale)
     try:
         source, own_scale = object_source(grasps, scale)
-        if (frame := frame_of(grasps)) is not None:
-            pose = grasps.extra[CAMERA][grasps.extra[FRAME].index(frame)].reshape(4, 4)
-            return load_scan(Path(source), pose.double().numpy(), own_scale)
-        return load_object(source, scale=own_scale)
+        pose = camera_pose(grasps)
+
+        def loaded(keep_table: bool) -> ObjectModel:
+            if pose is None:
+                return load_object(source, scale=own_scale, keep_table=keep_table)
+            return load_scan(Path(source), pose.double().numpy(), own_scale, keep_table)
+
+        obj, hashes = loaded(keep_table=False), set(grasps.object_sha256) - {""}
+        if obj.table is not None and hashes and obj.sha256 not in hashes:
+            with suppress(ObjectError):
+                whole = loaded(keep_table=True)
+                return whole if whole.sha256 in hashes else obj
+        return obj
     except ObjectError as error:
         raise ObjectError(f"the grasps are of object '{grasps.object[0]}', which cannot be loaded ({error}); give its file "
                           "with --object, and --scale if it had one") from error

@@ -67,6 +67,7 @@ class Studio(GraspPage):
         """
         self.predictor, self.shelf, self._first = predictor, Shelf(), (hand, obj)
         self._turn = turn or threading.Lock()
+        self._given: dict[str, Hand] = {}  # the hand that came with a file's grasps, by the name of their object
         super().__init__(place)
         if preview:
             self._guarded(self._preview)
@@ -81,12 +82,17 @@ class Studio(GraspPage):
         """Show the grasps of a file. Its hand and objects can be picked, and more grasps generated, like any other.
 
         Args:
-            hand: The hand of the grasps.
+            hand: The hand of the grasps, or another version of it, which is then said.
             grasps: Of one object or several.
             obj: Their object, where it is not the one that they name.
             first: Name of the object that is shown first.
+
+        Raises:
+            GraspFileError: The hand has other joints than the grasps.
         """
+        grasps.require_hand(hand)
         self.shelf.put(hand, grasps, obj)
+        self._given |= dict.fromkeys([name for name, _ in grasps.by_object()] if obj is None else [obj.name], hand)
         self.hand.options, self.object.options = self.shelf.hand_names(), self.shelf.object_names()
         self.hand.value = hand.name
         self.object.value = obj.name if obj is not None else first or grasps.object[0]
@@ -141,14 +147,16 @@ class Studio(GraspPage):
         """Show the grasps of the chosen object if a file has some of the chosen hand, and the pair alone otherwise."""
         grasps = self.shelf.batches.get(self.object.value)
         hand = self.shelf.hand(self.hand.value)
-        if grasps is None or grasps.hand_sha256 != hand.sha256:
+        if grasps is None or (grasps.hand_sha256 != hand.sha256 and self._given.get(self.object.value) is not hand):
             self._preview()
             return
+        other = [] if grasps.hand_sha256 in {"", hand.sha256} else [
+            f"The grasps were made for another '{grasps.hand}' than the given {hand.name}."]
         obj, label = self.shelf.obj(self.object.value), next(filter(None, grasps.protocol), "")
         self.made = ShownGrasps(hand, obj, grasps, grasps, protocol_name(label))
         self._present()
         held = f", **{int(grasps.success.sum())}** held under *{label}*" if label else ", not evaluated"
-        self._say("  \n".join([f"{len(grasps)} grasps of {obj.name}{held}", *diagnose(grasps)]))
+        self._say("  \n".join([f"{len(grasps)} grasps of {obj.name}{held}", *other, *diagnose(grasps)]))
 
     def _plain(self, text: str) -> str:
         return self.shelf.plain(text)
