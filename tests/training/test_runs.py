@@ -21,10 +21,11 @@ from torch import nn
 from dro_grasp.cli.main import main
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.errors import OptionError, OutputError, TrainingError
-from dro_grasp.models.network import DistanceNetwork
+from dro_grasp.models.network import DistanceNetwork, untrained_network
 from dro_grasp.training import loop, losses, pretraining
 from dro_grasp.training.config import AugmentationConfig, LossConfig, ScheduleConfig, TrainConfig
 from dro_grasp.training.run_folder import CHECKPOINT, LOG, RunFolder
+from dro_grasp.training.run_plan import run_plan
 from dro_grasp.training.runs import TrainingRun, check_schedule, learning_rate_share
 from tests.helpers.tiny_bundle import TINY
 from tests.helpers.training_stages import SCHEDULE, SHARDED, STAGES, curve, quiet, run_stage
@@ -172,6 +173,13 @@ def test_a_finished_run_with_other_settings_data_or_weights_is_refused(
             loop.train(data, TINY, asked, finished["train"], given, quiet)
     longer = dataclasses.replace(config, schedule=dataclasses.replace(SCHEDULE, minutes=5.0, log_every=5))
     loop.train(bundle, TINY, longer, finished["train"], report=quiet)
+
+
+def test_given_weights_count_by_their_parameters_whatever_their_names(bundle: Bundle) -> None:
+    plans = [run_plan(TrainConfig(SCHEDULE), bundle, TINY, initial=untrained_network(TINY, seed, name))
+             for seed, name in ((0, "a"), (1, "a"), (0, "b"))]
+    assert plans[0] == plans[2] != plans[1]
+    assert {k for k in plans[0] if plans[0][k] != plans[1][k]} == {"initial"}
 
 
 def test_a_checkpoint_of_another_training_is_refused(bundle: Bundle, finished: dict[str, Path]) -> None:

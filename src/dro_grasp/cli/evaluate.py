@@ -75,7 +75,7 @@ class Evaluate:
             raise OptionError(f"{self.file} holds grasps of {len(names)} objects; --object fits a file with one")
         for name, part in grasps.by_object():
             obj = object_of(part, self.object, self.scale)
-            compare("object", name, part.object_sha256[0], obj, self.output)
+            compare("object", name, next(filter(None, part.object_sha256), ""), obj, self.output)
             problems.append((name, part, obj))
         with progress_bar("evaluating", self.json) as progress:
             while problems:  # what an object gathers in its trials goes with it

@@ -46,7 +46,7 @@ def build_hand(description: Description, *, name: str | None = None, seed: int =
     fewest = POINTS_PER_LINK * len(hand.tips)
     if not fewest <= n_points <= hand.n_points:
         raise OptionError(f"n_points is {n_points}; give an integer from {fewest} to {hand.n_points}, the points that hand "
-                          f"'{hand.name}' can have, or leave it out")
+                          f"'{hand.name}' can have")
     keep = farthest_points(hand.points(hand.canonical_joints()), n_points)
     # A fingertip that is small beside the rest may have been left out.
     missing = [tip for tip in hand.tips if not bool((hand.link_index[keep] == tip).any())]

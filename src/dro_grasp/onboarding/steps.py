@@ -273,7 +273,8 @@ class _Onboarding:
             steps=10**6, minutes=self.config.minutes * TRAINING_SHARE, learning_rate=self.config.learning_rate,
             seed=self.config.seed, device=self.config.device)
         config = TrainConfig(schedule, hands_per_step=1, samples_per_hand=16)
-        model = train(bundle, initial.config, config, self.folder / "run", name=self.folder.name, initial=initial,
+        run = self.folder / "run" / bundle.fingerprint  # data that are made again make another run
+        model = train(bundle, initial.config, config, run, name=self.folder.name, initial=initial,
                       report=lambda run, means: self.say(f"step {run.step}: distance {1e3 * means['distance']:.1f} mm"))
         about = {"stage": "fine-tuning", "initial": initial.name, "data": bundle.summary(), "minutes": self.config.minutes}
         save_weights(model, self.folder / WEIGHTS, about, history_of(locate_weights(self.config.weights)))

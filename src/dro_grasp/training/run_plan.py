@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from hashlib import sha256
 from typing import Any
 
 from dro_grasp.datasets.bundle.training_file import Bundle
@@ -22,13 +23,21 @@ def run_plan(
         config: Settings of the stage, a dataclass with a `schedule`.
         bundle: Training data, of which the content counts, not the file.
         network: Configuration of the network in training.
-        given: Weights that the run begins with or takes parts of, by role; their names count.
+        given: Weights that the run begins with or takes parts of, by role; their parameters count, not their names.
     """
     settings = {name: value for name, value in _flat(config).items() if name.removeprefix("schedule.") not in BOOKKEEPING}
-    names = {role: None if weights is None else weights.name for role, weights in given.items()}
+    weights = {role: None if each is None else _digest(each) for role, each in given.items()}
     about = {} if network is None else _flat(network, "network.")
-    return {name.removeprefix("schedule."): value for name, value in settings.items()} | about | names | {
+    return {name.removeprefix("schedule."): value for name, value in settings.items()} | about | weights | {
         "bundle": bundle.fingerprint}
+
+
+def _digest(network: DistanceNetwork) -> str:
+    """Twelve digits that tell parameters apart; statistics of BatchNorm do not count, as each sitting measures its own."""
+    digest = sha256()
+    for parameter in network.parameters():
+        digest.update(parameter.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()[:12]
 
 
 def _flat(record: Any, prefix: str = "") -> dict[str, Any]:
