@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 
@@ -77,3 +78,13 @@ def toy_hand(dtype: torch.dtype = torch.float32) -> Hand:
         rest=torch.zeros(dof).to(dtype), abduction=torch.zeros(dof, dtype=torch.bool),
         contact_links=tuple(range(tree.n_links)), sha256="toy",
     )
+
+
+def coupled_hand() -> Hand:
+    """The toy hand with two independent joints: one bends every finger at the palm, the other every knuckle."""
+    own = toy_hand()
+    tree = replace(
+        own.tree, joint_names=("bases", "knuckles"), coupling=torch.eye(2).repeat(3, 1), lower=own.tree.lower[:2],
+        upper=own.tree.upper[:2])
+    per_joint = ("opening_signs", "open_ends", "movable", "rest", "abduction")
+    return replace(own, tree=tree, **{name: getattr(own, name)[:2] for name in per_joint})

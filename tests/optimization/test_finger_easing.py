@@ -9,9 +9,9 @@ import torch
 
 from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.optimization.finger_easing import EasingConfig, ease_fingers
+from dro_grasp.optimization.finger_easing import EasingConfig, ease_fingers, lacking_room
 from tests.helpers.claw import ball, grasps_of, wrist_below
-from tests.helpers.toy_hand import toy_hand
+from tests.helpers.toy_hand import coupled_hand, toy_hand
 
 HAND, RADIUS, CONFIG = toy_hand(), 0.03, EasingConfig()
 BALL = ball(RADIUS)
@@ -43,6 +43,50 @@ def test_fingers_open_until_they_stand_clear_and_nothing_else_moves() -> None:
         assert torch.equal(getattr(after, name), getattr(before, name))
 
 
+def test_fingers_leave_more_room_where_the_surface_is_a_guess_and_no_more_where_it_was_seen() -> None:
+    before = complete(TOUCHING, OPENED - 0.3)
+    points = HAND.points(before.joints, before.T_object_wrist)[0]
+    first = points[torch.isin(HAND.link_index, torch.tensor(HAND.fingers[0].links))]
+    cloud = torch.from_numpy(BALL.cloud)
+    seen = cloud[torch.cdist(cloud, first).amin(1) < 0.01]
+    assert 0 < len(seen) < len(cloud) / 3
+    plain, after = ease_fingers(ENERGY, before), ease_fingers(ENERGY, before, seen)
+    assert torch.equal(after.joints[0, :2], plain.joints[0, :2])
+    assert float(gaps(plain)[1:].max()) < 0.008
+    for unseen in (CONFIG.unseen, 0.008):
+        after = ease_fingers(ENERGY, before, seen, replace(CONFIG, unseen=unseen))
+        points = HAND.points(after.joints, after.T_object_wrist)[0]
+        away = points.norm(dim=-1) - RADIUS
+        wanted = (torch.cdist(points, seen).amin(1) - away).clamp(CONFIG.clearance, unseen)
+        others = torch.isin(HAND.link_index, torch.tensor([link for f in HAND.fingers[1:] for link in f.links]))
+        assert float((away - wanted)[others].min()) > -7e-4
+        assert float(gaps(after)[1:].min()) > 0.0075
+    assert float(gaps(after)[1:].max()) < 0.0115
+    everywhere = ease_fingers(ENERGY, before, cloud)
+    assert torch.equal(everywhere.joints, plain.joints), "nothing is a guess"
+
+
+@pytest.mark.parametrize("part", ["all", "top", "none"])
+def test_the_lacking_room_is_that_of_every_point_of_the_opened_hand(part: str) -> None:
+    both = GraspBatch.concatenate([complete(TOUCHING, TOUCHING), complete(TOUCHING, OPENED), complete(TOUCHING, OPENED, 0.3)])
+    cloud = torch.from_numpy(BALL.cloud)
+    seen = {"all": cloud, "top": cloud[cloud[:, 2] > 0.02], "none": None}[part]
+    expected = []
+    for T, q in zip(both.T_object_wrist, both.pregrasp_joints, strict=True):
+        wanted = []
+        for point in HAND.points(q[None], T[None])[0]:
+            distance = float(point.norm()) - RADIUS
+            guess = 0.0 if seen is None else float((seen - point).norm(dim=-1).min()) - max(distance, 0.0)
+            wanted.append(min(max(guess, CONFIG.clearance), CONFIG.unseen) - distance)
+        expected.append(max(0.0, *wanted))
+    found = lacking_room(ENERGY, both, seen)
+    assert found.tolist() == pytest.approx(expected, abs=7e-4)
+    assert expected[0] > 0.002
+    assert expected[2] == 0
+    assert torch.equal(lacking_room(ENERGY, both, seen, replace(CONFIG, batch_size=1)), found)
+    assert len(lacking_room(ENERGY, both[:0], seen)) == 0
+
+
 def test_a_finger_that_is_clear_stays_while_others_open() -> None:
     joints = TOUCHING.clone()
     joints[:2] = OPENED[:2]
@@ -51,6 +95,25 @@ def test_a_finger_that_is_clear_stays_while_others_open() -> None:
     after = ease_fingers(ENERGY, before)
     assert torch.equal(after.joints[0, :2], joints[:2])
     assert bool((after.joints[0, [3, 5]] < joints[[3, 5]]).all())
+
+
+def test_fingers_that_share_their_joints_open_until_all_stand_clear() -> None:
+    hand = coupled_hand()
+    energy = GraspEnergy.of_object(hand, BALL, EnergyConfig(hand_points=hand.n_points))
+    T = wrist_below(0.05)
+    T[0, 0, 3] = -0.004  # nearer to one finger than to the others
+    touching, opened = torch.tensor([[0.06, 0.58]]), torch.tensor([[-0.4, 0.1]])
+    before = grasps_of(hand, BALL, T, touching).replace(pregrasp_joints=opened, squeeze_joints=touching + 0.1)
+    after = ease_fingers(energy, before)
+
+    def nearest(joints: torch.Tensor) -> float:
+        return float(hand.points(joints, T).norm(dim=-1).amin()) - RADIUS
+
+    assert nearest(touching) < 0.002
+    assert CONFIG.clearance - 7e-4 < nearest(after.joints)
+    share = (after.joints - touching) / (opened - touching)
+    assert float(share[0, 0]) == pytest.approx(float(share[0, 1]), abs=1e-6)
+    assert nearest(touching + (share - 0.1) * (opened - touching)) < CONFIG.clearance + 7e-4
 
 
 def test_where_the_pregrasp_leaves_no_room_a_finger_goes_where_it_is_clearest() -> None:
@@ -68,8 +131,8 @@ def test_where_the_pregrasp_leaves_no_room_a_finger_goes_where_it_is_clearest() 
 def test_batches_do_not_matter_and_none_stay_none() -> None:
     both = GraspBatch.concatenate([complete(TOUCHING, OPENED), complete(TOUCHING - 0.05, OPENED), complete(TOUCHING, OPENED)])
     whole = ease_fingers(ENERGY, both)
-    assert torch.equal(ease_fingers(ENERGY, both, replace(CONFIG, batch_size=1)).joints, whole.joints)
+    assert torch.equal(ease_fingers(ENERGY, both, config=replace(CONFIG, batch_size=1)).joints, whole.joints)
     assert not torch.equal(whole.joints, both.joints)
     assert len(ease_fingers(ENERGY, both[slice(0, 0)])) == 0
-    wide = ease_fingers(ENERGY, both, replace(CONFIG, clearance=0.01))
+    wide = ease_fingers(ENERGY, both, config=replace(CONFIG, clearance=0.01))
     assert float(gaps(wide[0]).min()) == pytest.approx(0.0115, abs=0.0022)

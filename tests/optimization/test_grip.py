@@ -17,7 +17,7 @@ from dro_grasp.grasps.controller import pregrasp_and_squeeze
 from dro_grasp.optimization.grip import GripConfig, contact_forces, gripping
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.claw import ball, claw, grasps_of, power_grasp, wrist_below
-from tests.helpers.toy_hand import toy_hand
+from tests.helpers.toy_hand import coupled_hand, toy_hand
 
 CONFIG = GripConfig(iterations=2000)
 
@@ -88,6 +88,23 @@ def test_targets_stay_within_the_limits_and_shares_of_the_usual_squeeze_remain()
     assert bool((strong.squeeze_joints >= hand.tree.lower - 1e-6).all())
     assert math.isclose(float(strong.squeeze_joints.max()), 1.4, rel_tol=1e-6)
     assert len(gripping(GraspEnergy.of_object(hand, obj), far[slice(0, 0)])) == 0
+
+
+def test_a_joint_that_fingers_share_brings_those_that_do_not_touch_yet() -> None:
+    hand = coupled_hand()
+    obj = ball()
+    energy, config = GraspEnergy.of_object(hand, obj), GripConfig(force=0.0)
+    T = wrist_below(0.05, 2)
+    T[1, 0, 3] = -0.03  # one finger touches
+    grasps = grasps_of(hand, obj, T, torch.tensor([[0.1, 0.62]]).expand(2, -1))
+    near = NearestPoints.of(energy, T, grasps.joints)
+    gap = torch.stack([near.gap[:, torch.isin(near.links, torch.tensor(f.links))].amin(1) for f in hand.fingers], 1)
+    assert (gap < config.reach).sum(1).tolist() == [3, 1]
+    inner = pregrasp_and_squeeze(hand, T, grasps.joints, energy.centre)[1]
+    made = gripping(energy, grasps, config)
+    for row, share in enumerate((config.touching, config.idle)):
+        torch.testing.assert_close(made.squeeze_joints[row], (grasps.joints + share * (inner - grasps.joints))[row])
+    assert float((inner - grasps.joints).abs().min()) > 0.1
 
 
 def power_like(far: GraspBatch) -> GraspBatch:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial import KDTree
 
 from dro_grasp.errors import OptionError
 from dro_grasp.objects.catalogue import load_object
@@ -25,6 +26,11 @@ def test_a_view_is_a_cloud_in_the_objects_frame_that_follows_the_seed(view: View
     once, again, other = (partial_view(can, view, seed).cloud for seed in (3, 3, 4))
     np.testing.assert_array_equal(once, again)
     assert once.shape != other.shape or np.abs(once - other).max() > 0.005
+    seen, given = partial_view(can, view, 3).seen, visible_side(can, view, 3)[0]
+    assert seen is not None
+    assert KDTree(given).query(seen)[0].max() < 1e-6
+    assert len(seen) < 0.8 * len(once)
+    assert partial_view(can, "cloud", 3).seen is None
     low, high = can.cloud.min(0) - 0.03, can.cloud.max(0) + 0.03
     assert ((once > low) & (once < high)).mean() > 0.9
     if view == "half":

@@ -9,6 +9,7 @@ import igl
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from dro_grasp.cli.main import main
@@ -86,6 +87,20 @@ def test_a_scan_is_in_the_frame_asked_for_and_looks_at_the_camera(
     own = np.cross(*(mug.vertices[mug.faces[face, k]] - mug.vertices[mug.faces[face, 0]] for k in (1, 2)))
     own /= np.linalg.norm(own, axis=1, keepdims=True)
     assert np.median((own * scan.cloud_normals).sum(1)) > 0.95
+
+
+def test_a_completed_scan_knows_which_of_its_points_were_seen(
+    mug: ObjectModel, depth: np.ndarray, T_object_camera: np.ndarray
+) -> None:
+    points = depth_points(depth, INTRINSICS)
+    scan = scanned_object("mug seen", points, T_object_camera)
+    assert scan.seen is not None
+    given = KDTree(points @ T_object_camera[:3, :3].T + T_object_camera[:3, 3])
+    assert given.query(scan.seen)[0].max() < 1e-5
+    away = given.query(scan.cloud)[0]
+    assert (away < 1e-5).sum() == len(scan.seen)
+    assert 0.2 < (away > 0.003).mean() < 0.8
+    assert scanned_object("mug seen", points, T_object_camera, complete=False).seen is None
 
 
 @pytest.mark.parametrize(

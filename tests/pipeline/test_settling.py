@@ -7,17 +7,19 @@ import dataclasses
 import pytest
 import torch
 
+from dro_grasp.energy.grasp_energy import EnergyConfig
 from dro_grasp.errors import ObjectError
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.optimization.finger_easing import lacking_room
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
 from dro_grasp.perception.partial_views import partial_view
 from dro_grasp.pipeline import settling
 from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.settling import UNHELD_SCORE, Settled, best_settled, can_settle, settled
+from dro_grasp.pipeline.settling import ROOM_WORTH, UNHELD_SCORE, Settled, best_settled, can_settle, settled
 from dro_grasp.pipeline.stages import evaluate, refine, scored
 from dro_grasp.simulation.closed_poses import hand_shift
 from dro_grasp.simulation.holding import Holding, holding
@@ -103,6 +105,21 @@ def test_only_the_better_half_is_settled_and_what_is_not_held_scores_low(
     torch.testing.assert_close(found.T_object_wrist, known.T_object_wrist[[1, 3]])
     assert len(best_settled(PROBLEM, known, 4)[0]) == 4
     assert len(best_settled(PROBLEM, known, 9)[0]) == 5
+
+
+def test_a_grasp_scores_lower_for_room_that_it_lacks_beside_what_was_not_seen(
+    grasps: GraspBatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cloud = partial_view(CAN, "cloud", 0)
+    half = dataclasses.replace(cloud, seen=cloud.cloud[cloud.cloud[:, 0] > 0])
+    monkeypatch.setattr(settling, "settle", lambda hand, obj, some: shifted(some, [0.0] * len(some)))
+    (_, whole), (_, guessed) = (best_settled(p, scored(p, grasps), 5) for p in (GraspProblem(HAND, o) for o in (cloud, half)))
+    torch.testing.assert_close(whole.joints, guessed.joints)
+    problem = GraspProblem(HAND, half)
+    assert problem.seen is not None
+    lacking = lacking_room(problem.energy(EnergyConfig()), guessed, problem.seen)
+    assert float(lacking.max()) > 0.002
+    torch.testing.assert_close(whole.score - guessed.score, ROOM_WORTH * lacking)
 
 
 def test_a_hand_without_description_cannot_settle() -> None:

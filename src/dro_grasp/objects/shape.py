@@ -54,6 +54,8 @@ class ObjectModel:
     """`train`, `validate`, `test`, or None for a user's object."""
     exact_parts: tuple[Part, ...] | None = None
     """Convex parts known by construction or from a file; None computes them."""
+    seen: Float[np.ndarray, "m 3"] | None = None
+    """Points of a bare cloud that were seen, where its other points are a guess [m]; None where nothing is."""
     balls: Balls | None = None
     """What a bare cloud collides as where hands close on it; see `solid_of`."""
     file: str | None = None

@@ -124,16 +124,31 @@ def finger_distances(
     energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"]
 ) -> Float[Tensor, "n n_tips"]:
     """Signed distance of each finger's nearest surface point to the object, for wrist poses and joints on its device [m]."""
+    return least_by_finger(energy, energy.field.distances(body_points(energy, T, q))[0])
+
+
+def body_points(
+    energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"]
+) -> Float[Tensor, "n p 3"]:
+    """The hand's surface points, for wrist poses and joints on the energy's device [m]."""
+    return energy.body.place(T[:, None] @ energy.hand.tree.forward(q))
+
+
+def least_by_finger(energy: GraspEnergy, values: Float[Tensor, "n p"]) -> Float[Tensor, "n n_tips"]:
+    """The least value of each finger's points, of one for each of `body_points`."""
     hand = energy.hand
-    points = energy.body.place(T[:, None] @ hand.tree.forward(q))
-    distance = energy.field.distances(points)[0]
     finger = hand.finger_of_link[energy.body.members.argmax(-1)]
-    return torch.stack([torch.where(finger == index, distance, torch.inf).amin(-1) for index in range(len(hand.fingers))], -1)
+    return torch.stack([torch.where(finger == index, values, torch.inf).amin(-1) for index in range(len(hand.fingers))], -1)
+
+
+def finger_joints(hand: Hand) -> Bool[Tensor, "n_tips n_dof"]:
+    """The joints that move each finger, alone or with others."""
+    return torch.stack([hand.tree.moves[list(finger.links)].any(0) for finger in hand.fingers])
 
 
 def bending(hand: Hand) -> Bool[Tensor, "n_tips n_dof"]:
     """The joints that bend each finger and no other."""
-    moves = torch.stack([hand.tree.moves[list(finger.links)].any(0) for finger in hand.fingers])
+    moves = finger_joints(hand)
     return moves & (moves.sum(0) == 1) & hand.movable & ~hand.abduction
 
 

@@ -1,7 +1,7 @@
-"""Fingers stand clear of a surface that is an estimate: each opens alone until it leaves room, and closes with the squeeze.
+"""Fingers stand clear of a surface that is an estimate: each opens until it leaves room, and closes with the squeeze.
 
-A camera sees one side of an object. The other side is a guess that errs by some millimetres, and fingers that rest on the guess
-end up inside the object. Wrist, pregrasp and squeeze stay. Ours.
+A camera sees one side of an object. The other side is a guess that errs by some millimetres, and by more the farther it is from
+what was seen. Fingers that rest on the guess end up inside the object. Wrist, pregrasp and squeeze stay. Ours.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dro_grasp.energy.grasp_energy import GraspEnergy
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.optimization.finger_closing import bending, finger_distances
+from dro_grasp.optimization.finger_closing import body_points, finger_joints, least_by_finger
 
 
 @dataclass(frozen=True)
@@ -22,8 +22,9 @@ class EasingConfig:
     """How much room fingers leave (ours)."""
 
     clearance: float = 0.004
-    """Distance from which on a finger stands clear [m]: about the error of a completed surface; 6 mm cost a little where the
-    cloud is whole."""
+    """Distance from which on a finger stands clear [m]: 6 mm cost a little where the cloud is whole."""
+    unseen: float = 0.015
+    """The same at most, where the surface is a guess: as far as it is from the nearest point that was seen [m]."""
     steps: int = 11
     """Samples of the way from the grasp to the pregrasp."""
     batch_size: int = 64
@@ -31,29 +32,71 @@ class EasingConfig:
 
 
 @torch.no_grad()
-def ease_fingers(energy: GraspEnergy, grasps: GraspBatch, config: EasingConfig | None = None) -> GraspBatch:
+def ease_fingers(
+    energy: GraspEnergy, grasps: GraspBatch, seen: Float[Tensor, "m 3"] | None = None, config: EasingConfig | None = None
+) -> GraspBatch:
     """The grasps with fingers clear of the object, as far as their pregrasps open; wrist, pregrasp and squeeze stay.
 
     Args:
         energy: Of the grasps' hand on their object.
         grasps: Complete grasps of the two.
+        seen: Points of the object that were seen, where the rest is a guess, on the energy's device [m].
         config: Room and steps.
     """
     config = config or EasingConfig()
     if not len(grasps):
         return grasps
     parts = (grasps[slice(i, i + config.batch_size)] for i in range(0, len(grasps), config.batch_size))
-    return grasps.replace(joints=torch.cat([_eased(energy, part, config) for part in parts]))
+    return grasps.replace(joints=torch.cat([_eased(energy, part, seen, config) for part in parts]))
 
 
-def _eased(energy: GraspEnergy, grasps: GraspBatch, config: EasingConfig) -> Float[Tensor, "n n_dof"]:
+@torch.no_grad()
+def lacking_room(
+    energy: GraspEnergy, grasps: GraspBatch, seen: Float[Tensor, "m 3"] | None = None, config: EasingConfig | None = None
+) -> Float[Tensor, " n"]:
+    """How much less room the opened hands leave than fingers should, where it is least, palm included [m]; 0 for none.
+
+    Args:
+        energy: Of the grasps' hand on their object.
+        grasps: Complete grasps of the two.
+        seen: As in `ease_fingers`.
+        config: Room.
+    """
+    config, device = config or EasingConfig(), energy.centre.device
+    lacking = [torch.zeros(0)]
+    for i in range(0, len(grasps), config.batch_size):
+        part = grasps[slice(i, i + config.batch_size)]
+        spare = _spare_room(energy, part.T_object_wrist.to(device), part.pregrasp_joints.to(device), seen, config)
+        lacking.append((-spare).amax(-1).clamp_min(0).cpu())
+    return torch.cat(lacking)
+
+
+def _eased(
+    energy: GraspEnergy, grasps: GraspBatch, seen: Float[Tensor, "m 3"] | None, config: EasingConfig
+) -> Float[Tensor, "n n_dof"]:
     """Joints of some of the grasps, on the CPU."""
-    device, bends = energy.centre.device, bending(energy.hand)
+    device, hand = energy.centre.device, energy.hand
     T, q, opened = (x.to(device) for x in (grasps.T_object_wrist, grasps.joints, grasps.pregrasp_joints))
-    moves, finger = bends.any(0), bends.float().argmax(0)
+    moved = finger_joints(hand)
+    bends = moved.any(0) & hand.movable & ~hand.abduction
     shares = torch.linspace(0, 1, config.steps, device=device)
-    distances = torch.stack([finger_distances(energy, T, torch.where(moves, q + share * (opened - q), q)) for share in shares])
-    # The first share at which a finger is clear; the clearest where it never is.
-    first = torch.where((distances >= config.clearance).any(0), (distances >= config.clearance).float().argmax(0),
-                        distances.argmax(0))
-    return torch.where(moves, q + shares[first][:, finger] * (opened - q), q).cpu()
+    ways = (torch.where(bends, q + share * (opened - q), q) for share in shares)
+    spare = torch.stack([least_by_finger(energy, _spare_room(energy, T, way, seen, config)) for way in ways])
+    # The first share at which a finger is clear; the clearest where it never is. Fingers that share a joint open alike.
+    first = torch.where((spare >= 0).any(0), (spare >= 0).float().argmax(0), spare.argmax(0))
+    share = torch.where(moved, shares[first][..., None], 0).amax(1)
+    return torch.where(bends, q + share * (opened - q), q).cpu()
+
+
+def _spare_room(
+    energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], seen: Float[Tensor, "m 3"] | None,
+    config: EasingConfig,
+) -> Float[Tensor, "n p"]:
+    """How much more room each of the hand's surface points leaves than it should [m]."""
+    points = body_points(energy, T, q)
+    distance = energy.field.distances(points)[0]
+    if seen is None:
+        return distance - config.clearance
+    # The surface there is as much of a guess as it is farther away than what was seen.
+    guessed = torch.cdist(points.flatten(0, 1), seen).amin(-1).view_as(distance) - distance.clamp_min(0)
+    return distance - guessed.clamp(config.clearance, max(config.clearance, config.unseen))

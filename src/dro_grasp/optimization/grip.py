@@ -20,6 +20,7 @@ from dro_grasp.energy.nearest_points import NearestPoints
 from dro_grasp.geometry.contact_forces import friction_cone, nonnegative_least_squares
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
+from dro_grasp.optimization.finger_closing import finger_joints
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class GripConfig:
     touching: float = 0.3
     """Share of the usual squeeze that touching fingers keep."""
     idle: float = 0.7
-    """The same for fingers that do not touch."""
+    """The same for fingers that do not touch, and for those that share their joints."""
     iterations: int = 200
     """Steps of the solver."""
     batch_size: int = 64
@@ -83,8 +84,9 @@ def _targets(
     forces = contact_forces(near, touches, finger, energy.centre, energy.length, config)
     jacobian = tree.point_jacobian(T[:, None] @ tree.forward(q), near.points, near.links)
     torque = torch.einsum("nlxd,nlx->nd", jacobian, forces)
-    moved = torch.stack([tree.moves[list(f.links)].any(0) for f in hand.fingers])
-    active = (involved[..., None] & moved).any(1)
+    moved = finger_joints(hand)
+    # A joint that several fingers share goes on bringing those that do not touch yet.
+    active = moved.any(0) & (involved[..., None] | ~moved).all(1)
     share = torch.where(active, config.touching, config.idle)
     target = q + share * (inner - q) + torque * hand.movable * tree.joint_unit**2 / config.stiffness
     lower, upper = torch.minimum(hand.lower, q), torch.maximum(hand.upper, q)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -42,7 +42,8 @@ def partial_view(obj: ObjectModel, view: View, seed: int, camera: DepthCamera | 
     if view == "cloud":
         return cloud_object(name, np.concatenate([obj.cloud, obj.cloud_normals], 1), origin=name, keep_table=True)
     both = complete_cloud(*visible_side(obj, view, seed, camera))
-    return cloud_object(name, np.concatenate([both.points, both.normals], 1), origin=name, keep_table=True)
+    whole = cloud_object(name, np.concatenate([both.points, both.normals], 1), origin=name, keep_table=True)
+    return replace(whole, seen=both.seen)
 
 
 def visible_side(

@@ -14,7 +14,9 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from dro_grasp.energy.grasp_energy import EnergyConfig
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.optimization.finger_easing import lacking_room
 from dro_grasp.optimization.refinement import RefineConfig
 from dro_grasp.pipeline.admission import permitted
 from dro_grasp.pipeline.problem import GraspProblem
@@ -26,6 +28,8 @@ from dro_grasp.simulation.holding import Holding, holding
 
 SHARE = 0.5
 """Share of scored candidates that are settled, the best ones (ours)."""
+ROOM_WORTH = 80.0
+"""What the score of a grasp loses for room that the opened hand lacks where the object is a guess [log-odds per m] (ours)."""
 UNHELD_SCORE = -4.0
 """Highest score of a grasp that does not hold still when its closing is simulated [log-odds of holding] (ours)."""
 
@@ -67,8 +71,9 @@ def can_settle(problem: GraspProblem) -> bool:
 def best_settled(problem: GraspProblem, grasps: GraspBatch, least: int) -> tuple[Int[Tensor, " k"], GraspBatch]:
     """The better half of scored grasps, settled and scored again, in their order; which rows they are comes first.
 
-    The score counts how the object is held then. A grasp that does not hold still, or ends where the problem's
-    constraints forbid, stays as it was and scores at most UNHELD_SCORE.
+    The score counts how the object is held then, and on an object seen in part whether the opened hand keeps away from what was
+    not seen. A grasp that does not hold still, or ends where the problem's constraints forbid, stays as it was and scores at
+    most UNHELD_SCORE.
 
     Args:
         problem: Hand and object; see `can_settle`.
@@ -82,7 +87,10 @@ def best_settled(problem: GraspProblem, grasps: GraspBatch, least: int) -> tuple
     closed = replaced(closed, wrong, grasps[best[wrong]])
     score = scored(problem, closed).score
     score[held] = holding_score(score[held], state)
-    return best, closed.replace(score=torch.where(held & ~wrong, score, score.clamp_max(UNHELD_SCORE)))
+    score = torch.where(held & ~wrong, score, score.clamp_max(UNHELD_SCORE))
+    if problem.seen is not None:
+        score = score - ROOM_WORTH * lacking_room(problem.energy(EnergyConfig()), closed, problem.seen)
+    return best, closed.replace(score=score)
 
 
 def settled(problem: GraspProblem, grasps: GraspBatch, config: SettleConfig | None = None) -> Settled:

@@ -70,14 +70,16 @@ def eased(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
     """Complete grasps as they are given away: on a bare cloud, fingers leave room; those on a mesh stay.
 
     It comes last. Score and energy judge grasps whose fingers touch, and are kept. Where the constraints forbid the room, as a
-    table does, a grasp stays.
+    table does, fingers leave as much as on a surface that was seen, or none.
     """
     if not problem.obj.is_cloud:
         return grasps
-    with one_thread():
-        apart = ease_fingers(problem.energy(EnergyConfig()), grasps)
-    allowed = permitted(problem, apart)
-    return grasps.replace(joints=torch.where(allowed[:, None], apart.joints, grasps.joints))
+    energy, joints = problem.energy(EnergyConfig()), grasps.joints
+    for seen in (None,) if problem.seen is None else (None, problem.seen):
+        with one_thread():
+            apart = ease_fingers(energy, grasps, seen)
+        joints = torch.where(permitted(problem, apart)[:, None], apart.joints, joints)
+    return grasps.replace(joints=joints)
 
 
 def rank(problem: GraspProblem, grasps: GraspBatch, config: ScoreConfig | None = None) -> GraspBatch:

@@ -108,7 +108,8 @@ def pick_object(
     whole = scanned_object(name, sight.points, T_world_camera, keep_table=True)
     rows = np.concatenate([whole.cloud, whole.cloud_normals], 1)[whole.cloud[:, 2] > height]
     return PickedObject(
-        replace(cloud_object(name, rows, origin=name, keep_table=True), notes=whole.notes), _solid(sight), level)
+        replace(cloud_object(name, rows, origin=name, keep_table=True), notes=whole.notes, seen=whole.seen),
+        _solid(sight), level)
 
 
 def sees_table(world: Float[np.ndarray, "n 3"], table: Table) -> bool:
