@@ -9,6 +9,7 @@ import torch
 
 from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.optimization import finger_easing
 from dro_grasp.optimization.finger_easing import EasingConfig, ease_fingers, lacking_room
 from tests.helpers.claw import ball, grasps_of, wrist_below
 from tests.helpers.toy_hand import coupled_hand, toy_hand
@@ -50,11 +51,11 @@ def test_fingers_leave_more_room_where_the_surface_is_a_guess_and_no_more_where_
     cloud = torch.from_numpy(BALL.cloud)
     seen = cloud[torch.cdist(cloud, first).amin(1) < 0.01]
     assert 0 < len(seen) < len(cloud) / 3
-    plain, after = ease_fingers(ENERGY, before), ease_fingers(ENERGY, before, seen)
+    plain, after = ease_fingers(ENERGY, before), ease_fingers(ENERGY, before, seen.numpy())
     assert torch.equal(after.joints[0, :2], plain.joints[0, :2])
     assert float(gaps(plain)[1:].max()) < 0.008
     for unseen in (CONFIG.unseen, 0.008):
-        after = ease_fingers(ENERGY, before, seen, replace(CONFIG, unseen=unseen))
+        after = ease_fingers(ENERGY, before, seen.numpy(), replace(CONFIG, unseen=unseen))
         points = HAND.points(after.joints, after.T_object_wrist)[0]
         away = points.norm(dim=-1) - RADIUS
         wanted = (torch.cdist(points, seen).amin(1) - away).clamp(CONFIG.clearance, unseen)
@@ -62,7 +63,7 @@ def test_fingers_leave_more_room_where_the_surface_is_a_guess_and_no_more_where_
         assert float((away - wanted)[others].min()) > -7e-4
         assert float(gaps(after)[1:].min()) > 0.0075
     assert float(gaps(after)[1:].max()) < 0.0115
-    everywhere = ease_fingers(ENERGY, before, cloud)
+    everywhere = ease_fingers(ENERGY, before, cloud.numpy())
     assert torch.equal(everywhere.joints, plain.joints), "nothing is a guess"
 
 
@@ -71,6 +72,7 @@ def test_the_lacking_room_is_that_of_every_point_of_the_opened_hand(part: str) -
     both = GraspBatch.concatenate([complete(TOUCHING, TOUCHING), complete(TOUCHING, OPENED), complete(TOUCHING, OPENED, 0.3)])
     cloud = torch.from_numpy(BALL.cloud)
     seen = {"all": cloud, "top": cloud[cloud[:, 2] > 0.02], "none": None}[part]
+    given = None if seen is None else seen.numpy()
     expected = []
     for T, q in zip(both.T_object_wrist, both.pregrasp_joints, strict=True):
         wanted = []
@@ -79,12 +81,12 @@ def test_the_lacking_room_is_that_of_every_point_of_the_opened_hand(part: str) -
             guess = 0.0 if seen is None else float((seen - point).norm(dim=-1).min()) - max(distance, 0.0)
             wanted.append(min(max(guess, CONFIG.clearance), CONFIG.unseen) - distance)
         expected.append(max(0.0, *wanted))
-    found = lacking_room(ENERGY, both, seen)
+    found = lacking_room(ENERGY, both, given)
     assert found.tolist() == pytest.approx(expected, abs=7e-4)
     assert expected[0] > 0.002
     assert expected[2] == 0
-    assert torch.equal(lacking_room(ENERGY, both, seen, replace(CONFIG, batch_size=1)), found)
-    assert len(lacking_room(ENERGY, both[:0], seen)) == 0
+    assert torch.equal(lacking_room(ENERGY, both, given, replace(CONFIG, batch_size=1)), found)
+    assert len(lacking_room(ENERGY, both[:0], given)) == 0
 
 
 def test_a_finger_that_is_clear_stays_while_others_open() -> None:
@@ -95,6 +97,15 @@ def test_a_finger_that_is_clear_stays_while_others_open() -> None:
     after = ease_fingers(ENERGY, before)
     assert torch.equal(after.joints[0, :2], joints[:2])
     assert bool((after.joints[0, [3, 5]] < joints[[3, 5]]).all())
+
+
+def test_a_finger_that_finds_no_room_beside_a_guess_comes_no_nearer_to_the_surface(monkeypatch: pytest.MonkeyPatch) -> None:
+    gaps = iter([0.0045, *torch.linspace(0.0039, 0.001, CONFIG.steps - 1).tolist()])
+    spares = iter(torch.linspace(-0.02, -0.01, CONFIG.steps).tolist())
+    before = complete(TOUCHING, OPENED)
+    ones = torch.ones(1, len(ENERGY.body.members))
+    monkeypatch.setattr(finger_easing, "_room", lambda *_: (next(gaps) * ones, next(spares) * ones))
+    assert torch.equal(ease_fingers(ENERGY, before, BALL.cloud).joints, TOUCHING[None])
 
 
 def test_fingers_that_share_their_joints_open_until_all_stand_clear() -> None:

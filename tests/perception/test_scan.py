@@ -98,7 +98,7 @@ def test_a_completed_scan_knows_which_of_its_points_were_seen(
     given = KDTree(points @ T_object_camera[:3, :3].T + T_object_camera[:3, 3])
     assert given.query(scan.seen)[0].max() < 1e-5
     away = given.query(scan.cloud)[0]
-    assert (away < 1e-5).sum() == len(scan.seen)
+    assert 0.9 * len(points) < len(scan.seen) <= len(points), "without strays"
     assert 0.2 < (away > 0.003).mean() < 0.8
     assert scanned_object("mug seen", points, T_object_camera, complete=False).seen is None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import pytest
 import torch
@@ -14,6 +15,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize, synthesize_with
 from dro_grasp.perception.partial_views import partial_view
+from dro_grasp.pipeline import stages
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import complete, eased, evaluate, optimise, rank, refine, scored
@@ -71,6 +73,23 @@ def test_fingers_leave_room_on_a_bare_cloud_where_the_constraints_let_them(grasp
     assert float((clear[1] - clear[0]).min()) > -1e-4
     below = GraspProblem(HAND, cloud.obj, constraints=Constraints(cone=0.01, direction=(0.0, 0.0, 1.0)))
     assert torch.equal(eased(below, given).joints, given.joints), "none of these grasps is permitted"
+
+
+def test_where_the_wider_room_is_forbidden_fingers_leave_that_of_a_surface_that_was_seen(
+    grasps: GraspBatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = partial_view(PROBLEM.obj, "cloud", 0)
+    plain, half = (GraspProblem(PROBLEM.hand, o) for o in (whole, replace(whole, seen=whole.cloud[whole.cloud[:, 0] > 0])))
+    given = complete(plain, grasps)
+    narrow, wide = eased(plain, given).joints, eased(half, given).joints
+    other = (narrow != wide).any(1)
+    assert bool(other.any())
+
+    def all_but_the_wide(problem: GraspProblem, some: GraspBatch) -> torch.Tensor:
+        return torch.tensor([not any(torch.equal(row, w) for w in wide[other]) for row in some.joints])
+
+    monkeypatch.setattr(stages, "permitted", all_but_the_wide)
+    torch.testing.assert_close(eased(half, given).joints, torch.where(other[:, None], narrow, wide))
 
 
 def test_a_stopwatch_adds_up_and_lists_what_never_ran() -> None:

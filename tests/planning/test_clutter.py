@@ -15,6 +15,7 @@ from dro_grasp.planning.clutter import APART, other_objects, scatter
 from dro_grasp.planning.collisions import CollisionChecker, open_hand
 from dro_grasp.planning.physics import LiftScene
 from dro_grasp.planning.reachability import HITS_OBSTACLE, Reachability, ReachConfig
+from dro_grasp.planning.standing import moved
 from dro_grasp.planning.table_scene import pick_object, sees_table, sort_out
 from dro_grasp.planning.workcell import VOXEL, occupied
 
@@ -49,6 +50,22 @@ def test_the_thing_near_a_place_is_picked_and_the_other_is_an_obstacle(table_clo
     assert picked.robot.table.height == pytest.approx(0, abs=1e-3)
     below = np.linalg.norm(other.cloud - (*BALL, 0.02), axis=1).min()
     assert below < VOXEL  # only the ball's surface was given, but what is below its top is solid
+
+
+def test_what_a_camera_saw_of_the_thing_is_known_in_the_world(table_cloud: np.ndarray, robot: dro.Robot) -> None:
+    assert robot.camera is not None
+    T = robot.camera.T_world_camera
+    toward = np.linalg.inv(T)
+    visible = table_cloud[(table_cloud[:, 2] > 0.0595) | (table_cloud[:, 2] < 1e-3)]  # a cube's top, a ball's, and the table
+    obj = pick_object("cube", visible @ toward[:3, :3].T + toward[:3, 3], robot, T, near=CUBE).obj
+    assert obj.seen is not None
+    assert np.abs(obj.seen[:, 2] - 0.06).max() < 2e-3
+    assert obj.cloud[:, 2].min() < 0.05
+    turn = np.array([[0.0, -1, 0, 0.3], [1, 0, 0, 0], [0, 0, 1, 0.1], [0, 0, 0, 1]])
+    there = moved(obj, turn)
+    assert there.seen is not None
+    x, y, z = obj.seen.T
+    np.testing.assert_allclose(there.seen, np.column_stack([0.3 - y, x, z + 0.1]), atol=1e-6)
 
 
 def test_a_speck_is_an_obstacle_too(table_cloud: np.ndarray, robot: dro.Robot) -> None:

@@ -11,7 +11,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.settling import best_settled, can_settle
-from dro_grasp.pipeline.stages import refine, scored
+from dro_grasp.pipeline.stages import eased, refine, scored
 
 
 @dataclass(frozen=True)
@@ -63,4 +63,4 @@ class Method(ABC):
 def finished(problem: GraspProblem, grasps: GraspBatch, keep: int) -> GraspBatch:
     """Refined and scored grasps, the better half of them settled, `keep` at least: what any candidates can be made into."""
     grasps = scored(problem, refine(problem, grasps))
-    return best_settled(problem, grasps, keep)[1] if can_settle(problem) else grasps
+    return eased(problem, best_settled(problem, grasps, keep)[1] if can_settle(problem) else grasps)

@@ -55,7 +55,7 @@ class ObjectModel:
     exact_parts: tuple[Part, ...] | None = None
     """Convex parts known by construction or from a file; None computes them."""
     seen: Float[np.ndarray, "m 3"] | None = None
-    """Points of a bare cloud that were seen, where its other points are a guess [m]; None where nothing is."""
+    """What was seen of a bare cloud whose other points are a guess, in single precision [m]; None where nothing is."""
     balls: Balls | None = None
     """What a bare cloud collides as where hands close on it; see `solid_of`."""
     file: str | None = None

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from dro_grasp.energy.grasp_energy import GraspEnergy
@@ -33,26 +35,27 @@ class EasingConfig:
 
 @torch.no_grad()
 def ease_fingers(
-    energy: GraspEnergy, grasps: GraspBatch, seen: Float[Tensor, "m 3"] | None = None, config: EasingConfig | None = None
+    energy: GraspEnergy, grasps: GraspBatch, seen: Float[np.ndarray, "m 3"] | None = None, config: EasingConfig | None = None
 ) -> GraspBatch:
     """The grasps with fingers clear of the object, as far as their pregrasps open; wrist, pregrasp and squeeze stay.
 
     Args:
         energy: Of the grasps' hand on their object.
         grasps: Complete grasps of the two.
-        seen: Points of the object that were seen, where the rest is a guess, on the energy's device [m].
+        seen: Points of the object that were seen, where the rest is a guess [m].
         config: Room and steps.
     """
     config = config or EasingConfig()
     if not len(grasps):
         return grasps
     parts = (grasps[slice(i, i + config.batch_size)] for i in range(0, len(grasps), config.batch_size))
-    return grasps.replace(joints=torch.cat([_eased(energy, part, seen, config) for part in parts]))
+    tree = _tree(seen)
+    return grasps.replace(joints=torch.cat([_eased(energy, part, tree, config) for part in parts]))
 
 
 @torch.no_grad()
 def lacking_room(
-    energy: GraspEnergy, grasps: GraspBatch, seen: Float[Tensor, "m 3"] | None = None, config: EasingConfig | None = None
+    energy: GraspEnergy, grasps: GraspBatch, seen: Float[np.ndarray, "m 3"] | None = None, config: EasingConfig | None = None
 ) -> Float[Tensor, " n"]:
     """How much less room the opened hands leave than fingers should, where it is least, palm included [m]; 0 for none.
 
@@ -63,40 +66,49 @@ def lacking_room(
         config: Room.
     """
     config, device = config or EasingConfig(), energy.centre.device
-    lacking = [torch.zeros(0)]
+    lacking, tree = [torch.zeros(0)], _tree(seen)
     for i in range(0, len(grasps), config.batch_size):
         part = grasps[slice(i, i + config.batch_size)]
-        spare = _spare_room(energy, part.T_object_wrist.to(device), part.pregrasp_joints.to(device), seen, config)
+        _, spare = _room(energy, part.T_object_wrist.to(device), part.pregrasp_joints.to(device), tree, config)
         lacking.append((-spare).amax(-1).clamp_min(0).cpu())
     return torch.cat(lacking)
 
 
-def _eased(
-    energy: GraspEnergy, grasps: GraspBatch, seen: Float[Tensor, "m 3"] | None, config: EasingConfig
-) -> Float[Tensor, "n n_dof"]:
+def _tree(seen: Float[np.ndarray, "m 3"] | None) -> KDTree | None:
+    return None if seen is None else KDTree(seen)
+
+
+def _eased(energy: GraspEnergy, grasps: GraspBatch, seen: KDTree | None, config: EasingConfig) -> Float[Tensor, "n n_dof"]:
     """Joints of some of the grasps, on the CPU."""
     device, hand = energy.centre.device, energy.hand
     T, q, opened = (x.to(device) for x in (grasps.T_object_wrist, grasps.joints, grasps.pregrasp_joints))
     moved = finger_joints(hand)
     bends = moved.any(0) & hand.movable & ~hand.abduction
+    stays = ~(hand.tree.moves & bends).any(-1)[energy.body.members.argmax(-1)]
     shares = torch.linspace(0, 1, config.steps, device=device)
-    ways = (torch.where(bends, q + share * (opened - q), q) for share in shares)
-    spare = torch.stack([least_by_finger(energy, _spare_room(energy, T, way, seen, config)) for way in ways])
-    # The first share at which a finger is clear; the clearest where it never is. Fingers that share a joint open alike.
+    gaps, spares = [], []
+    for share in shares:
+        distance, spare = _room(energy, T, torch.where(bends, q + share * (opened - q), q), seen, config)
+        gaps.append(least_by_finger(energy, distance.masked_fill(stays, torch.inf)))
+        spares.append(least_by_finger(energy, spare.masked_fill(stays, torch.inf)))
+    gap, spare = torch.stack(gaps), torch.stack(spares)
+    # The first share at which a finger is clear; else the one at which it is clearest, of those as far from the surface itself
+    # as they have to be at least. Fingers that share a joint open alike.
+    spare = torch.where(gap >= gap.amax(0).clamp_max(config.clearance), spare, -torch.inf)
     first = torch.where((spare >= 0).any(0), (spare >= 0).float().argmax(0), spare.argmax(0))
     share = torch.where(moved, shares[first][..., None], 0).amax(1)
     return torch.where(bends, q + share * (opened - q), q).cpu()
 
 
-def _spare_room(
-    energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], seen: Float[Tensor, "m 3"] | None,
-    config: EasingConfig,
-) -> Float[Tensor, "n p"]:
-    """How much more room each of the hand's surface points leaves than it should [m]."""
+def _room(
+    energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], seen: KDTree | None, config: EasingConfig
+) -> tuple[Float[Tensor, "n p"], Float[Tensor, "n p"]]:
+    """Distance of each of the hand's surface points to the object, and how much more room it leaves than it should [m]."""
     points = body_points(energy, T, q)
     distance = energy.field.distances(points)[0]
     if seen is None:
-        return distance - config.clearance
+        return distance, distance - config.clearance
     # The surface there is as much of a guess as it is farther away than what was seen.
-    guessed = torch.cdist(points.flatten(0, 1), seen).amin(-1).view_as(distance) - distance.clamp_min(0)
-    return distance - guessed.clamp(config.clearance, max(config.clearance, config.unseen))
+    away = torch.from_numpy(seen.query(points.flatten(0, 1).cpu().numpy())[0]).to(distance).view_as(distance)
+    guessed = away - distance.clamp_min(0)
+    return distance, distance - guessed.clamp(config.clearance, max(config.clearance, config.unseen))

@@ -56,11 +56,6 @@ class CompletedCloud(NamedTuple):
     added: Bool[np.ndarray, " k"]
     """Which points are completed, not seen; they come last."""
 
-    @property
-    def seen(self) -> Float[np.ndarray, "m 3"] | None:
-        """The points that were seen, in single precision [m]; None if no others were added."""
-        return self.points[~self.added].astype(np.float32) if self.added.any() else None
-
 
 class SurfaceFeatures(NamedTuple):
     """Input of the network at n places."""

@@ -41,9 +41,10 @@ def partial_view(obj: ObjectModel, view: View, seed: int, camera: DepthCamera | 
     name = f"{obj.name}, {view} seen"
     if view == "cloud":
         return cloud_object(name, np.concatenate([obj.cloud, obj.cloud_normals], 1), origin=name, keep_table=True)
-    both = complete_cloud(*visible_side(obj, view, seed, camera))
+    seen, normals, place = visible_side(obj, view, seed, camera)
+    both = complete_cloud(seen, normals, place)
     whole = cloud_object(name, np.concatenate([both.points, both.normals], 1), origin=name, keep_table=True)
-    return replace(whole, seen=both.seen)
+    return replace(whole, seen=seen.astype(np.float32) if both.added.any() else None)
 
 
 def visible_side(

@@ -16,7 +16,7 @@ from dro_grasp.frames import motion_fault
 from dro_grasp.geometry.table_plane import above_plane, table_plane
 from dro_grasp.objects.loading import check_extent, cloud_object, estimate_normals, read_points, table_note
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
-from dro_grasp.perception.completion import CompletedCloud, complete_cloud
+from dro_grasp.perception.completion import complete_cloud
 
 NEIGHBOURS = 12
 """Neighbours that decide whether a point is an outlier (ours)."""
@@ -107,18 +107,18 @@ def scanned_object(
         raise ObjectError(f"{name} has points behind the camera, which is at the cloud's origin; give the cloud in the "
                           "camera's frame")
     normals = estimate_normals(kept.astype(np.float32), camera).astype(np.float64)
-    both = CompletedCloud(kept, normals, np.zeros(len(kept), bool))
+    seen, added = kept, np.zeros(0, bool)
     if complete:
         up = None if T_frame_camera is None else T_frame_camera[2, :3].astype(np.float64)
-        both = complete_cloud(kept, normals, camera, up)
+        kept, normals, added = complete_cloud(kept, normals, camera, up)
     if T_frame_camera is not None:
         R, t = T_frame_camera[:3, :3], T_frame_camera[:3, 3]
-        both = both._replace(points=both.points @ R.T + t, normals=both.normals @ R.T)
+        kept, seen, normals = kept @ R.T + t, seen @ R.T + t, normals @ R.T
         if table is not None:
             up = R @ table[:3]
             table = np.append(up, table[3] + up @ t)
-    obj = cloud_object(name, np.concatenate([both.points, both.normals], 1), origin=name, keep_table=True)
-    obj = replace(obj, seen=both.seen)
+    obj = cloud_object(name, np.concatenate([kept, normals], 1), origin=name, keep_table=True)
+    obj = replace(obj, seen=seen.astype(np.float32) if added.any() else None)
     return obj if table is None else replace(obj, table=table, notes=(*obj.notes, table_note(table, cut, total)))
 
 

@@ -74,11 +74,6 @@ class GraspProblem:
         return cloud[place.distances(cloud)[0] <= 0]
 
     @cached_property
-    def seen(self) -> Float[Tensor, "k 3"] | None:
-        """Points of the object that were seen, on the device [m]; None where nothing of it is a guess."""
-        return None if self.obj.seen is None else torch.as_tensor(self.obj.seen, dtype=torch.float32, device=self.device)
-
-    @cached_property
     def solid(self) -> ObjectModel:
         """The object as closing is simulated on it: balls stand for a bare cloud."""
         return solid_of(self.obj)

@@ -29,7 +29,7 @@ from dro_grasp.simulation.holding import Holding, holding
 SHARE = 0.5
 """Share of scored candidates that are settled, the best ones (ours)."""
 ROOM_WORTH = 80.0
-"""What the score of a grasp loses for room that the opened hand lacks where the object is a guess [log-odds per m] (ours)."""
+"""What the score of a grasp on an object seen in part loses for room that the opened hand lacks [log-odds per m] (ours)."""
 UNHELD_SCORE = -4.0
 """Highest score of a grasp that does not hold still when its closing is simulated [log-odds of holding] (ours)."""
 
@@ -71,9 +71,8 @@ def can_settle(problem: GraspProblem) -> bool:
 def best_settled(problem: GraspProblem, grasps: GraspBatch, least: int) -> tuple[Int[Tensor, " k"], GraspBatch]:
     """The better half of scored grasps, settled and scored again, in their order; which rows they are comes first.
 
-    The score counts how the object is held then, and on an object seen in part whether the opened hand keeps away from what was
-    not seen. A grasp that does not hold still, or ends where the problem's constraints forbid, stays as it was and scores at
-    most UNHELD_SCORE.
+    The score counts how the object is held then, and on an object seen in part the room that the opened hand leaves. A grasp
+    that does not hold still, or ends where the problem's constraints forbid, stays as it was and scores at most UNHELD_SCORE.
 
     Args:
         problem: Hand and object; see `can_settle`.
@@ -88,8 +87,8 @@ def best_settled(problem: GraspProblem, grasps: GraspBatch, least: int) -> tuple
     score = scored(problem, closed).score
     score[held] = holding_score(score[held], state)
     score = torch.where(held & ~wrong, score, score.clamp_max(UNHELD_SCORE))
-    if problem.seen is not None:
-        score = score - ROOM_WORTH * lacking_room(problem.energy(EnergyConfig()), closed, problem.seen)
+    if problem.obj.seen is not None:
+        score = score - ROOM_WORTH * lacking_room(problem.energy(EnergyConfig()), closed, problem.obj.seen)
     return best, closed.replace(score=score)
 
 

@@ -74,11 +74,14 @@ def eased(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
     """
     if not problem.obj.is_cloud:
         return grasps
-    energy, joints = problem.energy(EnergyConfig()), grasps.joints
-    for seen in (None,) if problem.seen is None else (None, problem.seen):
+    energy, seen = problem.energy(EnergyConfig()), problem.obj.seen
+    joints, rows = grasps.joints.clone(), torch.arange(len(grasps))
+    for known in (None,) if seen is None else (seen, None):
         with one_thread():
-            apart = ease_fingers(energy, grasps, seen)
-        joints = torch.where(permitted(problem, apart)[:, None], apart.joints, joints)
+            apart = ease_fingers(energy, grasps[rows], known)
+        allowed = permitted(problem, apart)
+        joints[rows[allowed]] = apart.joints[allowed]
+        rows = rows[~allowed]
     return grasps.replace(joints=joints)
 
 
