@@ -15,10 +15,12 @@ from dro_grasp.cli import view
 from dro_grasp.cli.main import main
 from dro_grasp.errors import OutputError
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.controller import completed
 from dro_grasp.hands.check import picture
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.perception.partial_views import partial_view
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.rendering.rasterizer import render
 from dro_grasp.viewer import pictures
@@ -128,6 +130,18 @@ def test_clouds_and_hands_without_description_are_drawn_as_points(hand, obj, gra
     tensors = Hand.from_tensors(hand.to_tensors())
     picture = draw_grasp(tensors, bare, grasps, 0)
     assert (picture != 255).any(-1).mean() > 0.05
+
+
+def test_hands_are_drawn_closed_on_a_cloud_too(hand: Hand, obj: ObjectModel, grasps: GraspBatch, tmp_path: Path) -> None:
+    cloud = partial_view(obj, "cloud", 0)
+    some = completed(hand, grasps[:1], torch.zeros(3))
+    closed = pictures.after_closing(hand, cloud, some)
+    assert float((closed.joints - some.joints).abs().amax()) > 0.02
+    sheets = []
+    for posture in ("held", "grasp"):
+        draw_grasps(hand, cloud, some, tmp_path / posture, style=PictureStyle(posture=posture))
+        sheets.append(np.asarray(Image.open(tmp_path / posture).convert("RGB"))[HEADER:])
+    assert (sheets[0] != sheets[1]).any(-1).mean() > 0.01
 
 
 def test_links_above_the_palm_can_be_left_out(hand, grasps) -> None:

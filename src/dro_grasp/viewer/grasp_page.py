@@ -182,7 +182,7 @@ class GraspPage:
         index, grasps = self.shown[min(int(self.slider.value), len(self.shown) - 1)], self._batch()
         grasp, posture = grasps[index], self.posture.value
         if posture == HELD:
-            grasp = after_closing(hand, obj, grasp) if shows_held(hand, obj, None) else grasp
+            grasp = after_closing(hand, obj, grasp) if shows_held(hand, None) else grasp
             joints = grasp.joints[0].float()
         else:
             joints = postures_of(hand, obj, grasp)[cast(Posture, posture)][0]

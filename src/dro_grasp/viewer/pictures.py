@@ -23,6 +23,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import require_pair
 from dro_grasp.grasps.summary import percent
 from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.ball_solid import solid_of
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.rendering.meshes import dots
 from dro_grasp.rendering.rasterizer import render
@@ -77,14 +78,14 @@ def draw_grasps(
 ) -> None:
     """Write a PNG with pictures of the first `count` grasps, `columns` side by side, captioned with score and trial outcome.
 
-    They are drawn as they hold the object after closing, unless the style asks for the grasps themselves or there is no
-    mesh. Links above the hand's palm are not drawn.
+    They are drawn as they hold the object after closing, a bare cloud as the balls that stand for it, unless the style asks for
+    the grasps themselves or the hand came without its description. Links above the hand's palm are not drawn.
 
     Raises:
         OutputError: The file cannot be written, or there is no grasp.
     """
     require_pair(hand, obj)
-    closed = ", drawn after closing" if shows_held(hand, obj, style) else ""
+    closed = ", drawn after closing" if shows_held(hand, style) else ""
     _save(*_tiles(hand, obj, grasps[:count], style), heading(hand, obj, grasps) + closed, path, columns)
 
 
@@ -113,7 +114,7 @@ def _tiles(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, style: PictureStyle | None
 ) -> tuple[list[UInt8[np.ndarray, "height width 3"]], list[tuple[str, bool | None]]]:
     """Pictures of grasps of one object, and their captions."""
-    drawn = after_closing(hand, obj, grasps) if shows_held(hand, obj, style) else grasps
+    drawn = after_closing(hand, obj, grasps) if shows_held(hand, style) else grasps
     width, height = (style or PictureStyle()).size
     with ThreadPoolExecutor(max(1, min(cores(), PIXELS_AT_ONCE // (width * height)))) as threads:
         tiles = list(threads.map(lambda i: draw_grasp(hand, obj, drawn, i, style), range(len(grasps))))
@@ -131,18 +132,19 @@ def _save(
         sheet.save(temporary, format="PNG")
 
 
-def shows_held(hand: Hand, obj: ObjectModel, style: PictureStyle | None) -> bool:
-    """Whether grasps are drawn after closing, which needs the hand's description and the object's mesh."""
-    return (style or PictureStyle()).posture == "held" and hand.description is not None and not obj.is_cloud
+def shows_held(hand: Hand, style: PictureStyle | None) -> bool:
+    """Whether grasps are drawn after closing, which needs the hand's description."""
+    return (style or PictureStyle()).posture == "held" and hand.description is not None
 
 
 def after_closing(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> GraspBatch:
-    """The grasps as they hold the object after closing, each under the protocol of its trial."""
+    """The grasps as they hold the object after closing, each under the protocol of its trial; balls stand for a bare cloud."""
+    solid = solid_of(obj)
     names = [protocol_name(label) for label in grasps.protocol]
     joints, poses = grasps.joints.clone(), grasps.T_object_wrist.clone()
     for name in set(names):
         rows = torch.tensor([i for i, own in enumerate(names) if own == name])
-        closed = held(hand, obj, grasps[rows], name)
+        closed = held(hand, solid, grasps[rows], name)
         joints[rows], poses[rows] = closed.joints, closed.T_object_wrist
     return grasps.replace(joints=joints, T_object_wrist=poses)
 
