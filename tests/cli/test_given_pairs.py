@@ -102,6 +102,18 @@ def test_a_mesh_does_not_replace_one_of_several_objects(
     assert "--object is 'sphere', but the grasps are of 2 objects (mug, can)" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("command", [["evaluate"], COMMANDS["export"]], ids=["evaluate", "export"])
+@pytest.mark.parametrize("names", [("mug", "can"), ("can", "can")], ids=["two names", "one name"])
+def test_an_object_that_is_given_stands_for_one_alone(
+    both: GraspBatch, command: list[str], names: tuple[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second = names
+    both.replace(object=(first, second, second)).save("both.parquet")
+    assert main([command[0], "both.parquet", "--object", "sphere", *command[1:]]) == 2
+    assert "both.parquet holds grasps of 2 objects; --object fits a file with one" in capsys.readouterr().err
+    assert [path.name for path in Path().iterdir()] == ["both.parquet"]
+
+
 def test_an_object_without_success_does_not_get_the_grasps_of_another(
     both: GraspBatch, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -152,7 +152,23 @@ def test_a_changed_hand_is_refused(stored, tmp_path):
         check(read_collection(tmp_path / "old.parquet"), 5, changed("dro"))
 
 
-def test_two_hands_of_one_name_are_refused_before_any_trial(stored, tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize("again", [check, keep_passing], ids=["check", "filter"])
+def test_a_changed_object_is_refused_before_any_trial(stored, tmp_path, monkeypatch, again):
+    def none(*_):
+        raise AssertionError("a trial")
+
+    monkeypatch.setattr(checking, "simulate", none)
+    grasps = GraspBatch.load(stored)
+    last = tuple("0123456789abcdef" if name == grasps.object[-1] else sha
+                 for name, sha in zip(grasps.object, grasps.object_sha256, strict=True))
+    grasps.replace(object_sha256=last).save(tmp_path / "old.parquet")
+    pairs = read_collection(tmp_path / "old.parquet", only_successful=False)
+    with pytest.raises(GraspFileError, match=f"another version of object '{grasps.object[-1]}'"):
+        again(pairs, *([24] if again is check else []), changed("dro"))
+
+
+@pytest.mark.parametrize("command", ["filter", "check"])
+def test_two_hands_of_one_name_are_refused_before_any_trial(stored, tmp_path, capsys, monkeypatch, command):
     def none(*_):
         raise AssertionError("a trial")
 
@@ -160,7 +176,8 @@ def test_two_hands_of_one_name_are_refused_before_any_trial(stored, tmp_path, ca
     monkeypatch.setattr(checking, "hand_of", none)
     GraspBatch.load(stored).replace(hand_sha256="0123456789abcdef").save(tmp_path / "other.parquet")
     output = tmp_path / "kept"
-    assert main(["dataset", "filter", str(stored), str(tmp_path / "other.parquet"), "--output", str(output)]) == 2
+    more = ["--output", str(output)] if command == "filter" else []
+    assert main(["dataset", command, str(stored), str(tmp_path / "other.parquet"), *more]) == 2
     said = capsys.readouterr().err
     for words in (f"in {stored} ", f"in {tmp_path / 'other.parquet'} ", "hash 0123456789ab", "Rename one file and make its"):
         assert words in said

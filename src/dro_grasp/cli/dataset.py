@@ -46,13 +46,7 @@ class DataSets:
     """Output folders of `dro-grasp synthesize`, folders of grasp files, or grasp files."""
 
     def pairs(self, only_successful: bool) -> Iterator[PairGrasps]:
-        """The grasps of each pair in them."""
-        from dro_grasp.datasets.collections.collection import read_collection
-
-        return (pair for path in self.inputs for pair in read_collection(path, only_successful))
-
-    def pairs_of_one_version(self, only_successful: bool) -> Iterator[PairGrasps]:
-        """Likewise; refuses two hands of one name, which cannot join in one file or table."""
+        """The grasps of each pair in them; refuses two hands of one name, which cannot join in one file or table."""
         from dro_grasp.datasets.collections.collection import read_collection
         from dro_grasp.evaluation.coverage import of_one_version
 
@@ -79,7 +73,7 @@ class Report(DataSets):
 
         if self.output is not None:
             check_output(self.output)
-        hands = measure_coverage(self.pairs_of_one_version(only_successful=True))
+        hands = measure_coverage(self.pairs(only_successful=True))
         if self.output is not None:
             with progress_bar("drawing", self.json) as progress:
                 write_report(hands, self.output, progress)
@@ -198,7 +192,7 @@ class Filter(DataSets):
 
         rules = changed(self.protocol, friction=self.friction)
         folder = make_folder(self.output)
-        pairs = list(self.pairs_of_one_version(only_successful=False))
+        pairs = list(self.pairs(only_successful=False))
         with progress_bar("evaluating", self.json) as progress:
             kept = keep_passing(pairs, rules, progress, self.close_fingers)
         for hand in dict.fromkeys(g.hand for _, g in kept):

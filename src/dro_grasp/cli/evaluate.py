@@ -51,12 +51,11 @@ class Evaluate:
 
     def run(self) -> int:
         """Evaluate object by object, then report."""
-        from dro_grasp.errors import OptionError
         from dro_grasp.evaluation.metrics import mean_share, wilson_interval
         from dro_grasp.files import check_output
         from dro_grasp.grasps.batch import GraspBatch
         from dro_grasp.grasps.reading import load_grasps
-        from dro_grasp.grasps.sources import hand_of, object_of
+        from dro_grasp.grasps.sources import hand_of, object_of, require_one_object
         from dro_grasp.pipeline.problem import GraspProblem
         from dro_grasp.pipeline.stages import evaluate
         from dro_grasp.simulation.contact_quality import with_contacts
@@ -71,8 +70,7 @@ class Evaluate:
         hand = hand_of(grasps, self.hand)
         compare("hand", grasps.hand, grasps.hand_sha256, hand, self.output)
         rows, evaluated, problems = [], [], []
-        if self.object is not None and len(names := set(grasps.object)) > 1:
-            raise OptionError(f"{self.file} holds grasps of {len(names)} objects; --object fits a file with one")
+        require_one_object(grasps, self.object, self.file)
         for name, part in grasps.by_object():
             obj = object_of(part, self.object, self.scale)
             compare("object", name, next(filter(None, part.object_sha256), ""), obj, self.output)

@@ -38,7 +38,7 @@ class Export:
     hand: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Hand to use instead of the one named in the file."""
     object: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
-    """Object to use instead, if pregrasps are missing."""
+    """Object to use instead, if pregrasps are missing, for a file with one object."""
     json: Flag = False
     """Print one JSON object."""
 
@@ -46,9 +46,11 @@ class Export:
         """Complete the grasps, then write a file for each object."""
         from dro_grasp.export.contents import Frame
         from dro_grasp.files import check_folder, check_output, make_folder
+        from dro_grasp.grasps.sources import require_one_object
 
         frame = Frame() if self.frame is None else Frame.load(self.frame)
         grasps, form = self._load(), FORMATS[self.format]
+        require_one_object(grasps, self.object, self.file)
         batches = dict(grasps.by_object())
         folder = form.file_per_grasp or len(batches) > 1
         target = check_folder(self.output) if folder else check_output(self.output)

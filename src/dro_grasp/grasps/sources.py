@@ -125,6 +125,16 @@ def object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectMode
                           "with --object, and --scale if it had one") from error
 
 
+def require_one_object(grasps: GraspBatch, given: str | None, file: Path) -> None:
+    """Refuse an object that is to stand for the one in a file, where the file has several.
+
+    Raises:
+        OptionError: It has.
+    """
+    if given is not None and (number := len(list(grasps.by_object()))) > 1:
+        raise OptionError(f"{file} holds grasps of {number} objects; --object fits a file with one")
+
+
 def object_source(grasps: GraspBatch, scale: float = 1.0) -> tuple[str, float]:
     """File or name of the object of some grasps, and its scale; `scale` is for objects found by name."""
     source = _recorded(grasps, OBJECT_FILE)

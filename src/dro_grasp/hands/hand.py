@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.devices import cached_tensor, on_device
+from dro_grasp.errors import OptionError
 from dro_grasp.geometry import se3
 from dro_grasp.geometry.point_clouds import farthest_points
 from dro_grasp.hands.anatomy import PALM, THUMB_CLOSING, Finger, find_fingers, find_thumb, measure_opposition, rigid_groups
@@ -254,10 +255,10 @@ class Hand:
         """The same hand with fewer points, spread evenly; each link keeps POINTS_PER_LINK if it has them.
 
         Raises:
-            ValueError: More points are asked for than the hand has.
+            OptionError: More points are asked for than the hand has, or none.
         """
-        if count > self.n_points:
-            raise ValueError(f"hand '{self.name}' has {self.n_points} points, {count} were asked for")
+        if not 0 < count <= self.n_points:
+            raise OptionError(f"hand '{self.name}' has {self.n_points} points, {count} were asked for")
         if count == self.n_points:
             return self
         rank = self.spread_rank

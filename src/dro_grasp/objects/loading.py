@@ -140,7 +140,8 @@ def mesh_object(
 
 
 def cloud_object(
-    name: str, points: Num[np.ndarray, "..."], *, origin: str, scale: float = 1.0, keep_table: bool = False
+    name: str, points: Num[np.ndarray, "..."], *, origin: str, scale: float = 1.0, keep_table: bool = False,
+    seen: Float[np.ndarray, "m 3"] | None = None,
 ) -> ObjectModel:
     """An object from a bare point cloud (n 3), or a cloud with normals (n 6); only the points are scaled.
 
@@ -150,6 +151,7 @@ def cloud_object(
         origin: Source of the cloud, for messages.
         scale: Multiplies all coordinates.
         keep_table: Take every point for the object's, also those of a table.
+        seen: What was seen of it, where the rest of the cloud is a guess [m].
 
     Raises:
         ObjectError: Another shape, NaN, too few distinct points, or an implausible size in metres.
@@ -186,7 +188,7 @@ def cloud_object(
     return ObjectModel(
         name=name, cloud=cloud, cloud_normals=np.ascontiguousarray(normals, np.float32),
         centre_of_mass=cloud.mean(0, dtype=np.float64), sha256=content_hash(cloud),
-        table=table,
+        table=table, seen=None if seen is None else seen.astype(np.float32),
         notes=(f"bare point cloud of {len(points)} points{fewer}{estimated}: no trial is possible without a mesh", *cut,
                *(() if has_normals else _one_sided(normals))),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -43,8 +43,9 @@ def partial_view(obj: ObjectModel, view: View, seed: int, camera: DepthCamera | 
         return cloud_object(name, np.concatenate([obj.cloud, obj.cloud_normals], 1), origin=name, keep_table=True)
     seen, normals, place = visible_side(obj, view, seed, camera)
     both = complete_cloud(seen, normals, place)
-    whole = cloud_object(name, np.concatenate([both.points, both.normals], 1), origin=name, keep_table=True)
-    return replace(whole, seen=seen.astype(np.float32) if both.added.any() else None)
+    return cloud_object(
+        name, np.concatenate([both.points, both.normals], 1), origin=name, keep_table=True,
+        seen=seen if both.added.any() else None)
 
 
 def visible_side(

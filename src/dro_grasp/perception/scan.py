@@ -117,8 +117,8 @@ def scanned_object(
         if table is not None:
             up = R @ table[:3]
             table = np.append(up, table[3] + up @ t)
-    obj = cloud_object(name, np.concatenate([kept, normals], 1), origin=name, keep_table=True)
-    obj = replace(obj, seen=seen.astype(np.float32) if added.any() else None)
+    obj = cloud_object(
+        name, np.concatenate([kept, normals], 1), origin=name, keep_table=True, seen=seen if added.any() else None)
     return obj if table is None else replace(obj, table=table, notes=(*obj.notes, table_note(table, cut, total)))
 
 

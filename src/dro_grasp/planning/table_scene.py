@@ -108,7 +108,7 @@ def pick_object(
     whole = scanned_object(name, sight.points, T_world_camera, keep_table=True)
     rows = np.concatenate([whole.cloud, whole.cloud_normals], 1)[whole.cloud[:, 2] > height]
     return PickedObject(
-        replace(cloud_object(name, rows, origin=name, keep_table=True), notes=whole.notes, seen=whole.seen),
+        replace(cloud_object(name, rows, origin=name, keep_table=True, seen=whole.seen), notes=whole.notes),
         _solid(sight), level)
 
 

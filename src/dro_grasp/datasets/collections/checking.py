@@ -13,7 +13,7 @@ from dro_grasp.datasets.engine.worker import EngineConfig
 from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.sources import hand_of, object_of, require_same
+from dro_grasp.grasps.sources import hand_of, object_of, object_source, require_same
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.finger_closing import close_idle_fingers
@@ -128,15 +128,22 @@ def _closed_where_it_holds(hand: Hand, obj: ObjectModel, evaluated: GraspBatch, 
 
 
 def _loaded(parts: Sequence[GraspBatch], progress: Progress | None) -> Iterator[tuple[Hand, ObjectModel]]:
-    """Hand and object of the grasps of one pair after the other; each hand is loaded once."""
+    """Hand and object of the grasps of one pair after the other.
+
+    All of them are found before the first pair: no trial is lost to a file that has changed.
+    """
     total, done = sum(map(len, parts)), 0
-    hands: dict[str, Hand] = {}
+    hands: dict[tuple[str, str], Hand] = {}
+    objects: dict[str | tuple[str, float], ObjectModel] = {}
+    pairs = []
     for grasps in parts:
-        if grasps.hand_sha256 not in hands:
-            hands[grasps.hand_sha256] = hand_of(grasps, None)
-        hand, obj = hands[grasps.hand_sha256], object_of(grasps, None, 1.0)
+        whose, of = (grasps.hand, grasps.hand_sha256), grasps.object_sha256[0] or object_source(grasps)
+        hand = hands[whose] = hands.get(whose) or hand_of(grasps, None)
+        obj = objects[of] = objects.get(of) or object_of(grasps, None, 1.0)
         require_same(grasps, hand, obj)
-        yield hand, obj
+        pairs.append((hand, obj))
+    for grasps, pair in zip(parts, pairs, strict=True):
+        yield pair
         done += len(grasps)
         if progress is not None:
             progress(done, total)
