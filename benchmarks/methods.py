@@ -2,7 +2,7 @@
 
     python benchmarks/methods.py [--hands HAND ...] [--objects NAME ...] [--num N] [--weights NAME] [--json]
 
-The best by score of each source are evaluated on the mesh; the seconds count everything but the trial. The row
+The best by score of each source are evaluated on the mesh; the seconds of processor time count everything but the trial. The row
 `network, first z` decodes the first z that is drawn, without a choice by geometry. Needs the development assets by default.
 """
 
@@ -54,10 +54,10 @@ def main() -> None:
             _ = problem.field, obj.parts
             request = GraspRequest(options.num, pair_seed(0, hand, obj))
             for method in options.methods:
-                begin = time.perf_counter()
+                begin = time.process_time()
                 source, chosen = (first, "network") if method == FIRST_Z else (predictor, method)
                 made = source.run(problem, replace(request, method=chosen))
-                seconds = (time.perf_counter() - begin) / options.num
+                seconds = (time.process_time() - begin) / options.num
                 held = [simulate(hand, obj, made.grasps, name).success.float() for name in PROTOCOLS]
                 optimised = torch.tensor([float(origin == "optimiser") for origin in made.origin])
                 rows = torch.stack([*held, optimised, torch.full_like(optimised, seconds)], 1).numpy()
@@ -68,7 +68,7 @@ def main() -> None:
         values = np.concatenate(parts)
         table.append([hand_name, method, len(values), *map(rate, values[:, : len(PROTOCOLS)].T),
                       f"{100 * values[:, -2].mean():.0f}", f"{values[:, -1].mean():.2f}"])
-    columns = ["hand", "method", "n", *(f"{name} [%]" for name in PROTOCOLS), "from the optimiser [%]", "seconds a grasp"]
+    columns = ["hand", "method", "n", *(f"{name} [%]" for name in PROTOCOLS), "from the optimiser [%]", "CPU seconds a grasp"]
     emit(f"{options.num} grasps of each hand on each of {' '.join(options.objects)}", table, columns,
          {f"{row[0]} / {row[1]}": dict(zip(columns[2:], row[2:], strict=True)) for row in table}, options.json)
 

@@ -254,16 +254,15 @@ def test_auto_lets_the_optimiser_help_only_where_the_score_distrusts_the_network
     network = predictor.run(problem, alone)
     assert network.origin == ["network"] * 4
     trusted = sorted(network.grasps.score.tolist())[1]  # three of the four best are above it
-    monkeypatch.setattr("dro_grasp.predictor.TRUSTED_SCORE", trusted - 1e-6)
-    monkeypatch.setattr("dro_grasp.predictor.DOUBTED_SCORE", -math.inf)
+    monkeypatch.setattr("dro_grasp.predictor.TRUSTED_SCORES", (trusted - 1e-6, -math.inf))
     helped = predictor.run(problem, dataclasses.replace(alone, method="auto"))
     assert helped.candidates == network.candidates + 3
     assert float(helped.grasps.score.min()) >= float(network.grasps.score.min())
-    monkeypatch.setattr("dro_grasp.predictor.DOUBTED_SCORE", math.inf)
+    monkeypatch.setattr("dro_grasp.predictor.TRUSTED_SCORES", (trusted - 1e-6, math.inf, math.inf))
     again = predictor.run(problem, dataclasses.replace(alone, method="auto"))
-    assert again.candidates == helped.candidates + 4 * 3, "a second round, for all four"
-    for name in ("TRUSTED_SCORE", "DOUBTED_SCORE"):
-        monkeypatch.setattr(f"dro_grasp.predictor.{name}", -math.inf)
+    assert again.candidates == helped.candidates + 2 * 4 * 3, "two rounds more, for all four"
+    assert bool((again.grasps.score >= helped.grasps.score).all())
+    monkeypatch.setattr("dro_grasp.predictor.TRUSTED_SCORES", (-math.inf, math.inf))
     assert predictor.run(problem, dataclasses.replace(alone, method="auto")).candidates == network.candidates
 
 

@@ -35,14 +35,14 @@ Progress = Callable[[int, int], None]
 """Called with (candidates made so far, candidates wanted), by the network and then by the optimiser."""
 Method = Literal["auto", "network", "optimise"]
 """Where candidates come from."""
-TRUSTED_SCORE = 1.5
-"""Log-odds of holding from which on a grasp needs no rival from the optimiser (ours)."""
-DOUBTED_SCORE = 0.5
-"""Log-odds of holding below which a grasp gets further rivals in a second round (ours)."""
+TRUSTED_SCORES = (1.5, 1.0, 1.0, 1.0)
+"""Log-odds of holding from which on a grasp needs no rival from the optimiser, in each round that it is asked (ours)."""
 OPTIMISED_PER_GRASP = 8
 """Candidates that the optimiser makes in a round for each grasp that needs rivals (ours)."""
+TRUSTED_IN_SURROUNDINGS = (1.5, 0.5)
+"""The scores where a descent also watches surroundings, which takes twice as long (ours)."""
 OPTIMISED_IN_SURROUNDINGS = 4
-"""The same where a descent also watches surroundings, which takes twice as long; as many of the grasps hold (ours)."""
+"""The candidates there; as many of the grasps hold (ours)."""
 
 
 @dataclass(frozen=True)
@@ -220,11 +220,12 @@ class GraspPredictor:
         pool.settle()
 
     def _ask_optimiser(self, pool: _Pool, progress: Progress | None) -> None:
-        """Rivals for each grasp that the score does not trust, and once more for each that it still doubts."""
+        """Rivals for each grasp that the score does not trust, again and again for those that it still does not."""
         problem, request = pool.problem, pool.request
-        each = OPTIMISED_PER_GRASP if problem.surroundings is None else OPTIMISED_IN_SURROUNDINGS
+        free = problem.surroundings is None
+        each = OPTIMISED_PER_GRASP if free else OPTIMISED_IN_SURROUNDINGS
         hand = problem.thinned(self.network.config.n_hand).to("cpu")
-        for number, least_score in enumerate((TRUSTED_SCORE, DOUBTED_SCORE)):
+        for number, least_score in enumerate(TRUSTED_SCORES if free else TRUSTED_IN_SURROUNDINGS):
             if not (count := each * pool.lacking(least_score)):
                 break
             with pool.watch("optimise"):
