@@ -2,7 +2,7 @@
 
     python benchmarks/methods.py [--hands HAND ...] [--objects NAME ...] [--num N] [--weights NAME] [--json]
 
-The best by score of each source are evaluated on the mesh; the seconds of processor time count everything but the trial. The row
+The best by score of each source are evaluated on the mesh; the processor time counts everything but the trial. The row
 `network, first z` decodes the first z that is drawn, without a choice by geometry. Needs the development assets by default.
 """
 

@@ -72,10 +72,15 @@ def part(bundle: Bundle, hands: Sequence[str]) -> Bundle:
     return Bundle({name: bundle.hands[name] for name in hands}, bundle.objects, {name: bundle.grasps[name] for name in hands})
 
 
+def label(options: argparse.Namespace, row: str, seed: int) -> str:
+    """Name of the files of a row with a seed."""
+    return f"{options.preset}_{row.replace(' ', '_')}_{options.steps}_{seed}"
+
+
 def trained(options: argparse.Namespace, row: str, seed: int, bundle: Bundle) -> Path:
     """The weights of a row, trained now unless the folder holds them."""
     form, folder = ROWS[row], options.output
-    path = folder / f"{options.preset}_{row.replace(' ', '_')}_{options.steps}_{seed}.safetensors"
+    path = folder / f"{label(options, row, seed)}.safetensors"
     if path.exists():
         return path
     network = NetworkConfig.preset(options.preset)
@@ -98,10 +103,10 @@ def trained(options: argparse.Namespace, row: str, seed: int, bundle: Bundle) ->
 
 def measured(options: argparse.Namespace, row: str, seed: int, bundle: Bundle) -> dict[str, Any]:
     """Train and evaluate a row with a seed, unless the folder holds the result."""
-    weights = trained(options, row, seed, bundle)
     where = "+".join(options.objects).replace(":", "-").replace("/", "-")
-    stored = weights.with_name(f"{weights.stem}_on_{where}_{options.num}.json")
+    stored = options.output / f"{label(options, row, seed)}_on_{where}_{options.num}.json"
     if not stored.exists():
+        weights = trained(options, row, seed, bundle)
         objects = [load_object(name) for name in resolve_objects(options.objects)]
         config = BenchmarkConfig(options.num, STAGES, tuple(map(protocol, PROTOCOLS)), seed=seed, workers=1)
         methods = [DistanceMethod(GraspPredictor(str(weights)))]
