@@ -53,15 +53,15 @@ class GuidedNetwork(DistanceNetwork):
     reached: list[Tensor]
     """Suitability of the decoded hands."""
 
-    def moved(self, phi_hand: Tensor, hand: Tensor, z: Tensor, suit: Suitability | None) -> tuple[Tensor, Tensor]:
+    def moved(self, phi_hand: Tensor, hand: Tensor, z: Tensor, suit: Suitability | None, kept: int) -> tuple[Tensor, Tensor]:
         """As the network's, after the ascent."""
         assert self.motion is not None
         assert suit is not None
         if self.ascent.steps:
             rows = torch.arange(len(z))[:, None]
             z = self._climbed(phi_hand, hand, z[rows, suit(self.motion(phi_hand, hand, z)).topk(KEPT, 1).indices], suit)
-        chosen = super().moved(phi_hand, hand, z, suit)
-        self.reached.append(suit(chosen[1][:, None])[:, 0])
+        chosen = super().moved(phi_hand, hand, z, suit, kept)
+        self.reached.append(suit(chosen[1])[:, 0])
         return chosen
 
     @torch.enable_grad()

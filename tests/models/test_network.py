@@ -214,7 +214,7 @@ def test_a_drawn_z_predicts_in_training_what_it_does_at_inference(changes: dict,
     drawn, honest = [], torch.randn
     monkeypatch.setattr(torch, "randn", lambda *a, **k: drawn.append(honest(*a, **k)) or drawn[-1])
     found = network(hand, obj, grasp, torch.Generator().manual_seed(1), columns=20, draw=True).drawn
-    expected = network.predict(hand, obj, drawn[-1][:, None])[:, :, :20]
+    expected = network.predict(hand, obj, drawn[-1][:, None])[:, 0, :, :20]
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
 
 

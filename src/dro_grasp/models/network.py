@@ -152,36 +152,40 @@ class DistanceNetwork(nn.Module):
 
     def predict(
         self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], noise: Float[Tensor, "b k latent"],
-        suit: Suitability | None = None,
-    ) -> Float[Tensor, "b n m"]:
-        """D(R,O) [m].
+        suit: Suitability | None = None, kept: int = 1,
+    ) -> Float[Tensor, "b kept n m"]:
+        """D(R,O) [m], of the best z first.
 
         Args:
             hand: As in `forward`.
             obj: As in `forward`.
             noise: Draws of `sample_latent`, k for each hand, which the prior turns into z.
-            suit: Judges the hands that they move; the best is taken. The first by default, and where z moves nothing.
+            suit: Judges the hands that they move. Without it, and where z moves nothing, the first draws are the best.
+            kept: z of each hand whose distances are predicted.
         """
         with fast_products():
             phi_hand, phi_object = self.encode(hand, obj)
             if self.motion is None or suit is None:
-                noise = noise[:, :1]
+                noise = noise[:, :kept]
             z = noise
             if self.condition is not None and self.prior is not None:
                 condition = self.condition(phi_hand, phi_object, hand, obj)[:, None].expand(-1, noise.shape[1], -1)
                 z = self.prior(noise.flatten(0, 1), condition.flatten(0, 1)).unflatten(0, noise.shape[:2])
-            z, moved = self.moved(phi_hand, hand, z, suit)
+            z, moved = (part.flatten(0, 1) for part in self.moved(phi_hand, hand, z, suit, kept))
+            phi_hand, phi_object, obj = (part.repeat_interleave(kept, 0) for part in (phi_hand, phi_object, obj))
             psi_hand, psi_object = self.relate(phi_hand, phi_object, moved)
-            return self._distances(psi_hand, psi_object, z, moved, obj)
+            return self._distances(psi_hand, psi_object, z, moved, obj).unflatten(0, (-1, kept))
 
     def moved(
         self, phi_hand: Float[Tensor, "b n width"], hand: Float[Tensor, "b n 3"], z: Float[Tensor, "b k latent"],
-        suit: Suitability | None,
-    ) -> tuple[Float[Tensor, "b latent"], Float[Tensor, "b n 3"]]:
-        """Of k z the one that moves the hand to suit the object best, and the moved hand [m]."""
-        moves = hand[:, None] if self.motion is None else self.motion(phi_hand, hand, z)
-        rows = torch.arange(len(hand), device=hand.device)
-        best = rows.new_zeros(len(hand)) if moves.shape[1] == 1 or suit is None else suit(moves).argmax(-1)
+        suit: Suitability | None, kept: int,
+    ) -> tuple[Float[Tensor, "b kept latent"], Float[Tensor, "b kept n 3"]]:
+        """Those of k z that move the hand to suit the object best, the best first, and the moved hands [m]."""
+        moves = hand[:, None].expand(-1, z.shape[1], -1, -1) if self.motion is None else self.motion(phi_hand, hand, z)
+        if z.shape[1] == kept == 1 or suit is None:
+            return z, moves
+        rows = torch.arange(len(hand), device=hand.device)[:, None]
+        best = suit(moves).topk(kept, -1).indices
         return z[rows, best], moves[rows, best]
 
     def _distances(

@@ -1,18 +1,20 @@
 """Choice of z: of several hands that z moves, the one whose points suit the object best.
 
 Differs from the paper, which decodes the one z that it draws. A draw is one of many grasps that fit the placement, and the
-motion of the hand tells before decoding which of them penetrate the object, cross their fingers or stay away from it.
+motion of the hand tells before decoding which of them penetrate the object, cross their fingers or stay away from it. Several
+z may be decoded, too: the decoded hands differ from the moved ones by millimetres, and the best of them is kept.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.energy.grasp_energy import Room
+from dro_grasp.errors import OptionError
 from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.hand import Hand
@@ -22,11 +24,9 @@ CROWDING_POINTS = 64
 
 
 @dataclass(frozen=True)
-class ChoiceConfig:
-    """How many z are drawn, and the penalties by which one is chosen; set by trials on training objects (ours)."""
+class Penalties:
+    """What speaks against a hand; set by trials on training objects (ours)."""
 
-    draws: int = 32
-    """z drawn for each placement; 1 takes the first."""
     finger_penetration: float = 800.0
     """Penalty for the deepest point of a finger inside the object, mean over fingers [1/m]."""
     palm_penetration: float = 800.0
@@ -45,16 +45,37 @@ class ChoiceConfig:
     """Distance between points of two fingers from which on they do not crowd each other [m]."""
 
 
+@dataclass(frozen=True)
+class ChoiceConfig(Penalties):
+    """How many z are drawn and decoded, and the penalties of moved and of decoded hands by which one is chosen."""
+
+    draws: int = 32
+    """z drawn for each placement; 1 takes the first."""
+    decoded: int = 1
+    """How many of them, the best by their moved hands, are decoded (ours): each takes two fifths more of the network's time."""
+    of_decoded: Penalties = field(default_factory=lambda: Penalties(palm_penetration=70.0, gap=30.0, crowding=170.0))
+    """Penalties of decoded hands, if there are several: the weights of a logistic regression of `strict` (ours)."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense.
+
+        Raises:
+            OptionError: `decoded` is not between 1 and `draws`.
+        """
+        if not 1 <= self.decoded <= self.draws:
+            raise OptionError(f"decoded is {self.decoded} of {self.draws} draws; decode at least one z, and at most all of them")
+
+
 def choice_scores(
-    hand: Hand, field: DistanceField, points: Float[Tensor, "*b n_points 3"], config: ChoiceConfig,
+    hand: Hand, field: DistanceField, points: Float[Tensor, "*b n_points 3"], config: Penalties,
     room: Room | None = None,
 ) -> Float[Tensor, "*b"]:
-    """How well moved hands suit the object; higher is better, comparable among hands of one kind.
+    """How well hands suit the object; higher is better, comparable among hands of one kind.
 
     Args:
-        hand: The hand that was moved.
+        hand: The hand that was moved or decoded.
         field: Signed distances of the object, from its mesh or from its cloud and normals.
-        points: The hand's surface points after the motion, in the object's frame [m].
+        points: Its surface points then, in the object's frame [m].
         config: Penalties.
         room: Where the hand may be, and where it may touch the object.
     """

@@ -106,15 +106,32 @@ def propose(
         with watch("network"):
             distances = _distances(problem, network, cloud, placement[part], joints[part], noise[part], config)
         with watch("decode"), one_thread():
-            links = distance_matrix.decode(hand, distances, cloud.expand(len(distances), -1, -1))
-            solution = distance_matrix.solve(hand, links, joints[part])
-        found.append((solution.T_world_wrist, solution.joints, links.points))
+            found.append(_decoded(problem, hand, distances, cloud, joints[part], config.choice))
         if progress is not None:
             progress(part.stop, num)
     T, q, points = (torch.cat(part).cpu() for part in zip(*found, strict=True))
     grasps = GraspBatch.create(
         problem.hand, problem.obj, T, q, seed=generator.initial_seed(), provenance=f"network {network.name}")
     return Proposal(grasps, points)
+
+
+def _decoded(
+    problem: GraspProblem, hand: Hand, distances: Float[Tensor, "b k n m"], cloud: Float[Tensor, "m 3"],
+    joints: Float[Tensor, "b n_dof"], config: ChoiceConfig,
+) -> tuple[Float[Tensor, "b 4 4"], Float[Tensor, "b n_dof"], Float[Tensor, "b n 3"]]:
+    """Wrist poses, joints and multilaterated points: of the k hands that D(R,O) gives, the one that suits the object best."""
+    b, k = distances.shape[:2]
+    links = distance_matrix.decode(hand, distances.flatten(0, 1), cloud.expand(b * k, -1, -1))
+    solution = distance_matrix.solve(hand, links, joints.repeat_interleave(k, 0))
+    found = solution.T_world_wrist, solution.joints, links.points
+    if k == 1:
+        return found
+    T, q = (part.unflatten(0, (b, k)) for part in found[:2])
+    whole = problem.thinned(len(problem.hand.link_index))
+    best = choice_scores(whole, problem.field, whole.points(q, T), config.of_decoded, problem.room).argmax(-1)
+    rows = torch.arange(b, device=best.device) * k + best
+    T, q, points = (part[rows] for part in found)
+    return T, q, points
 
 
 def check_temperature(temperature: float | None) -> None:
@@ -161,7 +178,7 @@ def _placements(
 def _distances(
     problem: GraspProblem, network: DistanceNetwork, cloud: Float[Tensor, "m 3"], placement: Float[Tensor, "b 4 4"],
     joints: Float[Tensor, "b n_dof"], noise: Float[Tensor, "b k latent"], config: ProposalConfig,
-) -> Float[Tensor, "b n m"]:
+) -> Float[Tensor, "b decoded n m"]:
     """D(R,O) of a batch of placed open hands, each with the best of k draws; distances are the same in every frame."""
     hand = problem.thinned(network.config.n_hand)
     placed = hand.points(joints, placement)
@@ -171,7 +188,7 @@ def _distances(
 
     def predict(
         points: Float[Tensor, "b n 3"], axes: Float[Tensor, "b 3 3"], z: Float[Tensor, "b k latent"]
-    ) -> Float[Tensor, "b n m"]:
+    ) -> Float[Tensor, "b decoded n m"]:
         centres = centre.expand(len(points), 3)
         opened = network.to_frame(points, centres, axes)
         obj = network.to_frame(cloud.expand(len(points), -1, -1), centres, axes)
@@ -179,7 +196,7 @@ def _distances(
         def suit(moves: Float[Tensor, "b k n 3"]) -> Float[Tensor, "b k"]:
             return choice_scores(hand, field, moves @ axes[:, None].mT + centre, config.choice, problem.room)
 
-        return network.predict(opened, obj, z, suit).float()
+        return network.predict(opened, obj, z, suit, config.choice.decoded).float()
 
     if len(placed) <= size:  # all threads for the one part that there is
         return predict(placed, turned, noise)
