@@ -234,6 +234,18 @@ def test_all_randomness_comes_from_the_generator(changes: dict) -> None:
     assert not torch.equal(first.distances, other.distances)
 
 
+@pytest.mark.parametrize("changes", [{}, {"latent_form": "motion", "prior": "flow", "frame": "wrist"}], ids=["paper", "ours"])
+def test_the_best_of_several_z_come_first(changes: dict) -> None:
+    torch.manual_seed(0)
+    network = untrained_network(dataclasses.replace(SMALL, **changes), seed=3).eval()
+    hand, obj, z = torch.randn(2, 40, 3) * 0.1, torch.randn(2, 32, 3) * 0.1, torch.randn(2, 4, 8)
+    each = torch.stack([network.predict(hand, obj, z[:, k : k + 1])[:, 0] for k in range(4)], 1)
+    order = [2, 0, 3, 1] if changes else [0, 1, 2, 3]  # in the paper's form no z moves the hand
+    judged = torch.tensor([2.0, 0.0, 3.0, 1.0]).expand(2, -1)
+    found = network.predict(hand, obj, z, lambda moves: judged, kept=3)
+    torch.testing.assert_close(found, each[:, order[:3]], rtol=1e-4, atol=1e-6)
+
+
 def test_prediction_does_not_depend_on_the_batch() -> None:
     torch.manual_seed(0)
     network = DistanceNetwork(SMALL).eval()

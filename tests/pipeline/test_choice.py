@@ -7,8 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from dro_grasp import distance_matrix
 from dro_grasp.energy.grasp_energy import Room
 from dro_grasp.energy.surroundings import Surroundings
+from dro_grasp.errors import OptionError
 from dro_grasp.geometry.balls import Balls
 from dro_grasp.geometry.se3 import random_rotations
 from dro_grasp.hands.anatomy import PALM
@@ -132,6 +134,35 @@ def test_the_moved_hands_are_judged_in_the_object_s_frame_and_the_best_is_taken(
     assert one.shape == many.shape == (6, network.config.latent)
     drawn = network.sample_latent(6, _after_cloud(network), 1.0, 8)
     torch.testing.assert_close(many, drawn[:, 5])
+
+
+def test_of_several_decoded_hands_the_one_at_the_surface_is_kept() -> None:
+    problem = GraspProblem(loaded_hand("allegro"), SPHERE)
+    cloud = problem.cloud(128, torch.Generator().manual_seed(0))
+    q = HAND.canonical_joints(0.45)
+    T = torch.eye(4).repeat(2, 3, 1, 1)  # inside, at the surface and away from it, in two orders
+    radius = float(torch.as_tensor(SPHERE.cloud).norm(dim=-1).mean())
+    away = HAND.palm_direction_wrist
+    for row, order in enumerate(((-2.0, 0.0, 5.0), (0.0, 5.0, -2.0))):
+        for k, share in enumerate(order):
+            T[row, k, :3, 3] = -HAND.grasp_centre_wrist - share * 0.6 * radius * away
+    points = HAND.points(q.expand(2, 3, -1), T)
+    distances = distance_matrix.build(points, cloud.expand(2, 3, -1, -1))
+    config = ChoiceConfig(decoded=3)
+    whole = problem.hand.points(q.expand(2, 3, -1), T)
+    wanted = choice_scores(problem.hand, problem.field, whole, config.of_decoded).argmax(-1)
+    assert wanted.tolist() == [1, 0]
+    found, joints, clouds = proposal._decoded(problem, HAND, distances, cloud, q.expand(2, -1), config)
+    rows = torch.arange(2)
+    torch.testing.assert_close(found, T[rows, wanted], atol=1e-3, rtol=0)
+    torch.testing.assert_close(joints, q.expand(2, -1), atol=5e-3, rtol=0)
+    torch.testing.assert_close(clouds, points[rows, wanted], atol=1e-4, rtol=0)
+
+
+def test_no_z_and_more_z_than_are_drawn_cannot_be_decoded() -> None:
+    for decoded in (0, 5):
+        with pytest.raises(OptionError, match=f"decoded is {decoded} of 4 draws"):
+            ChoiceConfig(draws=4, decoded=decoded)
 
 
 def _after_cloud(network: DistanceNetwork) -> torch.Generator:

@@ -181,8 +181,10 @@ class DistanceNetwork(nn.Module):
         suit: Suitability | None, kept: int,
     ) -> tuple[Float[Tensor, "b kept latent"], Float[Tensor, "b kept n 3"]]:
         """Those of k z that move the hand to suit the object best, the best first, and the moved hands [m]."""
-        moves = hand[:, None].expand(-1, z.shape[1], -1, -1) if self.motion is None else self.motion(phi_hand, hand, z)
-        if z.shape[1] == kept == 1 or suit is None:
+        if self.motion is None:
+            return z, hand[:, None].expand(-1, kept, -1, -1)
+        moves = self.motion(phi_hand, hand, z)
+        if z.shape[1] == 1 or suit is None:
             return z, moves
         rows = torch.arange(len(hand), device=hand.device)[:, None]
         best = suit(moves).topk(kept, -1).indices

@@ -52,7 +52,7 @@ class ChoiceConfig(Penalties):
     draws: int = 32
     """z drawn for each placement; 1 takes the first."""
     decoded: int = 1
-    """How many of them, the best by their moved hands, are decoded (ours): each takes two fifths more of the network's time."""
+    """How many of them, the best by their moved hands, are decoded (ours). Each adds half of the time of the first."""
     of_decoded: Penalties = field(default_factory=lambda: Penalties(palm_penetration=70.0, gap=30.0, crowding=170.0))
     """Penalties of decoded hands, if there are several: the weights of a logistic regression of `strict` (ours)."""
 
@@ -63,7 +63,7 @@ class ChoiceConfig(Penalties):
             OptionError: `decoded` is not between 1 and `draws`.
         """
         if not 1 <= self.decoded <= self.draws:
-            raise OptionError(f"decoded is {self.decoded} of {self.draws} draws; decode at least one z, and at most all of them")
+            raise OptionError(f"decoded is {self.decoded} of {self.draws} draws; decode at least one z and at most all")
 
 
 def choice_scores(
