@@ -60,6 +60,35 @@ def test_fingers_that_reach_nothing_stay() -> None:
     assert len(close_idle_fingers(ENERGY, far[slice(0, 0)])) == 0
 
 
+def test_a_finger_that_reaches_nothing_rests_as_bent_as_the_one_that_holds() -> None:
+    before = grasp(-0.2, -0.1, -0.3, 0.2, -0.3, 0.2)
+    T = before.T_object_wrist.clone()
+    T[0, 0, 3] += 0.06  # only finger 0 reaches the ball, across the palm
+    before = before.moved_to(T, before.joints)
+    after = close_idle_fingers(ENERGY, before)
+    holds, beside, last = after.joints[0].reshape(3, 2)
+    assert float(gaps(after)[0, 0]) == pytest.approx(CONFIG.contact, abs=7e-4)
+    as_bent = float(holds.mean())  # all joints of this hand have the same range
+    assert beside.tolist() == pytest.approx([as_bent, as_bent], abs=1e-5)
+    assert float(gaps(after)[0, 1:].min()) > CONFIG.contact
+    # The third would touch the second, and rests before it.
+    assert last[0] == last[1]
+    assert -0.05 < float(last[0]) < as_bent - 0.05
+    alone = close_idle_fingers(ENERGY, before, ClosingConfig(resting=(1.0,)))
+    assert torch.equal(alone.joints[0, 4:], before.joints[0, 4:])
+    assert torch.equal(close_idle_fingers(ENERGY, before, ClosingConfig(resting=())).joints[0, 2:], before.joints[0, 2:])
+
+
+def test_a_finger_that_is_bent_more_than_those_that_hold_stays() -> None:
+    before = grasp(-0.2, -0.1, 0.3, 0.6, -0.3, 0.2)
+    T = before.T_object_wrist.clone()
+    T[0, 0, 3] += 0.06
+    before = before.moved_to(T, before.joints)
+    after = close_idle_fingers(ENERGY, before)
+    assert float(gaps(after)[0, 0]) == pytest.approx(CONFIG.contact, abs=7e-4)
+    assert torch.equal(after.joints[0, 2:4], before.joints[0, 2:4])
+
+
 def test_fingers_do_not_close_into_each_other() -> None:
     """Fingers of 6 cm in radius, which overlap when they close: spheres stand for the links."""
     energy = copy(ENERGY)

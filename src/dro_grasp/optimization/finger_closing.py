@@ -1,7 +1,8 @@
-"""Idle fingers close: each finger of a grasp that touches nothing moves alone until it meets the object.
+"""Idle fingers close: each finger of a grasp that touches nothing moves alone until it meets the object, or rests.
 
-A person holds with all fingers that reach. Neither the network nor the descent of the energy sees to that: the energy's few
-contacts choose the fingers that are near anyway. Differs from the paper, which leaves idle fingers where the network puts them.
+A person holds with all fingers that reach, and bends the others beside them. Neither the network nor the descent of the
+energy sees to that: the energy's few contacts choose the fingers that are near anyway. Differs from the paper, which leaves
+idle fingers where the network puts them.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ class ClosingConfig:
     """Halvings of the interval between two samples that holds the contact."""
     openness: float = 0.9
     """Openness from which a finger closes that is bent too far to meet the object [share of its range]."""
+    resting: tuple[float, ...] = (1.0, 0.7, 0.4)
+    """Shares of the way to the bend of the fingers that hold, at the largest of which an idle finger has room to rest."""
     overlap: float = 0.001
     """Most that the self-penetration of a grasp may grow [m]."""
     batch_size: int = 64
@@ -43,6 +46,7 @@ def close_idle_fingers(energy: GraspEnergy, grasps: GraspBatch, config: ClosingC
     """The grasps with their idle fingers on the object, where they reach it without meeting others.
 
     A finger bends from where it is; if it meets nothing, from its open posture, with all joints and then with the first alone.
+    If it still meets nothing, it rests: bent as far as the fingers that hold, on average.
     Whatever belongs to the grasps before (pregrasp, squeeze, scores, energies, outcomes) is dropped.
 
     Args:
@@ -83,7 +87,37 @@ class _Closer:
                 kept = meets[:, finger] & idle[:, finger] & (self.overlap(new) < self.overlap(q) + config.overlap)
                 q = torch.where(kept[:, None], new, q)
                 idle[:, finger] &= ~kept
+        return self.rest(q, bends, idle)
+
+    def rest(
+        self, q: Float[Tensor, "n n_dof"], bends: Bool[Tensor, "n_tips n_dof"], idle: Bool[Tensor, "n n_tips"]
+    ) -> Float[Tensor, "n n_dof"]:
+        """Joints with the fingers that reach nothing bent as far as those that hold, or less where there is no room."""
+        hand, config = self.energy.hand, self.config
+        opened = torch.where(bends.any(0), hand.canonical_joints(1.0), q)
+        shares = torch.stack([self.bent(q, own) for own in bends], 1)
+        holding, resting = ~idle & bends.any(1), idle & bends.any(1)
+        if hand.thumb is not None:
+            holding[:, hand.thumb] = False  # it bends otherwise than the fingers that it opposes
+        wanted = (shares * holding).sum(1) / holding.sum(1).clamp_min(1)
+        for finger in resting.any(0).nonzero()[:, 0].tolist():
+            waiting = resting[:, finger] & (wanted > shares[:, finger])
+            for part in config.resting:
+                if not bool(waiting.any()):
+                    break
+                share = torch.lerp(shares[:, finger], wanted, part)
+                new = torch.where(bends[finger], self.along(opened, bends[finger], share[:, None]), q)
+                clear = self.distances(new)[:, finger] > config.contact
+                kept = waiting & clear & (self.overlap(new) < self.overlap(q) + config.overlap)
+                q = torch.where(kept[:, None], new, q)
+                waiting &= ~kept
         return q
+
+    def bent(self, q: Float[Tensor, "n n_dof"], own: Bool[Tensor, " n_dof"]) -> Float[Tensor, " n"]:
+        """How far a finger is bent: mean share of the way from open to closed of its joints."""
+        hand = self.energy.hand
+        opened = hand.canonical_joints(1.0)
+        return ((q - opened) / (hand.closed_ends - opened))[:, own].sum(1) / own.sum().clamp_min(1)
 
     def along(
         self, start: Float[Tensor, "n n_dof"], moving: Bool[Tensor, " n_dof"], share: Float[Tensor, "n #n_dof"]
