@@ -122,6 +122,16 @@ def test_images_that_show_nothing_are_refused(depth: np.ndarray, change: str, wo
         depth_points(image, INTRINSICS, mask)
 
 
+def test_points_that_coincide_count_once(depth: np.ndarray, T_object_camera: np.ndarray) -> None:
+    """Neighbours in the same place tell no normal, and hide outliers."""
+    points = depth_points(depth, INTRINSICS)
+    scan = scanned_object("mug", points, T_object_camera)
+    for repeated in (np.tile(points, (20, 1)), np.concatenate([points, np.tile(points[:1], (50_000, 1))])):
+        again = scanned_object("mug", repeated, T_object_camera)
+        assert again.sha256 == scan.sha256
+        np.testing.assert_array_equal(again.cloud_normals, scan.cloud_normals)
+
+
 def test_few_points_are_refused() -> None:
     with pytest.raises(ObjectError, match="3 points after cleaning"):
         scanned_object("crumbs", np.random.default_rng(0).normal(size=(3, 3)))

@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 
 from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.frames import motion_fault
+from dro_grasp.geometry.point_clouds import distinct_points
 from dro_grasp.geometry.table_plane import above_plane, table_plane
 from dro_grasp.objects.loading import check_extent, cloud_object, estimate_normals, read_points, table_note
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
@@ -92,6 +93,7 @@ def scanned_object(
         raise OptionError(f"T_frame_camera is not the camera's pose in the wanted frame, in metres: {fault}")
     kept = np.asarray(points, np.float64)
     kept, camera = kept[np.isfinite(kept).all(1)], np.zeros(3)
+    kept = kept[distinct_points(kept)]
     total, table = len(kept), None if keep_table else table_plane(kept, camera)
     if table is not None:
         kept = kept[above_plane(kept, table)]
