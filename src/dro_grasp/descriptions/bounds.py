@@ -38,14 +38,14 @@ HEAVIEST = 1e4
 """Largest mass [kg] and inertia [kg m^2] (ours)."""
 NUMBERS = (
     ("link", "body_pos", "origin", LONGEST), ("link", "body_quat", "rotation", 2.0),
-    ("link", "body_ipos", "centre of mass", LONGEST), ("link", "body_mass", "mass", HEAVIEST),
-    ("link", "body_inertia", "inertia", HEAVIEST), ("shape", "geom_pos", "origin", LONGEST),
-    ("shape", "geom_quat", "rotation", 2.0), ("shape", "geom_size", "size", LONGEST),
+    ("shape", "geom_pos", "origin", LONGEST), ("shape", "geom_quat", "rotation", 2.0), ("shape", "geom_size", "size", LONGEST),
     ("vertex", "mesh_vert", "vertex", LONGEST), ("joint", "jnt_pos", "anchor", LONGEST),
-    ("joint", "jnt_axis", "axis", 2.0), ("joint", "jnt_range", "limits", TURNS), ("joint", "qpos0", "reference", TURNS),
-    ("coupling", "eq_data", "coefficients", TURNS),
+    ("link", "body_ipos", "centre of mass", LONGEST), ("link", "body_mass", "mass", HEAVIEST),
+    ("link", "body_inertia", "inertia", HEAVIEST), ("joint", "jnt_axis", "axis", 2.0), ("joint", "jnt_range", "limits", TURNS),
+    ("joint", "qpos0", "reference", TURNS), ("coupling", "eq_data", "coefficients", TURNS),
 )
-"""Numbers of a compiled model: the kind of their owner, the array, what it means, and the largest value."""
+"""Numbers of a compiled model: the kind of their owner, the array, what it means, and the largest value. Lengths come before
+masses, which MuJoCo derives from them where a file states none."""
 
 
 def check_elements(root: ET.Element, path: Path) -> None:
@@ -102,17 +102,20 @@ def check_numbers(model: mujoco.MjModel, path: Path) -> None:
         if len(bad):
             raise HandError(f"{path}: the {what} of {_owner(model, kind, int(bad[0]))} is {_told(values[bad[0]])}; expected "
                             f"finite numbers of at most {largest:g}, in metres, radians and kilograms"
-                            f"{_hint(values[bad[0]], largest)}")
+                            f"{_hint(what, values[bad[0]], largest)}")
     for j in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE):
         if np.abs(model.jnt_range[j]).max() > LONGEST:
             raise HandError(f"{path}: the limits of joint '{model.joint(j).name}' are {_told(model.jnt_range[j])} m; expected "
                             f"at most {LONGEST:g} m")
 
 
-def _hint(values: Float[np.ndarray, " n"], largest: float) -> str:
-    """What lengths beyond all bounds may be, if they are finite."""
-    metres = largest == LONGEST and np.isfinite(values).all()
-    return "; this looks like millimetres: scale the file by 0.001" if metres else ""
+def _hint(what: str, values: Float[np.ndarray, " n"], largest: float) -> str:
+    """What lengths and masses beyond all bounds may be, if they are finite."""
+    if not np.isfinite(values).all():
+        return ""
+    if what in {"mass", "inertia"}:
+        return "; if the file does not state it, its shapes are in another unit than metres: scale the file"
+    return "; this looks like millimetres: scale the file by 0.001" if largest == LONGEST else ""
 
 
 def _owner(model: mujoco.MjModel, kind: str, index: int) -> str:
