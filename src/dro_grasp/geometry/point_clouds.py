@@ -10,8 +10,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 COINCIDENT = 1e-7
-"""Edge of a cube whose points count as one [m] (ours): single precision rounds a metre by as much, and trees that divide space until
-each cell has one point never end on points that coincide."""
+"""Edge of a cube whose points count as one [m] (ours): single precision rounds a metre by as much, and trees that divide space
+until each cell has one point never end on points that coincide."""
 
 
 def point_distances(a: Float[Tensor, "*#b n 3"], b: Float[Tensor, "*#b m 3"]) -> Float[Tensor, "*#b n m"]:
@@ -73,7 +73,7 @@ def farthest_points(points: Float[Tensor, "*batch n 3"], count: int, start: int 
 
 
 def distinct_points(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " k"]:
-    """Indices, in ascending order, of points none of which coincide in single precision: the first in each cube of COINCIDENT."""
+    """Indices, in ascending order, of points that do not coincide in single precision: the first in each cube of COINCIDENT."""
     with np.errstate(over="ignore"):
         cells = np.rint(points.astype(np.float32).astype(np.float64) / COINCIDENT)
     order, first = np.lexsort(cells.T), np.ones(len(points), bool)
