@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
-from dro_grasp.frames import read_motion
+from dro_grasp.frames import motion_fault, read_motion
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import frame_of
@@ -31,6 +31,15 @@ class Frame:
     name: str = OBJECT
     T_frame_object: Float[Tensor, "4 4"] = field(default_factory=lambda: torch.eye(4))
     """Takes coordinates of the object's frame to this one [m]."""
+
+    def __post_init__(self) -> None:
+        """Refuse what is no rigid motion.
+
+        Raises:
+            OptionError: As said.
+        """
+        if (fault := motion_fault(self.T_frame_object)) is not None:
+            raise OptionError(f"T_frame_object of frame '{self.name}' must be a rigid motion, in metres; {fault}")
 
     @staticmethod
     def load(path: Path) -> Frame:

@@ -46,8 +46,8 @@ def depth_points(
     """
     image, matrix = numbers(depth, "the depth image"), numbers(intrinsics, "the matrix of intrinsics")
     if image.ndim != 2 or matrix.shape != (3, 3) or not abs(float(np.linalg.det(matrix))) > 0:
-        raise ObjectError(f"the depth image has shape {image.shape}, the intrinsics are {matrix.tolist()}; expected (h, w), and "
-                          "a 3x3 matrix with focal lengths and principal point in pixels")
+        raise ObjectError(f"the depth image has shape {image.shape}, the intrinsics are {matrix.tolist()}; expected (h, w), "
+                          "and a 3x3 matrix with focal lengths and principal point in pixels")
     with np.errstate(invalid="ignore"):
         valid = np.isfinite(image) & (image > 0)
     if mask is not None:
