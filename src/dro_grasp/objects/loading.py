@@ -251,7 +251,8 @@ def check_extent(points: Float[np.ndarray, "n 3"], origin: str, scale: float = 1
         return
     if largest <= 0:
         raise ObjectError(f"{origin} is a single point; give a mesh or cloud that has an extent")
-    size = f"{largest:.4g} m, too large" if largest > LARGEST else f"{largest * 1000:.3g} mm, too small"
+    size, change = (f"{largest:.4g} m, too large", "--scale: 0.001 for millimetres;") if largest > LARGEST else (
+        f"{largest * 1000:.3g} mm, too small", "a larger --scale:")
     power = 10.0 ** math.ceil(math.log10(USUAL / largest))
-    raise ObjectError(f"{origin} measures {size} for a hand to grasp; if its unit is not the metre, give --scale: 0.001 "
-                      f"for millimetres; {scale * power:.3g} makes it {largest * power * 100:.2g} cm")
+    raise ObjectError(f"{origin} measures {size} for a hand to grasp; if its unit is not the metre, give {change} "
+                      f"{scale * power:.3g} makes it {largest * power * 100:.2g} cm")
