@@ -56,11 +56,16 @@ def read_motion(path: Path, key: str) -> NamedMotion:
         raise OptionError(f"{wanted}; it has no entry {error}") from error
     except (OSError, ValueError, TypeError, LookupError, ArithmeticError, RuntimeError) as error:
         raise OptionError(f"{wanted}; it does not ({error})") from error
-    if not isinstance(name, str) or not name:
-        raise OptionError(f"{wanted}; its frame is {name!r}, which is not a name")
+    if not is_name(name):
+        raise OptionError(f"{wanted}; its frame is {name!r}, which is not a name on one line")
     if (fault := motion_fault(T)) is not None:
         raise OptionError(f"{wanted}; {fault}")
     return NamedMotion(name, T.float())
+
+
+def is_name(name: object) -> bool:
+    """Whether it may name a frame: files of robots have names on one line, without control characters."""
+    return isinstance(name, str) and bool(name.strip()) and name.isprintable()
 
 
 def motion_fault(T: Float[Tensor, "*any"]) -> str | None:

@@ -33,6 +33,7 @@ def limits(upper: str, kind: str = "revolute") -> str:
 
 @pytest.mark.parametrize(("text", "message"), [
     (claw(joints=limits("1e300")), r"the limits of joint 'a' is 0 1e\+300"),
+    (claw(joints=limits("90")), r"the limits of joint 'a' is 0 90; .* this looks like degrees"),
     (claw(joints=limits("50", "prismatic")), r"the limits of joint 'a' are 0 50 m; expected at most 10 m"),
     (claw(joints=limits("1").replace("0 0 0.01", "1e30 0 0")), r"the origin of link 'left' is 1e\+30 0 0"),
     (claw(joints=limits("1").replace("0 0 0.01", "nan 0 0")), r"the origin of link 'left' is nan 0 0"),
@@ -69,6 +70,18 @@ def test_a_urdf_with_the_plugins_of_a_simulator_loads(tmp_path: Path) -> None:
     text = claw().replace("</robot>", simulated)
     assert simulated in text
     assert load_hand(written(tmp_path, text)).tree.joint_names == ("a", "b")
+
+
+def test_radians_that_are_read_as_degrees_are_warned_of(tmp_path: Path) -> None:
+    """Angles of MJCF are degrees unless it says otherwise."""
+    for text, warned in ((mjcf(), False), (mjcf().replace('angle="radian"', 'angle="degree"'), True)):
+        notes = load_description(written(tmp_path, text, "claw.xml")).notes
+        assert any("if the limits are radians" in note.text for note in notes) == warned
+
+
+@pytest.mark.parametrize("turns", ["6.2832", "12.566"])
+def test_a_joint_may_turn_twice(tmp_path: Path, turns: str) -> None:
+    assert float(load_description(written(tmp_path, claw(joints=limits(turns)))).tree.upper[0]) == pytest.approx(float(turns))
 
 
 def test_long_chains_and_many_joints_are_refused(tmp_path: Path) -> None:

@@ -136,12 +136,16 @@ def test_a_broken_mesh_is_named(tmp_path: Path) -> None:
         dro.load_hand(written(tmp_path, meshed("finger.stl")))
 
 
-@pytest.mark.parametrize(("factor", "told"), [(1000, "looks like millimetres"), (0.1, "another unit")])
-def test_units_that_are_not_metres_are_refused(tmp_path: Path, factor: float, told: str) -> None:
+@pytest.mark.parametrize(("factor", "lengths", "told"), [
+    (1000, "size=|<origin xyz=", "looks like millimetres"), (0.1, "size=|<origin xyz=", "another unit"),
+    (1000, "size=", "looks like millimetres"), (100, "size=|<origin xyz=", "mass of link 'palm' .*in another unit than metres"),
+    (40, "size=|<origin xyz=", "inertia of link 'palm' .*in another unit than metres")])
+def test_units_that_are_not_metres_are_refused(tmp_path: Path, factor: float, lengths: str, told: str) -> None:
+    """Its links state no mass, so MuJoCo derives one from their shapes, which is absurd too."""
     def scaled(match: re.Match[str]) -> str:
         return match[1] + " ".join(str(float(x) * factor) for x in match[2].split()) + '"'
 
-    text = re.sub(r'((?:size=|<origin xyz=)")([^"]*)"', scaled, claw())
+    text = re.sub(rf'((?:{lengths})")([^"]*)"', scaled, claw())
     with pytest.raises(HandError, match=told):
         dro.load_hand(written(tmp_path, text))
 

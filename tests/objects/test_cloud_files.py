@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
 from dro_grasp.errors import ObjectError
-from dro_grasp.objects.loading import MIN_CLOUD, estimate_normals, load_file
+from dro_grasp.objects.loading import MIN_CLOUD, cloud_object, estimate_normals, load_file
 from dro_grasp.objects.shape import CLOUD_POINTS
 
 
@@ -152,6 +153,25 @@ def test_huge_cloud_is_thinned_the_same_way_every_time(tmp_path: Path):
     np.testing.assert_array_equal(first.cloud, second.cloud)
     assert first.sha256 == second.sha256
     assert f"{CLOUD_POINTS} of them kept" in first.notes[0]
+
+
+BALL = 0.04 * directions(1500)
+NEAR = np.random.default_rng(3).normal(size=(300, 3))
+
+
+@pytest.mark.parametrize("points", [
+    np.concatenate([BALL, BALL[:1]]), np.concatenate([BALL, np.tile(BALL[:1], (300, 1))]), np.tile(BALL, (8, 1)),
+    np.concatenate([BALL, np.tile(BALL[:1], (60_000, 1))]), np.concatenate([BALL, BALL[:1] + 1e-9 * NEAR]),
+], ids=["one twice", "one often", "all often", "mostly one", "too near for single precision"])
+def test_points_that_coincide_are_one(points: np.ndarray) -> None:
+    """Trees that divide space until each cell has one point never end on them; the ball is the oracle."""
+    obj = cloud_object("ball", points, origin="ball")
+    assert 0 <= len(obj.cloud) - len(BALL) < 8, "points of one place lie in at most 8 cubes"
+    assert f"merged {len(points) - len(obj.cloud)} duplicated points" in obj.notes
+    places = np.random.default_rng(4).uniform(-0.06, 0.06, (500, 3))
+    radius = np.linalg.norm(places, axis=1)
+    found = obj.distance_field.distances(torch.from_numpy(places).float())[0].numpy()
+    assert np.abs(found - (radius - 0.04))[radius > 0.01].max() < 0.005
 
 
 def test_estimated_normals_of_a_box_point_outward():

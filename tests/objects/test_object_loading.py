@@ -75,7 +75,8 @@ def test_scale_applies_to_a_mesh_in_millimetres(tmp_path: Path):
 
 @pytest.mark.parametrize(
     ("radius", "message"),
-    [(5.0, r"10 m, too large .*0.01 makes it 10 cm"), (0.001, r"2 mm, too small .*100 makes it 20 cm"),
+    [(5.0, r"10 m, too large .*0.001 for millimetres; 0.01 makes it 10 cm"),
+     (0.001, r"2 mm, too small for a hand to grasp; .* give a larger --scale: 100 makes it 20 cm"),
      (0.75, r"1.5 m, too large .*0.1 makes it 15 cm")])
 def test_unlikely_sizes_are_refused_with_a_scale(tmp_path: Path, radius: float, message: str):
     with pytest.raises(ObjectError, match=message):

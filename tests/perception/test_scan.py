@@ -19,6 +19,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import object_of, with_sources
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.perception.partial_views import visible_points
 from dro_grasp.perception.scan import depth_points, load_scan, scanned_object, without_outliers
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.weights import untrained_weights
@@ -120,6 +121,54 @@ def test_images_that_show_nothing_are_refused(depth: np.ndarray, change: str, wo
         mask = np.zeros(SHAPE if change == "empty mask" else (5, 5), bool)
     with pytest.raises(ObjectError, match=word):
         depth_points(image, INTRINSICS, mask)
+
+
+@pytest.mark.parametrize("kind", [bool, np.uint8, int, float, list, torch.as_tensor])
+def test_a_mask_of_any_type_is_true_where_it_is_not_zero(depth: np.ndarray, kind) -> None:
+    """Masks of segmentation networks are bytes, of images 0 and 255."""
+    mask = np.zeros(SHAPE, np.uint8)
+    mask[:, 80:] = 255
+    given = mask.tolist() if kind is list else kind(mask) if kind is torch.as_tensor else mask.astype(kind)
+    expected = np.stack(np.nonzero((depth > 0) & (mask > 0)), 1)
+    points = depth_points(depth, INTRINSICS, given)
+    pixels = points @ INTRINSICS.T / points[:, 2:]
+    np.testing.assert_allclose(pixels[:, [1, 0]], expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", [torch.as_tensor, lambda a: torch.as_tensor(a).requires_grad_(), np.ndarray.tolist])
+def test_lists_and_tensors_are_taken_as_arrays_are(
+    mug: ObjectModel, depth: np.ndarray, T_object_camera: np.ndarray, kind
+) -> None:
+    points = depth_points(depth, INTRINSICS)
+    np.testing.assert_array_equal(depth_points(kind(depth), kind(INTRINSICS)), points)
+    scan = scanned_object("mug", points, T_object_camera)
+    assert scanned_object("mug", kind(points), kind(T_object_camera)).sha256 == scan.sha256
+    towards = np.array([1.0, 0.5, 2.0])
+    seen = [visible_points(mug, x, torch.Generator().manual_seed(0)) for x in (torch.from_numpy(towards), kind(towards))]
+    assert torch.equal(*seen)
+
+
+def test_arrays_of_wrong_shapes_are_refused_in_words(depth: np.ndarray) -> None:
+    for image, intrinsics, word in (
+        (depth[None], INTRINSICS, r"shape \(1, 120, 160\)"), (depth, [300.0, 300.0, 80.0, 60.0], r"\[300.0, 300.0, 80.0"),
+        (depth, np.diag([300.0, 300.0, 0.0]), "principal point"), ([[1.0, 2.0], [3.0]], INTRINSICS, "rows have equal lengths"),
+        ([["a"]], INTRINSICS, "instead of numbers"),
+    ):
+        with pytest.raises(ObjectError, match=word):
+            depth_points(image, intrinsics)
+    for points in (np.ones((40, 4)), np.ones(12), 5.0):
+        with pytest.raises(ObjectError, match=r"expected \(n, 3\) points"):
+            scanned_object("thing", points)
+
+
+def test_points_that_coincide_count_once(depth: np.ndarray, T_object_camera: np.ndarray) -> None:
+    """Neighbours in the same place tell no normal, and hide outliers."""
+    points = depth_points(depth, INTRINSICS)
+    scan = scanned_object("mug", points, T_object_camera)
+    for repeated in (np.tile(points, (20, 1)), np.concatenate([points, np.tile(points[:1], (50_000, 1))])):
+        again = scanned_object("mug", repeated, T_object_camera)
+        assert again.sha256 == scan.sha256
+        np.testing.assert_array_equal(again.cloud_normals, scan.cloud_normals)
 
 
 def test_few_points_are_refused() -> None:

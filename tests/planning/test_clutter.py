@@ -68,6 +68,20 @@ def test_what_a_camera_saw_of_the_thing_is_known_in_the_world(table_cloud: np.nd
     np.testing.assert_allclose(there.seen, np.column_stack([0.3 - y, x, z + 0.1]), atol=1e-6)
 
 
+def test_a_mask_of_bytes_and_lists_are_taken_and_a_pose_that_is_none_is_refused(
+    table_cloud: np.ndarray, robot: dro.Robot
+) -> None:
+    mask = 255 * (np.abs(table_cloud[:, :2] - CUBE).max(1) < 0.04).astype(np.uint8)
+    wanted = pick_object("cube", table_cloud, robot, mask=mask > 0).obj
+    assert np.allclose(wanted.cloud.mean(0)[:2], CUBE, atol=2e-3)
+    assert pick_object("cube", table_cloud, robot, mask=mask).obj.sha256 == wanted.sha256
+    assert pick_object("cube", table_cloud.tolist(), robot, mask=mask.tolist()).obj.sha256 == wanted.sha256
+    with pytest.raises(dro.DroGraspError, match="one entry for each point"):
+        pick_object("cube", table_cloud, robot, mask=mask[:-1])
+    with pytest.raises(dro.DroGraspError, match="is not a rotation"):
+        pick_object("cube", table_cloud, robot, np.diag([1.0, 1.0, -1.0, 1.0]), near=CUBE)
+
+
 def test_a_speck_is_an_obstacle_too(table_cloud: np.ndarray, robot: dro.Robot) -> None:
     speck = np.array([0.304, 0.304, 0.014]) + 0.001 * np.eye(3).repeat(2, 0)
     picked = pick_object("cube", np.concatenate([table_cloud[:-3000], speck]), robot, near=CUBE)

@@ -307,6 +307,13 @@ def test_bad_input_is_refused_in_words_and_nothing_is_written(
     assert sorted(tmp_path.iterdir()) == before
 
 
+def test_a_place_that_is_no_rigid_motion_is_refused(robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray]) -> None:
+    obj, T = standing
+    for wrong, word in ((T @ np.diag([1.0, -1.0, 1.0, 1.0]), "not a rotation"), (T * [[1.0], [1.0], [1000.0], [1.0]], "")):
+        with pytest.raises(dro.DroGraspError, match=f"T_world_object is not the object's pose.*{word}"):
+            plan(robot, obj, wrong)
+
+
 @pytest.mark.parametrize(("option", "said"), [("robot.yaml", "link 'link9', which the arm does not have"),
                                               ("xarm7_leaphand", "nothing stands on the table: 0 points are left")])
 def test_a_robot_and_a_cloud_that_cannot_be_used_leave_nothing_behind(

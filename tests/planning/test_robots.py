@@ -142,6 +142,7 @@ SQUASHED = [[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     (change("limits/acceleration", None), "has no acceleration limit"),
     (change("limits/velocity", -1), "expected a number above 0"),
     (change("home/joint2", 5.0), "outside its limits"),
+    (change("limits/position", {"joint1": [-170.0, 170.0]}), "looks like degrees"),
     (change("home/joint2", None), "home lacks joint 'joint2'"),
     (change("home/elbow", 0.1), "joint 'elbow', which the arm does not have"),
     (change("camera/T_world_camera", SQUASHED), "no rigid motion"),

@@ -125,6 +125,7 @@ SPHERE = trimesh.creation.icosphere(1, 0.03).vertices.tolist()
     ({"avoid": "/etc/passwd"}, "avoid names '/etc/passwd'"), ({"avoid": {"points": []}}, "holds no point"),
     ({"camera": {"frame": "base", "T_frame_camera": np.eye(4).tolist()}}, "send the cloud"),
     ({"camera": {"frame": "base", "T_frame_camera": np.zeros((4, 4)).tolist()}, "object": {"points": SPHERE}}, "last row"),
+    ({"camera": {"frame": "a\nb", "T_frame_camera": np.eye(4).tolist()}, "object": {"points": SPHERE}}, "a name on one line"),
 ])
 def test_refusals_say_why_and_nothing_but_what_was_sent_is_read(answerer: Answerer, asked: dict[str, Any], told: str) -> None:
     with pytest.raises(dro.DroGraspError, match=told):

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from dro_grasp.descriptions.notes import Note
 from dro_grasp.errors import HandError
 
 DEEPEST = 100
@@ -32,20 +33,26 @@ UNUSED = {"composite", "flexcomp", "flex", "hfield", "skin", "plugin"}
 """Elements of MJCF that no rigid hand has, and that can grow without limit (ours)."""
 LONGEST = 10.0
 """Largest coordinate, size or travel of a slide [m] (ours)."""
+MOST_TURN = 25.0
+"""Largest limit of a joint that turns [rad] (ours): four turns; no finger, wrist or arm makes more than two either way. In
+degrees, the limits of a finger are beyond it."""
+LEAST_TURN = 0.1
+"""Range of a hand's widest turning joint below which its limits look like radians that were read as degrees [rad] (ours)."""
 TURNS = 1e4
-"""Largest angle [rad], and largest ratio or offset of a coupling (ours)."""
+"""Largest reference angle [rad], and largest ratio or offset of a coupling (ours)."""
 HEAVIEST = 1e4
 """Largest mass [kg] and inertia [kg m^2] (ours)."""
 NUMBERS = (
     ("link", "body_pos", "origin", LONGEST), ("link", "body_quat", "rotation", 2.0),
-    ("link", "body_ipos", "centre of mass", LONGEST), ("link", "body_mass", "mass", HEAVIEST),
-    ("link", "body_inertia", "inertia", HEAVIEST), ("shape", "geom_pos", "origin", LONGEST),
-    ("shape", "geom_quat", "rotation", 2.0), ("shape", "geom_size", "size", LONGEST),
+    ("shape", "geom_pos", "origin", LONGEST), ("shape", "geom_quat", "rotation", 2.0), ("shape", "geom_size", "size", LONGEST),
     ("vertex", "mesh_vert", "vertex", LONGEST), ("joint", "jnt_pos", "anchor", LONGEST),
-    ("joint", "jnt_axis", "axis", 2.0), ("joint", "jnt_range", "limits", TURNS), ("joint", "qpos0", "reference", TURNS),
+    ("link", "body_ipos", "centre of mass", LONGEST), ("link", "body_mass", "mass", HEAVIEST),
+    ("link", "body_inertia", "inertia", HEAVIEST), ("joint", "jnt_axis", "axis", 2.0),
+    ("joint", "jnt_range", "limits", MOST_TURN), ("joint", "qpos0", "reference", TURNS),
     ("coupling", "eq_data", "coefficients", TURNS),
 )
-"""Numbers of a compiled model: the kind of their owner, the array, what it means, and the largest value."""
+"""Numbers of a compiled model: the kind of their owner, the array, what it means, and the largest value. Lengths come before
+masses, which MuJoCo derives from them where a file states none."""
 
 
 def check_elements(root: ET.Element, path: Path) -> None:
@@ -95,6 +102,10 @@ def check_numbers(model: mujoco.MjModel, path: Path) -> None:
     Raises:
         HandError: As said.
     """
+    for j in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE):
+        if np.abs(model.jnt_range[j]).max() > LONGEST:
+            raise HandError(f"{path}: the limits of joint '{model.joint(j).name}' are {_told(model.jnt_range[j])} m; expected "
+                            f"at most {LONGEST:g} m; this looks like millimetres: scale the file by 0.001")
     for kind, array, what, largest in NUMBERS:
         values = np.asarray(getattr(model, array), float)
         values = values[:, None] if values.ndim == 1 else values[:, :4]
@@ -102,17 +113,27 @@ def check_numbers(model: mujoco.MjModel, path: Path) -> None:
         if len(bad):
             raise HandError(f"{path}: the {what} of {_owner(model, kind, int(bad[0]))} is {_told(values[bad[0]])}; expected "
                             f"finite numbers of at most {largest:g}, in metres, radians and kilograms"
-                            f"{_hint(values[bad[0]], largest)}")
-    for j in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE):
-        if np.abs(model.jnt_range[j]).max() > LONGEST:
-            raise HandError(f"{path}: the limits of joint '{model.joint(j).name}' are {_told(model.jnt_range[j])} m; expected "
-                            f"at most {LONGEST:g} m")
+                            f"{_hint(what, values[bad[0]], largest)}")
 
 
-def _hint(values: Float[np.ndarray, " n"], largest: float) -> str:
-    """What lengths beyond all bounds may be, if they are finite."""
-    metres = largest == LONGEST and np.isfinite(values).all()
-    return "; this looks like millimetres: scale the file by 0.001" if metres else ""
+def limit_notes(model: mujoco.MjModel) -> list[Note]:
+    """A question if no joint of a hand turns by more than a few degrees."""
+    turns = np.ptp(model.jnt_range[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE], axis=1)
+    if not 0 < turns.max(initial=0.0) < LEAST_TURN:
+        return []
+    return [Note("warning", "limits", f"no joint turns by more than {turns.max():.2g} rad; if the limits are radians, say so: "
+                 'without <compiler angle="radian"/> MJCF has degrees')]
+
+
+def _hint(what: str, values: Float[np.ndarray, " n"], largest: float) -> str:
+    """What numbers beyond all bounds may be, if they are finite."""
+    if not np.isfinite(values).all():
+        return ""
+    if what in {"mass", "inertia"}:
+        return "; if the file does not state it, its shapes are in another unit than metres: scale the file"
+    if what == "limits":
+        return "; this looks like degrees: write radians, or leave the limits out where a joint has none"
+    return "; this looks like millimetres: scale the file by 0.001" if largest == LONGEST else ""
 
 
 def _owner(model: mujoco.MjModel, kind: str, index: int) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import mujoco
 
-from dro_grasp.descriptions.bounds import check_numbers
+from dro_grasp.descriptions.bounds import check_numbers, limit_notes
 from dro_grasp.descriptions.notes import Note
 from dro_grasp.errors import HandError
 
@@ -51,6 +51,7 @@ def compile_hand(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> mujoco.M
     with mujoco_speaks_to(notes, path):
         model = _compile(spec, notes)
     check_numbers(model, path)
+    notes.extend(limit_notes(model))
     return model
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
-from dro_grasp.frames import read_motion
+from dro_grasp.frames import is_name, motion_fault, read_motion
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import frame_of
@@ -31,6 +31,17 @@ class Frame:
     name: str = OBJECT
     T_frame_object: Float[Tensor, "4 4"] = field(default_factory=lambda: torch.eye(4))
     """Takes coordinates of the object's frame to this one [m]."""
+
+    def __post_init__(self) -> None:
+        """Refuse names that would break the files, and what is no rigid motion.
+
+        Raises:
+            OptionError: As said.
+        """
+        if not is_name(self.name):
+            raise OptionError(f"the frame is called {self.name!r}; expected a name on one line, without control characters")
+        if (fault := motion_fault(self.T_frame_object)) is not None:
+            raise OptionError(f"T_frame_object of frame '{self.name}' must be a rigid motion, in metres; {fault}")
 
     @staticmethod
     def load(path: Path) -> Frame:
@@ -79,8 +90,9 @@ def confidence(grasps: GraspBatch, i: int) -> float | None:
 
 def comment(grasps: GraspBatch, frame: Frame) -> str:
     """Three lines that a reader of the file needs: hand, frame, units and the meaning of numbers."""
+    named = f"Grasps by hand '{grasps.hand}': poses of link '{grasps.wrist_link}' in {frame.sentence(grasps)}."
     return (
-        f"# Grasps by hand '{grasps.hand}': poses of link '{grasps.wrist_link}' in {frame.sentence(grasps)}.\n"
+        f"# {''.join(c if c.isprintable() else ' ' for c in named)}\n"
         "# Metres and radians; quaternions by name or WXYZ. Joints are the independent ones; mimic joints follow them.\n"
         "# Score: predicted log-odds that the grasp holds; confidence is its logistic function. Energy: lower is better.\n"
     )

@@ -9,6 +9,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+COINCIDENT = 1e-7
+"""Edge of a cube whose points count as one [m] (ours): single precision rounds a metre by as much, and trees that divide space
+until each cell has one point never end on points that coincide."""
+
 
 def point_distances(a: Float[Tensor, "*#b n 3"], b: Float[Tensor, "*#b m 3"]) -> Float[Tensor, "*#b n m"]:
     """Distance of each point of one cloud to each of another [m], as their coordinates give it.
@@ -66,6 +70,15 @@ def farthest_points(points: Float[Tensor, "*batch n 3"], count: int, start: int 
         nearest = torch.minimum(nearest, (flat - flat[rows, current][:, None]).square().sum(-1))
         current = nearest.argmax(-1)
     return chosen.reshape(*points.shape[:-2], count)
+
+
+def distinct_points(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " k"]:
+    """Indices, in ascending order, of points that do not coincide in single precision: the first in each cube of COINCIDENT."""
+    with np.errstate(over="ignore"):
+        cells = np.rint(points.astype(np.float32).astype(np.float64) / COINCIDENT)
+    order, first = np.lexsort(cells.T), np.ones(len(points), bool)
+    first[1:] = (cells[order[1:]] != cells[order[:-1]]).any(1)
+    return np.sort(order[first])
 
 
 def random_half(points: Float[Tensor, "n 3"], count: int, generator: torch.Generator) -> Int[Tensor, " count"]:

@@ -46,7 +46,7 @@ def geometry_in_memory(source: Any) -> tuple[trimesh.Trimesh | Float[np.ndarray,
         geometry = merge_scene(source) if isinstance(source, trimesh.Scene) else source
         return (np.asarray(geometry.vertices, np.float64) if isinstance(geometry, trimesh.PointCloud) else geometry), unit
     if isinstance(source, tuple) and len(source) == 2:
-        vertices, faces = _numbers(source[0]), _numbers(source[1])
+        vertices, faces = numbers(source[0]), numbers(source[1])
         for what, array in (("vertices", vertices), ("faces", faces)):
             if array.ndim != 2 or array.shape[1] != 3:
                 raise ObjectError(f"the {what} have shape {array.shape}; expected (n, 3)")
@@ -54,18 +54,21 @@ def geometry_in_memory(source: Any) -> tuple[trimesh.Trimesh | Float[np.ndarray,
             raise ObjectError(f"the faces are numbers of type {faces.dtype}; give the indices of their vertices as integers")
         return trimesh.Trimesh(vertices, faces, process=False), 1.0
     if isinstance(source, np.ndarray | Tensor):
-        return _numbers(source).astype(np.float64), 1.0
+        return numbers(source).astype(np.float64), 1.0
     raise ObjectError(f"an object cannot be loaded from a {type(source).__name__}; give a name, the path of a mesh or cloud, a "
                       "trimesh mesh, a pair (vertices, faces), or an array of points (n, 3)")
 
 
-def _numbers(values: Any) -> Shaped[np.ndarray, "..."]:
-    """An array of numbers.
+def numbers(values: Any, origin: str = ORIGIN, kinds: str = "iuf") -> Shaped[np.ndarray, "..."]:
+    """An array of numbers from an array, a tensor or nested lists; `kinds` has NumPy's letters for the types that are taken.
 
     Raises:
         ObjectError: The values are none.
     """
-    array = np.asarray(values.detach().cpu() if isinstance(values, Tensor) else values)
-    if array.dtype.kind not in "iuf":
-        raise ObjectError(f"{ORIGIN} holds {array.dtype} instead of numbers; give arrays of floats, and of integers for faces")
+    try:
+        array = np.asarray(values.detach().cpu() if isinstance(values, Tensor) else values)
+    except (TypeError, ValueError) as error:
+        raise ObjectError(f"{origin} is no array of numbers ({error}); give one whose rows have equal lengths") from error
+    if array.dtype.kind not in kinds:
+        raise ObjectError(f"{origin} holds {array.dtype} instead of numbers; give arrays of floats, and of integers for faces")
     return array

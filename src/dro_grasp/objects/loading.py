@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 from dro_grasp.errors import ObjectError
 from dro_grasp.files import given_path, reading
 from dro_grasp.geometry.mesh_files import open_mesh
+from dro_grasp.geometry.point_clouds import distinct_points
 from dro_grasp.geometry.table_plane import above_plane, table_plane
 from dro_grasp.objects.cache import content_hash
 from dro_grasp.objects.cloud_files import CLOUD_SUFFIXES, read_cloud
@@ -162,17 +163,19 @@ def cloud_object(
     bad = int((~np.isfinite(points)).any(1).sum())
     if bad:
         raise ObjectError(f"{origin} has {bad} points with NaN or infinite coordinates; remove them first")
-    xyz, total = points[:, :3] * scale, len(points)
+    xyz = points[:, :3] * scale
+    one = distinct_points(xyz)
+    merged = () if len(one) == len(points) else (f"merged {len(points) - len(one)} duplicated points",)
+    xyz, points, total = xyz[one], points[one], len(one)
     table = None if keep_table else table_plane(xyz)
     if table is not None:
         kept = above_plane(xyz, table)
         xyz, points = xyz[kept], points[kept]
     keep = np.random.default_rng(0).permutation(len(xyz))[:CLOUD_POINTS]
-    distinct = len(np.unique(xyz[keep].round(6), axis=0))
     if len(xyz) and np.ptp(xyz, axis=0).max() > 0:
         check_extent(xyz, origin, scale)
-    if distinct < MIN_CLOUD:
-        raise ObjectError(f"{origin} has {distinct} distinct points; a cloud needs at least {MIN_CLOUD} spread over "
+    if len(xyz) < MIN_CLOUD:
+        raise ObjectError(f"{origin} has {len(xyz)} distinct points; a cloud needs at least {MIN_CLOUD} spread over "
                           "the object's surface")
     cloud = np.ascontiguousarray(xyz[keep], np.float32)
     given = points[keep, 3:]
@@ -189,8 +192,8 @@ def cloud_object(
         name=name, cloud=cloud, cloud_normals=np.ascontiguousarray(normals, np.float32),
         centre_of_mass=cloud.mean(0, dtype=np.float64), sha256=content_hash(cloud),
         table=table, seen=None if seen is None else seen.astype(np.float32),
-        notes=(f"bare point cloud of {len(points)} points{fewer}{estimated}: no trial is possible without a mesh", *cut,
-               *(() if has_normals else _one_sided(normals))),
+        notes=(f"bare point cloud of {len(points)} points{fewer}{estimated}: no trial is possible without a mesh", *merged,
+               *cut, *(() if has_normals else _one_sided(normals))),
     )
 
 
@@ -248,7 +251,8 @@ def check_extent(points: Float[np.ndarray, "n 3"], origin: str, scale: float = 1
         return
     if largest <= 0:
         raise ObjectError(f"{origin} is a single point; give a mesh or cloud that has an extent")
-    size = f"{largest:.4g} m, too large" if largest > LARGEST else f"{largest * 1000:.3g} mm, too small"
+    size, change = (f"{largest:.4g} m, too large", "--scale: 0.001 for millimetres;") if largest > LARGEST else (
+        f"{largest * 1000:.3g} mm, too small", "a larger --scale:")
     power = 10.0 ** math.ceil(math.log10(USUAL / largest))
-    raise ObjectError(f"{origin} measures {size} for a hand to grasp; if its unit is not the metre, give --scale: 0.001 "
-                      f"for millimetres; {scale * power:.3g} makes it {largest * power * 100:.2g} cm")
+    raise ObjectError(f"{origin} measures {size} for a hand to grasp; if its unit is not the metre, give {change} "
+                      f"{scale * power:.3g} makes it {largest * power * 100:.2g} cm")

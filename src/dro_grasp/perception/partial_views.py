@@ -9,10 +9,12 @@ import numpy as np
 import torch
 import trimesh
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
+from dro_grasp.objects.in_memory import numbers
 from dro_grasp.objects.loading import cloud_object, estimate_normals
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.completion import complete_cloud
@@ -94,29 +96,30 @@ class DepthCamera:
 
 
 def visible_points(
-    obj: ObjectModel, direction: Float[Tensor, "3"], generator: torch.Generator, camera: DepthCamera | None = None
+    obj: ObjectModel, direction: ArrayLike, generator: torch.Generator, camera: DepthCamera | None = None
 ) -> Float[Tensor, "n 3"]:
     """Points of one depth image of the object, in the object's frame [m].
 
     Rays are cast at a mesh. Of a bare cloud, the visible points are those that no others hide.
 
     Args:
-        direction: From the object towards the camera, of any length.
+        direction: From the object towards the camera, of any length: three numbers.
         generator: Draws noise and lost pixels.
 
     Raises:
         OptionError: The direction has no length, or the camera stands inside the object.
     """
     camera = camera or DepthCamera()
-    length = float(direction.norm())
-    if not np.isfinite(length) or length < 1e-9:
-        raise OptionError(f"direction is {direction.tolist()}; give a vector from the object to the camera, as 0 0 1")
+    towards = 1.0 * torch.from_numpy(numbers(direction, "direction"))
+    length = float(towards.norm())
+    if towards.shape != (3,) or not np.isfinite(length) or length < 1e-9:
+        raise OptionError(f"direction is {towards.tolist()}; give a vector from the object to the camera, as 0 0 1")
     low, high = obj.cloud.min(0).astype(np.float64), obj.cloud.max(0).astype(np.float64)
     radius = float(np.linalg.norm(high - low)) / 2
     if camera.distance <= radius:
         raise OptionError(f"a camera at {camera.distance:g} m is inside the object, {radius:.3g} m in radius; "
                           "move it away")
-    T_object_camera = _looking_at(_middle(obj), direction.double().numpy() / length, camera.distance)
+    T_object_camera = _looking_at(_middle(obj), towards.double().numpy() / length, camera.distance)
     image = _depth_of_cloud if obj.is_cloud else _depth_of_mesh
     rays, depth = image(obj, T_object_camera, radius, camera)
     return _measured(rays, depth, T_object_camera, camera, generator)

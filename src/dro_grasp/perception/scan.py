@@ -8,12 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Num
+from jaxtyping import Float
+from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.frames import motion_fault
+from dro_grasp.geometry.point_clouds import distinct_points
 from dro_grasp.geometry.table_plane import above_plane, table_plane
+from dro_grasp.objects.in_memory import numbers
 from dro_grasp.objects.loading import check_extent, cloud_object, estimate_normals, read_points, table_note
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
 from dro_grasp.perception.completion import complete_cloud
@@ -27,31 +30,39 @@ FARTHEST = 10.0
 
 
 def depth_points(
-    depth: Num[np.ndarray, "h w"], intrinsics: Float[np.ndarray, "3 3"], mask: Bool[np.ndarray, "rows columns"] | None = None
+    depth: ArrayLike, intrinsics: ArrayLike, mask: ArrayLike | None = None
 ) -> Float[np.ndarray, "n 3"]:
     """Points of a depth image in the camera's frame: x right, y down, z forward [m].
 
+    Arrays, tensors and nested lists are taken.
+
     Args:
-        depth: Depth along z [m]; 0 or NaN where there is no measurement.
-        intrinsics: Pinhole matrix: focal lengths and principal point [pixels].
-        mask: The object's pixels; all pixels with a depth by default.
+        depth: Depth along z [m], (h, w); 0 or NaN where there is no measurement.
+        intrinsics: Pinhole matrix, (3, 3): focal lengths and principal point [pixels].
+        mask: The object's pixels, (h, w), which are true or not 0; all pixels with a depth by default.
 
     Raises:
-        ObjectError: Mask and image differ in shape, nothing is left, or depths are not in metres.
+        ObjectError: Image, mask or matrix have wrong shapes, nothing is left, or depths are not in metres.
     """
-    if mask is not None and mask.shape != depth.shape:
-        raise ObjectError(f"the mask has shape {mask.shape}, the depth image {depth.shape}; give one of the same size")
+    image, matrix = numbers(depth, "the depth image"), numbers(intrinsics, "the matrix of intrinsics")
+    if image.ndim != 2 or matrix.shape != (3, 3) or not abs(float(np.linalg.det(matrix))) > 0:
+        raise ObjectError(f"the depth image has shape {image.shape}, the intrinsics are {matrix.tolist()}; expected (h, w), "
+                          "and a 3x3 matrix with focal lengths and principal point in pixels")
     with np.errstate(invalid="ignore"):
-        valid = np.isfinite(depth) & (depth > 0)
-    valid = valid if mask is None else valid & mask
+        valid = np.isfinite(image) & (image > 0)
+    if mask is not None:
+        wanted = numbers(mask, "the mask", "biuf") != 0
+        if wanted.shape != image.shape:
+            raise ObjectError(f"the mask has shape {wanted.shape}, the depth image {image.shape}; give one of the same size")
+        valid = valid & wanted
     if not valid.any():
         raise ObjectError("no pixel of the depth image has a depth" + ("" if mask is None else " within the mask")
                           + "; give depths in metres, and a mask that is true on the object")
-    if float(np.median(depth[valid])) > FARTHEST:
-        raise ObjectError(f"the median depth is {np.median(depth[valid]):g}, too far for metres; divide millimetres by 1000")
+    if float(np.median(image[valid])) > FARTHEST:
+        raise ObjectError(f"the median depth is {np.median(image[valid]):g}, too far for metres; divide millimetres by 1000")
     row, column = np.nonzero(valid)
-    z = depth[valid].astype(np.float64)
-    rays = np.linalg.solve(intrinsics.astype(np.float64), np.stack([column, row, np.ones_like(row)]).astype(np.float64))
+    z = image[valid].astype(np.float64)
+    rays = np.linalg.solve(matrix.astype(np.float64), np.stack([column, row, np.ones_like(row)]).astype(np.float64))
     return (rays / rays[2] * z).T
 
 
@@ -70,15 +81,17 @@ def load_scan(
 
 
 def scanned_object(
-    name: str, points: Float[np.ndarray, "n 3"], T_frame_camera: Float[np.ndarray, "4 4"] | None = None, denoise: bool = True,
-    complete: bool = True, keep_table: bool = False,
+    name: str, points: ArrayLike, T_frame_camera: ArrayLike | None = None, denoise: bool = True, complete: bool = True,
+    keep_table: bool = False,
 ) -> ObjectModel:
     """An object from the points of a camera at the origin; its grasps are in the given frame.
 
+    Arrays, tensors and nested lists are taken.
+
     Args:
-        points: Points in the camera's frame [m].
-        T_frame_camera: The camera's pose in the wanted frame, whose z axis points up and in which `direction` and `table`
-            are given; the camera's own frame by default.
+        points: Points in the camera's frame, (n, 3) [m].
+        T_frame_camera: The camera's pose, (4, 4), in the wanted frame, whose z axis points up and in which `direction` and
+            `table` are given; the camera's own frame by default.
         denoise: Drop outliers.
         complete: Add the unseen side; switch it off for a scan from all sides.
         keep_table: Take every point for the object's. By default a table in the cloud is found and cut off, said in a note, and
@@ -88,10 +101,10 @@ def scanned_object(
         ObjectError: Too few points are left, they are not in metres, or some lie behind the camera.
         OptionError: The pose is no rigid motion.
     """
-    if T_frame_camera is not None and (fault := motion_fault(torch.as_tensor(T_frame_camera).float())) is not None:
-        raise OptionError(f"T_frame_camera is not the camera's pose in the wanted frame, in metres: {fault}")
-    kept = np.asarray(points, np.float64)
+    T = None if T_frame_camera is None else camera_pose(T_frame_camera)
+    kept = given_points(points, name)
     kept, camera = kept[np.isfinite(kept).all(1)], np.zeros(3)
+    kept = kept[distinct_points(kept)]
     total, table = len(kept), None if keep_table else table_plane(kept, camera)
     if table is not None:
         kept = kept[above_plane(kept, table)]
@@ -109,10 +122,10 @@ def scanned_object(
     normals = estimate_normals(kept.astype(np.float32), camera).astype(np.float64)
     seen, added = kept, np.zeros(0, bool)
     if complete:
-        up = None if T_frame_camera is None else T_frame_camera[2, :3].astype(np.float64)
+        up = None if T is None else T[2, :3]
         kept, normals, added = complete_cloud(kept, normals, camera, up)
-    if T_frame_camera is not None:
-        R, t = T_frame_camera[:3, :3], T_frame_camera[:3, 3]
+    if T is not None:
+        R, t = T[:3, :3], T[:3, 3]
         kept, seen, normals = kept @ R.T + t, seen @ R.T + t, normals @ R.T
         if table is not None:
             up = R @ table[:3]
@@ -120,6 +133,30 @@ def scanned_object(
     obj = cloud_object(
         name, np.concatenate([kept, normals], 1), origin=name, keep_table=True, seen=seen if added.any() else None)
     return obj if table is None else replace(obj, table=table, notes=(*obj.notes, table_note(table, cut, total)))
+
+
+def given_points(points: ArrayLike, origin: str) -> Float[np.ndarray, "n 3"]:
+    """The points of a cloud, NaN included [m].
+
+    Raises:
+        ObjectError: They are no points.
+    """
+    array = numbers(points, origin).astype(np.float64)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ObjectError(f"{origin} holds an array of shape {array.shape}; expected (n, 3) points")
+    return array
+
+
+def camera_pose(T_frame_camera: ArrayLike) -> Float[np.ndarray, "4 4"]:
+    """The pose of a camera in the wanted frame [m].
+
+    Raises:
+        OptionError: It is no rigid motion.
+    """
+    T = numbers(T_frame_camera, "T_frame_camera").astype(np.float64)
+    if (fault := motion_fault(torch.from_numpy(T))) is not None:
+        raise OptionError(f"T_frame_camera is not the camera's pose in the wanted frame, in metres: {fault}")
+    return T
 
 
 def without_outliers(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:

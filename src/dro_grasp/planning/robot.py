@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from dro_grasp.descriptions.bounds import MOST_TURN
 from dro_grasp.descriptions.loader import Description, load_description
 from dro_grasp.descriptions.xml_files import parse_xml
 from dro_grasp.errors import HandError, RobotError
@@ -148,6 +149,8 @@ class _Fit:
                 if not isinstance(ends, list) or len(ends) != 2 or not ends[0] < ends[1]:
                     raise self.error(f"limits: position of joint '{name}' is {ends!r}; expected [lower, upper]")
                 lower[i], upper[i] = ends
+                if np.abs(ends).max() > MOST_TURN:
+                    raise self.error(f"limits: position of joint '{name}' is {ends}, which looks like degrees: expected rad")
             elif name in unlimited:
                 raise self.error(f"joint '{name}' of the arm has no position limits; state them in the arm's file, or here: "
                                  f"limits: {{position: {{{name}: [-3.1, 3.1]}}}}")

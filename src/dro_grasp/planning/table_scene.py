@@ -6,15 +6,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from dro_grasp.errors import ObjectError, RobotError
 from dro_grasp.geometry.table_plane import largest_plane
+from dro_grasp.objects.in_memory import numbers
 from dro_grasp.objects.loading import MIN_CLOUD, cloud_object
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.perception.scan import scanned_object
+from dro_grasp.perception.scan import camera_pose, given_points, scanned_object
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.robot_file import Table
 from dro_grasp.planning.workcell import VOXEL
@@ -68,8 +70,8 @@ class PickedObject:
 
 
 def pick_object(
-    name: str, points: Float[np.ndarray, "n 3"], robot: Robot, T_world_camera: Float[np.ndarray, "4 4"] | None = None,
-    near: tuple[float, float] | None = None, mask: Bool[np.ndarray, " n"] | None = None,
+    name: str, points: ArrayLike, robot: Robot, T_world_camera: ArrayLike | None = None,
+    near: tuple[float, float] | None = None, mask: ArrayLike | None = None,
 ) -> PickedObject:
     """Find the table in a cloud, remove it, and pick one of the objects on it.
 
@@ -81,31 +83,36 @@ def pick_object(
 
     Args:
         name: What to call it.
-        points: In the camera's frame, or in the world's [m]; several objects, and the table.
+        points: In the camera's frame, or in the world's, (n, 3) [m]; several objects, and the table. NaN are left out.
         robot: With a table.
         T_world_camera: The camera's pose [m], if the points are in its frame: the unseen side is then estimated.
         near: A place in the world near the object that is wanted [m]; needed where there are several.
-        mask: Which points belong to the object that is wanted.
+        mask: Which points belong to the object that is wanted, (n,): those where it is true or not 0.
 
     Raises:
         ObjectError: No level plane, nothing on it, or nothing within the mask; or it is not clear which object is wanted.
+        OptionError: The pose is no rigid motion.
         RobotError: The robot has no table.
     """
     if robot.table is None:
         raise RobotError(f"robot '{robot.name}' has no table to look for in '{name}'; state it in the robot file, or give the "
                          "object's points alone")
-    finite = np.isfinite(points).all(1)
-    points, mask = points[finite], None if mask is None else mask[finite]
-    sight = sort_out(points, np.eye(4) if T_world_camera is None else T_world_camera, robot.table, near, mask)
+    given, T = given_points(points, name), None if T_world_camera is None else camera_pose(T_world_camera)
+    wanted = None if mask is None else numbers(mask, "the mask", "biuf") != 0
+    if wanted is not None and wanted.shape != (len(given),):
+        raise ObjectError(f"the mask has shape {wanted.shape}; expected ({len(given)},), one entry for each point of '{name}'")
+    finite = np.isfinite(given).all(1)
+    sight = sort_out(
+        given[finite], np.eye(4) if T is None else T, robot.table, near, None if wanted is None else wanted[finite])
     if len(sight.places) > 1 and near is None and mask is None:
         places = ", ".join(f"({x:.2f}, {y:.2f})" for x, y in sight.places)
         raise ObjectError(f"'{name}' has {len(sight.places)} things that stand on the table, at {places} m; say which one is "
                           "wanted by a place near it (--near X Y), or give its points alone")
     height = sight.table_height
     level = replace(robot, table=replace(robot.table, height=height))
-    if T_world_camera is None:
+    if T is None:
         return PickedObject(cloud_object(name, sight.points, origin=name, keep_table=True), _solid(sight), level)
-    whole = scanned_object(name, sight.points, T_world_camera, keep_table=True)
+    whole = scanned_object(name, sight.points, T, keep_table=True)
     rows = np.concatenate([whole.cloud, whole.cloud_normals], 1)[whole.cloud[:, 2] > height]
     return PickedObject(
         replace(cloud_object(name, rows, origin=name, keep_table=True, seen=whole.seen), notes=whole.notes),

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from dro_grasp.errors import DroGraspError, HandError, ObjectError, OptionError
 from dro_grasp.files import given_path
-from dro_grasp.frames import motion_fault
+from dro_grasp.frames import is_name, motion_fault
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import hand_names, load_hand
@@ -243,8 +243,10 @@ def camera_pose(camera: SentCamera) -> Float[Tensor, "4 4"]:
     """The camera's pose in the named frame [m].
 
     Raises:
-        OptionError: It is no rigid motion.
+        OptionError: It is no rigid motion, or the frame has no proper name.
     """
+    if not is_name(camera.frame):
+        raise OptionError(f"frame is {camera.frame!r}; expected a name on one line, without control characters")
     T = torch.tensor(camera.T_frame_camera, dtype=torch.float64)
     if (fault := motion_fault(T)) is not None:
         raise OptionError(f"T_frame_camera must be 4 rows of 4 numbers, in metres; {fault}")
