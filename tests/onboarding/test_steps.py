@@ -165,6 +165,16 @@ def test_what_is_refused_leaves_no_folder(
     assert not (home / "new").exists()
 
 
+def test_objects_of_one_name_are_refused_before_the_work(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = [home / folder / "cup.stl" for folder in ("a", "b")]
+    for file in files:
+        file.parent.mkdir()
+        file.touch()
+    assert main([*command(home), "--output", str(home / "new"), "--objects", *map(str, files)]) == 2
+    assert f"objects '{files[0]}' and '{files[1]}' are both called 'cup'" in capsys.readouterr().err
+    assert not (home / "new").exists()
+
+
 def test_a_damaged_state_is_set_aside_and_a_second_run_kept_out(
     home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
