@@ -1,8 +1,9 @@
-"""Files of the user: paths are checked before the work, what is read is refused by one error, what is written is whole."""
+"""Files of the user: paths are checked before the work and quoted for shells, reading has one error, writing is whole."""
 
 from __future__ import annotations
 
 import os
+import shlex
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -33,6 +34,11 @@ def given_path(name: Path | str) -> Path:
     return path
 
 
+def command(*words: object) -> str:
+    """A command line that a shell splits into these words, for the user to run."""
+    return shlex.join(map(str, words))
+
+
 @contextmanager
 def reading(path: object, refuse: type[DroGraspError], expected: str) -> Iterator[None]:
     """Turn whatever a library raises over a damaged file into one error that names the file; our own errors pass.
@@ -60,7 +66,7 @@ def check_output(path: Path | str) -> Path:
     path = given_path(path)
     parent = path.absolute().parent
     if not parent.is_dir():
-        raise OutputError(f"cannot write {path}: no folder {parent}; create it first (mkdir -p {parent})")
+        raise OutputError(f"cannot write {path}: no folder {parent}; create it first ({command('mkdir', '-p', parent)})")
     if path.is_dir():
         raise OutputError(f"cannot write {path}: it is a folder; give the name of a file in it")
     if path.exists() and not path.is_file():

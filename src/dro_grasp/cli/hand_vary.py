@@ -32,7 +32,7 @@ class Vary:
     def run(self) -> int:
         """Read, change, write."""
         from dro_grasp.errors import OptionError, OutputError
-        from dro_grasp.files import check_output, replacing
+        from dro_grasp.files import check_output, command, replacing
         from dro_grasp.hands.variants import vary_hand
 
         if not self.mirrored and self.scale == 1:
@@ -45,5 +45,6 @@ class Vary:
         if self.json:
             print_json({"hand": self.hand, "mirrored": self.mirrored, "scale": self.scale, "output": str(self.output)})
         else:
-            say(f"{self.output}; see it with: dro-grasp hand check {self.output} --picture hand.png")
+            shown = command("dro-grasp", "hand", "check", self.output, "--picture", "hand.png")
+            say(f"{self.output}; see it with: {shown}")
         return 0
