@@ -16,6 +16,9 @@ from dro_grasp.errors import DroGraspError, OptionError, OutputError
 TOLD = 200
 """Characters of a path or a reason that an error repeats (ours)."""
 
+SAME = {".yaml": ".yml", ".html": ".htm"}
+"""Endings of file names, and others that mean the same."""
+
 
 def given_path(name: Path | str) -> Path:
     """The path that a user gives, with `~` expanded; there may be nothing at it.
@@ -57,11 +60,16 @@ def reading(path: object, refuse: type[DroGraspError], expected: str) -> Iterato
         raise refuse(f"{path} cannot be read ({reason[:TOLD]}); expected {expected}") from error
 
 
-def check_output(path: Path | str) -> Path:
+def check_output(path: Path | str, *endings: str) -> Path:
     """Refuse a path that cannot be written, before any work is done.
 
+    Args:
+        path: Of a file.
+        endings: What its name may end in, the usual one first, and what stands for these in SAME; anything by default.
+
     Raises:
-        OutputError: The parent folder is missing or read-only, or the path is a folder, a device or a read-only file.
+        OutputError: The parent folder is missing or read-only, the path is a folder, a device or a read-only file, or its name
+            ends otherwise.
     """
     path = given_path(path)
     parent = path.absolute().parent
@@ -69,24 +77,15 @@ def check_output(path: Path | str) -> Path:
         raise OutputError(f"cannot write {path}: no folder {parent}; create it first ({command('mkdir', '-p', parent)})")
     if path.is_dir():
         raise OutputError(f"cannot write {path}: it is a folder; give the name of a file in it")
+    allowed = [each for ending in endings for each in (ending, SAME.get(ending)) if each]
+    if endings and path.suffix.lower() not in allowed:
+        raise OutputError(f"cannot write {path}: give a name that ends in {' or '.join(allowed)}, such as "
+                          f"{path.with_suffix(endings[0]).name}")
     if path.exists() and not path.is_file():
         raise OutputError(f"cannot write {path}: it is a device or a pipe, which writing would replace; give the name of a "
                           "file")
     if not os.access(parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
         raise OutputError(f"cannot write {path}: no permission; choose another path")
-    return path
-
-
-def check_suffix(path: Path | str, suffix: str) -> Path:
-    """Refuse a file name with another suffix than `suffix` or none.
-
-    Raises:
-        OutputError: It has another.
-    """
-    path = Path(path)
-    if path.suffix.lower() not in {"", suffix}:
-        raise OutputError(f"{path} would hold {suffix[1:]} under another ending; call it {path.with_suffix(suffix).name}"
-                          + ("; `dro-grasp export` writes other formats" if suffix == ".parquet" else ""))
     return path
 
 

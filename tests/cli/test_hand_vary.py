@@ -46,7 +46,7 @@ def test_the_command_that_shows_it_is_one_for_shells(tmp_path: Path, capsys: pyt
 
 @pytest.mark.parametrize(("options", "said"), [
     (["--output", "same.urdf"], "give --mirrored, --scale, or both"),
-    (["--mirrored", "--output", "left.xml"], "left.xml: the description is a URDF; give a name that ends in .urdf"),
+    (["--mirrored", "--output", "left.xml"], "left.xml: give a name that ends in .urdf, such as left.urdf"),
     (["--mirrored", "--output", "nowhere/left.urdf"], "create it first"),
     (["--scale", "-1", "--output", "left.urdf"], "factor is -1.0; give a positive number"),
 ])

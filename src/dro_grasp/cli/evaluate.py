@@ -64,7 +64,7 @@ class Evaluate:
 
         rules = changed(self.protocol, friction=self.friction)
         if self.output is not None:
-            check_output(self.output)
+            check_output(self.output, ".parquet")
         begin = time.perf_counter()
         grasps = load_grasps(self.file)
         hand = hand_of(grasps, self.hand)

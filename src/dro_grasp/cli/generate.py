@@ -268,12 +268,12 @@ class ObjectResult:
 def paths_per_object(path: Path | None, names: list[str], several: bool, suffix: str) -> list[Path | None]:
     """Where each object's file goes, checked before the work: the path itself, or files in the folder that it names."""
     from dro_grasp.errors import OutputError
-    from dro_grasp.files import check_output, check_suffix, command
+    from dro_grasp.files import check_output, command
 
     if path is None:
         return [None] * len(names)
     if not several:
-        return [check_output(check_suffix(path, suffix))]
+        return [check_output(path, suffix)]
     if not path.is_dir():
         raise OutputError(f"{path} is no folder; for {len(names)} objects name an existing one "
                           f"({command('mkdir', '-p', path)})")

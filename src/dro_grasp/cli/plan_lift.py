@@ -93,9 +93,9 @@ class Plan:
         constraints = self.constraints.constraints(avoid=avoid)
         config = PlanConfig(
             self.num, self.top, self.directions, constraints, rehearsals=self.rehearsals, planner_seconds=self.planner_seconds)
-        for path in (self.output, self.trajectory, self.csv):
+        for path, ending in ((self.output, ".npz"), (self.trajectory, ".yaml"), (self.csv, ".csv")):
             if path is not None:
-                check_output(path)
+                check_output(path, ending)
         robot = load_robot(self.robot)
         obstacles = [load_object(name) for name in self.obstacles]
         picked, T_world_object = self._place(robot)
