@@ -237,7 +237,8 @@ def test_dataset_bundle_packs_what_is_for_training(dataset: Path, capsys: pytest
 
 @pytest.mark.parametrize(
     ("folder", "output", "word"),
-    [("none", "b.safetensors", "no grasps at"), ("data", "none/b.safetensors", "create it first"), ("empty", "b.safetensors", "no grasps")],
+    [("none", "b.safetensors", "no grasps at"), ("data", "none/b.safetensors", "create it first"),
+     ("empty", "b.safetensors", "no grasps")],
 )
 def test_dataset_bundle_refuses(
     dataset: Path, capsys: pytest.CaptureFixture[str], folder: str, output: str, word: str

@@ -18,7 +18,7 @@ import yaml
 
 import dro_grasp as dro
 from dro_grasp.cli.main import main
-from dro_grasp.errors import PlanError
+from dro_grasp.errors import OptionError, PlanError
 from dro_grasp.planning import extra
 from dro_grasp.planning.collisions import CollisionChecker
 from dro_grasp.planning.inverse_kinematics import WristSolver
@@ -290,6 +290,14 @@ BAD = {
     "no grasps": (["--num", "0"], "num is 0"),
     "no folder": (["--csv", "nowhere/plan.csv"], "no folder"),
 }
+
+
+def test_a_pose_that_is_none_is_refused_and_not_taken_for_the_table_s_fault(robot: dro.Robot) -> None:
+    lost, mirrored = np.eye(4), np.diag([1.0, 1.0, -1.0, 1.0])
+    lost[0, 3] = np.nan
+    for T, fault in ((lost, "its matrix holds NaN or infinity"), (mirrored, "not a rotation")):
+        with pytest.raises(OptionError, match=f"T_world_object is no pose of 'can'.*{fault}"):
+            plan(robot, dro.load_object("can"), T)
 
 
 @pytest.mark.parametrize(("options", "said"), BAD.values(), ids=BAD)

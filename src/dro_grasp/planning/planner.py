@@ -11,7 +11,8 @@ import torch
 from jaxtyping import Float
 
 from dro_grasp.devices import Stopwatch
-from dro_grasp.errors import PlanError, RobotError
+from dro_grasp.errors import OptionError, PlanError, RobotError
+from dro_grasp.frames import motion_fault
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.scenery import load_scene
 from dro_grasp.objects.shape import ObjectModel
@@ -61,10 +62,14 @@ def plan(
         PlanError: The object collides with the robot, lies below the table, or no grasp can be carried out; the message
             counts what was dropped where.
         RobotError: The robot collides at home.
-        OptionError: The extra `[arm]` is not installed, or the constraints leave nothing of the object.
+        OptionError: The extra `[arm]` is not installed, T_world_object is no rigid motion, or the constraints leave nothing of
+            the object.
     """
     require_arm_extra()
-    task = _Task(robot, obj, np.eye(4) if T_world_object is None else T_world_object, obstacles, config or PlanConfig(), seed)
+    T = np.eye(4) if T_world_object is None else T_world_object
+    if (fault := motion_fault(torch.as_tensor(T).float())) is not None:
+        raise OptionError(f"T_world_object is no pose of '{obj.name}' in metres; {fault}")
+    task = _Task(robot, obj, T, obstacles, config or PlanConfig(), seed)
     task.check_start()
     predictor = predictor or GraspPredictor() if grasps is None else None
     batches = task.config.batches if predictor is not None else 1
