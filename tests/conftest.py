@@ -69,6 +69,21 @@ def finished(home: Path, results: dict) -> dict[str, Path]:
     return {stage: home / stage for stage in results}
 
 
+@pytest.fixture(scope="session")
+def small_robot(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The file of the built-in xArm 7 with a hand that loads quickly, and without a camera."""
+    import yaml
+
+    from dro_grasp.planning.robot_file import BUILTIN_ROBOTS
+
+    values = yaml.safe_load((BUILTIN_ROBOTS / "xarm7_leaphand.yaml").read_text())
+    values |= {"arm": str(BUILTIN_ROBOTS / "xarm7.urdf"), "hand": "gripper3"}
+    del values["camera"]
+    path: Path = tmp_path_factory.mktemp("robot") / "small.yaml"
+    path.write_text(yaml.safe_dump(values))
+    return str(path)
+
+
 @pytest.fixture
 def quick_synthesis(monkeypatch: pytest.MonkeyPatch) -> None:
     """The optimiser beside the network takes a quarter of its steps: its grasps are worse, and made in the same way."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,13 @@ def test_a_folder_is_checked_without_a_trace_and_made_with_its_parents(
     assert list(tmp_path.iterdir()) == []
     assert make_folder(name) == make_folder(tmp_path / name).relative_to(tmp_path)
     assert (tmp_path / name).is_dir()
+
+
+def test_the_command_that_creates_a_folder_is_one_for_shells(tmp_path: Path) -> None:
+    folder = tmp_path / "grasps & more"
+    with pytest.raises(OutputError) as refusal:
+        check_output(folder / "a.parquet")
+    assert shlex.split(str(refusal.value).rpartition("(")[2].rstrip(")")) == ["mkdir", "-p", str(folder)]
 
 
 @pytest.mark.parametrize("name", ["file", "file/run", "file/runs/main"])

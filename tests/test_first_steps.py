@@ -106,7 +106,7 @@ def test_names_are_not_saved_as_files(hand, obj, predictor) -> None:
 
 def test_grasps_are_saved_under_their_own_suffix(hand, obj, tmp_path: Path) -> None:
     grasps = dro.palm_facing_starts(hand, obj, num=1, seed=0)
-    with pytest.raises(dro.DroGraspError, match=r"call it grasps\.parquet"):
+    with pytest.raises(dro.DroGraspError, match=r"such as grasps\.parquet"):
         grasps.save(tmp_path / "grasps.csv")
     assert not list(tmp_path.iterdir())
 

@@ -1,8 +1,9 @@
-"""Files of the user: paths are checked before the work, what is read is refused by one error, what is written is whole."""
+"""Files of the user: paths are checked before the work and quoted for shells, reading has one error, writing is whole."""
 
 from __future__ import annotations
 
 import os
+import shlex
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -14,6 +15,9 @@ from dro_grasp.errors import DroGraspError, OptionError, OutputError
 
 TOLD = 200
 """Characters of a path or a reason that an error repeats (ours)."""
+
+SAME = {".yaml": ".yml", ".html": ".htm"}
+"""Endings of file names, and others that mean the same."""
 
 
 def given_path(name: Path | str) -> Path:
@@ -31,6 +35,11 @@ def given_path(name: Path | str) -> Path:
         reason = getattr(error, "strerror", None) or error
         raise OptionError(f"{str(name)[:TOLD]!r} is no path of a file ({reason}); check its spelling") from error
     return path
+
+
+def command(*words: object) -> str:
+    """A command line that a shell splits into these words, for the user to run."""
+    return shlex.join(map(str, words))
 
 
 @contextmanager
@@ -51,36 +60,32 @@ def reading(path: object, refuse: type[DroGraspError], expected: str) -> Iterato
         raise refuse(f"{path} cannot be read ({reason[:TOLD]}); expected {expected}") from error
 
 
-def check_output(path: Path | str) -> Path:
+def check_output(path: Path | str, *endings: str) -> Path:
     """Refuse a path that cannot be written, before any work is done.
 
+    Args:
+        path: Of a file.
+        endings: What its name may end in, the usual one first, and what stands for these in SAME; anything by default.
+
     Raises:
-        OutputError: The parent folder is missing or read-only, or the path is a folder, a device or a read-only file.
+        OutputError: The parent folder is missing or read-only, the path is a folder, a device or a read-only file, or its name
+            ends otherwise.
     """
     path = given_path(path)
     parent = path.absolute().parent
     if not parent.is_dir():
-        raise OutputError(f"cannot write {path}: no folder {parent}; create it first (mkdir -p {parent})")
+        raise OutputError(f"cannot write {path}: no folder {parent}; create it first ({command('mkdir', '-p', parent)})")
     if path.is_dir():
         raise OutputError(f"cannot write {path}: it is a folder; give the name of a file in it")
+    allowed = [each for ending in endings for each in (ending, SAME.get(ending)) if each]
+    if endings and path.suffix.lower() not in allowed:
+        raise OutputError(f"cannot write {path}: give a name that ends in {' or '.join(allowed)}, such as "
+                          f"{path.with_suffix(endings[0]).name}")
     if path.exists() and not path.is_file():
         raise OutputError(f"cannot write {path}: it is a device or a pipe, which writing would replace; give the name of a "
                           "file")
     if not os.access(parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
         raise OutputError(f"cannot write {path}: no permission; choose another path")
-    return path
-
-
-def check_suffix(path: Path | str, suffix: str) -> Path:
-    """Refuse a file name with another suffix than `suffix` or none.
-
-    Raises:
-        OutputError: It has another.
-    """
-    path = Path(path)
-    if path.suffix.lower() not in {"", suffix}:
-        raise OutputError(f"{path} would hold {suffix[1:]} under another ending; call it {path.with_suffix(suffix).name}"
-                          + ("; `dro-grasp export` writes other formats" if suffix == ".parquet" else ""))
     return path
 
 

@@ -70,7 +70,9 @@ def is_name(name: object) -> bool:
 
 def motion_fault(T: Float[Tensor, "*any"]) -> str | None:
     """Why a matrix is no rigid motion in metres, in words; None if it is one."""
-    if T.shape != (4, 4) or not bool(T.isfinite().all()) or T[3].tolist() != [0, 0, 0, 1]:
+    if not bool(T.isfinite().all()):
+        return "its matrix holds NaN or infinity"
+    if T.shape != (4, 4) or T[3].tolist() != [0, 0, 0, 1]:
         return f"its matrix has shape {tuple(T.shape)} or a last row other than 0 0 0 1"
     R = T[:3, :3]
     if float((R @ R.T - torch.eye(3)).abs().max()) > 1e-3 or float(torch.linalg.det(R)) < 0:

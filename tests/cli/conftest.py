@@ -1,15 +1,12 @@
-"""Untrained weights, and `generate` with them; a robot that loads quickly."""
+"""Untrained weights, and `generate` with them."""
 
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
-import yaml
 
 from dro_grasp.cli.main import main
-from dro_grasp.planning.robot_file import BUILTIN_ROBOTS
 from tests.helpers.weights import untrained_weights
 
 
@@ -29,14 +26,3 @@ def generate(weights: str, capsys: pytest.CaptureFixture[str]):
         return json.loads(capsys.readouterr().out)
 
     return run
-
-
-@pytest.fixture(scope="session")
-def small_robot(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The file of the built-in xArm 7 with a small hand, and without a camera."""
-    values = yaml.safe_load((BUILTIN_ROBOTS / "xarm7_leaphand.yaml").read_text())
-    values |= {"arm": str(BUILTIN_ROBOTS / "xarm7.urdf"), "hand": "gripper3"}
-    del values["camera"]
-    path: Path = tmp_path_factory.mktemp("robot") / "small.yaml"
-    path.write_text(yaml.safe_dump(values))
-    return str(path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import trimesh
 from PIL import Image
@@ -122,6 +123,24 @@ def test_objects_of_one_name_in_one_file_are_told_apart_by_every_command(
     shelf.put(hand, GraspBatch.load(file))
     assert [shelf.obj(name).sha256 for name in ("textured", "textured (2)")] == [obj.sha256 for obj in objects]
     shelf.close()
+
+
+@pytest.mark.parametrize("command", ["evaluate", "dataset check", "dataset filter --output kept"])
+def test_a_bare_cloud_among_the_objects_is_refused_before_any_trial(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def none(*_: object, **__: object) -> None:
+        raise AssertionError("a trial")
+
+    monkeypatch.chdir(tmp_path)
+    np.save("points.npy", load_object("sphere").cloud)
+    hand, points = load_hand("gripper3"), load_object("points.npy")
+    batches = [palm_facing_starts(hand, obj, num=1, seed=0) for obj in (load_object("can"), points)]
+    GraspBatch.concatenate([batches[0], with_own_files(batches[1], hand, points)]).save("both.parquet")
+    for place in ("dro_grasp.pipeline.stages.evaluate", "dro_grasp.datasets.collections.checking.simulate"):
+        monkeypatch.setattr(place, none)
+    assert main([*command.split(), "both.parquet"]) == 2
+    assert "object 'points' is a bare point cloud; a trial needs a mesh" in capsys.readouterr().err
 
 
 def test_folders_of_several_hands_or_of_no_grasp_are_refused(folder: Path, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -36,9 +37,16 @@ def test_the_file_holds_the_variant_that_is_told(
     assert said == f"{output}; see it with: dro-grasp hand check {output} --picture hand.png\n"
 
 
+def test_the_command_that_shows_it_is_one_for_shells(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / "it's $HOME; left hand.urdf"
+    assert main(["hand", "vary", "gripper3", "--mirrored", "--output", str(output)]) == 0
+    said = capsys.readouterr().out.rpartition("see it with: ")[2]
+    assert shlex.split(said) == ["dro-grasp", "hand", "check", str(output), "--picture", "hand.png"]
+
+
 @pytest.mark.parametrize(("options", "said"), [
     (["--output", "same.urdf"], "give --mirrored, --scale, or both"),
-    (["--mirrored", "--output", "left.xml"], "left.xml: the description is a URDF; give a name that ends in .urdf"),
+    (["--mirrored", "--output", "left.xml"], "left.xml: give a name that ends in .urdf, such as left.urdf"),
     (["--mirrored", "--output", "nowhere/left.urdf"], "create it first"),
     (["--scale", "-1", "--output", "left.urdf"], "factor is -1.0; give a positive number"),
 ])

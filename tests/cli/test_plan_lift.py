@@ -91,6 +91,11 @@ def test_the_pose_in_a_file_is_the_objects_and_people_are_told_in_words(
     (["--seed", "-1"], "seed is -1; give an integer from 0"),
     (["--cone", "0.5"], "give both, for example --direction 0 0 -1"),
     (["--output", "nowhere/plan.npz"], "create it first"),
+    (["--at", "nan", "0.1"], "error: --at is nan 0.1; give x and y in metres"),
+    (["--at", "0.5", "inf"], "error: --at is 0.5 inf; give x and y in metres"),
+    (["--near", "nan", "0"], "error: --near is nan 0; give x and y in metres"),
+    (["--planner-seconds", "nan"], "planner_seconds is nan; give a number above 0"),
+    (["--planner-seconds", "inf"], "planner_seconds is inf; give a number above 0"),
     (["--camera", "robot"], "has no camera; state it in the robot file, or give --camera JSON"),
 ])
 def test_what_cannot_be_planned_is_refused_before_the_work(

@@ -334,6 +334,23 @@ def test_the_command_refuses_before_it_starts(tmp_path, monkeypatch, capsys, opt
     assert not (tmp_path / "sy").exists()
 
 
+@pytest.mark.parametrize("kind", ["object", "hand"])
+def test_files_of_one_name_are_refused_before_the_work(tmp_path, monkeypatch, capsys, kind):
+    monkeypatch.setattr(engine, "synthesize_dataset", lambda *_, **__: engine.DatasetReport(1, 1, 1, 1.0, {}))
+    files = [tmp_path / folder / ("mug.stl" if kind == "object" else "barrett.urdf") for folder in ("a", "b")]
+    for file in files:
+        file.parent.mkdir()
+        file.touch()
+    same = files[1].parent / ".." / "b" / files[1].name
+    name = files[0].stem
+    for given, refused in (([files[0], files[1]], True), ([files[0], name], True), ([files[1], same], False)):
+        pair = {"hand": ["gripper3"], "object": ["can"], kind: list(map(str, given))}
+        options = ["--hand", *pair["hand"], "--object", *pair["object"], "--output", str(tmp_path / "out")]
+        assert main(["synthesize", *options]) == (2 if refused else 0)
+        assert (f"{kind}s '{given[0]}' and '{given[1]}' are both called '{name}'" in capsys.readouterr().err) == refused
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(("grasps", "failures", "code"), [(0, True, 2), (3, True, 0), (0, False, 0)])
 @pytest.mark.parametrize("more", [[], ["--json"]])
 def test_the_command_fails_when_nothing_came_of_it(tmp_path, monkeypatch, capsys, grasps, failures, code, more):

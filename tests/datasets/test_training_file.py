@@ -237,7 +237,8 @@ def test_dataset_bundle_packs_what_is_for_training(dataset: Path, capsys: pytest
 
 @pytest.mark.parametrize(
     ("folder", "output", "word"),
-    [("none", "b.safetensors", "no grasps at"), ("data", "none/b.safetensors", "create it first"), ("empty", "b", "no grasps")],
+    [("none", "b.safetensors", "no grasps at"), ("data", "none/b.safetensors", "create it first"),
+     ("empty", "b.safetensors", "no grasps")],
 )
 def test_dataset_bundle_refuses(
     dataset: Path, capsys: pytest.CaptureFixture[str], folder: str, output: str, word: str
@@ -262,7 +263,7 @@ def test_namesakes_are_not_mixed_up(tmp_path: Path) -> None:
     hands, clouds = sources([batches[0], batches[0]])
     assert [hand.name for hand in hands] == ["mine"]
     assert list(clouds) == ["sphere"]
-    with pytest.raises(BundleError, match="of a hand are called mine"):
+    with pytest.raises(BundleError, match="different hands are called mine"):
         sources(batches)
 
 

@@ -85,6 +85,18 @@ def test_meshes_are_found_under_every_spelling(tmp_path, name):
     assert find_mesh("", tmp_path) is None
 
 
+@pytest.mark.parametrize("name", ["file://meshes/left%20tip%231.stl", "package://my%20hand/meshes/left%20tip%231.stl"])
+def test_meshes_are_found_under_encoded_uris(tmp_path, name):
+    mesh, literal = (tmp_path / "my hand" / "meshes" / stem for stem in ("left tip#1.stl", "left%20tip%231.stl"))
+    mesh.parent.mkdir(parents=True)
+    mesh.write_bytes(b"x")
+    assert find_mesh(name, tmp_path / "my hand") == mesh
+    assert find_mesh(f"file://{tmp_path}/my%20hand/meshes/left%20tip%231.stl", Path("/")) == mesh
+    assert find_mesh("meshes/left%20tip%231.stl", tmp_path / "my hand") is None, "a plain path is no URI"
+    literal.write_bytes(b"x")
+    assert find_mesh(name.replace("my%20hand", "my hand"), tmp_path / "my hand") == literal, "the very name comes first"
+
+
 def test_a_mesh_beside_the_packages_folder_is_found(tmp_path):
     mesh = tmp_path / "my_hand" / "meshes" / "tip.stl"
     mesh.parent.mkdir(parents=True)

@@ -125,16 +125,16 @@ def test_only_a_score_makes_a_confidence(grasps: GraspBatch, tmp_path: Path) -> 
     energies = torch.tensor([300.0, 0.1])
     synthesised = grasps[[0, 1]].without("score").replace(energy=energies)
     GraspBatch.concatenate([synthesised, grasps[[3]]]).save(tmp_path / "mug.parquet")
-    for format in ("isaac_grasp", "moveit", "csv"):
-        assert export(tmp_path / "mug.parquet", "--format", format, "--output", tmp_path / format) == 0
-    isaac = (tmp_path / "isaac_grasp").read_text()
+    for format, name in (("isaac_grasp", "isaac.yaml"), ("moveit", "moveit.yaml"), ("csv", "table.csv")):
+        assert export(tmp_path / "mug.parquet", "--format", format, "--output", tmp_path / name) == 0
+    isaac = (tmp_path / "isaac.yaml").read_text()
     known = 1 / (1 + np.exp(3.0))
     confidences = [grasp["confidence"] for grasp in yaml.safe_load(isaac)["grasps"].values()]
     assert confidences == [0.5, 0.5, pytest.approx(known, abs=1e-5)]
     assert "# 2 of 3 grasps have no score: their confidence 0.5 stands for unknown" in isaac
-    qualities = [message.get("grasp_quality") for message in yaml.safe_load((tmp_path / "moveit").read_text())]
+    qualities = [message.get("grasp_quality") for message in yaml.safe_load((tmp_path / "moveit.yaml").read_text())]
     assert qualities == [None, None, pytest.approx(known, abs=1e-5)]
-    rows = list(csv.DictReader(x for x in (tmp_path / "csv").read_text().splitlines() if not x.startswith("#")))
+    rows = list(csv.DictReader(x for x in (tmp_path / "table.csv").read_text().splitlines() if not x.startswith("#")))
     assert [row["score"] for row in rows] == ["", "", "-3.0"]
     assert [float(row["energy"] or "nan") for row in rows] == pytest.approx([300.0, 0.1, np.nan], abs=1e-6, nan_ok=True)
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+import html
 import json
+import shlex
 import shutil
 from pathlib import Path
 
@@ -59,6 +61,16 @@ def test_a_file_becomes_weights_and_a_report(home: Path, capsys: pytest.CaptureF
     assert told["weights"] == (told["fine_tuned"] if told["gained"] else str(home / "untrained.safetensors"))
     assert f"--weights {told['weights']}" in page
     assert told["without_grasps"] == []
+
+
+def test_the_next_steps_are_commands_for_shells(tmp_path: Path) -> None:
+    rows = [[{"stage": steps.REFINED, "success": {"strict/1": (rate, 0, 1)}}] for rate in (0.3, 0.4)]
+    folder, hand = tmp_path / "my hand", "it's $mine; hand.urdf"
+    done = steps.Onboarded(hand, folder, {"before": {"rows": rows[0]}, "after": {"rows": rows[1]}})
+    page = html.unescape(report._commands(done)).removeprefix("<pre>").removesuffix("</pre>")
+    words = [shlex.split(line) for line in page.splitlines()]
+    assert words[0][2:8] == ["--hand", hand, "--object", "my_mesh.stl", "--weights", str(folder / steps.WEIGHTS)]
+    assert words[-1] == ["dro-grasp", "dataset", "report", str(folder / steps.DATA), "--output", "data.html"]
 
 
 def test_a_rerun_does_nothing_again(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -162,6 +174,16 @@ def test_what_is_refused_leaves_no_folder(
     line = command(home, *more, hand=value) if option == "hand" else command(home, *more, option, value)
     assert main(line) == 2
     assert word in capsys.readouterr().err
+    assert not (home / "new").exists()
+
+
+def test_objects_of_one_name_are_refused_before_the_work(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = [home / folder / "cup.stl" for folder in ("a", "b")]
+    for file in files:
+        file.parent.mkdir()
+        file.touch()
+    assert main([*command(home), "--output", str(home / "new"), "--objects", *map(str, files)]) == 2
+    assert f"objects '{files[0]}' and '{files[1]}' are both called 'cup'" in capsys.readouterr().err
     assert not (home / "new").exists()
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import igl
@@ -200,45 +202,49 @@ def test_a_plane_loses_no_points_but_strays() -> None:
     assert len(cleaned) >= 396
 
 
+@pytest.fixture(scope="module")
+def command(depth: np.ndarray, T_object_camera: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """What grasps a cloud in the frame of a camera file from above, without what makes good grasps."""
+    folder = tmp_path_factory.mktemp("scan")
+    np.save(folder / "scan.npy", depth_points(depth, INTRINSICS))
+    (folder / "camera.json").write_text(json.dumps({"frame": "base", "T_frame_camera": T_object_camera.tolist()}))
+    return ["generate", "--object", str(folder / "scan.npy"), "--camera", str(folder / "camera.json"), "--hand", "gripper3",
+            "--num", "3", "--weights", str(untrained_weights(folder)), "--direction", "0", "0", "-1", "--no-refine",
+            "--method", "network", "--json"]
+
+
+@pytest.fixture(scope="module")
+def made(command: list[str]) -> Path:
+    """The file that it writes."""
+    file, said = Path(command[2]).with_name("g.parquet"), io.StringIO()
+    with redirect_stdout(said):
+        assert main([*command, "--output", str(file)]) == 0
+    assert json.loads(said.getvalue())["frame"] == "base"
+    return file
+
+
 def test_grasps_of_a_cloud_are_in_the_frame_of_the_camera_file(
-    depth: np.ndarray, T_object_camera: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    command: list[str], made: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The same cloud in two frames gives the same grasps in two frames, and the direction counts in the frame named."""
-    np.save(tmp_path / "scan.npy", depth_points(depth, INTRINSICS))
-    (tmp_path / "camera.json").write_text(json.dumps({"frame": "base", "T_frame_camera": T_object_camera.tolist()}))
-    base = ["generate", "--hand", "gripper3", "--object", str(tmp_path / "scan.npy"), "--num", "3", "--weights",
-            str(untrained_weights(tmp_path)), "--camera", str(tmp_path / "camera.json"), "--direction", "0", "0", "-1",
-            "--no-refine", "--method", "network", "--json"]
-    assert main([*base, "--output", str(tmp_path / "g.parquet")]) == 0
-    from tests.helpers.loaded_hands import loaded_hand
-
-    palms = loaded_hand("gripper3").palm_directions(GraspBatch.load(tmp_path / "g.parquet").T_object_wrist)
+    palms = loaded_hand("gripper3").palm_directions(GraspBatch.load(made).T_object_wrist)
     assert float(palms[:, 2].max()) < -0.8
-    wrists = GraspBatch.load(tmp_path / "g.parquet").T_object_wrist[:, :3, 3]
+    wrists = GraspBatch.load(made).T_object_wrist[:, :3, 3]
     assert float(wrists.norm(dim=1).max()) < 0.4, "about the object, not about the camera"
-    capsys.readouterr()
-    mesh = [a if not a.endswith("scan.npy") else "mug" for a in base]
+    mesh = [a if not a.endswith("scan.npy") else "mug" for a in command]
     assert main(mesh) == 2
     assert "camera cloud" in capsys.readouterr().err
     assert torch.isfinite(palms).all()
 
 
 def test_a_file_remembers_the_frame_and_where_the_camera_stood(
-    depth: np.ndarray, T_object_camera: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    made: Path, depth: np.ndarray, T_object_camera: np.ndarray, tmp_path: Path
 ) -> None:
     """Read again, the object stands where the grasps are; every export names their frame."""
-    points, file = depth_points(depth, INTRINSICS), tmp_path / "g.parquet"
-    np.save(tmp_path / "scan.npy", points)
-    (tmp_path / "camera.json").write_text(json.dumps({"frame": "base", "T_frame_camera": T_object_camera.tolist()}))
-    made = ["generate", "--hand", "gripper3", "--object", str(tmp_path / "scan.npy"), "--num", "2", "--weights",
-            str(untrained_weights(tmp_path)), "--camera", str(tmp_path / "camera.json"), "--output", str(file),
-            "--method", "network", "--json"]
-    assert main(made) == 0
-    assert json.loads(capsys.readouterr().out)["frame"] == "base"
-    grasps = GraspBatch.load(file)
+    points, file, grasps = depth_points(depth, INTRINSICS), made, GraspBatch.load(made)
     again = object_of(grasps, None, 1.0)
     assert again.sha256 == grasps.object_sha256[0] == load_scan(
-        tmp_path / "scan.npy", read_motion(tmp_path / "camera.json", "T_frame_camera").T.double().numpy()).sha256
+        made.with_name("scan.npy"), read_motion(made.with_name("camera.json"), "T_frame_camera").T.double().numpy()).sha256
     seen = points @ T_object_camera[:3, :3].T + T_object_camera[:3, 3]
     assert np.abs(again.cloud.mean(0) - seen.mean(0)).max() < 0.05
     for form, ending in (("isaac_grasp", "yaml"), ("moveit", "moveit.yaml"), ("csv", "csv")):

@@ -132,7 +132,7 @@ def test_an_attempt_repeats(robot: dro.Robot, can: dro.ObjectModel) -> None:
     assert (first.stage, first.raised, first.place) == (second.stage, second.raised, second.place)
 
 
-def test_attempts_are_stored_and_not_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_attempts_are_stored_and_not_repeated(small_robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     output, calls = tmp_path / "results.parquet", []
 
     def counted(robot: dro.Robot, obj: dro.ObjectModel, number: int, seed: int, *others: object) -> Attempt:
@@ -141,7 +141,7 @@ def test_attempts_are_stored_and_not_repeated(tmp_path: Path, monkeypatch: pytes
         return Attempt(robot.name, obj.name, number, seed, QUICK.label(), number > 0, ended, "no path", score=0.5)
 
     monkeypatch.setattr(tabletop, "attempt", counted)
-    run = TabletopRun("xarm7_leaphand", ("can",), attempts=2, config=QUICK)
+    run = TabletopRun(small_robot, ("can",), attempts=2, config=QUICK)
     first = run_tabletop(run, output)
     assert calls == [0, 1]
     assert run_tabletop(replace(run, attempts=3), output)[:2] == first
@@ -159,7 +159,7 @@ def test_attempts_are_stored_and_not_repeated(tmp_path: Path, monkeypatch: pytes
 
 
 def test_two_objects_of_one_name_are_refused_and_one_object_counts_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    small_robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def ended(robot: dro.Robot, obj: dro.ObjectModel, number: int, seed: int, *others: object) -> Attempt:
         return Attempt(robot.name, obj.name, number, seed, QUICK.label(), True, "done")
@@ -172,24 +172,24 @@ def test_two_objects_of_one_name_are_refused_and_one_object_counts_once(
     output = tmp_path / "results.parquet"
     refusal = rf"'{box}' and '{other}' are different objects of the name 'textured'.*rename one"
     with pytest.raises(OptionError, match=refusal):
-        run_tabletop(TabletopRun("xarm7_leaphand", (box, other), attempts=1, config=QUICK), output)
+        run_tabletop(TabletopRun(small_robot, (box, other), attempts=1, config=QUICK), output)
     assert not output.exists()
     again = str(tmp_path / "004" / ".." / "003" / "textured.obj")
-    (done,) = run_tabletop(TabletopRun("xarm7_leaphand", (box, again), attempts=1, config=QUICK), output)
+    (done,) = run_tabletop(TabletopRun(small_robot, (box, again), attempts=1, config=QUICK), output)
     assert (done.object, done.object_file) == ("textured", box)
     with pytest.raises(OptionError, match=rf"'{other}' and '{box}' are different .*--output"):
-        run_tabletop(TabletopRun("xarm7_leaphand", (other,), attempts=1, config=QUICK), output)
+        run_tabletop(TabletopRun(small_robot, (other,), attempts=1, config=QUICK), output)
     (tmp_path / "003" / "textured.obj").unlink()
-    (kept,) = run_tabletop(TabletopRun("xarm7_leaphand", (other,), attempts=1, config=QUICK), output)
+    (kept,) = run_tabletop(TabletopRun(small_robot, (other,), attempts=1, config=QUICK), output)
     assert kept.object_file == box, "nobody can tell any more"
 
 
 def test_the_command_prints_rates_and_refuses_what_cannot_be(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    small_robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(tabletop, "attempt", lambda robot, obj, number, seed, *_: Attempt(
         robot.name, obj.name, number, seed, "", True, "done", processor_seconds=2.0))
-    common = ["tabletop", "--robot", "xarm7_leaphand", "--objects", "can", "--attempts"]
+    common = ["tabletop", "--robot", small_robot, "--objects", "can", "--attempts"]
     assert main([*common, "4"]) == 0
     said = capsys.readouterr().out
     assert "4 of 4 attempts succeeded (100%, 95 % interval 51% to 100%)" in said

@@ -227,8 +227,8 @@ def file(grasps: GraspBatch, tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["--size", "100000", "100000"], "error: --size is 100000 100000; give a width and a height of 1 to 4096 pixels\n"),
         (["--size", "0", "100"], "error: --size is 0 100; "),
         (["--opacity", "nan"], "error: --opacity is nan; give a number from 0 to 1\n"),
-        (["--output", "p.svg"], "p.svg: pictures are PNG; give a name that ends in .png\n"),
-        (["--output", "p"], "p: pictures are PNG; "),
+        (["--output", "p.svg"], "p.svg: give a name that ends in .png, such as p.png\n"),
+        (["--output", "p"], "p: give a name that ends in .png"),
     ],
 )
 def test_the_command_names_the_option_that_is_wrong(

@@ -72,7 +72,7 @@ class Report(DataSets):
         from dro_grasp.viewer.dataset_pages import write_report
 
         if self.output is not None:
-            check_output(self.output)
+            check_output(self.output, ".html")
         hands = measure_coverage(self.pairs(only_successful=True))
         if self.output is not None:
             with progress_bar("drawing", self.json) as progress:
@@ -233,7 +233,7 @@ class BundleCommand(DataSets):
         from dro_grasp.files import check_output
         from dro_grasp.hands.library import load_hand
 
-        check_output(self.output)
+        check_output(self.output, ".safetensors")
         further = [load_hand(name) for name in self.hands_without_grasps]
         bundle, left_out = make_bundle(self.inputs, self.output, self.split, self.hands, self.per_pair, further)
         if left_out:

@@ -61,10 +61,11 @@ class Evaluate:
         from dro_grasp.simulation.contact_quality import with_contacts
         from dro_grasp.simulation.diagnosis import count_failures, diagnose, next_steps
         from dro_grasp.simulation.protocols import changed
+        from dro_grasp.simulation.scene import require_simulable
 
         rules = changed(self.protocol, friction=self.friction)
         if self.output is not None:
-            check_output(self.output)
+            check_output(self.output, ".parquet")
         begin = time.perf_counter()
         grasps = load_grasps(self.file)
         hand = hand_of(grasps, self.hand)
@@ -74,6 +75,7 @@ class Evaluate:
         for name, part in grasps.by_object():
             obj = object_of(part, self.object, self.scale)
             compare("object", name, next(filter(None, part.object_sha256), ""), obj, self.output)
+            require_simulable(hand, obj)
             problems.append((name, part, obj))
         with progress_bar("evaluating", self.json) as progress:
             while problems:  # what an object gathers in its trials goes with it

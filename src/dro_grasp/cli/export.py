@@ -53,7 +53,7 @@ class Export:
         require_one_object(grasps, self.object, self.file)
         batches = dict(grasps.by_object())
         folder = form.file_per_grasp or len(batches) > 1
-        target = check_folder(self.output) if folder else check_output(self.output)
+        target = check_folder(self.output) if folder else check_output(self.output, form.suffix)
         if form.file_per_grasp:
             refuse_mixing(target, form.suffix)
         jobs = {name: self._job(batch, frame) for name, batch in batches.items()}

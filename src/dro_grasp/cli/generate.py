@@ -268,14 +268,15 @@ class ObjectResult:
 def paths_per_object(path: Path | None, names: list[str], several: bool, suffix: str) -> list[Path | None]:
     """Where each object's file goes, checked before the work: the path itself, or files in the folder that it names."""
     from dro_grasp.errors import OutputError
-    from dro_grasp.files import check_output, check_suffix
+    from dro_grasp.files import check_output, command
 
     if path is None:
         return [None] * len(names)
     if not several:
-        return [check_output(check_suffix(path, suffix))]
+        return [check_output(path, suffix)]
     if not path.is_dir():
-        raise OutputError(f"{path} is no folder; for {len(names)} objects name an existing one (mkdir -p {path})")
+        raise OutputError(f"{path} is no folder; for {len(names)} objects name an existing one "
+                          f"({command('mkdir', '-p', path)})")
     stems = [Path(name).stem for name in names]
     # mug.obj and mug.ply would overwrite each other's results.
     labels = [Path(n).name.replace(".", "_") if stems.count(s) > 1 else s for n, s in zip(names, stems, strict=True)]

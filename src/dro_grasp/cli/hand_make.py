@@ -49,7 +49,7 @@ class Make:
 
         self._check_numbers()
         if self.picture is not None:
-            check_output(self.picture)
+            check_output(self.picture, ".png")
         folder = make_folder(self.output)
         seeds = range(self.seed, self.seed + self.num)
         files = [folder / f"{hand_name(seed)}.urdf" for seed in seeds]

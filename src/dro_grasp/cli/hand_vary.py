@@ -31,19 +31,19 @@ class Vary:
 
     def run(self) -> int:
         """Read, change, write."""
-        from dro_grasp.errors import OptionError, OutputError
-        from dro_grasp.files import check_output, replacing
+        from dro_grasp.errors import OptionError
+        from dro_grasp.files import check_output, command, replacing
         from dro_grasp.hands.variants import vary_hand
 
         if not self.mirrored and self.scale == 1:
             raise OptionError("nothing would change; give --mirrored, --scale, or both")
-        if self.output.suffix.lower() != ".urdf":
-            raise OutputError(f"cannot write {self.output}: the description is a URDF; give a name that ends in .urdf")
+        path = check_output(self.output, ".urdf")
         text = vary_hand(self.hand, mirrored=self.mirrored, factor=self.scale)
-        with replacing(check_output(self.output)) as temporary:
+        with replacing(path) as temporary:
             temporary.write_text(text)
         if self.json:
             print_json({"hand": self.hand, "mirrored": self.mirrored, "scale": self.scale, "output": str(self.output)})
         else:
-            say(f"{self.output}; see it with: dro-grasp hand check {self.output} --picture hand.png")
+            shown = command("dro-grasp", "hand", "check", self.output, "--picture", "hand.png")
+            say(f"{self.output}; see it with: {shown}")
         return 0

@@ -68,7 +68,7 @@ class Check:
         from dro_grasp.hands.check import check_hand, picture
 
         if self.picture is not None:
-            check_output(self.picture)
+            check_output(self.picture, ".png")
         report = check_hand(self.hand)
         if self.picture is not None:
             picture(report.hand, self.picture)

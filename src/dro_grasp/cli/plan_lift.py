@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -93,9 +94,12 @@ class Plan:
         constraints = self.constraints.constraints(avoid=avoid)
         config = PlanConfig(
             self.num, self.top, self.directions, constraints, rehearsals=self.rehearsals, planner_seconds=self.planner_seconds)
-        for path in (self.output, self.trajectory, self.csv):
+        for option, place in (("--at", self.at), ("--near", self.near)):
+            if place is not None and not all(map(math.isfinite, place)):
+                raise OptionError(f"{option} is {place[0]:g} {place[1]:g}; give x and y in metres, such as {option} 0.5 0.1")
+        for path, ending in ((self.output, ".npz"), (self.trajectory, ".yaml"), (self.csv, ".csv")):
             if path is not None:
-                check_output(path)
+                check_output(path, ending)
         robot = load_robot(self.robot)
         obstacles = [load_object(name) for name in self.obstacles]
         picked, T_world_object = self._place(robot)

@@ -32,7 +32,7 @@ class CheckRobot:
         from dro_grasp.planning.robot_check import check_robot, draw_robot
 
         if self.picture is not None:
-            check_output(self.picture)
+            check_output(self.picture, ".png")
         report = check_robot(self.robot)
         if self.picture is not None:
             draw_robot(report.robot, self.picture)

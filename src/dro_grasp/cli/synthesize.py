@@ -57,7 +57,7 @@ class Synthesize:
 
     def run(self) -> int:
         """Check numbers and names, then fill the folder; the exit code is 2 if every pair fails and there is no grasp."""
-        from dro_grasp.datasets.engine.schedule import require_known, synthesize_dataset
+        from dro_grasp.datasets.engine.schedule import require_distinct, require_known, synthesize_dataset
         from dro_grasp.datasets.engine.worker import EngineConfig
         from dro_grasp.objects.catalogue import resolve_objects
         from dro_grasp.optimization.synthesis import SynthesisConfig
@@ -65,6 +65,7 @@ class Synthesize:
         self._check_numbers()
         objects = resolve_objects(list(self.object))
         require_known(self.hand, objects)
+        require_distinct(self.hand, objects)
         config = EngineConfig(
             self.protocol, self.scale, None if self.minutes is None else 60 * self.minutes, shard=self._part(),
             synthesis=SynthesisConfig(device=self.device))

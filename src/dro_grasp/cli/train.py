@@ -114,7 +114,7 @@ class Pretrain(Stage):
         from dro_grasp.training.processes import is_first
         from dro_grasp.training.samples import SampleSource
 
-        check_output(self.output)
+        check_output(self.output, ".safetensors")
         initial = None if self.initial is None else load_weights(self.initial)
         network = network_config(self.preset, initial, latent=self.latent, latent_form=self.latent_form)
         schedule = self.schedule(steps=self.steps, learning_rate=self.learning_rate)
@@ -215,7 +215,7 @@ class Train(Stage):
         from dro_grasp.training.placement_training import train_placement
         from dro_grasp.training.processes import is_first
 
-        check_output(self.output)
+        check_output(self.output, ".safetensors")
         if self.method != "dro":
             return self._baseline()
         if self.part == "placement" and (self.initial is None or self.pretrained is not None):

@@ -7,6 +7,7 @@ import hashlib
 import os
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from urllib.parse import unquote
 
 from dro_grasp.descriptions.notes import Note
 from dro_grasp.errors import HandError
@@ -91,10 +92,11 @@ def _has_geometry(root: ET.Element) -> bool:
 
 
 def _candidates(name: str, folder: Path) -> list[Path]:
-    """Paths at which a mesh may lie, the most likely first."""
+    """Paths at which a mesh may lie, the most likely first; in URIs, %20 may stand for a space."""
     rest = name.replace("\\", "/").split("://", 1)[-1]
-    roots = (folder, *list(folder.parents)[:4]) if "://" in name else (folder,)
-    return [root / tail for root in roots for tail in dict.fromkeys((rest, rest.split("/", 1)[-1]))]
+    roots, spellings = ((folder, *list(folder.parents)[:4]), (rest, unquote(rest))) if "://" in name else ((folder,), (rest,))
+    tails = dict.fromkeys(tail for spelling in spellings for tail in (spelling, spelling.split("/", 1)[-1]))
+    return [root / tail for root in roots for tail in tails]
 
 
 def find_mesh(name: str, folder: Path) -> Path | None:

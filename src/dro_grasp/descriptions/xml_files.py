@@ -11,6 +11,7 @@ import defusedxml.ElementTree
 
 from dro_grasp.descriptions.bounds import MOST_BYTES, check_elements
 from dro_grasp.errors import HandError
+from dro_grasp.files import command
 
 XACRO = "{http://www.ros.org/wiki/xacro}"
 """Namespace of xacro's tags, as ElementTree spells it."""
@@ -43,7 +44,8 @@ def parse_xml(path: Path) -> ET.Element:
         raise HandError(f"{path} is an empty XML file; expected a URDF (<robot>) or MJCF (<mujoco>) file")
     check_elements(root, path)
     if any(isinstance(element.tag, str) and element.tag.startswith(XACRO) for element in root.iter()):
-        raise HandError(f"{path} is a xacro template; expand it first: xacro {path.name} > {path.stem}.urdf")
+        expanded = path.with_name("expanded.urdf")
+        raise HandError(f"{path} is a xacro template; expand it first: {command('xacro', path, '-o', expanded)}")
     return root
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.errors import GraspFileError
-from dro_grasp.files import check_output, check_suffix, reading, replacing
+from dro_grasp.files import check_output, reading, replacing
 from dro_grasp.grasps import codec, columns, summary
 from dro_grasp.grasps.table import EXPECTED, read_table, table_bytes
 
@@ -252,9 +252,9 @@ class GraspBatch:
             notes: Plain values about the making, kept in the file's header.
 
         Raises:
-            OutputError: The path cannot be written, or its suffix is not `.parquet`.
+            OutputError: The path cannot be written, or its name does not end in `.parquet`.
         """
-        path = check_output(check_suffix(path, ".parquet"))
+        path = check_output(path, ".parquet")
         with replacing(path) as temporary:
             temporary.write_bytes(self.to_bytes(notes))
 

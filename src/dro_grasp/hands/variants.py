@@ -10,6 +10,7 @@ from dro_grasp.descriptions.mirroring import mirror, scale
 from dro_grasp.descriptions.urdf_meshes import find_mesh
 from dro_grasp.descriptions.xml_files import parse_xml
 from dro_grasp.errors import HandError, OptionError
+from dro_grasp.files import command
 from dro_grasp.hands.library import locate_hand
 
 
@@ -29,7 +30,7 @@ def vary_hand(name: str | Path, *, mirrored: bool = False, factor: float = 1.0) 
     """
     if not (math.isfinite(factor) and factor > 0):
         raise OptionError(f"factor is {factor}; give a positive number, for example 1.2")
-    path, label = locate_hand(name)
+    path = locate_hand(name)[0]
     root = parse_xml(path)
     if root.tag != "robot":
         raise HandError(f"{path} starts with <{root.tag}>; only a URDF (<robot>) can be mirrored or scaled")
@@ -43,6 +44,7 @@ def vary_hand(name: str | Path, *, mirrored: bool = False, factor: float = 1.0) 
         if factor != 1:
             scale(root, factor)
     except ValueError as error:
-        raise HandError(f"{path}: {error}; expected numbers, see `dro-grasp hand check {label}`") from error
+        check = command("dro-grasp", "hand", "check", name)
+        raise HandError(f"{path}: {error}; expected numbers, see `{check}`") from error
     ET.indent(root)
     return f'<?xml version="1.0"?>\n{ET.tostring(root, encoding="unicode")}\n'

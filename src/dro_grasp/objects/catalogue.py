@@ -73,6 +73,17 @@ def _load(name: str | Path, scale: float, keep_table: bool) -> ObjectModel:
     raise ObjectError(_unknown(text))
 
 
+def locate_object(name: str) -> tuple[Path, str]:
+    """The file or folder of an object, or its bare name where it has none of its own; and what `load_object` calls it."""
+    path, bare = given_path(name), name.removeprefix(ASSET_PREFIX)
+    if name in BUILTIN:
+        return path, name
+    entry = _assets().get(bare)
+    if entry is not None:
+        return entry["folder"] / entry["file"], bare
+    return path, path.name if path.is_dir() else path.stem
+
+
 def object_names() -> dict[str, str]:
     """Names that `load_object` takes, with their split."""
     names = {name: kind.split for name, kind in BUILTIN.items()}

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from dro_grasp.evaluation.success_rates import BEST, RAW, REFINED, RETURNED
+from dro_grasp.files import command
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.onboarding.steps import DATA, PICTURE, REPORT, STRICT, Onboarded
@@ -94,11 +95,12 @@ def _data(step: dict[str, Any]) -> str:
 
 
 def _commands(done: Onboarded) -> str:
-    weights = "" if done.weights is None else f" --weights {done.weights}"
+    weights = () if done.weights is None else ("--weights", done.weights)
     lines = [
-        f"dro-grasp generate --hand {done.hand} --object my_mesh.stl{weights} --output grasps.parquet",
+        command("dro-grasp", "generate", "--hand", done.hand, "--object", "my_mesh.stl", *weights)
+        + " --output grasps.parquet",
         "dro-grasp evaluate grasps.parquet --protocol strict",
         "dro-grasp export grasps.parquet --format isaac_grasp --output grasps.yaml --only-successful",
-        f"dro-grasp dataset report {done.folder / DATA} --output data.html",
+        command("dro-grasp", "dataset", "report", done.folder / DATA, "--output", "data.html"),
     ]
     return f"<pre>{html.escape(chr(10).join(lines))}</pre>"

@@ -15,7 +15,7 @@ from dro_grasp.baselines.ours import DistanceMethod
 from dro_grasp.datasets.bundle.training_file import load_bundle, split_of
 from dro_grasp.datasets.collections.bundling import make_bundle
 from dro_grasp.datasets.collections.collection import count_collection
-from dro_grasp.datasets.engine.schedule import require_known, synthesize_dataset
+from dro_grasp.datasets.engine.schedule import require_distinct, require_known, synthesize_dataset
 from dro_grasp.datasets.engine.shards import sole_run
 from dro_grasp.datasets.engine.worker import EngineConfig
 from dro_grasp.devices import require_device
@@ -154,7 +154,8 @@ def onboard(
         ObjectError: An object does not exist.
         WeightsError: No weights have the name.
         OutputError: The folder cannot be made or written, or another run is filling it.
-        OptionError: Training and held-out objects overlap, or the folder is another hand's or was begun otherwise.
+        OptionError: Training and held-out objects overlap, two to train on have one name, or the folder is another hand's or
+            was begun otherwise.
         BundleError: No grasp of the hand holds, so there is nothing to train on.
     """
     config = config or OnboardingConfig()
@@ -163,6 +164,7 @@ def onboard(
     if both := sorted(set(objects) & set(held_out)):
         raise OptionError(f"{', '.join(both)} would be trained on and evaluated as unseen; name other --objects or --held-out")
     require_known([hand], [*objects, *held_out])
+    require_distinct([hand], objects)
     locate_weights(config.weights)
     onboarding = _Onboarding(hand, path, config, objects, held_out, say)
     with sole_run(make_folder(path)):

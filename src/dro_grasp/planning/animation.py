@@ -76,9 +76,7 @@ def check_animation(path: Path) -> None:
     Raises:
         OutputError: The ending is unknown, or the path cannot be written.
     """
-    check_output(path)
-    if path.suffix.lower() not in FORMATS:
-        raise OutputError(f"{path} is no name of an animation; let it end in {' or '.join(FORMATS)}")
+    check_output(path, *FORMATS)
 
 
 def draw_animation(robot: Robot, recorder: Recorder, path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -50,12 +51,12 @@ class PlanConfig:
         """Refuse what cannot be done.
 
         Raises:
-            OptionError: A number is not positive, or something is stated twice.
+            OptionError: A number is not positive or not finite, or something is stated twice.
         """
         if self.constraints.table is not None:
             raise OptionError("the table is the robot's: state its height in the robot file, and not in constraints")
         if self.constraints.direction is not None and self.directions != "all":
             raise OptionError(f"both direction and directions '{self.directions}' say whence to grasp; leave out one of them")
         for name in ("num", "top", "rounds", "batches", "planner_seconds"):
-            if getattr(self, name) <= 0:
+            if not 0 < getattr(self, name) < math.inf:
                 raise OptionError(f"{name} is {getattr(self, name)}; give a number above 0")

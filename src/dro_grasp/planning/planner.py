@@ -67,8 +67,8 @@ def plan(
     """
     require_arm_extra()
     T = np.eye(4) if T_world_object is None else T_world_object
-    if (fault := motion_fault(torch.as_tensor(T))) is not None:
-        raise OptionError(f"T_world_object is not the object's pose in the world, in metres: {fault}")
+    if (fault := motion_fault(torch.as_tensor(T).float())) is not None:
+        raise OptionError(f"T_world_object is no pose of '{obj.name}' in metres; {fault}")
     task = _Task(robot, obj, T, obstacles, config or PlanConfig(), seed)
     task.check_start()
     predictor = predictor or GraspPredictor() if grasps is None else None

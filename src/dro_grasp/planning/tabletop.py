@@ -89,7 +89,7 @@ def run_tabletop(
         OutputError: `output` or `plans` cannot be written.
     """
     require_arm_extra()
-    stored = read_attempts(output) if output is not None and check_output(output).exists() else []
+    stored = read_attempts(output) if output is not None and check_output(output, ".parquet").exists() else []
     name, label = load_robot(run.robot).name, run.config.label()
     done = {(a.object, a.number): a for a in stored if (a.robot, a.settings, a.seed) == (name, label, run.seed)}
     names = _names(run.objects, done.values())

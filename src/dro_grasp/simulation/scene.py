@@ -108,8 +108,8 @@ def _build_once(key: SceneKey) -> Scene:
     return build_scene(key.hand, key.obj, key.protocol)
 
 
-def build_scene(hand: Hand, obj: ObjectModel, protocol: Protocol) -> Scene:
-    """Put a hand and an object into one model.
+def require_simulable(hand: Hand, obj: ObjectModel) -> None:
+    """Refuse a hand or an object that no trial can have.
 
     Raises:
         ObjectError: The object is a bare point cloud, without balls that stand for it.
@@ -119,6 +119,11 @@ def build_scene(hand: Hand, obj: ObjectModel, protocol: Protocol) -> Scene:
         raise ObjectError(f"object '{obj.name}' is a bare point cloud; a trial needs a mesh (use --protocol none)")
     if hand.description is None:
         raise HandError(f"hand '{hand.name}' carries no description; load it by name or file to simulate it")
+
+
+def build_scene(hand: Hand, obj: ObjectModel, protocol: Protocol) -> Scene:
+    """Put a hand and an object into one model; errors are those of `require_simulable`."""
+    require_simulable(hand, obj)
     scene = _empty_scene(protocol)
     attach(scene, hand_spec(hand, protocol), scene.worldbody.add_frame())
     add_servos(scene, hand, protocol)

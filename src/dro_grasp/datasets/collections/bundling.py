@@ -90,6 +90,6 @@ def sources(batches: list[GraspBatch]) -> tuple[list[Hand], dict[str, ObjectClou
         names = [thing.name for thing in things.values()]
         double = sorted({name for name in names if names.count(name) > 1})
         if double:
-            raise BundleError(f"different files of a {kind} are called {', '.join(double)}; rename them and synthesise again")
+            raise BundleError(f"different {kind}s are called {', '.join(double)}; rename them and synthesise again")
     clouds = {o.name: ObjectCloud(torch.from_numpy(o.cloud), torch.from_numpy(o.cloud_normals)) for o in objects.values()}
     return list(hands.values()), clouds

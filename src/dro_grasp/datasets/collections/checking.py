@@ -19,6 +19,7 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.finger_closing import close_idle_fingers
 from dro_grasp.simulation.outcome import TrialResult
 from dro_grasp.simulation.protocols import Protocol
+from dro_grasp.simulation.scene import require_simulable
 from dro_grasp.simulation.trial import simulate
 
 Progress = Callable[[int, int], None]
@@ -130,7 +131,7 @@ def _closed_where_it_holds(hand: Hand, obj: ObjectModel, evaluated: GraspBatch, 
 def _loaded(parts: Sequence[GraspBatch], progress: Progress | None) -> Iterator[tuple[Hand, ObjectModel]]:
     """Hand and object of the grasps of one pair after the other.
 
-    All of them are found before the first pair: no trial is lost to a file that has changed.
+    All of them are found before the first pair: no trial is lost to a file that has changed, or to a bare cloud.
     """
     total, done = sum(map(len, parts)), 0
     hands: dict[tuple[str, str], Hand] = {}
@@ -141,6 +142,7 @@ def _loaded(parts: Sequence[GraspBatch], progress: Progress | None) -> Iterator[
         hand = hands[whose] = hands.get(whose) or hand_of(grasps, None)
         obj = objects[of] = objects.get(of) or object_of(grasps, None, 1.0)
         require_same(grasps, hand, obj)
+        require_simulable(hand, obj)
         pairs.append((hand, obj))
     for grasps, pair in zip(parts, pairs, strict=True):
         yield pair

@@ -22,7 +22,7 @@ from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.files import given_path, make_folder
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand, locate_hand
-from dro_grasp.objects.catalogue import ASSET_PREFIX, load_object, object_names
+from dro_grasp.objects.catalogue import ASSET_PREFIX, load_object, locate_object, object_names
 
 REPORT_EVERY = 10.0
 """Time between lines of progress [s]. Ours."""
@@ -148,6 +148,22 @@ def require_known(hands: Sequence[str], objects: Sequence[str]) -> None:
     for obj in objects:
         if obj.removeprefix(ASSET_PREFIX) not in names and not given_path(obj).is_file():
             load_object(obj)  # likewise
+
+
+def require_distinct(hands: Sequence[str], objects: Sequence[str]) -> None:
+    """Refuse different files of one name, before their grasps are made: merged and bundled grasps know their names alone.
+
+    Raises:
+        OptionError: Two hands or two objects have one name.
+    """
+    for kind, given, locate in (("hand", hands, locate_hand), ("object", objects, locate_object)):
+        found: dict[str, tuple[str, Path]] = {}
+        for source in given:
+            path, name = locate(source)
+            first, known = found.setdefault(name, (source, path.resolve()))
+            if path.resolve() != known:
+                raise OptionError(f"{kind}s '{first}' and '{source}' are both called '{name}', under which their grasps are "
+                                  "merged and bundled; rename one of the files, or leave one out")
 
 
 def own_pairs(hands: Sequence[str], objects: Sequence[str], shard: tuple[int, int]) -> list[Pair]:
