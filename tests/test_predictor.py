@@ -151,9 +151,11 @@ def test_the_temperature_scales_what_z_is_made_of(weights: str, ball: ObjectMode
         predictor = GraspPredictor(weights, config=PredictorConfig(temperature=temperature))
         honest = predictor.network.predict
 
-        def predict(hand: Tensor, points: Tensor, noise: Tensor, suit, at=(temperature, obj), honest=honest) -> Tensor:
+        def predict(
+            hand: Tensor, points: Tensor, noise: Tensor, suit, kept: int, at=(temperature, obj), honest=honest
+        ) -> Tensor:
             drawn[at] = noise
-            return honest(hand, points, noise, suit)
+            return honest(hand, points, noise, suit, kept)
 
         monkeypatch.setattr(predictor.network, "predict", predict)
         predictor.predict(HAND, obj, num=3, seed=5, candidates=1, refine=False, method="network")

@@ -89,7 +89,7 @@ def test_a_frame_takes_rigid_motions_with_the_rounding_of_single_precision(grasp
     (torch.diag(torch.tensor([1.001, 1.001, 1.001, 1.0])), "scaled, or mirrored"),
     (torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0])), "scaled, or mirrored"), (2 * torch.eye(4), "last row"),
     (torch.eye(4) + 0.01 * torch.eye(4).roll(1, 0).tril(), "scaled, or mirrored|last row"),
-    (torch.full((4, 4), torch.nan), "last row"),
+    (torch.full((4, 4), torch.nan), "NaN or infinity"),
     (torch.eye(4) + torch.tensor([0, 0, 0, 400.0]) * torch.eye(4)[:, :1], "millimetres"),
 ])
 def test_a_frame_that_is_no_rigid_motion_is_refused(T: torch.Tensor, fault: str) -> None:
