@@ -70,6 +70,14 @@ def finished(home: Path, results: dict) -> dict[str, Path]:
 
 
 @pytest.fixture(scope="session")
+def robot():
+    """The built-in xArm 7 with a LEAP hand."""
+    from dro_grasp.planning.robot import load_robot
+
+    return load_robot("xarm7_leaphand")
+
+
+@pytest.fixture(scope="session")
 def small_robot(tmp_path_factory: pytest.TempPathFactory) -> str:
     """The file of the built-in xArm 7 with a hand that loads quickly, and without a camera."""
     import yaml

@@ -19,10 +19,10 @@ from dro_grasp._version import __version__
 from dro_grasp.cli import main as cli
 from dro_grasp.cli.main import main
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.simulation.contact_quality import measure_contacts
 from dro_grasp.simulation.protocols import protocol
+from tests.helpers.loaded_hands import loaded_hand
 
 
 def names_of(command: Any) -> list[list[str]]:
@@ -165,7 +165,7 @@ def test_evaluate_measures_contacts_with_the_protocols_friction(generate, tmp_pa
     means = json.loads(capsys.readouterr().out)["contact_quality"]
     measured = GraspBatch.load(tried)
     rules = replace(protocol("dexgraspbench"), friction=0.9)
-    wanted = measure_contacts(load_hand("gripper3"), load_object("sphere"), measured, rules)
+    wanted = measure_contacts(loaded_hand("gripper3"), load_object("sphere"), measured, rules)
     assert set(means) == {field.name for field in fields(wanted)}
     for name, mean in means.items():
         # Poses in files are rounded.

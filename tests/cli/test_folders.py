@@ -16,12 +16,12 @@ from dro_grasp.errors import GraspFileError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.reading import load_grasps
 from dro_grasp.grasps.sources import with_own_files
-from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.viewer.pictures import CAPTION, HEADER, TILE
 from dro_grasp.viewer.shelf import Shelf
 from dro_grasp.viewer.studio import StudioServer
 from tests.helpers.browser import free_port
+from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.served_studio import visited
 
 
@@ -29,7 +29,7 @@ from tests.helpers.served_studio import visited
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Grasps of two objects by one hand, a file each, and a file of no grasp."""
     place = tmp_path_factory.mktemp("grasps")
-    hand = load_hand("gripper3")
+    hand = loaded_hand("gripper3")
     for name, num in (("sphere", 3), ("can", 2)):
         obj = load_object(name)
         starts = palm_facing_starts(hand, obj, num=num, seed=0)
@@ -84,7 +84,7 @@ def test_view_takes_a_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_objects_of_the_same_name_are_told_apart(tmp_path: Path) -> None:
-    hand, expected = load_hand("gripper3"), {}
+    hand, expected = loaded_hand("gripper3"), {}
     for kind, side in (("obj", 0.05), ("ply", 0.06)):
         trimesh.creation.box((side, side, 0.08)).export(tmp_path / f"box.{kind}")
         obj = load_object(tmp_path / f"box.{kind}")
@@ -98,7 +98,7 @@ def test_objects_of_the_same_name_are_told_apart(tmp_path: Path) -> None:
 def test_objects_of_one_name_in_one_file_are_told_apart_by_every_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    hand, batches, objects = load_hand("gripper3"), [], []
+    hand, batches, objects = loaded_hand("gripper3"), [], []
     for folder, side, num in (("003", 0.05, 1), ("004", 0.06, 2)):
         (tmp_path / folder).mkdir()
         trimesh.creation.box((side, side, 0.08)).export(tmp_path / folder / "textured.obj")
@@ -134,7 +134,7 @@ def test_a_bare_cloud_among_the_objects_is_refused_before_any_trial(
 
     monkeypatch.chdir(tmp_path)
     np.save("points.npy", load_object("sphere").cloud)
-    hand, points = load_hand("gripper3"), load_object("points.npy")
+    hand, points = loaded_hand("gripper3"), load_object("points.npy")
     batches = [palm_facing_starts(hand, obj, num=1, seed=0) for obj in (load_object("can"), points)]
     GraspBatch.concatenate([batches[0], with_own_files(batches[1], hand, points)]).save("both.parquet")
     for place in ("dro_grasp.pipeline.stages.evaluate", "dro_grasp.datasets.collections.checking.simulate"):
@@ -147,12 +147,12 @@ def test_folders_of_several_hands_or_of_no_grasp_are_refused(folder: Path, tmp_p
     with pytest.raises(GraspFileError, match="no grasp file"):
         load_grasps(tmp_path)
     for hand in ("barrett", "gripper3"):
-        starts = palm_facing_starts(load_hand(hand), load_object("can"), num=1, seed=0)
+        starts = palm_facing_starts(loaded_hand(hand), load_object("can"), num=1, seed=0)
         starts[:0].save(tmp_path / f"{hand}.parquet")
     with pytest.raises(GraspFileError, match="only grasp files without any grasp"):
         load_grasps(tmp_path)
     for hand in ("barrett", "gripper3"):
-        palm_facing_starts(load_hand(hand), load_object("can"), num=1, seed=0).save(tmp_path / f"{hand}.parquet")
+        palm_facing_starts(loaded_hand(hand), load_object("can"), num=1, seed=0).save(tmp_path / f"{hand}.parquet")
     with pytest.raises(GraspFileError, match=r"t\.parquet has grasps of hand 'barrett', .*3\.parquet of 'gripper3'"):
         load_grasps(tmp_path)
     with pytest.raises(GraspFileError, match="no grasp file"):

@@ -10,6 +10,7 @@ import pytest
 
 from dro_grasp.cli.main import main
 from dro_grasp.grasps.batch import GraspBatch
+from tests.helpers.loaded_hands import loaded_hand
 
 KEYS = {
     "hand", "object", "num", "candidates", "origin", "seed", "weights", "protocol", "success", "success_rate", "seconds",
@@ -132,7 +133,6 @@ def test_folder_of_objects_needs_a_folder_for_results(weights: str, tmp_path: Pa
 
 
 def test_table_keeps_hands_above_it(generate, tmp_path: Path) -> None:
-    from dro_grasp.hands.library import load_hand
     from dro_grasp.objects.catalogue import load_object
     from dro_grasp.pipeline.admission import permitted
     from dro_grasp.pipeline.constraints import Constraints
@@ -142,7 +142,7 @@ def test_table_keeps_hands_above_it(generate, tmp_path: Path) -> None:
     report = generate("--table", "-0.15", "--protocol", "none", "--output", str(path))
     assert report["candidates"] >= report["num"] == report["asked"] == 3
     assert report["shortage"] is None
-    problem = GraspProblem(load_hand("gripper3"), load_object("sphere"), constraints=Constraints(table=-0.15))
+    problem = GraspProblem(loaded_hand("gripper3"), load_object("sphere"), constraints=Constraints(table=-0.15))
     assert permitted(problem, GraspBatch.load(path)).all()
 
 

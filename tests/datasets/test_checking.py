@@ -15,17 +15,17 @@ from dro_grasp.datasets.collections.checking import check, keep_passing
 from dro_grasp.datasets.collections.collection import PairGrasps, read_collection
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
 from dro_grasp.simulation.protocols import changed
 from dro_grasp.simulation.trial import simulate
+from tests.helpers.loaded_hands import loaded_hand
 
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A file of evaluated grasps of two objects, successes and failures."""
-    hand, batches = load_hand("barrett"), []
+    hand, batches = loaded_hand("barrett"), []
     path = tmp_path_factory.mktemp("stored") / "barrett.parquet"
     for name in ("can", "sphere"):
         obj = load_object(name)
@@ -78,7 +78,7 @@ def test_filter_keeps_what_passes_with_its_new_numbers(stored):
     pairs = list(read_collection(stored, only_successful=False))
     kept = keep_passing(pairs, changed("strict"))
     for pair, passed in kept:
-        again = simulate(load_hand("barrett"), load_object(pair.object), pair.grasps, "strict")
+        again = simulate(loaded_hand("barrett"), load_object(pair.object), pair.grasps, "strict")
         assert torch.equal(passed.joints, pair.grasps.joints[again.success])
         assert set(passed.protocol or ()) <= {"strict/1"}
     assert 0 < sum(len(passed) for _, passed in kept) < 24
@@ -87,7 +87,7 @@ def test_filter_keeps_what_passes_with_its_new_numbers(stored):
 @pytest.fixture(scope="module")
 def lazy(stored: Path) -> list[PairGrasps]:
     """The grasps that held, with one finger opened, and the others."""
-    hand, grasps = load_hand("barrett"), GraspBatch.load(stored)
+    hand, grasps = loaded_hand("barrett"), GraspBatch.load(stored)
     joints = grasps.joints.clone()
     bends = hand.tree.moves[list(hand.fingers[0].links)].any(0) & ~hand.abduction
     joints[:, bends] = hand.open_ends[bends]
@@ -98,7 +98,7 @@ def lazy(stored: Path) -> list[PairGrasps]:
 
 
 def test_fingers_are_closed_where_the_grasp_holds_and_touches_with_more(lazy):
-    hand = load_hand("barrett")
+    hand = loaded_hand("barrett")
     plain, closed = (keep_passing(lazy, changed("dro"), close_fingers=close) for close in (False, True))
     gained = 0
     for (pair, before), (_, after) in zip(plain, closed, strict=True):

@@ -20,10 +20,10 @@ from dro_grasp.errors import OptionError, OutputError
 from dro_grasp.grasps import table
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.duplicates import DUPLICATE_DISTANCE
-from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import SynthesisConfig
 from tests.helpers.engine_work import GRASPS, easy
+from tests.helpers.loaded_hands import loaded_hand
 
 TINY = EngineConfig(
     candidates=64, min_candidates=64, trial_share=0.5, synthesis=SynthesisConfig(steps=80, batch_size=64))
@@ -224,7 +224,7 @@ def test_real_shards_hold_valid_grasps_repeat_and_add_up(tmp_path):
     assert made.candidates == sum(t.candidates for t in tasks)
     assert made.candidates == made.ranked_out + made.deep + made.moved + made.evaluated
     assert made.cpu_seconds > 0
-    points = load_hand("barrett").with_points(64).points(found.joints, found.T_object_wrist)
+    points = loaded_hand("barrett").with_points(64).points(found.joints, found.T_object_wrist)
     apart = (points[:, None] - points).norm(dim=-1).mean(-1) + torch.eye(len(found))
     assert apart.min() >= DUPLICATE_DISTANCE  # also across shards
     hand, can = worker._hand("barrett"), worker._object("can", scale=1.0)
@@ -248,7 +248,7 @@ def test_the_same_command_makes_the_same_grasps_however_many_work(tmp_path):
 
 
 def test_a_success_that_hardly_anything_touches_is_not_kept():
-    hand, can = load_hand("barrett"), load_object("can")
+    hand, can = loaded_hand("barrett"), load_object("can")
     kept, made = valid_grasps(hand, can, 3, TINY)
     strict, fewer = valid_grasps(hand, can, 3, replace(TINY, min_contact_links=5))
     held = [len(links) for links in kept.extra["contact_links"]]
@@ -262,7 +262,7 @@ def test_settled_labels_move_only_joints_that_hold(tmp_path):
     from dro_grasp.simulation.closed_poses import settle
     from dro_grasp.simulation.trial import simulate
 
-    hand, can = load_hand("allegro"), load_object("can")
+    hand, can = loaded_hand("allegro"), load_object("can")
     grasps = valid_grasps(hand, can, 1, EngineConfig(
         candidates=48, trial_share=0.5, settle=False, synthesis=SynthesisConfig(steps=80, batch_size=48)))[0]
     settled = settle(hand, can, grasps, "strict")

@@ -15,9 +15,9 @@ from dro_grasp.datasets.collections.merging import file_name
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.duplicates import DUPLICATE_DISTANCE
 from dro_grasp.grasps.table import read_footer
-from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import object_names
 from dro_grasp.simulation.protocols import changed
+from tests.helpers.loaded_hands import loaded_hand
 
 FOLDER = Path(__file__).parents[2] / "data" / "grasps"
 FILES = sorted(FOLDER.glob("*.parquet"))
@@ -77,7 +77,7 @@ def test_no_pair_has_more_than_was_asked_for(grasps):
 def hand_or_skip(name: str):
     if name.startswith("assets/"):
         "DRO_GRASP_ASSETS" in os.environ or pytest.skip("needs the development assets")
-    return load_hand(name)
+    return loaded_hand(name)
 
 
 def test_joints_keep_their_limits_and_no_grasp_is_there_twice(grasps):

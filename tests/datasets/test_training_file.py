@@ -27,6 +27,7 @@ from dro_grasp.hands.library import BUILTIN_FOLDER, load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.training.config import AugmentationConfig
 from dro_grasp.training.samples import SampleSource
+from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.tiny_bundle import SEMIAXES, TINY, ellipsoid, made_up_grasps, tiny_bundle
 from tests.helpers.toy_hand import toy_hand
 
@@ -231,7 +232,7 @@ def test_dataset_bundle_packs_what_is_for_training(dataset: Path, capsys: pytest
                       "objects": 1, "grasps": 16}
     bundle = load_bundle(output)
     assert bundle.object_names == ("sphere",)
-    expected = torch.cat([made_up_grasps(load_hand("gripper3"), "sphere", 5, seed=i).joints[1:] for i in range(2)])
+    expected = torch.cat([made_up_grasps(loaded_hand("gripper3"), "sphere", 5, seed=i).joints[1:] for i in range(2)])
     assert torch.equal(bundle.grasps["gripper3"].joints, expected)
 
 
@@ -268,7 +269,7 @@ def test_namesakes_are_not_mixed_up(tmp_path: Path) -> None:
 
 
 def test_an_object_that_has_changed_is_refused() -> None:
-    hand = load_hand("gripper3")
+    hand = loaded_hand("gripper3")
     grasps = made_up_grasps(hand, "sphere", 2).replace(object_sha256=("0123456789abcdef",) * 2)
     with pytest.raises(GraspFileError, match=r"another version of object .sphere. .hash 0123456789ab"):
         sources([grasps])

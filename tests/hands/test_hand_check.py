@@ -14,6 +14,7 @@ from dro_grasp.errors import HandError
 from dro_grasp.hands.check import check_hand, hand_side, picture
 from tests.helpers.bracket_hand import bracket_hand, bracket_urdf
 from tests.helpers.claw_urdf import LIMIT, claw, joint, link, meshed, written
+from tests.helpers.loaded_hands import loaded_hand
 
 
 def test_a_lost_mesh_is_named_and_the_rest_is_used(tmp_path: Path) -> None:
@@ -104,7 +105,7 @@ def test_four_fingers_all_around_have_no_side(tmp_path: Path) -> None:
      ("inspire", "right"), ("ability", "right"), ("orca", "right"), ("barrett", "none")],
 )
 def test_sides_of_real_hands(assets_folder: Path, name: str, side: str) -> None:
-    assert hand_side(dro.load_hand(f"assets/{name}")) == side
+    assert hand_side(loaded_hand(f"assets/{name}")) == side
 
 
 def test_the_picture_shows_the_hand_open_and_closed(tmp_path: Path) -> None:

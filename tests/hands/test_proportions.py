@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from dro_grasp.hands.library import load_hand
 from dro_grasp.hands.proportions import OPENNESS, UNIT, proportions
 from dro_grasp.models.placement import PROPORTIONS
+from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.toy_hand import toy_hand
 
 THUMBS = 6 * 3
@@ -17,7 +17,7 @@ THUMBS = 6 * 3
 
 @pytest.mark.parametrize("name", ["gripper3", "allegro"])
 def test_they_equal_a_plain_loop(name: str) -> None:
-    hand = load_hand(name)
+    hand = loaded_hand(name)
     axes = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     found = proportions(hand, torch.from_numpy(axes).float()).numpy()
     assert found.shape == (PROPORTIONS,)

@@ -18,6 +18,7 @@ from dro_grasp.geometry.point_clouds import enclosed_volume
 from dro_grasp.hands.check import hand_side
 from dro_grasp.hands.library import load_hand_description
 from tests.helpers.claw_urdf import LIMIT, claw, joint, link, written
+from tests.helpers.loaded_hands import loaded_hand
 
 MIRROR = np.diag([1.0, -1.0, 1.0])
 HANDS = ["allegro", "barrett", "leaphand", "shadowhand", "mixed"]
@@ -115,11 +116,11 @@ def test_scaled_hands_have_scaled_positions_masses_and_slides(source: str, tmp_p
 
 
 def test_a_right_hand_becomes_a_left_one(tmp_path: Path) -> None:
-    assert hand_side(dro.load_hand("leaphand")) == "right"
+    assert hand_side(loaded_hand("leaphand")) == "right"
     assert main(["hand", "vary", "leaphand", "--mirrored", "--scale", "0.8", "--output", str(tmp_path / "left.urdf")]) == 0
     left = dro.load_hand(tmp_path / "left.urdf")
     assert hand_side(left) == "left"
-    size = [np.ptp(hand.points(hand.canonical_joints()).numpy(), axis=0).max() for hand in (left, dro.load_hand("leaphand"))]
+    size = [np.ptp(hand.points(hand.canonical_joints()).numpy(), axis=0).max() for hand in (left, loaded_hand("leaphand"))]
     assert size[0] == pytest.approx(0.8 * size[1], rel=0.05)
 
 

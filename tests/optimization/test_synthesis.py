@@ -11,11 +11,11 @@ from dro_grasp.energy.grasp_energy import GraspEnergy, link_spheres
 from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.grasps.duplicates import distinct
 from dro_grasp.hands.anatomy import PALM
-from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.starts import StartConfig, starts
 from dro_grasp.optimization.synthesis import SynthesisConfig, depth, descend, synthesize
+from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.toy_hand import toy_hand
 
 SHORT = SynthesisConfig(steps=60, batch_size=32)
@@ -104,7 +104,7 @@ def test_impossible_requests_are_refused(ball):
 
 
 def test_idle_fingers_hold_nothing_and_two_always_hold():
-    hand = load_hand("allegro")
+    hand = loaded_hand("allegro")
     candidates = contact_candidates(hand)
     own = torch.arange(len(candidates.slot_finger))
     slots = candidates.assign(400, 0.5, torch.Generator().manual_seed(0))
@@ -147,6 +147,6 @@ def test_near_duplicates_are_counted_once(ball):
 def test_physics_agrees_on_an_easy_pair():
     from dro_grasp.simulation.trial import simulate
 
-    hand, can = load_hand("barrett"), load_object("can")
+    hand, can = loaded_hand("barrett"), load_object("can")
     best = synthesize(hand, can, 48, 0, SynthesisConfig(steps=120, batch_size=48))[slice(0, 12)]
     assert simulate(hand, can, best, "dro").success.float().mean() > 0.6

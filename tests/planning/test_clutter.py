@@ -23,11 +23,6 @@ CUBE, BALL, RADIUS = (0.45, 0.1), (0.5, -0.1), 0.04
 
 
 @pytest.fixture(scope="module")
-def robot() -> dro.Robot:
-    return dro.load_robot("xarm7_leaphand")
-
-
-@pytest.fixture(scope="module")
 def table_cloud() -> np.ndarray:
     """A table at z = 0 with a cube and a ball on it, in the world."""
     random = np.random.default_rng(0)

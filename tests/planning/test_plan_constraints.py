@@ -30,11 +30,6 @@ CONE = 0.6
 
 
 @pytest.fixture(scope="module")
-def robot() -> dro.Robot:
-    return dro.load_robot("xarm7_leaphand")
-
-
-@pytest.fixture(scope="module")
 def standing() -> tuple[dro.ObjectModel, np.ndarray]:
     can, T = dro.load_object("can"), np.eye(4)
     T[:3, :3] = Rotation.from_euler("z", 2.0).as_matrix()

@@ -39,11 +39,6 @@ PLACE = (0.5, 0.1)
 
 
 @pytest.fixture(scope="module")
-def robot() -> dro.Robot:
-    return dro.load_robot("xarm7_leaphand")
-
-
-@pytest.fixture(scope="module")
 def wall(tmp_path_factory: pytest.TempPathFactory) -> dro.ObjectModel:
     """A board between the home position and the object."""
     board = trimesh.creation.box(extents=(0.02, 0.2, 0.3))

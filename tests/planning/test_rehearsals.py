@@ -26,11 +26,6 @@ RADIUS = 0.04
 
 
 @pytest.fixture(scope="module")
-def robot() -> dro.Robot:
-    return dro.load_robot("xarm7_leaphand")
-
-
-@pytest.fixture(scope="module")
 def ball() -> dro.ObjectModel:
     """Stands on a table at z = 0 within reach."""
     mesh = trimesh.creation.icosphere(4, RADIUS)

@@ -14,7 +14,7 @@ import yaml
 from dro_grasp.cli.main import main
 from dro_grasp.errors import RobotError
 from dro_grasp.planning.collisions import CollisionChecker, open_hand
-from dro_grasp.planning.robot import load_robot
+from dro_grasp.planning.robot import Robot, load_robot
 from dro_grasp.planning.robot_file import BUILTIN_ROBOTS, robot_names
 
 
@@ -63,8 +63,7 @@ def test_the_ur5e_has_the_kinematics_that_its_maker_publishes() -> None:
 
 
 @pytest.mark.assets
-def test_the_xarm7_has_the_kinematics_of_another_model_of_it(assets_folder: Path) -> None:
-    robot = load_robot("xarm7_leaphand")
+def test_the_xarm7_has_the_kinematics_of_another_model_of_it(robot: Robot, assets_folder: Path) -> None:
     other = mujoco.MjModel.from_xml_path(str(assets_folder / "arms" / "xarm7" / "xarm7.xml"))
     data = mujoco.MjData(other)
     assert np.allclose(other.jnt_range, np.stack([robot.lower, robot.upper], 1), atol=1e-4)

@@ -30,11 +30,6 @@ QUICK = TabletopConfig(
 
 
 @pytest.fixture(scope="module")
-def robot() -> dro.Robot:
-    return dro.load_robot("xarm7_leaphand")
-
-
-@pytest.fixture(scope="module")
 def can() -> dro.ObjectModel:
     return dro.load_object("can")
 

@@ -16,6 +16,7 @@ from dro_grasp.simulation.contacts import measure_penetration
 from dro_grasp.simulation.protocols import protocol
 from dro_grasp.simulation.scene import CACHED_SCENES, Scene, attach, build_scene, cached_scene
 from tests.helpers.claw import ball, claw, grasps_of, wrist_below
+from tests.helpers.loaded_hands import loaded_hand
 
 GRIPPER = """<mujoco><worldbody><body name="base"><geom type="box" size="0.06 0.02 0.01" mass="0.3"/>
 <body name="left" pos="-0.05 0 0.04"><joint name="left" type="slide" axis="1 0 0" range="0 0.045"/>
@@ -182,7 +183,7 @@ def test_every_link_of_the_claw_collides(hand):
 @pytest.mark.assets
 @pytest.mark.parametrize("name", sorted(ASSET_FILES))
 def test_every_link_collides_and_the_hand_closes(name: str, assets_folder: Path):
-    hand = load_hand(f"assets/{name}")
+    hand = loaded_hand(f"assets/{name}")
     assert deaf_links(hand) == []
     assert largest_shift(hand) < 1e-5
     scene = build_scene(hand, ball(0.005), protocol("dro"))

@@ -20,6 +20,7 @@ from dro_grasp.simulation.outcome import GIVE_UP, Failure
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, protocol
 from dro_grasp.simulation.trial import TrialResult, record, simulate
 from tests.helpers.claw import ball, claw, grasps_of, power_grasp, wrist_below
+from tests.helpers.loaded_hands import loaded_hand
 
 
 @pytest.fixture(scope="module")
@@ -293,11 +294,10 @@ def test_a_cloud_cannot_be_simulated(hand, obj):
 @pytest.mark.assets
 @pytest.mark.parametrize("name", ["barrett_multidex", "allegro_left", "shadowhand"])
 def test_synthesised_grasps_of_the_paper_hands_hold(name: str, assets_folder: Path):
-    from dro_grasp.hands.library import load_hand
     from dro_grasp.objects.catalogue import load_object
     from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
 
-    hand, can = load_hand(f"assets/{name}"), load_object("can")
+    hand, can = loaded_hand(f"assets/{name}"), load_object("can")
     grasps = synthesize(hand, can, 48, config=SynthesisConfig(steps=100))[0:16]
     result = simulate(hand, can, grasps, "dro")
     assert result.success.float().mean() >= 0.5, Counter(result.reason)

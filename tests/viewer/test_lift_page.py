@@ -21,11 +21,6 @@ from tests.helpers.browser import free_port
 
 
 @pytest.fixture(scope="module")
-def robot() -> dro.Robot:
-    return dro.load_robot("xarm7_leaphand")
-
-
-@pytest.fixture(scope="module")
 def plan(robot: dro.Robot) -> dro.MotionPlan:
     """The second joint moves in the last stage only."""
     k, n = 101, len(robot.hand_joints)
