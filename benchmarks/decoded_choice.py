@@ -26,7 +26,7 @@ from dro_grasp.predictor import GraspPredictor
 from dro_grasp.simulation.trial import simulate
 
 OBJECTS = ["bottle", "wrench", "bowl", "toy_airplane", "rod", "tall_box"]
-"""Built-in training objects; the penalties were fitted on others."""
+"""Built-in training objects; rod, toy_airplane and wrench are among the eight by which the penalties were fitted."""
 PROTOCOLS = ("dro", "strict")
 """Trials of every grasp."""
 ALL = "all"

@@ -179,7 +179,7 @@ def _distances(
     problem: GraspProblem, network: DistanceNetwork, cloud: Float[Tensor, "m 3"], placement: Float[Tensor, "b 4 4"],
     joints: Float[Tensor, "b n_dof"], noise: Float[Tensor, "b k latent"], config: ProposalConfig,
 ) -> Float[Tensor, "b decoded n m"]:
-    """D(R,O) of a batch of placed open hands, each with the best of k draws; distances are the same in every frame."""
+    """D(R,O) of a batch of placed open hands, each with the best `decoded` of k draws; the same in every frame."""
     hand = problem.thinned(network.config.n_hand)
     placed = hand.points(joints, placement)
     turned = placement[:, :3, :3] @ network.config.axes(hand.palm_axes_wrist)
