@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from dro_grasp.errors import GraspFileError, OptionError, OutputError
-from dro_grasp.files import check_folder, check_output, given_path, make_folder, reading
+from dro_grasp.files import check_folder, check_output, given_path, make_folder, reading, replacing
 
 
 @pytest.mark.parametrize("name", ["run", "runs/main/motion"])
@@ -68,6 +68,25 @@ def test_what_a_library_raises_becomes_one_error_that_names_the_file(error: Exce
     with pytest.raises(GraspFileError, match=r"^f\.parquet cannot be read \(.+\); expected a grasp file$"):
         with reading("f.parquet", GraspFileError, "a grasp file"):
             raise error
+
+
+def test_a_file_that_is_replaced_has_the_permissions_of_a_new_one_and_a_failure_leaves_nothing(tmp_path: Path) -> None:
+    mask = os.umask(0o027)
+    try:
+        with replacing(tmp_path / "new.txt") as temporary:
+            temporary.write_text("new")
+    finally:
+        os.umask(mask)
+    assert (tmp_path / "new.txt").stat().st_mode & 0o777 == 0o640
+
+    def fail_halfway() -> None:
+        with replacing(tmp_path / "new.txt") as temporary:
+            temporary.write_text("half")
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail_halfway()
+    assert [(f.name, f.read_text()) for f in tmp_path.iterdir()] == [("new.txt", "new")]
 
 
 def test_our_own_errors_and_ctrl_c_pass() -> None:

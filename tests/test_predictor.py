@@ -121,6 +121,11 @@ def test_no_grasp_cannot_be_asked_for(predictor: GraspPredictor, ball: ObjectMod
         predictor.predict(HAND, ball, num=num)
 
 
+def test_an_option_that_does_not_exist_is_named(predictor: GraspPredictor, ball: ObjectModel) -> None:
+    with pytest.raises(OptionError, match=r"no option 'tabel'; the options are direction, .*table.*candidates"):
+        predictor.predict(HAND, ball, num=1, tabel=0.1)
+
+
 @pytest.mark.parametrize("direction", [(0.0, 0.0, 0.0), (math.nan, 0.0, 1.0), (math.inf, 0.0, 0.0)])
 def test_a_direction_must_point_somewhere(
     predictor: GraspPredictor, ball: ObjectModel, direction: tuple[float, float, float]

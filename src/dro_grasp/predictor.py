@@ -172,8 +172,11 @@ class GraspPredictor:
 
         Raises:
             ObjectError: The scene to avoid contains the object.
-            OptionError: An argument is out of range, the table is above the object, or no grasp was found.
+            OptionError: An argument is out of range or unknown, the table is above the object, or no grasp was found.
         """
+        known = [f.name for part in (Constraints, GraspRequest) for f in fields(part)]
+        if unknown := [name for name in options if name not in known]:
+            raise OptionError(f"there is no option '{unknown[0]}'; the options are {', '.join(known)}")
         names = {f.name for f in fields(Constraints)} & set(options)
         constraints = replace(constraints or Constraints(), **{name: options.pop(name) for name in names})
         problem = GraspProblem(hand, obj, self.device, constraints)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dro_grasp.geometry.table_plane import THICKNESS, above_plane, largest_plane, table_plane
+from dro_grasp.geometry.table_plane import THICKNESS, above_plane, largest_plane, moved_plane, table_plane
 from dro_grasp.objects.catalogue import load_object
 
 
@@ -32,6 +32,17 @@ def test_a_table_is_found_in_any_pose(name: str) -> None:
     higher = points[:own, 2] > points[:own, 2].min() + 3 * THICKNESS
     assert kept[:own][higher].all()
     assert kept[own:].mean() < 0.001
+
+
+def test_points_stay_on_a_plane_that_is_moved_with_them() -> None:
+    rng, T = np.random.default_rng(1), np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.random(random_state=5).as_matrix(), (0.3, -0.2, 0.7)
+    normal = np.array([0.6, 0.0, 0.8])
+    across = np.array([[0.0, 1.0, 0.0], [0.8, 0.0, -0.6]])
+    points = 0.25 * normal + rng.uniform(-1, 1, (20, 2)) @ across
+    plane = moved_plane(np.append(normal, 0.25), T)
+    assert np.allclose((points @ T[:3, :3].T + T[:3, 3]) @ plane[:3], plane[3])
+    assert np.allclose(plane[:3], T[:3, :3] @ normal)
 
 
 def test_a_table_is_seen_from_above() -> None:

@@ -74,9 +74,9 @@ def test_a_finger_that_reaches_nothing_rests_as_bent_as_the_one_that_holds() -> 
     # The third would touch the second, and rests before it.
     assert last[0] == last[1]
     assert -0.05 < float(last[0]) < as_bent - 0.05
-    alone = close_idle_fingers(ENERGY, before, ClosingConfig(resting=(1.0,)))
+    alone = close_idle_fingers(ENERGY, before, ClosingConfig(rest_shares=(1.0,)))
     assert torch.equal(alone.joints[0, 4:], before.joints[0, 4:])
-    assert torch.equal(close_idle_fingers(ENERGY, before, ClosingConfig(resting=())).joints[0, 2:], before.joints[0, 2:])
+    assert torch.equal(close_idle_fingers(ENERGY, before, ClosingConfig(rest_shares=())).joints[0, 2:], before.joints[0, 2:])
 
 
 def test_a_finger_that_is_bent_more_than_those_that_hold_stays() -> None:
@@ -87,6 +87,32 @@ def test_a_finger_that_is_bent_more_than_those_that_hold_stays() -> None:
     after = close_idle_fingers(ENERGY, before)
     assert float(gaps(after)[0, 0]) == pytest.approx(CONFIG.contact, abs=7e-4)
     assert torch.equal(after.joints[0, 2:4], before.joints[0, 2:4])
+
+
+def test_outer_links_wrap_around_an_object_that_inner_links_touch() -> None:
+    before = grasp(0.05, -0.5, 0.05, -0.4, 0.05, -0.3, height=0.04)
+    outer = torch.isin(HAND.link_index, torch.tensor([f.tip for f in HAND.fingers]))
+
+    def least(grasps: GraspBatch, points: torch.Tensor) -> float:
+        return float((HAND.points(grasps.joints, grasps.T_object_wrist).norm(dim=-1) - RADIUS)[0, points].min())
+
+    assert float(gaps(before).max()) < CONFIG.idle < least(before, outer)
+    after = close_idle_fingers(ENERGY, before)
+    assert torch.equal(after.joints[:, ::2], before.joints[:, ::2]), "inner links touch already"
+    assert bool((after.joints[:, 1::2] > before.joints[:, 1::2]).all())
+    for finger in HAND.fingers:
+        assert least(after, HAND.link_index == finger.tip) == pytest.approx(CONFIG.contact, abs=7e-4)
+
+
+def test_an_outer_link_that_meets_nothing_bends_as_the_fingers_that_hold() -> None:
+    before = grasp(0.4, -0.3, 0.6, 0.3, 0.6, 0.3, height=0.04)
+    T = before.T_object_wrist.clone()
+    T[0, 0, 3] -= 0.07  # the back of finger 0 touches the ball
+    before = before.moved_to(T, before.joints)
+    assert float(gaps(before)[0, 0]) < CONFIG.idle
+    after = close_idle_fingers(ENERGY, before)
+    assert float(after.joints[0, 1]) == pytest.approx((0.4 - 0.3) / 2, abs=1e-5)
+    assert torch.equal(after.joints[0, [0, 2, 3, 4, 5]], before.joints[0, [0, 2, 3, 4, 5]])
 
 
 def test_fingers_do_not_close_into_each_other() -> None:

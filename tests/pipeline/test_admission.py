@@ -193,6 +193,12 @@ def test_a_scene_has_the_distances_of_its_boxes() -> None:
     assert load_scene(DOTS).near(np.full(3, 1.0), np.full(3, 1.2)) is None, "nothing of it is there"
 
 
+@pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf])
+def test_a_scene_is_scaled_by_a_positive_number(scale: float) -> None:
+    with pytest.raises(ObjectError, match="give a positive number, for example"):
+        load_scene(DOTS, scale=scale)
+
+
 def test_scenes_that_are_none_are_refused(tmp_path) -> None:
     with pytest.raises(ObjectError, match="no file at"):
         load_scene(tmp_path / "nowhere.ply")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +59,9 @@ def test_what_a_camera_saw_of_the_thing_is_known_in_the_world(table_cloud: np.nd
     assert obj.cloud[:, 2].min() < 0.05
     turn = np.array([[0.0, -1, 0, 0.3], [1, 0, 0, 0], [0, 0, 1, 0.1], [0, 0, 0, 1]])
     there = moved(obj, turn)
+    tilted = moved(replace(obj, table=np.array([0.0, 0.0, 1.0, 0.02])), turn[[2, 0, 1, 3]])
+    assert tilted.table is not None
+    assert np.allclose(tilted.table, (1, 0, 0, 0.02 + 0.1)), "its table turns with it"
     assert there.seen is not None
     x, y, z = obj.seen.T
     np.testing.assert_allclose(there.seen, np.column_stack([0.3 - y, x, z + 0.1]), atol=1e-6)

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -208,6 +209,9 @@ def test_drivers_get_every_target_and_controllers_the_same_motion(planned: Motio
     assert np.allclose(last["positions"], planned.hand.position[-1], atol=1e-6)
     end = last["time_from_start"]
     assert end["sec"] + 1e-9 * end["nanosec"] == pytest.approx(planned.seconds, abs=1e-6)
+    late = replace(planned, arm=replace(planned.arm, time=planned.arm.time - planned.arm.time[-1] + 2 - 4e-10))
+    stamps = [p["time_from_start"] for p in yaml.load(dro.trajectory_yaml(late), yaml.CSafeLoader)["arm"]["points"]]
+    assert stamps[-1] == {"sec": 2, "nanosec": 0}, "a second has 10^9 nanoseconds, not one more"
     rows = list(csv.DictReader(io.StringIO(dro.trajectory_csv(planned))))
     assert len(rows) == len(planned.stage)
     assert float(rows[-1]["arm/joint1"]) == pytest.approx(planned.arm.position[-1, 0], abs=1e-6)

@@ -110,6 +110,23 @@ def test_limits_of_an_mjcf_arm_are_read_and_those_that_it_cannot_state_are_asked
     assert robot.effort.tolist() == [20, 7]
 
 
+def test_a_limit_that_is_no_number_is_named(values: dict[str, Any], tmp_path: Path) -> None:
+    arm = tmp_path / "arm.urdf"
+    text = (BUILTIN_ROBOTS / "xarm7.urdf").read_text()
+    assert text.count(' velocity="') == 7
+    arm.write_text(text.replace(' velocity="', ' velocity="fast" was="', 1))
+    with pytest.raises(RobotError, match=r"arm\.urdf: joint 'joint1' has velocity=\"fast\"; expected a number"):
+        load_robot(written(values | {"arm": str(arm)}, tmp_path))
+
+
+def test_an_unusable_arm_is_named_by_the_path_that_was_given(values: dict[str, Any], tmp_path: Path) -> None:
+    arm = tmp_path / "my hand" / "hands.urdf"
+    arm.parent.mkdir()
+    arm.write_text('<robot name="x"><link name="a"/></robot>')
+    with pytest.raises(RobotError, match=rf"cannot be used: {arm} has no moving joint .*; a robot needs"):
+        load_robot(written(values | {"arm": str(arm)}, tmp_path))
+
+
 def test_an_arm_that_dips_into_the_table_collides_with_it_and_with_nothing_else(values: dict[str, Any], tmp_path: Path) -> None:
     robot = load_robot(written(values, tmp_path))
     down = robot.home.copy()

@@ -11,6 +11,8 @@ from dro_grasp.descriptions.bounds import MOST_JOINTS
 from dro_grasp.descriptions.notes import Note
 from dro_grasp.errors import HandError
 
+NO_LIMITS = "states no limits"
+"""Beginning of the note of a joint whose limits had to be assumed."""
 CONTINUOUS_LIMIT = math.pi
 """Limits of hinges that state none, both ways from zero [rad] (ours)."""
 SLIDE_LIMIT = 0.05
@@ -139,7 +141,7 @@ def _check_joints(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
             stated = math.degrees(limit) if spec.compiler.degree and not slides else limit
             joint.range = [-stated, stated]
             joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
-            notes.append(Note("warning", joint.name, f"states no limits; taken as +-{limit:.2f}"))
+            notes.append(Note("warning", joint.name, f"{NO_LIMITS}; taken as +-{limit:.2f}"))
 
 
 def _let_visuals_collide(spec: mujoco.MjSpec, notes: list[Note]) -> None:

@@ -107,7 +107,7 @@ class GraspEnergy:
     """The energy of a hand on an object, prepared for many evaluations."""
 
     def __init__(
-        self, hand: Hand, field: DistanceField, centre: Float[Tensor, 3], length: float, config: EnergyConfig | None = None,
+        self, hand: Hand, field: DistanceField, centre: Float[Tensor, "3"], length: float, config: EnergyConfig | None = None,
         contacts: ContactConfig | None = None, device: torch.device | str = "cpu", room: Room | None = None,
     ) -> None:
         """Prepare everything that stays the same from step to step.

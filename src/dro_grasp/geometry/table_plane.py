@@ -56,6 +56,12 @@ def above_plane(points: Float[np.ndarray, "n 3"], plane: Float[np.ndarray, "4"])
     return points @ plane[:3] - plane[3] > THICKNESS
 
 
+def moved_plane(plane: Float[np.ndarray, "4"], T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4"]:
+    """The same plane in another frame, of which `T` is the pose of the old one: unit normal, and height along it [m]."""
+    normal = T[:3, :3] @ plane[:3]
+    return np.append(normal, plane[3] + normal @ T[:3, 3])
+
+
 def largest_plane(
     points: Float[np.ndarray, "n 3"], near: float, steepest: float = math.pi / 2, fits: int = 1
 ) -> Float[np.ndarray, "4"] | None:

@@ -239,7 +239,7 @@ class Hand:
 
     def to(self, device: torch.device | str) -> Hand:
         """The same hand with its tensors on another device; this hand if they are there already."""
-        if torch.device(device) == self.link_points.device:
+        if torch.empty(0, device=device).device == self.link_points.device:  # "cuda" is the current one of several
             return self
         return on_device(self, device)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import json
-import math
 import os
 import re
 from dataclasses import replace
@@ -20,7 +19,7 @@ from dro_grasp.files import given_path
 from dro_grasp.objects.builtin import BUILTIN, make_builtin
 from dro_grasp.objects.convex_parts import Part
 from dro_grasp.objects.in_memory import ObjectSource, object_in_memory
-from dro_grasp.objects.loading import load_file, mesh_object, read_geometry
+from dro_grasp.objects.loading import check_scale, load_file, mesh_object, read_geometry
 from dro_grasp.objects.mesh_process import load_processed, processed_folder
 from dro_grasp.objects.shape import ObjectModel
 
@@ -49,8 +48,7 @@ def load_object(
     Raises:
         ObjectError: The object does not exist, it is unusable, or `scale` is not positive.
     """
-    if not (math.isfinite(scale) and scale > 0):
-        raise ObjectError(f"scale is {scale}; give a positive number, for example --scale 0.001 for millimetres")
+    check_scale(scale)
     obj = (
         _load(source, scale, keep_table) if isinstance(source, str | Path) else object_in_memory(source, scale, keep_table))
     return obj if name is None else replace(obj, name=name)

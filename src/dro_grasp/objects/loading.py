@@ -237,6 +237,16 @@ def _check_numbers(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, ".
         raise ObjectError(f"{origin} has {bad} vertices with NaN or infinite coordinates; repair the mesh first")
 
 
+def check_scale(scale: float) -> None:
+    """Refuse a factor that is no positive number.
+
+    Raises:
+        ObjectError: As said.
+    """
+    if not (math.isfinite(scale) and scale > 0):
+        raise ObjectError(f"scale is {scale}; give a positive number, for example --scale 0.001 for millimetres")
+
+
 def check_extent(points: Float[np.ndarray, "n 3"], origin: str, scale: float = 1.0) -> None:
     """Refuse sizes and places that are implausible in metres: most files state no unit, and a wrong guess would grasp air.
 

@@ -17,7 +17,7 @@ from dro_grasp.errors import ObjectError
 from dro_grasp.files import given_path
 from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.objects.in_memory import ObjectSource, geometry_in_memory
-from dro_grasp.objects.loading import FARTHEST, read_geometry
+from dro_grasp.objects.loading import FARTHEST, check_scale, read_geometry
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.objects.surface_distances import banded_values, search_tree, signed_distances
 
@@ -106,8 +106,9 @@ def load_scene(source: ObjectSource, name: str | None = None, scale: float = 1.0
         scale: Multiplies all coordinates; 0.001 for millimetres.
 
     Raises:
-        ObjectError: It cannot be read, is empty, or is not in metres.
+        ObjectError: It cannot be read, is empty, or is not in metres, or `scale` is not positive.
     """
+    check_scale(scale)
     geometry: Any
     if isinstance(source, str | Path):
         path = given_path(source)

@@ -1,4 +1,4 @@
-"""Idle fingers close: each finger of a grasp that touches nothing moves alone until it meets the object, or rests.
+"""Idle fingers close: whatever of a finger touches nothing moves alone until it meets the object, or rests.
 
 A person holds with all fingers that reach, and bends the others beside them. Neither the network nor the descent of the
 energy sees to that: the energy's few contacts choose the fingers that are near anyway. Differs from the paper, which leaves
@@ -7,7 +7,7 @@ idle fingers where the network puts them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -33,8 +33,8 @@ class ClosingConfig:
     """Halvings of the interval between two samples that holds the contact."""
     openness: float = 0.9
     """Openness from which a finger closes that is bent too far to meet the object [share of its range]."""
-    resting: tuple[float, ...] = (1.0, 0.7, 0.4)
-    """Shares of the way to the bend of the fingers that hold, at the largest of which an idle finger has room to rest."""
+    rest_shares: tuple[float, ...] = (1.0, 0.7, 0.4)
+    """Shares of the way to the bend of the fingers that hold; an idle finger rests at the first at which it has room."""
     overlap: float = 0.001
     """Most that the self-penetration of a grasp may grow [m]."""
     batch_size: int = 64
@@ -46,7 +46,8 @@ def close_idle_fingers(energy: GraspEnergy, grasps: GraspBatch, config: ClosingC
     """The grasps with their idle fingers on the object, where they reach it without meeting others.
 
     A finger bends from where it is; if it meets nothing, from its open posture, with all joints and then with the first alone.
-    If it still meets nothing, it rests: bent as far as the fingers that hold, on average.
+    Of a finger that touches the object, the joints bend that move none of its touching links. What still meets nothing rests:
+    bent as far as the fingers that hold, on average.
     Whatever belongs to the grasps before (pregrasp, squeeze, scores, energies, outcomes) is dropped.
 
     Args:
@@ -65,100 +66,141 @@ def close_idle_fingers(energy: GraspEnergy, grasps: GraspBatch, config: ClosingC
 
 @dataclass(frozen=True)
 class _Closer:
-    """Hands that stay where they are while fingers move."""
+    """Hands that stay where they are while fingers move.
+
+    Joints that move are given for each grasp and finger; no joint is of two fingers.
+    """
 
     energy: GraspEnergy
     T: Float[Tensor, "n 4 4"]
     config: ClosingConfig
 
     def close(self, q: Float[Tensor, "n n_dof"]) -> Float[Tensor, "n n_dof"]:
-        """Joints with idle fingers closed."""
+        """Joints with idle fingers closed, and the outer links of the others wrapped around the object."""
         hand, config = self.energy.hand, self.config
         bends = bending(hand)
-        idle = self.distances(q) > config.idle
+        bend, first = (joints.expand(len(q), -1, -1) for joints in (bends, _first(hand, bends)))
         opened = torch.where(bends.any(0), hand.canonical_joints(config.openness), q)
-        for start, moving in ((q, bends), (opened, bends), (opened, _first(hand, bends))):
-            if not bool(idle.any()):
-                break
-            share, meets = self.first_contact(start, moving)
-            for finger in (meets & idle).any(0).nonzero()[:, 0].tolist():
-                own = bends[finger]
-                new = torch.where(own, self.along(start, moving[finger], share[:, finger, None]), q)
-                kept = meets[:, finger] & idle[:, finger] & (self.overlap(new) < self.overlap(q) + config.overlap)
-                q = torch.where(kept[:, None], new, q)
-                idle[:, finger] &= ~kept
-        return self.rest(q, bends, idle)
+        idle = least_by_finger(self.energy, self.distances(q)) > config.idle
+        for start, moving in ((q, bend), (opened, bend), (opened, first)):
+            q, idle = self.contact(q, start, moving, idle)
+        holding = ~idle
+        outer = self.outer(q, bend)
+        hanging = holding & outer.any(-1) & (self.gaps(q, self.moved(outer)) > config.idle)
+        q, hanging = self.contact(q, q, outer, hanging)
+        moving = torch.where(idle[..., None], bend, outer)
+        return self.rest(q, moving, idle | hanging, holding)
+
+    def contact(
+        self, q: Float[Tensor, "n n_dof"], start: Float[Tensor, "n n_dof"], moving: Bool[Tensor, "n n_tips n_dof"],
+        waiting: Bool[Tensor, "n n_tips"],
+    ) -> tuple[Float[Tensor, "n n_dof"], Bool[Tensor, "n n_tips"]]:
+        """Joints with those waiting fingers on the object that meet it on their way from `start`, and which still wait."""
+        rows = waiting.any(1)
+        if not bool(rows.any()):
+            return q, waiting
+        some = replace(self, T=self.T[rows])
+        new_q, still = some.meeting(q[rows], start[rows], moving[rows], waiting[rows])
+        return q.index_put((rows,), new_q), waiting.index_put((rows,), still)
+
+    def meeting(
+        self, q: Float[Tensor, "n n_dof"], start: Float[Tensor, "n n_dof"], moving: Bool[Tensor, "n n_tips n_dof"],
+        waiting: Bool[Tensor, "n n_tips"],
+    ) -> tuple[Float[Tensor, "n n_dof"], Bool[Tensor, "n n_tips"]]:
+        """`contact` of grasps that all have fingers that wait."""
+        bends, waiting = bending(self.energy.hand), waiting.clone()
+        share, meets = self.first_contact(start, moving)
+        for finger in (meets & waiting).any(0).nonzero()[:, 0].tolist():
+            new = torch.where(bends[finger], self.along(start, moving[:, finger], share[:, finger, None]), q)
+            kept = (meets & waiting)[:, finger] & self.roomy(new, q)
+            q = torch.where(kept[:, None], new, q)
+            waiting[:, finger] &= ~kept
+        return q, waiting
 
     def rest(
-        self, q: Float[Tensor, "n n_dof"], bends: Bool[Tensor, "n_tips n_dof"], idle: Bool[Tensor, "n n_tips"]
+        self, q: Float[Tensor, "n n_dof"], moving: Bool[Tensor, "n n_tips n_dof"], waiting: Bool[Tensor, "n n_tips"],
+        holding: Bool[Tensor, "n n_tips"],
     ) -> Float[Tensor, "n n_dof"]:
-        """Joints with the fingers that reach nothing bent as far as those that hold, or less where there is no room."""
+        """Joints with what reaches nothing bent as far as the fingers that hold, or less where there is no room."""
         hand, config = self.energy.hand, self.config
+        bends = bending(hand)
         opened = torch.where(bends.any(0), hand.canonical_joints(1.0), q)
-        shares = torch.stack([self.bent(q, own) for own in bends], 1)
-        holding, resting = ~idle & bends.any(1), idle & bends.any(1)
+        holding = holding & bends.any(1)
         if hand.thumb is not None:
             holding[:, hand.thumb] = False  # it bends otherwise than the fingers that it opposes
-        wanted = (shares * holding).sum(1) / holding.sum(1).clamp_min(1)
-        for finger in resting.any(0).nonzero()[:, 0].tolist():
-            waiting = resting[:, finger] & (wanted > shares[:, finger])
-            for part in config.resting:
-                if not bool(waiting.any()):
+        wanted = (self.bent(q, bends) * holding).sum(1) / holding.sum(1).clamp_min(1)
+        shares, counted = self.bent(q, moving), self.moved(moving)
+        waiting = waiting & moving.any(-1) & (wanted[:, None] > shares)
+        for finger in waiting.any(0).nonzero()[:, 0].tolist():
+            for part in config.rest_shares:
+                if not bool(waiting[:, finger].any()):
                     break
                 share = torch.lerp(shares[:, finger], wanted, part)
-                new = torch.where(bends[finger], self.along(opened, bends[finger], share[:, None]), q)
-                clear = self.distances(new)[:, finger] > config.contact
-                kept = waiting & clear & (self.overlap(new) < self.overlap(q) + config.overlap)
+                new = torch.where(moving[:, finger], self.along(opened, moving[:, finger], share[:, None]), q)
+                kept = waiting[:, finger] & (self.gaps(new, counted)[:, finger] > config.contact) & self.roomy(new, q)
                 q = torch.where(kept[:, None], new, q)
-                waiting &= ~kept
+                waiting[:, finger] &= ~kept
         return q
 
-    def bent(self, q: Float[Tensor, "n n_dof"], own: Bool[Tensor, " n_dof"]) -> Float[Tensor, " n"]:
-        """How far a finger is bent: mean share of the way from open to closed of its joints."""
-        hand = self.energy.hand
-        opened = hand.canonical_joints(1.0)
-        return ((q - opened) / (hand.closed_ends - opened))[:, own].sum(1) / own.sum().clamp_min(1)
+    def outer(self, q: Float[Tensor, "n n_dof"], moving: Bool[Tensor, "n n_tips n_dof"]) -> Bool[Tensor, "n n_tips n_dof"]:
+        """Those of the joints that move no link of their finger that touches the object."""
+        touches = (self.distances(q) <= self.config.idle).float() @ self.energy.body.members  # points of each link
+        return moving & (touches @ self.energy.hand.tree.moves.float() == 0)[:, None]
+
+    def bent(self, q: Float[Tensor, "n n_dof"], moving: Bool[Tensor, "*n n_tips n_dof"]) -> Float[Tensor, "n n_tips"]:
+        """How far fingers are bent: mean share of the way from open to closed of the joints that move."""
+        opened = self.energy.hand.canonical_joints(1.0)
+        share = (q - opened) / (self.energy.hand.closed_ends - opened)
+        return torch.where(moving, share[:, None], 0).sum(-1) / moving.sum(-1).clamp_min(1)
 
     def along(
-        self, start: Float[Tensor, "n n_dof"], moving: Bool[Tensor, " n_dof"], share: Float[Tensor, "n #n_dof"]
+        self, start: Float[Tensor, "n n_dof"], moving: Bool[Tensor, "n n_dof"], share: Float[Tensor, "n #n_dof"]
     ) -> Float[Tensor, "n n_dof"]:
         """Moving joints this share of the way from `start` to closed."""
         return torch.where(moving, start + share * (self.energy.hand.closed_ends - start), start)
 
     def first_contact(
-        self, start: Float[Tensor, "n n_dof"], moving: Bool[Tensor, "n_tips n_dof"]
+        self, start: Float[Tensor, "n n_dof"], moving: Bool[Tensor, "n n_tips n_dof"]
     ) -> tuple[Float[Tensor, "n n_tips"], Bool[Tensor, "n n_tips"]]:
-        """The share of the way at which each finger meets the object, and whether it does; all close at once."""
-        config, every = self.config, moving.any(0)
+        """The share of the way at which what moves of each finger meets the object, and whether it does; all close at once."""
+        config, every = self.config, moving.any(1)
         shares = torch.linspace(0, 1, config.steps, device=start.device)
         path = [self.along(start, every, share.expand(len(start), 1)) for share in shares]
-        near = torch.stack([self.distances(q) <= config.contact for q in path])
+        counted = self.moved(moving)
+        near = torch.stack([self.gaps(q, counted) <= config.contact for q in path])
         first = near.float().argmax(0)
         meets = near.any(0) & (first > 0)  # a path that begins in the object meets nothing
         low, high = shares[(first - 1).clamp_min(0)], shares[first]
-        owner = moving.float().argmax(0).expand(len(start), -1)  # the finger that each joint moves
+        owner = moving.float().argmax(1)  # the finger that each joint moves
         for _ in range(config.halvings):
             middle = (low + high) / 2
-            inside = self.distances(self.along(start, every, middle.gather(1, owner))) <= config.contact
+            inside = self.gaps(self.along(start, every, middle.gather(1, owner)), counted) <= config.contact
             high, low = torch.where(inside, middle, high), torch.where(inside, low, middle)
         return low, meets
 
-    def distances(self, q: Float[Tensor, "n n_dof"]) -> Float[Tensor, "n n_tips"]:
-        """Distance of each finger's nearest point to the object [m]."""
-        return finger_distances(self.energy, self.T, q)
+    def moved(self, moving: Bool[Tensor, "n n_tips n_dof"]) -> Bool[Tensor, "n n_tips p"]:
+        """Those of each finger's surface points that its joints move."""
+        hand, member = self.energy.hand, self.energy.body.members.argmax(-1)
+        own = hand.finger_of_link[member] == torch.arange(len(hand.fingers), device=member.device)[:, None]
+        return own & (moving.float() @ hand.tree.moves.float().mT > 0)[..., member]
+
+    def gaps(self, q: Float[Tensor, "n n_dof"], counted: Bool[Tensor, "n n_tips p"]) -> Float[Tensor, "n n_tips"]:
+        """Distance to the object of the nearest of some of each finger's points; inf for none [m]."""
+        return torch.where(counted, self.distances(q)[:, None], torch.inf).amin(-1)
+
+    def distances(self, q: Float[Tensor, "n n_dof"]) -> Float[Tensor, "n p"]:
+        """Signed distance of the hand's surface points to the object [m]."""
+        return self.energy.field.distances(body_points(self.energy, self.T, q))[0]
+
+    def roomy(self, new: Float[Tensor, "n n_dof"], q: Float[Tensor, "n n_dof"]) -> Bool[Tensor, " n"]:
+        """Whether self-penetration grows no more than it may from `q` to `new`."""
+        return self.overlap(new) < self.overlap(q) + self.config.overlap
 
     def overlap(self, q: Float[Tensor, "n n_dof"]) -> Float[Tensor, " n"]:
         """Self-penetration [m]."""
         energy = self.energy
         centres = energy.ball.place(self.T[:, None] @ energy.hand.tree.forward(q))
         return energies.self_penetration(centres, energy.spheres.radii, energy.spheres.pairs).value.sum(-1)
-
-
-def finger_distances(
-    energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"]
-) -> Float[Tensor, "n n_tips"]:
-    """Signed distance of each finger's nearest surface point to the object, for wrist poses and joints on its device [m]."""
-    return least_by_finger(energy, energy.field.distances(body_points(energy, T, q))[0])
 
 
 def body_points(

@@ -73,7 +73,7 @@ def start_joints(hand: Hand, n: int, config: StartConfig, generator: torch.Gener
 
 
 def starts(
-    hand: Hand, field: DistanceField, surface: Float[Tensor, "k 3"], centre: Float[Tensor, 3], n: int, config: StartConfig,
+    hand: Hand, field: DistanceField, surface: Float[Tensor, "k 3"], centre: Float[Tensor, "3"], n: int, config: StartConfig,
     generator: torch.Generator, surroundings: Surroundings | None = None,
 ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n n_dof"]]:
     """Wrist poses and joints to start from.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,9 +14,9 @@ from scipy.spatial import KDTree
 from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.frames import motion_fault
 from dro_grasp.geometry.point_clouds import distinct_points
-from dro_grasp.geometry.table_plane import above_plane, table_plane
+from dro_grasp.geometry.table_plane import above_plane, moved_plane, table_plane
 from dro_grasp.objects.in_memory import numbers
-from dro_grasp.objects.loading import check_extent, cloud_object, estimate_normals, read_points, table_note
+from dro_grasp.objects.loading import check_extent, check_scale, cloud_object, estimate_normals, read_points, table_note
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
 from dro_grasp.perception.completion import complete_cloud
 
@@ -75,8 +74,7 @@ def load_scan(
         ObjectError: The file holds no cloud, or none of an object's size, or `scale` is not positive.
         OptionError: The pose is no rigid motion.
     """
-    if not (math.isfinite(scale) and scale > 0):
-        raise ObjectError(f"scale is {scale}; give a positive number, for example --scale 0.001 for millimetres")
+    check_scale(scale)
     return scanned_object(path.stem, read_points(path) * scale, T_frame_camera, keep_table=keep_table)
 
 
@@ -127,9 +125,7 @@ def scanned_object(
     if T is not None:
         R, t = T[:3, :3], T[:3, 3]
         kept, seen, normals = kept @ R.T + t, seen @ R.T + t, normals @ R.T
-        if table is not None:
-            up = R @ table[:3]
-            table = np.append(up, table[3] + up @ t)
+        table = None if table is None else moved_plane(table, T)
     obj = cloud_object(
         name, np.concatenate([kept, normals], 1), origin=name, keep_table=True, seen=seen if added.any() else None)
     return obj if table is None else replace(obj, table=table, notes=(*obj.notes, table_note(table, cut, total)))

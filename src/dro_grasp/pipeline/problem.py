@@ -118,7 +118,7 @@ class GraspProblem:
         """The hand with `count` surface points, on the device.
 
         Raises:
-            ValueError: The hand has fewer points.
+            OptionError: The hand has fewer points.
         """
         if count not in self._thinned:
             self._thinned[count] = self.hand.with_points(count).to(self.device)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from jaxtyping import Float
 
 from dro_grasp.descriptions.bounds import MOST_TURN
 from dro_grasp.descriptions.loader import Description, load_description
+from dro_grasp.descriptions.reduction import NO_LIMITS
 from dro_grasp.descriptions.xml_files import parse_xml
 from dro_grasp.errors import HandError, RobotError
 from dro_grasp.hands.hand import Hand
@@ -24,8 +26,6 @@ LONGEST_ARM = 5.0
 """A farther link must be in another unit [m] (ours)."""
 TURN = np.pi
 """Planned motions stay this near home, so that configurations a whole turn apart count once [rad] (ours)."""
-NO_LIMITS = "states no limits"
-"""Beginning of the note of a joint whose limits had to be assumed."""
 DEFAULT_EFFORT = 50.0
 """Largest torque of an arm's joint that states none [Nm]; only simulated servos use it (ours)."""
 
@@ -102,7 +102,9 @@ def load_robot(name: str | Path) -> Robot:
     try:
         arm = load_description(file.arm)
     except HandError as error:
-        raise RobotError(f"{file.path}: the arm cannot be used: {str(error).replace('hand', 'robot')}") from error
+        path = str(file.arm)
+        reason = path.join(re.sub(r"\bhand\b", "robot", part) for part in str(error).split(path))
+        raise RobotError(f"{file.path}: the arm cannot be used: {reason}") from error
     fit = _Fit(file, arm)
     fit.check_tree()
     lower, upper = fit.positions()
@@ -196,12 +198,19 @@ def _stated_limits(path: Path, kind: str) -> dict[str, float]:
 
     MuJoCo does not keep the velocities of a URDF, and MJCF has none; its efforts are those of joints and of their actuators.
     """
-    root = parse_xml(path)
     if kind not in {"velocity", "effort"}:
         return {}
+    root = parse_xml(path)
     if root.tag != "robot":
         return _mjcf_efforts(path) if kind == "effort" else {}
-    found = {j.get("name", ""): float(limit.get(kind, 0)) for j in root.findall("joint") for limit in j.findall("limit")}
+    found = {}
+    for joint in root.findall("joint"):
+        name, limit = joint.get("name", ""), joint.find("limit")
+        stated = "0" if limit is None else limit.get(kind, "0")
+        try:
+            found[name] = float(stated)
+        except ValueError:
+            raise RobotError(f"{path}: joint '{name}' has {kind}=\"{stated}\"; expected a number") from None
     return {name: value for name, value in found.items() if value > 0}
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from dro_grasp.geometry.table_plane import moved_plane
 from dro_grasp.objects.cache import content_hash
 from dro_grasp.objects.shape import ObjectModel
 
@@ -32,8 +33,9 @@ def moved(obj: ObjectModel, T: Float[np.ndarray, "4 4"]) -> ObjectModel:
     vertices = None if obj.vertices is None else obj.vertices @ R.T + t
     faces = np.zeros((0, 3), np.int32) if obj.faces is None else obj.faces
     shape = cloud if vertices is None else vertices
+    table = None if obj.table is None else moved_plane(obj.table, T)
     seen = None if obj.seen is None else (obj.seen @ R.T + t).astype(np.float32)
     return replace(
         obj, cloud=cloud, cloud_normals=normals, vertices=vertices, centre_of_mass=R @ obj.centre_of_mass + t,
         inertia=R @ obj.inertia @ R.T, sha256=content_hash(shape.astype(np.float32), faces.astype(np.int32)),
-        seen=seen, balls=None, exact_parts=None if obj.is_cloud else tuple((v @ R.T + t, f) for v, f in obj.parts))
+        seen=seen, table=table, balls=None, exact_parts=None if obj.is_cloud else tuple((v @ R.T + t, f) for v, f in obj.parts))

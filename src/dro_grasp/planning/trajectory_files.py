@@ -43,11 +43,11 @@ def trajectory_csv(plan: MotionPlan) -> str:
 def _message(frame: str, names: tuple[str, ...], part: Trajectory) -> dict[str, object]:
     points = []
     for i, time in enumerate(part.time.tolist()):
-        second = int(time)
+        second, nanosecond = divmod(round(time * 1e9), 10**9)
         points.append({
             "positions": _plain(part.position[i]), "velocities": _plain(part.velocity[i]),
             "accelerations": _plain(part.acceleration[i]), "effort": [],
-            "time_from_start": {"sec": second, "nanosec": round((time - second) * 1e9)}})
+            "time_from_start": {"sec": second, "nanosec": nanosecond}})
     header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": frame}
     return {"header": header, "joint_names": list(names), "points": points}
 
