@@ -12,10 +12,9 @@ import argparse
 
 import numpy as np
 import torch
-from report import emit
+from report import emit, rate
 from synthesis import HANDS
 
-from dro_grasp.evaluation.metrics import wilson_interval
 from dro_grasp.evaluation.success_rates import pair_seed
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
@@ -64,12 +63,6 @@ def main() -> None:
     columns = ["weights", "points", "hand", "n", *(f"{name} [%]" for name in PROTOCOLS)]
     emit(f"network alone on points of the validate objects, {options.num} grasps of each hand on each", rows, columns,
          {" / ".join(row[:3]): dict(zip(columns[3:], row[3:], strict=True)) for row in rows}, options.json)
-
-
-def rate(held: list[bool]) -> str:
-    """Success in per cent with its 95 % interval."""
-    low, high = wilson_interval(sum(held), len(held))
-    return f"{100 * sum(held) / len(held):.1f} [{100 * low:.0f}-{100 * high:.0f}]"
 
 
 if __name__ == "__main__":

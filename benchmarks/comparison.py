@@ -23,7 +23,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from report import emit
+from report import emit, rate
 
 from dro_grasp.baselines.method import Method
 from dro_grasp.baselines.ours import DistanceMethod, SynthesisMethod
@@ -182,12 +182,6 @@ def lines(name: str, per_hand: dict[str, list[Measured]], trials: Sequence[str])
 def outcomes(parts: Sequence[Measured], trial: str) -> np.ndarray:
     """Which of all grasps hold in a trial."""
     return np.array([held for part in parts for held in part.held[trial]], bool)
-
-
-def rate(held: np.ndarray) -> str:
-    """Success in per cent with its 95 % interval."""
-    low, high = wilson_interval(int(held.sum()), len(held))
-    return f"{100 * held.mean():.1f} [{100 * low:.0f}-{100 * high:.0f}]"
 
 
 def draw(found: dict[str, dict[str, list[Measured]]], path: Path) -> None:

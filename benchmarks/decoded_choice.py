@@ -12,9 +12,8 @@ import dataclasses
 import time
 
 import torch
-from report import emit
+from report import emit, rate
 
-from dro_grasp.evaluation.metrics import wilson_interval
 from dro_grasp.evaluation.success_rates import pair_seed
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
@@ -43,11 +42,7 @@ class Tally:
     def cells(self) -> list[object]:
         """Number, success with its interval for each protocol, and time."""
         n = len(self.held[PROTOCOLS[0]])
-        rates = []
-        for outcomes in self.held.values():
-            low, high = wilson_interval(sum(outcomes), n)
-            rates.append(f"{100 * sum(outcomes) / n:.1f} [{100 * low:.0f}-{100 * high:.0f}]")
-        return [n, *rates, 1e3 * self.seconds / n]
+        return [n, *map(rate, self.held.values()), 1e3 * self.seconds / n]
 
 
 @torch.no_grad()

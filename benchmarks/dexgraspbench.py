@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from report import emit
+from report import emit, rate
 
 from dro_grasp.datasets.collections.importing import ForeignGrasp, in_order, read_foreign, read_npy
 from dro_grasp.evaluation.metrics import wilson_interval
@@ -142,10 +142,8 @@ def groups(grasps: GraspBatch) -> dict[str, list[int]]:
 
 def success(grasps: GraspBatch) -> list[object]:
     """Number, success with its interval, and means of the metrics."""
-    k, n = int(grasps.success.sum()), len(grasps)
-    low, high = wilson_interval(k, n)
     means = [float(torch.as_tensor(grasps.extra[name]).mean()) for name in NAMES]
-    return [n, f"{100 * k / n:.1f} [{100 * low:.0f}-{100 * high:.0f}]", *means]
+    return [len(grasps), rate(grasps.success), *means]
 
 
 def official_results(folder: Path) -> dict[str, dict[str, float]]:

@@ -22,10 +22,9 @@ from typing import Any
 import numpy as np
 import torch
 from dexgraspbench import OFFICIAL, OURS, PALM
-from report import emit
+from report import emit, rate
 
 from dro_grasp.datasets.collections.importing import read_npy
-from dro_grasp.evaluation.metrics import wilson_interval
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
@@ -123,12 +122,6 @@ def entries(hand: Hand, grasps: GraspBatch, object_path: str, scale: float) -> l
     pose = np.array([0.0, 0, 0, 1, 0, 0, 0])
     return [{"obj_pose": pose, "obj_scale": scale, "obj_path": object_path, **{k: v[i] for k, v in postures.items()}}
             for i in range(len(grasps))]
-
-
-def rate(held: list[bool]) -> str:
-    """Share in per cent with its 95 % interval."""
-    low, high = wilson_interval(sum(held), len(held))
-    return f"{100 * sum(held) / len(held):.1f} [{100 * low:.0f}-{100 * high:.0f}]"
 
 
 if __name__ == "__main__":

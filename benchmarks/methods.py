@@ -14,10 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from report import emit
+from report import emit, rate
 
 from dro_grasp.datasets.bundle.training_file import HELD_OUT_HANDS
-from dro_grasp.evaluation.metrics import wilson_interval
 from dro_grasp.evaluation.success_rates import pair_seed
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
@@ -71,12 +70,6 @@ def main() -> None:
     columns = ["hand", "method", "n", *(f"{name} [%]" for name in PROTOCOLS), "from the optimiser [%]", "CPU seconds a grasp"]
     emit(f"{options.num} grasps of each hand on each of {' '.join(options.objects)}", table, columns,
          {f"{row[0]} / {row[1]}": dict(zip(columns[2:], row[2:], strict=True)) for row in table}, options.json)
-
-
-def rate(held: np.ndarray) -> str:
-    """Success in per cent with its 95 % interval."""
-    low, high = wilson_interval(int(held.sum()), len(held))
-    return f"{100 * held.mean():.1f} [{100 * low:.0f}-{100 * high:.0f}]"
 
 
 if __name__ == "__main__":

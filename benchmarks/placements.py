@@ -18,11 +18,10 @@ from tempfile import TemporaryDirectory
 from typing import Literal
 
 import torch
-from report import emit
+from report import emit, rate
 from torch import Tensor
 
 from dro_grasp.datasets.bundle.training_file import Bundle, load_bundle
-from dro_grasp.evaluation.metrics import wilson_interval
 from dro_grasp.evaluation.success_rates import pair_seed
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
@@ -136,12 +135,6 @@ def main() -> None:
          f"{len(options.hands) * len(options.objects) * options.num} proposals of other hands",
          rows, ["prior", *(name.removeprefix("assets/") for name in sorted(unseen.names)), "average", "log-density", *proposed],
          values, options.json)
-
-
-def rate(held: Tensor) -> str:
-    """Success in per cent with its 95 % interval."""
-    low, high = wilson_interval(int(held.sum()), len(held))
-    return f"{100 * float(held.float().mean()):.1f} [{100 * low:.0f}-{100 * high:.0f}]"
 
 
 if __name__ == "__main__":

@@ -6,11 +6,15 @@ import json
 import os
 import platform
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+import numpy as np
 import torch
+from torch import Tensor
+
+from dro_grasp.evaluation.metrics import wilson_interval
 
 ROOT = Path(__file__).resolve().parent.parent
 """Folder of the repository."""
@@ -61,6 +65,13 @@ def emit(
     for key, value in json_object.items():
         if isinstance(value, int | float | str):
             print(f"{key}: {_cell(value)}")
+
+
+def rate(held: Collection[bool] | np.ndarray | Tensor) -> str:
+    """Success in per cent with its 95 % interval."""
+    success, total = int(sum(map(bool, held))), len(held)
+    low, high = wilson_interval(success, total)
+    return f"{100 * success / total:.1f} [{100 * low:.0f}-{100 * high:.0f}]"
 
 
 def _cell(value: object) -> str:

@@ -34,7 +34,7 @@ from dro_grasp.optimization.refinement import RefineConfig as RefineConfig
 from dro_grasp.optimization.synthesis import SynthesisConfig as SynthesisConfig, synthesize as synthesize
 from dro_grasp.perception.partial_views import DepthCamera as DepthCamera, visible_points as visible_points
 from dro_grasp.perception.scan import depth_points as depth_points, scanned_object as scanned_object
-from dro_grasp.pipeline.choice import ChoiceConfig as ChoiceConfig
+from dro_grasp.pipeline.choice import ChoiceConfig as ChoiceConfig, ChoicePenalties as ChoicePenalties
 from dro_grasp.pipeline.constraints import Constraints as Constraints
 from dro_grasp.pipeline.problem import GraspProblem as GraspProblem
 from dro_grasp.pipeline.stages import complete as complete, evaluate as evaluate, rank as rank, refine as refine

@@ -117,7 +117,7 @@ def test_the_chosen_rotation_of_a_mean_grasp_is_the_best_of_its_draws(bundle: Bu
     problem, mean, config = GraspProblem(HAND, bare("egg", 0.5)), mean_grasp(bundle, "toy"), ChoiceConfig(draws=6)
     every = mean_grasps(problem, mean, 4 * config.draws, 3, ChoiceConfig(draws=1))
     thin = problem.thinned(min(CHOICE_POINTS, HAND.n_points))
-    scores = choice_scores(thin, problem.field, thin.points(every.joints, every.T_object_wrist), config)
+    scores = choice_scores(thin, problem.field, thin.points(every.joints, every.T_object_wrist), config.of_moved)
     best = scores.unflatten(0, (4, config.draws)).argmax(-1) + config.draws * torch.arange(4)
     chosen = mean_grasps(problem, mean, 4, 3, config)
     torch.testing.assert_close(chosen.T_object_wrist, every.T_object_wrist[best])

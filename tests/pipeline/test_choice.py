@@ -19,14 +19,14 @@ from dro_grasp.models.network import DistanceNetwork, untrained_network
 from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.pipeline import proposal
-from dro_grasp.pipeline.choice import CROWDING_POINTS, ChoiceConfig, choice_scores
+from dro_grasp.pipeline.choice import CROWDING_POINTS, ChoiceConfig, ChoicePenalties, choice_scores
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.proposal import ProposalConfig, propose
 from tests.helpers.loaded_hands import loaded_hand
 
 HAND = loaded_hand("allegro").with_points(160)
 SPHERE = load_object("sphere")
-CONFIG = ChoiceConfig()
+CONFIG = ChoicePenalties()
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +111,7 @@ def test_the_moved_hands_are_judged_in_the_object_s_frame_and_the_best_is_taken(
     monkeypatch.setattr(type(HAND), "random_open_joints", lambda *_: joints)
     judged, kept = [], []
 
-    def scores(hand: Hand, field: object, points: torch.Tensor, config: ChoiceConfig, room: object) -> torch.Tensor:
+    def scores(hand: Hand, field: object, points: torch.Tensor, penalties: ChoicePenalties, room: object) -> torch.Tensor:
         judged.append(points)
         return torch.arange(points.shape[1]).remainder(6).float().expand(points.shape[:2])  # the fifth is the best
 
@@ -152,11 +152,11 @@ def test_of_several_decoded_hands_the_one_at_the_surface_is_kept() -> None:
     whole = problem.hand.points(q.expand(2, 3, -1), T)
     wanted = choice_scores(problem.hand, problem.field, whole, config.of_decoded).argmax(-1)
     assert wanted.tolist() == [1, 0]
-    found, joints, clouds = proposal._decoded(problem, HAND, distances, cloud, q.expand(2, -1), config)
-    rows = torch.arange(2)
-    torch.testing.assert_close(found, T[rows, wanted], atol=1e-3, rtol=0)
-    torch.testing.assert_close(joints, q.expand(2, -1), atol=5e-3, rtol=0)
-    torch.testing.assert_close(clouds, points[rows, wanted], atol=1e-4, rtol=0)
+    found, joints, clouds = proposal._decoded(HAND, distances, cloud, q.expand(2, -1))
+    torch.testing.assert_close(found, T, atol=1e-3, rtol=0)
+    torch.testing.assert_close(joints, q.expand(2, 3, -1), atol=5e-3, rtol=0)
+    torch.testing.assert_close(clouds, points, atol=1e-4, rtol=0)
+    assert torch.equal(proposal._best(problem, found, joints, config), wanted)
 
 
 def test_no_z_and_more_z_than_are_drawn_cannot_be_decoded() -> None:

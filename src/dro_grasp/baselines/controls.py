@@ -83,7 +83,7 @@ def mean_grasps(
     T = compose(rotation, centre - rotation @ mean.object_centre)
     thin = problem.thinned(min(CHOICE_POINTS, hand.n_points))
     points = apply_to_cloud(T.to(problem.device), thin.points(mean.joints.to(problem.device)).expand(len(T), -1, -1))
-    best = choice_scores(thin, problem.field, points, config).unflatten(0, (num, config.draws)).argmax(-1).cpu()
+    best = choice_scores(thin, problem.field, points, config.of_moved).unflatten(0, (num, config.draws)).argmax(-1).cpu()
     T = T.unflatten(0, (num, config.draws))[torch.arange(num), best]
     joints = mean.joints.expand(num, -1).contiguous()
     return GraspBatch.create(hand, obj, T, joints, seed=seed, provenance="control: mean grasp")

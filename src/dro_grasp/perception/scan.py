@@ -99,7 +99,7 @@ def scanned_object(
         ObjectError: Too few points are left, they are not in metres, or some lie behind the camera.
         OptionError: The pose is no rigid motion.
     """
-    T = None if T_frame_camera is None else camera_pose(T_frame_camera)
+    T = None if T_frame_camera is None else given_pose(T_frame_camera)
     kept = given_points(points, name)
     kept, camera = kept[np.isfinite(kept).all(1)], np.zeros(3)
     kept = kept[distinct_points(kept)]
@@ -143,7 +143,7 @@ def given_points(points: ArrayLike, origin: str) -> Float[np.ndarray, "n 3"]:
     return array
 
 
-def camera_pose(T_frame_camera: ArrayLike) -> Float[np.ndarray, "4 4"]:
+def given_pose(T_frame_camera: ArrayLike) -> Float[np.ndarray, "4 4"]:
     """The pose of a camera in the wanted frame [m].
 
     Raises:

@@ -24,7 +24,7 @@ CROWDING_POINTS = 64
 
 
 @dataclass(frozen=True)
-class Penalties:
+class ChoicePenalties:
     """What speaks against a hand; set by trials on training objects (ours)."""
 
     finger_penetration: float = 800.0
@@ -46,15 +46,17 @@ class Penalties:
 
 
 @dataclass(frozen=True)
-class ChoiceConfig(Penalties):
-    """How many z are drawn and decoded, and the penalties of moved and of decoded hands by which one is chosen."""
+class ChoiceConfig:
+    """How many z are drawn and decoded, and the penalties by which one is chosen."""
 
     draws: int = 32
     """z drawn for each placement; 1 takes the first."""
     decoded: int = 1
     """How many of them, the best by their moved hands, are decoded (ours). Each adds half of the time of the first."""
-    of_decoded: Penalties = field(default_factory=lambda: Penalties(palm_penetration=70.0, gap=30.0, crowding=170.0))
-    """Penalties of decoded hands, if there are several: the weights of a logistic regression of `strict` (ours)."""
+    of_moved: ChoicePenalties = field(default_factory=ChoicePenalties)
+    """ChoicePenalties of the hands that z moves, of all draws."""
+    of_decoded: ChoicePenalties = field(default_factory=lambda: ChoicePenalties(palm_penetration=70.0, gap=30.0, crowding=170.0))
+    """ChoicePenalties of decoded hands, if there are several: the weights of a logistic regression of `strict` (ours)."""
 
     def __post_init__(self) -> None:
         """Refuse numbers that make no sense.
@@ -67,7 +69,7 @@ class ChoiceConfig(Penalties):
 
 
 def choice_scores(
-    hand: Hand, field: DistanceField, points: Float[Tensor, "*b n_points 3"], config: Penalties,
+    hand: Hand, field: DistanceField, points: Float[Tensor, "*b n_points 3"], penalties: ChoicePenalties,
     room: Room | None = None,
 ) -> Float[Tensor, "*b"]:
     """How well hands suit the object; higher is better, comparable among hands of one kind.
@@ -76,7 +78,7 @@ def choice_scores(
         hand: The hand that was moved or decoded.
         field: Signed distances of the object, from its mesh or from its cloud and normals.
         points: Its surface points then, in the object's frame [m].
-        config: Penalties.
+        penalties: What speaks against a hand.
         room: Where the hand may be, and where it may touch the object.
     """
     room = room or Room()
@@ -89,15 +91,15 @@ def choice_scores(
 
     fingers = [i for i in range(len(hand.fingers)) if bool((finger == i).any())]
     nearest_of, gap_of = (torch.stack([nearest(i, d) for i in fingers], -1) for d in (distance, wanted))
-    score = -config.finger_penetration * (config.margin - nearest_of).clamp_min(0).mean(-1)
-    score = score - config.gap * gap_of.clamp(0, config.reach).mean(-1)
+    score = -penalties.finger_penetration * (penalties.margin - nearest_of).clamp_min(0).mean(-1)
+    score = score - penalties.gap * gap_of.clamp(0, penalties.reach).mean(-1)
     if bool((finger == PALM).any()):
-        score = score - config.palm_penetration * (config.margin - nearest(PALM)).clamp_min(0)
+        score = score - penalties.palm_penetration * (penalties.margin - nearest(PALM)).clamp_min(0)
     if room.surroundings is not None:
         closest = room.surroundings.distances(points)[0].amin(-1)
-        score = score - config.clearance * (config.margin - closest).clamp_min(0)
+        score = score - penalties.clearance * (penalties.margin - closest).clamp_min(0)
     some = hand.spread_rank < CROWDING_POINTS
     owner = finger[some]
     rivals = (owner[:, None] != owner) & (owner[:, None] != PALM) & (owner != PALM)
     apart = torch.cdist(points[..., some, :], points[..., some, :])
-    return score - config.crowding * (config.apart - torch.where(rivals, apart, torch.inf).amin((-1, -2))).clamp_min(0)
+    return score - penalties.crowding * (penalties.apart - torch.where(rivals, apart, torch.inf).amin((-1, -2))).clamp_min(0)

@@ -100,13 +100,15 @@ def propose(
         placement = _placements(problem, hand, network, cloud, num, config, generator)
         joints = hand.random_open_joints(num, generator)
         noise = network.sample_latent(num, generator, _temperature(problem, config), config.choice.draws).to(problem.device)
-    found: list[tuple[Tensor, Tensor, Tensor]] = []
+    found: list[tuple[Tensor, ...]] = []
     for start in range(0, num, config.batch_size):
         part = slice(start, min(start + config.batch_size, num))
         with watch("network"):
             distances = _distances(problem, network, cloud, placement[part], joints[part], noise[part], config)
         with watch("decode"), one_thread():
-            found.append(_decoded(problem, hand, distances, cloud, joints[part], config.choice))
+            several = _decoded(hand, distances, cloud, joints[part])
+            best = _best(problem, *several[:2], config.choice)
+            found.append(tuple(each[torch.arange(len(best)), best] for each in several))
         if progress is not None:
             progress(part.stop, num)
     T, q, points = (torch.cat(part).cpu() for part in zip(*found, strict=True))
@@ -116,22 +118,24 @@ def propose(
 
 
 def _decoded(
-    problem: GraspProblem, hand: Hand, distances: Float[Tensor, "b k n m"], cloud: Float[Tensor, "m 3"],
-    joints: Float[Tensor, "b n_dof"], config: ChoiceConfig,
-) -> tuple[Float[Tensor, "b 4 4"], Float[Tensor, "b n_dof"], Float[Tensor, "b n 3"]]:
-    """Wrist poses, joints and multilaterated points: of the k hands that D(R,O) gives, the one that suits the object best."""
+    hand: Hand, distances: Float[Tensor, "b k n m"], cloud: Float[Tensor, "m 3"], joints: Float[Tensor, "b n_dof"]
+) -> tuple[Float[Tensor, "b k 4 4"], Float[Tensor, "b k n_dof"], Float[Tensor, "b k n 3"]]:
+    """Wrist poses, joints and multilaterated points of the k hands that D(R,O) gives for each placement."""
     b, k = distances.shape[:2]
     links = distance_matrix.decode(hand, distances.flatten(0, 1), cloud.expand(b * k, -1, -1))
     solution = distance_matrix.solve(hand, links, joints.repeat_interleave(k, 0))
-    found = solution.T_world_wrist, solution.joints, links.points
-    if k == 1:
-        return found
-    T, q = (part.unflatten(0, (b, k)) for part in found[:2])
-    whole = problem.thinned(len(problem.hand.link_index))
-    best = choice_scores(whole, problem.field, whole.points(q, T), config.of_decoded, problem.room).argmax(-1)
-    rows = torch.arange(b, device=best.device) * k + best
-    T, q, points = (part[rows] for part in found)
+    T, q, points = (part.unflatten(0, (b, k)) for part in (solution.T_world_wrist, solution.joints, links.points))
     return T, q, points
+
+
+def _best(
+    problem: GraspProblem, T: Float[Tensor, "b k 4 4"], q: Float[Tensor, "b k n_dof"], config: ChoiceConfig
+) -> Int[Tensor, " b"]:
+    """Which of the k hands that were decoded for a placement suits the object best."""
+    if T.shape[1] == 1:
+        return torch.zeros(len(T), dtype=torch.long, device=T.device)
+    whole = problem.thinned(problem.hand.n_points)
+    return choice_scores(whole, problem.field, whole.points(q, T), config.of_decoded, problem.room).argmax(-1)
 
 
 def check_temperature(temperature: float | None) -> None:
@@ -194,7 +198,7 @@ def _distances(
         obj = network.to_frame(cloud.expand(len(points), -1, -1), centres, axes)
 
         def suit(moves: Float[Tensor, "b k n 3"]) -> Float[Tensor, "b k"]:
-            return choice_scores(hand, field, moves @ axes[:, None].mT + centre, config.choice, problem.room)
+            return choice_scores(hand, field, moves @ axes[:, None].mT + centre, config.choice.of_moved, problem.room)
 
         return network.predict(opened, obj, z, suit, config.choice.decoded).float()
 

@@ -16,7 +16,7 @@ from dro_grasp.geometry.table_plane import largest_plane
 from dro_grasp.objects.in_memory import numbers
 from dro_grasp.objects.loading import MIN_CLOUD, cloud_object
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.perception.scan import camera_pose, given_points, scanned_object
+from dro_grasp.perception.scan import given_points, given_pose, scanned_object
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.robot_file import Table
 from dro_grasp.planning.workcell import VOXEL
@@ -97,7 +97,7 @@ def pick_object(
     if robot.table is None:
         raise RobotError(f"robot '{robot.name}' has no table to look for in '{name}'; state it in the robot file, or give the "
                          "object's points alone")
-    given, T = given_points(points, name), None if T_world_camera is None else camera_pose(T_world_camera)
+    given, T = given_points(points, name), None if T_world_camera is None else given_pose(T_world_camera)
     wanted = None if mask is None else numbers(mask, "the mask", "biuf") != 0
     if wanted is not None and wanted.shape != (len(given),):
         raise ObjectError(f"the mask has shape {wanted.shape}; expected ({len(given)},), one entry for each point of '{name}'")

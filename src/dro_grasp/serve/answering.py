@@ -188,7 +188,7 @@ class Answerer:
         def load() -> Scene:
             with unpacked(sent, self.own_objects) as source:
                 scene = load_scene(source, scale=sent.scale)
-                return scene if camera is None else scene.moved(camera_pose(camera).numpy())
+                return scene if camera is None else scene.moved(sent_pose(camera).numpy())
 
         return self.scenes.get(content_key(sent, camera), load)
 
@@ -196,7 +196,7 @@ class Answerer:
         with unpacked(sent, self.own_objects) as source:
             if camera is None:
                 return replace(load_object(source, scale=sent.scale, keep_table=sent.keep_table), file=None)
-            T, named = camera_pose(camera), isinstance(source, Path)
+            T, named = sent_pose(camera), isinstance(source, Path)
             points = read_points(source) if named else source
             return scanned_object(source.stem if named else "cloud", points * sent.scale, T.numpy(), keep_table=sent.keep_table)
 
@@ -239,7 +239,7 @@ def unpacked(sent: SentObject, own: Mapping[str, str]) -> Iterator[Any]:
                 raise type(error)(str(error).replace(f"{folder}/", "")) from error
 
 
-def camera_pose(camera: SentCamera) -> Float[Tensor, "4 4"]:
+def sent_pose(camera: SentCamera) -> Float[Tensor, "4 4"]:
     """The camera's pose in the named frame [m].
 
     Raises:
