@@ -7,7 +7,7 @@ z may be decoded, too: the decoded hands differ from the moved ones by millimetr
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -53,10 +53,10 @@ class ChoiceConfig:
     """z drawn for each placement; 1 takes the first."""
     decoded: int = 1
     """How many of them, the best by their moved hands, are decoded (ours). Each adds half of the time of the first."""
-    of_moved: ChoicePenalties = field(default_factory=ChoicePenalties)
-    """ChoicePenalties of the hands that z moves, of all draws."""
-    of_decoded: ChoicePenalties = field(default_factory=lambda: ChoicePenalties(palm_penetration=70.0, gap=30.0, crowding=170.0))
-    """ChoicePenalties of decoded hands, if there are several: the weights of a logistic regression of `strict` (ours)."""
+    of_moved: ChoicePenalties = ChoicePenalties()
+    """For the hands that z moves, of all draws."""
+    of_decoded: ChoicePenalties = ChoicePenalties(palm_penetration=70.0, gap=30.0, crowding=170.0)
+    """For decoded hands, if there are several: the weights of a logistic regression of `strict` (ours)."""
 
     def __post_init__(self) -> None:
         """Refuse numbers that make no sense.
