@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import torch
 from scipy.special import expit
 
 from dro_grasp.cli.main import main
@@ -12,6 +13,8 @@ from dro_grasp.cli.output import print_table
 from dro_grasp.grasps.summary import percent
 from dro_grasp.models.checkpoints import SMALL, weights_names
 from dro_grasp.viewer.dataset_pages import LABEL, short_names
+from tests.helpers.tiny_bundle import made_up_grasps
+from tests.helpers.toy_hand import toy_hand
 
 
 def test_columns_that_say_nothing_are_left_out(capsys: pytest.CaptureFixture[str]) -> None:
@@ -27,7 +30,9 @@ def test_columns_that_say_nothing_are_left_out(capsys: pytest.CaptureFixture[str
 
 @pytest.mark.parametrize("score", [-3.0, -0.2, 0.0, 1.0, 2.823, 1e4, -1e4])
 def test_a_score_is_shown_as_the_probability_that_it_states(score: float) -> None:
-    assert percent(score) == f"{100 * expit(score):.0f} %"
+    grasps = made_up_grasps(toy_hand(), count=1).replace(score=torch.tensor([score]))
+    assert float(grasps.confidence[0]) == pytest.approx(expit(score), abs=1e-7)
+    assert percent(float(grasps.confidence[0])) == f"{100 * expit(score):.0f} %"
 
 
 def test_without_a_score_there_is_no_probability() -> None:

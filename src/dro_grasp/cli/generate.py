@@ -213,6 +213,7 @@ class Generate:
             return evaluate(problem, grasps, protocol, progress)
 
     def _show(self, report: dict[str, Any], grasps: GraspBatch, origin: list[str]) -> None:
+        from dro_grasp.grasps.columns import CONTACT_LINKS, REASON
         from dro_grasp.grasps.summary import percent
         from dro_grasp.simulation.diagnosis import diagnose
 
@@ -220,9 +221,9 @@ class Generate:
         for i in range(min(len(grasps), ROWS_SHOWN)):
             outcome: list[Any] = [None] * 4
             if grasps.evaluated[i]:
-                outcome = [bool(grasps.success[i]), len(grasps.extra["contact_links"][i]), float(grasps.penetration[i]) * 1e3,
-                           grasps.extra["reason"][i]]
-            rows.append([i, origin[i], percent(float(grasps.score[i])), *outcome])
+                outcome = [bool(grasps.success[i]), len(grasps.extra[CONTACT_LINKS][i]), float(grasps.penetration[i]) * 1e3,
+                           grasps.extra[REASON][i]]
+            rows.append([i, origin[i], percent(float(grasps.confidence[i])), *outcome])
         columns = ["grasp", "origin", "confidence", "success", "contacts", "penetration [mm]", "reason"]
         seconds = "  ".join(f"{k} {v:.2f} s" for k, v in report["seconds"].items())
         print_table(f"{report['hand']} on {report['object']}", columns, rows)

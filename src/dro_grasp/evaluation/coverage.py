@@ -19,7 +19,7 @@ from dro_grasp.evaluation.metrics import diversity
 from dro_grasp.frames import HALF_AXES, half_axis
 from dro_grasp.geometry import se3
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.columns import HAND_FILE
+from dro_grasp.grasps.columns import CONTACT_LINKS, HAND_FILE
 from dro_grasp.grasps.sources import hand_of
 from dro_grasp.hands.hand import Hand
 
@@ -133,7 +133,7 @@ def _of_pair(hand: Hand, pair: PairGrasps) -> PairCoverage:
     counts = torch.bincount(half_axis(hand.palm_directions(grasps.T_object_wrist)), minlength=6)
     sector = (wrist_rolls(hand, grasps) / (2 * math.pi) * ROLL_BINS).long() % ROLL_BINS
     sizes = grasp_sizes(hand, grasps)
-    touched = [len(links) for links in grasps.extra.get("contact_links", ()) if isinstance(links, list)]
+    touched = [len(links) for links in grasps.extra.get(CONTACT_LINKS, ()) if isinstance(links, list)]
     return PairCoverage(
         grasps.object[0] if len(grasps) else pair.object, len(grasps), pair.made, tuple(counts.tolist()), len(sector.unique()),
         (float(sizes.min()), float(sizes.max())) if len(grasps) else (math.nan, math.nan),

@@ -20,8 +20,6 @@ from dro_grasp.grasps.sources import frame_of
 
 OBJECT = "object"
 """Name of the frame that grasps are stored in: that of the object's mesh or cloud."""
-LARGEST_SCORE = 30.0
-"""Log-odds beyond which the confidence is 0 or 1 to all digits that are written (ours)."""
 
 
 @dataclass(frozen=True)
@@ -81,11 +79,9 @@ def postures(grasps: GraspBatch) -> dict[str, Float[Tensor, "n n_dof"]]:
 
 
 def confidence(grasps: GraspBatch, i: int) -> float | None:
-    """Predicted probability that a grasp holds, the logistic function of its score; None without a score."""
-    score = float(grasps.score[i])
-    if math.isnan(score):
-        return None
-    return round(1 / (1 + math.exp(-max(-LARGEST_SCORE, min(LARGEST_SCORE, score)))), 6)
+    """Predicted probability that a grasp holds, as files state it; None without a score."""
+    known = float(grasps.confidence[i])
+    return None if math.isnan(known) else round(known, 6)
 
 
 def comment(grasps: GraspBatch, frame: Frame) -> str:

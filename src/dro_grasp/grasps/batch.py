@@ -183,14 +183,14 @@ class GraspBatch:
         return codec.quaternions_wxyz(self.T_object_wrist)
 
     @property
+    def confidence(self) -> Float[Tensor, " n"]:
+        """Predicted probability of holding, of which the score is the log-odds; NaN without a score."""
+        return self.score.double().sigmoid()
+
+    @property
     def states_closing(self) -> Bool[Tensor, " n"]:
         """Which grasps state both pregrasp and squeeze."""
         return torch.stack([self.pregrasp_joints, self.squeeze_joints]).isfinite().all(-1).all(0)
-
-    @property
-    def tried(self) -> Bool[Tensor, " n"]:
-        """Former name of `evaluated`."""
-        return self.evaluated
 
     @staticmethod
     def concatenate(batches: Sequence[GraspBatch]) -> GraspBatch:

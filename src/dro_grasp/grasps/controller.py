@@ -53,7 +53,7 @@ def pregrasp_and_squeeze(
     moves = hand.movable & ~hand.abduction & (slope.abs() > config.dead_zone)
     # The pregrasp opens as far as the hand opens; a grasp that is beyond already opens no farther.
     lower = torch.maximum(torch.minimum(hand.lower, joints), hand.tree.lower)
-    upper = torch.minimum(torch.maximum(hand.upper, joints), hand.tree.upper)
+    upper = hand.upper.clamp(joints, hand.tree.upper)
     away = torch.where(slope > 0, upper, lower)
     towards = torch.where(slope > 0, lower, upper)
     outer = torch.where(moves, joints + config.outer * (away - joints), joints)

@@ -11,15 +11,13 @@ from dro_grasp.grasps.columns import NOT_EVALUATED, REASON
 
 ROWS = 10
 """Most grasps in the HTML table (ours)."""
-LARGEST_SCORE = 50.0
-"""Log-odds beyond which a grasp is certain to hold, or to fail (ours)."""
 NAMES = 3
 """Most objects that are named (ours)."""
 
 
-def percent(score: float) -> str | None:
-    """The probability of holding that a score states, which is its log-odds; None without a score."""
-    return None if math.isnan(score) else f"{100 / (1 + math.exp(-min(max(score, -LARGEST_SCORE), LARGEST_SCORE))):.0f} %"
+def percent(confidence: float) -> str | None:
+    """A probability for people; None for NaN, which is unknown."""
+    return None if math.isnan(confidence) else f"{100 * confidence:.0f} %"
 
 
 def sentence(grasps: Any) -> str:

@@ -111,4 +111,4 @@ def _independent(
     matrix = rows.T @ rows + RIDGE * torch.eye(tree.n_dof, dtype=q.dtype, device=q.device)
     right = (x - tree.offset)[..., known] @ rows + RIDGE * q
     fitted = torch.linalg.solve(matrix, right[..., None])[..., 0]
-    return torch.minimum(torch.maximum(fitted, tree.lower), tree.upper)
+    return fitted.clamp(tree.lower, tree.upper)

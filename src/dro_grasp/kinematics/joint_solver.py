@@ -162,9 +162,9 @@ def solve_joints(
     low, high = (torch.where(movable, limit.double(), q) for limit in (tree.lower, tree.upper))
     problem = _problem(tree.double, targets, low, high)
     T = T_world_wrist.reshape(-1, 4, 4).double()
-    final = _iterate(problem, _state(problem, T, torch.minimum(torch.maximum(q, low), high), config), config)
+    final = _iterate(problem, _state(problem, T, q.clamp(low, high), config), config)
     # Rounding to single precision may step over a limit by half a unit: clamp once more.
-    joints = torch.minimum(torch.maximum(final.joints.to(dtype), low.to(dtype)), high.to(dtype))
+    joints = final.joints.to(dtype).clamp(low.to(dtype), high.to(dtype))
     # Repeated products leave rounding errors in the rotation: make it orthonormal again.
     T = compose(roma.special_gramschmidt(final.T_world_wrist[:, :3, :2]), final.T_world_wrist[:, :3, 3])
     return JointSolution(
@@ -204,7 +204,7 @@ def _advance(problem: _Problem, state: _State, config: JointSolverConfig) -> tup
     damping = state.damping * (weight * config.damping_length**2)
     step = best_step(state.jacobian, state.residual, low, high, damping, state.sharpness, config.step)
     T, q = _move(state, step)
-    q = torch.minimum(torch.maximum(q, problem.lower), problem.upper)
+    q = q.clamp(problem.lower, problem.upper)
     proposed = _state(problem, T, q, config)
     better = proposed.cost <= state.cost
     change = step.abs().amax(-1)

@@ -119,7 +119,7 @@ def _minimum_in_box(quadratic: _Quadratic, passes: int) -> Float[Tensor, "b p"]:
             break
         again = _pass(quadratic.rows(rows), at_lower[rows], at_upper[rows])
         step[rows], at_lower[rows], at_upper[rows], changed[rows] = again
-    return torch.minimum(torch.maximum(step, lower), upper)
+    return step.clamp(lower, upper)
 
 
 def _pass(

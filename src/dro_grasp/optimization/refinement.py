@@ -101,7 +101,7 @@ def _descend(
             config.largest_turn)
         # `bend` has unit length over all joints: scaled so that the root mean square step of a joint is joint_step.
         new_q = q + pace * config.joint_step * len(unit) ** 0.5 * bend * unit
-        new_q = torch.minimum(torch.maximum(new_q, lower), upper)
+        new_q = new_q.clamp(lower, upper)
         new_T = turned_about(start, pivot, new_move, new_turn)
         new_contacts = energy.nearest_contacts(new_T, new_q, config.reach)
         new = energy(new_T, new_q, new_contacts)

@@ -68,7 +68,7 @@ def start_joints(hand: Hand, n: int, config: StartConfig, generator: torch.Gener
     q = opened * share + closed * (1 - share)
     span = hand.upper - hand.lower
     q = q + config.joint_noise * span * torch.randn(n, hand.tree.n_dof, generator=generator)
-    q = torch.minimum(torch.maximum(q, hand.lower), hand.upper)
+    q = q.clamp(hand.lower, hand.upper)
     return torch.where(hand.movable, q, hand.rest)
 
 

@@ -16,6 +16,7 @@ from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.geometry.se3 import turned_about
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import DEPTH, ENERGY_TERM
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.starts import StartConfig, starts
@@ -132,7 +133,7 @@ def synthesize_with(
             progress(begin + size, num)
     T, q, terms, totals, depths = (torch.cat(part) for part in zip(*parts, strict=True))
     T[:, :3, :3] = torch.as_tensor(roma.special_procrustes(T[:, :3, :3]))
-    columns = {"depth": depths} | {f"energy_{name}": terms[:, i] for i, name in enumerate(TERMS)}
+    columns = {DEPTH: depths} | {f"{ENERGY_TERM}{name}": terms[:, i] for i, name in enumerate(TERMS)}
     batch = GraspBatch.create(hand, obj, T, q, energy=totals, seed=seed, provenance=PROVENANCE, extra=columns)
     return batch.sorted_by_energy()
 
@@ -185,7 +186,7 @@ def propose(
     T = turned_about(state.T, energy.pivot(state.T), config.translation_step * move, config.rotation_step * turn)
     hand = energy.hand
     step = config.joint_step * hand.tree.joint_unit
-    q = torch.minimum(torch.maximum(state.q + step * bend, hand.lower), hand.upper)
+    q = (state.q + step * bend).clamp(hand.lower, hand.upper)
     contacts = switched(energy, state, config.switch, generator)
     return State(T, q, contacts, state.slots, energy(T, q, contacts))
 

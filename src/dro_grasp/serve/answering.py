@@ -21,6 +21,7 @@ from dro_grasp.errors import DroGraspError, HandError, ObjectError, OptionError
 from dro_grasp.files import given_path
 from dro_grasp.frames import is_name, motion_fault
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import REASON
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import hand_names, load_hand
 from dro_grasp.objects.catalogue import load_object, object_names, resolve_objects
@@ -257,7 +258,7 @@ def sent_grasps(grasps: GraspBatch, made: Prediction) -> list[SentGrasp]:
     """The grasps of a batch one by one."""
     rows = zip(grasps.wrist_position.tolist(), grasps.wrist_quaternion_wxyz.tolist(), grasps.joints.tolist(),
                grasps.pregrasp_joints.tolist(), grasps.squeeze_joints.tolist(), grasps.score.tolist(), made.origin, strict=True)
-    reasons = grasps.extra.get("reason") or [None] * len(grasps)
+    reasons = grasps.extra.get(REASON) or [None] * len(grasps)
     return [
         SentGrasp(
             wrist_position=tuple(position), wrist_quaternion_wxyz=tuple(quaternion), joints=joints, pregrasp_joints=pregrasp,

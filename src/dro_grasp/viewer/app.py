@@ -109,7 +109,7 @@ def describe(grasps: GraspBatch, index: int) -> str:
         lines.append(f"**{outcome}** under {grasps.protocol[index]}{f': {why}' if why else ''}")
     else:
         lines.append("not evaluated")
-    values = {"confidence": (grasps.score.sigmoid(), 100.0, " %"), "energy": (grasps.energy, 1.0, ""),
+    values = {"confidence": (grasps.confidence, 100.0, " %"), "energy": (grasps.energy, 1.0, ""),
               "displacement": (grasps.displacement, 1e3, " mm"), "rotation": (grasps.rotation, 180 / np.pi, "°"),
               "penetration": (grasps.penetration, 1e3, " mm"), "robustness": (grasps.robustness, 100.0, " %")}
     for name, (column, factor, unit) in values.items():

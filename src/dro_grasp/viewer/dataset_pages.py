@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from dro_grasp.evaluation.coverage import ROLL_BINS, HandCoverage, PairCoverage, grasp_sizes, wrist_rolls
 from dro_grasp.files import check_output
 from dro_grasp.frames import HALF_AXES
+from dro_grasp.grasps.columns import ENERGY_TERM
 from dro_grasp.grasps.sources import object_of
 from dro_grasp.viewer.page import ShadedCount, image, table, write_page
 from dro_grasp.viewer.pictures import caption, contact_sheet, draw_grasp
@@ -99,7 +100,7 @@ def _directions(axes: Axes, hand: HandCoverage) -> None:
 
 
 def _energies(axes: Axes, hand: HandCoverage) -> None:
-    terms = {k.removeprefix("energy_"): v for k, v in hand.grasps.extra.items() if k.startswith("energy_")}
+    terms = {k.removeprefix(ENERGY_TERM): v for k, v in hand.grasps.extra.items() if k.startswith(ENERGY_TERM)}
     if not terms:
         axes.text(0.5, 0.5, "energies not recorded", ha="center", transform=axes.transAxes)
         return

@@ -208,7 +208,7 @@ def outcome(grasps: GraspBatch, index: int) -> bool | None:
 def caption(grasps: GraspBatch, index: int) -> tuple[str, bool | None]:
     """The caption of a picture, and the trial outcome that gives its colour."""
     words = {True: "success", False: "failed", None: "not evaluated"}[outcome(grasps, index)]
-    confidence, energy = percent(float(grasps.score[index])), float(grasps.energy[index])
+    confidence, energy = percent(float(grasps.confidence[index])), float(grasps.energy[index])
     numbers = "" if confidence is None else f"   confidence {confidence}"
     numbers += f"   energy {energy:.2f}" if math.isfinite(energy) else ""
     return f"{index}   {words}{numbers}", outcome(grasps, index)

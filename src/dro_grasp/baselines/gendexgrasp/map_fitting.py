@@ -112,7 +112,7 @@ def _descend(
             optimiser.zero_grad()
             energy.sum().backward()
             optimiser.step()
-    return T.detach(), torch.minimum(torch.maximum(q.detach(), hand.lower), hand.upper), energy.detach()
+    return T.detach(), q.detach().clamp(hand.lower, hand.upper), energy.detach()
 
 
 def map_energy(

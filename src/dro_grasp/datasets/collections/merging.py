@@ -22,6 +22,7 @@ from dro_grasp.geometry.rotations import roma
 from dro_grasp.geometry.se3 import compose
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.codec import encode
+from dro_grasp.grasps.columns import FAILURE, REASON
 from dro_grasp.grasps.duplicates import distinct
 from dro_grasp.grasps.sources import hand_of
 from dro_grasp.grasps.table import table_bytes
@@ -34,10 +35,10 @@ ANGLE_STEP = 2.0**-13
 UNIT_STEP = 2.0**-15
 """Grid of quaternions in merged files. Ours: 0.03 mrad."""
 MANTISSA = 10
-"""Bits of the mantissa of all other numbers in merged files. Ours: three digits."""
+"""Bits of the mantissa of scores, energies, what trials measure, and further columns. Ours: three digits."""
 FILE_BYTES = 100_000_000
 """Size of a merged file from which on the next object goes into another [bytes] (ours)."""
-PLAIN_COLUMNS = ("reason", "failure")
+PLAIN_COLUMNS = (REASON, FAILURE)
 """Columns that are empty for successes."""
 
 
@@ -191,7 +192,7 @@ def compact(hand: Hand, grasps: GraspBatch) -> GraspBatch:
     rotation = roma.unitquat_to_rotmat(quaternion / quaternion.norm(dim=-1, keepdim=True))
     T = compose(rotation, _on_grid(grasps.T_object_wrist[:, :3, 3], POSITION_STEP))
     joints = _on_grid(grasps.joints, ANGLE_STEP)
-    joints = torch.minimum(torch.maximum(joints, hand.tree.lower), hand.tree.upper)
+    joints = joints.clamp(hand.tree.lower, hand.tree.upper)
     extra = {
         name: _short(value) if isinstance(value, Tensor) and value.is_floating_point() else value
         for name, value in grasps.extra.items() if name not in PLAIN_COLUMNS

@@ -14,6 +14,7 @@ from dro_grasp.datasets.bundle.training_file import split_of
 from dro_grasp.datasets.engine.shards import Shard, Yield, notes_of
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import DEPTH
 from dro_grasp.grasps.duplicates import distinct
 from dro_grasp.grasps.sources import with_sources
 from dro_grasp.hands.hand import Hand
@@ -150,7 +151,7 @@ def valid_grasps(
     count = candidates or config.candidates
     drawn = synthesize(hand, obj, count, seed, config.synthesis)
     ranked = drawn[0 : max(1, round(config.trial_share * count))]
-    grasps = ranked[ranked.extra["depth"] < config.max_penetration]
+    grasps = ranked[ranked.extra[DEPTH] < config.max_penetration]
     made = Yield(candidates=count, ranked_out=count - len(ranked), deep=len(ranked) - len(grasps))
     if config.settle and len(grasps):
         closed = settle(hand, obj, grasps, config.protocol, workers=1)
