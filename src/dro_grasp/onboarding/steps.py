@@ -28,7 +28,7 @@ from dro_grasp.models.checkpoints import DEFAULT, history_of, load_weights, loca
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.optimization.synthesis import SynthesisConfig
 from dro_grasp.predictor import GraspPredictor
-from dro_grasp.simulation.protocols import protocol
+from dro_grasp.simulation.protocols import PROTOCOLS, protocol
 from dro_grasp.training.config import ScheduleConfig, TrainConfig
 from dro_grasp.training.loop import train
 
@@ -46,7 +46,7 @@ DATA_SHARE = 0.45
 """Share of the time for synthesis (ours); what the shares leave is for the benchmarks before and after."""
 TRAINING_SHARE = 0.40
 """Share of the time for fine-tuning (ours)."""
-STRICT = "strict/1"
+STRICT = PROTOCOLS["strict"].label
 """Protocol by which fine-tuning is judged."""
 MOST_GRASPS = 400
 """Grasps of an object beyond which time is better spent on training (ours)."""

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dro_grasp.energy.grasp_energy import EnergyConfig
 from dro_grasp.energy.surroundings import Surroundings
 from dro_grasp.geometry.balls import Ball, Balls
 from dro_grasp.geometry.distance_field import DistanceField
@@ -19,8 +20,8 @@ from dro_grasp.hands.hand import Hand
 
 Direction = tuple[float, float, float]
 """A vector in the object's frame, of any length but zero."""
-CLEAR = 0.005
-"""Distance from its surroundings at which a hand starts [m] (ours)."""
+CLEAR = EnergyConfig.clear
+"""Distance from its surroundings at which a hand starts [m]: the one that it keeps later."""
 LARGEST_TILT = math.radians(60.0)
 """How far palms tilt from the wanted direction towards a plane, where the hand needs room [rad] (ours)."""
 TILT_COST = 0.03

@@ -12,6 +12,7 @@ from torch import Tensor
 from dro_grasp.energy.surroundings import Surroundings
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.anatomy import PALM
+from dro_grasp.optimization.grip import GripConfig
 from dro_grasp.optimization.starts import APPROACH, angle_to_arc
 from dro_grasp.pipeline.problem import GraspProblem
 
@@ -23,8 +24,8 @@ TOUCH = 0.003
 """Distance at which a hand touches the object [m] (ours): refined grasps keep 1 mm off it."""
 FEWEST_FINGERS = 2
 """Fingers that touch the place to hold, at least (ours)."""
-REACH = 0.006
-"""Distance up to which they count as touching [m], as where forces are balanced (ours)."""
+REACH = GripConfig.reach
+"""Distance up to which they count as touching [m]: as where forces are balanced."""
 WAYPOINTS = 9
 """Places on the approach at which the hand is checked, both ends included (ours)."""
 OPENINGS = 9

@@ -24,7 +24,7 @@ from dro_grasp.planning.table_scene import PickedObject
 from dro_grasp.planning.tabletop import TabletopRun
 from dro_grasp.predictor import GraspPredictor
 from dro_grasp.rendering.camera import Camera
-from dro_grasp.rendering.meshes import Colour, Mesh
+from dro_grasp.rendering.meshes import OBJECT_COLOUR, Colour, Mesh
 from dro_grasp.rendering.rasterizer import render
 
 FORMATS = {".gif": "GIF", ".webp": "WEBP"}
@@ -35,8 +35,6 @@ SIZE = (480, 360)
 """Width and height [pixels]."""
 VIEW = (0.9, -1.25, 0.75)
 """Direction from the robot towards the camera, in the world."""
-OBJECT_COLOUR: Colour = (0.95, 0.62, 0.28)
-"""Orange of the object."""
 OTHER_COLOUR: Colour = (0.62, 0.68, 0.55)
 """Green of other objects on the table."""
 LAST_SECONDS = 1.0

@@ -20,7 +20,7 @@ from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.planning.clutter import MOST_CLUTTER, Region, other_objects, scatter
 from dro_grasp.planning.depth_images import depth_image, thinned_intrinsics
 from dro_grasp.planning.motion import STAGES, MotionPlan
-from dro_grasp.planning.physics import LiftScene
+from dro_grasp.planning.physics import TICK, LiftScene
 from dro_grasp.planning.plan_config import PlanConfig
 from dro_grasp.planning.planner import plan
 from dro_grasp.planning.reachability import ReachConfig
@@ -37,6 +37,8 @@ PUSHED = 0.03
 """Farthest that the object may move before the hand closes [m] (ours)."""
 SLIPPED = 0.05
 """Farthest that it may move in the hand after the lift [m] (ours)."""
+STAYED = 0.02
+"""An object that the lift raised less than this stayed where it was [m] (ours)."""
 SHAKE_FREQUENCY = 1.5
 """[1/s] (ours)"""
 SHAKE_ANGLE = 0.04
@@ -229,19 +231,19 @@ def carry_out(scene: LiftScene, made: MotionPlan, config: TabletopConfig, watch:
             return stage, f"the hand pushed the object by {100 * moved:.1f} cm before it closed"
     lifted = float(scene.pose(0)[2, 3] - start[2, 3])
     if lifted < config.plan.reach.lift / 2:
-        return "lift", "the object stayed on the table" if lifted < 0.02 else "the object fell during the lift"
-    grip = np.linalg.inv(scene.wrist()) @ scene.pose(0)
+        return "lift", "the object stayed on the table" if lifted < STAYED else "the object fell during the lift"
+    grip = scene.in_hand(0)
     arm, hand = made.arm.position[-1], made.hand.position[-1]
     for stage, seconds in (("hold", config.hold_seconds), ("shake", config.shake_seconds)):
-        for k in range(round(seconds / 0.02)):
+        for k in range(round(seconds / TICK)):
             target, velocity = arm.copy(), np.zeros_like(arm)
             if stage == "shake":
                 phase = 2 * np.pi * SHAKE_FREQUENCY
-                target[0] += SHAKE_ANGLE * np.sin(phase * 0.02 * k)
-                velocity[0] = SHAKE_ANGLE * phase * np.cos(phase * 0.02 * k)
+                target[0] += SHAKE_ANGLE * np.sin(phase * TICK * k)
+                velocity[0] = SHAKE_ANGLE * phase * np.cos(phase * TICK * k)
             scene.command(target, velocity, hand)
-            scene.advance(0.02, call)
-        slip = _apart(np.linalg.inv(scene.wrist()) @ scene.pose(0), grip)
+            scene.advance(TICK, call)
+        slip = _apart(scene.in_hand(0), grip)
         if slip > SLIPPED or not scene.touched(0):
             return stage, f"the object slipped by {100 * slip:.0f} cm out of the hand"
     return "done", ""

@@ -26,6 +26,8 @@ LIFT_PROTOCOL = replace(PROTOCOLS["dro"], name="tabletop", timestep=0.002, force
 """Contacts and servos of the hand: friction 1, density 500 kg/m^3 and the servos' gains as in trials; at most 3 Nm (ours).
 
 Without the solver against slip, held objects creep out of soft contacts; DexGraspBench has two of its iterations."""
+TICK = 0.02
+"""Time between targets of the servos [s] (ours)."""
 STIFFNESS_PER_EFFORT = 40.0
 """Gain of an arm's servo for each Nm that it can exert [1/rad]: full torque at an error of 1.4 degrees (ours)."""
 DAMPING_TIME = 0.03
@@ -117,6 +119,10 @@ class LiftScene:
         body, T = self.data.body(PREFIX + self.robot.hand.wrist_link), np.eye(4)
         T[:3, :3], T[:3, 3] = body.xmat.reshape(3, 3), body.xpos
         return T
+
+    def in_hand(self, index: int) -> Float[np.ndarray, "4 4"]:
+        """Where an object really is in the frame of the hand's root link [m]."""
+        return np.linalg.inv(self.wrist()) @ self.pose(index)
 
     def joints(self) -> tuple[Float[np.ndarray, " n_arm"], Float[np.ndarray, " n_dof"]]:
         """Where arm and hand really are, in independent joints [rad or m]."""

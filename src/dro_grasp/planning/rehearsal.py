@@ -13,14 +13,12 @@ import numpy as np
 from jaxtyping import Float
 
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.planning.physics import LIFT_PROTOCOL, LiftScene
+from dro_grasp.planning.physics import LIFT_PROTOCOL, TICK, LiftScene
 from dro_grasp.planning.reachability import Feasible, Postures
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.standing import moved
 from dro_grasp.planning.timed_stages import closing
 
-TICK = 0.02
-"""Time between targets of the servos [s] (ours)."""
 TIME_STEP = 0.004
 """Time step of the simulation [s] (ours)."""
 APPROACH = 0.03
@@ -102,11 +100,11 @@ class Rehearsal:
             return False
         rows = self._within(goal.lift, HEIGHT)
         self._follow(rows, hand.squeeze[None], LIFT_SECONDS)
-        risen, grip = scene.pose(0)[2, 3] - start[2, 3], np.linalg.inv(scene.wrist()) @ scene.pose(0)
+        risen, grip = scene.pose(0)[2, 3] - start[2, 3], scene.in_hand(0)
         if risen < RISEN * self._lengths(rows)[-1]:
             return False
         self._follow(rows[-1:], hand.squeeze[None], HOLD_SECONDS)
-        slip = np.linalg.norm((np.linalg.inv(scene.wrist()) @ scene.pose(0) - grip)[:3, 3])
+        slip = np.linalg.norm((scene.in_hand(0) - grip)[:3, 3])
         return bool(slip < SLIPPED) and scene.touched(0) >= FEWEST_LINKS
 
     def _within(self, rows: Float[np.ndarray, "k n_arm"], length: float) -> Float[np.ndarray, "m n_arm"]:

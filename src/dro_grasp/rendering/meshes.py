@@ -9,6 +9,8 @@ from jaxtyping import Float, Int, Num
 
 Colour = tuple[float, float, float]
 """Red, green, blue between 0 and 1."""
+OBJECT_COLOUR: Colour = (0.95, 0.62, 0.28)
+"""Orange of objects that are grasped."""
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,9 @@ from dro_grasp.geometry.contact_forces import friction_cone, nonnegative_least_s
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.simulation.outcome import FORCES
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
-from dro_grasp.simulation.rollout import FORCES, Rollout, quiet, rollouts, scene_of
+from dro_grasp.simulation.rollout import Rollout, quiet, rollouts, scene_of
 
 CONTACTS = 16
 """Most contacts of a grasp that are weighed, those that press hardest (ours)."""

@@ -16,8 +16,10 @@ from torch import Tensor
 from dro_grasp.simulation.contacts import Penetration
 from dro_grasp.simulation.protocols import Protocol
 
+FORCES = np.concatenate([np.eye(3), -np.eye(3)])
+"""Directions of the forces, in the object's frame."""
 DIRECTIONS = ("+x", "+y", "+z", "-x", "-y", "-z")
-"""Order of the forces, in the object's frame."""
+"""Their names, in the same order."""
 GIVE_UP = 0.1
 """An object that moves this far counts as lost [m]. Ours."""
 

@@ -19,13 +19,11 @@ from dro_grasp.grasps.controller import completed
 from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.simulation.outcome import GIVE_UP
+from dro_grasp.simulation.outcome import FORCES, GIVE_UP
 from dro_grasp.simulation.perturbation import Conditions
 from dro_grasp.simulation.protocols import Protocol, protocol as find_protocol
 from dro_grasp.simulation.scene import Scene, cached_scene, object_mass
 
-FORCES = np.concatenate([np.eye(3), -np.eye(3)])
-"""Directions of the forces, in the object's frame."""
 RAMP = 10
 """Number of stages in which a gradual protocol moves the servos' targets from one posture to the next. Ours."""
 CHUNK = 64

@@ -16,10 +16,8 @@ from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.rendering.camera import Camera
-from dro_grasp.rendering.meshes import Colour, Mesh, dots
+from dro_grasp.rendering.meshes import OBJECT_COLOUR, Colour, Mesh, dots
 
-OBJECT_COLOUR: Colour = (0.95, 0.62, 0.28)
-"""Orange of the object."""
 PALM_COLOUR: Colour = (0.58, 0.62, 0.69)
 """Grey of links that belong to no finger."""
 PREDICTED_COLOUR: Colour = (0.85, 0.20, 0.55)

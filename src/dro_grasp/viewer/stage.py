@@ -18,7 +18,7 @@ from dro_grasp.errors import OptionError
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.rendering.camera import Camera
-from dro_grasp.rendering.meshes import Colour
+from dro_grasp.rendering.meshes import OBJECT_COLOUR, Colour
 from dro_grasp.viewer import appearance
 from dro_grasp.viewer.guard import guarded_server
 
@@ -79,7 +79,7 @@ class Stage:
         self.hand = hand
         self._object = scene.add_frame(f"{name}/object", show_axes=False)
         for i, mesh in enumerate(appearance.object_meshes(obj)):
-            colour = rgb(appearance.OBJECT_COLOUR)
+            colour = rgb(OBJECT_COLOUR)
             scene.add_mesh_simple(f"{name}/object/{i}", mesh.vertices, mesh.faces, color=colour, side="double")
         colours = appearance.link_colours(hand)
         self.links = [scene.add_frame(f"{name}/hand/{i}", show_axes=False) for i in range(hand.tree.n_links)]

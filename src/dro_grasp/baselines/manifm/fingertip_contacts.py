@@ -13,8 +13,8 @@ from dro_grasp.energy.nearest_points import NearestPoints
 from dro_grasp.hands.hand import Hand
 from dro_grasp.optimization.grip import GripConfig, contact_forces
 
-REACH = 0.006
-"""Fingers nearer than this to the object are taken to touch it [m]; as where squeezes are made (ours)."""
+REACH = GripConfig.reach
+"""Fingers nearer than this to the object are taken to touch it [m]: as where squeezes are made."""
 WIDTH = 0.01
 """Standard deviation of the heat around a contact [m] (ours)."""
 

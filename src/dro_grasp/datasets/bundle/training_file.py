@@ -33,6 +33,8 @@ Tensors = dict[str, Shaped[Tensor, "..."]]
 """The tensors of a file by key."""
 FORMAT_VERSION = 1
 """Version of the bundle file that this code writes and reads."""
+HEADER = "dro_grasp_bundle"
+"""Key of the file's metadata that describes its content."""
 MAX_BYTES = 25_000_000
 """Largest bundle [bytes]. Ours: a repository takes it as it is."""
 HELD_OUT_HANDS = frozenset(f"assets/{name}" for name in ("inspire", "ability", "dclaw", "orca", "ezgripper"))
@@ -162,7 +164,7 @@ def write_bundle(
         raise BundleError(f"the bundle would have {size / 1e6:.1f} MB, at most {MAX_BYTES / 1e6:.0f} MB are allowed; take "
                           "fewer objects or fewer grasps a pair (--per-pair)")
     with replacing(Path(path)) as temporary:
-        save_file(tensors, temporary, metadata={"dro_grasp_bundle": json.dumps(header)})
+        save_file(tensors, temporary, metadata={HEADER: json.dumps(header)})
     return load_bundle(path)
 
 
@@ -177,7 +179,7 @@ def load_bundle(path: Path | str) -> Bundle:
         raise BundleError(f"no bundle at {path}; make one with `dro-grasp dataset bundle`")
     with reading(path, BundleError, "a bundle that is not cut short; make it again with `dro-grasp dataset bundle`"):
         with safe_open(path, "pt") as file:
-            header = json.loads((file.metadata() or {}).get("dro_grasp_bundle", "null"))
+            header = json.loads((file.metadata() or {}).get(HEADER, "null"))
             tensors = {key: file.get_tensor(key) for key in file.keys()}
         if not isinstance(header, dict):
             raise BundleError(f"{path} is a safetensors file but no bundle; make one with `dro-grasp dataset bundle`")
