@@ -128,9 +128,11 @@ def replacing(path: Path, what: str = "") -> Iterator[Path]:
     temporary: Path | None = None
     try:
         unused = path.absolute().parent / f".{path.name}{secrets.token_hex(4)}.part"
-        os.close(os.open(unused, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))  # less what the user's umask takes
-        temporary = unused
+        handle = os.open(unused, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)  # less what the user's umask takes
+        temporary, mode = unused, os.fstat(handle).st_mode
+        os.close(handle)
         yield temporary
+        os.chmod(temporary, mode)  # a library may have put a new file there
         os.replace(temporary, path)
     except (OSError, SafetensorError) as error:
         reason = getattr(error, "strerror", None) or error
