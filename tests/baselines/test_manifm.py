@@ -11,9 +11,9 @@ import torch
 
 from dro_grasp.baselines.bundle_draws import BundleDraws
 from dro_grasp.baselines.manifm import contact_training
-from dro_grasp.baselines.manifm.contact_method import ReachConfig, reached
+from dro_grasp.baselines.manifm.contact_method import ContactMethodConfig, reached
 from dro_grasp.baselines.manifm.contact_network import LATENT, ContactNetwork
-from dro_grasp.baselines.manifm.contact_training import ContactTrainingConfig, contact_losses, draw_contacts, open_hand
+from dro_grasp.baselines.manifm.contact_training import ContactTrainingConfig, contact_losses, draw_contacts, open_hand_cloud
 from dro_grasp.baselines.manifm.fingertip_contacts import REACH, WIDTH, Pads, contact_maps, contacts_of
 from dro_grasp.baselines.registry import make_method
 from dro_grasp.cli.main import main
@@ -77,7 +77,7 @@ def test_a_hand_reaches_the_contacts_of_a_known_posture_in_any_order() -> None:
     spots = apply(poses, pads.points)
     normals = -(poses[..., :3, :3] @ pads.normals[..., None])[..., 0]
     order = torch.tensor([2, 0, 1])
-    config = dataclasses.replace(ReachConfig(), depth=0.0)
+    config = dataclasses.replace(ContactMethodConfig(), depth=0.0)
     found, joints = reached(problem, pads, spots[:, order], normals[:, order], config)
     placed = apply(found[:, None] @ HAND.tree.forward(joints)[:, pads.links], pads.points)
     assert float(torch.cdist(spots[0], placed[0]).amin(1).max()) < 5e-4
@@ -86,7 +86,7 @@ def test_a_hand_reaches_the_contacts_of_a_known_posture_in_any_order() -> None:
 def test_losses_fall(bundle) -> None:
     obj, told, true = draw_contacts(BundleDraws(bundle, SMALL.hand_points), SMALL, torch.Generator().manual_seed(0))
     assert obj.shape == (4, 24, 6)
-    assert torch.equal(told[0], open_hand(HAND.with_points(48)))
+    assert torch.equal(told[0], open_hand_cloud(HAND.with_points(48)))
     torch.manual_seed(0)
     network, noise = ContactNetwork(), torch.randn(4, LATENT)
     optimiser = torch.optim.Adam(network.parameters(), 3e-3)

@@ -18,7 +18,7 @@ from dro_grasp.planning.physics import MEMORY, LiftScene
 from dro_grasp.planning.plan_config import PlanConfig
 from dro_grasp.planning.planner import LOSES, plan
 from dro_grasp.planning.reachability import Feasible, Postures
-from dro_grasp.planning.rehearsal import CONDITIONS, Rehearsal
+from dro_grasp.planning.rehearsal import DEVIATIONS, Rehearsal
 from tests.helpers.claw import claw_xml
 from tests.helpers.clouds import cloud_of
 
@@ -94,7 +94,7 @@ def test_the_chosen_grasp_holds_and_one_that_never_closes_does_not(
     assert planned.notes.seconds["rehearsal"] > 0
     for distance in (0.005, 0.02):  # between the poses that were solved; nothing depends on it
         line = replace(chosen, approach=evenly(robot, chosen.approach, distance), lift=evenly(robot, chosen.lift, distance))
-        assert rehearsal.holds(line, postures, CONDITIONS[0])
+        assert rehearsal.holds(line, postures, DEVIATIONS[0])
     seen, scene = [], rehearsal.scene
     monkeypatch.setattr(rehearsal_module, "FEW_CONTACTS", 12)
     honest = scene.advance
@@ -104,7 +104,7 @@ def test_the_chosen_grasp_holds_and_one_that_never_closes_does_not(
         honest(*arguments, **options)
 
     monkeypatch.setattr(scene, "advance", advance)
-    rehearsal.holds(chosen, postures, CONDITIONS[0])
+    rehearsal.holds(chosen, postures, DEVIATIONS[0])
     assert set(seen) == {(False, False), (True, True)}  # many contacts cost no more than in proportion
 
 
@@ -114,5 +114,5 @@ def test_where_none_holds_the_best_score_is_taken_all_the_same(
     monkeypatch.setattr(Rehearsal, "holds", lambda *_: False)
     made = plan(robot, ball, grasps=grasps)
     assert made.notes.chosen == plan(robot, ball, config=PlanConfig(rehearsals=0), grasps=grasps).notes.chosen
-    monkeypatch.setattr(Rehearsal, "holds", lambda *a: a[-1] is not CONDITIONS[1])
+    monkeypatch.setattr(Rehearsal, "holds", lambda *a: a[-1] is not DEVIATIONS[1])
     assert LOSES not in plan(robot, ball, grasps=grasps).notes.dropped

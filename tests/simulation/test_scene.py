@@ -14,7 +14,7 @@ from dro_grasp.hands.library import ASSET_FILES, load_hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.contacts import measure_penetration
 from dro_grasp.simulation.protocols import protocol
-from dro_grasp.simulation.scene import CACHED_SCENES, Scene, attach, build_scene, cached_scene
+from dro_grasp.simulation.scene import CACHED_SCENES, TrialScene, attach, build_scene, cached_scene
 from tests.helpers.claw import ball, claw, grasps_of, wrist_below
 from tests.helpers.loaded_hands import loaded_hand
 
@@ -31,7 +31,7 @@ def hand(tmp_path_factory: pytest.TempPathFactory) -> Hand:
 
 
 @pytest.fixture(scope="module")
-def scene(hand: Hand) -> Scene:
+def scene(hand: Hand) -> TrialScene:
     return build_scene(hand, ball(), protocol("dro"))
 
 
@@ -133,7 +133,7 @@ def test_a_hand_without_description_has_no_scene(hand):
         build_scene(replace(hand, description=None), ball(), protocol("dro"))
 
 
-def touched(scene: Scene, hand: Hand, q: torch.Tensor, place: torch.Tensor) -> set[str]:
+def touched(scene: TrialScene, hand: Hand, q: torch.Tensor, place: torch.Tensor) -> set[str]:
     """Links in contact with the object at a place in the wrist frame."""
     T = torch.eye(4)[None].clone()
     T[0, :3, 3] = -place

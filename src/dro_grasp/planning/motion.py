@@ -129,7 +129,7 @@ class MotionPlan:
         spans = ", ".join(f"{s} {np.ptp(self.arm.time[self.part(s)]):.1f} s" for s in STAGES)
         x, y, z = (row[3] for row in n.T_world_wrist[:3])
         return [
-            dropped_in_words(n.grasps, n.dropped) + f"; {n.goals} given to the planner",
+            grasps_and_dropped(n.grasps, n.dropped) + f"; {n.goals} given to the planner",
             f"grasp {n.chosen}, score {n.score:.2f}: wrist at ({x:.3f}, {y:.3f}, {z:.3f}) m in frame '{n.frame}'",
             f"motion of {self.seconds:.1f} s: {spans}",
             "planned in " + f"{sum(n.seconds.values()):.2f} s: " + ", ".join(f"{k} {v:.2f} s" for k, v in n.seconds.items()),
@@ -168,7 +168,7 @@ class MotionPlan:
             return MotionPlan(PlanNotes(**header), scene, stage, arm, hand)
 
 
-def dropped_in_words(grasps: int, dropped: dict[str, int]) -> str:
+def grasps_and_dropped(grasps: int, dropped: dict[str, int]) -> str:
     """How many grasps were dropped, and why."""
     reasons = ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count)
     return f"{grasps} grasps: {reasons or 'none dropped'}"

@@ -22,7 +22,7 @@ from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.planning.candidates import grasps_in_world
 from dro_grasp.planning.collisions import OBSTACLE, TARGET, CollisionChecker, open_hand
 from dro_grasp.planning.extra import require_arm_extra
-from dro_grasp.planning.motion import CHOSEN, READY, WAITING, MotionPlan, PlanNotes, PlanScene, dropped_in_words
+from dro_grasp.planning.motion import CHOSEN, READY, WAITING, MotionPlan, PlanNotes, PlanScene, grasps_and_dropped
 from dro_grasp.planning.plan_config import PlanConfig
 from dro_grasp.planning.reachability import Feasible, Postures, Reachability
 from dro_grasp.planning.rehearsal import Rehearsal
@@ -83,7 +83,7 @@ def plan(
         task.add(grasps)
         if (made := task.run(last=batch == batches - 1)) is not None:
             return made
-    raise PlanError(f"{dropped_in_words(len(task.grasps), task.dropped)}, and none is left for '{obj.name}'; {task.advice()}")
+    raise PlanError(f"{grasps_and_dropped(len(task.grasps), task.dropped)}, and none is left for '{obj.name}'; {task.advice()}")
 
 
 class _Task:

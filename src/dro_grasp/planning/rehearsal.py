@@ -48,7 +48,7 @@ has some 20."""
 
 
 @dataclass(frozen=True)
-class Condition:
+class Deviation:
     """What is different from what the planner thinks."""
 
     shift: tuple[float, float] = (0.0, 0.0)
@@ -59,9 +59,9 @@ class Condition:
     """Factor of the object's weight."""
 
 
-CONDITIONS = (Condition(), Condition((0.008, 0.0), 0.8, 1.3), Condition((-0.004, 0.007), 0.8, 1.3),
-              Condition((-0.004, -0.007), 0.8, 1.3))
-"""Conditions of the rehearsals of one grasp: as it is thought to be, then shifted, slippery and heavy.
+DEVIATIONS = (Deviation(), Deviation((0.008, 0.0), 0.8, 1.3), Deviation((-0.004, 0.007), 0.8, 1.3),
+              Deviation((-0.004, -0.007), 0.8, 1.3))
+"""Those of the rehearsals of one grasp: none, then shifted, slippery and heavy.
 
 Ours: on training objects, half of these shifts let two of 25 grasps pass that lose the true object, and these let none."""
 
@@ -80,16 +80,16 @@ class Rehearsal:
 
     def share(self, goal: Feasible, hand: Postures) -> float:
         """Share of the rehearsals in which the object is held; one that drops it where it is thought to be is the last."""
-        if not self.holds(goal, hand, CONDITIONS[0]):
+        if not self.holds(goal, hand, DEVIATIONS[0]):
             return 0.0
-        return (1 + sum(self.holds(goal, hand, condition) for condition in CONDITIONS[1:])) / len(CONDITIONS)
+        return (1 + sum(self.holds(goal, hand, deviation) for deviation in DEVIATIONS[1:])) / len(DEVIATIONS)
 
-    def holds(self, goal: Feasible, hand: Postures, condition: Condition) -> bool:
+    def holds(self, goal: Feasible, hand: Postures, deviation: Deviation) -> bool:
         """Approach, close, lift and hold once."""
         scene, start = self.scene, self.T_world_object.copy()
-        start[:2, 3] += condition.shift
-        scene.model.opt.gravity[:] = condition.weight * self._gravity
-        scene.model.geom_friction[:] = condition.friction * self._friction
+        start[:2, 3] += deviation.shift
+        scene.model.opt.gravity[:] = deviation.weight * self._gravity
+        scene.model.geom_friction[:] = deviation.friction * self._friction
         approach = self._within(goal.approach[::-1], APPROACH)[::-1]
         scene.begin(approach[0], hand.pregrasp)
         scene.place(0, start)

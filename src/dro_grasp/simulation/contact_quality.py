@@ -18,7 +18,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.force_closure import q1, wrench_error
 from dro_grasp.simulation.protocols import PROTOCOLS, Protocol, protocol as find_protocol
-from dro_grasp.simulation.scene import PREFIX, Scene, cached_scene
+from dro_grasp.simulation.scene import PREFIX, TrialScene, cached_scene
 
 REACH = 0.01
 """Largest distance that is measured between a finger and the object [m]. Source: DexGraspBench."""
@@ -101,7 +101,7 @@ class _Contacts:
     """From the first body to the second."""
 
 
-def _near_contacts(scene: Scene, grasps: GraspBatch) -> list[_Contacts]:
+def _near_contacts(scene: TrialScene, grasps: GraspBatch) -> list[_Contacts]:
     """Contacts of each grasp, those of hand and object up to REACH apart."""
     model = copy.copy(scene.model)
     model.geom_gap[model.geom_bodyid == scene.object_body] = REACH
@@ -114,7 +114,7 @@ def _near_contacts(scene: Scene, grasps: GraspBatch) -> list[_Contacts]:
     return found
 
 
-def _measured(scene: Scene, contacts: _Contacts) -> tuple[float, ...]:
+def _measured(scene: TrialScene, contacts: _Contacts) -> tuple[float, ...]:
     """The metrics of one grasp, in the order of NAMES."""
     hand, rules, obj = scene.hand, scene.protocol, scene.object_body
     on_object = (contacts.bodies == obj).any(1)

@@ -17,7 +17,7 @@ from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol, protocol as find_protocol
-from dro_grasp.simulation.scene import PREFIX, Scene, cached_scene
+from dro_grasp.simulation.scene import PREFIX, TrialScene, cached_scene
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Penetration:
         return Penetration(self.object[index], self.own[index])
 
 
-def measure_penetration(scene: Scene, grasps: GraspBatch) -> Penetration:
+def measure_penetration(scene: TrialScene, grasps: GraspBatch) -> Penetration:
     """Penetration of the collision shapes in the labelled pose, without any step of time."""
     depth, own = np.zeros(len(grasps)), np.zeros(len(grasps))
     for i, (bodies, distance) in enumerate(_contacts(scene, scene.qpos(grasps.T_object_wrist, grasps.joints))):
@@ -71,7 +71,7 @@ def deepest_penetration(
     return torch.as_tensor(np.maximum(found.object, found.own), dtype=torch.float32)
 
 
-def find_contact_links(scene: Scene, qpos: Float[np.ndarray, "n nq"]) -> tuple[tuple[str, ...], ...]:
+def find_contact_links(scene: TrialScene, qpos: Float[np.ndarray, "n nq"]) -> tuple[tuple[str, ...], ...]:
     """Names of the links that touch the object in each configuration, sorted."""
     names = [scene.model.body(i).name.removeprefix(PREFIX) for i in range(scene.model.nbody)]
     found = []
@@ -98,7 +98,7 @@ def count_fingers(hand: Hand, contact_links: Sequence[Sequence[str]]) -> Int[Ten
 
 
 def _contacts(
-    scene: Scene, qpos: Float[np.ndarray, "n nq"]
+    scene: TrialScene, qpos: Float[np.ndarray, "n nq"]
 ) -> Iterator[tuple[Int[np.ndarray, "k 2"], Float[np.ndarray, " k"]]]:
     """The two bodies and the distance [m] of each contact, one configuration after the other."""
     data = mujoco.MjData(scene.model)

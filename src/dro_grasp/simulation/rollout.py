@@ -22,7 +22,7 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.outcome import FORCES, GIVE_UP
 from dro_grasp.simulation.perturbation import Conditions
 from dro_grasp.simulation.protocols import Protocol, protocol as find_protocol
-from dro_grasp.simulation.scene import Scene, cached_scene, object_mass
+from dro_grasp.simulation.scene import TrialScene, cached_scene, object_mass
 
 RAMP = 10
 """Number of stages in which a gradual protocol moves the servos' targets from one posture to the next. Ours."""
@@ -63,12 +63,13 @@ class Rollout:
     """Trials of several grasps side by side; each hand waits at its start."""
 
     def __init__(
-        self, scene: Scene, grasps: GraspBatch, workers: int, stride: int | None = None, conditions: Conditions | None = None
+        self, scene: TrialScene, grasps: GraspBatch, workers: int, stride: int | None = None,
+        conditions: Conditions | None = None,
     ) -> None:
         """Place hands and objects.
 
         Args:
-            scene: Scene of the hand and the object.
+            scene: TrialScene of the hand and the object.
             grasps: At least one; each states its pregrasp and squeeze if the protocol closes the hand.
             workers: Threads.
             stride: Record a frame every so many time steps; None records nothing.
@@ -187,7 +188,7 @@ class Rollout:
                     self.frames.append(self.poses())
 
 
-def scene_of(hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol) -> Scene:
+def scene_of(hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol) -> TrialScene:
     """The scene in which the grasps are simulated."""
     require_pair(hand, obj)
     grasps.require_hand(hand)
@@ -195,7 +196,7 @@ def scene_of(hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | P
 
 
 def rollouts(
-    scene: Scene, hand: Hand, grasps: GraspBatch, workers: int | None, stride: int | None = None
+    scene: TrialScene, hand: Hand, grasps: GraspBatch, workers: int | None, stride: int | None = None
 ) -> Iterator[tuple[GraspBatch, Rollout]]:
     """The grasps in parts that are simulated together, with pregrasp and squeeze; each part's rollout at its start."""
     centre = torch.as_tensor(scene.obj.centre_of_mass)

@@ -37,7 +37,7 @@ CACHED_SCENES = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class TrialScene:
     """A compiled hand and object, and where to write a grasp."""
 
     model: mujoco.MjModel
@@ -93,7 +93,7 @@ class SceneKey:
     obj: ObjectModel = field(compare=False)
 
 
-def cached_scene(hand: Hand, obj: ObjectModel, protocol: Protocol) -> Scene:
+def cached_scene(hand: Hand, obj: ObjectModel, protocol: Protocol) -> TrialScene:
     """The scene of a pair; the process keeps the last few, least recently used first to go.
 
     Raises:
@@ -104,7 +104,7 @@ def cached_scene(hand: Hand, obj: ObjectModel, protocol: Protocol) -> Scene:
 
 
 @lru_cache(maxsize=CACHED_SCENES)
-def _build_once(key: SceneKey) -> Scene:
+def _build_once(key: SceneKey) -> TrialScene:
     return build_scene(key.hand, key.obj, key.protocol)
 
 
@@ -121,7 +121,7 @@ def require_simulable(hand: Hand, obj: ObjectModel) -> None:
         raise HandError(f"hand '{hand.name}' carries no description; load it by name or file to simulate it")
 
 
-def build_scene(hand: Hand, obj: ObjectModel, protocol: Protocol) -> Scene:
+def build_scene(hand: Hand, obj: ObjectModel, protocol: Protocol) -> TrialScene:
     """Put a hand and an object into one model; errors are those of `require_simulable`."""
     require_simulable(hand, obj)
     scene = _empty_scene(protocol)
@@ -131,7 +131,7 @@ def build_scene(hand: Hand, obj: ObjectModel, protocol: Protocol) -> Scene:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         _exclude_resting_contacts(scene, hand)
-        return Scene(scene.compile(), hand, obj, protocol)
+        return TrialScene(scene.compile(), hand, obj, protocol)
 
 
 def _empty_scene(protocol: Protocol) -> mujoco.MjSpec:

@@ -22,7 +22,7 @@ from dro_grasp.simulation.outcome import DIRECTIONS, GIVE_UP, Failure, Measureme
 from dro_grasp.simulation.perturbation import draw
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
 from dro_grasp.simulation.rollout import Rollout, rollouts, scene_of
-from dro_grasp.simulation.scene import Scene, cached_scene
+from dro_grasp.simulation.scene import TrialScene, cached_scene
 
 __all__ = ["DIRECTIONS", "Failure", "TrialResult", "record", "simulate"]
 
@@ -113,7 +113,7 @@ def _run(rollout: Rollout, penetration: Penetration) -> TrialResult:
 
 
 def _repeated(
-    scene: Scene, grasps: GraspBatch, first: TrialResult, penetration: Penetration, workers: int | None
+    scene: TrialScene, grasps: GraspBatch, first: TrialResult, penetration: Penetration, workers: int | None
 ) -> TrialResult:
     """The outcome with all trials of a protocol that perturbs, from the first; who penetrates too deep fails them all."""
     rules = scene.protocol.perturbations
@@ -132,7 +132,7 @@ def _repeated(
     return TrialResult.join(results, first.protocol).rows(torch.cat([others, rows]).argsort())
 
 
-def _scene_of_trial(scene: Scene, trial: int) -> Scene:
+def _scene_of_trial(scene: TrialScene, trial: int) -> TrialScene:
     """The scene of a trial: in the last ones the object has coarse parts."""
     rules = scene.protocol.perturbations
     fine = trial < rules.trials - rules.coarse

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.baselines.manifm.contact_network import LATENT, ContactNetwork
-from dro_grasp.baselines.manifm.contact_training import open_hand
+from dro_grasp.baselines.manifm.contact_training import open_hand_cloud
 from dro_grasp.baselines.manifm.fingertip_contacts import Pads, contacts_of
 from dro_grasp.baselines.method import Method
 from dro_grasp.geometry.registration import register
@@ -32,7 +32,7 @@ from dro_grasp.pipeline.problem import GraspProblem
 
 
 @dataclass(frozen=True)
-class ReachConfig:
+class ContactMethodConfig:
     """From contacts to grasps; the numbers are ManiFM's, unless stated otherwise."""
 
     points: int = 256
@@ -54,13 +54,13 @@ class ContactMethod(Method):
 
     name = "manifm"
 
-    def __init__(self, weights: Path, config: ReachConfig | None = None) -> None:
+    def __init__(self, weights: Path, config: ContactMethodConfig | None = None) -> None:
         """Load the weights.
 
         Raises:
             WeightsError: They are missing or of another network.
         """
-        self.config, self.network = config or ReachConfig(), load_into(ContactNetwork(), weights)
+        self.config, self.network = config or ContactMethodConfig(), load_into(ContactNetwork(), weights)
 
     @torch.no_grad()
     def make(self, problem: GraspProblem, num: int, seed: int) -> GraspBatch:
@@ -70,7 +70,7 @@ class ContactMethod(Method):
         rows = torch.randint(len(cloud), (config.points,), generator=generator)
         points, normals = cloud[rows], outward[rows]
         obj = torch.cat([points - cloud.mean(0), normals], -1).expand(num, -1, -1)
-        told = open_hand(hand).expand(num, -1, -1)
+        told = open_hand_cloud(hand).expand(num, -1, -1)
         maps = self.network.decode(obj, told, torch.randn(num, LATENT, generator=generator))
         pads = Pads.of(hand)
         chosen = contacts_of(points, maps.heat, min(config.contacts, len(pads.links)), config.radius)
@@ -81,7 +81,8 @@ class ContactMethod(Method):
 
 
 def reached(
-    problem: GraspProblem, pads: Pads, spots: Float[Tensor, "n k 3"], normals: Float[Tensor, "n k 3"], config: ReachConfig
+    problem: GraspProblem, pads: Pads, spots: Float[Tensor, "n k 3"], normals: Float[Tensor, "n k 3"],
+    config: ContactMethodConfig,
 ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n n_dof"]]:
     """Hands whose pads come nearest to contacts, over all fingers and orders."""
     hand, count = problem.hand, spots.shape[1]
@@ -104,7 +105,7 @@ def reached(
 
 
 def _solved(
-    hand: Hand, pads: Pads, fingers: list[int], positions: Float[Tensor, "b t 3"], config: ReachConfig
+    hand: Hand, pads: Pads, fingers: list[int], positions: Float[Tensor, "b t 3"], config: ContactMethodConfig
 ) -> tuple[Float[Tensor, "b 4 4"], Float[Tensor, "b n_dof"]]:
     """Wrist and joints that bring pads, and the points behind them, to positions; registration gives the start."""
     local = torch.cat([pads.points[fingers], pads.points[fingers] - config.stalk * pads.normals[fingers]])

@@ -59,13 +59,13 @@ def draw_contacts(
     for _ in range(2):
         drawn = draws.draw(config.batch // 2, config.points, generator)
         true = contact_maps(drawn.points, drawn.normals, drawn.hand, drawn.body)
-        told = open_hand(drawn.hand).expand(len(drawn.points), -1, -1)
+        told = open_hand_cloud(drawn.hand).expand(len(drawn.points), -1, -1)
         parts.append((torch.cat([drawn.points, drawn.normals], -1), told, true.heat, true.force))
     obj, told, heat, force = (torch.cat(part) for part in zip(*parts, strict=True))
     return obj, told, ContactMaps(heat, force)
 
 
-def open_hand(hand: Hand) -> Float[Tensor, "n 6"]:
+def open_hand_cloud(hand: Hand) -> Float[Tensor, "n 6"]:
     """Points of the open hand in its palm's axes about its grasp centre [m], and normals there."""
     thin = hand.with_points(min(HAND_POINTS, hand.n_points))
     points, normals = thin.points_and_normals(hand.canonical_joints())
