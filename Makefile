@@ -28,7 +28,7 @@ demo-arm: setup  # a robot sees an object on a table, plans and lifts it; out/li
 test: setup
 	$(BIN)/python -m pytest -n 2 --dist loadfile -q
 
-test-slow: setup  # what takes a minute each, such as a Ray cluster that loses a node
+test-slow: setup  # what takes more than about 10 s each, such as a Ray cluster that loses a node
 	$(BIN)/python -m pytest -q -m slow
 
 lint: setup

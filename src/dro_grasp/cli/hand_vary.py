@@ -15,7 +15,7 @@ from dro_grasp.cli.output import print_json, say
 class Vary:
     """Write the URDF of a hand's mirror image, or of a larger or smaller hand.
 
-    Example: dro-grasp hand vary leaphand --mirrored --scale 0.9 --output leap_left_small.urdf
+    Example: dro-grasp hand vary leaphand --mirrored --scale 0.95 --output leap_left_small.urdf
     """
 
     hand: tyro.conf.Positional[str]
