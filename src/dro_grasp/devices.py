@@ -1,22 +1,19 @@
-"""Devices and cores of this machine, and time spent on them. Records of tensors: moved to a device, cached."""
+"""Devices and cores of this machine: which there are, and how work is spread over them."""
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
-from functools import cache, cached_property
+from functools import cache
 from typing import Any, TypeVar
 
 import torch
 
 from dro_grasp.errors import OptionError
 
-Record = TypeVar("Record")
 Result = TypeVar("Result")
 LARGEST_DEVIATION = 1e-5
 """Largest relative deviation of a test product with which the quick path is taken. Source: ours; single precision has 4e-7."""
@@ -130,35 +127,3 @@ def quick_path_is_accurate() -> bool:
         product = a @ b
     exact = a.double() @ b.double()
     return bool((product - exact).abs().max() <= LARGEST_DEVIATION * exact.abs().max())
-
-
-def on_device(record: Record, device: torch.device | str) -> Record:
-    """Copy a frozen dataclass to a device: its tensors, and its records that have a `to`."""
-    values = {f.name: getattr(record, f.name) for f in dataclasses.fields(record)}  # type: ignore[arg-type]
-    moved = {name: value.to(device) for name, value in values.items() if hasattr(value, "to")}
-    return dataclasses.replace(record, **moved)  # type: ignore[type-var]
-
-
-class cached_tensor(cached_property):  # type: ignore[type-arg]  # reads like the decorator it extends
-    """A cached property whose tensors still work in training after inference has computed them."""
-
-    def __get__(self, instance: Any, owner: type | None = None) -> Any:
-        with torch.inference_mode(False):
-            return super().__get__(instance, owner)
-
-
-class Stopwatch:
-    """Adds up the time spent in named blocks."""
-
-    def __init__(self, *names: str) -> None:
-        """Start the named parts at zero; others appear when they run."""
-        self.seconds: dict[str, float] = dict.fromkeys(names, 0.0)
-
-    @contextmanager
-    def __call__(self, name: str) -> Iterator[None]:
-        """Count the block towards a part; CUDA, if it is in use, is waited for before the clock is read."""
-        begin = time.perf_counter()
-        yield
-        if torch.cuda.is_initialized():
-            torch.cuda.synchronize()
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.devices import Stopwatch, require_device
+from dro_grasp.devices import require_device
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import with_own_files
@@ -28,6 +28,7 @@ from dro_grasp.pipeline.proposal import Proposal, ProposalConfig, check_temperat
 from dro_grasp.pipeline.settling import best_settled, can_settle
 from dro_grasp.pipeline.shortage import shortage_in_words
 from dro_grasp.pipeline.stages import complete, eased, optimise, refine, scored
+from dro_grasp.stopwatch import Stopwatch
 
 LARGEST_CALL = 100_000
 """Most candidates of one call; more do not fit memory."""

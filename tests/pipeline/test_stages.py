@@ -8,7 +8,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from dro_grasp.devices import Stopwatch
 from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.errors import GraspFileError
 from dro_grasp.grasps.batch import GraspBatch
@@ -19,6 +18,7 @@ from dro_grasp.pipeline import stages
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import complete, eased, evaluate, optimise, rank, refine, scored
+from dro_grasp.stopwatch import Stopwatch
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.toy_hand import toy_hand
 

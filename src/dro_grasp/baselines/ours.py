@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 
 from dro_grasp.baselines.method import Made, Method, finished
-from dro_grasp.devices import Stopwatch
 from dro_grasp.energy.contact_candidates import ContactConfig
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.optimization.starts import StartConfig
@@ -14,6 +13,7 @@ from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.proposal import propose
 from dro_grasp.pipeline.stages import optimise
 from dro_grasp.predictor import GraspPredictor, GraspRequest
+from dro_grasp.stopwatch import Stopwatch
 
 CANDIDATES = 4
 """Candidates for each grasp that a method returns which ranks them, as `generate` has it (ours)."""

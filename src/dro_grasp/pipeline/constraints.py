@@ -17,7 +17,7 @@ from dro_grasp.files import TOLD
 from dro_grasp.geometry.balls import Ball, Balls
 from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimization.starts import Direction
+from dro_grasp.optimization.palm_directions import Direction
 
 ELSEWHERE = 0.01
 """A table farther than this from the one in the cloud is another [m] (ours)."""

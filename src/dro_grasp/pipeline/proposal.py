@@ -16,16 +16,18 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp import distance_matrix
-from dro_grasp.devices import Stopwatch, one_thread, side_by_side
+from dro_grasp.devices import one_thread, side_by_side
 from dro_grasp.errors import OptionError
 from dro_grasp.geometry.se3 import apply_to_cloud, compose, rotate
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.proportions import proportions
 from dro_grasp.models.network import DistanceNetwork
-from dro_grasp.optimization.starts import CHOICES, CLEAR, Spread, lack_of_room, wrist_rotations
+from dro_grasp.optimization.palm_directions import CLEAR, Spread, lack_of_room, wrist_rotations
+from dro_grasp.optimization.starts import CHOICES
 from dro_grasp.pipeline.choice import ChoiceConfig, choice_scores
 from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.stopwatch import Stopwatch
 
 CLOUD_TEMPERATURE = 0.5
 """Default temperature for a bare cloud: where less of the object is known, likelier grasps are proposed (ours)."""

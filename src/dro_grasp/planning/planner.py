@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from dro_grasp.devices import Stopwatch
 from dro_grasp.errors import OptionError, PlanError, RobotError
 from dro_grasp.frames import motion_fault
 from dro_grasp.grasps.batch import GraspBatch
@@ -31,6 +30,7 @@ from dro_grasp.planning.scene_solids import scene_solid
 from dro_grasp.planning.standing import moved, upright
 from dro_grasp.planning.timed_stages import timed_stages
 from dro_grasp.predictor import GraspPredictor
+from dro_grasp.stopwatch import Stopwatch
 
 BATCH_SEED = 7919
 """Between the seeds of batches of grasps (ours)."""

@@ -1,0 +1,26 @@
+"""Records of tensors, which are frozen dataclasses: moved to a device, and with tensors that are computed once."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cached_property
+from typing import Any, TypeVar
+
+import torch
+
+Record = TypeVar("Record")
+
+
+def on_device(record: Record, device: torch.device | str) -> Record:
+    """Copy a frozen dataclass to a device: its tensors, and its records that have a `to`."""
+    values = {f.name: getattr(record, f.name) for f in dataclasses.fields(record)}  # type: ignore[arg-type]
+    moved = {name: value.to(device) for name, value in values.items() if hasattr(value, "to")}
+    return dataclasses.replace(record, **moved)  # type: ignore[type-var]
+
+
+class cached_tensor(cached_property):  # type: ignore[type-arg]  # reads like the decorator it extends
+    """A cached property whose tensors still work in training after inference has computed them."""
+
+    def __get__(self, instance: Any, owner: type | None = None) -> Any:
+        with torch.inference_mode(False):
+            return super().__get__(instance, owner)
