@@ -56,6 +56,15 @@ def test_a_file_that_holds_no_such_score_is_refused(tmp_path: Path, content: str
         load_holding_score(path)
 
 
+def test_a_file_with_a_number_that_is_none_is_refused(tmp_path: Path) -> None:
+    broken = load_holding_score(SHIPPED)
+    with torch.no_grad():
+        broken.layers[0].bias[0] = torch.nan
+    save_weights(broken, tmp_path / "score.safetensors")
+    with pytest.raises(WeightsError, match=r"'layers.0.bias' holds NaN"):
+        load_holding_score(tmp_path / "score.safetensors")
+
+
 @pytest.mark.slow
 def test_it_tells_better_than_geometry_alone_which_settled_grasps_hold() -> None:
     hand, obj = loaded_hand("gripper3"), load_object("hammer")

@@ -6,12 +6,12 @@ import dataclasses
 import hashlib
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
-from jaxtyping import Float, Num
+from jaxtyping import Num
 from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
@@ -77,8 +77,12 @@ def load_weights(name: str | Path | None = None) -> DistanceNetwork:
         config = NetworkConfig.from_dict(entry["config"])
         with torch.device("meta"):  # a network of the wrong size is never made
             _check_tensors(DistanceNetwork(config).state_dict(), tensors, path)
-        network = DistanceNetwork(config, name=path.stem)
-        network.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in tensors.items()})
+        return _filled(DistanceNetwork(config, name=path.stem), tensors)
+
+
+def _filled(network: Network, tensors: dict[str, Num[Tensor, "..."]]) -> Network:
+    """The network with these tensors in single precision, in evaluation mode."""
+    network.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in tensors.items()})
     return network.eval()
 
 
@@ -92,7 +96,8 @@ def _check_tensors(expected: dict[str, Num[Tensor, "..."]], given: dict[str, Num
         if tensor.shape != wanted.shape or tensor.is_floating_point() != wanted.is_floating_point() or tensor.is_complex():
             raise WeightsError(f"{path}: '{name}' is {tensor.dtype} of shape {tuple(tensor.shape)}, expected {wanted.dtype} "
                                f"of shape {tuple(wanted.shape)}; use weights made with this version")
-        if tensor.is_floating_point() and not (tensor.isfinite().all() and (tensor >= 0).all() | ("running_var" not in name)):
+        finite = not tensor.is_floating_point() or bool(tensor.isfinite().all())
+        if not finite or ("running_var" in name and bool((tensor < 0).any())):
             raise WeightsError(f"{path}: '{name}' holds NaN, infinity, or a negative variance; train again")
 
 
@@ -102,19 +107,27 @@ def load_into(network: Network, path: Path) -> Network:
     Raises:
         WeightsError: The file is missing, truncated, foreign, or of another network.
     """
-    _, tensors = _read(locate_weights(path))
+    tensors = _read(locate_weights(path))[1]
     _check_tensors(network.state_dict(), tensors, path)
-    network.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in tensors.items()})
-    return network.eval()
+    return _filled(network, tensors)
 
 
-def load_small(path: Path) -> dict[str, Float[Tensor, "..."]]:
-    """The tensors of a small network's file in single precision.
+def load_small(path: Path, make: Callable[[dict[str, Num[Tensor, "..."]]], Network], expected: str) -> Network:
+    """A small network that ships beside those that predict D(R,O), in evaluation mode; its gradients are switched off.
+
+    Args:
+        path: The file.
+        make: Makes the network of the size that the file's tensors have.
+        expected: What the file should be, and a remedy, in words.
 
     Raises:
-        WeightsError: The file is missing, truncated or foreign.
+        WeightsError: The file is missing, truncated, foreign, or of another network.
     """
-    return {name: value.float() for name, value in _read(path)[1].items()}
+    tensors = _read(path)[1]
+    with reading(path, WeightsError, expected):
+        network = make(tensors)
+        _check_tensors(network.state_dict(), tensors, path)
+        return _filled(network, tensors).requires_grad_(False)
 
 
 def history_of(path: Path) -> list[dict[str, Any]]:

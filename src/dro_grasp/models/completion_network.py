@@ -48,9 +48,9 @@ class SurfaceNetwork(nn.Module):
 @cache
 def shipped_surface() -> SurfaceNetwork:
     """The network that ships, loaded once."""
-    tensors = load_small(SHIPPED)
-    width, features = tensors["enter.weight"].shape
-    depth = sum(name.endswith(".0.weight") for name in tensors)
-    network = SurfaceNetwork(len(tensors["leave.bias"]) - 1, features, width, depth)
-    network.load_state_dict(tensors)
-    return network.eval().requires_grad_(False)
+    def sized(tensors: dict[str, Tensor]) -> SurfaceNetwork:
+        width, features = tensors["enter.weight"].shape
+        depth = sum(name.endswith(".0.weight") for name in tensors)
+        return SurfaceNetwork(len(tensors["leave.bias"]) - 1, features, width, depth)
+
+    return load_small(SHIPPED, sized, "the network that completes surfaces; install the package again")

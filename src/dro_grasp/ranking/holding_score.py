@@ -13,8 +13,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from dro_grasp.errors import WeightsError
-from dro_grasp.files import reading
 from dro_grasp.models.checkpoints import SHIPPED_FOLDER, load_small
 
 if TYPE_CHECKING:
@@ -82,11 +80,9 @@ def load_holding_score(path: Path) -> HoldingScore:
     Raises:
         WeightsError: There is no such file, or it is no such model.
     """
-    tensors = load_small(path)
-    with reading(path, WeightsError, "a score of settled grasps; train it again (scripts/train_holding_score.py)"):
-        model = HoldingScore(len(tensors["layers.2.bias"]), len(tensors["layers.0.bias"]))
-        model.load_state_dict(tensors)
-    return model.eval().requires_grad_(False)
+    return load_small(
+        path, lambda tensors: HoldingScore(len(tensors["layers.2.bias"]), len(tensors["layers.0.bias"])),
+        "a score of settled grasps; train it again (scripts/train_holding_score.py)")
 
 
 @cache

@@ -12,7 +12,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from dro_grasp.errors import WeightsError
-from dro_grasp.files import reading
 from dro_grasp.models.checkpoints import SHIPPED_FOLDER, history_of, load_small, save_weights
 from dro_grasp.ranking.features import GRASP_FEATURES, LINK_FEATURES, feature_names
 
@@ -78,11 +77,9 @@ def load_score_network(path: Path) -> ScoreNetwork:
     if trained != feature_names():
         raise WeightsError(f"{path} states the features {trained}; this version computes {feature_names()}; train "
                            "the network again (scripts/train_ranking.py)")
-    tensors = load_small(path)
-    with reading(path, WeightsError, "a ranking network; train it again (scripts/train_ranking.py)"):
-        network = ScoreNetwork(len(tensors["grasp.4.bias"]), len(tensors["link.0.bias"]))
-        network.load_state_dict(tensors)
-    return network.eval().requires_grad_(False)
+    return load_small(
+        path, lambda tensors: ScoreNetwork(len(tensors["grasp.4.bias"]), len(tensors["link.0.bias"])),
+        "a ranking network; train it again (scripts/train_ranking.py)")
 
 
 @cache
