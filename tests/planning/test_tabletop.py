@@ -149,7 +149,7 @@ def test_attempts_are_stored_and_not_repeated(small_robot: str, tmp_path: Path, 
     run_tabletop(run, output)
     assert calls == [0, 1, 2, 1]
     (tmp_path / "other.parquet").write_bytes(b"not this")
-    with pytest.raises(dro.DroGraspError, match="holds no attempts"):
+    with pytest.raises(dro.DroGraspError, match="expected a file of attempts"):
         run_tabletop(run, tmp_path / "other.parquet")
 
 

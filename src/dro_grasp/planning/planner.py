@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -71,17 +71,11 @@ def plan(
         raise OptionError(f"T_world_object is no pose of '{obj.name}' in metres; {fault}")
     task = _Task(robot, obj, T, obstacles, config or PlanConfig(), seed)
     task.check_start()
-    predictor = predictor or GraspPredictor() if grasps is None else None
-    batches = task.config.batches if predictor is not None else 1
-    for batch in range(batches):
-        if predictor is not None:
-            with task.watch("grasps"):
-                grasps = grasps_in_world(
-                    predictor, robot.hand, task.obj, task.T_world_object, task.config.num, task.wanted(),
-                    task.config.directions, seed + batch * BATCH_SEED)
-        assert grasps is not None
-        task.add(grasps)
-        if (made := task.run(last=batch == batches - 1)) is not None:
+    batches = [grasps] if grasps is not None else task.predicted(predictor or GraspPredictor())
+    count = 1 if grasps is not None else task.config.batches
+    for number, batch in enumerate(batches, 1):
+        task.add(batch)
+        if (made := task.run(last=number == count)) is not None:
             return made
     raise PlanError(f"{grasps_and_dropped(len(task.grasps), task.dropped)}, and none is left for '{obj.name}'; {task.advice()}")
 
@@ -150,6 +144,15 @@ class _Task:
         clouds = [thing.cloud for thing in self.obstacles]
         scene = load_scene(np.concatenate(clouds), OBSTACLE) if clouds else None
         return replace(self.constraints, table=self.height, avoid=scene)
+
+    def predicted(self, predictor: GraspPredictor) -> Iterator[GraspBatch]:
+        """Batch after batch of grasps in the world's frame, as many as the configuration allows."""
+        for batch in range(self.config.batches):
+            with self.watch("grasps"):
+                grasps = grasps_in_world(
+                    predictor, self.robot.hand, self.obj, self.T_world_object, self.config.num, self.wanted(),
+                    self.config.directions, self.seed + batch * BATCH_SEED)
+            yield grasps
 
     def add(self, grasps: GraspBatch) -> None:
         """Further grasps to choose from."""
@@ -273,6 +276,7 @@ class _Task:
         return float(np.linalg.norm(middle - self.robot.T_world_base[:2, 3]))
 
     def advice(self) -> str:
+        """What to change, by the reason for which most grasps were dropped."""
         reason = max(self.dropped, key=lambda r: self.dropped[r], default="")
         if reason in (TURNED, SPARED, BESIDE, NARROW):
             return f"most grasps are {reason}; relax cone, hold, spare or opening, or ask for more grasps (--num)"

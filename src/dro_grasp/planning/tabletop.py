@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 
 from dro_grasp.devices import one_thread
 from dro_grasp.errors import GraspFileError, ObjectError, OptionError
-from dro_grasp.files import check_output, make_folder, replacing
+from dro_grasp.files import check_output, make_folder, reading, replacing
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.planning.attempts import Attempt, TabletopConfig, Watcher, attempt
 from dro_grasp.planning.extra import require_arm_extra
@@ -167,11 +167,9 @@ def read_attempts(path: Path) -> list[Attempt]:
         GraspFileError: It is another file.
     """
     known = {f.name for f in fields(Attempt)}
-    try:
+    with reading(path, GraspFileError, "a file of attempts; name another one, or move this one away"):
         rows = pq.read_table(path).to_pylist()
         return [Attempt(**{k: v for k, v in row.items() if k in known}) for row in rows]
-    except (OSError, pa.ArrowInvalid, TypeError) as error:
-        raise GraspFileError(f"{path} holds no attempts ({error}); name another file, or move this one away") from error
 
 
 def endings(attempts: Sequence[Attempt]) -> dict[str, int]:
