@@ -121,6 +121,17 @@ def test_iterating_ends_and_out_of_range_is_an_index_error():
         make(3)[3]
 
 
+@pytest.mark.parametrize("size", [1, 2, 5, 9])
+def test_parts_join_to_the_whole(size):
+    whole = make(5)
+    parts = list(whole.in_parts(size))
+    assert [len(p) for p in parts] == [min(size, 5 - i) for i in range(0, 5, size)]
+    joined = GraspBatch.concatenate(parts)
+    assert torch.equal(joined.joints, whole.joints)
+    assert joined.object == whole.object
+    assert list(whole[0:0].in_parts(size)) == []
+
+
 def test_joining_evaluated_and_unevaluated_survives_the_file(tmp_path):
     joined = GraspBatch.concatenate([make(2, score=torch.rand(2)), evaluated(3, obj=CUBE, seed=7)])
     joined.save(tmp_path / "g.parquet")

@@ -133,6 +133,7 @@ class GraspBatch:
 
         Raises:
             OptionError: The mask is `success`, and no grasp has been evaluated.
+            IndexError: There is no such grasp.
         """
         if index is self.success:
             columns.require_outcomes(self)
@@ -191,6 +192,10 @@ class GraspBatch:
     def states_closing(self) -> Bool[Tensor, " n"]:
         """Which grasps state both pregrasp and squeeze."""
         return torch.stack([self.pregrasp_joints, self.squeeze_joints]).isfinite().all(-1).all(0)
+
+    def in_parts(self, size: int) -> Iterator[GraspBatch]:
+        """The grasps in parts of this size; the last may be smaller."""
+        return (self[slice(start, start + size)] for start in range(0, len(self), size))
 
     @staticmethod
     def concatenate(batches: Sequence[GraspBatch]) -> GraspBatch:

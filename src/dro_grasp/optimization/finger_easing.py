@@ -48,9 +48,8 @@ def ease_fingers(
     config = config or EasingConfig()
     if not len(grasps):
         return grasps
-    parts = (grasps[slice(i, i + config.batch_size)] for i in range(0, len(grasps), config.batch_size))
     tree = _tree(seen)
-    return grasps.replace(joints=torch.cat([_eased(energy, part, tree, config) for part in parts]))
+    return grasps.replace(joints=torch.cat([_eased(energy, part, tree, config) for part in grasps.in_parts(config.batch_size)]))
 
 
 @torch.no_grad()
@@ -67,8 +66,7 @@ def lacking_room(
     """
     config, device = config or EasingConfig(), energy.centre.device
     lacking, tree = [torch.zeros(0)], _tree(seen)
-    for i in range(0, len(grasps), config.batch_size):
-        part = grasps[slice(i, i + config.batch_size)]
+    for part in grasps.in_parts(config.batch_size):
         _, spare = _room(energy, part.T_object_wrist.to(device), part.pregrasp_joints.to(device), tree, config)
         lacking.append((-spare).amax(-1).clamp_min(0).cpu())
     return torch.cat(lacking)

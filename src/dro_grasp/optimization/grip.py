@@ -63,7 +63,7 @@ def gripping(energy: GraspEnergy, grasps: GraspBatch, config: GripConfig | None 
         config: Contacts, forces and servos.
     """
     config = config or GripConfig()
-    made = [_targets(energy, grasps[slice(i, i + config.batch_size)], config) for i in range(0, len(grasps), config.batch_size)]
+    made = [_targets(energy, part, config) for part in grasps.in_parts(config.batch_size)]
     if not made:
         return grasps
     pregrasp, squeeze = (torch.cat(part) for part in zip(*made, strict=True))

@@ -38,9 +38,7 @@ def score_grasps(energy: GraspEnergy, grasps: GraspBatch, config: ScoreConfig | 
         config: Batch size.
     """
     network, scores, device = shipped_score_network(), [torch.zeros(0)], energy.centre.device
-    size = (config or ScoreConfig()).batch_size
-    for start in range(0, len(grasps), size):
-        part = grasps[start : start + size]
+    for part in grasps.in_parts((config or ScoreConfig()).batch_size):
         # Each finger touches with its candidate nearest to the surface.
         terms = energy(part.T_object_wrist.to(device), part.joints.to(device)).terms
         features = grasp_features(energy, part, terms)  # the network is small and stays on the CPU

@@ -200,8 +200,7 @@ def rollouts(
 ) -> Iterator[tuple[GraspBatch, Rollout]]:
     """The grasps in parts that are simulated together, with pregrasp and squeeze; each part's rollout at its start."""
     centre = torch.as_tensor(scene.obj.centre_of_mass)
-    for start in range(0, len(grasps), CHUNK):
-        part = grasps[slice(start, start + CHUNK)]
+    for part in grasps.in_parts(CHUNK):
         if scene.protocol.closing:
             part = completed(hand, part, centre, scene.protocol.controller)
         yield part, Rollout(scene, part, workers or cores(), stride)
