@@ -14,8 +14,10 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import ControllerConfig
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.planning.standing import moved
 from dro_grasp.simulation import rollout as rollouts
 from dro_grasp.simulation.closed_poses import held, settle
+from dro_grasp.simulation.holding import holding
 from dro_grasp.simulation.outcome import GIVE_UP, Failure
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, protocol
 from dro_grasp.simulation.trial import TrialResult, record, simulate
@@ -54,6 +56,23 @@ def test_power_grasp_holds_a_ball(hand, obj, name):
     assert (result.displacement[:, -1] < 0.02).all()
     assert (result.contacts >= 3).all()
     assert result.protocol == f"{name}/1"
+
+
+def test_outcomes_do_not_depend_on_where_the_objects_frame_is(hand, obj):
+    grasps = power_grasp(hand, obj, 3)
+    spread = torch.tensor([[0.0, 0.0, 0.0], [0.012, 0.0, 0.0], [0.0, 0.02, 0.008]])  # the last ones turn the ball, or lose it
+    T = grasps.T_object_wrist.clone()
+    T[:, :3, 3] += spread
+    there = np.eye(4)
+    there[:3, 3] = (1.5, -2.0, 0.7)
+    far, T_far = moved(obj, there), T.clone()
+    T_far[:, :3, 3] += torch.from_numpy(there[:3, 3]).float()
+    near, away = (simulate(hand, o, grasps_of(hand, o, pose, grasps.joints), "dro") for o, pose in ((obj, T), (far, T_far)))
+    assert near.success.tolist() == away.success.tolist()
+    torch.testing.assert_close(near.displacement, away.displacement, atol=5e-5, rtol=0, equal_nan=True)
+    torch.testing.assert_close(near.rotation, away.rotation, atol=2e-3, rtol=0, equal_nan=True)
+    close, remote = (holding(hand, o, grasps_of(hand, o, pose, grasps.joints)) for o, pose in ((obj, T), (far, T_far)))
+    torch.testing.assert_close(close.speed, remote.speed, atol=5e-4, rtol=0)
 
 
 def test_held_grasps_are_where_the_recorded_trial_has_them_after_closing(hand, obj):

@@ -64,8 +64,7 @@ class LiftScene:
             body.gravcomp = 1.0  # a robot's controller holds its own weight
         _add_arm_servos(scene, robot)
         add_servos(scene, robot.hand, LIFT_PROTOCOL)
-        for i, obj in enumerate(objects):
-            _add_thing(scene, obj, i)
+        self._centres = [_add_thing(scene, obj, i) for i, obj in enumerate(objects)]
         if robot.table is not None:
             board = scene.geom(TABLE)
             board.condim, board.friction = 6, [LIFT_PROTOCOL.friction, 0.005, ROLLING]
@@ -93,8 +92,8 @@ class LiftScene:
 
     def place(self, index: int, T_world_object: Float[np.ndarray, "4 4"]) -> None:
         """Put an object somewhere, at rest."""
-        start = self._objects[index]
-        self.data.qpos[start:start + 7] = [*T_world_object[:3, 3], *wxyz(T_world_object[:3, :3])]
+        start, R = self._objects[index], T_world_object[:3, :3]
+        self.data.qpos[start:start + 7] = [*(T_world_object[:3, 3] + R @ self._centres[index]), *wxyz(R)]
         velocity = int(self.model.jnt_dofadr[self.model.joint(f"object{index}-").id])
         self.data.qvel[velocity:velocity + 6] = 0.0
         mujoco.mj_forward(self.model, self.data)
@@ -103,9 +102,9 @@ class LiftScene:
         """Where an object is [m]."""
         start = self._objects[index]
         T = np.eye(4)
-        T[:3, 3] = self.data.qpos[start:start + 3]
         quaternion = torch.from_numpy(self.data.qpos[start + 3:start + 7].copy())
         T[:3, :3] = roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(quaternion / quaternion.norm())).numpy()
+        T[:3, 3] = self.data.qpos[start:start + 3] - T[:3, :3] @ self._centres[index]
         return T
 
     def speed(self, index: int) -> float:
@@ -159,31 +158,36 @@ class LiftScene:
         return len(links)
 
 
-def _add_thing(scene: mujoco.MjSpec, obj: ObjectModel, index: int) -> None:
-    """An object that collides as its convex parts, and is seen as its mesh; a bare cloud collides as balls."""
+def _add_thing(scene: mujoco.MjSpec, obj: ObjectModel, index: int) -> Float[np.ndarray, "3"]:
+    """An object that collides as its convex parts, and is seen as its mesh; a bare cloud collides as balls.
+
+    Returns:
+        Its centre of mass, at which its body's frame is [m].
+    """
     if obj.is_cloud:
-        _add_estimate(scene, obj, index)
-        return
+        return _add_estimate(scene, obj, index)
     assert obj.vertices is not None
     assert obj.faces is not None
     body = add_object(scene, obj, LIFT_PROTOCOL, f"object{index}-")
     for geom in body.geoms:
         geom.group = PART_GROUP
     shape = scene.add_mesh(
-        name=f"shape{index}", uservert=obj.vertices.ravel(), userface=obj.faces.astype(np.int32).ravel())
+        name=f"shape{index}", uservert=(obj.vertices - obj.centre_of_mass).ravel(), userface=obj.faces.astype(np.int32).ravel())
     shape.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
     body.add_geom(
         type=mujoco.mjtGeom.mjGEOM_MESH, meshname=shape.name, contype=0, conaffinity=0, group=SHAPE_GROUP, mass=0.0)
+    return obj.centre_of_mass
 
 
-def _add_estimate(scene: mujoco.MjSpec, obj: ObjectModel, index: int) -> None:
+def _add_estimate(scene: mujoco.MjSpec, obj: ObjectModel, index: int) -> Float[np.ndarray, "3"]:
     """A bare cloud: the hand touches its balls; its hull stands on the table with a flat foot, so that the object stays put."""
-    body, board = add_object(scene, solid_of(obj), LIFT_PROTOCOL, f"object{index}-"), scene.geom(TABLE)
+    solid, board = solid_of(obj), scene.geom(TABLE)
+    body = add_object(scene, solid, LIFT_PROTOCOL, f"object{index}-")
     for ball in body.geoms:
         ball.contype = ball.conaffinity = BALL_BIT
     cloud, height = obj.cloud.astype(float), float(board.pos[2] + board.size[2])
     foot = cloud[cloud[:, 2] < cloud[:, 2].min() + FOOT] * (1, 1, 0) + (0, 0, height)
-    corners = np.concatenate([cloud, foot])
+    corners = np.concatenate([cloud, foot]) - solid.centre_of_mass
     mesh = scene.add_mesh(name=f"hull{index}", uservert=corners[ConvexHull(corners).vertices].ravel())
     mesh.maxhullvert = HULL_VERTICES
     body.add_geom(
@@ -192,6 +196,7 @@ def _add_estimate(scene: mujoco.MjSpec, obj: ObjectModel, index: int) -> None:
     hand = [geom for geom in scene.geoms if geom.parent is not None and geom.parent.name.startswith(PREFIX) and geom.contype]
     for geom, bit in [*((geom, BALL_BIT) for geom in hand), (board, HULL_BIT)]:
         geom.contype, geom.conaffinity = geom.contype | bit, geom.conaffinity | bit
+    return solid.centre_of_mass
 
 
 def _add_arm_servos(scene: mujoco.MjSpec, robot: Robot) -> None:

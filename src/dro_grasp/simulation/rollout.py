@@ -141,10 +141,9 @@ class Rollout:
         rows = np.arange(self.size) if rows is None else rows
         pose = self.qpos[rows][:, self.scene.object_qpos]
         rotation = _matrices(pose[:, 3:])
-        position = pose[:, :3] + rotation @ self.scene.obj.centre_of_mass
         # MuJoCo resets a trial that explodes and continues; only the warning tells.
         unstable = self.batch.warning[rows][:, :, 1].any(1) | ~np.isfinite(self.qpos[rows]).all(1)
-        return ObjectState(position, rotation, ~unstable)
+        return ObjectState(pose[:, :3], rotation, ~unstable)
 
     def poses(self) -> tuple[Float[np.ndarray, "n n_dof"], Float[np.ndarray, "n 4 4"]]:
         """Independent joints [rad or m] and object poses in the wrist frame [m] now."""
@@ -155,7 +154,8 @@ class Rollout:
                 joints[:, tree.joint_names.index(name)] = self.qpos[:, address]
         pose = self.qpos[:, self.scene.object_qpos]
         poses = np.tile(np.eye(4), (self.size, 1, 1))
-        poses[:, :3, :3], poses[:, :3, 3] = _matrices(pose[:, 3:]), pose[:, :3]
+        rotation = _matrices(pose[:, 3:])
+        poses[:, :3, :3], poses[:, :3, 3] = rotation, pose[:, :3] - rotation @ self.scene.obj.centre_of_mass
         return joints, poses
 
     def _change(self, conditions: Conditions) -> None:

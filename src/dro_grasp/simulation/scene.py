@@ -54,7 +54,7 @@ class TrialScene:
 
     @cached_property
     def object_qpos(self) -> slice:
-        """Place of the object's position and quaternion WXYZ in qpos."""
+        """Place in qpos of the object's centre of mass and quaternion WXYZ."""
         start = int(self.model.jnt_qposadr[self.model.joint("object").id])
         return slice(start, start + 7)
 
@@ -76,9 +76,10 @@ class TrialScene:
         tree = self.hand.tree
         q[:, addresses] = (joints @ tree.coupling.T + tree.offset).numpy()[:, moving]
         T_wrist_object = torch.linalg.inv(T_object_wrist.double())
-        rotation = roma.special_procrustes(T_wrist_object[:, :3, :3])
+        rotation = torch.as_tensor(roma.special_procrustes(T_wrist_object[:, :3, :3]))
         quaternion = roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(rotation))
-        q[:, self.object_qpos] = torch.cat([T_wrist_object[:, :3, 3], quaternion], -1).numpy()
+        centre = T_wrist_object[:, :3, 3] + rotation @ torch.from_numpy(self.obj.centre_of_mass).double()
+        q[:, self.object_qpos] = torch.cat([centre, quaternion], -1).numpy()
         return q
 
 
@@ -221,15 +222,20 @@ def _hold_joints(spec: mujoco.MjSpec, hand: Hand) -> None:
 
 
 def add_object(scene: mujoco.MjSpec, obj: ObjectModel, protocol: Protocol, name: str = "object") -> mujoco.MjsBody:
-    """The object as its convex parts, or as its balls, with its mass and inertia; body and free joint have the name."""
+    """The object as its convex parts, or as its balls, with its mass and inertia; body and free joint have the name.
+
+    The body's frame has the object's axes at its centre of mass: MuJoCo integrates the motion of that frame's origin, which
+    errs the more the farther a turning body's centre of mass is from it.
+    """
     body = scene.worldbody.add_body(name=name, pos=FAR_AWAY)
+    middle = obj.centre_of_mass
     body.add_freejoint(name=name)
     touch = {"condim": 4, "mass": 0.0, "friction": [protocol.friction, protocol.torsional_friction, 1e-4]}
     if obj.balls is not None:
-        for centre, radius in zip(obj.balls.centres.tolist(), obj.balls.radii.tolist(), strict=True):
+        for centre, radius in zip((obj.balls.centres.numpy() - middle).tolist(), obj.balls.radii.tolist(), strict=True):
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], pos=centre, **touch)
     for i, (vertices, faces) in enumerate(obj.parts if obj.balls is None else ()):
-        mesh = scene.add_mesh(name=f"{name}{i}", uservert=np.asarray(vertices, float).ravel(),
+        mesh = scene.add_mesh(name=f"{name}{i}", uservert=(np.asarray(vertices, float) - middle).ravel(),
                               userface=np.asarray(faces, np.int32).ravel())
         mesh.maxhullvert = HULL_VERTICES
         # A part's own inertia plays no role, and thin parts would be refused for it.
@@ -237,7 +243,7 @@ def add_object(scene: mujoco.MjSpec, obj: ObjectModel, protocol: Protocol, name:
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, **touch)
     mass = object_mass(obj, protocol)
     inertia = obj.inertia / obj.volume * mass
-    body.explicitinertial, body.mass, body.ipos = True, mass, obj.centre_of_mass
+    body.explicitinertial, body.mass, body.ipos = True, mass, [0, 0, 0]
     body.fullinertia = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
     return body
 
