@@ -116,6 +116,16 @@ def test_what_a_class_returns_is_checked() -> None:
         ForeignMethod("mine", Returns(right)).make(GraspProblem(loaded_hand("gripper3"), load_object("sphere")), 2, 0)
 
 
+def test_a_method_that_fails_is_named_with_its_error() -> None:
+    class Broken:
+        def predict(self, *_: object) -> object:
+            raise ValueError("my own bug")
+
+    problem = GraspProblem(loaded_hand("gripper3"), load_object("sphere"))
+    with pytest.raises(OptionError, match=r"method 'mine' failed: ValueError: my own bug"):
+        ForeignMethod("mine", Broken()).make(problem, 1, 0)
+
+
 def test_stored_grasps_are_a_method_of_their_hand_and_objects(tmp_path: Path) -> None:
     hand, obj = toy_hand(), load_object("sphere")
     stored = make_method("start").predict(hand, obj, 5).replace(score=torch.arange(5.0))

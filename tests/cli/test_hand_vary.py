@@ -57,3 +57,12 @@ def test_what_cannot_be_written_is_refused_in_words(
     assert main(["hand", "vary", "gripper3", *options]) == 2
     assert said in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_the_hand_that_is_read_is_not_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "mine.urdf"
+    assert main(["hand", "vary", "gripper3", "--scale", "1.1", "--output", str(file)]) == 0
+    before = file.read_text()
+    assert main(["hand", "vary", str(file), "--scale", "2", "--output", str(file)]) == 2
+    assert "is the hand itself, which would be lost" in capsys.readouterr().err
+    assert file.read_text() == before

@@ -12,7 +12,9 @@ import torch
 import yaml
 from scipy.spatial.transform import Rotation
 
+import dro_grasp as dro
 from dro_grasp.cli.main import main
+from dro_grasp.errors import OptionError
 from dro_grasp.export.contents import Frame
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
@@ -245,3 +247,11 @@ def test_a_failed_export_leaves_no_folder(grasps: GraspBatch, tmp_path: Path, ca
     assert export(tmp_path / "all.parquet", *bad) == 2
     assert "nowhere.urdf" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_grasps_of_several_objects_or_of_none_share_no_frame(grasps: GraspBatch) -> None:
+    two = GraspBatch.concatenate([grasps[:1], grasps[:1].replace(object=("another",), object_sha256=("f" * 64,))])
+    for batch in (two, grasps[:0]):
+        with pytest.raises(OptionError, match=r"grasps of \d objects; a file has the frame of one object"):
+            dro.isaac_grasp(batch, Frame())
+    assert "object_frame_link: bench" in dro.isaac_grasp(two, Frame("bench"))

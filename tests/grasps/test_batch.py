@@ -15,6 +15,9 @@ from dro_grasp.files import check_output
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.simulation.outcome import Failure
+from tests.helpers.claw import ball
+from tests.helpers.tiny_bundle import made_up_grasps
+from tests.helpers.toy_hand import toy_hand
 
 HAND = SimpleNamespace(
     name="toy", sha256="a" * 64, tree=SimpleNamespace(link_names=("base", "tip"), joint_names=("j0", "j1"))
@@ -119,6 +122,12 @@ def test_iterating_ends_and_out_of_range_is_an_index_error():
     assert torch.equal(torch.cat([single.joints for single in singles]), grasps.joints)
     with pytest.raises(IndexError):
         make(3)[3]
+
+
+@pytest.mark.parametrize("cut", [slice(None, None, -1), slice(4, 1, -2), slice(-2, None), slice(9, 12)])
+def test_slices_are_those_of_lists(cut):
+    grasps = evaluated(5).replace(extra={"row": torch.arange(5)})
+    assert grasps[cut].extra["row"].tolist() == list(range(5))[cut]
 
 
 @pytest.mark.parametrize("size", [1, 2, 5, 9])
@@ -361,3 +370,25 @@ def test_another_hand_is_refused():
     other = SimpleNamespace(name="x", sha256="", tree=tree)
     with pytest.raises(GraspFileError, match="toy"):
         make(1).require_hand(other)
+
+
+def test_poses_and_joints_may_be_arrays_of_any_precision():
+    hand, obj = toy_hand(), ball()
+    given = made_up_grasps(hand, count=3)
+    made = GraspBatch.create(hand, obj, given.T_object_wrist.double().numpy(), given.joints.double().numpy(), seed=1)
+    assert made.joints.dtype == made.T_object_wrist.dtype == torch.float32
+    assert torch.equal(made.joints, given.joints)
+    assert made.seed.tolist() == [1, 1, 1]
+
+
+@pytest.mark.parametrize(("change", "told"), [
+    (lambda T, q: (T[:, :3, :3], q), r"poses of shape \(3, 3, 3\).*expected \(n, 4, 4\)"),
+    (lambda T, q: (T, q[:, 1:]), r"joints of shape \(3, 5\).*\(n, 6\) for this hand"),
+    (lambda T, q: (T * torch.tensor([2.0, 2, 2, 1]), q), "grasp 0 is no rigid motion, and 2 more"),
+    (lambda T, q: (T * torch.tensor([-1.0, 1, 1, 1]), q), "grasp 0 is no rigid motion"),
+    (lambda T, q: (T, torch.full_like(q, torch.nan)), "grasp 0 has a pose or joints that are not finite, and 2 more"),
+])
+def test_poses_and_joints_that_are_none_are_refused(change, told):
+    given = made_up_grasps(toy_hand(), count=3)
+    with pytest.raises(OptionError, match=told):
+        GraspBatch.create(toy_hand(), ball(), *change(given.T_object_wrist, given.joints))

@@ -110,8 +110,9 @@ def test_only_what_is_not_stated_is_completed(hand):
     other = torch.tensor([True, False, True, False])[:, None]
     tree = SimpleNamespace(link_names=hand.tree.link_names, joint_names=hand.tree.joint_names)
     owner, thing = SimpleNamespace(name="toy", sha256="a", tree=tree), SimpleNamespace(name="b", sha256="b", split=None)
-    grasps = GraspBatch.create(owner, thing, T, joints, pregrasp_joints=torch.where(some, hints, nothing),
-                               squeeze_joints=torch.where(other, hints, nothing))
+    grasps = GraspBatch.create(owner, thing, T, joints).replace(
+        T_object_wrist=T, joints=joints, pregrasp_joints=torch.where(some, hints, nothing),
+        squeeze_joints=torch.where(other, hints, nothing))
     whole = completed(hand, grasps, centre)
     torch.testing.assert_close(whole.pregrasp_joints, torch.where(some, hints, before))
     torch.testing.assert_close(whole.squeeze_joints, torch.where(other, hints, after))

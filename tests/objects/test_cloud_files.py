@@ -205,3 +205,16 @@ def test_a_header_that_claims_to_be_longer_than_the_file_is_refused_before_it_is
     (tmp_path / "long.npy").write_bytes(b"\x93NUMPY\x02\x00" + (2**32 - 1).to_bytes(4, "little") + b"{}")
     with pytest.raises(ObjectError, match="its header claims 4294967295 bytes"):
         load_file(tmp_path / "long.npy")
+
+
+def test_normals_of_a_ply_cloud_are_kept(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(600, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    rows = np.hstack([0.03 * normals, -normals])  # of a cavity: estimated ones would point outwards
+    names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
+    text = "\n".join(" ".join(f"{value:.7f}" for value in row) for row in rows)
+    file = tmp_path / "cavity.ply"
+    file.write_text(f"ply\nformat ascii 1.0\nelement vertex 600\n{names}end_header\n{text}\n")
+    obj = load_file(file)
+    assert (np.einsum("ij,ij->i", obj.cloud, obj.cloud_normals) < 0).all()

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import torch
 
 from dro_grasp.baselines.method import Method
-from dro_grasp.errors import GraspFileError, OptionError
+from dro_grasp.errors import DroGraspError, GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.reading import load_grasps
 from dro_grasp.hands.hand import Hand
@@ -43,9 +43,14 @@ class ForeignMethod(Method):
         """What it predicts.
 
         Raises:
-            OptionError: It returns something else than grasps of this hand on this object.
+            OptionError: It fails, or returns something else than grasps of this hand on this object.
         """
-        grasps = self.predictor.predict(problem.hand, problem.obj, num, seed)
+        try:
+            grasps = self.predictor.predict(problem.hand, problem.obj, num, seed)
+        except DroGraspError:
+            raise
+        except Exception as error:
+            raise OptionError(f"method '{self.name}' failed: {type(error).__name__}: {error}") from error
         if not isinstance(grasps, GraspBatch):
             raise OptionError(f"method '{self.name}' returned a {type(grasps).__name__}, expected a GraspBatch; make one with "
                               "GraspBatch.create(hand, obj, T_object_wrist, joints)")

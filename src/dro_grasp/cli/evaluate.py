@@ -123,7 +123,8 @@ def compare(kind: str, name: str, stored: str, given: Hand | ObjectModel, output
         raise OptionError(f"the grasps were made for another {kind} '{name}' than the given {given.name} (hash {stored[:12]}, "
                           f"given {given.sha256[:12]}), and outcomes in {output} would pass for outcomes with their own; leave "
                           f"out --output, or generate grasps for this {kind} anew")
-    say_aside(f"the grasps were made for another '{name}' than the given {given.name}")
+    say_aside(f"the grasps were made for another '{name}' than the given {given.name}: its file has changed since, its scale "
+              "is another, or only the name is the same")
 
 
 def shares(grasps: GraspBatch, hand: Hand) -> dict[str, float]:

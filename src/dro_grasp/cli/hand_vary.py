@@ -33,11 +33,14 @@ class Vary:
         """Read, change, write."""
         from dro_grasp.errors import OptionError
         from dro_grasp.files import check_output, command, replacing
+        from dro_grasp.hands.library import locate_hand
         from dro_grasp.hands.variants import vary_hand
 
         if not self.mirrored and self.scale == 1:
             raise OptionError("nothing would change; give --mirrored, --scale, or both")
         path = check_output(self.output, ".urdf")
+        if path.exists() and path.samefile(locate_hand(self.hand)[0]):
+            raise OptionError(f"{path} is the hand itself, which would be lost; give --output another name")
         text = vary_hand(self.hand, mirrored=self.mirrored, factor=self.scale)
         with replacing(path) as temporary:
             temporary.write_text(text)

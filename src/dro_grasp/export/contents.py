@@ -57,8 +57,19 @@ class Frame:
         return T[:, :3, 3].double(), torch.where(quaternion[:, :1] < 0, -quaternion, quaternion)
 
     def name_for(self, grasps: GraspBatch) -> str:
-        """This frame's name; the object's own frame has the name that its grasps give it, or else the object's."""
-        return self.name if self.name != OBJECT else frame_of(grasps) or grasps.object[0]
+        """This frame's name; the object's own frame has the name that its grasps give it, or else the object's.
+
+        Raises:
+            OptionError: The frame is the object's, and there are several objects, or none.
+        """
+        if self.name != OBJECT:
+            return self.name
+        if (named := frame_of(grasps)) is not None:
+            return named
+        if len(set(grasps.object)) != 1:
+            raise OptionError(f"{len(grasps)} grasps of {len(set(grasps.object))} objects; a file has the frame of one object, "
+                              "so export the grasps of each (GraspBatch.by_object)")
+        return grasps.object[0]
 
     def sentence(self, grasps: GraspBatch) -> str:
         """This frame in words."""

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from dro_grasp.errors import GraspFileError
@@ -91,18 +92,24 @@ class GraspBatch:
 
     @staticmethod
     def create(
-        hand: Hand, obj: ObjectModel | Sequence[ObjectModel], T_object_wrist: Float[Tensor, "n 4 4"],
-        joints: Float[Tensor, "n n_dof"], **optional: Any,
+        hand: Hand, obj: ObjectModel | Sequence[ObjectModel], T_object_wrist: ArrayLike | Tensor, joints: ArrayLike | Tensor,
+        **optional: Any,
     ) -> GraspBatch:
         """A batch for a hand and one or several objects.
 
         Args:
             hand: The hand: name, sha256 and tree are recorded.
             obj: The object or one object per grasp: name, sha256 and split are recorded.
-            T_object_wrist: Wrist poses in the object's frame [m].
-            joints: Independent joints [rad or m].
+            T_object_wrist: Wrist poses in the object's frame, (n, 4, 4) [m].
+            joints: Independent joints, (n, n_dof) [rad or m].
             optional: Any other field of GraspBatch; `seed` may be one int, `provenance` one string.
+
+        Poses and joints may be arrays; numbers in any precision become single.
+
+        Raises:
+            OptionError: Poses or joints have another shape, are not finite, or a pose is no rigid motion.
         """
+        T_object_wrist, joints = columns.placed(T_object_wrist, joints, len(hand.tree.joint_names))
         n = len(joints)
         objects = list(obj) if isinstance(obj, Sequence) else [obj] * n
         fields: dict[str, Any] = {name: columns.unknown(name, joints) for name in columns.COLUMNS[2:]}
@@ -113,7 +120,9 @@ class GraspBatch:
         }
         if "success" in optional:
             fields["protocol"] = (columns.UNKNOWN_PROTOCOL,) * n
-        fields |= optional
+        fields |= {
+            name: value.float() if isinstance(value, Tensor) and value.is_floating_point() else value
+            for name, value in optional.items()}
         if isinstance(fields["seed"], int):
             fields["seed"] = torch.full((n,), fields["seed"], dtype=torch.int64)
         if isinstance(fields["provenance"], str):
@@ -137,11 +146,11 @@ class GraspBatch:
         """
         if index is self.success:
             columns.require_outcomes(self)
-        rows = torch.arange(len(self))
         if isinstance(index, int) and not -len(self) <= index < len(self):
             raise IndexError(f"grasp {index} of a batch of {len(self)}")
         if isinstance(index, slice):
-            return self._take(rows[index])
+            return self._take(torch.tensor(range(len(self))[index], dtype=torch.long))
+        rows = torch.arange(len(self))
         chosen = torch.as_tensor(index).cpu()
         return self._take(rows[chosen if chosen.numel() else chosen.long()].reshape(-1))
 

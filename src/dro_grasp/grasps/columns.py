@@ -50,6 +50,8 @@ FRAME = "frame"
 """Further column of grasps on a camera's cloud: name of the frame of the poses."""
 CAMERA = "T_frame_camera"
 """Further column of such grasps: pose of the camera in that frame, row by row [m]."""
+RIGID = 1e-2
+"""Largest deviation of a rotation's product with its transpose from the identity (ours)."""
 ENERGY_TERM = "energy_"
 """How the names of further columns with the terms of the grasp energy begin."""
 
@@ -69,6 +71,27 @@ def require_fit(batch: Any, n_names: int) -> None:
         raise ValueError(f"further columns have the names of fields: {taken_names}; set the fields instead")
     if bool((batch.success & ~batch.evaluated).any()):
         raise ValueError("some grasps succeeded without a protocol; name the protocol of their trial")
+
+
+def placed(T_object_wrist: Any, joints: Any, n_dof: int) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n n_dof"]]:
+    """Poses and joints of grasps as tensors in single precision.
+
+    Raises:
+        OptionError: They have another shape, are not finite, or a pose is no rigid motion.
+    """
+    T, q = (torch.as_tensor(values).float() for values in (T_object_wrist, joints))
+    if T.ndim != 3 or T.shape[1:] != (4, 4) or q.ndim != 2 or q.shape != (len(T), n_dof):
+        raise OptionError(f"wrist poses of shape {tuple(T.shape)} and joints of shape {tuple(q.shape)}; expected (n, 4, 4) and "
+                          f"(n, {n_dof}) for this hand")
+    if wrong := (~(T.isfinite().all(-1).all(-1) & q.isfinite().all(-1))).nonzero()[:, 0].tolist():
+        raise OptionError(f"grasp {wrong[0]} has a pose or joints that are not finite, and {len(wrong) - 1} more have; leave "
+                          "them out")
+    R, last = T[:, :3, :3], torch.tensor([0.0, 0.0, 0.0, 1.0], device=T.device)
+    apart = (R @ R.mT - torch.eye(3, device=T.device)).abs().amax((-1, -2)).maximum((T[:, 3] - last).abs().amax(-1))
+    if wrong := ((apart > RIGID) | (torch.linalg.det(R) < 0)).nonzero()[:, 0].tolist():
+        raise OptionError(f"the wrist pose of grasp {wrong[0]} is no rigid motion, and {len(wrong) - 1} more; give rotation "
+                          "matrices, and metres beside them")
+    return T, q
 
 
 def require_outcomes(batch: Any) -> None:

@@ -85,11 +85,21 @@ def read_geometry(path: Path) -> tuple[trimesh.Trimesh | Float[np.ndarray, "..."
         unit = trimesh.units.unit_conversion(loaded.units, "meters") if loaded.units else 1.0
         geometry = merge_scene(loaded) if isinstance(loaded, trimesh.Scene) else loaded
     if isinstance(geometry, trimesh.PointCloud):
-        return np.asarray(geometry.vertices, np.float64), unit
+        return _with_normals(geometry), unit
     if not isinstance(geometry, trimesh.Trimesh):
         raise ObjectError(f"{path} holds a {type(geometry).__name__}, which has no faces; give a triangle mesh, or a "
                           "point cloud as PLY, NPY or PCD")
     return geometry, unit
+
+
+def _with_normals(cloud: trimesh.PointCloud) -> Float[np.ndarray, "n k"]:
+    """The points of a cloud, and the normals that a PLY file has of them, which trimesh keeps aside."""
+    points = np.asarray(cloud.vertices, np.float64)
+    raw = cloud.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
+    names = ("nx", "ny", "nz")
+    if not isinstance(raw, dict) or any(name not in raw or len(raw[name]) != len(points) for name in names):
+        return points
+    return np.column_stack([points, *(np.asarray(raw[name], np.float64).reshape(len(points)) for name in names)])
 
 
 def merge_scene(scene: trimesh.Scene) -> trimesh.Trimesh | trimesh.PointCloud:

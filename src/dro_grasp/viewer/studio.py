@@ -151,7 +151,8 @@ class Studio(GraspPage):
             self._preview()
             return
         other = [] if grasps.hand_sha256 in {"", hand.sha256} else [
-            f"The grasps were made for another '{grasps.hand}' than the given {hand.name}."]
+            f"The grasps were made for another '{grasps.hand}' than the given {hand.name}: its file has changed since, or only "
+            "the name is the same."]
         obj, label = self.shelf.obj(self.object.value), next(filter(None, grasps.protocol), "")
         self.made = ShownGrasps(hand, obj, grasps, grasps, protocol_name(label))
         self._present()
