@@ -6,7 +6,7 @@ import math
 import warnings
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import torch
@@ -28,6 +28,7 @@ from dro_grasp.pipeline.proposal import Proposal, ProposalConfig, check_temperat
 from dro_grasp.pipeline.settling import best_settled, can_settle
 from dro_grasp.pipeline.shortage import shortage_in_words
 from dro_grasp.pipeline.stages import complete, eased, optimise, refine, scored
+from dro_grasp.records import by_record
 from dro_grasp.stopwatch import Stopwatch
 
 LARGEST_CALL = 100_000
@@ -168,22 +169,17 @@ class GraspPredictor:
             num: Grasps to return.
             seed: The same seed gives the same grasps.
             constraints: What grasps have to respect.
-            options: Fields of `Constraints`, such as direction and table, and other fields of `GraspRequest`: candidates,
-                refine, temperature, method.
+            options: Fields of `Constraints` (direction, table, ...) and of `GraspRequest` (candidates, refine, method, ...).
 
         Raises:
             ObjectError: The scene to avoid contains the object.
             OptionError: An argument is out of range or unknown, the table is above the object, or no grasp was found.
         """
-        known = [f.name for part in (Constraints, GraspRequest) for f in fields(part)]
-        if unknown := [name for name in options if name not in known]:
-            raise OptionError(f"there is no option '{unknown[0]}'; the options are {', '.join(known)}")
-        names = {f.name for f in fields(Constraints)} & set(options)
-        constraints = replace(constraints or Constraints(), **{name: options.pop(name) for name in names})
-        problem = GraspProblem(hand, obj, self.device, constraints)
+        wanted, asked = by_record(options, Constraints, GraspRequest)
+        problem = GraspProblem(hand, obj, self.device, replace(constraints or Constraints(), **wanted))
         if (doubt := problem.constraints.doubt(obj)) is not None:
             warnings.warn(doubt, stacklevel=2)
-        made = self.run(problem, GraspRequest(num, seed, **options))
+        made = self.run(problem, GraspRequest(num, seed, **asked))
         if made.shortage is not None:
             warnings.warn(made.shortage, stacklevel=2)
         return made.grasps
@@ -300,5 +296,4 @@ class _Pool:
         proposed = complete(self.problem, chosen.grasps)
         given = eased(self.problem, grasps[best]) if self.request.refine else grasps[best]
         grasps = with_own_files(given, self.problem.hand, self.problem.obj)
-        return Prediction(
-            grasps, proposed, chosen.points, self.made, dict(self.dropped), self.watch.seconds, shortage)
+        return Prediction(grasps, proposed, chosen.points, self.made, dict(self.dropped), self.watch.seconds, shortage)

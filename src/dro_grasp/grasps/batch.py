@@ -92,7 +92,7 @@ class GraspBatch:
 
     @staticmethod
     def create(
-        hand: Hand, obj: ObjectModel | Sequence[ObjectModel], T_object_wrist: ArrayLike | Tensor, joints: ArrayLike | Tensor,
+        hand: Hand, obj: ObjectModel | Sequence[ObjectModel], T_object_wrist: ArrayLike, joints: ArrayLike,
         **optional: Any,
     ) -> GraspBatch:
         """A batch for a hand and one or several objects.
@@ -110,23 +110,13 @@ class GraspBatch:
             OptionError: Poses or joints have another shape, are not finite, or a pose is no rigid motion.
         """
         T_object_wrist, joints = columns.placed(T_object_wrist, joints, len(hand.tree.joint_names))
-        n = len(joints)
-        objects = list(obj) if isinstance(obj, Sequence) else [obj] * n
-        fields: dict[str, Any] = {name: columns.unknown(name, joints) for name in columns.COLUMNS[2:]}
-        fields |= {
+        objects = list(obj) if isinstance(obj, Sequence) else [obj] * len(joints)
+        fields = {
             "hand": hand.name, "hand_sha256": hand.sha256, "wrist_link": hand.tree.link_names[0],
             "joint_names": tuple(hand.tree.joint_names), "object": tuple(o.name for o in objects),
             "object_sha256": tuple(o.sha256 for o in objects), "split": tuple(o.split or "" for o in objects),
         }
-        if "success" in optional:
-            fields["protocol"] = (columns.UNKNOWN_PROTOCOL,) * n
-        fields |= {
-            name: value.float() if isinstance(value, Tensor) and value.is_floating_point() else value
-            for name, value in optional.items()}
-        if isinstance(fields["seed"], int):
-            fields["seed"] = torch.full((n,), fields["seed"], dtype=torch.int64)
-        if isinstance(fields["provenance"], str):
-            fields["provenance"] = (fields["provenance"],) * n
+        fields = columns.filled(joints, fields, optional)
         return GraspBatch(T_object_wrist=T_object_wrist, joints=joints, **fields)
 
     def __len__(self) -> int:
@@ -244,14 +234,7 @@ class GraspBatch:
 
     def with_trial(self, trial: Any) -> GraspBatch:
         """The batch with the outcome of a trial, a TrialResult; why grasps failed and what they touched are further columns."""
-        further = {
-            columns.REASON: list(trial.reason), columns.CONTACT_LINKS: [list(links) for links in trial.contact_links],
-            columns.FAILURE: [failure.name if failure else None for failure in trial.failure],
-        }
-        return self.replace(
-            success=trial.success, displacement=trial.displacement.amax(-1), rotation=trial.rotation.amax(-1),
-            penetration=trial.penetration, robustness=trial.robustness, fingers_in_contact=trial.fingers_in_contact.float(),
-            protocol=(trial.protocol,) * len(self), extra=self.extra | further)
+        return self.replace(**columns.outcomes(trial, len(self), self.extra))
 
     def without_trial(self) -> GraspBatch:
         """The batch as if no grasp had been evaluated."""

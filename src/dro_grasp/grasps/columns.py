@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import count
 from typing import Any
 
@@ -122,6 +122,35 @@ def places(objects: Sequence[str], hashes: Sequence[str]) -> dict[str, list[int]
             taken_names.add(labels[key])
         rows.setdefault(labels[key], []).append(i)
     return rows
+
+
+def filled(joints: Float[Tensor, "n n_dof"], known: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """All fields of a batch but poses and joints: those known, those given, in single precision, and the others unknown."""
+    n = len(joints)
+    fields: dict[str, Any] = {name: unknown(name, joints) for name in COLUMNS[2:]} | dict(known)
+    if "success" in given:
+        fields["protocol"] = (UNKNOWN_PROTOCOL,) * n
+    for name, value in given.items():
+        fields[name] = value.float() if isinstance(value, Tensor) and value.is_floating_point() else value
+    if isinstance(fields["seed"], int):
+        fields["seed"] = torch.full((n,), fields["seed"], dtype=torch.int64)
+    if isinstance(fields["provenance"], str):
+        fields["provenance"] = (fields["provenance"],) * n
+    return fields
+
+
+def outcomes(trial: Any, n: int, extra: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of n grasps, and further columns beside these, that state the outcome of a trial, a TrialResult."""
+    further = {
+        REASON: list(trial.reason), CONTACT_LINKS: [list(links) for links in trial.contact_links],
+        FAILURE: [failure.name if failure else None for failure in trial.failure],
+    }
+    return {
+        "success": trial.success, "displacement": trial.displacement.amax(-1), "rotation": trial.rotation.amax(-1),
+        "penetration": trial.penetration, "robustness": trial.robustness,
+        "fingers_in_contact": trial.fingers_in_contact.float(), "protocol": (trial.protocol,) * n,
+        "extra": {**extra, **further},
+    }
 
 
 def unknown(name: str, joints: Float[Tensor, "n n_dof"]) -> Any:

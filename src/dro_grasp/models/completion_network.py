@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Num
 from torch import Tensor, nn
 
 from dro_grasp.models.checkpoints import SHIPPED_FOLDER, load_small
@@ -48,7 +48,7 @@ class SurfaceNetwork(nn.Module):
 @cache
 def shipped_surface() -> SurfaceNetwork:
     """The network that ships, loaded once."""
-    def sized(tensors: dict[str, Tensor]) -> SurfaceNetwork:
+    def sized(tensors: dict[str, Num[Tensor, "..."]]) -> SurfaceNetwork:
         width, features = tensors["enter.weight"].shape
         depth = sum(name.endswith(".0.weight") for name in tensors)
         return SurfaceNetwork(len(tensors["leave.bias"]) - 1, features, width, depth)

@@ -224,8 +224,7 @@ def _hold_joints(spec: mujoco.MjSpec, hand: Hand) -> None:
 def add_object(scene: mujoco.MjSpec, obj: ObjectModel, protocol: Protocol, name: str = "object") -> mujoco.MjsBody:
     """The object as its convex parts, or as its balls, with its mass and inertia; body and free joint have the name.
 
-    The body's frame has the object's axes at its centre of mass: MuJoCo integrates the motion of that frame's origin, which
-    errs the more the farther a turning body's centre of mass is from it.
+    The body's frame is at the centre of mass: MuJoCo integrates its origin, which errs where a body turns about another point.
     """
     body = scene.worldbody.add_body(name=name, pos=FAR_AWAY)
     middle = obj.centre_of_mass
