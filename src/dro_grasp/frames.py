@@ -8,13 +8,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
 
 HALF_AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
 """Names of the half-axes, in the order of the indices of `half_axis`."""
+ROUNDING = 1e-3
+"""Largest deviation of a rotation's product with its transpose from the identity (ours)."""
 LONGEST = 100.0
 """A longer translation must be in another unit [m] (ours)."""
 
@@ -68,14 +70,19 @@ def is_name(name: object) -> bool:
     return isinstance(name, str) and bool(name.strip()) and name.isprintable()
 
 
+def are_rotations(R: Float[Tensor, "*b 3 3"]) -> Bool[Tensor, "*b"]:
+    """Which matrices are rotations, up to ROUNDING."""
+    apart = (R @ R.mT - torch.eye(3, dtype=R.dtype, device=R.device)).abs().amax((-1, -2))
+    return (apart <= ROUNDING) & (torch.linalg.det(R) > 0)
+
+
 def motion_fault(T: Float[Tensor, "*any"]) -> str | None:
     """Why a matrix is no rigid motion in metres, in words; None if it is one."""
     if not bool(T.isfinite().all()):
         return "its matrix holds NaN or infinity"
     if T.shape != (4, 4) or T[3].tolist() != [0, 0, 0, 1]:
         return f"its matrix has shape {tuple(T.shape)} or a last row other than 0 0 0 1"
-    R = T[:3, :3]
-    if float((R @ R.T - torch.eye(3)).abs().max()) > 1e-3 or float(torch.linalg.det(R)) < 0:
+    if not bool(are_rotations(T[:3, :3])):
         return "the upper left 3x3 of its matrix is not a rotation (scaled, or mirrored)"
     if float(T[:3, 3].norm()) > LONGEST:
         return f"its translation is {float(T[:3, 3].norm()):g} m long; divide millimetres by 1000"

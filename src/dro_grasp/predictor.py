@@ -21,6 +21,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.models.checkpoints import load_weights
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.options import by_owner
 from dro_grasp.pipeline.admission import permitted, reasons_against
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem
@@ -28,7 +29,6 @@ from dro_grasp.pipeline.proposal import Proposal, ProposalConfig, check_temperat
 from dro_grasp.pipeline.settling import best_settled, can_settle
 from dro_grasp.pipeline.shortage import shortage_in_words
 from dro_grasp.pipeline.stages import complete, eased, optimise, refine, scored
-from dro_grasp.records import by_record
 from dro_grasp.stopwatch import Stopwatch
 
 LARGEST_CALL = 100_000
@@ -175,7 +175,7 @@ class GraspPredictor:
             ObjectError: The scene to avoid contains the object.
             OptionError: An argument is out of range or unknown, the table is above the object, or no grasp was found.
         """
-        wanted, asked = by_record(options, Constraints, GraspRequest)
+        wanted, asked = by_owner(options, Constraints, GraspRequest)
         problem = GraspProblem(hand, obj, self.device, replace(constraints or Constraints(), **wanted))
         if (doubt := problem.constraints.doubt(obj)) is not None:
             warnings.warn(doubt, stacklevel=2)

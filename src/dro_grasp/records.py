@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from functools import cached_property
 from typing import Any, TypeVar
 
 import torch
-
-from dro_grasp.errors import OptionError
 
 Record = TypeVar("Record")
 
@@ -19,19 +16,6 @@ def on_device(record: Record, device: torch.device | str) -> Record:
     values = {f.name: getattr(record, f.name) for f in dataclasses.fields(record)}  # type: ignore[arg-type]
     moved = {name: value.to(device) for name, value in values.items() if hasattr(value, "to")}
     return dataclasses.replace(record, **moved)  # type: ignore[type-var]
-
-
-def by_record(values: Mapping[str, Any], *records: type[Any]) -> list[dict[str, Any]]:
-    """Values by the dataclass of which their names are fields, the first of several.
-
-    Raises:
-        OptionError: A name is no field of any; the error lists those that there are.
-    """
-    home = {f.name: record for record in reversed(records) for f in dataclasses.fields(record)}
-    if unknown := [name for name in values if name not in home]:
-        names = dict.fromkeys(f.name for record in records for f in dataclasses.fields(record))
-        raise OptionError(f"there is no option '{unknown[0]}'; the options are {', '.join(names)}")
-    return [{name: value for name, value in values.items() if home[name] is record} for record in records]
 
 
 class cached_tensor(cached_property):  # type: ignore[type-arg]  # reads like the decorator it extends

@@ -254,4 +254,6 @@ def test_grasps_of_several_objects_or_of_none_share_no_frame(grasps: GraspBatch)
     for batch in (two, grasps[:0]):
         with pytest.raises(OptionError, match=r"grasps of \d objects; a file has the frame of one object"):
             dro.isaac_grasp(batch, Frame())
+        with pytest.raises(OptionError, match=r"a file has the frame of one object"):
+            dro.csv_table(batch, Frame())
     assert "object_frame_link: bench" in dro.isaac_grasp(two, Frame("bench"))

@@ -386,6 +386,7 @@ def test_poses_and_joints_may_be_arrays_of_any_precision():
     (lambda T, q: (T, q[:, 1:]), r"joints of shape \(3, 5\).*\(n, 6\) for this hand"),
     (lambda T, q: (T * torch.tensor([2.0, 2, 2, 1]), q), "grasp 0 is no rigid motion, and 2 more"),
     (lambda T, q: (T * torch.tensor([-1.0, 1, 1, 1]), q), "grasp 0 is no rigid motion"),
+    (lambda T, q: ([[1.0], [2.0, 3.0]], q), "no arrays of numbers"),
     (lambda T, q: (T, torch.full_like(q, torch.nan)), "grasp 0 has a pose or joints that are not finite, and 2 more"),
 ])
 def test_poses_and_joints_that_are_none_are_refused(change, told):

@@ -116,6 +116,7 @@ def compare(kind: str, name: str, stored: str, given: Hand | ObjectModel, output
         OptionError: Outcomes with it are to be saved, where they would pass for those with the grasps' own.
     """
     from dro_grasp.errors import OptionError
+    from dro_grasp.grasps.sources import made_for_another
 
     if stored in {"", given.sha256}:
         return
@@ -123,8 +124,7 @@ def compare(kind: str, name: str, stored: str, given: Hand | ObjectModel, output
         raise OptionError(f"the grasps were made for another {kind} '{name}' than the given {given.name} (hash {stored[:12]}, "
                           f"given {given.sha256[:12]}), and outcomes in {output} would pass for outcomes with their own; leave "
                           f"out --output, or generate grasps for this {kind} anew")
-    say_aside(f"the grasps were made for another '{name}' than the given {given.name}: its file has changed since, its scale "
-              "is another, or only the name is the same")
+    say_aside(made_for_another(name, given.name))
 
 
 def shares(grasps: GraspBatch, hand: Hand) -> dict[str, float]:

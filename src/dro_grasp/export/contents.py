@@ -74,7 +74,7 @@ class Frame:
     def sentence(self, grasps: GraspBatch) -> str:
         """This frame in words."""
         own = self.name == OBJECT and frame_of(grasps) is None
-        return f"the mesh frame of object '{grasps.object[0]}'" if own else f"frame '{self.name_for(grasps)}'"
+        return f"{'the mesh frame of object' if own else 'frame'} '{self.name_for(grasps)}'"
 
 
 def postures(grasps: GraspBatch) -> dict[str, Float[Tensor, "n n_dof"]]:

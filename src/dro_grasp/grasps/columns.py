@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
+from dro_grasp.frames import ROUNDING, are_rotations
 
 TRIAL_FLOATS = ("displacement", "rotation", "penetration", "robustness", "fingers_in_contact")
 """Columns of one number per grasp that a trial fills; NaN is unknown."""
@@ -50,8 +51,6 @@ FRAME = "frame"
 """Further column of grasps on a camera's cloud: name of the frame of the poses."""
 CAMERA = "T_frame_camera"
 """Further column of such grasps: pose of the camera in that frame, row by row [m]."""
-RIGID = 1e-2
-"""Largest deviation of a rotation's product with its transpose from the identity (ours)."""
 ENERGY_TERM = "energy_"
 """How the names of further columns with the terms of the grasp energy begin."""
 
@@ -79,16 +78,18 @@ def placed(T_object_wrist: Any, joints: Any, n_dof: int) -> tuple[Float[Tensor, 
     Raises:
         OptionError: They have another shape, are not finite, or a pose is no rigid motion.
     """
-    T, q = (torch.as_tensor(values).float() for values in (T_object_wrist, joints))
+    try:
+        T, q = (torch.as_tensor(values).float() for values in (T_object_wrist, joints))
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise OptionError(f"wrist poses or joints are no arrays of numbers ({error}); give rows of equal lengths") from error
     if T.ndim != 3 or T.shape[1:] != (4, 4) or q.ndim != 2 or q.shape != (len(T), n_dof):
         raise OptionError(f"wrist poses of shape {tuple(T.shape)} and joints of shape {tuple(q.shape)}; expected (n, 4, 4) and "
                           f"(n, {n_dof}) for this hand")
     if wrong := (~(T.isfinite().all(-1).all(-1) & q.isfinite().all(-1))).nonzero()[:, 0].tolist():
         raise OptionError(f"grasp {wrong[0]} has a pose or joints that are not finite, and {len(wrong) - 1} more have; leave "
                           "them out")
-    R, last = T[:, :3, :3], torch.tensor([0.0, 0.0, 0.0, 1.0], device=T.device)
-    apart = (R @ R.mT - torch.eye(3, device=T.device)).abs().amax((-1, -2)).maximum((T[:, 3] - last).abs().amax(-1))
-    if wrong := ((apart > RIGID) | (torch.linalg.det(R) < 0)).nonzero()[:, 0].tolist():
+    rigid = are_rotations(T[:, :3, :3]) & ((T[:, 3] - T.new_tensor([0, 0, 0, 1])).abs() <= ROUNDING).all(-1)
+    if wrong := (~rigid).nonzero()[:, 0].tolist():
         raise OptionError(f"the wrist pose of grasp {wrong[0]} is no rigid motion, and {len(wrong) - 1} more; give rotation "
                           "matrices, and metres beside them")
     return T, q

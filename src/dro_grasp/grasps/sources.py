@@ -155,6 +155,12 @@ def camera_pose(grasps: GraspBatch) -> Float[Tensor, "4 4"] | None:
     return None if frame is None else grasps.extra[CAMERA][grasps.extra[FRAME].index(frame)].reshape(4, 4)
 
 
+def made_for_another(name: str, given: str) -> str:
+    """A sentence about grasps that are used with another hand or object than their own."""
+    return (f"the grasps were made for another '{name}' than the given {given}: its file or scale has changed since, or only "
+            "the name is the same")
+
+
 def require_same(grasps: GraspBatch, hand: Hand, obj: ObjectModel) -> None:
     """Refuse a hand or an object that has changed since grasps of one object were made.
 

@@ -60,7 +60,8 @@ def close_idle_fingers(energy: GraspEnergy, grasps: GraspBatch, config: ClosingC
         return grasps
     device = energy.centre.device
     parts = zip(grasps.T_object_wrist.split(config.batch_size), grasps.joints.split(config.batch_size), strict=True)
-    ends = [_Closer(energy, T.to(device), config).close(q.to(device)) for T, q in parts]
+    bends = bending(energy.hand)
+    ends = [_Closer(energy, bends, T.to(device), config).close(q.to(device)) for T, q in parts]
     return grasps.moved_to(grasps.T_object_wrist, torch.cat(ends).cpu())
 
 
@@ -72,13 +73,13 @@ class _Closer:
     """
 
     energy: GraspEnergy
+    bends: Bool[Tensor, "n_tips n_dof"]
     T: Float[Tensor, "n 4 4"]
     config: ClosingConfig
 
     def close(self, q: Float[Tensor, "n n_dof"]) -> Float[Tensor, "n n_dof"]:
         """Joints with idle fingers closed, and the outer links of the others wrapped around the object."""
-        hand, config = self.energy.hand, self.config
-        bends = bending(hand)
+        hand, config, bends = self.energy.hand, self.config, self.bends
         bend, first = (joints.expand(len(q), -1, -1) for joints in (bends, _first(hand, bends)))
         opened = torch.where(bends.any(0), hand.canonical_joints(config.openness), q)
         idle = least_by_finger(self.energy, self.distances(q)) > config.idle
@@ -100,18 +101,18 @@ class _Closer:
         if not bool(rows.any()):
             return q, waiting
         some = replace(self, T=self.T[rows])
-        new_q, still = some.meeting(q[rows], start[rows], moving[rows], waiting[rows])
+        new_q, still = some.all_waiting(q[rows], start[rows], moving[rows], waiting[rows])
         return q.index_put((rows,), new_q), waiting.index_put((rows,), still)
 
-    def meeting(
+    def all_waiting(
         self, q: Float[Tensor, "n n_dof"], start: Float[Tensor, "n n_dof"], moving: Bool[Tensor, "n n_tips n_dof"],
         waiting: Bool[Tensor, "n n_tips"],
     ) -> tuple[Float[Tensor, "n n_dof"], Bool[Tensor, "n n_tips"]]:
-        """`contact` of grasps that all have fingers that wait."""
-        bends, waiting = bending(self.energy.hand), waiting.clone()
+        """`contact` of grasps each of which has a finger that waits."""
+        waiting = waiting.clone()
         share, meets = self.first_contact(start, moving)
         for finger in (meets & waiting).any(0).nonzero()[:, 0].tolist():
-            new = torch.where(bends[finger], self.along(start, moving[:, finger], share[:, finger, None]), q)
+            new = torch.where(self.bends[finger], self.along(start, moving[:, finger], share[:, finger, None]), q)
             kept = (meets & waiting)[:, finger] & self.roomy(new, q)
             q = torch.where(kept[:, None], new, q)
             waiting[:, finger] &= ~kept
@@ -122,8 +123,7 @@ class _Closer:
         holding: Bool[Tensor, "n n_tips"],
     ) -> Float[Tensor, "n n_dof"]:
         """Joints with what reaches nothing bent as far as the fingers that hold, or less where there is no room."""
-        hand, config = self.energy.hand, self.config
-        bends = bending(hand)
+        hand, config, bends = self.energy.hand, self.config, self.bends
         opened = torch.where(bends.any(0), hand.canonical_joints(1.0), q)
         holding = holding & bends.any(1)
         if hand.thumb is not None:

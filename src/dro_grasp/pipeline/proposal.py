@@ -102,15 +102,16 @@ def propose(
         placement = _placements(problem, hand, network, cloud, num, config, generator)
         joints = hand.random_open_joints(num, generator)
         noise = network.sample_latent(num, generator, _temperature(problem, config), config.choice.draws).to(problem.device)
-    found: list[tuple[Tensor, ...]] = []
+    found: list[tuple[Tensor, Tensor, Tensor]] = []
     for start in range(0, num, config.batch_size):
         part = slice(start, min(start + config.batch_size, num))
         with watch("network"):
             distances = _distances(problem, network, cloud, placement[part], joints[part], noise[part], config)
         with watch("decode"), one_thread():
-            several = _decoded(hand, distances, cloud, joints[part])
-            best = _best(problem, *several[:2], config.choice)
-            found.append(tuple(each[torch.arange(len(best)), best] for each in several))
+            T, q, points = _decoded(hand, distances, cloud, joints[part])
+            best = _best(problem, T, q, config.choice)
+            rows = torch.arange(len(best), device=best.device)
+            found.append((T[rows, best], q[rows, best], points[rows, best]))
         if progress is not None:
             progress(part.stop, num)
     T, q, points = (torch.cat(part).cpu() for part in zip(*found, strict=True))

@@ -61,7 +61,7 @@ class Deviation:
 
 DEVIATIONS = (Deviation(), Deviation((0.008, 0.0), 0.8, 1.3), Deviation((-0.004, 0.007), 0.8, 1.3),
               Deviation((-0.004, -0.007), 0.8, 1.3))
-"""Those of the rehearsals of one grasp: none, then shifted, slippery and heavy.
+"""How the rehearsals of one grasp deviate: not at all, then shifted, slippery and heavy.
 
 Ours: on training objects, half of these shifts let two of 25 grasps pass that lose the true object, and these let none."""
 

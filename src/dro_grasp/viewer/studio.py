@@ -15,6 +15,7 @@ import viser
 
 from dro_grasp.errors import DroGraspError
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.sources import made_for_another
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import hand_names
 from dro_grasp.objects.catalogue import object_names
@@ -150,9 +151,7 @@ class Studio(GraspPage):
         if grasps is None or (grasps.hand_sha256 != hand.sha256 and self._given.get(self.object.value) is not hand):
             self._preview()
             return
-        other = [] if grasps.hand_sha256 in {"", hand.sha256} else [
-            f"The grasps were made for another '{grasps.hand}' than the given {hand.name}: its file has changed since, or only "
-            "the name is the same."]
+        other = [] if grasps.hand_sha256 in {"", hand.sha256} else [f"{made_for_another(grasps.hand, hand.name)}."]
         obj, label = self.shelf.obj(self.object.value), next(filter(None, grasps.protocol), "")
         self.made = ShownGrasps(hand, obj, grasps, grasps, protocol_name(label))
         self._present()
