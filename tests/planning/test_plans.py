@@ -20,7 +20,7 @@ import yaml
 import dro_grasp as dro
 from dro_grasp.cli.main import main
 from dro_grasp.errors import OptionError, PlanError
-from dro_grasp.planning import extra
+from dro_grasp.planning import extra, planner
 from dro_grasp.planning.collisions import CollisionChecker
 from dro_grasp.planning.inverse_kinematics import WristSolver
 from dro_grasp.planning.motion import STAGES, MotionPlan
@@ -332,6 +332,25 @@ def test_a_robot_and_a_cloud_that_cannot_be_used_leave_nothing_behind(
     assert main(["plan", *given, "--output", "plan.npz", "--csv", "plan.csv"]) == 2
     assert said in capsys.readouterr().err
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_each_batch_of_grasps_is_another_one(
+    robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[int] = []
+
+    def nowhere(predictor: object, hand: dro.Hand, obj: dro.ObjectModel, T: object, num: int, *rest: object) -> dro.GraspBatch:
+        asked.append(int(str(rest[-1])))
+        away = torch.eye(4).repeat(num, 1, 1)
+        away[:, 2, 3] = 9.0
+        q = hand.canonical_joints().repeat(num, 1)
+        return dro.GraspBatch.create(hand, obj, away, q, score=torch.zeros(num), pregrasp_joints=q, squeeze_joints=q)
+
+    monkeypatch.setattr(planner, "grasps_in_world", nowhere)
+    with pytest.raises(PlanError, match="6 grasps: 6 out of reach"):
+        plan(robot, *standing, config=PlanConfig(num=2, batches=3), seed=7)
+    assert asked[0] == 7
+    assert len(set(asked)) == 3
 
 
 def test_without_the_extra_planning_says_what_to_install(
