@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from PIL import Image
 
@@ -125,21 +126,46 @@ def test_objects_of_one_name_in_one_file_are_told_apart_by_every_command(
     shelf.close()
 
 
-@pytest.mark.parametrize("command", ["evaluate", "dataset check", "dataset filter --output kept"])
+@pytest.fixture
+def beside_a_cloud(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file of grasps of a can and of a bare cloud."""
+    monkeypatch.chdir(tmp_path)
+    np.save("points.npy", load_object("sphere").cloud)
+    hand, points = loaded_hand("gripper3"), load_object("points.npy")
+    batches = [palm_facing_starts(hand, obj, num=n, seed=0) for obj, n in ((points, 2), (load_object("can"), 1))]
+    GraspBatch.concatenate([with_own_files(batches[0], hand, points), batches[1]]).save("both.parquet")
+    return tmp_path / "both.parquet"
+
+
+def test_evaluate_leaves_grasps_of_bare_clouds_as_they_are(
+    beside_a_cloud: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tried, asked = tmp_path / "tried.parquet", ["--contact-quality", "--json"]
+    assert main(["evaluate", str(beside_a_cloud), "--output", str(tried), *asked]) == 0
+    told = capsys.readouterr()
+    assert "points: a bare point cloud has no trial; its 2 grasps" in told.err
+    report = json.loads(told.out)
+    assert (report["num"], list(report["objects"]), report["bare_clouds"]) == (1, ["can"], ["points"])
+    outcomes = GraspBatch.load(tried)
+    assert dict(zip(outcomes.object, outcomes.evaluated.tolist(), strict=True)) == {"can": True, "points": False}
+    assert len(outcomes) == 3
+    given = GraspBatch.load(beside_a_cloud)
+    left = torch.tensor([name == "points" for name in given.object])
+    torch.testing.assert_close(outcomes[~outcomes.evaluated].T_object_wrist, given[left].T_object_wrist)
+    given[left].save(beside_a_cloud)
+    assert main(["evaluate", str(beside_a_cloud)]) == 2
+    assert "object 'points' is a bare point cloud; a trial needs a mesh" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["check", "filter --output kept"])
 def test_a_bare_cloud_among_the_objects_is_refused_before_any_trial(
-    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    command: str, beside_a_cloud: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def none(*_: object, **__: object) -> None:
         raise AssertionError("a trial")
 
-    monkeypatch.chdir(tmp_path)
-    np.save("points.npy", load_object("sphere").cloud)
-    hand, points = loaded_hand("gripper3"), load_object("points.npy")
-    batches = [palm_facing_starts(hand, obj, num=1, seed=0) for obj in (load_object("can"), points)]
-    GraspBatch.concatenate([batches[0], with_own_files(batches[1], hand, points)]).save("both.parquet")
-    for place in ("dro_grasp.pipeline.stages.evaluate", "dro_grasp.datasets.collections.checking.simulate"):
-        monkeypatch.setattr(place, none)
-    assert main([*command.split(), "both.parquet"]) == 2
+    monkeypatch.setattr("dro_grasp.datasets.collections.checking.simulate", none)
+    assert main(["dataset", *command.split(), str(beside_a_cloud)]) == 2
     assert "object 'points' is a bare point cloud; a trial needs a mesh" in capsys.readouterr().err
 
 

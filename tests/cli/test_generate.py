@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from dro_grasp.cli.main import main
 from dro_grasp.grasps.batch import GraspBatch
@@ -150,3 +151,17 @@ def test_impossible_table_says_so(weights: str, capsys: pytest.CaptureFixture[st
     base = ["generate", "--hand", "gripper3", "--object", "sphere", "--weights", weights, "--num", "2"]
     assert main([*base, "--table", "5"]) == 2
     assert "leaves nothing of the object" in capsys.readouterr().err
+
+
+def test_a_file_without_any_success_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def failing(problem: object, grasps: GraspBatch, *_: object) -> GraspBatch:
+        none = torch.zeros(len(grasps), dtype=torch.bool)
+        return grasps.replace(success=none, protocol=("strict/1",) * len(grasps))
+
+    monkeypatch.setattr("dro_grasp.pipeline.stages.evaluate", failing)
+    path = tmp_path / "grasps.parquet"
+    arguments = ["generate", "--hand", "gripper3", "--object", "sphere", "--num", "2", "--method", "network", "--json"]
+    assert main([*arguments, "--only-successful", "--output", str(path)]) == 0
+    assert f"no grasp succeeded, so {path} holds none" in capsys.readouterr().err

@@ -28,6 +28,14 @@ def test_columns_that_say_nothing_are_left_out(capsys: pytest.CaptureFixture[str
     assert "size" in capsys.readouterr().out, "an empty table keeps its head"
 
 
+def test_long_names_are_folded_and_never_cut(capsys: pytest.CaptureFixture[str]) -> None:
+    names = [f"{letter}_hand_{'x' * 60}_left" for letter in "ab"]
+    print_table("t", ["hand", "object", "rate"], [[*names, 0.5]])
+    said = capsys.readouterr().out
+    assert "…" not in said
+    assert said.count("x") == 120
+
+
 @pytest.mark.parametrize("score", [-3.0, -0.2, 0.0, 1.0, 2.823, 1e4, -1e4])
 def test_a_score_is_shown_as_the_probability_that_it_states(score: float) -> None:
     grasps = made_up_grasps(toy_hand(), count=1).replace(score=torch.tensor([score]))

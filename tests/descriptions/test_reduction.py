@@ -43,6 +43,19 @@ def test_links_without_mass_get_some() -> None:
     assert [note.subject for note in notes] == ["mass"]
 
 
+def test_a_negative_mass_is_told_and_replaced() -> None:
+    spec, _ = reduced("<body name='palm'><geom size='.02'/><body name='finger'><inertial pos='0 0 0' mass='-1' "
+                      "diaginertia='1 1 1'/><joint name='bend'/><geom size='.01'/></body></body>")
+    notes: list[Note] = []
+    assert compile_hand(spec, PATH, notes).body("finger").mass[0] == pytest.approx(LEAST_MASS)
+    assert [(note.subject, note.text.split(";")[0]) for note in notes] == [("finger", "states a mass of -1 kg")]
+
+
+def test_names_that_a_file_leaves_out_are_told() -> None:
+    _, notes = reduced("<body name='link_1'><geom size='.02'/><body><joint range='0 1'/><geom size='.01'/></body></body>")
+    assert [note.subject for note in notes if "has no name" in note.text] == ["link_1_", "joint_0"]
+
+
 def test_ball_joints_are_refused() -> None:
     finger = FINGER.replace("<joint name='bend' axis='0 1 0'", "<joint name='bend' type='ball'")
     with pytest.raises(HandError, match="joint 'bend' is a ball joint; expected hinges"):

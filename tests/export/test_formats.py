@@ -212,6 +212,16 @@ def test_a_frame_that_is_none_is_refused(
     assert not (tmp_path / "out.csv").exists()
 
 
+def test_a_hand_is_checked_even_where_a_format_needs_none(
+    one: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out.csv"
+    for hand in ("barrett", "no_such_hand"):
+        assert export(one, "--format", "csv", "--hand", hand, "--output", out) == 2
+        assert hand in capsys.readouterr().err
+    assert not out.exists()
+
+
 def test_nothing_successful_is_told(grasps: GraspBatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     grasps[[1]].save(tmp_path / "failed.parquet")
     out = tmp_path / "out.csv"

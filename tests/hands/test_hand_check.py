@@ -53,6 +53,14 @@ def test_check_names_free_coupled_and_unlimited_joints(tmp_path: Path) -> None:
     assert any("free joints" in line and "a, b" in line for line in report.lines())
 
 
+def test_check_says_what_a_root_called_world_is_called_here(tmp_path: Path) -> None:
+    text = claw().replace("</robot>", '<link name="world"/><joint name="stand" type="fixed"><parent link="world"/>'
+                                      '<child link="palm"/></joint></robot>')
+    assert "'world_link'" in notes(tmp_path, text)["world"]
+    hand = dro.load_hand(written(tmp_path, text))
+    assert hand.wrist_link == "world_link"
+
+
 def test_check_names_a_mimic_of_nothing(tmp_path: Path) -> None:
     text = claw(joints=joint("a", "palm", "left", "-0.035 0 0.01", more=LIMIT + '<mimic joint="ghost"/>')
                 + joint("b", "palm", "right", "0.035 0 0.01", "0 -1 0"))

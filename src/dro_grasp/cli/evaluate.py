@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.hands.hand import Hand
     from dro_grasp.objects.shape import ObjectModel
+    from dro_grasp.pipeline.problem import GraspProblem
+    from dro_grasp.simulation.protocols import Protocol
 
 SHARES = {"trials_held": "held", "fingers_in_contact": "fingers", "all_fingers_in_contact": "all fingers"}
 """Shares beside the success rate, in the JSON object, and their columns in the table."""
@@ -51,17 +53,13 @@ class Evaluate:
 
     def run(self) -> int:
         """Evaluate object by object, then report."""
-        from dro_grasp.evaluation.metrics import mean_share, wilson_interval
         from dro_grasp.files import check_output
         from dro_grasp.grasps.batch import GraspBatch
         from dro_grasp.grasps.reading import load_grasps
-        from dro_grasp.grasps.sources import hand_of, object_of, require_one_object
-        from dro_grasp.pipeline.problem import GraspProblem
+        from dro_grasp.grasps.sources import hand_of, require_one_object
         from dro_grasp.pipeline.stages import evaluate
         from dro_grasp.simulation.contact_quality import with_contacts
-        from dro_grasp.simulation.diagnosis import count_failures, diagnose, next_steps
         from dro_grasp.simulation.protocols import changed
-        from dro_grasp.simulation.scene import require_simulable
 
         rules = changed(self.protocol, friction=self.friction)
         if self.output is not None:
@@ -70,35 +68,72 @@ class Evaluate:
         grasps = load_grasps(self.file)
         hand = hand_of(grasps, self.hand)
         compare("hand", grasps.hand, grasps.hand_sha256, hand, self.output)
-        rows, evaluated, problems = [], [], []
         require_one_object(grasps, self.object, self.file)
+        problems, bare = self._problems(hand, grasps)
+        evaluated: dict[str, GraspBatch] = {}
+        with progress_bar("evaluating", self.json) as progress:
+            while problems:  # what an object gathers in its trials goes with it
+                name, problem, part = problems.pop(0)
+                done = evaluate(problem, part, rules, progress)
+                evaluated[name] = with_contacts(hand, problem.obj, done, rules) if self.contact_quality else done
+        if self.output is not None:
+            GraspBatch.concatenate([*evaluated.values(), *bare.values()]).save(self.output)
+        self._report(hand, rules, evaluated, list(bare), time.perf_counter() - begin)
+        return 0
+
+    def _problems(
+        self, hand: Hand, grasps: GraspBatch
+    ) -> tuple[list[tuple[str, GraspProblem, GraspBatch]], dict[str, GraspBatch]]:
+        """Problem and grasps of each object, checked before the first trial; apart from them the grasps on bare clouds.
+
+        Raises:
+            ObjectError: All objects are bare clouds.
+        """
+        from dro_grasp.errors import ObjectError
+        from dro_grasp.grasps.sources import object_of
+        from dro_grasp.pipeline.problem import GraspProblem
+        from dro_grasp.simulation.scene import require_simulable
+
+        problems, bare = [], {}
+        refusal: ObjectError | None = None
         for name, part in grasps.by_object():
             obj = object_of(part, self.object, self.scale)
             compare("object", name, next(filter(None, part.object_sha256), ""), obj, self.output)
-            require_simulable(hand, obj)
-            problems.append((name, part, obj))
-        with progress_bar("evaluating", self.json) as progress:
-            while problems:  # what an object gathers in its trials goes with it
-                name, part, obj = problems.pop(0)
-                done = evaluate(GraspProblem(hand, obj), part, rules, progress)
-                evaluated.append(with_contacts(hand, obj, done, rules) if self.contact_quality else done)
-                success = int(done.success.sum())
-                rows.append([name, len(done), success, success / max(1, len(done)), *shares(done, hand).values()])
-        done = GraspBatch.concatenate(evaluated)
-        if self.output is not None:
-            done.save(self.output)
-        success = sum(row[2] for row in rows)
-        low, high = wilson_interval(success, len(grasps))
-        rate, beside = success / max(1, len(grasps)), shares(done, hand)
+            try:
+                require_simulable(hand, obj)
+            except ObjectError as error:
+                refusal = error
+                bare[name] = part
+            else:
+                problems.append((name, GraspProblem(hand, obj), part))
+        if refusal is not None and not problems:
+            raise refusal
+        for name, part in bare.items():
+            say_aside(f"warning: {name}: a bare point cloud has no trial; its {len(part)} grasps are left as they are")
+        return problems, bare
+
+    def _report(self, hand: Hand, rules: Protocol, evaluated: dict[str, GraspBatch], bare: list[str], seconds: float) -> None:
+        """Print the rates of each object and of all."""
+        from dro_grasp.evaluation.metrics import mean_share, wilson_interval
+        from dro_grasp.grasps.batch import GraspBatch
+        from dro_grasp.simulation.diagnosis import count_failures, diagnose, next_steps
+
+        rows = []
+        for name, part in evaluated.items():
+            held = int(part.success.sum())
+            rows.append([name, len(part), held, held / len(part), *shares(part, hand).values()])
+        done = GraspBatch.concatenate(list(evaluated.values()))
+        success, total = int(done.success.sum()), len(done)
+        rate, (low, high), beside = success / total, wilson_interval(success, total), shares(done, hand)
         report = {
-            "file": str(self.file), "hand": hand.name, "protocol": rules.label, "num": len(grasps), "success": success,
+            "file": str(self.file), "hand": hand.name, "protocol": rules.label, "num": total, "success": success,
             "success_rate": rate, "interval_95": [low, high],
             **beside, "contact_quality": qualities(done),
-            "objects": {row[0]: {"num": row[1], "success": row[2]} for row in rows},
-            "reasons": count_failures(done), "next": next_steps(done), "seconds": round(time.perf_counter() - begin, 3),
+            "objects": {row[0]: {"num": row[1], "success": row[2]} for row in rows}, "bare_clouds": bare,
+            "reasons": count_failures(done), "next": next_steps(done), "seconds": round(seconds, 3),
             "output": None if self.output is None else str(self.output),
         }
-        note = f"{success} of {len(grasps)} succeeded: {rate:.1%} (95 %: {low:.1%} to {high:.1%})"
+        note = f"{success} of {total} succeeded: {rate:.1%} (95 %: {low:.1%} to {high:.1%})"
         if "trials_held" in beside:
             mean, low, high = mean_share(done.robustness)
             note += f", and held in {mean:.1%} of their trials (95 %: {low:.1%} to {high:.1%})"
@@ -106,7 +141,6 @@ class Evaluate:
         means = ", ".join(f"{name.replace('_', ' ')} {mean:.3g}" for name, mean in report["contact_quality"].items())
         notes = [note, *([f"means: {means} (lengths in m)"] if means else []), *diagnose(done)]
         print_result(self.json, report, f"{hand.name}, protocol {rules.label}", columns, rows, *notes)
-        return 0
 
 
 def compare(kind: str, name: str, stored: str, given: Hand | ObjectModel, output: Path | None) -> None:

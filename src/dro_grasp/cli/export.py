@@ -90,7 +90,8 @@ class Export:
         from dro_grasp.grasps.sources import hand_of, object_of, object_source
 
         stated = bool(grasps.states_closing.all())
-        hand = hand_of(grasps, self.hand) if FORMATS[self.format].needs_hand or not stated else None
+        needed = FORMATS[self.format].needs_hand or not stated
+        hand = hand_of(grasps, self.hand) if needed or self.hand is not None else None
         if hand is not None:
             grasps.require_hand(hand)
         if hand is not None and not stated:

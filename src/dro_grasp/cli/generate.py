@@ -170,6 +170,8 @@ class Generate:
         middle = time.perf_counter()
         keep = grasps.success if simulated and self.only_successful else slice(None)
         kept = grasps[keep]
+        if output is not None and not len(kept):
+            say_aside(f"warning: {obj.name}: no grasp succeeded, so {output} holds none")
         if output is not None:
             with_sources(kept, self.hand, name, self.scale, job.camera).save(output)
         if picture is not None:

@@ -68,7 +68,8 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]
     told = [not cells or any(row[i] not in NOTHING for row in cells) for i in range(len(columns))]
     table = Table(title=title, title_justify="left")
     for column in compress(columns, told):
-        table.add_column(column, justify="left" if column in {"name", "hand", "object", "reason", "from"} else "right")
+        words = column in {"name", "hand", "object", "reason", "from"}
+        table.add_column(column, overflow="fold", justify="left" if words else "right")
     for row in cells:
         table.add_row(*compress(row, told))
     stdout.print(table)

@@ -15,7 +15,7 @@ from dro_grasp.descriptions.notes import Note
 from dro_grasp.errors import HandError
 
 LEAST_MASS = 1e-4
-"""Mass of moving links that state none [kg] (ours)."""
+"""Mass of moving links that state none, or a negative one [kg] (ours)."""
 LEAST_INERTIA = 1e-8
 """Inertia of moving links that state none [kg m^2] (ours)."""
 MOST_REPAIRS = 64
@@ -49,10 +49,19 @@ def compile_hand(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> mujoco.M
         HandError: MuJoCo refuses the description for a reason that cannot be repaired, or a number is absurd.
     """
     with mujoco_speaks_to(notes, path):
+        _settle_masses(spec, notes)
         model = _compile(spec, notes)
     check_numbers(model, path)
     notes.extend(limit_notes(model))
     return model
+
+
+def _settle_masses(spec: mujoco.MjSpec, notes: list[Note]) -> None:
+    """Take the least mass where a link states a negative one, which MuJoCo may raise to its least without a word."""
+    for body in list(spec.bodies)[1:]:
+        if body.mass < 0:
+            notes.append(Note("warning", body.name, f"states a mass of {body.mass:g} kg; taken as {LEAST_MASS:g} kg"))
+            body.mass = LEAST_MASS
 
 
 def _compile(spec: mujoco.MjSpec, notes: list[Note]) -> mujoco.MjModel:

@@ -29,7 +29,7 @@ def keep_hand_only(spec: mujoco.MjSpec, path: Path) -> tuple[Note, ...]:
     """
     notes: list[Note] = []
     hand = _largest_tree(spec, path)
-    _name_everything(spec)
+    named = _name_everything(spec)
     _couple_tendons(spec, notes)
     for kind in (spec.actuators, spec.sensors, spec.keys, spec.excludes, spec.pairs, spec.tendons, spec.cameras,
                  spec.lights, spec.tuples, spec.skins):
@@ -50,7 +50,8 @@ def keep_hand_only(spec: mujoco.MjSpec, path: Path) -> tuple[Note, ...]:
     _keep_joint_equalities(spec, notes)
     _check_joints(spec, path, notes)
     _let_visuals_collide(spec, notes)
-    return tuple(notes)
+    kept = {item.name for item in (*spec.bodies, *spec.joints)}
+    return (*notes, *(note for note in named if note.subject in kept))
 
 
 def _largest_tree(spec: mujoco.MjSpec, path: Path) -> mujoco.MjsBody:
@@ -68,8 +69,9 @@ def _all_joints(body: mujoco.MjsBody) -> list[mujoco.MjsJoint]:
     return [*body.joints, *(j for child in body.bodies for j in _all_joints(child))]
 
 
-def _name_everything(spec: mujoco.MjSpec) -> None:
+def _name_everything(spec: mujoco.MjSpec) -> list[Note]:
     """Name bodies and joints that MJCF leaves unnamed: links and joints are known by their names here."""
+    notes = []
     for kind, items in (("link", list(spec.bodies)[1:]), ("joint", list(spec.joints))):
         taken = {item.name for item in items}
         for number, item in enumerate(items):
@@ -78,7 +80,9 @@ def _name_everything(spec: mujoco.MjSpec) -> None:
                 while name in taken:
                     name += "_"
                 item.name = name
+                notes.append(Note("info", name, f"has no name in the file; this {kind} is number {number} there"))
                 taken.add(name)
+    return notes
 
 
 def _couple_tendons(spec: mujoco.MjSpec, notes: list[Note]) -> None:

@@ -19,6 +19,8 @@ from dro_grasp.errors import HandError
 
 MOVING = {"revolute", "continuous", "prismatic"}
 """URDF joint types with one degree of freedom."""
+RENAMED_WORLD = "world_link"
+"""Name of a link that its file calls `world`, which is MuJoCo's name for the ground."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,9 @@ def prepare_urdf(root: ET.Element, path: Path) -> PreparedUrdf:
     _drop_empty_shapes(root, path, notes)
     base = _check_links(root, path)
     if base == "world":
-        _rename_link(root, "world", "world_link")
+        _rename_link(root, "world", RENAMED_WORLD)
+        notes.append(Note("info", "world", f"is MuJoCo's name for the ground; this link is called '{RENAMED_WORLD}' here "
+                          "and in exported files"))
     _check_mimic(root, path, notes)
     files, converted = resolve_meshes(root, path, notes)
     extension = root.find("mujoco")
