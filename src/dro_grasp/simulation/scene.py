@@ -117,8 +117,7 @@ def require_simulable(hand: Hand, obj: ObjectModel) -> None:
         HandError: The hand came without its description.
     """
     if obj.is_cloud and obj.balls is None:
-        raise ObjectError(f"object '{obj.name}' is a bare point cloud; a trial needs a mesh: give the object's (--object), or "
-                          "generate without a trial (--protocol none)")
+        raise ObjectError(f"object '{obj.name}' is a bare point cloud; a trial needs a mesh (--object); or use --protocol none")
     if hand.description is None:
         raise HandError(f"hand '{hand.name}' carries no description; load it by name or file to simulate it")
 
