@@ -24,8 +24,8 @@ from dro_grasp.planning.collisions import CollisionChecker
 from dro_grasp.planning.motion import STAGES, MotionPlan
 from dro_grasp.planning.robot import Robot, load_robot
 from dro_grasp.planning.workcell import arm_addresses, robot_spec
+from dro_grasp.simulation.hand_part import joint_addresses
 from dro_grasp.simulation.protocols import PROTOCOLS
-from dro_grasp.simulation.scene import joint_addresses
 
 FINER = 10
 """Configurations that are checked for each sample of a plan (ours)."""

@@ -21,8 +21,8 @@ from dro_grasp.planning.motion import MotionPlan
 from dro_grasp.planning.planner import plan
 from dro_grasp.planning.scene_solids import scene_solid
 from dro_grasp.planning.workcell import arm_addresses, robot_spec
+from dro_grasp.simulation.hand_part import joint_addresses
 from dro_grasp.simulation.protocols import PROTOCOLS
-from dro_grasp.simulation.scene import joint_addresses
 
 SHELF = ((0.62, 0.1, 0.5), (0.02, 2.0, 2.0))
 """Centre and size of a board beside the object, larger than any object that is loaded [m]."""

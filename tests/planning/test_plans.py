@@ -32,8 +32,8 @@ from dro_grasp.planning.robot_file import BUILTIN_ROBOTS
 from dro_grasp.planning.timed_stages import closing
 from dro_grasp.planning.timing import USED, cornered, smooth
 from dro_grasp.planning.workcell import arm_addresses, robot_spec
+from dro_grasp.simulation.hand_part import joint_addresses
 from dro_grasp.simulation.protocols import PROTOCOLS
-from dro_grasp.simulation.scene import joint_addresses
 
 FINER = 10
 PLACE = (0.5, 0.1)

@@ -5,6 +5,7 @@ What is beyond these bounds is a mistake or an attack: MuJoCo and the kinematics
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -114,6 +115,16 @@ def check_numbers(model: mujoco.MjModel, path: Path) -> None:
             raise HandError(f"{path}: the {what} of {_owner(model, kind, int(bad[0]))} is {_told(values[bad[0]])}; expected "
                             f"finite numbers of at most {largest:g}, in metres, radians and kilograms"
                             f"{_hint(what, values[bad[0]], largest)}")
+
+
+def guess_unit(spec: mujoco.MjSpec) -> list[Note]:
+    """Take the angles of an MJCF file that states no unit as radians, in place, if no joint would turn as degrees."""
+    turns = [joint.range[1] - joint.range[0] for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_HINGE]
+    if not (spec.compiler.degree and 0 < max(turns, default=0.0) < math.degrees(LEAST_TURN)):
+        return []
+    spec.compiler.degree = False
+    return [Note("warning", "limits", f"no joint would turn by more than {max(turns):.2g} degrees, MJCF's unit where none is "
+                 'stated; taken as radians: state <compiler angle="radian"/>')]
 
 
 def limit_notes(model: mujoco.MjModel) -> list[Note]:

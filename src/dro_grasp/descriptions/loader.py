@@ -17,13 +17,14 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from dro_grasp.descriptions.bounds import guess_unit
 from dro_grasp.descriptions.compiling import compile_hand, mujoco_speaks_to
 from dro_grasp.descriptions.couplings import Coupling
 from dro_grasp.descriptions.link_geometry import LinkGeometry, read_geometry
 from dro_grasp.descriptions.notes import Note
 from dro_grasp.descriptions.open_posture import open_key, open_state
 from dro_grasp.descriptions.reduction import keep_hand_only
-from dro_grasp.descriptions.tree_reading import read_couplings, read_tree
+from dro_grasp.descriptions.tree_reading import contradicted_limits, read_couplings, read_tree
 from dro_grasp.descriptions.urdf import prepare_urdf
 from dro_grasp.descriptions.urdf_meshes import as_obj
 from dro_grasp.descriptions.xml_files import included_files, parse_xml
@@ -54,9 +55,9 @@ def load_description(path: Path | str) -> Description:
         raise HandError(f"{path} starts with <{root.tag}>; expected a URDF (<robot>) or MJCF (<mujoco>) file")
     notes.extend(keep_hand_only(spec, path))
     model = compile_hand(spec, path, notes)
-    description = Description(path.resolve(), spec, model, _digest(path, files), tuple(notes), stated)
-    _ = description.tree  # raises the errors of the tree now
-    return description
+    tree = read_tree(model, read_couplings(model), path)
+    notes.extend(contradicted_limits(model, tree))
+    return Description(path.resolve(), spec, model, tree, _digest(path, files), tuple(notes), stated)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +69,8 @@ class Description:
     _spec: mujoco.MjSpec
     model: mujoco.MjModel
     """The hand alone, compiled."""
+    tree: KinematicTree
+    """The kinematic tree, with couplings resolved."""
     sha256: str
     """Hash of the file and of the files it uses."""
     notes: tuple[Note, ...]
@@ -88,11 +91,6 @@ class Description:
     def couplings(self) -> tuple[Coupling, ...]:
         """Stated couplings between joints (URDF mimic, MJCF joint equalities and shared tendons)."""
         return read_couplings(self.model)
-
-    @cached_property
-    def tree(self) -> KinematicTree:
-        """The kinematic tree, with couplings resolved."""
-        return read_tree(self.model, self.couplings, self.path)
 
     @cached_property
     def link_of_body(self) -> dict[int, int]:
@@ -128,6 +126,8 @@ def _read_mjcf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.
         raise HandError(f"{path} is MJCF, which MuJoCo reads only from files that end in .xml; rename it")
     with mujoco_speaks_to(notes, path):
         spec = mujoco.MjSpec.from_file(str(path))
+    if not any("angle" in c.attrib for tree in (root, *map(parse_xml, included)) for c in tree.iter("compiler")):
+        notes.extend(guess_unit(spec))
     folder, pictures = path.parent / (spec.meshdir or ""), path.parent / (spec.texturedir or "")
     meshes = {folder / mesh.file for mesh in spec.meshes if mesh.file}
     used = {*meshes, *(pictures / name for texture in spec.textures for name in (texture.file, *texture.cubefiles) if name)}

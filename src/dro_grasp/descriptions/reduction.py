@@ -8,6 +8,7 @@ from pathlib import Path
 import mujoco
 
 from dro_grasp.descriptions.bounds import MOST_JOINTS
+from dro_grasp.descriptions.closed_loops import couple_closed_loops, driven_joints, is_linear
 from dro_grasp.descriptions.notes import Note
 from dro_grasp.errors import HandError
 
@@ -30,9 +31,9 @@ def keep_hand_only(spec: mujoco.MjSpec, path: Path) -> tuple[Note, ...]:
     notes: list[Note] = []
     hand = _largest_tree(spec, path)
     named = _name_everything(spec)
+    driven = driven_joints(spec)
     _couple_tendons(spec, notes)
-    for kind in (spec.actuators, spec.sensors, spec.keys, spec.excludes, spec.pairs, spec.tendons, spec.cameras,
-                 spec.lights, spec.tuples, spec.skins):
+    for kind in (spec.actuators, spec.sensors, spec.keys, spec.pairs, spec.cameras, spec.lights, spec.tuples, spec.skins):
         for item in list(kind):
             spec.delete(item)
     for geom in list(spec.worldbody.geoms):
@@ -47,8 +48,11 @@ def keep_hand_only(spec: mujoco.MjSpec, path: Path) -> tuple[Note, ...]:
     for joint in list(hand.joints):
         if joint.type == mujoco.mjtJoint.mjJNT_FREE:
             spec.delete(joint)
-    _keep_joint_equalities(spec, notes)
     _check_joints(spec, path, notes)
+    couple_closed_loops(spec, driven, path, notes)
+    for tendon in list(spec.tendons):
+        spec.delete(tendon)
+    _keep_joint_equalities(spec, notes)
     _let_visuals_collide(spec, notes)
     kept = {item.name for item in (*spec.bodies, *spec.joints)}
     return (*notes, *(note for note in named if note.subject in kept))
@@ -88,16 +92,23 @@ def _name_everything(spec: mujoco.MjSpec) -> list[Note]:
 def _couple_tendons(spec: mujoco.MjSpec, notes: list[Note]) -> None:
     """Couple the joints of each actuated fixed tendon: they move together, each by the same tendon length."""
     driven = {a.target for a in spec.actuators if a.trntype == mujoco.mjtTrn.mjTRN_TENDON}
-    followers = {e.name1 for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT and e.active}
+    leader = {e.name1: e.name2 for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT and e.active}
+
+    def last_leader(name: str) -> str:
+        for _ in leader:  # as often as there are followers; a cycle is reported when the tree is built
+            name = leader.get(name) or name
+        return name
+
     for tendon in spec.tendons:
         wraps = [w for w in tendon.path if w.type == mujoco.mjtWrap.mjWRAP_JOINT and w.target is not None]
         if tendon.name not in driven or len(wraps) < 2:
             continue
         first = wraps[0]
         for other in wraps[1:]:
-            if other.target.name in followers or abs(other.coef) < 1e-9:
+            tied = last_leader(other.target.name) == last_leader(first.target.name)
+            if tied or other.target.name in leader or abs(other.coef) < 1e-9:
                 continue
-            followers.add(other.target.name)
+            leader[other.target.name] = first.target.name
             equality = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1=other.target.name, name2=first.target.name,
                                          objtype=mujoco.mjtObj.mjOBJ_JOINT)
             equality.data[:2] = [0.0, first.coef / other.coef]
@@ -111,14 +122,17 @@ def _keep_joint_equalities(spec: mujoco.MjSpec, notes: list[Note]) -> None:
     for equality in list(spec.equalities):
         inside = equality.name1 in joints and (not equality.name2 or equality.name2 in joints)
         if equality.type == mujoco.mjtEq.mjEQ_JOINT and equality.active and inside:
-            if any(abs(x) > 1e-9 for x in equality.data[2:5]):
+            if not is_linear(equality):
                 equality.data[2:5] = 0.0
                 notes.append(Note("warning", equality.name1, f"follows '{equality.name2}' by a polynomial; only its linear "
                                   "part is kept"))
             continue
-        if equality.active and equality.type in {mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD} and _within(spec, equality):
-            notes.append(Note("warning", equality.name1, f"is tied to '{equality.name2}' in a closed loop, which a tree "
-                              "cannot state; the tie is left out and the joints on it move freely"))
+        if equality.active and equality.type == mujoco.mjtEq.mjEQ_TENDON:
+            notes.append(Note("warning", equality.name1, "is a tendon whose length cannot stay within the limits of its joints; "
+                              "it is left out, and they move freely"))
+        elif equality.active and equality.type in {mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD} and _within(spec, equality):
+            notes.append(Note("warning", equality.name1, f"is tied to '{equality.name2}' in a loop that does not "
+                              "close within the limits of its joints; the tie is left out, and they move freely"))
         spec.delete(equality)
 
 

@@ -11,8 +11,11 @@ import torch
 from jaxtyping import Float
 
 from dro_grasp.descriptions.couplings import Coupling, resolve_couplings
+from dro_grasp.descriptions.notes import Note
 from dro_grasp.kinematics.tree import FIXED, PRISMATIC, REVOLUTE, KinematicTree
 
+BEYOND = 0.02
+"""Least motion beyond a follower's own limits that is told [rad or m] (ours)."""
 NARROWEST = 0.2
 """Share of a leading joint's range that its followers' limits must leave; narrower limits count as mistakes (ours)."""
 
@@ -99,6 +102,20 @@ def _limits(
             if narrowed[1] - narrowed[0] > NARROWEST * (upper[column] - lower[column]):
                 lower[column], upper[column] = narrowed
     return lower, upper
+
+
+def contradicted_limits(model: mujoco.MjModel, tree: KinematicTree) -> list[Note]:
+    """Followers whose leaders take them beyond their own limits, which are ignored then."""
+    notes = []
+    ends = (tree.lower, tree.upper)
+    reached = np.sort(np.stack([(tree.coupling @ end + tree.offset).double().numpy() for end in ends]), 0)
+    for joint, name in enumerate(tree.moving_names):
+        beyond = max(model.jnt_range[joint, 0] - reached[0, joint], reached[1, joint] - model.jnt_range[joint, 1])
+        if beyond > BEYOND:
+            limits, way = (f"{low:.3g} to {high:.3g}" for low, high in (model.jnt_range[joint], reached[:, joint]))
+            notes.append(Note("warning", name, f"has limits of {limits}, but what it follows takes it through {way}; they are "
+                              "ignored"))
+    return notes
 
 
 def quaternion_matrix(quaternion: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:

@@ -6,7 +6,7 @@ results, and all other code reads the hand.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -109,20 +109,27 @@ def fixed_below(tree: KinematicTree, link: int) -> list[int]:
     return [i for i in range(tree.n_links) if below[i] and group[i] == group[link]]
 
 
-def find_fingers(tree: KinematicTree, tips: Sequence[int], palm: int) -> tuple[Finger, ...]:
+def find_fingers(
+    tree: KinematicTree, tips: Sequence[int], palm: int, rods: Mapping[int, int] | None = None
+) -> tuple[Finger, ...]:
     """The finger of each tip.
 
-    A link that carries one tip belongs to that finger; a link that carries none belongs to the finger of its parent. A link
-    fixed to the palm belongs to no finger, even if it carries one, because it does not move.
+    A link that carries one tip, or a rod of its finger, belongs to that finger; a link that carries none belongs to the finger
+    of its parent. A link fixed to the palm belongs to no finger, even if it carries one, because it does not move.
+
+    Args:
+        rods: For last links that are no tips the tip of the finger that they are pinned to.
 
     Raises:
         HandError: A finger has more joints than any has.
     """
     still, below = set(fixed_below(tree, palm)), tree.descends[:, palm].tolist()
     chains = [tuple(i for i in path_to(tree, tip) if below[i] and i not in still) for tip in tips]
+    carries = [set(chain).union(*(path_to(tree, rod) for rod, finger in (rods or {}).items() if finger == tip))
+               for tip, chain in zip(tips, chains, strict=True)]
     owner = [PALM] * tree.n_links
     for link in range(tree.n_links):
-        carried = [finger for finger, chain in enumerate(chains) if link in chain]
+        carried = [finger for finger, links in enumerate(carries) if link in links]
         if below[link] and link not in still:
             owner[link] = owner[tree.parent[link]] if not carried else carried[0] if len(carried) == 1 else PALM
     fingers = []

@@ -19,6 +19,7 @@ from dro_grasp.geometry.point_clouds import farthest_points
 from dro_grasp.hands.anatomy import Finger, find_fingers, find_palm_link, find_tips, fixed_below, path_to, rigid_groups
 from dro_grasp.hands.closing import Closing, ClosingFinder
 from dro_grasp.hands.hand import POINTS_PER_LINK, Hand
+from dro_grasp.hands.linkages import find_rods
 from dro_grasp.hands.surface import LinkSurface, sample_links
 from dro_grasp.kinematics.tree import FIXED
 
@@ -89,13 +90,23 @@ class HandBuilder:
         return shaped
 
     @cached_property
-    def tips(self) -> tuple[int, ...]:
-        """Fingertip links."""
+    def ends(self) -> tuple[int, ...]:
+        """Fingertip links, and the ends of linkages' rods."""
         try:
             return find_tips(self.tree, self.shaped)
         except HandError as error:
             lost = [note.text for note in self.description.notes if note.level == "warning"]
             raise self._error("; ".join([str(error), *lost[:3]])) from error
+
+    @cached_property
+    def rods(self) -> dict[int, int]:
+        """For each end of a linkage's rod the fingertip that it is pinned to."""
+        return find_rods(self.tree, self.ends, self.description.geometry)
+
+    @cached_property
+    def tips(self) -> tuple[int, ...]:
+        """Fingertip links."""
+        return tuple(end for end in self.ends if end not in self.rods)
 
     @cached_property
     def palm(self) -> int:
@@ -106,7 +117,7 @@ class HandBuilder:
     def fingers(self) -> tuple[Finger, ...]:
         """One for each fingertip."""
         try:
-            return find_fingers(self.tree, self.tips, self.palm)
+            return find_fingers(self.tree, self.tips, self.palm, self.rods)
         except HandError as error:
             raise self._error(str(error)) from error
 

@@ -16,8 +16,8 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.robot_file import Table
 from dro_grasp.planning.workcell import ARM, add_solids, arm_addresses, robot_spec, wxyz
+from dro_grasp.simulation.hand_part import PREFIX, joint_addresses
 from dro_grasp.simulation.protocols import PROTOCOLS
-from dro_grasp.simulation.scene import PREFIX, joint_addresses
 
 ARM_PART = 0
 """Geoms of the arm."""

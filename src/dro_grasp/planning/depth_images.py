@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from dro_grasp.planning.physics import SHAPE_GROUP, LiftScene
 from dro_grasp.planning.robot_file import CameraMount
-from dro_grasp.simulation.scene import PREFIX
+from dro_grasp.simulation.hand_part import PREFIX
 
 STRIDE = 2
 """Every so many pixels, in both directions, one ray is cast (ours)."""

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.workcell import ARM, arm_addresses, placed_frame, wxyz
-from dro_grasp.simulation.scene import attach
+from dro_grasp.simulation.hand_part import attach
 
 POSITION_TOLERANCE = 5e-4
 """Largest error of the wrist's position [m] (ours)."""

@@ -18,9 +18,10 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.planning.collisions import exclude_constant_contacts, open_hand
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.workcell import ARM, TABLE, arm_addresses, robot_spec, wxyz
+from dro_grasp.simulation.hand_part import HULL_VERTICES, PREFIX, add_servos, joint_addresses, servo_joints
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.rollout import quiet
-from dro_grasp.simulation.scene import HULL_VERTICES, PREFIX, add_object, add_servos, joint_addresses, servo_joints
+from dro_grasp.simulation.scene import add_object
 
 LIFT_PROTOCOL = replace(PROTOCOLS["dro"], name="tabletop", timestep=0.002, force_limit=3.0, noslip=3)
 """Contacts and servos of the hand: friction 1, density 500 kg/m^3 and the servos' gains as in trials; at most 3 Nm (ours).

@@ -19,7 +19,7 @@ from dro_grasp.planning.robot_file import Table
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.rendering.meshes import Colour, Mesh, arrow
 from dro_grasp.rendering.rasterizer import render
-from dro_grasp.simulation.scene import PREFIX
+from dro_grasp.simulation.hand_part import PREFIX
 
 SIZE = (900, 660)
 """Width and height of the picture [pixels]."""

@@ -12,8 +12,8 @@ from dro_grasp.objects.scenery import one_per_cell
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.robot_file import Table
+from dro_grasp.simulation.hand_part import HULL_VERTICES, attach, hand_spec, let_touch
 from dro_grasp.simulation.protocols import Protocol
-from dro_grasp.simulation.scene import HULL_VERTICES, attach, hand_spec
 
 ARM = "arm/"
 """Prefix of the arm's names."""
@@ -36,7 +36,7 @@ def robot_spec(robot: Robot, protocol: Protocol, table: Table | None) -> mujoco.
     for mesh in arm.meshes:
         mesh.maxhullvert = HULL_VERTICES
     for geom in arm.geoms:
-        geom.condim, geom.margin, geom.gap = 1, 0.0, 0.0
+        let_touch(geom)
     attach(scene, arm, placed_frame(scene.worldbody, robot.T_world_base), ARM)
     attach(scene, hand_spec(robot.hand, protocol), placed_frame(scene.body(ARM + robot.mount_link), robot.T_link_wrist))
     if table is not None:

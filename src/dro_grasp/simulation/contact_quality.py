@@ -17,8 +17,9 @@ from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.force_closure import q1, wrench_error
+from dro_grasp.simulation.hand_part import PREFIX
 from dro_grasp.simulation.protocols import PROTOCOLS, Protocol, protocol as find_protocol
-from dro_grasp.simulation.scene import PREFIX, TrialScene, cached_scene
+from dro_grasp.simulation.scene import TrialScene, cached_scene
 
 REACH = 0.01
 """Largest distance that is measured between a finger and the object [m]. Source: DexGraspBench."""

@@ -16,8 +16,9 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.simulation.hand_part import PREFIX
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol, protocol as find_protocol
-from dro_grasp.simulation.scene import PREFIX, TrialScene, cached_scene
+from dro_grasp.simulation.scene import TrialScene, cached_scene
 
 
 @dataclass(frozen=True)
