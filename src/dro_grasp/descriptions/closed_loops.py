@@ -161,7 +161,8 @@ class Linkage:
             return q
 
         def errors(x: Float[np.ndarray, " k"]) -> Float[np.ndarray, " e"]:
-            return np.concatenate([self.gaps(full(x), group.ties)[0] / CLOSED, self.springs[free] * (x - rest), STAY * (x - before)])
+            gaps = self.gaps(full(x), group.ties)[0]
+            return np.concatenate([gaps / CLOSED, self.springs[free] * (x - rest), STAY * (x - before)])
 
         def slopes(x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "e k"]:
             jacobian = self.gaps(full(x), group.ties)[1][:, free]

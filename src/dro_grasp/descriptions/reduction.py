@@ -16,6 +16,10 @@ NO_LIMITS = "states no limits"
 """Beginning of the note of a joint whose limits had to be assumed."""
 CONTINUOUS_LIMIT = math.pi
 """Limits of hinges that state none, both ways from zero [rad] (ours)."""
+LOOPS = frozenset({mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD})
+"""Kinds of ties between two bodies."""
+AS_FREE = "within its joints' limits; it is left out, and they move freely"
+"""End of the notes of ties that cannot hold."""
 SLIDE_LIMIT = 0.05
 """Limits of slides that state none, both ways from zero [m] (ours)."""
 
@@ -128,11 +132,10 @@ def _keep_joint_equalities(spec: mujoco.MjSpec, notes: list[Note]) -> None:
                                   "part is kept"))
             continue
         if equality.active and equality.type == mujoco.mjtEq.mjEQ_TENDON:
-            notes.append(Note("warning", equality.name1, "is a tendon whose length cannot stay within the limits of its joints; "
-                              "it is left out, and they move freely"))
-        elif equality.active and equality.type in {mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD} and _within(spec, equality):
-            notes.append(Note("warning", equality.name1, f"is tied to '{equality.name2}' in a loop that does not "
-                              "close within the limits of its joints; the tie is left out, and they move freely"))
+            notes.append(Note("warning", equality.name1, f"is a tendon whose length cannot stay {AS_FREE}"))
+        elif equality.active and equality.type in LOOPS and _within(spec, equality):
+            tied = f"is tied to '{equality.name2}' in a loop that cannot close"
+            notes.append(Note("warning", equality.name1, f"{tied} {AS_FREE}"))
         spec.delete(equality)
 
 

@@ -33,6 +33,11 @@ ranges, 16 hands keep 0.19 to 1."""
 ALL_ROLLED_UP = 0.5
 """The same for hands all of whose fingers roll up, once joints that move fingers sideways are still (ours). D'Claw, whose
 fingers bend as far back as forth, keeps 0.36 at most; of 15 other hands some finger keeps 0.65 or more."""
+ROLLING_UP = 8.0
+"""Angle of all joints of a finger together from which it rolls up when it closes [rad] (ours): 1.3 turns; Allegro's have 6.5.
+Limits that say little are often half a turn for each joint."""
+EARLY_CLOSINGS = (0.1, 0.2, *CLOSINGS)
+"""Shares of the way at which hands with such fingers are examined: half closed, they enclose nothing any more (ours)."""
 PATH = 65
 """Postures on the way from closed to open at which a hand is examined (ours)."""
 
@@ -71,6 +76,8 @@ class ClosingFinder:
     """The open posture that the hand's file states [rad or m]; NaN for joints of which it says nothing."""
     sideways: Bool[Tensor, " n_dof"]
     """Joints that are taken to spread the fingers, whatever their axes."""
+    closings: tuple[float, ...] = CLOSINGS
+    """Shares of the way from open to closed at which the hand is examined."""
 
     def find(self) -> Closing:
         """The closing between the limits, or from the widest posture of fingers that fold back beyond it."""
@@ -78,7 +85,10 @@ class ClosingFinder:
         if bool((self.folded(found) | (self.kept_of_spread(found) < ROLLED_UP)).any()):
             return self.from_widest()
         other = dataclasses.replace(self, sideways=self.motion.sideways(self.rest, self.movable, _tensor(found.palm.direction)))
-        return other.unrolled(found) if bool((other.kept_of_spread(found) < ALL_ROLLED_UP).all()) else found
+        if bool((other.kept_of_spread(found) < ALL_ROLLED_UP).all()):
+            return other.unrolled(found)
+        bend = self.motion.bend(found.open_ends, self.posture(found.open_ends, found.opening_signs, found.abduction, 1.0))
+        return found if bend < ROLLING_UP else dataclasses.replace(self, closings=EARLY_CLOSINGS).between_limits()
 
     def kept_of_spread(self, found: Closing) -> Float[Tensor, " n_tips"]:
         """Least share of each finger's reach at the widest spread that it keeps on the way from there to its open ends."""
@@ -279,7 +289,7 @@ class ClosingFinder:
         """
         on_finger = [np.isin(self.coarse.link.numpy(), finger.chain) for finger in self.fingers]
         palms = []
-        for share in CLOSINGS:
+        for share in self.closings:
             points, normals = self.coarse.posed(self.tree, self.posture(opened, signs, abduction, share))
             palms.append(find_palm(points[self.on_palm], normals[self.on_palm], [points[mask] for mask in on_finger]))
         return max(palms, key=lambda palm: palm.score)

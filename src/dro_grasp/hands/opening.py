@@ -16,7 +16,7 @@ from torch import Tensor
 from dro_grasp.geometry import se3
 from dro_grasp.hands.anatomy import Finger
 from dro_grasp.hands.hand import Hand
-from dro_grasp.kinematics.tree import KinematicTree
+from dro_grasp.kinematics.tree import REVOLUTE, KinematicTree
 
 STEPS = 64
 """Steps in which a joint's range, or the way from closed to open, is searched (ours)."""
@@ -117,6 +117,11 @@ class FingerMotion:
                 alike = bool((others @ bending).abs().min() > ALIKE)
                 found[joint] |= alike and bool(torch.stack([bending, palm_direction]).mv(ways[i]).abs().max() < ACROSS)
         return found
+
+    def bend(self, opened: Float[Tensor, " n_dof"], closed: Float[Tensor, " n_dof"]) -> float:
+        """Angle by which the joints of a finger turn in all from one posture to another, largest of all fingers [rad]."""
+        turns = self.tree.link_coupling.abs() @ (closed - opened).abs() * (torch.tensor(self.tree.kind) == REVOLUTE)
+        return max(float(turns[list(finger.chain)].sum()) for finger in self.fingers)
 
     def reaches(self, q: Float[Tensor, "*batch n_dof"], bends: Bool[Tensor, " n_dof"]) -> Float[Tensor, "*batch n_tips 3"]:
         """From the knuckle of each finger to its tip [m]."""
