@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
 import pytest
+import torch
 
 from dro_grasp.descriptions import bounds
 from dro_grasp.descriptions.loader import load_description
@@ -121,3 +123,31 @@ def test_every_checked_array_is_one_of_mujocos(tmp_path: Path, name: str) -> Non
     model = load_description(written(tmp_path, mjcf(), "claw.xml")).model
     assert re.fullmatch(r"\w+", name)
     assert hasattr(model, name)
+
+
+RADIANS = ("<mujoco>{compiler}<worldbody><body name='palm' euler='0 0 1.2'><geom size='.02'/>"
+           "<body name='finger' pos='0 0 .03' euler='.7 0 0'><joint name='bend' axis='1 0 0' limited='true' range='0 1.6'/>"
+           "<geom size='.01'/></body></body></worldbody></mujoco>")
+
+
+def test_radians_that_are_not_stated_are_found(tmp_path: Path) -> None:
+    found = []
+    for name, compiler in (("stated", "<compiler angle='radian'/>"), ("unsaid", "<compiler autolimits='true'/>")):
+        path = tmp_path / f"{name}.xml"
+        path.write_text(RADIANS.format(compiler=compiler))
+        found.append(load_description(path))
+    stated, unsaid = found
+    torch.testing.assert_close(unsaid.tree.upper, stated.tree.upper)
+    torch.testing.assert_close(unsaid.tree.origin, stated.tree.origin)
+    assert [note.text for note in unsaid.notes if note.subject == "limits"] == [
+        "no joint would turn by more than 1.6 degrees, MJCF's unit where none is stated; taken as radians: state "
+        '<compiler angle="radian"/>']
+    assert not stated.notes
+
+
+def test_degrees_that_are_stated_are_kept(tmp_path: Path) -> None:
+    path = tmp_path / "hand.xml"
+    path.write_text(RADIANS.format(compiler="<compiler angle='degree'/>"))
+    description = load_description(path)
+    assert description.tree.upper.tolist() == pytest.approx([math.radians(1.6)])
+    assert ["no joint turns by more than" in note.text for note in description.notes] == [True]

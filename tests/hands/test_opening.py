@@ -17,7 +17,7 @@ from dro_grasp.hands.library import hand_names
 from dro_grasp.optimization.starts import StartConfig, start_joints
 from tests.helpers.bracket_hand import bracket_urdf
 from tests.helpers.claw_urdf import LIMIT, claw, joint, link, written
-from tests.helpers.folding_hands import folding_bracket, folding_claw, swinging_ring
+from tests.helpers.folding_hands import folding_bracket, folding_claw, rolling_ring, swinging_ring
 from tests.helpers.loaded_hands import loaded_hand
 
 
@@ -215,3 +215,11 @@ def test_a_finger_that_only_follows_a_held_joint_stays_as_it_is(tmp_path: Path) 
     hand = dro.load_hand(written(tmp_path, text))
     assert [hand.tree.joint_names[j] for j in hand.movable.nonzero()[:, 0]] == ["b"]
     assert bool(hand.opening_signs.isfinite().all())
+
+
+@pytest.mark.parametrize("end", [1.3, math.pi])
+def test_the_palm_of_a_hand_whose_limits_let_it_roll_up_is_between_its_fingers(tmp_path: Path, end: float) -> None:
+    hand = load(tmp_path, rolling_ring(end))
+    assert hand.palm_direction[2] > 0.95
+    assert 0.02 < hand.grasp_centre[2] < 0.12
+    assert (hand.opening_signs == -1).all()

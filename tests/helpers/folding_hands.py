@@ -43,3 +43,16 @@ def swinging_ring(back: float) -> str:
                    joint(f"knuckle{i}", f"base{i}", f"middle{i}", "0 0 0.03", "0 1 0", limit(-1.57, back)),
                    joint(f"bend{i}", f"middle{i}", f"tip{i}", "0 0 0.06", "0 -1 0", limit(-back, 1.57))]
     return claw(links="".join(links), joints="".join(joints))
+
+
+def rolling_ring(end: float) -> str:
+    """Three upright fingers about a palm, which bend at three joints, each as far as this angle [rad]; pi rolls them up."""
+    links, joints = [], []
+    for i in range(3):
+        angle = 2 * math.pi * i / 3
+        place = f'{0.04 * math.cos(angle):.6f} {0.04 * math.sin(angle):.6f} 0.02" rpy="0 0 {angle:.6f}'
+        links += [link(f"base{i}", '<box size="0.02 0.02 0.05"/>'), link(f"middle{i}"), link(f"tip{i}")]
+        joints += [joint(f"knuckle{i}", "palm", f"base{i}", place, "0 -1 0", limit(-0.3, end)),
+                   joint(f"bend{i}", f"base{i}", f"middle{i}", "0 0 0.05", "0 -1 0", limit(0, end)),
+                   joint(f"curl{i}", f"middle{i}", f"tip{i}", "0 0 0.06", "0 -1 0", limit(0, end))]
+    return claw(links="".join(links), joints="".join(joints))

@@ -17,6 +17,7 @@ from dro_grasp.simulation.hand_part import attach
 from dro_grasp.simulation.protocols import protocol
 from dro_grasp.simulation.scene import CACHED_SCENES, TrialScene, build_scene, cached_scene
 from tests.helpers.claw import ball, claw, grasps_of, wrist_below
+from tests.helpers.claw_urdf import LIMIT, claw as claw_text, joint, written
 from tests.helpers.loaded_hands import loaded_hand
 
 GRIPPER = """<mujoco><worldbody><body name="base"><geom type="box" size="0.06 0.02 0.01" mass="0.3"/>
@@ -210,3 +211,34 @@ def test_what_is_attached_with_options_of_its_own_takes_the_scenes_without_a_war
     attach(scene, part, scene.worldbody.add_frame())
     model = scene.compile()  # a warning of MuJoCo would be raised here
     assert (model.opt.timestep, model.opt.integrator, model.narena) == (0.004, mujoco.mjtIntegrator.mjINT_EULER, 2**21)
+
+
+@pytest.mark.parametrize("stated", ['priority="1" condim="1"', 'contype="2" conaffinity="2"', 'contype="0" conaffinity="4"'])
+def test_contacts_with_the_object_have_friction_whatever_a_file_says(tmp_path, stated):
+    """Fingertips of published hands often take precedence in contacts, or collide by bits of their own."""
+    file = tmp_path / "gripper.xml"
+    file.write_text(GRIPPER.replace('<geom type="box" size="0.006', f'<geom {stated} type="box" size="0.006'))
+    model = build_scene(load_hand(file), ball(0.02), protocol("dro")).model
+    data = mujoco.MjData(model)
+    start = int(model.jnt_qposadr[model.joint("object").id])
+    data.qpos[start:start + 7] = [0, 0, 0.04, 1, 0, 0, 0]
+    data.qpos[:2] = 0.025  # each finger 1 mm into the ball
+    mujoco.mj_forward(model, data)
+    touched = {model.body(int(model.geom_bodyid[g])).name for contact in data.contact for g in contact.geom} - {"object"}
+    assert touched == {"hand/left", "hand/right"}
+    assert {contact.dim for contact in data.contact} == {4}
+
+
+def test_a_follower_goes_where_its_leader_takes_it(tmp_path):
+    """Limits that contradict a coupling, as some published files have them, would block the whole hand."""
+    follower = joint("b", "palm", "right", "0.035 0 0.01", "0 -1 0", LIMIT + '<mimic joint="a" multiplier="-1"/>')
+    file = written(tmp_path, claw_text(joints=joint("a", "palm", "left", "-0.035 0 0.01") + follower))
+    hand = load_hand(file)
+    assert hand.description is not None
+    assert [note.text for note in hand.description.notes] == [
+        "has limits of 0 to 1.5, but what it follows takes it through -1.5 to 0; they are ignored"]
+    model = build_scene(hand, ball(0.01), protocol("dro")).model
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 1.0
+    mujoco.mj_step(model, data, nstep=300)
+    np.testing.assert_allclose(data.qpos[:2], [1.0, -1.0], atol=0.05)

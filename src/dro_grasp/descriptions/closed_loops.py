@@ -184,7 +184,7 @@ class Linkage:
                     break
                 way.append(q)
             ways.append(way)
-        return np.array([*ways[0][::-1], *ways[1]])
+        return np.array([*ways[0][::-1], *ways[1]]).reshape(-1, self.model.njnt)
 
     def _depth(self, joint: int) -> int:
         depth, body = 0, int(self.model.jnt_bodyid[joint])

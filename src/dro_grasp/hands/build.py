@@ -20,6 +20,8 @@ from dro_grasp.hands.anatomy import Finger, find_fingers, find_palm_link, find_t
 from dro_grasp.hands.closing import Closing, ClosingFinder
 from dro_grasp.hands.hand import POINTS_PER_LINK, Hand
 from dro_grasp.hands.linkages import find_rods
+from dro_grasp.hands.opening import ROLLING_UP
+from dro_grasp.hands.palm import EARLY_CLOSINGS, MUCH_BETTER, WELL_ENCLOSED
 from dro_grasp.hands.surface import LinkSurface, sample_links
 from dro_grasp.kinematics.tree import FIXED
 
@@ -162,11 +164,18 @@ class HandBuilder:
 
     @cached_property
     def closing(self) -> Closing:
-        """From where and to where the joints close, and the palm."""
+        """From where and to where the joints close, and the palm.
+
+        Half closed, a hand whose limits let its fingers roll up encloses little; it is examined earlier then.
+        """
         finder = ClosingFinder(self.tree, self.fingers, self.coarse, self.on_palm, self.rest, self.movable, self.stated,
                                torch.zeros_like(self.movable))
         try:
-            return finder.find()
+            found = finder.find()
+            if found.palm.score > WELL_ENCLOSED or finder.motion.bend(self.tree.lower, self.tree.upper) < ROLLING_UP:
+                return found
+            early = dataclasses.replace(finder, closings=EARLY_CLOSINGS).find()
+            return early if early.palm.score > found.palm.score + MUCH_BETTER else found
         except HandError as error:
             raise self._error(str(error)) from error
 

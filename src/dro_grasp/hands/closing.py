@@ -33,11 +33,6 @@ ranges, 16 hands keep 0.19 to 1."""
 ALL_ROLLED_UP = 0.5
 """The same for hands all of whose fingers roll up, once joints that move fingers sideways are still (ours). D'Claw, whose
 fingers bend as far back as forth, keeps 0.36 at most; of 15 other hands some finger keeps 0.65 or more."""
-ROLLING_UP = 8.0
-"""Angle of all joints of a finger together from which it rolls up when it closes [rad] (ours): 1.3 turns; Allegro's have 6.5.
-Limits that say little are often half a turn for each joint."""
-EARLY_CLOSINGS = (0.1, 0.2, *CLOSINGS)
-"""Shares of the way at which hands with such fingers are examined: half closed, they enclose nothing any more (ours)."""
 PATH = 65
 """Postures on the way from closed to open at which a hand is examined (ours)."""
 
@@ -85,10 +80,7 @@ class ClosingFinder:
         if bool((self.folded(found) | (self.kept_of_spread(found) < ROLLED_UP)).any()):
             return self.from_widest()
         other = dataclasses.replace(self, sideways=self.motion.sideways(self.rest, self.movable, _tensor(found.palm.direction)))
-        if bool((other.kept_of_spread(found) < ALL_ROLLED_UP).all()):
-            return other.unrolled(found)
-        bend = self.motion.bend(found.open_ends, self.posture(found.open_ends, found.opening_signs, found.abduction, 1.0))
-        return found if bend < ROLLING_UP else dataclasses.replace(self, closings=EARLY_CLOSINGS).between_limits()
+        return other.unrolled(found) if bool((other.kept_of_spread(found) < ALL_ROLLED_UP).all()) else found
 
     def kept_of_spread(self, found: Closing) -> Float[Tensor, " n_tips"]:
         """Least share of each finger's reach at the widest spread that it keeps on the way from there to its open ends."""

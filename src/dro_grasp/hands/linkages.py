@@ -15,8 +15,9 @@ from dro_grasp.kinematics.tree import KinematicTree
 
 POSTURES = 16
 """Random postures in which a pin must be where both links have it (ours)."""
-LOOSE = 3e-3
-"""Largest distance between the places where two links have their pin [m] (ours): couplings state some linkages only about."""
+LOOSE = 0.03
+"""How far a pin may be from its mean place, as a share of its distance from the two links' own joints (ours): couplings state
+some linkages only about. Of five grippers it is 0.014 at most; jaws that turn against each other about near axes have 0.09."""
 TURN = 0.1
 """Least angle that two links turn about their pin [rad] (ours); with none, any point would do."""
 APART = 3e-3
@@ -39,10 +40,13 @@ class _End:
     axis: Float[np.ndarray, "3"]
 
     def has(self, pin: Float[np.ndarray, "3"]) -> bool:
-        """Whether a point is at this link, and not on the axis of its own joint."""
-        beside = np.linalg.norm(np.cross(pin - self.anchor, self.axis)) > APART
+        """Whether a point is at this link."""
         low, high = self.vertices.min(0) - OUTSIDE, self.vertices.max(0) + OUTSIDE
-        return bool(beside and ((pin >= low) & (pin <= high)).all())
+        return bool(((pin >= low) & (pin <= high)).all())
+
+    def lever(self, pin: Float[np.ndarray, "3"]) -> float:
+        """Distance of a point from the axis of this link's own joint [m]."""
+        return float(np.linalg.norm(np.cross(pin - self.anchor, self.axis)))
 
 
 def find_rods(tree: KinematicTree, tips: Sequence[int], geometry: Sequence[LinkGeometry]) -> dict[int, int]:
@@ -94,8 +98,9 @@ def _are_pinned(poses: Float[np.ndarray, "k n_links 4 4"], first: _End, second: 
     slopes, gaps = (T[1:, :3, :3] - T[0, :3, :3]).reshape(-1, 3), (moved[0] - moved[1:]).reshape(-1)
     pin = middle + np.linalg.lstsq(slopes, gaps, 1e-3)[0]
     places = T[:, :3, :3] @ pin + T[:, :3, 3]
-    loose = np.linalg.norm(places - places.mean(0), axis=1).max() > LOOSE
-    return not loose and second.has(pin) and first.has(places.mean(0))
+    lever = min(first.lever(places.mean(0)), second.lever(pin))
+    loose = np.linalg.norm(places - places.mean(0), axis=1).max() > LOOSE * lever
+    return not loose and lever > APART and second.has(pin) and first.has(places.mean(0))
 
 
 def _reach(poses: Float[np.ndarray, "k n_links 4 4"], end: _End, origin: int) -> float:

@@ -37,6 +37,9 @@ ALIKE = 0.9
 """Cosine between the ways in which two joints move a fingertip from which on they bend the finger alike (ours)."""
 ACROSS = 0.3
 """Cosine up to which a joint moves a fingertip across such a way (ours)."""
+ROLLING_UP = 8.0
+"""Range of all joints of a finger together from which it may roll up [rad] (ours): 1.3 turns; Allegro's have 6.5. Limits that
+say little are often half a turn for each joint."""
 STILL = 5e-3
 """Slower fingertips do not move with a joint [m/rad or m/m] (ours)."""
 
