@@ -119,7 +119,8 @@ class Linkage:
     def groups(self) -> list[Group]:
         """The groups of joints that ties connect, those without any but linear rules left out."""
         places = (self.start, self._off_centre())
-        moved = [sum(np.abs(self.gaps(q, [tie])[1]).sum(0) for q in places) > 1e-9 for tie in range(len(self.ties))]
+        jacobians = [np.concatenate([self.gaps(q, [tie])[1] for q in places]) for tie in range(len(self.ties))]
+        moved = [np.abs(jacobian).sum(0) > 1e-9 for jacobian in jacobians]
         connected = np.eye(self.model.njnt, dtype=bool)
         for its in moved:
             connected |= its[:, None] & its
@@ -169,7 +170,8 @@ class Linkage:
             return np.vstack([jacobian / CLOSED, np.diag(self.springs[free]), STAY * np.eye(len(free))])
 
         bounds = self.lower[free], self.upper[free]
-        return full(least_squares(errors, before, slopes, bounds, xtol=1e-12, ftol=1e-12).x)
+        # The stubs know no function as jac.
+        return full(least_squares(errors, before, slopes, bounds, xtol=1e-12, ftol=1e-12).x)  # pyright: ignore[reportArgumentType]
 
     def sweep(self, group: Group, leaders: Sequence[int], leader: int) -> Float[np.ndarray, "k n"]:
         """Joint values while one leader goes through its range and the others stay, as far as the loops close."""
