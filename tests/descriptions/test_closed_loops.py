@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import mujoco
@@ -11,7 +12,8 @@ import pytest
 import torch
 
 from dro_grasp.descriptions.loader import Description, load_description
-from tests.helpers.linkage_gripper import linkage_xml, write_linkage
+from dro_grasp.errors import HandError
+from tests.helpers.linkage_gripper import PIN, linkage_xml, write_linkage
 
 BOX = "<geom type='box' size='.02 .02 .01' mass='.1'/>"
 BALL = "<geom size='.01' mass='.1'/>"
@@ -141,3 +143,22 @@ def test_inactive_ties_are_not_there(tmp_path: Path) -> None:
     path = tmp_path / "gripper.xml"
     path.write_text(linkage_xml().replace("<connect ", "<connect active='false' "))
     assert len(load_description(path).tree.joint_names) == 7
+
+
+@pytest.mark.parametrize(
+    ("stated", "absurd", "refused"),
+    [('springref="2.5"', 'springref="nan"', "the spring's reference of joint 'right_rocker' is nan"),
+     ('stiffness=".05"', 'stiffness="inf"', "the stiffness of joint 'right_rocker' is inf"),
+     (f'anchor="{PIN}"', 'anchor="0 .018 nan"', "the coefficients of the tie number 0 is 0 0.018 nan"),
+     ('solref=".005 1"', 'solref="-1 1"', None), ('stiffness=".05"', 'stiffness="-1"', None)])
+def test_absurd_numbers_are_refused_or_harmless_and_nothing_is_printed(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], stated: str, absurd: str, refused: str | None
+) -> None:
+    path = tmp_path / "gripper.xml"
+    path.write_text(linkage_xml().replace(stated, absurd))
+    if refused is None:
+        assert "left_driver" in load_description(path).tree.joint_names
+    else:
+        with pytest.raises(HandError, match=re.escape(refused)):
+            load_description(path)
+    assert capfd.readouterr() == ("", "")

@@ -41,6 +41,8 @@ LEAST_TURN = 0.1
 """Range of a hand's widest turning joint below which its limits look like radians that were read as degrees [rad] (ours)."""
 TURNS = 1e4
 """Largest reference angle [rad], and largest ratio or offset of a coupling (ours)."""
+STIFFEST = 1e9
+"""Largest stiffness of a joint [Nm/rad or N/m] (ours)."""
 HEAVIEST = 1e4
 """Largest mass [kg] and inertia [kg m^2] (ours)."""
 NUMBERS = (
@@ -50,6 +52,7 @@ NUMBERS = (
     ("link", "body_ipos", "centre of mass", LONGEST), ("link", "body_mass", "mass", HEAVIEST),
     ("link", "body_inertia", "inertia", HEAVIEST), ("joint", "jnt_axis", "axis", 2.0),
     ("joint", "jnt_range", "limits", MOST_TURN), ("joint", "qpos0", "reference", TURNS),
+    ("joint", "qpos_spring", "spring's reference", TURNS), ("joint", "jnt_stiffness", "stiffness", STIFFEST),
     ("coupling", "eq_data", "coefficients", TURNS),
 )
 """Numbers of a compiled model: the kind of their owner, the array, what it means, and the largest value. Lengths come before
@@ -152,7 +155,8 @@ def _owner(model: mujoco.MjModel, kind: str, index: int) -> str:
     if kind == "shape":
         return f"a shape of link '{model.body(int(model.geom_bodyid[index])).name}'"
     if kind == "coupling":
-        return f"the coupling of joint '{model.joint(int(model.eq_obj1id[index])).name}'"
+        of_joint, first = model.eq_type[index] == mujoco.mjtEq.mjEQ_JOINT, int(model.eq_obj1id[index])
+        return f"the coupling of joint '{model.joint(first).name}'" if of_joint else f"the tie number {index}"
     if kind == "vertex":
         return f"mesh '{model.mesh(int(np.searchsorted(model.mesh_vertadr, index, 'right')) - 1).name}'"
     return f"{kind} '{(model.body if kind == 'link' else model.joint)(index).name}'"

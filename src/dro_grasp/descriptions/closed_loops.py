@@ -99,12 +99,13 @@ class Linkage:
             spec.delete(equality)
         self.ties = list(spec.equalities)
         self.model = compile_hand(spec, path, [])
+        self.model.eq_solref[:] = 0.02, 1.0  # MuJoCo's own; it prints what it finds wrong with others
         self.model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
         self.model.opt.disableflags = int(off.mjDSBL_CONTACT | off.mjDSBL_LIMIT | off.mjDSBL_FRICTIONLOSS)
         self.data = mujoco.MjData(self.model)
         self.lower, self.upper = self.model.jnt_range.T
         self.start = self.model.qpos0.clip(self.lower, self.upper)
-        springs = self.model.jnt_stiffness.reshape(self.model.njnt, -1)[:, 0]
+        springs = self.model.jnt_stiffness.reshape(self.model.njnt, -1)[:, 0].clip(0)
         self.springs = SPRING * np.sqrt(springs / max(springs.max(initial=0.0), 1e-12))
 
     def gaps(
@@ -112,7 +113,8 @@ class Linkage:
     ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
         """Gaps of some ties [m or rad], and their derivatives by the joints."""
         self.data.qpos[:] = q
-        mujoco.mj_fwdPosition(self.model, self.data)
+        for step in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_tendon, mujoco.mj_makeConstraint):
+            step(self.model, self.data)
         of_these = np.isin(self.data.efc_id, ties)
         return self.data.efc_pos[of_these], self.data.efc_J.reshape(-1, self.model.nv)[of_these]
 
