@@ -162,3 +162,11 @@ def test_absurd_numbers_are_refused_or_harmless_and_nothing_is_printed(
         with pytest.raises(HandError, match=re.escape(refused)):
             load_description(path)
     assert capfd.readouterr() == ("", "")
+
+
+def test_a_tie_that_no_joint_moves_is_no_loop(tmp_path: Path) -> None:
+    """The palm welded to the ground, beside a joint that follows another one."""
+    ties = "<equality><joint joint1='b' joint2='a' polycoef='0 .5 0 0 0'/><weld body1='palm'/></equality>"
+    description = two_joints(tmp_path, ties)
+    assert description.tree.joint_names == ("a",)
+    assert not description.notes

@@ -115,8 +115,9 @@ class Linkage:
         self.data.qpos[:] = q
         for step in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_tendon, mujoco.mj_makeConstraint):
             step(self.model, self.data)
-        of_these = np.isin(self.data.efc_id, ties)
-        return self.data.efc_pos[of_these], self.data.efc_J.reshape(-1, self.model.nv)[of_these]
+        n, of_these = self.data.nefc, np.isin(self.data.efc_id, ties)
+        # Gaps that no joint moves are left out, but room for their derivatives may be there.
+        return self.data.efc_pos[of_these], self.data.efc_J.reshape(-1, self.model.nv)[:n][of_these]
 
     def groups(self) -> list[Group]:
         """The groups of joints that ties connect, those without any but linear rules left out."""
