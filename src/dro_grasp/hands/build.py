@@ -5,6 +5,7 @@ Source: paper section III-B and appendix, dataset preprocessing.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from functools import cached_property
 
@@ -174,8 +175,10 @@ class HandBuilder:
             found = finder.find()
             if found.palm.score > WELL_ENCLOSED or finder.motion.bend(self.tree.lower, self.tree.upper) < ROLLING_UP:
                 return found
-            early = dataclasses.replace(finder, closings=EARLY_CLOSINGS).find()
-            return early if early.palm.score > found.palm.score + MUCH_BETTER else found
+            with contextlib.suppress(HandError):  # nothing is enclosed so early
+                early = dataclasses.replace(finder, closings=EARLY_CLOSINGS).find()
+                return early if early.palm.score > found.palm.score + MUCH_BETTER else found
+            return found
         except HandError as error:
             raise self._error(str(error)) from error
 
