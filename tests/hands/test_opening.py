@@ -12,8 +12,10 @@ import dro_grasp as dro
 from dro_grasp.errors import HandError
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
 from dro_grasp.hands.check import check_hand, picture
+from dro_grasp.hands.closing import Closing, ClosingFinder
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import hand_names
+from dro_grasp.hands.palm import EARLY_CLOSINGS
 from dro_grasp.optimization.starts import StartConfig, start_joints
 from tests.helpers.bracket_hand import bracket_urdf
 from tests.helpers.claw_urdf import LIMIT, claw, joint, link, written
@@ -223,3 +225,15 @@ def test_the_palm_of_a_hand_whose_limits_let_it_roll_up_is_between_its_fingers(t
     assert hand.palm_direction[2] > 0.95
     assert 0.02 < hand.grasp_centre[2] < 0.12
     assert (hand.opening_signs == -1).all()
+
+
+def test_a_hand_that_encloses_nothing_so_early_is_not_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    find = ClosingFinder.find
+
+    def refusing(finder: ClosingFinder) -> Closing:
+        if finder.closings == EARLY_CLOSINGS:
+            raise HandError("nothing is enclosed")
+        return find(finder)
+
+    monkeypatch.setattr(ClosingFinder, "find", refusing)
+    assert load(tmp_path, rolling_ring(math.pi)).tips
