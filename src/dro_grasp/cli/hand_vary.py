@@ -39,7 +39,7 @@ class Vary:
         if not self.mirrored and self.scale == 1:
             raise OptionError("nothing would change; give --mirrored, --scale, or both")
         path = check_output(self.output, ".urdf")
-        if path.exists() and path.samefile(locate_hand(self.hand)[0]):
+        if path.exists() and path.samefile(locate_hand(self.hand).path):
             raise OptionError(f"{path} is the hand itself, which would be lost; give --output another name")
         text = vary_hand(self.hand, mirrored=self.mirrored, factor=self.scale)
         with replacing(path) as temporary:

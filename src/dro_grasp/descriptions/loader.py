@@ -23,6 +23,7 @@ from dro_grasp.descriptions.couplings import Coupling
 from dro_grasp.descriptions.link_geometry import LinkGeometry, read_geometry
 from dro_grasp.descriptions.notes import Note
 from dro_grasp.descriptions.open_posture import open_key, open_state
+from dro_grasp.descriptions.part import named, part_of_mjcf, part_of_urdf
 from dro_grasp.descriptions.reduction import keep_hand_only
 from dro_grasp.descriptions.tree_reading import contradicted_limits, read_couplings, read_tree
 from dro_grasp.descriptions.urdf import prepare_urdf
@@ -33,31 +34,41 @@ from dro_grasp.files import given_path
 from dro_grasp.kinematics.tree import KinematicTree
 
 
-def load_description(path: Path | str) -> Description:
-    """Read a URDF or MJCF file.
+def load_description(path: Path | str, link: str | None = None, *, fixed_base: bool = False) -> Description:
+    """Read a URDF or MJCF file, or the part of it that begins at a link.
+
+    Args:
+        path: The file.
+        link: The root link of the part; by default everything that moves.
+        fixed_base: Whether its root link stands still, as that of an arm. A hand is free, so the joints that move all of it
+            are left out.
 
     Raises:
-        HandError: The file cannot be used; the message gives the reason and a remedy.
+        HandError: The file cannot be used, or has no such link; the message gives the reason and a remedy.
     """
     path = given_path(path)
     root = parse_xml(path)
     notes: list[Note] = []
     if root.tag == "robot":
+        if link is not None:
+            part_of_urdf(root, link, path)
         spec, files = _read_urdf(root, path, notes)
         srdf = path.with_suffix(".srdf")
         stated = open_state(srdf) if os.path.isfile(srdf) else {}
         files = (*files, srdf) if stated else files
     elif root.tag == "mujoco":
         spec, files = _read_mjcf(root, path, notes)
+        if link is not None:
+            spec = part_of_mjcf(spec, link, path)
         with mujoco_speaks_to(notes, path):
             stated = open_key(spec)
     else:
         raise HandError(f"{path} starts with <{root.tag}>; expected a URDF (<robot>) or MJCF (<mujoco>) file")
-    notes.extend(keep_hand_only(spec, path))
+    notes.extend(keep_hand_only(spec, path, fixed_base))
     model = compile_hand(spec, path, notes)
     tree = read_tree(model, read_couplings(model), path)
     notes.extend(contradicted_limits(model, tree))
-    return Description(path.resolve(), spec, model, tree, _digest(path, files), tuple(notes), stated)
+    return Description(path.resolve(), link, spec, model, tree, _digest(path, files, link), tuple(notes), stated)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,13 +77,15 @@ class Description:
 
     path: Path
     """The file."""
+    link: str | None
+    """The link at which the part that was read begins; None for the whole file."""
     _spec: mujoco.MjSpec
     model: mujoco.MjModel
     """The hand alone, compiled."""
     tree: KinematicTree
     """The kinematic tree, with couplings resolved."""
     sha256: str
-    """Hash of the file and of the files it uses."""
+    """Hash of the file, of the files it uses, and of the part's name."""
     notes: tuple[Note, ...]
     """Findings and repairs."""
     open_posture: Mapping[str, float]
@@ -80,8 +93,13 @@ class Description:
 
     @property
     def name(self) -> str:
-        """The file's stem."""
-        return self.path.stem
+        """The file's stem, and the part of it."""
+        return named(self.path.stem, self.link)
+
+    @property
+    def source(self) -> str:
+        """The file, and the part of it."""
+        return named(self.path, self.link)
 
     def spec(self) -> mujoco.MjSpec:
         """A new copy of the hand alone: without actuators, with couplings as joint equalities."""
@@ -138,8 +156,8 @@ def _read_mjcf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.
     return spec, (*included, *meshes)
 
 
-def _digest(path: Path, files: tuple[Path, ...]) -> str:
-    digest = hashlib.sha256()
+def _digest(path: Path, files: tuple[Path, ...], link: str | None) -> str:
+    digest = hashlib.sha256(b"" if link is None else named("", link).encode())
     for file in (path, *sorted(set(files), key=os.fspath)):
         digest.update(file.read_bytes())
     return digest.hexdigest()

@@ -24,10 +24,15 @@ SLIDE_LIMIT = 0.05
 """Limits of slides that state none, both ways from zero [m] (ours)."""
 
 
-def keep_hand_only(spec: mujoco.MjSpec, path: Path) -> tuple[Note, ...]:
+def keep_hand_only(spec: mujoco.MjSpec, path: Path, fixed_base: bool = False) -> tuple[Note, ...]:
     """Reduce a file, in place, to its largest articulated body tree, with its root at identity.
 
     Actuators, sensors, cameras, lights and everything else that is not the hand are deleted.
+
+    Args:
+        spec: The file.
+        path: Where it is, for messages.
+        fixed_base: As of `load_description`.
 
     Raises:
         HandError: Nothing moves, or a joint is neither a hinge nor a slide.
@@ -52,6 +57,8 @@ def keep_hand_only(spec: mujoco.MjSpec, path: Path) -> tuple[Note, ...]:
     for joint in list(hand.joints):
         if joint.type == mujoco.mjtJoint.mjJNT_FREE:
             spec.delete(joint)
+    if not fixed_base:
+        _free_wrist(spec, hand, notes)
     _check_joints(spec, path, notes)
     couple_closed_loops(spec, driven, path, notes)
     for tendon in list(spec.tendons):
@@ -60,6 +67,17 @@ def keep_hand_only(spec: mujoco.MjSpec, path: Path) -> tuple[Note, ...]:
     _let_visuals_collide(spec, notes)
     kept = {item.name for item in (*spec.bodies, *spec.joints)}
     return (*notes, *(note for note in named if note.subject in kept))
+
+
+def _free_wrist(spec: mujoco.MjSpec, hand: mujoco.MjsBody, notes: list[Note]) -> None:
+    """Delete the joints that move the whole hand, as those by which simulators let it float: a grasp's wrist is free."""
+    link: mujoco.MjsBody | None = hand
+    while link is not None:
+        for joint in list(link.joints):
+            notes.append(Note("info", joint.name, "moves the whole hand and is left out: the wrist of a grasp is free anyway"))
+            spec.delete(joint)
+        below = list(link.bodies)
+        link = below[0] if len(below) == 1 and not list(link.geoms) else None
 
 
 def _largest_tree(spec: mujoco.MjSpec, path: Path) -> mujoco.MjsBody:

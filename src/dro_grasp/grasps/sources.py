@@ -31,11 +31,13 @@ def with_sources(grasps: GraspBatch, hand: str, obj: str, scale: float, camera: 
     """
     import torch
 
+    from dro_grasp.descriptions.part import named, split_part
     from dro_grasp.hands.library import locate_hand
 
     n, extra = len(grasps), dict(grasps.extra)
-    if given_path(hand).is_file() and locate_hand(hand)[0] == given_path(hand):
-        extra[HAND_FILE] = (str(given_path(hand).resolve()),) * n
+    file, link = split_part(hand)
+    if given_path(file).is_file() and locate_hand(hand).path == given_path(file):
+        extra[HAND_FILE] = (named(given_path(file).resolve(), link),) * n
     if given_path(obj).is_file():
         extra[OBJECT_FILE] = (str(given_path(obj).resolve()),) * n
         extra[OBJECT_SCALE] = torch.full((n,), scale)
@@ -49,9 +51,9 @@ def with_own_files(grasps: GraspBatch, hand: Hand, obj: ObjectModel) -> GraspBat
     """Grasps of one object that record the files which a user's own hand and object were loaded from."""
     from dro_grasp.hands.library import BUILTIN_FOLDER
 
-    file = None if hand.description is None else hand.description.path
-    own = file is not None and hand.name == file.stem and file.parent != BUILTIN_FOLDER
-    return with_sources(grasps, str(file) if own else hand.name, obj.file or obj.name, obj.scale)
+    read = hand.description
+    own = read is not None and hand.name == read.name and read.path.parent != BUILTIN_FOLDER
+    return with_sources(grasps, read.source if read is not None and own else hand.name, obj.file or obj.name, obj.scale)
 
 
 def require_pair(hand: Any, obj: Any) -> None:

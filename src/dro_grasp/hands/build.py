@@ -24,6 +24,7 @@ from dro_grasp.hands.linkages import find_rods
 from dro_grasp.hands.opening import ROLLING_UP
 from dro_grasp.hands.palm import EARLY_CLOSINGS, MUCH_BETTER, WELL_ENCLOSED
 from dro_grasp.hands.surface import LinkSurface, sample_links
+from dro_grasp.hands.whole_robots import require_one_hand
 from dro_grasp.kinematics.tree import FIXED
 
 TIP_OFFSET = 0.03
@@ -114,13 +115,20 @@ class HandBuilder:
     @cached_property
     def palm(self) -> int:
         """The palm link."""
-        return find_palm_link(self.tree, self.tips, self.shaped)
+        palm = find_palm_link(self.tree, self.tips, self.shaped)
+        if self.description.link is None:
+            try:
+                require_one_hand(self.tree, self.tips, palm, self.description.path.name)
+            except HandError as error:
+                raise self._error(str(error)) from error
+        return palm
 
     @cached_property
     def fingers(self) -> tuple[Finger, ...]:
         """One for each fingertip."""
+        palm = self.palm
         try:
-            return find_fingers(self.tree, self.tips, self.palm, self.rods)
+            return find_fingers(self.tree, self.tips, palm, self.rods)
         except HandError as error:
             raise self._error(str(error)) from error
 

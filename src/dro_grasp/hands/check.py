@@ -14,6 +14,7 @@ from torch import Tensor
 
 from dro_grasp.descriptions.loader import Description
 from dro_grasp.descriptions.notes import Note
+from dro_grasp.descriptions.part import named
 from dro_grasp.files import replacing
 from dro_grasp.geometry import se3
 from dro_grasp.geometry.point_clouds import enclosed_volume
@@ -22,6 +23,7 @@ from dro_grasp.hands.build import build_hand
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand_description
 from dro_grasp.hands.opening_notes import opening_notes
+from dro_grasp.hands.whole_robots import LONGEST_REACH, reach
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.rendering.meshes import Mesh, arrow
 from dro_grasp.rendering.rasterizer import render
@@ -89,7 +91,8 @@ def check_hand(name: str | Path) -> HandReport:
     """
     description, label = load_hand_description(name)
     hand = build_hand(description, name=label)
-    found = (*_finger_notes(hand), *opening_notes(hand), *_shape_notes(hand, description), *_point_notes(hand))
+    found = (*_part_notes(hand, description), *_finger_notes(hand), *opening_notes(hand), *_shape_notes(hand, description),
+             *_point_notes(hand))
     return HandReport(hand, _facts(hand, description), (*description.notes, *found))
 
 
@@ -102,7 +105,7 @@ def _facts(hand: Hand, description: Description) -> dict[str, Any]:
     ]
     joints, movable = tree.joint_names, hand.movable.tolist()
     return {
-        "file": str(description.path),
+        "file": description.source,
         "wrist_link": hand.wrist_link,
         "palm_link": names[hand.palm],
         "palm_direction": [round(float(x), 3) for x in hand.palm_direction_wrist],
@@ -153,6 +156,15 @@ def hand_side(hand: Hand) -> str:
     aside = torch.linalg.cross(others - palm, hand.palm_direction_wrist)
     handed = float(torch.nn.functional.cosine_similarity(aside, tips[hand.thumb] - palm, dim=0))
     return "none" if abs(handed) < SIDEWAYS else "right" if handed > 0 else "left"
+
+
+def _part_notes(hand: Hand, description: Description) -> list[Note]:
+    """A hand on an arm, whose joints are none of the hand's."""
+    tree, palm = hand.tree, hand.tree.link_names[hand.palm]
+    if reach(tree, 0, hand.palm) < LONGEST_REACH:
+        return []
+    return [Note("warning", palm, f"hangs on {int((~hand.movable).sum())} joints that are held at rest, and a grasp's wrist is "
+                 f"'{hand.wrist_link}'; for the hand alone give {named(description.path.name, palm)}")]
 
 
 def _finger_notes(hand: Hand) -> list[Note]:

@@ -6,8 +6,10 @@ import difflib
 import importlib
 import os
 from pathlib import Path
+from typing import NamedTuple
 
 from dro_grasp.descriptions.loader import Description, load_description
+from dro_grasp.descriptions.part import named, split_part
 from dro_grasp.errors import HandError
 from dro_grasp.files import given_path
 from dro_grasp.hands.build import build_hand
@@ -37,7 +39,8 @@ def load_hand(name: str | Path, *, seed: int = 0, n_points: int = 512) -> Hand:
     """Load a hand by name or from a URDF or MJCF file; nothing needs to be annotated.
 
     A bare name is a built-in hand first, then one of the development assets (folder `DRO_GRASP_ASSETS`), then a
-    `robot_descriptions` module; `assets/NAME` forces the asset.
+    `robot_descriptions` module; `assets/NAME` forces the asset. Where a file holds a whole robot, `FILE#LINK` is the hand
+    that begins at this link.
 
     Args:
         name: Name or file.
@@ -48,14 +51,14 @@ def load_hand(name: str | Path, *, seed: int = 0, n_points: int = 512) -> Hand:
         HandError: No such hand, or its description cannot be used.
         OptionError: The hand cannot have so many points, or so few.
     """
-    path, label = locate_hand(name)
-    return build_hand(load_description(path), name=label, seed=seed, n_points=n_points)
+    description, label = load_hand_description(name)
+    return build_hand(description, name=label, seed=seed, n_points=n_points)
 
 
 def load_hand_description(name: str | Path) -> tuple[Description, str]:
     """The description of a hand, and the hand's name; derives neither points nor palm."""
-    path, label = locate_hand(name)
-    return load_description(path), label
+    found = locate_hand(name)
+    return load_description(found.path, found.link), found.name
 
 
 def hand_names() -> dict[str, str]:
@@ -68,10 +71,30 @@ def hand_names() -> dict[str, str]:
     return names
 
 
-def locate_hand(name: str | Path) -> tuple[Path, str]:
-    """The file of a hand, and the hand's name in results."""
-    text, path = str(name), given_path(name)
-    builtin = BUILTIN_FOLDER / f"{text}.urdf"
+class HandFile(NamedTuple):
+    """Where a hand is described."""
+
+    path: Path
+    """The file."""
+    name: str
+    """The hand's name in results."""
+    link: str | None
+    """The link at which the hand begins; None where the file is the hand's."""
+
+
+def locate_hand(name: str | Path) -> HandFile:
+    """The file of a hand, and its part; the file need not exist.
+
+    Raises:
+        HandError: No hand has this name.
+    """
+    text, link = split_part(str(name))
+    path, label = _locate(text)
+    return HandFile(path, named(label, link), link)
+
+
+def _locate(text: str) -> tuple[Path, str]:
+    path, builtin = given_path(text), BUILTIN_FOLDER / f"{text}.urdf"
     if "/" not in text and os.path.isfile(builtin):
         return builtin, text
     asset = _asset_file(text.removeprefix(ASSET_PREFIX))

@@ -7,6 +7,7 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 from dro_grasp.descriptions.mirroring import mirror, scale
+from dro_grasp.descriptions.part import part_of_urdf
 from dro_grasp.descriptions.urdf_meshes import find_mesh
 from dro_grasp.descriptions.xml_files import parse_xml
 from dro_grasp.errors import HandError, OptionError
@@ -30,10 +31,12 @@ def vary_hand(name: str | Path, *, mirrored: bool = False, factor: float = 1.0) 
     """
     if not (math.isfinite(factor) and factor > 0):
         raise OptionError(f"factor is {factor}; give a positive number, for example 1.2")
-    path = locate_hand(name)[0]
+    path, _, link = locate_hand(name)
     root = parse_xml(path)
     if root.tag != "robot":
         raise HandError(f"{path} starts with <{root.tag}>; only a URDF (<robot>) can be mirrored or scaled")
+    if link is not None:
+        part_of_urdf(root, link, path)
     for mesh in root.iter("mesh"):
         file = find_mesh(mesh.get("filename", ""), path.parent)
         if file is not None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from dro_grasp.evaluation.success_rates import BEST, RAW, REFINED, RETURNED
 from dro_grasp.files import command
-from dro_grasp.hands.library import load_hand
+from dro_grasp.hands.library import load_hand, locate_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.onboarding.steps import DATA, PICTURE, REPORT, STRICT, Onboarded
 from dro_grasp.pipeline.problem import GraspProblem
@@ -31,7 +31,7 @@ def write_report(done: Onboarded, held_out: list[str]) -> Path:
     Raises:
         OutputError: The page cannot be written.
     """
-    path, name = done.folder / REPORT, html.escape(Path(done.hand).stem)
+    path, name = done.folder / REPORT, html.escape(locate_hand(done.hand).name)
     parts = [
         f"<h1>{name}</h1>", _summary(done), _rates(done),
         "<h2>What generate returns with the better weights</h2>", _drawn(done, held_out),
@@ -40,7 +40,7 @@ def write_report(done: Onboarded, held_out: list[str]) -> Path:
         f"<pre>{html.escape(chr(10).join(done.steps['check']['lines']))}</pre>", "<h2>Training grasps</h2>",
         _data(done.steps["data"]), "<h2>Next steps</h2>", _commands(done),
     ]
-    write_page(path, f"{Path(done.hand).stem} onboarded", "".join(parts))
+    write_page(path, f"{name} onboarded", "".join(parts))
     return path
 
 

@@ -100,7 +100,7 @@ def load_robot(name: str | Path) -> Robot:
     """
     file = read_robot_file(locate_robot(name))
     try:
-        arm = load_description(file.arm)
+        arm = load_description(file.arm, fixed_base=True)
     except HandError as error:
         path = str(file.arm)
         reason = path.join(re.sub(r"\bhand\b", "robot", part) for part in str(error).split(path))

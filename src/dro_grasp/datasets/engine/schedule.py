@@ -142,7 +142,7 @@ def require_known(hands: Sequence[str], objects: Sequence[str]) -> None:
         ObjectError: Likewise of an object.
     """
     for hand in hands:
-        if not locate_hand(hand)[0].is_file():
+        if not locate_hand(hand).path.is_file():
             load_hand(hand)  # its error says what is wrong
     names = object_names()
     for obj in objects:
@@ -159,7 +159,7 @@ def require_distinct(hands: Sequence[str], objects: Sequence[str]) -> None:
     for kind, given, locate in (("hand", hands, locate_hand), ("object", objects, locate_object)):
         found: dict[str, tuple[str, Path]] = {}
         for source in given:
-            path, name = locate(source)
+            path, name, *_ = locate(source)
             first, known = found.setdefault(name, (source, path.resolve()))
             if path.resolve() != known:
                 raise OptionError(f"{kind}s '{first}' and '{source}' are both called '{name}', under which their grasps are "
