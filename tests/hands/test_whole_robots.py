@@ -129,7 +129,7 @@ def test_joints_that_move_the_whole_hand_are_left_out(tmp_path: Path) -> None:
     assert torch.allclose(hand.palm_direction_wrist, load_hand(written(tmp_path, claw())).palm_direction_wrist, atol=1e-5)
     assert [n.subject for n in check_hand(path).notes if "moves the whole hand" in n.text] == ["x", "y", "turn"]
     with pytest.raises(HandError, match="millimetres"):
-        load_description(path, fixed_base=True)  # an arm's joints are not left out, so these limits count
+        load_description(path, arm=True)  # an arm's joints are not left out, so these limits count
 
 
 def test_file_whose_name_has_the_mark_is_a_file(tmp_path: Path) -> None:

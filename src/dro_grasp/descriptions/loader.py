@@ -23,7 +23,7 @@ from dro_grasp.descriptions.couplings import Coupling
 from dro_grasp.descriptions.link_geometry import LinkGeometry, read_geometry
 from dro_grasp.descriptions.notes import Note
 from dro_grasp.descriptions.open_posture import open_key, open_state
-from dro_grasp.descriptions.part import named, part_of_mjcf, part_of_urdf
+from dro_grasp.descriptions.part import arm_in_mjcf, arm_in_urdf, named, part_of_mjcf, part_of_urdf
 from dro_grasp.descriptions.reduction import keep_hand_only
 from dro_grasp.descriptions.tree_reading import contradicted_limits, read_couplings, read_tree
 from dro_grasp.descriptions.urdf import prepare_urdf
@@ -34,14 +34,14 @@ from dro_grasp.files import given_path
 from dro_grasp.kinematics.tree import KinematicTree
 
 
-def load_description(path: Path | str, link: str | None = None, *, fixed_base: bool = False) -> Description:
+def load_description(path: Path | str, link: str | None = None, *, arm: bool = False) -> Description:
     """Read a URDF or MJCF file, or the part of it that begins at a link.
 
     Args:
         path: The file.
-        link: The root link of the part; by default everything that moves.
-        fixed_base: Whether its root link stands still, as that of an arm. A hand is free, so the joints that move all of it
-            are left out.
+        link: The link at which the hand begins; by default the file is the hand's, or the arm's.
+        arm: Read the arm instead of the hand, up to this link. Its root stands still; a hand is free, so joints that move all
+            of it are left out.
 
     Raises:
         HandError: The file cannot be used, or has no such link; the message gives the reason and a remedy.
@@ -51,20 +51,22 @@ def load_description(path: Path | str, link: str | None = None, *, fixed_base: b
     notes: list[Note] = []
     if root.tag == "robot":
         if link is not None:
-            part_of_urdf(root, link, path)
+            (arm_in_urdf if arm else part_of_urdf)(root, link, path)
         spec, files = _read_urdf(root, path, notes)
         srdf = path.with_suffix(".srdf")
         stated = open_state(srdf) if os.path.isfile(srdf) else {}
         files = (*files, srdf) if stated else files
     elif root.tag == "mujoco":
         spec, files = _read_mjcf(root, path, notes)
-        if link is not None:
+        if link is not None and arm:
+            arm_in_mjcf(spec, link, path)
+        elif link is not None:
             spec = part_of_mjcf(spec, link, path)
         with mujoco_speaks_to(notes, path):
             stated = open_key(spec)
     else:
         raise HandError(f"{path} starts with <{root.tag}>; expected a URDF (<robot>) or MJCF (<mujoco>) file")
-    notes.extend(keep_hand_only(spec, path, fixed_base))
+    notes.extend(keep_hand_only(spec, path, fixed_base=arm))
     model = compile_hand(spec, path, notes)
     tree = read_tree(model, read_couplings(model), path)
     notes.extend(contradicted_limits(model, tree))
@@ -78,7 +80,7 @@ class Description:
     path: Path
     """The file."""
     link: str | None
-    """The link at which the part that was read begins; None for the whole file."""
+    """The link at which the hand that was read begins, or at which the arm ends; None for the whole file."""
     _spec: mujoco.MjSpec
     model: mujoco.MjModel
     """The hand alone, compiled."""

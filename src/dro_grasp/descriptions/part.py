@@ -1,10 +1,10 @@
-"""Take a part of a description: the hand of a file that holds a whole robot, by the link at which it begins."""
+"""Take a part of a file that holds a whole robot: the hand, by the link at which it begins, or the arm that carries it."""
 
 from __future__ import annotations
 
 import difflib
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import mujoco
@@ -38,15 +38,56 @@ def part_of_urdf(root: ET.Element, link: str, path: Path) -> None:
     """
     links = {element.get("name", ""): element for element in root.findall("link")}
     _require(link, list(links), path)
-    ends, kept = {joint: (_end(joint, "parent"), _end(joint, "child")) for joint in root.findall("joint")}, {link}
-    while grown := {below for above, below in ends.values() if above in kept} - kept:
-        kept |= grown
+    ends = _ends(root)
+    kept = _below(ends, link)
     for joint, (above, below) in ends.items():
         if above not in kept or below == link:
             root.remove(joint)
     for name, element in links.items():
         if name not in kept:
             root.remove(element)
+
+
+def arm_in_urdf(root: ET.Element, link: str, path: Path) -> None:
+    """Keep, in place, all of a URDF but a hand; of the link at which it begins, a frame. Only joints that move this frame move.
+
+    Raises:
+        HandError: There is no such link.
+    """
+    links = {element.get("name", ""): element for element in root.findall("link")}
+    _require(link, list(links), path)
+    ends = _ends(root)
+    hand, carriers = _below(ends, link), {link}
+    while grown := {above for above, below in ends.values() if below in carriers} - carriers:
+        carriers |= grown
+    for joint, (above, below) in ends.items():
+        if above in hand:
+            root.remove(joint)
+        elif below not in carriers:
+            joint.set("type", "fixed")
+            _remove_all(joint, {"mimic"})
+    for name in hand - {link}:
+        root.remove(links[name])
+    _remove_all(links[link], {"visual", "collision", "inertial"})
+
+
+def arm_in_mjcf(spec: mujoco.MjSpec, link: str, path: Path) -> None:
+    """The same of an MJCF, in place; its keyframes are lost.
+
+    Raises:
+        HandError: There is no such body.
+    """
+    _require(link, [body.name for body in list(spec.bodies)[1:]], path)
+    hand = spec.body(link)
+    for item in [*hand.bodies, *hand.geoms, *spec.keys]:
+        spec.delete(item)
+    hand.explicitinertial, carriers, above = False, {link}, hand.parent
+    while above is not None and above.name != "world":
+        carriers.add(above.name)
+        above = above.parent
+    for joint in list(spec.joints):
+        if joint.parent.name not in carriers:
+            spec.delete(joint)
 
 
 def part_of_mjcf(spec: mujoco.MjSpec, link: str, path: Path) -> mujoco.MjSpec:
@@ -65,6 +106,24 @@ def part_of_mjcf(spec: mujoco.MjSpec, link: str, path: Path) -> mujoco.MjSpec:
         if mesh.name not in shown:
             part.delete(mesh)
     return part
+
+
+def _ends(root: ET.Element) -> dict[ET.Element, tuple[str, str]]:
+    """Parent and child link of every joint of a URDF."""
+    return {joint: (_end(joint, "parent"), _end(joint, "child")) for joint in root.findall("joint")}
+
+
+def _below(ends: Mapping[ET.Element, tuple[str, str]], link: str) -> set[str]:
+    """A link and all links that hang on it."""
+    found = {link}
+    while grown := {below for above, below in ends.values() if above in found} - found:
+        found |= grown
+    return found
+
+
+def _remove_all(element: ET.Element, tags: Collection[str]) -> None:
+    for child in [child for child in element if child.tag in tags]:
+        element.remove(child)
 
 
 def _end(joint: ET.Element, which: str) -> str:

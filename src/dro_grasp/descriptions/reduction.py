@@ -24,7 +24,7 @@ SLIDE_LIMIT = 0.05
 """Limits of slides that state none, both ways from zero [m] (ours)."""
 
 
-def keep_hand_only(spec: mujoco.MjSpec, path: Path, fixed_base: bool = False) -> tuple[Note, ...]:
+def keep_hand_only(spec: mujoco.MjSpec, path: Path, *, fixed_base: bool = False) -> tuple[Note, ...]:
     """Reduce a file, in place, to its largest articulated body tree, with its root at identity.
 
     Actuators, sensors, cameras, lights and everything else that is not the hand are deleted.
@@ -32,7 +32,7 @@ def keep_hand_only(spec: mujoco.MjSpec, path: Path, fixed_base: bool = False) ->
     Args:
         spec: The file.
         path: Where it is, for messages.
-        fixed_base: As of `load_description`.
+        fixed_base: Whether the root stands still; else the joints that move all of the hand are deleted, too.
 
     Raises:
         HandError: Nothing moves, or a joint is neither a hinge nor a slide.

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dro_grasp.descriptions.loader import Description
+from dro_grasp.descriptions.part import named
 from dro_grasp.errors import HandError, OptionError
 from dro_grasp.geometry.point_clouds import farthest_points
 from dro_grasp.hands.anatomy import Finger, find_fingers, find_palm_link, find_tips, fixed_below, path_to, rigid_groups
@@ -153,8 +154,9 @@ class HandBuilder:
         surface = sample_links(self.description, [link for link in self.links if link in self.shaped], self.seed)
         size = float(np.ptp(surface.posed(self.tree, self.rest)[0], axis=0).max())
         if size > LARGEST_HAND:
+            whole = named(self.description.path.name, "LINK")
             raise self._error(f"the hand is {size:.3g} m large, which looks like millimetres; expected metres: scale its "
-                              "origins, shapes and meshes by 0.001")
+                              f"origins, shapes and meshes by 0.001; or, if this is a whole robot, give its hand: {whole}")
         if size < SMALLEST_HAND:
             raise self._error(f"the hand is {size:.3g} m large, which looks like another unit than metres; expected "
                               f"{SMALLEST_HAND} to {LARGEST_HAND} m: scale its origins, shapes and meshes")

@@ -15,11 +15,12 @@ from jaxtyping import Float
 
 from dro_grasp.descriptions.bounds import MOST_TURN
 from dro_grasp.descriptions.loader import Description, load_description
+from dro_grasp.descriptions.part import named
 from dro_grasp.descriptions.reduction import NO_LIMITS
 from dro_grasp.descriptions.xml_files import parse_xml
 from dro_grasp.errors import HandError, RobotError
 from dro_grasp.hands.hand import Hand
-from dro_grasp.hands.library import load_hand
+from dro_grasp.hands.library import load_hand, locate_hand
 from dro_grasp.planning.robot_file import CameraMount, RobotFile, Table, locate_robot, read_robot_file
 
 LONGEST_ARM = 5.0
@@ -99,17 +100,23 @@ def load_robot(name: str | Path) -> Robot:
         HandError: The hand cannot be used.
     """
     file = read_robot_file(locate_robot(name))
+    hand = locate_hand(file.hand)
+    within = hand.link if hand.path.resolve() == file.arm.resolve() else None
+    mount = file.mount_link or within
+    if mount is None:
+        raise RobotError(f"{file.path} lacks the entry 'mount'; state where the hand sits, or, if the arm's file has the hand, "
+                         f"give it as a part of that: hand: {named(file.arm.name, 'LINK')}")
     try:
-        arm = load_description(file.arm, fixed_base=True)
+        arm = load_description(file.arm, within, arm=True)
     except HandError as error:
         path = str(file.arm)
         reason = path.join(re.sub(r"\bhand\b", "robot", part) for part in str(error).split(path))
         raise RobotError(f"{file.path}: the arm cannot be used: {reason}") from error
-    fit = _Fit(file, arm)
+    fit = _Fit(file, arm, mount)
     fit.check_tree()
     lower, upper = fit.positions()
     return Robot(
-        file.name, arm, load_hand(file.hand), file.mount_link, file.T_link_wrist, file.T_world_base,
+        file.name, arm, load_hand(file.hand), mount, file.T_link_wrist, file.T_world_base,
         fit.home(lower, upper), lower, upper, fit.limit("velocity"), fit.limit("acceleration"),
         fit.limit("effort", DEFAULT_EFFORT), file.hand_velocity, file.hand_acceleration, file.camera, file.table)
 
@@ -117,8 +124,8 @@ def load_robot(name: str | Path) -> Robot:
 class _Fit:
     """Compares a robot file with its arm."""
 
-    def __init__(self, file: RobotFile, arm: Description) -> None:
-        self.file, self.arm, self.tree = file, arm, arm.tree
+    def __init__(self, file: RobotFile, arm: Description, mount: str) -> None:
+        self.file, self.arm, self.tree, self.mount = file, arm, arm.tree, mount
         self.joints = list(self.tree.joint_names)
 
     def error(self, text: str) -> RobotError:
@@ -126,7 +133,7 @@ class _Fit:
 
     def check_tree(self) -> None:
         """The mount link exists, and every joint of the arm moves it."""
-        tree, link = self.tree, self.file.mount_link
+        tree, link = self.tree, self.mount
         if link not in tree.link_names:
             raise self.error(f"the hand is mounted at link '{link}', which the arm does not have; its links are "
                              f"{', '.join(tree.link_names)}")

@@ -12,6 +12,7 @@ import torch
 import yaml
 from jaxtyping import Float
 
+from dro_grasp.descriptions.part import named, split_part
 from dro_grasp.errors import RobotError
 from dro_grasp.files import given_path
 from dro_grasp.frames import motion_fault
@@ -66,8 +67,8 @@ class RobotFile:
     """URDF or MJCF file of the arm."""
     hand: str
     """Name or file of the hand."""
-    mount_link: str
-    """The arm's link that carries the hand."""
+    mount_link: str | None
+    """The arm's link that carries the hand; None if the file does not say it."""
     T_link_wrist: Float[np.ndarray, "4 4"]
     """Pose of the hand's root link in the mount link [m]."""
     T_world_base: Float[np.ndarray, "4 4"]
@@ -115,14 +116,14 @@ def read_robot_file(path: Path) -> RobotFile:
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise RobotError(f"{path} cannot be read as YAML: {' '.join(str(error).split())}") from error
     read = _Reader(path)
-    values = read.mapping(values, "the file", KEYS, {"arm", "hand", "mount", "home"})
-    mount = read.mapping(values["mount"], "mount", {"link", *POSE_KEYS}, {"link"})
+    values = read.mapping(values, "the file", KEYS, {"arm", "hand", "home"})
+    mount = read.mapping(values["mount"], "mount", {"link", *POSE_KEYS}, {"link"}) if "mount" in values else {}
     hand_limits = read.mapping(values.get("hand_limits", {}), "hand_limits", {"velocity", "acceleration"})
     hand = str(values["hand"])
-    beside = path.parent / hand
+    file, link = split_part(str(path.parent / hand))
     return RobotFile(
         path, str(values.get("name", path.stem)), path.parent / given_path(str(values["arm"])),
-        str(beside) if beside.is_file() else hand, str(mount["link"]), read.pose(mount, "mount"),
+        named(file, link) if Path(file).is_file() else hand, str(mount["link"]) if mount else None, read.pose(mount, "mount"),
         read.pose(read.mapping(values.get("base", {}), "base", POSE_KEYS), "base"),
         {str(k): read.number(v, f"home of joint {k}") for k, v in read.mapping(values["home"], "home").items()},
         read.mapping(values.get("limits", {}), "limits", LIMITS),
