@@ -99,7 +99,7 @@ def self_penetration(centres: Float[Tensor, "*b s 3"], radii: Float[Tensor, " s"
     overlap = radii[first] + radii[second] - distance
     overlapping = (overlap > 0).to(centres.dtype)
     push = -apart * (overlapping / distance)[..., None, :]
-    by_point = (push.reshape(-1, len(pairs)) @ difference).unflatten(0, (*centres.shape[:-2], 3)).mT
+    by_point = (push.flatten(0, -2) @ difference).unflatten(0, (*centres.shape[:-2], 3)).mT
     return PointTerm(overlap * overlapping, by_point)
 
 
