@@ -95,6 +95,13 @@ def test_alignment_is_zero_where_the_normals_oppose():
     torch.testing.assert_close(normals, by_object, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.parametrize("batch", [(), (2,), (2, 3)])
+def test_links_that_may_all_touch_do_not_penetrate(batch: tuple[int, ...]):
+    term = energies.self_penetration(torch.rand(*batch, 4, 3), torch.ones(4), torch.empty(0, 2, dtype=torch.long))
+    assert term.value.shape == (*batch, 0)
+    assert torch.equal(term.by_point, torch.zeros(*batch, 4, 3))
+
+
 def test_self_penetration_gradient_and_value():
     centres, radii = random(2, 5, 3, scale=0.02), torch.full((5,), 0.02, dtype=torch.float64)
     pairs = torch.combinations(torch.arange(5), 2)

@@ -16,6 +16,7 @@ from dro_grasp.errors import RobotError
 from dro_grasp.planning.collisions import CollisionChecker, open_hand
 from dro_grasp.planning.robot import Robot, load_robot
 from dro_grasp.planning.robot_file import BUILTIN_ROBOTS, robot_names
+from tests.helpers.whole_robot import arm_with_claw, two_arms
 
 
 @pytest.fixture
@@ -90,6 +91,31 @@ def test_any_arm_and_any_hand_are_one_file(
     if "lite6" in arm:  # what its actuators state
         assert robot.effort.tolist() == [50, 50, 32, 32, 32, 20]
         assert np.allclose(robot.lower[[0, 2]], [-6.28319, -0.061087], atol=1e-4)
+
+
+@pytest.mark.parametrize(("text", "name", "palm", "home"), [
+    (two_arms(), "robot.urdf", "left_palm", {"left_shoulder_joint": 0.2, "left_elbow_joint": 0.4, "left_palm_joint": 0.1}),
+    (arm_with_claw(), "robot.xml", "palm", {"elbow": 0.3, "wrist": 0.2})])
+def test_an_arm_and_a_hand_in_one_file_need_no_mount(
+    text: str, name: str, palm: str, home: dict[str, float], values: dict[str, Any], tmp_path: Path
+) -> None:
+    (tmp_path / name).write_text(text)
+    values |= {"arm": name, "hand": f"{name}#{palm}", "home": home, "limits": {"velocity": 1.0, "acceleration": 4.0}}
+    del values["mount"]
+    robot = load_robot(written(values, tmp_path))
+    assert robot.arm_joints == tuple(home)
+    assert robot.hand.wrist_link == palm
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / name))  # which reads the file whole
+    data, q = mujoco.MjData(model), np.array([0.3, -0.2, 0.5])[: len(home)]
+    for joint, value in zip(home, q, strict=True):
+        data.qpos[model.joint(joint).qposadr[0]] = value
+    mujoco.mj_kinematics(model, data)
+    T = robot.T_world_wrist(q)
+    assert np.allclose(T[:3, 3], data.body(palm).xpos, atol=1e-6)
+    assert np.allclose(T[:3, :3], data.body(palm).xmat.reshape(3, 3), atol=1e-6)
+    del values["hand"]
+    with pytest.raises(RobotError, match=rf"lacks the entry 'mount'.*hand: {name}#LINK"):
+        load_robot(written(values | {"hand": "gripper3"}, tmp_path))
 
 
 def test_limits_of_an_mjcf_arm_are_read_and_those_that_it_cannot_state_are_asked_for(
