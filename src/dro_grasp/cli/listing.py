@@ -27,7 +27,7 @@ class Hands:
 
         names = hand_names()
         print_result(self.json, {"hands": names}, "hands", ["name", "from"], [*names.items()],
-                     "also: the path of a URDF or MJCF file, or a robot_descriptions name")
+                     "also: the path of a URDF or MJCF file, FILE#LINK of a whole robot, or a robot_descriptions name")
         return 0
 
 
@@ -56,7 +56,7 @@ class Check:
     """
 
     hand: tyro.conf.Positional[str]
-    """Name of a hand, or path of a URDF or MJCF file."""
+    """Name of a hand, or path of a URDF or MJCF file; FILE#LINK for the hand of a whole robot, by its first link."""
     picture: Annotated[Path | None, optional("PNG", "none")] = None
     """PNG file with the hand open and closed, its palm direction and its contact links."""
     json: Flag = False
