@@ -37,7 +37,7 @@ def blocks(language: str) -> list[tuple[str, str]]:
 def commands() -> list[str]:
     """Every line of shell in the documents, and of the examples in --help."""
     texts = [text.replace("\\\n", " ") for _, text in blocks("bash")]
-    lines = [line.split("#")[0].strip() for text in texts for line in text.splitlines()]
+    lines = [re.split(r"(?:^|\s)#", line)[0].strip() for text in texts for line in text.splitlines()]
     for file in (ROOT / "src" / "dro_grasp" / "cli").glob("*.py"):
         for example in re.findall(r"Example: (.*?)\n    (?:\"\"\"|\n)", file.read_text(), re.DOTALL):
             lines.append(" ".join(example.split()))
