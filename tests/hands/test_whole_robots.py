@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 
@@ -81,6 +82,15 @@ def test_link_that_is_not_there_is_refused_with_those_that_are_near(tmp_path: Pa
     path = written(tmp_path, text, name)
     with pytest.raises(HandError, match=rf"no link '{wrong}'.*perhaps .*palm"):
         load_description(path, wrong)
+
+
+@pytest.mark.parametrize("arm", [False, True])
+@pytest.mark.parametrize("more", [joint("lost", "left_one", "nowhere", "0 0 0"), link("left_one"),
+                                  joint("loop", "left_one", "torso", "0 0 0")])
+def test_faults_of_names_within_the_part_are_told_or_left_out(tmp_path: Path, more: str, arm: bool) -> None:
+    path = written(tmp_path, two_arms(more), "robot.urdf")
+    with suppress(HandError):  # any other error fails
+        assert load_description(path, "left_palm", arm=arm).tree.n_dof
 
 
 def test_faults_outside_the_part_do_not_matter(tmp_path: Path) -> None:

@@ -36,15 +36,14 @@ def part_of_urdf(root: ET.Element, link: str, path: Path) -> None:
     Raises:
         HandError: There is no such link.
     """
-    links = {element.get("name", ""): element for element in root.findall("link")}
-    _require(link, list(links), path)
     ends = _ends(root)
     kept = _below(ends, link)
+    _require(link, [element.get("name", "") for element in root.findall("link")], path)
     for joint, (above, below) in ends.items():
         if above not in kept or below == link:
             root.remove(joint)
-    for name, element in links.items():
-        if name not in kept:
+    for element in root.findall("link"):
+        if element.get("name", "") not in kept:
             root.remove(element)
 
 
@@ -54,8 +53,7 @@ def arm_in_urdf(root: ET.Element, link: str, path: Path) -> None:
     Raises:
         HandError: There is no such link.
     """
-    links = {element.get("name", ""): element for element in root.findall("link")}
-    _require(link, list(links), path)
+    _require(link, [element.get("name", "") for element in root.findall("link")], path)
     ends = _ends(root)
     hand, carriers = _below(ends, link), {link}
     while grown := {above for above, below in ends.values() if below in carriers} - carriers:
@@ -66,9 +64,11 @@ def arm_in_urdf(root: ET.Element, link: str, path: Path) -> None:
         elif below not in carriers:
             joint.set("type", "fixed")
             _remove_all(joint, {"mimic"})
-    for name in hand - {link}:
-        root.remove(links[name])
-    _remove_all(links[link], {"visual", "collision", "inertial"})
+    for element in root.findall("link"):
+        if element.get("name") == link:
+            _remove_all(element, {"visual", "collision", "inertial"})
+        elif element.get("name") in hand:
+            root.remove(element)
 
 
 def arm_in_mjcf(spec: mujoco.MjSpec, link: str, path: Path) -> None:
@@ -132,7 +132,7 @@ def _end(joint: ET.Element, which: str) -> str:
 
 
 def _require(link: str, links: Sequence[str], path: Path) -> None:
-    if link in links:
+    if link and link in links:
         return
     near = difflib.get_close_matches(link, links, n=3)
     hint = f"perhaps {' or '.join(near)}" if near else f"it has {', '.join(links[:12])}{', ...' if len(links) > 12 else ''}"
