@@ -75,7 +75,8 @@ def contact_candidates(hand: Hand, config: ContactConfig | None = None) -> Conta
     """Candidate contacts on the inner sides of fingers and palm, and their probabilities in each slot.
 
     There are as many slots as fingers, but at least `min_contacts`. Each finger has a slot of its own, so the thumb always
-    holds; the other slots are free to use any finger or the palm.
+    holds; the other slots are free to use any finger or the palm. A single finger presses on the palm, which has a slot of its
+    own then and counts as much as the finger.
     """
     config = config or ContactConfig()
     q = hand.canonical_joints(1 - config.closing)
@@ -114,11 +115,13 @@ def _slots(
     finger: Int[Tensor, " k"], weight: Float[Tensor, " k"], n_fingers: int, config: ContactConfig
 ) -> tuple[Float[Tensor, "n_slots k"], tuple[int, ...]]:
     """The slots' weights and their fingers; the slot of a finger without candidates is a free one."""
-    rows = [_normalised(weight * (finger == i)) for i in range(n_fingers)]
-    free = torch.stack(rows).sum(0) + config.palm_weight * _normalised(weight * (finger == PALM))
-    extra = max(0, config.min_contacts - n_fingers)
-    owners = [i if bool(row.any()) else PALM for i, row in enumerate(rows)] + [PALM] * extra
-    return torch.stack([free / free.sum() if i == PALM else rows[i] for i in owners]), tuple(owners)
+    rows, palm = [_normalised(weight * (finger == i)) for i in range(n_fingers)], _normalised(weight * (finger == PALM))
+    alone = n_fingers == 1
+    free = _normalised(torch.stack(rows).sum(0) + (1.0 if alone else config.palm_weight) * palm)
+    owners = [i if bool(row.any()) else PALM for i, row in enumerate(rows)]
+    slots = [free if i == PALM else rows[i] for i in owners] + ([palm] if alone and bool(palm.any()) else [])
+    extra = max(0, config.min_contacts - len(slots))
+    return torch.stack(slots + [free] * extra), tuple(owners + [PALM] * (len(slots) - len(owners) + extra))
 
 
 def _normalised(row: Float[Tensor, " k"]) -> Float[Tensor, " k"]:

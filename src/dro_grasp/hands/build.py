@@ -179,8 +179,8 @@ class HandBuilder:
 
         Half closed, a hand whose limits let its fingers roll up encloses little; it is examined earlier then.
         """
-        finder = ClosingFinder(self.tree, self.fingers, self.coarse, self.on_palm, self.rest, self.movable, self.stated,
-                               torch.zeros_like(self.movable))
+        finder = ClosingFinder(self.tree, self.rest, self.movable, self.stated, self.fingers, self.coarse, self.on_palm,
+                               sideways=torch.zeros_like(self.movable))
         try:
             found = finder.find()
             if found.palm.score > WELL_ENCLOSED or finder.motion.bend(self.tree.lower, self.tree.upper) < ROLLING_UP:

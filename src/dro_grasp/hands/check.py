@@ -20,6 +20,7 @@ from dro_grasp.geometry import se3
 from dro_grasp.geometry.point_clouds import enclosed_volume
 from dro_grasp.hands.anatomy import Finger
 from dro_grasp.hands.build import build_hand
+from dro_grasp.hands.fixed_jaw import fixed_jaw_of
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand_description
 from dro_grasp.hands.opening_notes import opening_notes
@@ -168,9 +169,13 @@ def _part_notes(hand: Hand, description: Description) -> list[Note]:
 
 
 def _finger_notes(hand: Hand) -> list[Note]:
-    """A finger alone closes on nothing but the palm."""
-    text = "is the only fingertip; it can only press an object against the palm. Is a finger missing?"
-    return [Note("warning", hand.tree.link_names[tip], text) for tip in hand.tips if len(hand.tips) == 1]
+    """A finger alone closes on nothing but the palm, or on the jaw that is part of it."""
+    if len(hand.tips) > 1:
+        return []
+    tip = hand.tree.link_names[hand.tips[0]]
+    if fixed_jaw_of(hand) is not None:
+        return [Note("info", tip, f"closes on a jaw that is part of '{hand.tree.link_names[hand.palm]}'")]
+    return [Note("warning", tip, "is the only fingertip; it can only press an object against the palm. Is a finger missing?")]
 
 
 def _shape_notes(hand: Hand, description: Description) -> list[Note]:

@@ -18,15 +18,14 @@ from torch import Tensor
 
 from dro_grasp.errors import HandError
 from dro_grasp.hands.anatomy import Finger, axes_along, closing_gains
+from dro_grasp.hands.fixed_jaw import JUST_BEFORE, NEARLY_CLOSED, FixedJaw, closing_direction, find_fixed_jaw
 from dro_grasp.hands.opening import FingerMotion, Line, main_axis, span
 from dro_grasp.hands.palm import CLOSINGS, NOTHING_ENCLOSED, Palm, find_palm
+from dro_grasp.hands.postures import Postures
 from dro_grasp.hands.surface import LinkSurface
-from dro_grasp.kinematics.tree import KinematicTree
 
 REFINEMENTS = 3
 """Rounds in which opening signs and palm are derived from each other (ours)."""
-AT_LIMIT = 0.1
-"""Distance to a limit, as a share of the range, within which a joint is at this limit (ours)."""
 ROLLED_UP = 0.15
 """Share of its reach at the widest spread below which a finger that opens farther is rolled up (ours). At the limits of their
 ranges, 16 hands keep 0.19 to 1."""
@@ -52,23 +51,15 @@ class Closing:
 
 
 @dataclass(frozen=True)
-class ClosingFinder:
+class ClosingFinder(Postures):
     """What the closing of a hand is derived from."""
 
-    tree: KinematicTree
-    """Links and joints."""
     fingers: tuple[Finger, ...]
     """The fingers."""
     coarse: LinkSurface
     """Some samples of every link from the palm on."""
     on_palm: Bool[np.ndarray, " n"]
     """The samples on the palm."""
-    rest: Float[Tensor, " n_dof"]
-    """As in `Hand`."""
-    movable: Bool[Tensor, " n_dof"]
-    """As in `Hand`."""
-    stated: Float[Tensor, " n_dof"]
-    """The open posture that the hand's file states [rad or m]; NaN for joints of which it says nothing."""
     sideways: Bool[Tensor, " n_dof"]
     """Joints that are taken to spread the fingers, whatever their axes."""
     closings: tuple[float, ...] = CLOSINGS
@@ -77,6 +68,8 @@ class ClosingFinder:
     def find(self) -> Closing:
         """The closing between the limits, or from the widest posture of fingers that fold back beyond it."""
         found = self.between_limits()
+        if self.fixed_jaw(found.open_ends, found.opening_signs, found.abduction) is not None:
+            return found
         if bool((self.folded(found) | (self.kept_of_spread(found) < ROLLED_UP)).any()):
             return self.from_widest()
         other = dataclasses.replace(self, sideways=self.motion.sideways(self.rest, self.movable, _tensor(found.palm.direction)))
@@ -190,7 +183,9 @@ class ClosingFinder:
         """
         bases = (self.rest, self.posture(self.opened(signs), signs, abduction, 0.5))
         gains = torch.stack([self.gains(self.tree, q, centre) for q in bases]).sum(0)
-        return self.as_stated(torch.where((gains >= 0) | spreads, -1.0, 1.0))
+        signs = torch.where((gains >= 0) | spreads, -1.0, 1.0)
+        jaw, other = (self.fixed_jaw(self.opened(way), way, abduction) for way in (signs, -signs))
+        return self.as_stated(signs if other is None or (jaw and jaw.length >= other.length) else -signs)
 
     def signs_from(
         self, widest: Float[Tensor, " n_dof"], signs: Float[Tensor, " n_dof"], abduction: Bool[Tensor, " n_dof"],
@@ -238,31 +233,6 @@ class ClosingFinder:
         """How much each joint, from end to end, brings its fingertips nearer to the grasp centre and to the palm [m]."""
         return closing_gains(tree, q, self.motion.links, self.motion.tip_points, (centre, self.palm_middle))
 
-    def opened(self, signs: Float[Tensor, " n_dof"]) -> Float[Tensor, " n_dof"]:
-        """The stated open posture; for other joints the limits towards which they open."""
-        limits = torch.where(signs > 0, self.tree.upper, self.tree.lower)
-        return torch.where(self.stated.isnan(), limits, self.stated)
-
-    def as_stated(self, signs: Float[Tensor, " n_dof"]) -> Float[Tensor, " n_dof"]:
-        """The signs, but a joint whose stated open posture is a limit opens towards it."""
-        return torch.where(self.stated.isnan(), signs, self.away_from_limits(self.stated, signs))
-
-    def away_from_limits(
-        self, opened: Float[Tensor, " n_dof"], signs: Float[Tensor, "*batch n_dof"]
-    ) -> Float[Tensor, "*batch n_dof"]:
-        """The signs, but joints that are open at one of their limits close towards the other one."""
-        room = AT_LIMIT * (self.tree.upper - self.tree.lower)
-        at_lower, at_upper = opened - self.tree.lower < room, self.tree.upper - opened < room
-        return torch.where(at_lower, -1.0, torch.where(at_upper, 1.0, signs))
-
-    def posture(
-        self, opened: Float[Tensor, " n_dof"], signs: Float[Tensor, "*batch n_dof"], abduction: Bool[Tensor, " n_dof"],
-        share: float,
-    ) -> Float[Tensor, "*batch n_dof"]:
-        """Joints this share of the way from open to closed; those that are held or only spread fingers at rest."""
-        closed = torch.where(signs > 0, self.tree.lower, self.tree.upper)
-        return torch.where(self.movable & ~abduction, opened + share * (closed - opened), self.rest)
-
     def out_of_palm(
         self, opened: Float[Tensor, " n_dof"], signs: Float[Tensor, " n_dof"], palm: Palm
     ) -> Bool[Tensor, " n_dof"]:
@@ -279,12 +249,30 @@ class ClosingFinder:
         Raises:
             HandError: They enclose nothing.
         """
-        on_finger = [np.isin(self.coarse.link.numpy(), finger.chain) for finger in self.fingers]
+        jaw, on_palm, on_fingers = self.fixed_jaw(opened, signs, abduction), self.on_palm, self.on_fingers
+        if jaw is not None:
+            on_palm, on_fingers = on_palm & ~jaw.mask, [*on_fingers, jaw.mask]
         palms = []
         for share in self.closings:
             points, normals = self.coarse.posed(self.tree, self.posture(opened, signs, abduction, share))
-            palms.append(find_palm(points[self.on_palm], normals[self.on_palm], [points[mask] for mask in on_finger]))
-        return max(palms, key=lambda palm: palm.score)
+            palms.append(find_palm(points[on_palm], normals[on_palm], [points[mask] for mask in on_fingers]))
+        best = max(palms, key=lambda palm: palm.score)
+        return best if jaw is None else dataclasses.replace(best, direction=jaw.direction)
+
+    @cached_property
+    def on_fingers(self) -> list[Bool[np.ndarray, " n"]]:
+        """The samples on each finger."""
+        return [np.isin(self.coarse.link.numpy(), finger.chain) for finger in self.fingers]
+
+    def fixed_jaw(
+        self, opened: Float[Tensor, " n_dof"], signs: Float[Tensor, " n_dof"], abduction: Bool[Tensor, " n_dof"]
+    ) -> FixedJaw | None:
+        """The part of the palm that a single finger closes on; None for several fingers."""
+        if len(self.fingers) > 1:
+            return None
+        before, after = (self.posture(opened, signs, abduction, share) for share in (JUST_BEFORE, NEARLY_CLOSED))
+        points, closing = self.coarse.posed(self.tree, after)[0], closing_direction(self.motion, before, after)
+        return find_fixed_jaw(points, self.on_palm, self.on_fingers[0], closing)
 
 
 def _tensor(values: Float[np.ndarray, "3"]) -> Float[Tensor, "3"]:
