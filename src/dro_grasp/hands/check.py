@@ -170,7 +170,7 @@ def _part_notes(hand: Hand, description: Description) -> list[Note]:
 
 def _finger_notes(hand: Hand) -> list[Note]:
     """A finger alone closes on nothing but the palm, or on the jaw that is part of it."""
-    if len(hand.tips) > 1:
+    if len(hand.tips) != 1:
         return []
     tip = hand.tree.link_names[hand.tips[0]]
     if fixed_jaw_of(hand) is not None:

@@ -23,6 +23,7 @@ from dro_grasp.hands.opening import FingerMotion, Line, main_axis, span
 from dro_grasp.hands.palm import CLOSINGS, NOTHING_ENCLOSED, Palm, find_palm
 from dro_grasp.hands.postures import Postures
 from dro_grasp.hands.surface import LinkSurface
+from dro_grasp.kinematics.tree import KinematicTree
 
 REFINEMENTS = 3
 """Rounds in which opening signs and palm are derived from each other (ours)."""
