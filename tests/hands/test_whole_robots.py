@@ -113,9 +113,23 @@ def test_arm_with_a_single_jaw_is_refused_and_the_jaw_is_a_hand(tmp_path: Path) 
     joints = (joint("shoulder", "palm", "upper", "0 0 0.3") + joint("elbow", "upper", "lower", "0 0 0.3")
               + joint("grip", "lower", "jaw", "0.02 0 0.03"))
     path = written(tmp_path, claw(links=links, joints=joints), "arm.urdf")
-    with pytest.raises(HandError, match=r"arm\.urdf: its only fingertip, 'jaw', is 0\.64 m .*an arm;.* arm\.urdf#lower$"):
+    with pytest.raises(HandError, match=r"arm\.urdf: its fingertip 'jaw' is 0\.64 m .*an arm;.* arm\.urdf#lower$"):
         load_hand(path)
     assert load_hand(f"{path}#lower").tree.joint_names == ("grip",)
+
+
+def test_arms_with_a_single_jaw_each_are_refused_before_their_palm_is_looked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    links = "".join(link(f"{side}_{part}") for side in "ab" for part in ("upper", "lower", "jaw"))
+    joints = "".join(joint(f"{side}_shoulder", "palm", f"{side}_upper", f"{at} 0 0.3")
+                     + joint(f"{side}_elbow", f"{side}_upper", f"{side}_lower", "0 0 0.3")
+                     + joint(f"{side}_grip", f"{side}_lower", f"{side}_jaw", "0.02 0 0.03")
+                     for side, at in (("a", 0.2), ("b", -0.2)))
+    path = written(tmp_path, claw(links=links, joints=joints), "arms.urdf")
+    monkeypatch.setattr("dro_grasp.hands.build.ClosingFinder", None)
+    with pytest.raises(HandError, match=r"so these are arms or legs;.* arms\.urdf#a_lower or arms\.urdf#b_lower$"):
+        load_hand(path)
 
 
 def test_hand_on_an_arm_is_told_how_to_be_had_alone(tmp_path: Path) -> None:

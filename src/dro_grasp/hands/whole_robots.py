@@ -37,15 +37,18 @@ def require_one_hand(tree: KinematicTree, tips: Sequence[int], palm: int, file: 
     """Refuse a whole robot, of which nobody could say what its hand is.
 
     Raises:
-        HandError: It has several hands, or one beside other moving ends, or it is an arm; the message says how to ask for one.
+        HandError: It has several hands, or one beside other moving ends, or arms alone; the message says how to ask for one.
     """
     hands = find_hands(tree, tips)
     if hands and not bool(tree.descends[list(tips), hands[0]].all()):
         more = ", ..." if len(hands) > MOST_NAMED else ""
         given = ", ".join(named(file, tree.link_names[hand]) for hand in hands[:MOST_NAMED])
         raise HandError(f"this is a whole robot; give the hand that you want: {given}{more}")
-    if len(tips) == 1 and (length := reach(tree, palm, tips[0])) > LONGEST_REACH:
-        carrier = tree.parent[max(link for link in path_to(tree, tips[0]) if tree.kind[link] != FIXED)]
-        raise HandError(f"its only fingertip, '{tree.link_names[tips[0]]}', is {length:.2g} m of links away from "
-                        f"'{tree.link_names[palm]}', so this is an arm; if a hand is part of it, name the link at which it "
-                        f"begins, for example {named(file, tree.link_names[carrier])}")
+    far = [tip for tip in tips if reach(tree, palm, tip) > LONGEST_REACH]
+    if far and not hands:
+        carriers = [tree.parent[max(link for link in path_to(tree, tip) if tree.kind[link] != FIXED)] for tip in far]
+        given = " or ".join(named(file, tree.link_names[carrier]) for carrier in dict.fromkeys(carriers[:MOST_NAMED]))
+        what = "this is an arm" if len(tips) == 1 else "these are arms or legs"
+        raise HandError(f"its fingertip '{tree.link_names[far[0]]}' is {reach(tree, palm, far[0]):.2g} m of links away from "
+                        f"'{tree.link_names[palm]}', so {what}; if a hand is part of it, name the link at which it begins, "
+                        f"for example {given}")
