@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dro_grasp.errors import HandError
 from dro_grasp.hands.anatomy import Finger, axes_along, closing_gains
-from dro_grasp.hands.fixed_jaw import JUST_BEFORE, NEARLY_CLOSED, FixedJaw, closing_direction, find_fixed_jaw
+from dro_grasp.hands.fixed_jaw import JUST_BEFORE, NEARLY_CLOSED, FixedJaw, find_fixed_jaw
 from dro_grasp.hands.opening import FingerMotion, Line, main_axis, span
 from dro_grasp.hands.palm import CLOSINGS, NOTHING_ENCLOSED, Palm, find_palm
 from dro_grasp.hands.postures import Postures
@@ -271,9 +271,9 @@ class ClosingFinder(Postures):
         """The part of the palm that a single finger closes on; None for several fingers."""
         if len(self.fingers) > 1:
             return None
-        before, after = (self.posture(opened, signs, abduction, share) for share in (JUST_BEFORE, NEARLY_CLOSED))
-        points, closing = self.coarse.posed(self.tree, after)[0], closing_direction(self.motion, before, after)
-        return find_fixed_jaw(points, self.on_palm, self.on_fingers[0], closing)
+        postures = (self.posture(opened, signs, abduction, share) for share in (JUST_BEFORE, NEARLY_CLOSED))
+        before, after = (self.coarse.posed(self.tree, q)[0] for q in postures)
+        return find_fixed_jaw(before, after, self.on_palm, self.on_fingers[0])
 
 
 def _tensor(values: Float[np.ndarray, "3"]) -> Float[Tensor, "3"]:

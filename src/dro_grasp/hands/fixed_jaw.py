@@ -10,20 +10,22 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from torch import Tensor
 
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.hand import Hand
-from dro_grasp.hands.opening import FingerMotion
 
 NEARLY_CLOSED = 0.8
 """Share of the way from open to closed at which the jaw is looked for (ours). Closed all the way, jaws often overlap."""
 JUST_BEFORE = 0.79
-"""Share of the way from which the fingertip moves there in the closing direction (ours)."""
+"""Share of the way from which the finger moves there (ours)."""
+SLIDING = 0.1
+"""Difference in speed along a finger, as a share of its mean, below which it slides rather than turns (ours)."""
+KNUCKLE = 0.25
+"""Share of the finger beside which the jaw has not begun (ours)."""
 LEAST_LENGTH = 0.3
 """Length of a jaw, as a share of the finger's, below which the palm has none (ours)."""
-LARGEST_SHARE = 0.75
-"""Share of the palm's surface above which the finger closes on a palm, not on a jaw beside a block (ours)."""
+LARGEST_WIDTH = 2.5
+"""Width of a jaw, as a multiple of the finger's, above which it is a flat palm (ours). Published jaws have 0.9 to 1.3."""
 
 
 @dataclass(frozen=True)
@@ -39,49 +41,52 @@ class FixedJaw:
 
 
 def find_fixed_jaw(
-    points: Float[np.ndarray, "n 3"], on_palm: Bool[np.ndarray, " n"], on_finger: Bool[np.ndarray, " n"],
-    closing: Float[np.ndarray, "3"],
+    before: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "n 3"], on_palm: Bool[np.ndarray, " n"],
+    on_finger: Bool[np.ndarray, " n"],
 ) -> FixedJaw | None:
     """The jaw that a nearly closed finger approaches; None if the palm has no such part: it is flat, or a block alone.
 
     Along the finger, the jaw begins where the part of the palm ends that the closing finger has passed.
 
     Args:
-        points: Surface points of the hand [m].
+        before: Surface points of the hand, JUST_BEFORE it is [m].
+        points: The same points when it is NEARLY_CLOSED [m].
         on_palm: Those of the palm.
         on_finger: Those of the finger.
-        closing: Unit vector of the motion of the fingertip.
     """
-    palm, finger = points[on_palm], points[on_finger]
-    outwards = finger.mean(0) - palm.mean(0)
-    outwards = outwards - (outwards @ closing) * closing
-    if (norm := float(np.linalg.norm(outwards))) < 1e-6:
+    palm, finger, motion = points[on_palm], points[on_finger], (points - before)[on_finger]
+    if not (closing := _unit(motion.mean(0))).any():
         return None
-    outwards = outwards / norm
+    outwards = _faster(finger, np.linalg.norm(motion, axis=1))
+    outwards = finger.mean(0) - palm.mean(0) if outwards is None else outwards
+    outwards = _unit(outwards - (outwards @ closing) * closing)
+    across = np.cross(outwards, closing)
     along_palm, along_finger = palm @ outwards, finger @ outwards
     outer_half = finger[along_finger > along_finger.mean()]
     passed = palm @ closing < outer_half.mean(0) @ closing
-    begin = along_palm[passed].max(initial=along_finger.min())
-    length = float(along_palm.max() - begin)
-    mask = on_palm & (points @ outwards > begin)
-    if length < LEAST_LENGTH * np.ptp(along_finger) or mask.sum() > LARGEST_SHARE * len(palm):
+    begin = along_palm[passed].max(initial=along_finger.min() + KNUCKLE * np.ptp(along_finger))
+    length, mask = float(along_palm.max() - begin), on_palm & (points @ outwards > begin)
+    if length < LEAST_LENGTH * np.ptp(along_finger):
         return None
-    return FixedJaw(mask, outwards, length)
+    flat = np.ptp(points[mask] @ across) > LARGEST_WIDTH * np.ptp(finger @ across)
+    return None if flat else FixedJaw(mask, outwards, length)
 
 
 def fixed_jaw_of(hand: Hand) -> FixedJaw | None:
     """The part of the palm that a hand's single finger closes on; None of several fingers."""
     if len(hand.fingers) > 1:
         return None
-    before, after = (hand.canonical_joints(1 - share) for share in (JUST_BEFORE, NEARLY_CLOSED))
-    on_palm, on_finger = ((hand.finger_of_link[hand.link_index] == part).numpy() for part in (PALM, 0))
-    closing = closing_direction(FingerMotion.of(hand), before, after)
-    return find_fixed_jaw(hand.points(after).numpy(), on_palm, on_finger, closing)
+    before, after = (hand.points(hand.canonical_joints(1 - share)).numpy() for share in (JUST_BEFORE, NEARLY_CLOSED))
+    return find_fixed_jaw(before, after, *((hand.finger_of_link[hand.link_index] == part).numpy() for part in (PALM, 0)))
 
 
-def closing_direction(
-    motion: FingerMotion, before: Float[Tensor, " n_dof"], after: Float[Tensor, " n_dof"]
-) -> Float[np.ndarray, "3"]:
-    """Unit vector of the first fingertip's motion from one posture to another [rad or m]; zero if it stays."""
-    moved = (motion.tips(after) - motion.tips(before))[0]
-    return (moved / moved.norm().clamp_min(1e-12)).numpy()
+def _faster(points: Float[np.ndarray, "m 3"], speed: Float[np.ndarray, " m"]) -> Float[np.ndarray, "3"] | None:
+    """The direction in which points move faster, from the hinge outwards; None if all move alike."""
+    offset = points - points.mean(0)
+    gradient = np.linalg.lstsq(offset, speed - speed.mean())[0]
+    return gradient if np.ptp(offset @ gradient) > SLIDING * speed.mean() else None
+
+
+def _unit(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """The vector's direction; zero if it has none."""
+    return vector / max(float(np.linalg.norm(vector)), 1e-12)

@@ -12,6 +12,9 @@ from dro_grasp.kinematics.tree import FIXED, KinematicTree
 LONGEST_REACH = 0.45
 """Longest way from a hand's palm along its links to a fingertip [m] (ours). Of the built-in hands, the development assets and
 thirty published ones, the longest is 0.23; arms begin at 0.5."""
+LONGEST_JAW = 0.2
+"""The same where there is a single fingertip [m] (ours): 0.03 to 0.05 for the jaws of six published arms; the smallest of these
+arms is 0.34."""
 MOST_NAMED = 6
 """Most hands that an error names (ours)."""
 
@@ -44,7 +47,8 @@ def require_one_hand(tree: KinematicTree, tips: Sequence[int], palm: int, file: 
         more = ", ..." if len(hands) > MOST_NAMED else ""
         given = ", ".join(named(file, tree.link_names[hand]) for hand in hands[:MOST_NAMED])
         raise HandError(f"this is a whole robot; give the hand that you want: {given}{more}")
-    far = [tip for tip in tips if reach(tree, palm, tip) > LONGEST_REACH]
+    longest = LONGEST_REACH if len(tips) > 1 else LONGEST_JAW
+    far = [tip for tip in tips if reach(tree, palm, tip) > longest]
     if far and not hands:
         carriers = [tree.parent[max(link for link in path_to(tree, tip) if tree.kind[link] != FIXED)] for tip in far]
         given = " or ".join(named(file, tree.link_names[carrier]) for carrier in dict.fromkeys(carriers[:MOST_NAMED]))
