@@ -230,7 +230,7 @@ def carry_out(scene: LiftScene, made: MotionPlan, config: TabletopConfig, watch:
         if stage == "approach" and (moved := _apart(scene.pose(0), start)) > PUSHED:
             return stage, f"the hand pushed the object by {100 * moved:.1f} cm before it closed"
     lifted = float(scene.pose(0)[2, 3] - start[2, 3])
-    if lifted < config.plan.reach.lift / 2:
+    if lifted < config.plan.reach.within(scene.robot).lift / 2:
         return "lift", "the object stayed on the table" if lifted < STAYED else "the object fell during the lift"
     grip = scene.in_hand(0)
     arm, hand = made.arm.position[-1], made.hand.position[-1]

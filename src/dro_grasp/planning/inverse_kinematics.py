@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from dro_grasp.planning.few_joints import TURNED, has_few_joints
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.workcell import ARM, arm_addresses, placed_frame, wxyz
 from dro_grasp.simulation.hand_part import attach
@@ -17,6 +18,10 @@ POSITION_TOLERANCE = 5e-4
 """Largest error of the wrist's position [m] (ours)."""
 ROTATION_TOLERANCE = 2e-3
 """Largest error of its rotation [rad] (ours)."""
+ROTATION_COST = 0.3
+"""Weight of a radian against that of a metre (ours)."""
+LITTLE_COST = 0.01
+"""The same for arms that cannot reach every rotation, so that they are exact in position (ours)."""
 ITERATIONS = 25
 """Most steps towards a pose (ours)."""
 LARGEST_STEP = 0.25
@@ -24,14 +29,21 @@ LARGEST_STEP = 0.25
 
 
 class WristSolver:
-    """Solves for one robot; it knows no obstacles."""
+    """Solves for one robot; it knows no obstacles.
+
+    An arm with few joints brings the grasp centre to its place, and turns the wrist as nearly as it can.
+    """
 
     def __init__(self, robot: Robot) -> None:
         """Build the model of the arm and the wrist's frame."""
         scene = mujoco.MjSpec()
         attach(scene, robot.arm.spec(), placed_frame(scene.worldbody, robot.T_world_base), ARM)
-        scene.body(ARM + robot.mount_link).add_site(
-            name="wrist", pos=robot.T_link_wrist[:3, 3], quat=wxyz(robot.T_link_wrist[:3, :3]))
+        few = has_few_joints(robot)
+        self._T_wrist_frame, self._turned = np.eye(4), TURNED if few else ROTATION_TOLERANCE
+        if few:
+            self._T_wrist_frame[:3, 3] = robot.hand.grasp_centre_wrist.double().numpy()
+        frame = robot.T_link_wrist @ self._T_wrist_frame
+        scene.body(ARM + robot.mount_link).add_site(name="wrist", pos=frame[:3, 3], quat=wxyz(frame[:3, :3]))
         self.model = scene.compile()
         self.addresses = arm_addresses(self.model, robot)
         self.lower, self.upper = robot.working_range
@@ -39,7 +51,8 @@ class WristSolver:
         self.model.jnt_range[joints] = np.stack([self.lower, self.upper], 1)
         self.model.jnt_limited[joints] = 1
         self._configuration = mink.Configuration(self.model)
-        self._task = mink.FrameTask("wrist", "site", position_cost=1.0, orientation_cost=0.3, lm_damping=1e-4)
+        self._task = mink.FrameTask(
+            "wrist", "site", position_cost=1.0, orientation_cost=LITTLE_COST if few else ROTATION_COST, lm_damping=1e-4)
         self._limit = mink.ConfigurationLimit(self.model)
 
     def solve(
@@ -53,7 +66,7 @@ class WristSolver:
             seeds: Where to start [rad or m].
             iterations: Most steps from each.
         """
-        self._task.set_target(mink.SE3.from_matrix(T_world_wrist))
+        self._task.set_target(mink.SE3.from_matrix(T_world_wrist @ self._T_wrist_frame))
         for seed in seeds:
             q = np.zeros(self.model.nq)
             q[self.addresses] = np.clip(seed, self.lower, self.upper)
@@ -86,5 +99,5 @@ class WristSolver:
 
     def _arrived(self) -> bool:
         error = self._task.compute_error(self._configuration)
-        return bool(np.linalg.norm(error[:3]) < POSITION_TOLERANCE and np.linalg.norm(error[3:]) < ROTATION_TOLERANCE)
+        return bool(np.linalg.norm(error[:3]) < POSITION_TOLERANCE and np.linalg.norm(error[3:]) < self._turned)
 

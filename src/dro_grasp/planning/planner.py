@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from dro_grasp.errors import OptionError, PlanError, RobotError
 from dro_grasp.frames import motion_fault
@@ -18,9 +19,10 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pipeline.admission import BESIDE, NARROW, SPARED, TURNED, faults
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.planning.candidates import grasps_in_world
+from dro_grasp.planning.candidates import Directions, grasps_in_world
 from dro_grasp.planning.collisions import OBSTACLE, TARGET, CollisionChecker, open_hand
 from dro_grasp.planning.extra import require_arm_extra
+from dro_grasp.planning.few_joints import has_few_joints, reachable_directions
 from dro_grasp.planning.motion import CHOSEN, READY, WAITING, MotionPlan, PlanNotes, PlanScene, grasps_and_dropped
 from dro_grasp.planning.plan_config import PlanConfig
 from dro_grasp.planning.reachability import Feasible, Postures, Reachability
@@ -147,12 +149,20 @@ class _Task:
 
     def predicted(self, predictor: GraspPredictor) -> Iterator[GraspBatch]:
         """Batch after batch of grasps in the world's frame, as many as the configuration allows."""
+        directions = self.directions()
         for batch in range(self.config.batches):
             with self.watch("grasps"):
                 grasps = grasps_in_world(
                     predictor, self.robot.hand, self.obj, self.T_world_object, self.config.num, self.wanted(),
-                    self.config.directions, self.seed + batch * BATCH_SEED)
+                    directions, self.seed + batch * BATCH_SEED)
             yield grasps
+
+    def directions(self) -> Directions | Float[Tensor, "k 3"]:
+        """Palm directions to ask for: those that an arm with few joints can reach, or as configured."""
+        if self.config.directions != "all" or self.constraints.direction is not None or not has_few_joints(self.robot):
+            return self.config.directions
+        middle = self.T_world_object[:3, :3] @ self.obj.cloud.mean(0) + self.T_world_object[:3, 3]
+        return reachable_directions(self.robot, middle, self.seed)
 
     def add(self, grasps: GraspBatch) -> None:
         """Further grasps to choose from."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -35,6 +35,14 @@ NO_LIFT = "without a straight lift"
 """The arm cannot raise the object so far, or hits something with it."""
 
 
+SMALL_ARM = 0.7
+"""Length of arm and hand below which an arm is small [m] (ours)."""
+SMALL_STANDOFF = 0.05
+"""Longest approach of a small arm [m] (ours)."""
+SMALL_LIFT = 0.08
+"""Highest lift of a small arm [m] (ours)."""
+
+
 @dataclass(frozen=True)
 class ReachConfig:
     """How grasps are approached and lifted. Values are ours."""
@@ -55,6 +63,12 @@ class ReachConfig:
     """Distance that the robot keeps from table and obstacles on approach and lift [m]."""
     seeds: int = 6
     """Starts of inverse kinematics: home, and random ones."""
+
+    def within(self, robot: Robot) -> ReachConfig:
+        """The same, but approach and lift of a small arm are shorter."""
+        if robot.longest_reach >= SMALL_ARM:
+            return self
+        return replace(self, standoff=min(self.standoff, SMALL_STANDOFF), lift=min(self.lift, SMALL_LIFT))
 
 
 @dataclass(frozen=True)
@@ -96,7 +110,7 @@ class Reachability:
         """Prepare the solver; `table` is the height of the table [m], the object stands where the checker has it."""
         from dro_grasp.planning.inverse_kinematics import WristSolver
 
-        self.robot, self.checker, self.obj, self.table, self.config = robot, checker, obj, table, config
+        self.robot, self.checker, self.obj, self.table, self.config = robot, checker, obj, table, config.within(robot)
         self.solver, self.random = WristSolver(robot), np.random.default_rng(seed)
         self.reasons: dict[int, str] = {}
         """Why grasps were dropped, by their number."""
