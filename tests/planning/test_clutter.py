@@ -178,3 +178,5 @@ def test_clutter_stands_on_the_table_around_the_object(robot: dro.Robot) -> None
             assert np.linalg.norm(cloud[::20, None] - other[None, ::20], axis=-1).min() > APART / 3
     with pytest.raises(dro.DroGraspError, match="clutter is 9"):
         TabletopConfig(clutter=9)
+    with pytest.raises(dro.DroGraspError, match=r"region is \(0.5, 0.0, 0.4, 0.1\); give two corners"):
+        TabletopConfig(region=(0.5, 0.0, 0.4, 0.1))

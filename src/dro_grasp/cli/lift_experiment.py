@@ -39,6 +39,8 @@ class Tabletop:
     """Grasps to choose from, in each of up to three batches."""
     rehearsals: int = 8
     """Grasps of each batch whose lift is simulated on the object as it is known, before one is chosen; 0 for none."""
+    region: Annotated[tuple[float, float, float, float] | None, optional("X0 Y0 X1 Y1", "0.38 -0.18 0.58 0.18")] = None
+    """Where objects are put, from corner to corner about the arm's base [m]; a small arm needs them nearer."""
     clutter: int = 0
     """Other objects, drawn from the built-in ones, that stand around the one that is asked for: 2 to 4 make a crowd."""
     segment: Literal["cluster", "mask"] = "cluster"
@@ -73,7 +75,7 @@ class Tabletop:
         if self.video is not None:
             check_animation(self.video)
         config = TabletopConfig(
-            self.see, self.noise, clutter=self.clutter, segment=self.segment,
+            self.see, self.noise, self.region or TabletopConfig.region, clutter=self.clutter, segment=self.segment,
             plan=PlanConfig(
                 self.num, directions=self.directions, order=self.order, rehearsals=self.rehearsals,
                 constraints=self.constraints.constraints()))

@@ -54,7 +54,7 @@ class TabletopConfig:
     noise: float = 0.0015
     """Standard deviation of depth [m]."""
     region: Region = (0.38, -0.18, 0.58, 0.18)
-    """Where objects are put."""
+    """Where objects are put, from corner to corner about the arm's base [m]."""
     clutter: int = 0
     """Other objects, drawn from the built-in ones, that stand around the one that is asked for."""
     segment: Literal["cluster", "mask"] = "cluster"
@@ -70,7 +70,8 @@ class TabletopConfig:
         """Refuse what cannot be set up.
 
         Raises:
-            OptionError: Too many other objects, or fewer than none, noise that is none, or constraints on places.
+            OptionError: Too many other objects, or fewer than none, noise that is none, a region that is none, or constraints
+                on places.
         """
         wanted = self.plan.constraints
         if wanted.avoid is not None or wanted.hold or wanted.spare:
@@ -78,6 +79,9 @@ class TabletopConfig:
                               "leave them out, or use dro_grasp.plan for one object in its place")
         if not 0 <= self.noise < math.inf:
             raise OptionError(f"noise is {self.noise}; give a standard deviation in metres from 0 on, for example 0.0015")
+        x, y, far_x, far_y = self.region
+        if not (-math.inf < x < far_x < math.inf and -math.inf < y < far_y < math.inf):
+            raise OptionError(f"region is {self.region}; give two corners, the lower one first: X0 Y0 X1 Y1 in metres")
         if not 0 <= self.clutter <= MOST_CLUTTER:
             raise OptionError(f"clutter is {self.clutter}; give a number of other objects from 0 to {MOST_CLUTTER}")
 

@@ -70,7 +70,7 @@ class PlanNotes:
     score: float
     """Its score."""
     T_world_wrist: list[list[float]]
-    """The wrist pose of the grasp [m]."""
+    """The wrist pose of the grasp [m], from which an arm with few joints may turn a little."""
     seed: int
     seconds: dict[str, float]
     """Time spent on planning, by part [s]."""
