@@ -77,6 +77,18 @@ def test_a_finger_that_folds_onto_a_flat_palm_finds_no_jaw(tmp_path: Path) -> No
     assert fixed_jaw_of(hand) is None
 
 
+def test_a_palm_without_surface_or_all_beyond_the_knuckle_is_no_jaw() -> None:
+    points = np.random.default_rng(0).uniform(0, 1, (80, 3)) * [1.0, 0.1, 0.1]
+    on_palm = np.arange(80) < 40
+    points[on_palm] += [0.4, 0.0, 0.3]
+    before = points - np.where(on_palm, 0, 0.01 * points[:, 0])[:, None] * [0.0, 0.0, 1.0]
+    assert find_fixed_jaw(before, points, on_palm, ~on_palm) is None
+    points[0] = before[0] = [0.0, 0.0, 0.3]  # a knuckle
+    assert find_fixed_jaw(before, points, on_palm, ~on_palm) is not None
+    assert find_fixed_jaw(before, points, np.ones(80, bool), ~on_palm) is None  # as for a palm that no sample is on
+    assert find_fixed_jaw(before, points, np.zeros(80, bool), ~on_palm) is None
+
+
 def test_a_finger_that_stands_still_finds_no_jaw() -> None:
     points = np.random.default_rng(0).normal(size=(40, 3))
     on_palm = np.arange(40) < 20

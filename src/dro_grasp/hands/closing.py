@@ -176,6 +176,8 @@ class ClosingFinder(Postures):
     ) -> Float[Tensor, " n_dof"]:
         """Opening signs by what each joint does from limit to limit, with the others at rest or, by these signs, half closed.
 
+        A single finger closes on the jaw that is part of the palm, if there is one on either side.
+
         Args:
             signs: Opening signs so far.
             abduction: The joints that are at rest when the hand is half closed.

@@ -44,7 +44,7 @@ def find_fixed_jaw(
     before: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "n 3"], on_palm: Bool[np.ndarray, " n"],
     on_finger: Bool[np.ndarray, " n"],
 ) -> FixedJaw | None:
-    """The jaw that a nearly closed finger approaches; None if the palm has no such part: it is flat, or a block alone.
+    """The jaw that a nearly closed finger approaches; None if the palm has no such part, as a flat palm or a block alone.
 
     Along the finger, the jaw begins where the part of the palm ends that the closing finger has passed.
 
@@ -54,6 +54,8 @@ def find_fixed_jaw(
         on_palm: Those of the palm.
         on_finger: Those of the finger.
     """
+    if not on_palm.any() or (on_palm & on_finger).any():
+        return None
     palm, finger, motion = points[on_palm], points[on_finger], (points - before)[on_finger]
     if not (closing := _unit(motion.mean(0))).any():
         return None
@@ -66,7 +68,7 @@ def find_fixed_jaw(
     passed = palm @ closing < outer_half.mean(0) @ closing
     begin = along_palm[passed].max(initial=along_finger.min() + KNUCKLE * np.ptp(along_finger))
     length, mask = float(along_palm.max() - begin), on_palm & (points @ outwards > begin)
-    if length < LEAST_LENGTH * np.ptp(along_finger):
+    if length < LEAST_LENGTH * np.ptp(along_finger) or np.array_equal(mask, on_palm):
         return None
     flat = np.ptp(points[mask] @ across) > LARGEST_WIDTH * np.ptp(finger @ across)
     return None if flat else FixedJaw(mask, outwards, length)
