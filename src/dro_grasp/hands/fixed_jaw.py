@@ -25,7 +25,7 @@ KNUCKLE = 0.25
 LEAST_LENGTH = 0.3
 """Length of a jaw, as a share of the finger's, below which the palm has none (ours)."""
 LARGEST_WIDTH = 2.5
-"""Width of a jaw, as a multiple of the finger's, above which it is a flat palm (ours). Published jaws have 0.9 to 1.3."""
+"""Width of a jaw, as a multiple of the finger's, above which it is a flat palm (ours)."""
 
 
 @dataclass(frozen=True)

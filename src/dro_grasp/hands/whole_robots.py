@@ -13,8 +13,8 @@ LONGEST_REACH = 0.45
 """Longest way from a hand's palm along its links to a fingertip [m] (ours). Of the built-in hands, the development assets and
 thirty published ones, the longest is 0.23; arms begin at 0.5."""
 LONGEST_JAW = 0.2
-"""The same where there is a single fingertip [m] (ours): 0.03 to 0.05 for the jaws of six published arms; the smallest of these
-arms is 0.34."""
+"""The same where there is a single fingertip [m] (ours): 0.03 to 0.05 for the jaws of SO-100, SO-101, Z1 and
+Talos; the smallest arm that was seen, Koch's, has 0.34."""
 MOST_NAMED = 6
 """Most hands that an error names (ours)."""
 
