@@ -136,5 +136,6 @@ def test_closing_refuses_what_waits() -> None:
     taken = [submitted(desk, "running", "hang"), desk.submit(call("queued"))]
     desk.close()
     assert [t.reply.result(0).status for t in taken] == [409, 409]
+    assert desk.tally.starts == 1, "nothing is loaded again for a server that stops"
     with pytest.raises(ServerError, match="stopping"):
         desk.submit(call("late"))

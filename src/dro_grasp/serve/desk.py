@@ -157,7 +157,7 @@ class Desk:
                 self.tally.computing_seconds += time.monotonic() - begin
                 self._forget(request, reply)
             request.reply.set_result(reply)
-            if not self._process.is_alive():
+            if not self._process.is_alive() and not self.closed:
                 with suppress(OptionError):  # the next request tells
                     self._start()
 
