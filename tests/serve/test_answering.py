@@ -113,6 +113,8 @@ def test_only_the_values_used_last_are_kept() -> None:
 
 GLTF = b'{"asset": {"version": "2.0"}, "buffers": [{"uri": "/etc/passwd", "byteLength": 9}]}'
 SPHERE = trimesh.creation.icosphere(1, 0.03).vertices.tolist()
+AHEAD = [[x, y, z + 0.5] for x, y, z in SPHERE]
+CAMERA = {"frame": "base", "T_frame_camera": np.eye(4).tolist()}
 
 
 @pytest.mark.parametrize(("asked", "told"), [
@@ -123,9 +125,10 @@ SPHERE = trimesh.creation.icosphere(1, 0.03).vertices.tolist()
     ({"num": 1001}, "at most 1000"), ({"object": {"points": [[0, 0, 0.1]] * 40}}, "1 distinct points"),
     ({"object": {"points": SPHERE}, "protocol": "dro"}, "no trial"), ({"object": {"points": []}}, "distinct points"),
     ({"avoid": "/etc/passwd"}, "avoid names '/etc/passwd'"), ({"avoid": {"points": []}}, "holds no point"),
-    ({"camera": {"frame": "base", "T_frame_camera": np.eye(4).tolist()}}, "send the cloud"),
+    ({"camera": CAMERA}, "send the cloud"),
     ({"camera": {"frame": "base", "T_frame_camera": np.zeros((4, 4)).tolist()}, "object": {"points": SPHERE}}, "last row"),
     ({"camera": {"frame": "a\nb", "T_frame_camera": np.eye(4).tolist()}, "object": {"points": SPHERE}}, "a name on one line"),
+    *(({"camera": CAMERA, "object": {"points": AHEAD, "scale": scale}}, f"scale is {scale}") for scale in (-1.0, 0.0)),
 ])
 def test_refusals_say_why_and_nothing_but_what_was_sent_is_read(answerer: Answerer, asked: dict[str, Any], told: str) -> None:
     with pytest.raises(dro.DroGraspError, match=told):

@@ -25,7 +25,7 @@ from dro_grasp.grasps.columns import REASON
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import hand_names, load_hand
 from dro_grasp.objects.catalogue import load_object, object_names, resolve_objects
-from dro_grasp.objects.loading import read_points
+from dro_grasp.objects.loading import check_scale, read_points
 from dro_grasp.objects.scenery import Scene, load_scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.scan import scanned_object
@@ -197,6 +197,7 @@ class Answerer:
         with unpacked(sent, self.own_objects) as source:
             if camera is None:
                 return replace(load_object(source, scale=sent.scale, keep_table=sent.keep_table), file=None)
+            check_scale(sent.scale)
             T, named = sent_pose(camera), isinstance(source, Path)
             points = read_points(source) if named else source
             return scanned_object(source.stem if named else "cloud", points * sent.scale, T.numpy(), keep_table=sent.keep_table)
