@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from io import BytesIO
 from types import SimpleNamespace
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -379,6 +381,40 @@ def test_poses_and_joints_may_be_arrays_of_any_precision():
     assert made.joints.dtype == made.T_object_wrist.dtype == torch.float32
     assert torch.equal(made.joints, given.joints)
     assert made.seed.tolist() == [1, 1, 1]
+
+
+def test_every_column_may_be_an_array_of_any_precision():
+    hand, obj = toy_hand(), ball()
+    given = made_up_grasps(hand, count=3)
+    q = given.joints.flip(0).double().numpy()[::-1]
+    made = GraspBatch.create(
+        hand, obj, given.T_object_wrist.flip(0).numpy()[::-1], q, pregrasp_joints=q - 1, squeeze_joints=(q + 1).tolist(),
+        score=np.array([1, 3, 2]), energy=np.arange(3.0), success=np.array([1, 0, 1]), seed=np.array([7, 8, 9], np.uint8),
+        protocol=np.array(["dro/1"] * 3), extra={"depth": np.arange(3.0), "count": np.arange(3), "note": np.array(list("abc"))})
+    assert "score 1.00 to 3.00" in repr(made)
+    assert made.states_closing.tolist() == [True] * 3
+    back = GraspBatch.load(BytesIO(made.sorted_by_score().to_bytes()))
+    assert back.seed.tolist() == [8, 9, 7]
+    assert back.success.tolist() == [False, True, True]
+    assert back.protocol == ("dro/1",) * 3
+    torch.testing.assert_close(back.pregrasp_joints, given.joints[[1, 2, 0]] - 1)
+    torch.testing.assert_close(back.squeeze_joints, given.joints[[1, 2, 0]] + 1)
+    assert back.extra["note"] == ["b", "c", "a"]
+    assert back.extra["depth"].tolist() == back.extra["count"].tolist() == [1, 2, 0]
+    assert back.energy.dtype == made.extra["depth"].dtype == torch.float32
+    assert GraspBatch.create(hand, obj, given.T_object_wrist, q, seed=np.int64(5)).seed.tolist() == [5, 5, 5]
+
+
+@pytest.mark.parametrize(("column", "told"), [
+    ({"pregrasp_joints": np.zeros((3, 1))}, r"pregrasp_joints has shape \(3, 1\); expected \(3, 2\)"),
+    ({"score": np.zeros((3, 1))}, r"score has shape \(3, 1\); expected \(3,\)"),
+    ({"success": True}, r"success has shape \(\); expected \(3,\)"),
+    ({"seed": [1, 2]}, r"seed has shape \(2,\); expected \(3,\)"),
+    ({"energy": ["low"] * 3}, "energy is no array of numbers"),
+])
+def test_columns_that_do_not_fit_are_refused(column, told):
+    with pytest.raises(OptionError, match=told):
+        GraspBatch.create(HAND, BALL, torch.eye(4).repeat(3, 1, 1), torch.zeros(3, 2), **column)
 
 
 @pytest.mark.parametrize(("change", "told"), [

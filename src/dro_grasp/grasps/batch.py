@@ -104,10 +104,10 @@ class GraspBatch:
             joints: Independent joints, (n, n_dof) [rad or m].
             optional: Any other field of GraspBatch; `seed` may be one int, `provenance` one string.
 
-        Poses and joints may be arrays; numbers in any precision become single.
+        Numbers may be arrays or lists; those in any precision become single.
 
         Raises:
-            OptionError: Poses or joints have another shape, are not finite, or a pose is no rigid motion.
+            OptionError: A column has another shape, poses or joints are not finite, or a pose is no rigid motion.
         """
         T_object_wrist, joints = columns.placed(T_object_wrist, joints, len(hand.tree.joint_names))
         objects = list(obj) if isinstance(obj, Sequence) else [obj] * len(joints)

@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from itertools import count
 from typing import Any
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
@@ -79,7 +80,7 @@ def placed(T_object_wrist: Any, joints: Any, n_dof: int) -> tuple[Float[Tensor, 
         OptionError: They have another shape, are not finite, or a pose is no rigid motion.
     """
     try:
-        T, q = (torch.as_tensor(values).float() for values in (T_object_wrist, joints))
+        T, q = (torch.as_tensor(_own(values)).float() for values in (T_object_wrist, joints))
     except (TypeError, ValueError, RuntimeError) as error:
         raise OptionError(f"wrist poses or joints are no arrays of numbers ({error}); give rows of equal lengths") from error
     if T.ndim != 3 or T.shape[1:] != (4, 4) or q.ndim != 2 or q.shape != (len(T), n_dof):
@@ -126,18 +127,53 @@ def places(objects: Sequence[str], hashes: Sequence[str]) -> dict[str, list[int]
 
 
 def filled(joints: Float[Tensor, "n n_dof"], known: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """All fields of a batch but poses and joints: those known, those given, in single precision, and the others unknown."""
+    """All fields of a batch but poses and joints: those known, those given, and the others unknown.
+
+    Raises:
+        OptionError: A given column of numbers holds something else, or has another shape.
+    """
     n = len(joints)
     fields: dict[str, Any] = {name: unknown(name, joints) for name in COLUMNS[2:]} | dict(known)
     if "success" in given:
         fields["protocol"] = (UNKNOWN_PROTOCOL,) * n
     for name, value in given.items():
-        fields[name] = value.float() if isinstance(value, Tensor) and value.is_floating_point() else value
-    if isinstance(fields["seed"], int):
-        fields["seed"] = torch.full((n,), fields["seed"], dtype=torch.int64)
+        if isinstance(fields.get(name), Tensor):
+            fields[name] = _numbers(name, value, fields[name])
+        elif name == "extra":
+            fields[name] = {each: _further(column) for each, column in value.items()}
+        else:
+            fields[name] = tuple(value.tolist()) if isinstance(value, np.ndarray) else value
     if isinstance(fields["provenance"], str):
         fields["provenance"] = (fields["provenance"],) * n
     return fields
+
+
+def _numbers(name: str, value: Any, like: Shaped[Tensor, "n *k"]) -> Shaped[Tensor, "n *k"]:
+    """A given column in type, shape and place of an unknown one; one seed stands for all."""
+    try:
+        column = torch.as_tensor(_own(value), dtype=like.dtype, device=like.device)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise OptionError(f"{name} is no array of numbers ({error}); give one of shape {tuple(like.shape)}, or leave it "
+                          "out") from error
+    if name == "seed" and column.ndim == 0:
+        return column.repeat(len(like))
+    if column.shape != like.shape:
+        raise OptionError(f"{name} has shape {tuple(column.shape)}; expected {tuple(like.shape)} for these grasps")
+    return column
+
+
+def _further(column: Any) -> Any:
+    """A given further column; arrays become tensors, of floats in single precision, or lists."""
+    if not isinstance(column, np.ndarray):
+        return column
+    if column.dtype.kind not in "biuf":
+        return column.tolist()
+    return torch.as_tensor(_own(column), dtype=torch.float32 if column.dtype.kind == "f" else None)
+
+
+def _own(value: Any) -> Any:
+    """A copy of an array, as tensors take none with negative strides, and warn of one that is read-only."""
+    return np.array(value) if isinstance(value, np.ndarray) else value
 
 
 def outcomes(trial: Any, n: int, extra: Mapping[str, Any]) -> dict[str, Any]:
