@@ -6,6 +6,7 @@ import asyncio
 import dataclasses
 import json
 import re
+import socket
 from collections import Counter
 from concurrent.futures import Future
 from pathlib import Path
@@ -115,6 +116,13 @@ def test_a_body_that_is_no_json_or_too_deep_is_refused(content: bytes) -> None:
 ])
 def test_foreign_pages_are_refused(headers: dict[str, str], status: int) -> None:
     assert client()("POST", "/grasps", PLAIN, headers).status == status
+
+
+def test_no_request_waits_for_a_name_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    here = client()
+    monkeypatch.setattr(socket, "getfqdn", lambda *_: pytest.fail("it is asked"))
+    assert here("GET", "/health").status == 200
+    assert here("GET", "/health", headers={"Host": "evil.example"}).status == 403
 
 
 @pytest.mark.parametrize(("borne", "status"), [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import io
+import socket
 import zipfile
 from collections.abc import Iterator
 from http.client import HTTPConnection
@@ -14,7 +15,7 @@ import viser
 import websockets
 
 from dro_grasp.errors import OptionError
-from dro_grasp.viewer.guard import refusal
+from dro_grasp.viewer.guard import own_names, refusal
 from dro_grasp.viewer.stage import ServedPage
 from dro_grasp.viewer.uploads import store_upload
 from tests.helpers.claw_urdf import claw, meshed
@@ -29,7 +30,13 @@ from tests.helpers.claw_urdf import claw, meshed
 ])
 def test_foreign_hosts_and_origins_are_refused(host: str, origin: str | None, refused: bool) -> None:
     headers = {"Host": host} | ({} if origin is None else {"Origin": origin})
-    assert bool(refusal(headers, "robot-pc")) == refused
+    assert bool(refusal(headers, own_names("robot-pc"))) == refused
+
+
+def test_a_machine_has_its_names_and_that_which_it_is_served_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(socket, "gethostname", lambda: "Arm")
+    monkeypatch.setattr(socket, "getfqdn", lambda *_: "arm.lab.example")
+    assert own_names("Robot-PC") == {"localhost", "robot-pc", "arm", "arm.lab.example"}
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +60,8 @@ def test_a_foreign_page_opens_no_socket_and_the_own_one_does(page: ServedPage) -
     assert b"not from this one" in (refused.value.response.body or b"")
 
 
-def test_a_name_that_somebody_else_gives_this_machine_is_refused(page: ServedPage) -> None:
+def test_a_name_that_somebody_else_gives_this_machine_is_refused(page: ServedPage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(socket, "getfqdn", lambda *_: pytest.fail("a request waits for a name server"))
     for host, status in (("evil.example", 403), (f"127.0.0.1:{page.server.get_port()}", 200)):
         connection = HTTPConnection("127.0.0.1", page.server.get_port(), timeout=10)
         connection.request("GET", "/", headers={"Host": host})

@@ -23,7 +23,7 @@ from dro_grasp.errors import OptionError, ServerError
 from dro_grasp.serve.computing import Reply, refused
 from dro_grasp.serve.desk import Desk
 from dro_grasp.serve.messages import GraspAnswer, GraspCall, Refusal
-from dro_grasp.viewer.guard import refusal
+from dro_grasp.viewer.guard import own_names, refusal
 
 SLOWEST_BODY = 30.0
 """Time within which the whole of a request must arrive [s] (ours)."""
@@ -64,9 +64,9 @@ class Access:
 class Gate:
     """Refuses what comes from foreign pages, bears no token, or is too large or too slow, before anything reads it."""
 
-    def __init__(self, app: Callable[..., Awaitable[None]], access: Access) -> None:
-        """Stand before an application."""
-        self.app, self.access = app, access
+    def __init__(self, app: Callable[..., Awaitable[None]], access: Access, own: frozenset[str]) -> None:
+        """Stand before an application on a machine with these names."""
+        self.app, self.access, self.own = app, access, own
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         """Pass a request on, or refuse it."""
@@ -81,7 +81,7 @@ class Gate:
         await self.app(scope, self._limited(receive), send)
 
     def _refusal(self, headers: dict[str, str], path: str) -> Reply | None:
-        if why := refusal(headers, self.access.host):
+        if why := refusal(headers, self.own):
             return refused(HTTPStatus.FORBIDDEN, f"the request is refused: {why}")
         borne = headers.get("Authorization", "").removeprefix("Bearer ").encode()
         if self.access.token and path not in OPEN and not secrets.compare_digest(borne, self.access.token.encode()):
@@ -127,7 +127,7 @@ def application(desk: Desk, access: Access) -> FastAPI:
 
     app = FastAPI(title="dro-grasp", version=__version__, lifespan=life,
                   description="Grasps of any object by any hand. Lengths are metres, angles radians, quaternions WXYZ.")
-    app.add_middleware(Gate, access=access)
+    app.add_middleware(Gate, access=access, own=own_names(access.host))
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(AnyHTTPException, _failed)
     told: dict[int | str, dict[str, Any]] = {status: {"model": Refusal} for status in (401, 403, 409, 413, 422, 500, 503, 504)}

@@ -8,7 +8,7 @@ from __future__ import annotations
 import http
 import ipaddress
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from typing import Any
 from urllib.parse import urlsplit
@@ -21,12 +21,23 @@ MOST_CONNECTIONS = 64
 """Most open connections to one page (ours)."""
 
 
-def refusal(headers: Any, served_at: str) -> str:
+def own_names(served_at: str) -> frozenset[str]:
+    """Names of this machine, in small letters.
+
+    A name server may be asked, which takes seconds where none answers: call it once, before requests come.
+
+    Args:
+        served_at: The address that the page is served at, as the user gave it.
+    """
+    return frozenset(name.lower() for name in ("localhost", served_at, socket.gethostname(), socket.getfqdn()))
+
+
+def refusal(headers: Any, own: Collection[str]) -> str:
     """Why a request is refused; empty if it is not.
 
     Args:
         headers: Of the request, by name.
-        served_at: The address that the page is served at, as the user gave it.
+        own: Names of this machine; see `own_names`.
     """
     host, origin = headers.get("Host", ""), headers.get("Origin")
     try:
@@ -34,7 +45,6 @@ def refusal(headers: Any, served_at: str) -> str:
         theirs = None if origin is None else urlsplit(origin).netloc
     except ValueError:
         return "its Host or Origin is no address"
-    own = {"localhost", *(text.lower() for text in (served_at, socket.gethostname(), socket.getfqdn()))}
     if not (_is_address(name) or name in own):
         return f"it asks for the host '{name}', which is no name of this machine; open the page at the machine's address"
     if theirs is not None and theirs != host:
@@ -56,12 +66,12 @@ def guarded_server(served_at: str) -> Iterator[None]:
 
     viser has no switch for it; it passes a function that sees every request to websockets, and this one is put before it.
     """
-    serve = websockets.asyncio.server.serve
+    serve, own = websockets.asyncio.server.serve, own_names(served_at)
 
     def guarded(*args: Any, process_request: Callable[..., Any] | None = None, **options: Any) -> Any:
         def check(connection: ServerConnection, request: Request) -> Response | None:
             crowd = len(getattr(connection.server, "connections", ())) > MOST_CONNECTIONS
-            why = "too many browsers show it; close some" if crowd else refusal(request.headers, served_at)
+            why = "too many browsers show it; close some" if crowd else refusal(request.headers, own)
             if why:
                 return connection.respond(http.HTTPStatus.FORBIDDEN, f"This page refuses the request: {why}.\n")
             return None if process_request is None else process_request(connection, request)
