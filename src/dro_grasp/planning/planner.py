@@ -92,8 +92,8 @@ class _Task:
         self.robot, self.config, self.seed = robot, config, seed
         self.obj, self.T_world_object = upright(obj, T_world_object)
         avoid, self.constraints = config.constraints.avoid, replace(config.constraints, avoid=None)
-        base = robot.T_world_base[:3, 3]
-        obstacles = [*obstacles, *(scene_solid(avoid, base, robot.longest_reach) if avoid is not None else ())]
+        base, reach = robot.T_world_base[:3, 3], robot.full_reach + float(np.linalg.norm(np.ptp(self.obj.cloud, axis=0)))
+        obstacles = [*obstacles, *(scene_solid(avoid, base, reach) if avoid is not None else ())]
         self.obstacles = obstacles
         self.watch = Stopwatch("grasps", "reach", "rehearsal", "path", "timing")
         self.checker = CollisionChecker(robot, robot.table, obstacles, self.obj, self.T_world_object)

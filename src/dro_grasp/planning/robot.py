@@ -21,6 +21,7 @@ from dro_grasp.descriptions.xml_files import parse_xml
 from dro_grasp.errors import HandError, RobotError
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand, locate_hand
+from dro_grasp.planning.extent import farthest, farthest_surface
 from dro_grasp.planning.robot_file import CameraMount, RobotFile, Table, locate_robot, read_robot_file
 
 LONGEST_ARM = 5.0
@@ -80,9 +81,21 @@ class Robot:
 
     @property
     def longest_reach(self) -> float:
-        """No grasp centre gets farther from the base than this [m]: the sum of all distances between joints."""
-        links = float(self.arm.tree.origin[1:, :3, 3].norm(dim=-1).sum())
-        return links + float(np.linalg.norm(self.T_link_wrist[:3, 3])) + float(self.hand.grasp_centre_wrist.norm())
+        """No grasp centre gets farther from the base than this [m]: all distances between joints, and travel of sliding ones."""
+        return self._wrist_reach + float(self.hand.grasp_centre_wrist.norm())
+
+    @property
+    def full_reach(self) -> float:
+        """No part of arm or hand gets farther from the base than this [m]."""
+        assert self.hand.description is not None
+        limits = self.hand.tree.lower.double().numpy(), self.hand.tree.upper.double().numpy()
+        return max(farthest_surface(self.arm, *self.working_range),
+                   self._wrist_reach + farthest_surface(self.hand.description, *limits))
+
+    @property
+    def _wrist_reach(self) -> float:
+        tree = self.arm.tree
+        return farthest(tree, *self.working_range, tree.link_names.index(self.mount_link), self.T_link_wrist[None, :3, 3])
 
     def T_world_wrist(self, arm: Float[np.ndarray, "*batch n_arm"]) -> Float[np.ndarray, "*batch 4 4"]:
         """Pose of the hand's root link [m]."""

@@ -23,7 +23,7 @@ def scene_solid(scene: Scene, centre: Float[np.ndarray, "3"], reach: float) -> l
     Args:
         scene: In the world's frame.
         centre: The robot's base [m].
-        reach: How far the robot gets from there [m].
+        reach: How far anything of the robot, and what it carries, gets from there [m].
     """
     points = scene.points
     if scene.faces is not None:
