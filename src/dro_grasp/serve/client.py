@@ -11,9 +11,9 @@ from urllib.error import HTTPError, URLError
 from urllib.request import Request, urlopen
 
 import numpy as np
-from jaxtyping import Float
+from numpy.typing import ArrayLike
 
-from dro_grasp.errors import ServerError
+from dro_grasp.errors import OptionError, ServerError
 
 
 class GraspClient:
@@ -35,21 +35,23 @@ class GraspClient:
         self.url, self.timeout = url.rstrip("/"), timeout
         self.headers = {"Content-Type": "application/json"} | ({"Authorization": f"Bearer {token}"} if token else {})
 
-    def predict(self, hand: str, obj: str | Path | Float[np.ndarray, "n 3"], num: int = 16, **options: Any) -> dict[str, Any]:
+    def predict(self, hand: str, obj: str | Path | ArrayLike, num: int = 16, **options: Any) -> dict[str, Any]:
         """The server's answer: its list `grasps`, the best first, and all that is known of it.
 
         Args:
             hand: Name of a hand that the server knows.
-            obj: The path of a mesh or cloud, which is sent; the name of an object that the server knows; or points [m].
+            obj: The path of a mesh or cloud, which is sent; the name of an object that the server knows; or points,
+                (n, 3), as an array, tensor or nested lists [m].
             num: Grasps to return.
             options: What else a request holds, such as direction, table, camera, protocol; scale and keep_table are the
-                object's, and avoid is a path or points, as the object is.
+                object's, and avoid is a path or points, as the object is. Numbers may be arrays or tensors.
 
         Raises:
+            OptionError: A value cannot be sent.
             ServerError: The server refuses, fails or is not there.
         """
         of_object = {name: options.pop(name) for name in ("scale", "keep_table") if name in options}
-        if "avoid" in options:
+        if options.get("avoid") is not None:
             options["avoid"] = sent_object(options["avoid"])
         return self.ask("POST", "/grasps", {"hand": hand, "object": sent_object(obj) | of_object, "num": num, **options})
 
@@ -61,9 +63,10 @@ class GraspClient:
         """What a page of the server answers.
 
         Raises:
+            OptionError: The content cannot be sent.
             ServerError: It refuses, fails or is not there.
         """
-        body = None if content is None else json.dumps(content).encode()
+        body = None if content is None else json.dumps(content, default=listed).encode()
         try:
             with urlopen(Request(self.url + page, body, self.headers, method=method), timeout=self.timeout) as answer:
                 return json.load(answer)
@@ -78,12 +81,37 @@ class GraspClient:
             raise ServerError(f"no grasp server answers at {self.url} ({error}); start one with `dro-grasp serve`") from error
 
 
-def sent_object(obj: str | Path | Float[np.ndarray, "n 3"]) -> dict[str, Any]:
-    """An object as a request holds it: its file's bytes, its points as a file, or its name."""
-    if isinstance(obj, np.ndarray):
-        np.save(file := io.BytesIO(), obj)
-        return sent_file("cloud.npy", file.getvalue())
-    return sent_file(Path(obj).name, Path(obj).read_bytes()) if Path(obj).is_file() else {"name": str(obj)}
+def listed(value: Any) -> Any:
+    """An array or tensor as lists of numbers, as JSON has them; lists stay.
+
+    Raises:
+        OptionError: The value is neither.
+    """
+    if isinstance(value, list | tuple):
+        return value
+    if not hasattr(value, "tolist"):
+        raise OptionError(f"a {type(value).__name__} cannot be sent to a grasp server; give names and paths as text, and "
+                          "numbers as numbers, lists or arrays")
+    return value.tolist()
+
+
+def sent_object(obj: str | Path | ArrayLike) -> dict[str, Any]:
+    """An object as a request holds it: its file's bytes, its points as a file, or its name.
+
+    Raises:
+        OptionError: It is none of these.
+    """
+    if isinstance(obj, str | Path):
+        return sent_file(Path(obj).name, Path(obj).read_bytes()) if Path(obj).is_file() else {"name": str(obj)}
+    try:
+        points = np.asarray(obj if isinstance(obj, np.ndarray) else listed(obj))
+    except ValueError:  # rows of several lengths
+        points = np.array(None)
+    if points.dtype.kind not in "iuf":
+        raise OptionError(f"a {type(obj).__name__} that holds no array of numbers cannot be sent as an object; give the name "
+                          "of one that the server knows, the path of a mesh or cloud, or points (n, 3)")
+    np.save(file := io.BytesIO(), points)
+    return sent_file("cloud.npy", file.getvalue())
 
 
 def sent_file(name: str, content: bytes) -> dict[str, Any]:
