@@ -1,4 +1,4 @@
-"""Records of tensors, which are frozen dataclasses: moved to a device, and with tensors that are computed once."""
+"""Records, which are frozen dataclasses: moved to a device, with tensors that are computed once, and as flat settings."""
 
 from __future__ import annotations
 
@@ -16,6 +16,16 @@ def on_device(record: Record, device: torch.device | str) -> Record:
     values = {f.name: getattr(record, f.name) for f in dataclasses.fields(record)}  # type: ignore[arg-type]
     moved = {name: value.to(device) for name, value in values.items() if hasattr(value, "to")}
     return dataclasses.replace(record, **moved)  # type: ignore[type-var]
+
+
+def flat(record: Any, prefix: str = "") -> dict[str, Any]:
+    """The values of a dataclass and of those in it, by name; what is nested has dots in its name."""
+    values: dict[str, Any] = {}
+    for field in dataclasses.fields(record):
+        value = getattr(record, field.name)
+        name = f"{prefix}{field.name}"
+        values |= flat(value, f"{name}.") if dataclasses.is_dataclass(value) else {name: value}
+    return values
 
 
 class cached_tensor(cached_property):  # type: ignore[type-arg]  # reads like the decorator it extends

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
 import signal
+import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from itertools import repeat
 from pathlib import Path
 
 import pytest
@@ -15,6 +19,7 @@ from dro_grasp.cli.main import main
 from dro_grasp.datasets.engine import schedule
 from dro_grasp.datasets.engine.pools import Outcome, Work
 from dro_grasp.datasets.engine.schedule import own_pairs, synthesize_dataset
+from dro_grasp.datasets.engine.settings import SETTINGS, require_settings
 from dro_grasp.datasets.engine.shards import Shard, find_shards, sole_run
 from dro_grasp.datasets.engine.worker import EngineConfig, Job, Task
 from dro_grasp.errors import GraspFileError, OptionError, OutputError
@@ -77,6 +82,30 @@ def test_two_parts_and_one_that_is_killed_and_rerun_make_what_one_run_makes(tmp_
     assert report.shards == 18 - len(before)
     assert report.grasps == 2 * GOAL
     assert content(folder) == content(tmp_path / "whole")
+
+
+def begin(folder: Path, protocol: str, barrier: threading.Barrier) -> str:
+    """How a part that begins the folder together with others fares."""
+    barrier.wait()
+    try:
+        require_settings(folder, Job(0, EngineConfig(protocol)))
+    except OptionError as error:
+        return str(error)
+    return protocol
+
+
+def test_of_parts_that_begin_at_once_with_other_settings_one_kind_goes_on(tmp_path: Path) -> None:
+    for turn in range(20):
+        folder, asked = tmp_path / str(turn), ["dro", "strict"] * 4
+        folder.mkdir()
+        barrier = threading.Barrier(len(asked))
+        with ThreadPoolExecutor(len(asked)) as pool:
+            told = list(pool.map(begin, repeat(folder), asked, repeat(barrier)))
+        kept = json.loads((folder / SETTINGS).read_text())["protocol"]
+        refused = [text for protocol, text in zip(asked, told, strict=True) if protocol != kept]
+        assert [text for text in told if text == kept] == [kept] * 4
+        assert all(f"was begun with protocol {kept}, " in text for text in refused)
+        assert [path.name for path in folder.iterdir()] == [SETTINGS]
 
 
 def test_every_pair_belongs_to_one_part() -> None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 from hashlib import sha256
 from typing import Any
 
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.models.presets import NetworkConfig
+from dro_grasp.records import flat
 
 BOOKKEEPING = frozenset({"minutes", "device", "log_every", "checkpoint_seconds", "tensorboard"})
 """Settings of a schedule that a resumed run may change: how long it goes on, where, and what it tells."""
@@ -25,9 +25,9 @@ def run_plan(
         network: Configuration of the network in training.
         given: Weights that the run begins with or takes parts of, by role; their parameters count, not their names.
     """
-    settings = {name: value for name, value in _flat(config).items() if name.removeprefix("schedule.") not in BOOKKEEPING}
+    settings = {name: value for name, value in flat(config).items() if name.removeprefix("schedule.") not in BOOKKEEPING}
     weights = {role: None if each is None else _digest(each) for role, each in given.items()}
-    about = {} if network is None else _flat(network, "network.")
+    about = {} if network is None else flat(network, "network.")
     return {name.removeprefix("schedule."): value for name, value in settings.items()} | about | weights | {
         "bundle": bundle.fingerprint}
 
@@ -38,13 +38,3 @@ def _digest(network: DistanceNetwork) -> str:
     for parameter in network.parameters():
         digest.update(parameter.detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()[:12]
-
-
-def _flat(record: Any, prefix: str = "") -> dict[str, Any]:
-    """The values of a dataclass and of those in it."""
-    values: dict[str, Any] = {}
-    for field in dataclasses.fields(record):
-        value = getattr(record, field.name)
-        name = f"{prefix}{field.name}"
-        values |= _flat(value, f"{name}.") if dataclasses.is_dataclass(value) else {name: value}
-    return values

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from dro_grasp.datasets.engine.pools import Failed, LocalPool, Outcome, Pool
+from dro_grasp.datasets.engine.settings import require_settings
 from dro_grasp.datasets.engine.shards import Shard, Yield, find_shards, read_yield, remove_leftovers, set_aside, sole_run
 from dro_grasp.datasets.engine.worker import EngineConfig, Job, Task
 from dro_grasp.devices import require_device
@@ -110,7 +111,8 @@ def synthesize_dataset(
         progress: Called with a line of text now and then; None prints to stderr.
 
     Raises:
-        OptionError: A number is not positive, the time is not finite, or this machine lacks the device.
+        OptionError: A number is not positive, the time is not finite, this machine lacks the device, or the folder was begun
+            with other settings (see `require_settings`).
         OutputError: The folder cannot be made or written, or another run is filling it.
     """
     config = config or EngineConfig()
@@ -123,9 +125,11 @@ def synthesize_dataset(
     folder = make_folder(output_dir)
     say = progress or (lambda line: print(line, file=sys.stderr, flush=True))
     with sole_run(folder, config.shard):
+        job = Job(seed, config)
+        require_settings(folder, job)
         states = {pair: PairState() for pair in own_pairs(hands, objects, config.shard)}
         resume(folder, states, grasps_per_pair, say)
-        before, started, job = sum(s.grasps for s in states.values()), time.perf_counter(), Job(seed, config)
+        before, started = sum(s.grasps for s in states.values()), time.perf_counter()
         pool = LocalPool(job, workers, config.shard_seconds) if isinstance(workers, int) else workers(job)
         end = math.inf if config.seconds is None else started + config.seconds
         shards = Production(pool, folder, states, grasps_per_pair, config, say, end).finish()
