@@ -28,7 +28,8 @@ def done(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Attempt]:
         return done[-1]
 
     monkeypatch.setattr(tabletop, "attempt", attempt)
-    monkeypatch.setattr(tabletop, "load_robot", lambda name: SimpleNamespace(name=name))
+    monkeypatch.setattr(tabletop, "load_robot", lambda name: SimpleNamespace(name=name, sha256=name))
+    monkeypatch.setattr(tabletop, "describe_weights", lambda weights: {"sha256": weights})
     monkeypatch.setattr(tabletop, "GraspPredictor", lambda weights: weights)
     monkeypatch.chdir(tmp_path)
     return done

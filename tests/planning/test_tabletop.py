@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import torch
 import trimesh
@@ -14,6 +15,7 @@ from PIL import Image
 import dro_grasp as dro
 from dro_grasp.cli.main import main
 from dro_grasp.errors import OptionError
+from dro_grasp.models.checkpoints import load_weights, save_weights
 from dro_grasp.perception.scan import depth_points
 from dro_grasp.planning import tabletop
 from dro_grasp.planning.animation import Recorder, draw_animation
@@ -172,11 +174,48 @@ def test_two_objects_of_one_name_are_refused_and_one_object_counts_once(
     again = str(tmp_path / "004" / ".." / "003" / "textured.obj")
     (done,) = run_tabletop(TabletopRun(small_robot, (box, again), attempts=1, config=QUICK), output)
     assert (done.object, done.object_file) == ("textured", box)
-    with pytest.raises(OptionError, match=rf"'{other}' and '{box}' are different .*--output"):
+    with pytest.raises(OptionError, match=rf"'{other}' is not the object 'textured' .* made with '{box}'.*--output"):
         run_tabletop(TabletopRun(small_robot, (other,), attempts=1, config=QUICK), output)
-    (tmp_path / "003" / "textured.obj").unlink()
-    (kept,) = run_tabletop(TabletopRun(small_robot, (other,), attempts=1, config=QUICK), output)
-    assert kept.object_file == box, "nobody can tell any more"
+    trimesh.creation.box((0.04, 0.05, 0.08)).export(box)
+    with pytest.raises(OptionError, match=rf"'{box}' is not the object 'textured' .* as it was then"):
+        run_tabletop(TabletopRun(small_robot, (box,), attempts=1, config=QUICK), output)
+
+
+def test_attempts_with_other_weights_or_another_robot_are_no_results_of_these(
+    small_robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[str] = []
+
+    def counted(robot: dro.Robot, obj: dro.ObjectModel, number: int, seed: int, *others: object) -> Attempt:
+        calls.append(obj.name)
+        return Attempt(robot.name, obj.name, number, seed, QUICK.label(), True, "done", score=float(len(calls)))
+
+    def run(output: Path = tmp_path / "results.parquet") -> list[float]:
+        return [a.score for a in run_tabletop(TabletopRun(str(file), ("can",), 1, 0, weights, QUICK), output)]
+
+    monkeypatch.setattr(tabletop, "attempt", counted)
+    monkeypatch.setattr(tabletop, "GraspPredictor", lambda weights: None)
+    text, file, weights = Path(small_robot).read_text(), tmp_path / "robot.yaml", None
+    file.write_text(f"{text}\n# a remark changes nothing\n")
+    assert run() == [1]
+    file.write_text(text)
+    assert run() == [1]
+    weights = str(tmp_path / "more_hands.safetensors")
+    save_weights(load_weights(), weights, {"trained": "elsewhere"})
+    assert run() == [2], "the name is not enough"
+    file.write_text(text.replace("velocity: 2.0", "velocity: 1.25"))
+    assert run() == [3]
+    assert run() == [3]
+    stored = read_attempts(tmp_path / "results.parquet")
+    assert [(a.weights, Path(a.robot_file).name) for a in stored] == [
+        ("more_hands", "robot.yaml"), (weights, "robot.yaml"), (weights, "robot.yaml")]
+    before = tmp_path / "before.parquet"
+    known = pq.read_table(tmp_path / "results.parquet")
+    pq.write_table(known.drop_columns(["weights", "weights_sha256", "robot_sha256", "object_sha256"]), before)
+    assert len(read_attempts(before)) == 3
+    with pytest.raises(OptionError, match=r"before\.parquet holds 3 of these attempts .* give another --output"):
+        run(before)
+    assert len(read_attempts(before)) == 3
 
 
 def test_the_command_prints_rates_and_refuses_what_cannot_be(

@@ -54,7 +54,8 @@ class Tabletop:
     workers: int = 1
     """Processes; each takes one object after the other."""
     output: Annotated[Path | None, optional("PARQUET", "not saved")] = None
-    """A row for each attempt, with stage, reason, times and seed. Attempts that it holds are not repeated."""
+    """A row for each attempt, with stage, reason, times and seed. Attempts that it holds with the same robot, objects, weights,
+    settings and seed are not repeated."""
     plans: Annotated[Path | None, optional("FOLDER", "not saved")] = None
     """Folder for the plan of each attempt, ROBOT-OBJECT-NUMBER.npz."""
     video: Annotated[Path | None, optional("GIF|WEBP", "none")] = None

@@ -156,6 +156,12 @@ class Attempt:
     """Name or file that the robot was loaded from."""
     object_file: str = ""
     """The same of the object."""
+    weights: str = ""
+    """The same of the weights."""
+    robot_sha256: str = ""
+    """Hash of the robot, of its arm and hand; empty, as the following, in files from before there was one."""
+    object_sha256: str = ""
+    weights_sha256: str = ""
 
 
 Proposer = Callable[[PickedObject, Float[np.ndarray, "4 4"], int], GraspBatch]

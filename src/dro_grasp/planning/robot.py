@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,11 +25,14 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand, locate_hand
 from dro_grasp.planning.extent import farthest, farthest_surface
 from dro_grasp.planning.robot_file import CameraMount, RobotFile, Table, locate_robot, read_robot_file
+from dro_grasp.records import flat
 
 LONGEST_ARM = 5.0
 """A farther link must be in another unit [m] (ours)."""
 TURN = np.pi
 """Planned motions stay this near home, so that configurations a whole turn apart count once [rad] (ours)."""
+HASHED_DIGITS = 9
+"""Decimals of poses and limits that count for a robot's hash (ours)."""
 DEFAULT_EFFORT = 50.0
 """Largest torque of an arm's joint that states none [Nm]; only simulated servos use it (ours)."""
 
@@ -75,13 +80,20 @@ class Robot:
         return tuple(self.hand.tree.joint_names)
 
     @property
+    def sha256(self) -> str:
+        """Hash of all that motions depend on: robots of one hash are the same, whatever they and their files are called."""
+        own = {name: value for name, value in flat(self).items() if not name.startswith(("name", "arm.", "hand."))}
+        stated = own | {"arm": self.arm.sha256, "hand": self.hand.sha256}
+        return hashlib.sha256(json.dumps(stated, sort_keys=True, default=_rounded).encode()).hexdigest()
+
+    @property
     def working_range(self) -> tuple[Float[np.ndarray, " n_arm"], Float[np.ndarray, " n_arm"]]:
         """The joints' limits, and at most TURN from home."""
         return np.maximum(self.lower, self.home - TURN), np.minimum(self.upper, self.home + TURN)
 
     @property
     def longest_reach(self) -> float:
-        """No grasp centre gets farther from the base than this [m]: all distances between joints, and travel of sliding ones."""
+        """No grasp centre gets farther from the base than this [m]: all distances between joints, and the travel of slides."""
         return self._wrist_reach + float(self.hand.grasp_centre_wrist.norm())
 
     @property
@@ -103,6 +115,11 @@ class Robot:
         links = tree.forward(torch.from_numpy(np.ascontiguousarray(arm, np.float64)))
         mount = links[..., tree.link_names.index(self.mount_link), :, :]
         return self.T_world_base @ mount.numpy() @ self.T_link_wrist
+
+
+def _rounded(values: Float[np.ndarray, "..."]) -> list[Any]:
+    """For hashes: what machines compute differs in the last digits."""
+    return (values.round(HASHED_DIGITS) + 0.0).tolist()
 
 
 def load_robot(name: str | Path) -> Robot:

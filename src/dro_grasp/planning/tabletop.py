@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import multiprocessing
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 
@@ -15,8 +14,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from dro_grasp.devices import one_thread
-from dro_grasp.errors import GraspFileError, ObjectError, OptionError
+from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.files import check_output, make_folder, reading, replacing
+from dro_grasp.models.checkpoints import DEFAULT, describe_weights
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.planning.attempts import Attempt, TabletopConfig, Watcher, attempt
 from dro_grasp.planning.extra import require_arm_extra
@@ -76,23 +76,24 @@ def run_tabletop(
 
     Args:
         run: What is attempted.
-        output: Parquet file; attempts of the same robot, settings and seed in it are not repeated, others stay.
+        output: Parquet file; attempts with the same robot, objects, weights, settings and seed in it are not repeated, others
+            stay. Files of the same names count as the same only if their contents are.
         workers: Processes, which share out the objects; with several, attempts are stored object by object.
         progress: See `Progress`.
         plans: Folder for the plan of each attempt, ROBOT-OBJECT-NUMBER.npz.
 
     Raises:
-        OptionError: The extra is missing, something cannot be attempted, or two objects have one name.
+        OptionError: The extra is missing, something cannot be attempted, two objects have one name, or `output` holds such
+            attempts from before contents were noted.
         RobotError: The robot cannot be used.
         ObjectError: An object cannot be used.
+        WeightsError: The weights cannot be used.
         GraspFileError: `output` is there and is no such file.
         OutputError: `output` or `plans` cannot be written.
     """
     require_arm_extra()
     stored = read_attempts(output) if output is not None and check_output(output, ".parquet").exists() else []
-    name, label = load_robot(run.robot).name, run.config.label()
-    done = {(a.object, a.number): a for a in stored if (a.robot, a.settings, a.seed) == (name, label, run.seed)}
-    names = _names(run.objects, done.values())
+    done, names = _done(run, stored, output)
     missing = {o: [k for k in range(run.attempts) if (n, k) not in done] for o, n in names.items()}
     if plans is not None:
         make_folder(plans)
@@ -106,29 +107,45 @@ def run_tabletop(
     return [done[n, k] for n in names.values() for k in range(run.attempts)]
 
 
-def _names(given: Sequence[str], done: Iterable[Attempt]) -> dict[str, str]:
-    """The name of each object that is given, once each.
+def _done(
+    run: TabletopRun, stored: Sequence[Attempt], output: Path | None
+) -> tuple[dict[tuple[str, int], Attempt], dict[str, str]]:
+    """The attempts of a run that are stored, by object and number; and the name of each object that is given, once each.
 
     Raises:
-        OptionError: Two of them differ and have one name, or attempts with another object of the name are done.
+        OptionError: Nobody can tell of some, or they are of another object of the name.
+    """
+    robot, weights, objects = load_robot(run.robot), describe_weights(run.weights)["sha256"], _objects(run.objects)
+    alike = [a for a in stored if (a.robot, a.settings, a.seed) == (robot.name, run.config.label(), run.seed)]
+    unknown = [a for a in alike if not a.weights_sha256 and a.object in objects and a.number < run.attempts]
+    if unknown:
+        raise OptionError(f"{output} holds {len(unknown)} of these attempts from a version that did not note the contents of "
+                          "robot, object and weights, so that they may be of others; keep it, and give another --output")
+    done = [a for a in alike if (a.robot_sha256, a.weights_sha256) == (robot.sha256, weights)]
+    for a in done:
+        source, sha256 = objects.get(a.object, ("", a.object_sha256))
+        if a.object_sha256 != sha256:
+            raise OptionError(f"'{source}' is not the object '{a.object}' of the attempts in {output}, made with "
+                              f"'{a.object_file}' as it was then; rename the file, or attempt it apart, with its own --output "
+                              "and --plans")
+    return {(a.object, a.number): a for a in done}, {source: name for name, (source, _) in objects.items()}
+
+
+def _objects(given: Sequence[str]) -> dict[str, tuple[str, str]]:
+    """What each object was given as, and its hash, by its name.
+
+    Raises:
+        OptionError: Two of them differ and have one name.
     """
     found: dict[str, tuple[str, str]] = {}
-
-    def refuse_another(source: str) -> None:
+    for source in dict.fromkeys(given):
         obj = load_object(source)
         first, sha256 = found.setdefault(obj.name, (source, obj.sha256))
         if obj.sha256 != sha256:
             raise OptionError(f"'{first}' and '{source}' are different objects of the name '{obj.name}', under which attempts "
                               "and plans are stored; rename one of the files, or attempt them apart, each with its own "
                               "--output and --plans")
-
-    for source in dict.fromkeys(given):
-        refuse_another(source)
-    for name, source in sorted({(a.object, a.object_file) for a in done}):
-        if name in found and source not in {"", *given}:
-            with suppress(ObjectError):  # the file may be gone
-                refuse_another(source)
-    return {source: name for name, (source, _) in found.items()}
+    return found
 
 
 def _results(run: TabletopRun, missing: dict[str, list[int]], workers: int, plans: Path | None) -> Iterator[Attempt]:
@@ -148,10 +165,13 @@ def _all_attempts(run: TabletopRun, name: str, numbers: Sequence[int], plans: Pa
 
 def _attempts(run: TabletopRun, name: str, numbers: Sequence[int], plans: Path | None) -> Iterator[Attempt]:
     robot, obj, predictor = load_robot(run.robot), load_object(name), GraspPredictor(run.weights)
+    weights = describe_weights(run.weights)["sha256"]
     for number in numbers:
         keeper = None if plans is None else PlanKeeper(plans / f"{robot.name}-{obj.name}-{number}.npz")
         made = attempt(robot, obj, number, run.seed, predictor, run.config, keeper)
-        yield replace(made, robot_file=str(run.robot), object_file=str(name))
+        yield replace(
+            made, robot_file=str(run.robot), object_file=str(name), weights=str(run.weights or DEFAULT),
+            robot_sha256=robot.sha256, object_sha256=obj.sha256, weights_sha256=weights)
 
 
 def write_attempts(attempts: Sequence[Attempt], path: Path) -> None:
