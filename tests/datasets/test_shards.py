@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -108,3 +109,24 @@ def test_only_old_leftovers_are_removed(tmp_path):
     assert remove_leftovers(tmp_path) == 1
     assert young.exists()
     assert not old.exists()
+
+
+def test_temporary_files_that_others_finish_meanwhile_are_left_to_them(tmp_path, monkeypatch):
+    """As the other parts of an array job do, between the listing of a file and the look at it."""
+    folder = tmp_path / "toy" / "ball"
+    folder.mkdir(parents=True)
+    names = [".settings.json1.part", *(f"toy/ball/.0000{i}.parquet.part" for i in range(3))]
+    for name in names:
+        (tmp_path / name).touch()
+        os.utime(tmp_path / name, (time.time() - 7200,) * 2)
+    listed = Path.glob
+
+    def rename(place: Path, pattern: str) -> list[Path]:
+        found = sorted(listed(place, pattern))
+        for path in found[1:]:
+            path.rename(path.with_name(path.name.strip(".")))
+        return found
+
+    monkeypatch.setattr(Path, "glob", rename)
+    assert remove_leftovers(tmp_path) == 2
+    assert sorted(path.name for path in folder.iterdir()) == ["00001.parquet.part", "00002.parquet.part"]

@@ -234,7 +234,10 @@ def set_aside(folder: Path, shard: Shard) -> Path:
 
 def remove_leftovers(folder: Path) -> int:
     """Remove temporary files that killed processes left behind; returns how many."""
-    old = [p for p in folder.glob("*/*/.*.part") if time.time() - p.stat().st_mtime > STALE]
-    for path in old:
-        path.unlink(missing_ok=True)
-    return len(old)
+    removed = 0
+    for path in [*folder.glob(".*.part"), *folder.glob("*/*/.*.part")]:
+        with suppress(FileNotFoundError):  # another part of the run has renamed or removed it
+            if time.time() - path.stat().st_mtime > STALE:
+                path.unlink()
+                removed += 1
+    return removed
