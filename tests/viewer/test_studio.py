@@ -133,6 +133,33 @@ def test_a_trial_plays_and_ends_where_it_began(
     assert studio.moment.disabled, "another picture has no moments"
 
 
+def test_a_filter_that_no_grasp_passes_ends_a_trial_that_plays(
+    studio: Studio, made: module.ShownGrasps, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    poses = torch.eye(4).repeat(5, 1, 1)
+    monkeypatch.setattr(module, "record", lambda *_: (poses, made.refined.joints[:1].expand(5, -1)))
+    monkeypatch.setattr(module, "chosen", lambda *_: torch.zeros(6, dtype=torch.bool))
+    waits: list[float] = []
+
+    def wait(seconds: float) -> None:
+        waits.append(seconds)
+        if len(waits) == 2:
+            studio._filter()
+
+    monkeypatch.setattr(module.time, "sleep", wait)
+    try:
+        studio._guarded(studio._play)
+        assert (len(waits), studio.moment.disabled, studio.moment.value) == (2, True, 0)
+        assert studio.text.content == "No grasp passes these filters."
+        assert "something else was picked" in studio.status.content
+        studio._show_moment(1)
+        studio._guarded(studio._play)
+        assert len(waits) == 2, "nothing is left to play"
+    finally:
+        monkeypatch.undo()
+        studio._filter()
+
+
 @pytest.mark.parametrize("kind", EXPORTS)
 def test_what_is_taken_away_is_what_is_shown(studio: Studio, made: module.ShownGrasps, kind: str) -> None:
     name, content = studio.exported(kind)

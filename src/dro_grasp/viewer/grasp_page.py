@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import NamedTuple, cast
 
 import torch
 import viser
@@ -56,6 +56,17 @@ class ShownGrasps:
     """Whether a table is shown below them."""
 
 
+class Film(NamedTuple):
+    """A trial that was played."""
+
+    T_object_wrist: Float[Tensor, "4 4"]
+    """Wrist pose of its grasp [m]."""
+    poses: Float[Tensor, "frames 4 4"]
+    """Of the object, in the wrist's frame [m]."""
+    joints: Float[Tensor, "frames n_dof"]
+    """Of the hand [rad or m]."""
+
+
 class Closed(Exception):
     """The page was closed while it worked."""
 
@@ -70,7 +81,7 @@ class GraspPage:
         """Whether nobody sees the page any more."""
         self.made: ShownGrasps | None = None
         self.shown: list[int] = []
-        self.film: tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames n_dof"]] | None = None
+        self.film: Film | None = None
         self._busy = threading.Lock()
         with place.atomic():  # the browser gets no control before all are connected
             self._add_choices()
@@ -168,7 +179,13 @@ class GraspPage:
         if some:
             self._show()
         else:
+            self._forget_film()
             self.text.content = "No grasp passes these filters."
+
+    def _picked(self) -> int | None:
+        """Row of the picked grasp; None if none passes the filters."""
+        shown = self.shown
+        return shown[min(int(self.slider.value), len(shown) - 1)] if shown else None
 
     def _batch(self) -> GraspBatch:
         assert self.made is not None
@@ -176,10 +193,10 @@ class GraspPage:
 
     def _show(self) -> None:
         """Move the hand to the picked grasp."""
-        if self.made is None or not self.shown:
+        index = self._picked()
+        if self.made is None or index is None:
             return
-        hand, obj = self.made.hand, self.made.obj
-        index, grasps = self.shown[min(int(self.slider.value), len(self.shown) - 1)], self._batch()
+        hand, obj, grasps = self.made.hand, self.made.obj, self._batch()
         grasp, posture = grasps[index], self.posture.value
         if posture == HELD:
             grasp = after_closing(hand, obj, grasp) if shows_held(hand, None) else grasp
@@ -198,14 +215,21 @@ class GraspPage:
             self.text.content = f"{describe(grasps, index)}  \nposture: {posture}"
 
     def _play(self) -> None:
-        """Play the trial of the picked grasp."""
-        assert self.made is not None
-        index, grasps = self.shown[int(self.slider.value)], self._batch()
-        self._say(f"Playing the trial under *{self.made.protocol}*.")
-        self.film = record(self.made.hand, self.made.obj, grasps, index, self.made.protocol)
-        last = len(self.film[0]) - 1
-        self.moment.max, self.moment.disabled = last, False
+        """Play the trial of the picked grasp, until another choice is made."""
+        index = self._picked()
+        if self.made is None or index is None:
+            return
+        grasps, protocol = self._batch(), self.made.protocol
+        self._say(f"Playing the trial under *{protocol}*.")
+        film = Film(grasps.T_object_wrist[index].float(), *record(self.made.hand, self.made.obj, grasps, index, protocol))
+        last = len(film.poses) - 1
+        self.film, self.moment.max, self.moment.disabled = film, last, False
+        if self._picked() != index:  # while it was recorded
+            self._forget_film()
         for moment in range(last + 1):
+            if self.film is not film:
+                self._say("Stopped: something else was picked.")
+                return
             self._show_moment(moment)
             self.moment.value = moment
             time.sleep(FRAME_TIME)
@@ -213,12 +237,10 @@ class GraspPage:
 
     def _show_moment(self, moment: int) -> None:
         """Show a moment of the trial that was played."""
-        if self.film is None or self.made is None:
+        if (film := self.film) is None:
             return
-        poses, joints = self.film
-        T = self._batch().T_object_wrist[self.shown[int(self.slider.value)]].float()
         self.stage.contacts.visible = False
-        self.stage.show(joints[moment], T, T @ poses[moment])
+        self.stage.show(film.joints[moment], film.T_object_wrist, film.T_object_wrist @ film.poses[moment])
 
     def _forget_film(self) -> None:
         """No trial was played of what is shown now."""
