@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import threading
 import time
@@ -24,6 +25,7 @@ from dro_grasp.hands.library import BUILTIN_FOLDER
 from dro_grasp.objects.builtin import BUILTIN
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.viewer import grasp_page as module
+from dro_grasp.viewer.app import postures_of
 from dro_grasp.viewer.grasp_page import EXPORTS, chosen
 from dro_grasp.viewer.shelf import Shelf
 from dro_grasp.viewer.stage import HOST, ServedPage
@@ -171,6 +173,20 @@ def test_what_is_taken_away_is_what_is_shown(studio: Studio, made: module.ShownG
     else:
         read = yaml.safe_load(content)
         assert len(read["grasps"] if isinstance(read, dict) else read) == 6
+
+
+@pytest.mark.parametrize("kind", [title for title in EXPORTS if title != module.GRASP_FILE])
+def test_grasps_that_state_no_pregrasp_are_taken_away_with_the_one_that_is_shown(
+    studio: Studio, made: module.ShownGrasps, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    unknown = torch.full_like(made.refined.joints, float("nan"))
+    bare = made.refined.replace(pregrasp_joints=unknown, squeeze_joints=unknown)
+    monkeypatch.setattr(studio, "made", dataclasses.replace(made, refined=bare))
+    name, content = studio.exported(kind)
+    shown = postures_of(made.hand, made.obj, bare)
+    stated = made.refined.replace(pregrasp_joints=shown["pregrasp"], squeeze_joints=shown["squeeze"])
+    monkeypatch.setattr(studio, "made", dataclasses.replace(made, refined=stated))
+    assert (name, content) == studio.exported(kind)
 
 
 def test_uploads_are_picked_and_errors_are_shown(studio: Studio) -> None:

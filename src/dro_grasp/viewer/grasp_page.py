@@ -20,6 +20,7 @@ from dro_grasp.export.contents import Frame
 from dro_grasp.export.formats import FORMATS, ExportJob
 from dro_grasp.frames import HALF_AXES, half_axis
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.controller import completed
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.trial import record
@@ -254,12 +255,17 @@ class GraspPage:
         self._say(f"{name}: {len(self.shown)} grasps.")
 
     def exported(self, kind: str) -> tuple[str, bytes]:
-        """Name and content of a file with the shown grasps, in one of EXPORTS."""
+        """Name and content of a file with the shown grasps, in one of EXPORTS.
+
+        A grasp file has what they state; for other software, the controller makes the pregrasps and squeezes that they lack.
+        """
         assert self.made is not None
         grasps = self._batch()[self.shown]
         stem = f"{Path(self.made.hand.name).name}_{Path(self.made.obj.name).name}"
         if kind == GRASP_FILE:
             return f"{stem}.parquet", grasps.to_bytes()
+        centre = torch.as_tensor(self.made.obj.centre_of_mass, dtype=grasps.joints.dtype)
+        grasps = completed(self.made.hand, grasps, centre)
         name, form = next((name, form) for name, form in FORMATS.items() if form.title == kind)
         content = form.content(ExportJob(grasps, Frame(), self.made.hand))
         return f"{stem}_{name}{form.suffix}", cast(bytes, content)
