@@ -17,7 +17,7 @@ from safetensors.torch import save_file
 from dro_grasp.cli.main import main
 from dro_grasp.datasets.bundle import training_file as bundle_module
 from dro_grasp.datasets.bundle.training_file import SPLITS, ObjectCloud, load_bundle, split_of, write_bundle
-from dro_grasp.datasets.collections.bundling import sources
+from dro_grasp.datasets.collections.bundling import make_bundle, sources
 from dro_grasp.datasets.engine.shards import Shard
 from dro_grasp.errors import BundleError, GraspFileError, OutputError
 from dro_grasp.grasps.batch import GraspBatch
@@ -261,11 +261,34 @@ def test_namesakes_are_not_mixed_up(tmp_path: Path) -> None:
         own.write_text((BUILTIN_FOLDER / "gripper3.urdf").read_text() + f"<!-- {folder} -->")
         made = made_up_grasps(load_hand(own), "sphere", 2).replace(object_sha256=(load_object("sphere").sha256,) * 2)
         batches.append(with_sources(made, str(own), "sphere", 1.0))
-    hands, clouds = sources([batches[0], batches[0]])
+    hands, clouds, _ = sources([batches[0], batches[0]])
     assert [hand.name for hand in hands] == ["mine"]
     assert list(clouds) == ["sphere"]
     with pytest.raises(BundleError, match="different hands are called mine"):
         sources(batches)
+
+
+@pytest.mark.parametrize("unknown", ["hash of the hand", "hashes of the objects", "both", "the first object's hash"])
+def test_grasps_whose_files_state_no_hash_are_bundled_with_what_they_name(path: Path, unknown: str) -> None:
+    hand, batches = loaded_hand("gripper3"), []
+    for name in ("sphere", "cube"):
+        made = made_up_grasps(hand, name, 4, success=[True] * 4)
+        hashes = (load_object(name).sha256,) * 4
+        empty = 1 if unknown.startswith("the") else 0 if unknown == "hash of the hand" else 4
+        made = made.replace(object_sha256=("",) * empty + hashes[empty:])
+        batches.append(made if "objects" in unknown or "first" in unknown else made.replace(hand_sha256=""))
+        batches[-1].save(path.with_name(f"{name}.parquet"))
+    bundle, _ = make_bundle([path.with_name("sphere.parquet"), path.with_name("cube.parquet")], path, per_pair=2)
+    assert bundle.summary() == {"hands": {"gripper3": 4}, "objects": 2, "grasps": 4}
+    assert bundle.hands["gripper3"].sha256 == hand.sha256
+    for name, cloud in bundle.objects.items():
+        torch.testing.assert_close(cloud.points, torch.from_numpy(load_object(name).cloud), atol=1e-5, rtol=0)
+
+
+def test_an_object_that_has_changed_is_refused_also_where_the_first_grasp_states_no_hash() -> None:
+    grasps = made_up_grasps(loaded_hand("gripper3"), "sphere", 2).replace(object_sha256=("", "0123456789abcdef"))
+    with pytest.raises(GraspFileError, match=r"another version of object .sphere. .hash 0123456789ab"):
+        sources([grasps])
 
 
 def test_an_object_that_has_changed_is_refused() -> None:

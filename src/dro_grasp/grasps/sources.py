@@ -146,6 +146,12 @@ def object_source(grasps: GraspBatch, scale: float = 1.0) -> tuple[str, float]:
     return source or grasps.object[0], scale
 
 
+def pair_keys(grasps: GraspBatch) -> tuple[tuple[str, str], tuple[str, str | tuple[str, float]]]:
+    """What tells the hands and the objects of grasps of one object apart: names, and hashes or, where unknown, the sources."""
+    source = grasps.hand_sha256 or _recorded(grasps, HAND_FILE) or ""
+    return (grasps.hand, source), (grasps.object[0], _known_hash(grasps) or object_source(grasps))
+
+
 def frame_of(grasps: GraspBatch) -> str | None:
     """Name of the frame of grasps on a camera's cloud; None for grasps in the object's own frame."""
     return _recorded(grasps, FRAME)
@@ -170,7 +176,7 @@ def require_same(grasps: GraspBatch, hand: Hand, obj: ObjectModel) -> None:
         GraspFileError: A hash differs.
     """
     for kind, name, stored, found in (
-        ("hand", hand.name, grasps.hand_sha256, hand.sha256), ("object", obj.name, grasps.object_sha256[0], obj.sha256)
+        ("hand", hand.name, grasps.hand_sha256, hand.sha256), ("object", obj.name, _known_hash(grasps), obj.sha256)
     ):
         if stored and stored != found:
             raise GraspFileError(f"the grasps were made for another version of {kind} '{name}' (hash {stored[:12]}, found "
@@ -179,3 +185,8 @@ def require_same(grasps: GraspBatch, hand: Hand, obj: ObjectModel) -> None:
 
 def _recorded(grasps: GraspBatch, column: str) -> str | None:
     return next((value for value in grasps.extra.get(column, ()) if value), None)
+
+
+def _known_hash(grasps: GraspBatch) -> str:
+    """Hash of the object of grasps of one object, empty if no grasp states it."""
+    return next((sha256 for sha256 in grasps.object_sha256 if sha256), "")

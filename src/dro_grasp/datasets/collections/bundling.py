@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence, Set
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -13,7 +14,7 @@ from dro_grasp.datasets.collections.collection import read_collection
 from dro_grasp.datasets.collections.merging import spread
 from dro_grasp.errors import BundleError
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.sources import hand_of, object_of, require_same
+from dro_grasp.grasps.sources import hand_of, object_of, pair_keys, require_same
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 
@@ -50,7 +51,7 @@ def make_bundle(
             kept.append(grasps)
     if not kept:
         raise BundleError(_why_none(split, seen, hands, hands_seen))
-    found, clouds = sources(kept)
+    found, clouds, kept = sources(kept)
     if per_pair is not None:
         by_hash = {hand.sha256: hand for hand in found}
         kept = [grasps[spread(by_hash[grasps.hand_sha256], grasps, per_pair)] for grasps in kept]
@@ -71,25 +72,30 @@ def _why_none(split: str, seen: Counter[str], hands: Sequence[str], hands_seen: 
     return f"no grasps of split '{split}' were given, but {counts}; {advice}, or make grasps of {where} (`dro-grasp objects`)"
 
 
-def sources(batches: list[GraspBatch]) -> tuple[list[Hand], dict[str, ObjectCloud]]:
-    """The hands and object clouds of batches of one hand and one object, each once; their hashes are checked.
+def sources(batches: list[GraspBatch]) -> tuple[list[Hand], dict[str, ObjectCloud], list[GraspBatch]]:
+    """The hands and object clouds of batches of one hand and one object, each once, and the batches with the hashes of these.
+
+    Hashes that the batches state are checked.
 
     Raises:
         BundleError: Different files have one name.
         GraspFileError: A hand or an object has changed since.
     """
-    hands: dict[str, Hand] = {}
-    objects: dict[str, ObjectModel] = {}
+    hands: dict[Any, Hand] = {}
+    objects: dict[Any, ObjectModel] = {}
+    stated = []
     for grasps in batches:
-        if grasps.hand_sha256 not in hands:
-            hands[grasps.hand_sha256] = hand_of(grasps, None)
-        if grasps.object_sha256[0] not in objects:
-            objects[grasps.object_sha256[0]] = object_of(grasps, None, 1.0)
-        require_same(grasps, hands[grasps.hand_sha256], objects[grasps.object_sha256[0]])
-    for kind, things in (("hand", hands), ("object", objects)):
-        names = [thing.name for thing in things.values()]
+        whose, of = pair_keys(grasps)
+        hand = hands[whose] = hands.get(whose) or hand_of(grasps, None)
+        obj = objects[of] = objects.get(of) or object_of(grasps, None, 1.0)
+        require_same(grasps, hand, obj)
+        stated.append(grasps.replace(hand_sha256=hand.sha256, object_sha256=(obj.sha256,) * len(grasps)))
+    found = {hand.sha256: hand for hand in reversed(hands.values())}
+    named = {(name, obj.sha256): obj for (name, _), obj in objects.items()}
+    for kind, names in (("hand", [hand.name for hand in found.values()]), ("object", [name for name, _ in named])):
         double = sorted({name for name in names if names.count(name) > 1})
         if double:
             raise BundleError(f"different {kind}s are called {', '.join(double)}; rename them and synthesise again")
-    clouds = {o.name: ObjectCloud(torch.from_numpy(o.cloud), torch.from_numpy(o.cloud_normals)) for o in objects.values()}
-    return list(hands.values()), clouds
+    clouds = {
+        name: ObjectCloud(torch.from_numpy(obj.cloud), torch.from_numpy(obj.cloud_normals)) for (name, _), obj in named.items()}
+    return [found[sha256] for sha256 in dict.fromkeys(hand.sha256 for hand in hands.values())], clouds, stated

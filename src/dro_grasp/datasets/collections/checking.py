@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 
@@ -13,7 +14,7 @@ from dro_grasp.datasets.engine.worker import EngineConfig
 from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.sources import hand_of, object_of, object_source, require_same
+from dro_grasp.grasps.sources import hand_of, object_of, pair_keys, require_same
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.finger_closing import close_idle_fingers
@@ -134,11 +135,11 @@ def _loaded(parts: Sequence[GraspBatch], progress: Progress | None) -> Iterator[
     All of them are found before the first pair: no trial is lost to a file that has changed, or to a bare cloud.
     """
     total, done = sum(map(len, parts)), 0
-    hands: dict[tuple[str, str], Hand] = {}
-    objects: dict[str | tuple[str, float], ObjectModel] = {}
+    hands: dict[Any, Hand] = {}
+    objects: dict[Any, ObjectModel] = {}
     pairs = []
     for grasps in parts:
-        whose, of = (grasps.hand, grasps.hand_sha256), grasps.object_sha256[0] or object_source(grasps)
+        whose, of = pair_keys(grasps)
         hand = hands[whose] = hands.get(whose) or hand_of(grasps, None)
         obj = objects[of] = objects.get(of) or object_of(grasps, None, 1.0)
         require_same(grasps, hand, obj)
