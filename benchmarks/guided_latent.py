@@ -18,8 +18,9 @@ from torch import Tensor
 
 from dro_grasp.evaluation.success_rates import pair_seed
 from dro_grasp.hands.library import load_hand
-from dro_grasp.models.network import DistanceNetwork, Suitability
+from dro_grasp.models.network import DistanceNetwork, Moves
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.pipeline.choice import ChoiceConfig, choice_scores
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import complete
 from dro_grasp.predictor import GraspPredictor, PredictorConfig
@@ -35,7 +36,7 @@ KEPT = 4
 class Ascent:
     """How z climbs."""
 
-    draws: int = 32
+    draws: int = 16
     """Draws of z for each placement."""
     steps: int = 0
     """Adam's steps; 0 keeps the best draw."""
@@ -50,27 +51,42 @@ class GuidedNetwork(DistanceNetwork):
 
     ascent = Ascent()
     """How z climbs."""
+    problem: GraspProblem
+    """Hand and object."""
     reached: list[Tensor]
-    """Suitability of the decoded hands."""
+    """Suitability of the best hands."""
 
-    def moved(self, phi_hand: Tensor, hand: Tensor, z: Tensor, suit: Suitability | None, kept: int) -> tuple[Tensor, Tensor]:
-        """As the network's, after the ascent."""
-        assert self.motion is not None
-        assert suit is not None
+    def to_frame(self, points: Tensor, centre: Tensor, rotation: Tensor) -> Tensor:
+        """As the network's; remembered, because suitability is judged in the object's frame."""
+        self.frame = centre, rotation
+        return super().to_frame(points, centre, rotation)
+
+    def move(self, hand: Tensor, obj: Tensor, noise: Tensor) -> Moves:
+        """As the network's, after the ascent of the best draws."""
+        moves = super().move(hand, obj, noise)
+        suits = self._suit(moves.points)
         if self.ascent.steps:
-            rows = torch.arange(len(z))[:, None]
-            z = self._climbed(phi_hand, hand, z[rows, suit(self.motion(phi_hand, hand, z)).topk(KEPT, 1).indices], suit)
-        chosen = super().moved(phi_hand, hand, z, suit, kept)
-        self.reached.append(suit(chosen[1])[:, 0])
-        return chosen
+            rows = torch.arange(len(hand))[:, None]
+            z = self._climbed(moves.hand_features, hand, moves.z[rows, suits.topk(KEPT, 1).indices])
+            assert self.motion is not None
+            moves = replace(moves, z=z, points=self.motion(moves.hand_features, hand, z))
+            suits = self._suit(moves.points)
+        self.reached.append(suits.amax(1))
+        return moves
+
+    def _suit(self, points: Tensor) -> Tensor:
+        centre, rotation = self.frame
+        hand = self.problem.thinned(self.config.n_hand)
+        placed = points @ rotation[:, None].mT + centre[:, None, None]
+        return choice_scores(hand, self.problem.field, placed, ChoiceConfig().penalties)
 
     @torch.enable_grad()
-    def _climbed(self, phi_hand: Tensor, hand: Tensor, start: Tensor, suit: Suitability) -> Tensor:
+    def _climbed(self, phi_hand: Tensor, hand: Tensor, start: Tensor) -> Tensor:
         assert self.motion is not None
         z = start.clone().requires_grad_(True)
         adam, best, found = torch.optim.Adam([z], lr=self.ascent.rate), torch.full(z.shape[:2], -torch.inf), start.clone()
         for _ in range(self.ascent.steps + 1):
-            value = suit(self.motion(phi_hand, hand, z)) - self.ascent.penalty * (z - start).square().sum(-1)
+            value = self._suit(self.motion(phi_hand, hand, z)) - self.ascent.penalty * (z - start).square().sum(-1)
             better = value.detach() > best
             best, found = torch.where(better, value.detach(), best), torch.where(better[..., None], z.detach(), found)
             adam.zero_grad()
@@ -95,7 +111,7 @@ def main() -> None:
     pairs = [(load_hand(hand), load_object(obj)) for hand in options.hands for obj in options.objects]
     columns = ["draws", "steps", "penalty", "n", "dro [%]", "strict [%]", "suitability", "CPU ms a grasp"]
     rows: list[list[object]] = []
-    for ascent in (Ascent(), Ascent(draws=128), Ascent(steps=10), Ascent(steps=10, penalty=0.3),
+    for ascent in (Ascent(), Ascent(draws=64), Ascent(steps=10), Ascent(steps=10, penalty=0.3),
                    Ascent(steps=20, rate=0.1, penalty=0.1)):
         network.ascent, network.reached = ascent, []
         held: dict[str, list[Tensor]] = {"dro": [], "strict": []}
@@ -103,7 +119,7 @@ def main() -> None:
         config = PredictorConfig()
         shipped.config = replace(config, choice=replace(config.choice, draws=ascent.draws))
         for hand, obj in pairs:
-            problem = GraspProblem(hand, obj)
+            problem = network.problem = GraspProblem(hand, obj)
             assert problem.field is not None  # made before the clock runs
             start = time.process_time()
             grasps = shipped.predict(

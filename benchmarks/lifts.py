@@ -73,7 +73,7 @@ def mean_grasp_attempts(run: TabletopRun, mean: MeanGrasp) -> Iterator[Attempt]:
     def propose(seen: PickedObject, T_world_object: np.ndarray, seed: int) -> GraspBatch:
         obj, T = upright(seen.obj, T_world_object)
         problem = GraspProblem(robot.hand, obj)
-        grasps = complete(problem, mean_grasps(problem, mean, MEAN_GRASPS, seed, ChoiceConfig(draws=1)))
+        grasps = complete(problem, mean_grasps(problem, mean, MEAN_GRASPS, seed, ChoiceConfig.first()))
         T = torch.from_numpy(T).float()
         return grasps.replace(T_object_wrist=T @ grasps.T_object_wrist, score=torch.zeros(len(grasps)))
 

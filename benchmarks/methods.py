@@ -45,7 +45,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     predictor = GraspPredictor(options.weights)
-    first = GraspPredictor(options.weights, config=PredictorConfig(choice=ChoiceConfig(draws=1)))
+    first = GraspPredictor(options.weights, config=PredictorConfig(choice=ChoiceConfig.first()))
     found: dict[tuple[str, str], list[np.ndarray]] = {}
     for hand in map(load_hand, options.hands):
         for obj in map(load_object, resolve_objects(options.objects)):

@@ -102,7 +102,7 @@ def test_mean_grasp_is_the_mean_in_the_wrist_frame(bundle: Bundle) -> None:
 
 
 def test_mean_grasps_ignore_the_shape(bundle: Bundle) -> None:
-    mean, first = mean_grasp(bundle, "toy"), ChoiceConfig(draws=1)
+    mean, first = mean_grasp(bundle, "toy"), ChoiceConfig.first()
     ball, egg = (mean_grasps(GraspProblem(HAND, obj), mean, 12, 3, first) for obj in (bare("ball"), bare("egg", 0.5)))
     assert torch.equal(ball.joints, egg.joints)
     assert torch.equal(ball.joints, mean.joints.expand(12, -1))
@@ -114,14 +114,15 @@ def test_mean_grasps_ignore_the_shape(bundle: Bundle) -> None:
 
 
 def test_the_chosen_rotation_of_a_mean_grasp_is_the_best_of_its_draws(bundle: Bundle) -> None:
-    problem, mean, config = GraspProblem(HAND, bare("egg", 0.5)), mean_grasp(bundle, "toy"), ChoiceConfig(draws=6)
-    every = mean_grasps(problem, mean, 4 * config.draws, 3, ChoiceConfig(draws=1))
+    problem, mean, config = GraspProblem(HAND, bare("egg", 0.5)), mean_grasp(bundle, "toy"), ChoiceConfig(placements=2, draws=3)
+    draws = config.placements * config.draws
+    every = mean_grasps(problem, mean, 4 * draws, 3, ChoiceConfig.first())
     thin = problem.thinned(min(CHOICE_POINTS, HAND.n_points))
-    scores = choice_scores(thin, problem.field, thin.points(every.joints, every.T_object_wrist), config.of_moved)
-    best = scores.unflatten(0, (4, config.draws)).argmax(-1) + config.draws * torch.arange(4)
+    scores = choice_scores(thin, problem.field, thin.points(every.joints, every.T_object_wrist), config.penalties)
+    best = scores.unflatten(0, (4, draws)).argmax(-1) + draws * torch.arange(4)
     chosen = mean_grasps(problem, mean, 4, 3, config)
     torch.testing.assert_close(chosen.T_object_wrist, every.T_object_wrist[best])
-    assert scores.unflatten(0, (4, config.draws)).std(-1).min() > 0
+    assert scores.unflatten(0, (4, draws)).std(-1).min() > 0
 
 
 @pytest.mark.parametrize("name", list(SEMIAXES))
@@ -148,4 +149,4 @@ def test_controls_know_no_network(bundle: Bundle, monkeypatch: pytest.MonkeyPatc
     again = palm_facing_starts(HAND, obj, 8, 1)
     assert torch.equal(before.T_object_wrist, again.T_object_wrist)
     assert not torch.equal(before.T_object_wrist, palm_facing_starts(HAND, obj, 8, 2).T_object_wrist)
-    mean_grasps(GraspProblem(HAND, obj), mean_grasp(bundle, "toy"), 8, 1, ChoiceConfig(draws=1))
+    mean_grasps(GraspProblem(HAND, obj), mean_grasp(bundle, "toy"), 8, 1, ChoiceConfig.first())

@@ -89,7 +89,7 @@ def test_placements_put_the_grasp_centre_where_the_prior_says(
     monkeypatch.setattr(network, "sample_placements", sample)
     points = torch.from_numpy(obj.cloud)
     problem = GraspProblem(hand, obj, constraints=Constraints(direction=(0.0, 1.0, 0.0)))
-    T = _placements(problem, hand, network, points, 5, ProposalConfig(), torch.Generator().manual_seed(0))
+    T = _placements(problem, hand, network, points, 5, 1, ProposalConfig(), torch.Generator().manual_seed(0))[:, 0]
     axes = T[:, :3, :3] @ (hand.palm_axes_wrist if frame == "palm" else torch.eye(3))
     torch.testing.assert_close(hand.grasp_centres(T), points.mean(0) + (axes @ offset), atol=1e-5, rtol=0)
     assert float(hand.palm_directions(T)[:, 1].min()) > 0.9

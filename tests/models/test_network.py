@@ -124,7 +124,7 @@ def test_training_pass_has_gradients_everywhere(frame: str) -> None:
 
 def test_zero_centred_hand_forgets_its_place_unless_placed() -> None:
     torch.manual_seed(0)
-    hand, obj, z = torch.randn(1, 40, 3) * 0.1, torch.randn(1, 32, 3) * 0.1, torch.randn(1, 1, 8)
+    hand, obj, z = torch.randn(1, 40, 3) * 0.1, torch.randn(1, 32, 3) * 0.1, torch.randn(1, 8)
     moved = hand + torch.tensor([0.2, 0.0, 0.0])
     paper = DistanceNetwork(SMALL).eval()
     torch.testing.assert_close(paper.predict(hand, obj, z), paper.predict(moved, obj, z), rtol=1e-4, atol=1e-5)
@@ -147,7 +147,7 @@ def test_a_learned_prior_changes_nothing_before_training_and_much_after() -> Non
     paper = DistanceNetwork(SMALL).eval()
     ours = DistanceNetwork(dataclasses.replace(SMALL, prior="learned")).eval()
     assert not ours.load_state_dict(paper.state_dict(), strict=False).unexpected_keys
-    hand, obj, noise = torch.randn(3, 40, 3) * 0.1, torch.randn(3, 32, 3) * 0.1, torch.randn(3, 1, 8)
+    hand, obj, noise = torch.randn(3, 40, 3) * 0.1, torch.randn(3, 32, 3) * 0.1, torch.randn(3, 8)
     torch.testing.assert_close(ours.predict(hand, obj, noise), paper.predict(hand, obj, noise))
     assert not ours(hand, obj, hand, torch.Generator()).prior_mean.any()
     with torch.no_grad():
@@ -214,7 +214,7 @@ def test_a_drawn_z_predicts_in_training_what_it_does_at_inference(changes: dict,
     drawn, honest = [], torch.randn
     monkeypatch.setattr(torch, "randn", lambda *a, **k: drawn.append(honest(*a, **k)) or drawn[-1])
     found = network(hand, obj, grasp, torch.Generator().manual_seed(1), columns=20, draw=True).drawn
-    expected = network.predict(hand, obj, drawn[-1][:, None])[:, 0, :, :20]
+    expected = network.predict(hand, obj, drawn[-1])[:, :, :20]
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
 
 
@@ -235,21 +235,23 @@ def test_all_randomness_comes_from_the_generator(changes: dict) -> None:
 
 
 @pytest.mark.parametrize("changes", [{}, {"latent_form": "motion", "prior": "flow", "frame": "wrist"}], ids=["paper", "ours"])
-def test_the_best_of_several_z_come_first(changes: dict) -> None:
+def test_a_draw_that_is_picked_predicts_what_it_does_alone(changes: dict) -> None:
     torch.manual_seed(0)
     network = untrained_network(dataclasses.replace(SMALL, **changes), seed=3).eval()
     hand, obj, z = torch.randn(2, 40, 3) * 0.1, torch.randn(2, 32, 3) * 0.1, torch.randn(2, 4, 8)
-    each = torch.stack([network.predict(hand, obj, z[:, k : k + 1])[:, 0] for k in range(4)], 1)
-    order = [2, 0, 3, 1] if changes else [0, 1, 2, 3]  # in the paper's form no z moves the hand
-    judged = torch.tensor([2.0, 0.0, 3.0, 1.0]).expand(2, -1)
-    found = network.predict(hand, obj, z, lambda moves: judged, kept=3)
-    torch.testing.assert_close(found, each[:, order[:3]], rtol=1e-4, atol=1e-6)
+    moves = network.move(hand, obj, z)
+    assert network.z_moves == bool(changes)
+    assert bool((moves.points.diff(dim=1) != 0).any()) == network.z_moves
+    rows, draws = torch.tensor([1, 0, 1]), torch.tensor([2, 3, 0])
+    alone = network.predict(hand[rows], obj[rows], z[rows, draws])
+    torch.testing.assert_close(network.distances(moves.pick(rows, draws)), alone, rtol=1e-4, atol=1e-6)
+    assert (alone[0] - alone[2]).abs().max() > 1e-4
 
 
 def test_prediction_does_not_depend_on_the_batch() -> None:
     torch.manual_seed(0)
     network = DistanceNetwork(SMALL).eval()
-    hand, obj, z = torch.randn(5, 40, 3) * 0.1, torch.randn(5, 32, 3) * 0.1, torch.randn(5, 1, 8)
+    hand, obj, z = torch.randn(5, 40, 3) * 0.1, torch.randn(5, 32, 3) * 0.1, torch.randn(5, 8)
     whole = network.predict(hand, obj, z)
     for i in range(5):
         torch.testing.assert_close(network.predict(hand[i : i + 1], obj[i : i + 1], z[i : i + 1])[0], whole[i],

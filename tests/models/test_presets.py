@@ -70,7 +70,7 @@ def test_shipped_weights_predict_what_they_predicted() -> None:
     obj = torch.randn(5, 128, 3, generator=generator) * 0.05
     turns = torch.linalg.qr(torch.randn(40, 3, 3, generator=generator))[0]
     turns = turns * torch.linalg.det(turns)[:, None, None]
-    distances = network.predict(hand, obj, network.sample_latent(5, generator))[:, 0]
+    distances = network.predict(hand, obj, network.sample_latent(5, generator))
     network.sample_latent(5, generator, 0.3)
     _, positions = network.sample_placements(hand[0], obj[0], turns, 7, generator)
     expected = torch.tensor([[0.1620, 0.0485, 0.0841], [0.1886, 0.0393, 0.0769], [0.2520, 0.0994, 0.1122]])

@@ -1,13 +1,13 @@
-"""The choice of z: scores against a plain loop, and choices whose answer is known."""
+"""The choice of placement and z: scores against a plain loop, and choices whose answer is known."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 
-from dro_grasp import distance_matrix
 from dro_grasp.energy.grasp_energy import Room
 from dro_grasp.energy.surroundings import Surroundings
 from dro_grasp.errors import OptionError
@@ -48,11 +48,14 @@ def plain_score(points: torch.Tensor) -> float:
     tips = [d for f, d in nearest.items() if f != PALM]
     some = [i for i in range(len(points)) if HAND.spread_rank[i] < CROWDING_POINTS and finger[i] != PALM]
     apart = min(float((points[i] - points[j]).norm()) for i in some for j in some if finger[i] != finger[j])
+    parts = [math.exp(-max(0.0, d) / CONFIG.nearness) * (owner != PALM) for d, owner in zip(distance, finger, strict=True)]
+    mean_normal = sum(part * p / p.norm() for part, p in zip(parts, points, strict=True)) / sum(parts)  # a sphere's normals
     penalties = (
         CONFIG.finger_penetration * sum(max(0.0, CONFIG.margin - d) for d in tips) / len(tips),
         CONFIG.gap * sum(min(max(0.0, d), CONFIG.reach) for d in tips) / len(tips),
         CONFIG.palm_penetration * max(0.0, CONFIG.margin - nearest[PALM]),
         CONFIG.crowding * max(0.0, CONFIG.apart - apart),
+        CONFIG.imbalance * float(mean_normal.norm()),
     )
     return -sum(penalties)
 
@@ -104,65 +107,62 @@ def test_the_moved_hands_are_judged_in_the_object_s_frame_and_the_best_is_taken(
     with torch.no_grad():
         network.motion.last.weight.zero_()
         network.motion.last.bias.zero_()  # nothing moves: the judged points are those of the placed hand
-    T = torch.eye(4).repeat(6, 1, 1)
-    T[:, :3, :3], T[:, :3, 3] = random_rotations(6, torch.Generator().manual_seed(1)), torch.tensor([0.1, 0.2, -0.3])
+    T = torch.eye(4).repeat(12, 1, 1)
+    T[:, :3, :3], T[:, :3, 3] = random_rotations(12, torch.Generator().manual_seed(1)), torch.tensor([0.1, 0.2, -0.3])
     joints = torch.stack([HAND.canonical_joints(share) for share in torch.linspace(0.6, 0.9, 6).tolist()])
-    monkeypatch.setattr(proposal, "_placements", lambda *_: T)
+    monkeypatch.setattr(proposal, "_placements", lambda *args: T[: args[4] * args[5]].unflatten(0, args[4:6]))
     monkeypatch.setattr(type(HAND), "random_open_joints", lambda *_: joints)
-    judged, kept = [], []
+    judged, placed, kept = [], [], []
 
     def scores(hand: Hand, field: object, points: torch.Tensor, penalties: ChoicePenalties, room: object) -> torch.Tensor:
         judged.append(points)
-        return torch.arange(points.shape[1]).remainder(6).float().expand(points.shape[:2])  # the fifth is the best
+        draw, second = torch.arange(points.shape[1]).remainder(6).float(), torch.arange(len(points)).remainder(2)
+        return draw - 10 * (1 - second[:, None])  # the fifth draw of every second placement is the best
 
     def head(psi_hand: torch.Tensor, psi_object: torch.Tensor, z: torch.Tensor, *clouds: torch.Tensor) -> torch.Tensor:
         kept.append(z)
+        placed.append(clouds[0])
         return plain(psi_hand, psi_object, z, *clouds)
 
     plain, network._distances = network._distances, head
     network.prior, network.condition = None, None  # z is the draw itself
     monkeypatch.setattr(proposal, "choice_scores", scores)
-    with torch.no_grad():
-        for draws in (1, 8):
-            config = ProposalConfig(choice=ChoiceConfig(draws=draws))
-            propose(GraspProblem(loaded_hand("allegro"), SPHERE), network, 6, torch.Generator().manual_seed(0), config)
-    points = torch.cat(judged)
-    assert points.shape[:2] == (6, 8)  # nothing is judged where there is one draw
-    expected = HAND.points(joints, T)[:, None].expand_as(points)
-    torch.testing.assert_close(points, expected, atol=1e-5, rtol=1e-4)
-    one, many = torch.cat(kept[:2]), torch.cat(kept[2:])
-    assert one.shape == many.shape == (6, network.config.latent)
-    drawn = network.sample_latent(6, _after_cloud(network), 1.0, 8)
-    torch.testing.assert_close(many, drawn[:, 5])
-
-
-def test_of_several_decoded_hands_the_one_at_the_surface_is_kept() -> None:
     problem = GraspProblem(loaded_hand("allegro"), SPHERE)
-    cloud = problem.cloud(128, torch.Generator().manual_seed(0))
-    q = HAND.canonical_joints(0.45)
-    T = torch.eye(4).repeat(2, 3, 1, 1)  # inside, at the surface and away from it, in two orders
-    radius = float(torch.as_tensor(SPHERE.cloud).norm(dim=-1).mean())
-    away = HAND.palm_direction_wrist
-    for row, order in enumerate(((-2.0, 0.0, 5.0), (0.0, 5.0, -2.0))):
-        for k, share in enumerate(order):
-            T[row, k, :3, 3] = -HAND.grasp_centre_wrist - share * 0.6 * radius * away
-    points = HAND.points(q.expand(2, 3, -1), T)
-    distances = distance_matrix.build(points, cloud.expand(2, 3, -1, -1))
-    config = ChoiceConfig(decoded=3)
-    whole = problem.hand.points(q.expand(2, 3, -1), T)
-    wanted = choice_scores(problem.hand, problem.field, whole, config.of_decoded).argmax(-1)
-    assert wanted.tolist() == [1, 0]
-    found, joints, clouds = proposal._decoded(HAND, distances, cloud, q.expand(2, -1))
-    torch.testing.assert_close(found, T, atol=1e-3, rtol=0)
-    torch.testing.assert_close(joints, q.expand(2, 3, -1), atol=5e-3, rtol=0)
-    torch.testing.assert_close(clouds, points, atol=1e-4, rtol=0)
-    assert torch.equal(proposal._best(problem, found, joints, config), wanted)
+    with torch.no_grad():
+        for choice in (ChoiceConfig.first(), ChoiceConfig(placements=2, draws=8)):
+            propose(problem, network, 6, torch.Generator().manual_seed(0), ProposalConfig(choice=choice))
+    points = torch.cat(judged)
+    assert points.shape[:2] == (12, 8)  # nothing is judged where there is one draw
+    expected = HAND.points(joints.repeat_interleave(2, 0), T)
+    torch.testing.assert_close(points, expected[:, None].expand_as(points), atol=1e-5, rtol=1e-4)
+    first, chosen = (torch.cat(part) for part in (kept[:2], kept[2:]))
+    assert first.shape == chosen.shape == (6, network.config.latent)
+    drawn = network.sample_latent(12 * 8, _after_cloud(network)).unflatten(0, (6, 2, 8))
+    torch.testing.assert_close(chosen, drawn[:, 1, 5])
+    cloud = problem.cloud(network.config.n_object, torch.Generator().manual_seed(0))
+    second = (expected[1::2] - cloud.mean(0)) @ (T[1::2, :3, :3] @ network.config.axes(HAND.palm_axes_wrist))
+    torch.testing.assert_close(torch.cat(placed[2:]), second, atol=1e-5, rtol=1e-4)
 
 
-def test_no_z_and_more_z_than_are_drawn_cannot_be_decoded() -> None:
-    for decoded in (0, 5):
-        with pytest.raises(OptionError, match=f"decoded is {decoded} of 4 draws"):
-            ChoiceConfig(draws=4, decoded=decoded)
+def test_fingers_on_one_side_are_worse_than_fingers_around() -> None:
+    finger = HAND.finger_of_link[HAND.link_index]
+    unit = torch.nn.functional.normalize(torch.randn(2, HAND.n_points, 3, generator=torch.Generator().manual_seed(2)), dim=-1)
+    unit[0, :, 2] = unit[0, :, 2].abs()  # all on one half of the sphere
+    radius = torch.as_tensor(SPHERE.cloud).norm(dim=-1).mean()
+    alone = replace(CONFIG, crowding=0.0, gap=0.0)
+    one_side, around = choice_scores(HAND, SPHERE.distance_field, (radius + 0.004) * unit, alone)
+    means = [row[finger != PALM].mean(0).norm() for row in unit]
+    torch.testing.assert_close(around - one_side, CONFIG.imbalance * (means[0] - means[1]), rtol=0.05, atol=0)
+    assert around - one_side > 0.3 * CONFIG.imbalance
+    far = choice_scores(HAND, SPHERE.distance_field, 1000 * unit, replace(alone, finger_penetration=0.0, palm_penetration=0.0))
+    assert not far.any(), "fingers that are nowhere near push nothing"
+
+
+@pytest.mark.parametrize("wrong", [{"draws": 0}, {"placements": -1}])
+def test_less_than_one_draw_is_refused(wrong: dict[str, int]) -> None:
+    (name, value), = wrong.items()
+    with pytest.raises(OptionError, match=f"{name} is {value}; draw at least one"):
+        ChoiceConfig(**wrong)
 
 
 def _after_cloud(network: DistanceNetwork) -> torch.Generator:

@@ -93,7 +93,7 @@ def test_wrists_are_turned_at_random_or_face_the_direction(direction: Direction 
     network, hand = DistanceNetwork(PAPER), loaded_hand("leaphand").with_points(PAPER.n_hand)
     cloud = torch.rand(60, 3) * torch.tensor([0.2, 0.02, 0.05])
     problem = GraspProblem(hand, load_object("sphere"), constraints=Constraints(direction=direction))
-    T = _placements(problem, hand, network, cloud, COUNT, ProposalConfig(), torch.Generator().manual_seed(0))
+    T = _placements(problem, hand, network, cloud, COUNT, 1, ProposalConfig(), torch.Generator().manual_seed(0))[:, 0]
     torch.testing.assert_close(hand.grasp_centres(T), cloud.mean(0).expand(COUNT, 3), atol=1e-5, rtol=0)
     facing = hand.palm_directions(T)
     if direction is None:  # each coordinate of a uniform direction is uniform, and so is that of any other axis of the hand

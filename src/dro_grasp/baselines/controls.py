@@ -45,7 +45,7 @@ class MeanGraspMethod(Method):
     """The mean of a hand's training grasps at random rotations, or at rotations chosen by geometry as z is."""
 
     def __init__(self, bundle: Bundle, chosen: bool = False) -> None:
-        self.bundle, self.config = bundle, ChoiceConfig() if chosen else ChoiceConfig(draws=1)
+        self.bundle, self.config = bundle, ChoiceConfig() if chosen else ChoiceConfig.first()
         self.name = "mean-grasp-chosen" if chosen else "mean-grasp"
 
     def knows(self, hand: Hand) -> bool:
@@ -72,19 +72,20 @@ def mean_grasp(bundle: Bundle, hand_name: str) -> MeanGrasp:
 def mean_grasps(
     problem: GraspProblem, mean: MeanGrasp, num: int, seed: int, config: ChoiceConfig
 ) -> GraspBatch:
-    """The mean grasp at random wrist rotations about the object's centre, each the best of `config.draws` as z is chosen.
+    """The mean grasp at random wrist rotations about the object's centre, each chosen from as many as a prediction is.
 
     With one draw, nothing looks at the object's shape.
     """
+    draws = config.placements * config.draws
     hand, obj = problem.hand, problem.obj
     generator = torch.Generator().manual_seed(seed)
-    rotation = random_rotations(num * config.draws, generator)
+    rotation = random_rotations(num * draws, generator)
     centre = torch.from_numpy(obj.cloud).mean(0)
     T = compose(rotation, centre - rotation @ mean.object_centre)
     thin = problem.thinned(min(CHOICE_POINTS, hand.n_points))
     points = apply_to_cloud(T.to(problem.device), thin.points(mean.joints.to(problem.device)).expand(len(T), -1, -1))
-    best = choice_scores(thin, problem.field, points, config.of_moved).unflatten(0, (num, config.draws)).argmax(-1).cpu()
-    T = T.unflatten(0, (num, config.draws))[torch.arange(num), best]
+    best = choice_scores(thin, problem.field, points, config.penalties).unflatten(0, (num, draws)).argmax(-1).cpu()
+    T = T.unflatten(0, (num, draws))[torch.arange(num), best]
     joints = mean.joints.expand(num, -1).contiguous()
     return GraspBatch.create(hand, obj, T, joints, seed=seed, provenance="control: mean grasp")
 

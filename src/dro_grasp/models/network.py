@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from dro_grasp.devices import fast_products
@@ -24,8 +23,25 @@ PLACE_SCALE = 10.0
 """Factor of the placed hand's coordinates, a tenth of a metre large, at the network's input [1/m]. Source: ours."""
 
 
-Suitability = Callable[[Float[Tensor, "b k n 3"]], Float[Tensor, "b k"]]
-"""How well moved hands [m], in the network's frame, suit the object; higher is better."""
+@dataclass(frozen=True)
+class Moves:
+    """Open hands as draws of z move them, before any distance is predicted."""
+
+    hand_features: Float[Tensor, "b n width"]
+    """Of the open hand's points."""
+    object_features: Float[Tensor, "b m width"]
+    """Of the object's points."""
+    obj: Float[Tensor, "b m 3"]
+    """The object, in the network's frame [m]."""
+    z: Float[Tensor, "b k latent"]
+    """Draws of z, k for each hand."""
+    points: Float[Tensor, "b k n 3"]
+    """The hand that each of them moves, in the network's frame [m]; where z moves nothing, the open hand."""
+
+    def pick(self, rows: Int[Tensor, " c"], draws: Int[Tensor, " c"]) -> Moves:
+        """One draw each of some of the hands."""
+        return Moves(self.hand_features[rows], self.object_features[rows], self.obj[rows],
+                     self.z[rows, draws][:, None], self.points[rows, draws][:, None])
 
 
 @dataclass(frozen=True)
@@ -150,45 +166,42 @@ class DistanceNetwork(nn.Module):
         return NetworkOutput(
             distances, mean, log_variance, prior_mean, prior_log_variance, flow_error, moved, phi_hand.mean(1), drawn)
 
+    @property
+    def z_moves(self) -> bool:
+        """Whether z moves the hand, so that draws can be told apart before distances are predicted."""
+        return self.motion is not None
+
     def predict(
-        self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], noise: Float[Tensor, "b k latent"],
-        suit: Suitability | None = None, kept: int = 1,
-    ) -> Float[Tensor, "b kept n m"]:
-        """D(R,O) [m], of the best z first.
+        self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], noise: Float[Tensor, "b latent"]
+    ) -> Float[Tensor, "b n m"]:
+        """D(R,O) [m] of one z for each hand.
 
         Args:
             hand: As in `forward`.
             obj: As in `forward`.
-            noise: Draws of `sample_latent`, k for each hand, which the prior turns into z.
-            suit: Judges the hands that they move. Without it, and where z moves nothing, the first draws are the best.
-            kept: z of each hand whose distances are predicted.
+            noise: Draws of `sample_latent`, which the prior turns into z.
         """
+        return self.distances(self.move(hand, obj, noise[:, None]))
+
+    def move(
+        self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], noise: Float[Tensor, "b k latent"]
+    ) -> Moves:
+        """The open hand as each z moves it; arguments as those of `predict`, with k draws for each hand."""
         with fast_products():
             phi_hand, phi_object = self.encode(hand, obj)
-            if self.motion is None or suit is None:
-                noise = noise[:, :kept]
             z = noise
             if self.condition is not None and self.prior is not None:
                 condition = self.condition(phi_hand, phi_object, hand, obj)[:, None].expand(-1, noise.shape[1], -1)
                 z = self.prior(noise.flatten(0, 1), condition.flatten(0, 1)).unflatten(0, noise.shape[:2])
-            z, moved = (part.flatten(0, 1) for part in self.moved(phi_hand, hand, z, suit, kept))
-            phi_hand, phi_object, obj = (part.repeat_interleave(kept, 0) for part in (phi_hand, phi_object, obj))
-            psi_hand, psi_object = self.relate(phi_hand, phi_object, moved)
-            return self._distances(psi_hand, psi_object, z, moved, obj).unflatten(0, (-1, kept))
+            points = hand[:, None].expand(-1, noise.shape[1], -1, -1) if self.motion is None else self.motion(phi_hand, hand, z)
+            return Moves(phi_hand, phi_object, obj, z, points)
 
-    def moved(
-        self, phi_hand: Float[Tensor, "b n width"], hand: Float[Tensor, "b n 3"], z: Float[Tensor, "b k latent"],
-        suit: Suitability | None, kept: int,
-    ) -> tuple[Float[Tensor, "b kept latent"], Float[Tensor, "b kept n 3"]]:
-        """Those of k z that move the hand to suit the object best, the best first, and the moved hands [m]."""
-        if self.motion is None:
-            return z, hand[:, None].expand(-1, kept, -1, -1)
-        moves = self.motion(phi_hand, hand, z)
-        if z.shape[1] == 1 or suit is None:
-            return z, moves
-        rows = torch.arange(len(hand), device=hand.device)[:, None]
-        best = suit(moves).topk(kept, -1).indices
-        return z[rows, best], moves[rows, best]
+    def distances(self, moves: Moves) -> Float[Tensor, "b n m"]:
+        """D(R,O) [m] of hands with one draw of z each."""
+        z, points = moves.z[:, 0], moves.points[:, 0]
+        with fast_products():
+            psi_hand, psi_object = self.relate(moves.hand_features, moves.object_features, points)
+            return self._distances(psi_hand, psi_object, z, points, moves.obj)
 
     def _distances(
         self, psi_hand: Float[Tensor, "b n width"], psi_object: Float[Tensor, "b m width"], z: Float[Tensor, "b latent"],
@@ -211,13 +224,13 @@ class DistanceNetwork(nn.Module):
         return centred @ rotation if self.config.placed else centred
 
     def sample_latent(
-        self, num: int, generator: torch.Generator, temperature: float = 1.0, draws: int = 1
-    ) -> Float[Tensor, "num draws latent"]:
-        """Draws that `predict` turns into z, on the network's device; without a learned prior they are z.
+        self, num: int, generator: torch.Generator, temperature: float = 1.0
+    ) -> Float[Tensor, "num latent"]:
+        """Draws that `predict` and `move` turn into z, on the network's device; without a learned prior they are z.
 
         Their standard deviation is `temperature`: 1 as in training, 0 for the likeliest z.
         """
-        noise = torch.randn(num, draws, self.config.latent, generator=generator, device=generator.device) * temperature
+        noise = torch.randn(num, self.config.latent, generator=generator, device=generator.device) * temperature
         return noise.to(self.head.first.weight.device)
 
     def sample_placements(

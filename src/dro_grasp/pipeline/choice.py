@@ -1,8 +1,8 @@
-"""Choice of z: of several hands that z moves, the one whose points suit the object best.
+"""Choice of placement and z: of several hands that z moves, the one whose points suit the object best.
 
 Differs from the paper, which decodes the one z that it draws. A draw is one of many grasps that fit the placement, and the
-motion of the hand tells before decoding which of them penetrate the object, cross their fingers or stay away from it. Several
-z may be decoded, too: the decoded hands differ from the moved ones by millimetres, and the best of them is kept.
+motion of the hand tells before decoding which of them penetrate the object, cross their fingers, stay away from it, or would
+push it aside as they close.
 """
 
 from __future__ import annotations
@@ -22,12 +22,15 @@ from dro_grasp.hands.hand import Hand
 CROWDING_POINTS = 64
 """Hand points, spread evenly, between which the distance of fingers is measured (ours)."""
 
+LEAST_PART = 1e-6
+"""Sum of the fingers' parts below which they count as not near at all (ours)."""
+
 
 @dataclass(frozen=True)
 class ChoicePenalties:
     """What speaks against a hand; set by trials on training objects (ours)."""
 
-    finger_penetration: float = 800.0
+    finger_penetration: float = 1200.0
     """Penalty for the deepest point of a finger inside the object, mean over fingers [1/m]."""
     palm_penetration: float = 800.0
     """The same for the palm [1/m]."""
@@ -37,8 +40,12 @@ class ChoicePenalties:
     """Penalty for the deepest point of the hand in its surroundings [1/m]."""
     gap: float = 150.0
     """Penalty for the distance of a finger from the surface, mean over fingers [1/m]."""
-    crowding: float = 330.0
+    crowding: float = 500.0
     """Penalty for how much closer than `apart` two fingers come [1/m]."""
+    imbalance: float = 10.0
+    """Penalty for a mean normal of the object where the fingers are near: they push it to one side as they close."""
+    nearness: float = 0.015
+    """Distance from the surface over which a finger's part in that mean falls to 1 / e [m]."""
     reach: float = 0.03
     """Fingers farther from the surface than this are all alike [m]."""
     apart: float = 0.012
@@ -47,25 +54,29 @@ class ChoicePenalties:
 
 @dataclass(frozen=True)
 class ChoiceConfig:
-    """How many z are drawn and decoded, and the penalties by which one is chosen."""
+    """How many placements and z are drawn for each candidate, and the penalties by which one is chosen."""
 
-    draws: int = 32
+    placements: int = 2
+    """Placements drawn for each candidate; 1 takes the first."""
+    draws: int = 16
     """z drawn for each placement; 1 takes the first."""
-    decoded: int = 1
-    """How many of them, the best by their moved hands, are decoded (ours). Each adds half of the time of the first."""
-    of_moved: ChoicePenalties = ChoicePenalties()
-    """For the hands that z moves, of all draws."""
-    of_decoded: ChoicePenalties = ChoicePenalties(palm_penetration=70.0, gap=30.0, crowding=170.0)
-    """For decoded hands, if there are several: the weights of a logistic regression of `strict` (ours)."""
+    penalties: ChoicePenalties = ChoicePenalties()
+    """What speaks against a moved hand."""
 
     def __post_init__(self) -> None:
         """Refuse numbers that make no sense.
 
         Raises:
-            OptionError: `decoded` is not between 1 and `draws`.
+            OptionError: `placements` or `draws` is not positive.
         """
-        if not 1 <= self.decoded <= self.draws:
-            raise OptionError(f"decoded is {self.decoded} of {self.draws} draws; decode at least one z and at most all")
+        for name in ("placements", "draws"):
+            if getattr(self, name) < 1:
+                raise OptionError(f"{name} is {getattr(self, name)}; draw at least one for each candidate")
+
+    @staticmethod
+    def first() -> ChoiceConfig:
+        """The first draw, whatever it is: what the paper does."""
+        return ChoiceConfig(placements=1, draws=1)
 
 
 def choice_scores(
@@ -82,7 +93,7 @@ def choice_scores(
         room: Where the hand may be, and where it may touch the object.
     """
     room = room or Room()
-    distance, _ = field.distances(points)
+    distance, normal = field.distances(points)
     wanted = distance if room.hold is None else distance.clamp_min(0) + room.hold.distances(points)[0].clamp_min(0)
     finger = hand.finger_of_link[hand.link_index]
 
@@ -93,6 +104,9 @@ def choice_scores(
     nearest_of, gap_of = (torch.stack([nearest(i, d) for i in fingers], -1) for d in (distance, wanted))
     score = -penalties.finger_penetration * (penalties.margin - nearest_of).clamp_min(0).mean(-1)
     score = score - penalties.gap * gap_of.clamp(0, penalties.reach).mean(-1)
+    part = (-distance.clamp_min(0) / penalties.nearness).exp() * (finger != PALM)
+    mean_normal = (part[..., None] * normal).sum(-2) / part.sum(-1, keepdim=True).clamp_min(LEAST_PART)
+    score = score - penalties.imbalance * mean_normal.norm(dim=-1)
     if bool((finger == PALM).any()):
         score = score - penalties.palm_penetration * (penalties.margin - nearest(PALM)).clamp_min(0)
     if room.surroundings is not None:

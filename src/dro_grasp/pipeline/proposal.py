@@ -33,6 +33,8 @@ CLOUD_TEMPERATURE = 0.5
 """Default temperature for a bare cloud: where less of the object is known, likelier grasps are proposed (ours)."""
 HIGHEST_TEMPERATURE = 2.0
 """Highest temperature that is accepted; 1 is what the weights were trained for (ours)."""
+PRIOR_CHOICES = 2
+"""Wrist rotations among which the placement prior chooses each of those that it offers, at least (ours)."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class ProposalConfig:
     """How candidates are sampled and decoded."""
 
     rotations_per_grasp: int = 16
-    """Wrist rotations offered to the placement prior for each candidate, when no direction is given."""
+    """Wrist rotations offered to the placement prior for each placement, when no direction is given."""
     rolls_per_grasp: int = 8
     """Rolls about the direction that are offered instead, when one is given."""
     direction_spread: float = math.radians(5.0)
@@ -49,7 +51,7 @@ class ProposalConfig:
     """Spread of z: 0 proposes the likeliest grasp of each placement, 1 is as diverse as the training grasps. None takes 1,
     and CLOUD_TEMPERATURE for a bare cloud."""
     choice: ChoiceConfig = field(default_factory=ChoiceConfig)
-    """How one of several z is chosen for each placement."""
+    """How one of several placements and z is chosen for each candidate."""
     batch_size: int = 16
     """Candidates that are decoded at once."""
     network_batch_size: int = 4
@@ -98,47 +100,27 @@ def propose(
     watch = watch or Stopwatch()
     hand = problem.thinned(network.config.n_hand)
     cloud = problem.cloud(network.config.n_object, generator)
+    rivals, draws = (config.choice.placements, config.choice.draws) if network.z_moves else (1, 1)
     with watch("network"):
-        placement = _placements(problem, hand, network, cloud, num, config, generator)
+        placement = _placements(problem, hand, network, cloud, num, rivals, config, generator)
         joints = hand.random_open_joints(num, generator)
-        noise = network.sample_latent(num, generator, _temperature(problem, config), config.choice.draws).to(problem.device)
+        noise = network.sample_latent(num * rivals * draws, generator, _temperature(problem, config)).to(problem.device)
+        noise = noise.unflatten(0, (num, rivals, draws))
     found: list[tuple[Tensor, Tensor, Tensor]] = []
     for start in range(0, num, config.batch_size):
         part = slice(start, min(start + config.batch_size, num))
         with watch("network"):
             distances = _distances(problem, network, cloud, placement[part], joints[part], noise[part], config)
         with watch("decode"), one_thread():
-            T, q, points = _decoded(hand, distances, cloud, joints[part])
-            best = _best(problem, T, q, config.choice)
-            rows = torch.arange(len(best), device=best.device)
-            found.append((T[rows, best], q[rows, best], points[rows, best]))
+            links = distance_matrix.decode(hand, distances, cloud.expand(len(distances), -1, -1))
+            solution = distance_matrix.solve(hand, links, joints[part])
+            found.append((solution.T_world_wrist, solution.joints, links.points))
         if progress is not None:
             progress(part.stop, num)
     T, q, points = (torch.cat(part).cpu() for part in zip(*found, strict=True))
     grasps = GraspBatch.create(
         problem.hand, problem.obj, T, q, seed=generator.initial_seed(), provenance=f"network {network.name}")
     return Proposal(grasps, points)
-
-
-def _decoded(
-    hand: Hand, distances: Float[Tensor, "b k n m"], cloud: Float[Tensor, "m 3"], joints: Float[Tensor, "b n_dof"]
-) -> tuple[Float[Tensor, "b k 4 4"], Float[Tensor, "b k n_dof"], Float[Tensor, "b k n 3"]]:
-    """Wrist poses, joints and multilaterated points of the k hands that D(R,O) gives for each placement."""
-    b, k = distances.shape[:2]
-    links = distance_matrix.decode(hand, distances.flatten(0, 1), cloud.expand(b * k, -1, -1))
-    solution = distance_matrix.solve(hand, links, joints.repeat_interleave(k, 0))
-    T, q, points = (part.unflatten(0, (b, k)) for part in (solution.T_world_wrist, solution.joints, links.points))
-    return T, q, points
-
-
-def _best(
-    problem: GraspProblem, T: Float[Tensor, "b k 4 4"], q: Float[Tensor, "b k n_dof"], config: ChoiceConfig
-) -> Int[Tensor, " b"]:
-    """Which of the k hands that were decoded for a placement suits the object best."""
-    if T.shape[1] == 1:
-        return torch.zeros(len(T), dtype=torch.long, device=T.device)
-    whole = problem.thinned(problem.hand.n_points)
-    return choice_scores(whole, problem.field, whole.points(q, T), config.of_decoded, problem.room).argmax(-1)
 
 
 def check_temperature(temperature: float | None) -> None:
@@ -159,52 +141,61 @@ def _temperature(problem: GraspProblem, config: ProposalConfig) -> float:
 
 
 def _placements(
-    problem: GraspProblem, hand: Hand, network: DistanceNetwork, cloud: Float[Tensor, "m 3"], num: int,
+    problem: GraspProblem, hand: Hand, network: DistanceNetwork, cloud: Float[Tensor, "m 3"], num: int, rivals: int,
     config: ProposalConfig, generator: torch.Generator,
-) -> Float[Tensor, "num 4 4"]:
-    """Wrist poses of the open hand near which the network is asked for grasps, in the object's frame."""
+) -> Float[Tensor, "num rivals 4 4"]:
+    """Wrist poses of the open hand near which the network is asked for grasps, in the object's frame.
+
+    In surroundings the prior gives more of them than are wanted, those that it prefers first, and the ones with most room
+    are taken; among those with all the room that they need it is the prior that chooses.
+    """
     axes, surroundings = network.config.axes(hand.palm_axes_wrist), problem.surroundings
     direction, cone = problem.constraints.direction, problem.constraints.cone
     spread, up = Spread(config.direction_spread, cone), None if surroundings is None else surroundings.up
-    offered = num if surroundings is None else CHOICES * num
-    count = num * (config.rotations_per_grasp if direction is None else config.rolls_per_grasp)
-    rotations = wrist_rotations(hand, max(count, offered), direction, spread, generator, up)
+    wanted = num * rivals
+    offered = wanted if surroundings is None else max(wanted, CHOICES * num)
+    count = wanted * (config.rotations_per_grasp if direction is None else config.rolls_per_grasp)
+    rotations = wrist_rotations(hand, max(count, PRIOR_CHOICES * offered), direction, spread, generator, up)
     opened = hand.points(hand.canonical_joints())
     shape = proportions(hand, axes) if network.config.placement_hand == "proportions" else None
     rotation, position = network.sample_placements(opened @ axes, cloud, rotations @ axes, offered, generator, shape)
     offset = cloud.mean(0) + rotate(rotation, position - hand.grasp_centre_wrist @ axes)
     placed = compose(rotation @ axes.mT, offset)
-    if surroundings is None:
-        return placed
-    lack = lack_of_room(hand, placed, opened, None if cone else direction, surroundings)
-    best = lack.topk(num, largest=False).indices
-    rotation, offset = rotation[best] @ axes.mT, offset[best]
-    return compose(rotation, offset + surroundings.lift(apply_to_cloud(placed[best], opened), CLEAR))
+    if surroundings is not None:
+        lack = lack_of_room(hand, placed, opened, None if cone else direction, surroundings)
+        best = lack.argsort(stable=True)[:wanted]
+        rotation, offset = rotation[best] @ axes.mT, offset[best]
+        placed = compose(rotation, offset + surroundings.lift(apply_to_cloud(placed[best], opened), CLEAR))
+    return placed.unflatten(0, (num, rivals))
 
 
 def _distances(
-    problem: GraspProblem, network: DistanceNetwork, cloud: Float[Tensor, "m 3"], placement: Float[Tensor, "b 4 4"],
-    joints: Float[Tensor, "b n_dof"], noise: Float[Tensor, "b k latent"], config: ProposalConfig,
-) -> Float[Tensor, "b decoded n m"]:
-    """D(R,O) of a batch of placed open hands, each with the best `decoded` of k draws; the same in every frame."""
+    problem: GraspProblem, network: DistanceNetwork, cloud: Float[Tensor, "m 3"], placement: Float[Tensor, "b p 4 4"],
+    joints: Float[Tensor, "b n_dof"], noise: Float[Tensor, "b p k latent"], config: ProposalConfig,
+) -> Float[Tensor, "b n m"]:
+    """D(R,O) of the best of p placements with k draws each of every open hand; the same in every frame."""
     hand = problem.thinned(network.config.n_hand)
-    placed = hand.points(joints, placement)
-    turned = placement[:, :3, :3] @ network.config.axes(hand.palm_axes_wrist)
     centre, size = cloud.mean(0), config.network_batch_size
     field = problem.field  # made before threads ask for it
 
     def predict(
-        points: Float[Tensor, "b n 3"], axes: Float[Tensor, "b 3 3"], z: Float[Tensor, "b k latent"]
-    ) -> Float[Tensor, "b decoded n m"]:
-        centres = centre.expand(len(points), 3)
-        opened = network.to_frame(points, centres, axes)
-        obj = network.to_frame(cloud.expand(len(points), -1, -1), centres, axes)
+        placement: Float[Tensor, "b p 4 4"], joints: Float[Tensor, "b n_dof"], noise: Float[Tensor, "b p k latent"]
+    ) -> Float[Tensor, "b n m"]:
+        count, rivals = placement.shape[:2]
+        T = placement.flatten(0, 1)
+        axes = T[:, :3, :3] @ network.config.axes(hand.palm_axes_wrist)
+        centres = centre.expand(len(T), 3)
+        opened = network.to_frame(hand.points(joints.repeat_interleave(rivals, 0), T), centres, axes)
+        obj = network.to_frame(cloud.expand(len(T), -1, -1), centres, axes)
+        moves = network.move(opened, obj, noise.flatten(0, 1))
+        draws = moves.z.shape[1]
+        if rivals * draws > 1:
+            points = moves.points @ axes[:, None].mT + centre
+            suits = choice_scores(hand, field, points, config.choice.penalties, problem.room)
+            best = suits.reshape(count, rivals * draws).argmax(-1)
+            moves = moves.pick(torch.arange(count, device=T.device) * rivals + best // draws, best % draws)
+        return network.distances(moves).float()
 
-        def suit(moves: Float[Tensor, "b k n 3"]) -> Float[Tensor, "b k"]:
-            return choice_scores(hand, field, moves @ axes[:, None].mT + centre, config.choice.of_moved, problem.room)
-
-        return network.predict(opened, obj, z, suit, config.choice.decoded).float()
-
-    if len(placed) <= size:  # all threads for the one part that there is
-        return predict(placed, turned, noise)
-    return torch.cat(side_by_side(predict, placed.split(size), turned.split(size), noise.split(size)))
+    if len(placement) <= size:  # all threads for the one part that there is
+        return predict(placement, joints, noise)
+    return torch.cat(side_by_side(predict, placement.split(size), joints.split(size), noise.split(size)))

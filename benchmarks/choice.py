@@ -1,8 +1,6 @@
-"""The network alone with one, two or more z decoded for each placement, of whose hands the best is kept by geometry.
+"""The network alone: the first draw, and the choice among several z and placements, with and without their imbalance.
 
-    python benchmarks/decoded_choice.py [--hands HAND ...] [--objects OBJECT ...] [--decoded N ...] [--num N] [--json]
-
-All rows have the same placements and draws.
+python benchmarks/choice.py [--hands HAND ...] [--objects OBJECT ...] [--num N] [--each] [--json]
 """
 
 from __future__ import annotations
@@ -17,19 +15,30 @@ from report import emit, rate
 from dro_grasp.evaluation.success_rates import pair_seed
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
-from dro_grasp.pipeline.choice import ChoiceConfig
+from dro_grasp.pipeline.choice import ChoiceConfig, ChoicePenalties
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.proposal import ProposalConfig, propose
 from dro_grasp.pipeline.stages import complete
 from dro_grasp.predictor import GraspPredictor
 from dro_grasp.simulation.trial import simulate
 
-OBJECTS = ["bottle", "wrench", "bowl", "toy_airplane", "rod", "tall_box"]
-"""Built-in training objects; rod, toy_airplane and wrench are among the eight by which the penalties were fitted."""
+OBJECTS = ["jar", "rod", "toy_airplane", "wrench", "vase", "joystick", "brick", "egg"]
+"""Built-in training objects, by which the penalties were chosen."""
 PROTOCOLS = ("dro", "strict")
 """Trials of every grasp."""
 ALL = "all"
 """The row over all hands."""
+BLIND = dataclasses.replace(ChoicePenalties(), imbalance=0.0)
+"""Penalties of before, which do not ask whether the fingers' pushes cancel."""
+ROWS = {
+    "first draw": ChoiceConfig.first(),
+    "1 x 32, without imbalance": ChoiceConfig(1, 32, BLIND),
+    "1 x 32": ChoiceConfig(1, 32),
+    "2 x 16, without imbalance": ChoiceConfig(2, 16, BLIND),
+    "2 x 16": ChoiceConfig(2, 16),
+    "4 x 8": ChoiceConfig(4, 8),
+}
+"""What each row chooses among: placements x z."""
 
 
 @dataclasses.dataclass
@@ -51,30 +60,31 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--hands", nargs="+", default=["allegro", "barrett", "shadowhand"])
     parser.add_argument("--objects", nargs="+", default=OBJECTS)
-    parser.add_argument("--decoded", nargs="+", type=int, default=[1, 2, 3, 4], help="z that are decoded; a row for each")
     parser.add_argument("--num", type=int, default=20, help="grasps of each hand on each object")
+    parser.add_argument("--each", action="store_true", help="rows of each hand, too")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     torch.set_num_threads(1)
     network = GraspPredictor().network
-    configs = {k: ProposalConfig(choice=ChoiceConfig(decoded=k)) for k in options.decoded}
-    found: dict[tuple[int, str], Tally] = {}
+    found: dict[tuple[str, str], Tally] = {}
     for hand in map(load_hand, options.hands):
         for obj in map(load_object, resolve_objects(options.objects)):
             problem, seed = GraspProblem(hand, obj), pair_seed(0, hand, obj)
             assert problem.field is not None  # made before the clock runs
-            for decoded, config in configs.items():
+            for row, choice in ROWS.items():
                 start = time.process_time()
-                grasps = propose(problem, network, options.num, torch.Generator().manual_seed(seed), config).grasps
+                generator = torch.Generator().manual_seed(seed)
+                grasps = propose(problem, network, options.num, generator, ProposalConfig(choice=choice)).grasps
                 seconds = time.process_time() - start
                 outcomes = {name: simulate(hand, obj, complete(problem, grasps), name).success.tolist() for name in PROTOCOLS}
-                for tally in (found.setdefault((decoded, row), Tally()) for row in (hand.name, ALL)):
+                for tally in (found.setdefault((row, of), Tally()) for of in ((hand.name, ALL) if options.each else (ALL,))):
                     tally.seconds += seconds
                     for name, held in outcomes.items():
                         tally.held[name] += held
-    rows = [[decoded, name, *tally.cells()] for (decoded, name), tally in sorted(found.items(), key=lambda item: item[0][0])]
-    columns = ["decoded", "hand", "n", *(f"{name} [%]" for name in PROTOCOLS), "CPU ms a grasp"]
-    emit("z decoded for each placement", rows, columns,
+    ordered = sorted(found.items(), key=lambda item: list(ROWS).index(item[0][0]))
+    rows = [[row, name, *tally.cells()] for (row, name), tally in ordered]
+    columns = ["placements x z", "hand", "n", *(f"{name} [%]" for name in PROTOCOLS), "CPU ms a grasp"]
+    emit("choice of placement and z", rows, columns,
          {f"{row[0]} / {row[1]}": dict(zip(columns[2:], row[2:], strict=True)) for row in rows}, options.json)
 
 
