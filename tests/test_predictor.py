@@ -12,12 +12,15 @@ from torch import Tensor
 from dro_grasp import predictor as predictor_module
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.models.network import Moves
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.palm_directions import Spread, wrist_rotations
+from dro_grasp.pipeline.admission import TURNED
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.stages import scored
+from dro_grasp.pipeline.proposal import _placements
+from dro_grasp.pipeline.stages import Optimised, optimise, scored
 from dro_grasp.predictor import GraspPredictor, GraspRequest, PredictorConfig
 from tests.helpers.toy_hand import toy_hand
 from tests.helpers.weights import untrained_weights
@@ -154,15 +157,13 @@ def test_the_temperature_scales_what_z_is_made_of(weights: str, ball: ObjectMode
     cloud = dataclasses.replace(ball, vertices=None, faces=None)
     for temperature, obj in ((None, ball), (0.0, ball), (0.5, ball), (None, cloud)):
         predictor = GraspPredictor(weights, config=PredictorConfig(temperature=temperature))
-        honest = predictor.network.predict
+        honest = predictor.network.move
 
-        def predict(
-            hand: Tensor, points: Tensor, noise: Tensor, suit, kept: int, at=(temperature, obj), honest=honest
-        ) -> Tensor:
+        def move(hand: Tensor, points: Tensor, noise: Tensor, at=(temperature, obj), honest=honest) -> Moves:
             drawn[at] = noise
-            return honest(hand, points, noise, suit, kept)
+            return honest(hand, points, noise)
 
-        monkeypatch.setattr(predictor.network, "predict", predict)
+        monkeypatch.setattr(predictor.network, "move", move)
         predictor.predict(HAND, obj, num=3, seed=5, candidates=1, refine=False, method="network")
     assert float(drawn[0.0, ball].abs().max()) == 0
     torch.testing.assert_close(drawn[0.5, ball], 0.5 * drawn[None, ball])
@@ -184,6 +185,27 @@ def test_placements_face_the_direction_at_any_roll(
     seen = turns @ torch.eye(3)[0]
     roll = torch.atan2(seen @ torch.linalg.cross(wanted, side), seen @ side)
     assert bool((torch.histc(roll, 4, -math.pi, math.pi) > 70).all())
+
+
+def test_where_there_is_room_for_all_the_prior_chooses_above_a_table_too(
+    predictor: GraspPredictor, ball: ObjectModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    preferred: list[torch.Tensor] = []
+    network = predictor.network
+
+    def sample(opened, points, rotations, num, generator, shape):  # type: ignore[no-untyped-def]
+        assert len(rotations) >= 2 * num, "the prior has a choice"
+        preferred.append(rotations[-num:].flip(0))
+        return preferred[-1], torch.zeros(num, 3)
+
+    monkeypatch.setattr(network, "sample_placements", sample)
+    cloud = torch.from_numpy(ball.cloud)
+    for direction in ((0.0, 0.0, -1.0), None):
+        problem = GraspProblem(HAND, ball, constraints=Constraints(table=-3.0, direction=direction))
+        T = _placements(problem, HAND, network, cloud, 6, 1, predictor.config, torch.Generator().manual_seed(0))
+        assert T.shape == (6, 1, 4, 4)
+    turns = (T[..., :3, :3] @ network.config.axes(HAND.palm_axes_wrist)).flatten(0, 1)
+    torch.testing.assert_close(turns, preferred[-1][:6], atol=1e-5, rtol=0)
 
 
 def test_hands_stay_above_the_table(predictor: GraspPredictor, ball: ObjectModel) -> None:
@@ -273,11 +295,39 @@ def test_auto_lets_the_optimiser_help_only_where_the_score_distrusts_the_network
     assert predictor.run(problem, dataclasses.replace(alone, method="auto")).candidates == network.candidates
 
 
+def test_seeds_next_to_each_other_share_no_round_of_the_optimiser(
+    predictor: GraspPredictor, ball: ObjectModel, quick_synthesis: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dro_grasp.predictor.TRUSTED_SCORES", (math.inf,) * 3)
+    monkeypatch.setattr("dro_grasp.predictor.OPTIMISED_PER_GRASP", 2)
+    seeds: list[int] = []
+
+    def counted(problem: GraspProblem, num: int, seed: int, *rest: object) -> Optimised:
+        seeds.append(seed)
+        return optimise(problem, num, seed)
+
+    monkeypatch.setattr("dro_grasp.predictor.optimise", counted)
+    for first in (0, 1, 2, 2**63 - 1):
+        predictor.run(GraspProblem(HAND, ball), GraspRequest(2, seed=first, method="optimise"))
+    assert len(set(seeds)) == len(seeds) == 4 * 3
+
+
+def test_candidates_that_turn_away_as_they_are_made_are_counted(
+    predictor: GraspPredictor, ball: ObjectModel, quick_synthesis: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dro_grasp.predictor.OPTIMISED_PER_GRASP", 4)
+    monkeypatch.setattr("dro_grasp.predictor.TRUSTED_SCORES", (math.inf,))
+    monkeypatch.setattr("dro_grasp.pipeline.stages.facing", lambda problem, grasps: torch.arange(len(grasps)) < 3)
+    problem = GraspProblem(HAND, ball, constraints=Constraints(direction=(0.0, 0.0, -1.0)))
+    made = predictor.run(problem, GraspRequest(2, seed=1, method="optimise"))
+    assert (made.candidates, made.dropped[TURNED]) == (8, 5)
+
+
 def test_the_optimiser_alone_asks_no_network(
     predictor: GraspPredictor, ball: ObjectModel, quick_synthesis: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("dro_grasp.predictor.OPTIMISED_PER_GRASP", 4)
-    monkeypatch.setattr(predictor.network, "predict", None)
+    monkeypatch.setattr(predictor.network, "move", None)
     cloud = dataclasses.replace(ball, vertices=None, faces=None)
     direction = torch.tensor([0.0, 0.6, -0.8])
     for obj in (ball, cloud):
@@ -285,7 +335,7 @@ def test_the_optimiser_alone_asks_no_network(
         problem = GraspProblem(HAND, obj, constraints=constraints)
         made = predictor.run(problem, GraspRequest(2, seed=1, method="optimise"))
         assert made.origin == ["optimiser"] * 2
-        assert 2 <= made.candidates <= 16  # of two rounds; the descent turned some away from the direction
+        assert made.candidates == 16, "of two rounds; those that the descent turned away count, too"
         assert made.seconds["optimise"] > 0 == made.seconds["network"]
         angles = torch.rad2deg(torch.acos(HAND.palm_directions(made.proposed.T_object_wrist) @ direction))
         assert float(angles.max()) < 20

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -22,7 +23,7 @@ from dro_grasp.models.checkpoints import load_weights
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.options import by_owner
-from dro_grasp.pipeline.admission import permitted, reasons_against
+from dro_grasp.pipeline.admission import TURNED, permitted, reasons_against
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.proposal import Proposal, ProposalConfig, check_temperature, propose
@@ -225,12 +226,15 @@ class GraspPredictor:
         free = problem.surroundings is None
         each = OPTIMISED_PER_GRASP if free else OPTIMISED_IN_SURROUNDINGS
         hand = problem.thinned(self.network.config.n_hand).to("cpu")
-        for number, least_score in enumerate(TRUSTED_SCORES if free else TRUSTED_IN_SURROUNDINGS):
+        levels = TRUSTED_SCORES if free else TRUSTED_IN_SURROUNDINGS
+        # Drawn, not counted up from the request's seed: neighbouring seeds must not share rounds.
+        seeds = np.random.default_rng(request.seed).integers(2**63, size=len(levels)).tolist()
+        for seed, least_score in zip(seeds, levels, strict=True):
             if not (count := each * pool.lacking(least_score)):
                 break
             with pool.watch("optimise"):
-                grasps = optimise(problem, count, request.seed + number, progress)
-            pool.add(Proposal(grasps, hand.points(grasps.joints, grasps.T_object_wrist)))
+                grasps, turned = optimise(problem, count, seed, progress)
+            pool.add(Proposal(grasps, hand.points(grasps.joints, grasps.T_object_wrist)), turned=turned)
             pool.settle()
 
 
@@ -251,10 +255,11 @@ class _Pool:
     def __len__(self) -> int:
         return sum(map(len, self.grasps))
 
-    def add(self, proposal: Proposal, most: int | None = None) -> None:
-        """Take in candidates, until there are `most`."""
+    def add(self, proposal: Proposal, most: int | None = None, turned: int = 0) -> None:
+        """Take in candidates, until there are `most`; `turned` others turned away from the direction as they were made."""
         problem, request = self.problem, self.request
-        self.made += len(proposal.grasps)
+        self.made += len(proposal.grasps) + turned
+        self.dropped[TURNED] += turned
         with self.watch("refine"):
             grasps = refine(problem, proposal.grasps) if request.refine else complete(problem, proposal.grasps)
         allowed = permitted(problem, grasps)

@@ -111,13 +111,13 @@ def shortfall(case: str, grasps: GraspBatch, row: int) -> float:
 @pytest.fixture(scope="module")
 def free() -> GraspBatch:
     problem = GraspProblem(HAND, MUG)
-    return refine(problem, optimise(problem, 4, seed=0))
+    return refine(problem, optimise(problem, 4, seed=0).grasps)
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_grasps_that_are_permitted_respect_the_constraint(case: str, free: GraspBatch) -> None:
     problem = GraspProblem(HAND, MUG, constraints=CASES[case])
-    found = refine(problem, optimise(problem, 4, seed=0))
+    found = refine(problem, optimise(problem, 4, seed=0).grasps)
     kept = found[permitted(problem, found)]
     assert len(kept) >= 1
     worst = max(shortfall(case, kept, row) for row in range(len(kept)))

@@ -104,6 +104,7 @@ def test_a_stopwatch_adds_up_and_lists_what_never_ran() -> None:
 def test_optimised_candidates_are_those_of_lowest_energy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dro_grasp.pipeline.stages.STARTS_PER_CANDIDATE", 2)
     free = synthesize_with(GraspProblem(HAND, CAN).energy(SynthesisConfig().energy), CAN, 6, 0, SynthesisConfig())
-    kept = optimise(GraspProblem(HAND, CAN), 3, seed=0)
+    kept, turned = optimise(GraspProblem(HAND, CAN), 3, seed=0)
+    assert turned == 0
     torch.testing.assert_close(kept.T_object_wrist, free.T_object_wrist[:3])
     assert not kept.extra

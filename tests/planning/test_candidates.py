@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.pipeline.stages import Optimised
 from dro_grasp.planning import candidates
 from dro_grasp.predictor import GraspPredictor
 from tests.helpers.loaded_hands import loaded_hand
@@ -21,7 +21,7 @@ from tests.helpers.loaded_hands import loaded_hand
 def test_the_optimiser_is_asked_for_what_the_network_lacks(known: float, lacking: int, monkeypatch: pytest.MonkeyPatch) -> None:
     asked, optimise = [], candidates.optimise
 
-    def counted(problem: GraspProblem, num: int, seed: int) -> GraspBatch:
+    def counted(problem: GraspProblem, num: int, seed: int) -> Optimised:
         asked.append(num)
         return optimise(problem, num, seed)
 

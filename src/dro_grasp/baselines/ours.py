@@ -53,7 +53,7 @@ class SynthesisMethod(Method):
 
     def make(self, problem: GraspProblem, num: int, seed: int) -> GraspBatch:
         """The data engine's candidates: of several descents, those of lowest energy."""
-        return optimise(problem, num, seed)
+        return optimise(problem, num, seed).grasps
 
     def best(self, problem: GraspProblem, num: int, seed: int) -> Made:
         """The best of refined, settled candidates by score."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 
@@ -123,15 +124,24 @@ def evaluate(
     return grasps.with_trial(simulate(problem.hand, problem.obj, grasps, protocol, workers=workers, progress=progress))
 
 
+class Optimised(NamedTuple):
+    """Candidates from synthesis."""
+
+    grasps: GraspBatch
+    """Without pregrasp, squeeze and score."""
+    turned: int
+    """How many of the wanted ones are missing, because they turned away from the direction."""
+
+
 def optimise(
     problem: GraspProblem, num: int, seed: int,
     progress: Callable[[int, int], None] | None = None,
-) -> GraspBatch:
+) -> Optimised:
     """Candidates from synthesis; no network is asked, so any hand and object will do.
 
     Args:
         problem: Hand and object.
-        num: How many, at most: those are left out that turn away from the direction.
+        num: How many, at most.
         seed: The same seed gives the same candidates.
         progress: Called with (grasps optimised, grasps to optimise).
     """
@@ -139,4 +149,6 @@ def optimise(
     config = SynthesisConfig(starts=StartConfig(direction=wanted.direction, cone=wanted.cone, hold=wanted.hold))
     energy = problem.energy(config.energy)
     grasps = synthesize_with(energy, problem.obj, STARTS_PER_CANDIDATE * num, seed, config, progress)
-    return grasps[facing(problem, grasps)][:num].bare()
+    kept = facing(problem, grasps)
+    found = grasps[kept][:num].bare()
+    return Optimised(found, min(int((~kept).sum()), num - len(found)))

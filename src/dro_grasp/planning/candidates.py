@@ -82,7 +82,7 @@ def grasps_in_world(
         lacking = math.ceil(KNOWN_SHARE * count) - int((grasps.score > KNOWN).sum())
         if lacking <= 0:
             return grasps
-        rivals = scored(problem, refine(problem, optimise(problem, OPTIMISED_IN_SURROUNDINGS * lacking, seeds[i])))
+        rivals = scored(problem, refine(problem, optimise(problem, OPTIMISED_IN_SURROUNDINGS * lacking, seeds[i]).grasps))
         return GraspBatch.concatenate([grasps, rivals]).sorted_by_score()[:count]
 
     with fast_products():
