@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from dro_grasp.pipeline.admission import PLANE
 from dro_grasp.pipeline.problem import GraspProblem
 
 
@@ -31,6 +32,8 @@ def shortage_in_words(
         "opening": f"ask for less opening (now {constraints.opening} m)",
     }
     given = [words for name, words in advice.items() if getattr(constraints, name) not in (None, ())]
+    if constraints.table is None and dropped.get(PLANE):
+        given.append("state the table's height if it is lower than the one found in the cloud")
     given += ["use the method 'auto'"] if alone else []
     return (f"only {found} of {made} candidates on object '{problem.obj.name}' meet what was asked of them"
             f"{dropped_in_words(dropped)}; {asked} were asked for. {'; or '.join(['Try another seed', *given])}")
