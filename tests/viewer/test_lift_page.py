@@ -10,12 +10,14 @@ import pytest
 import dro_grasp as dro
 from dro_grasp.cli.main import main
 from dro_grasp.cli.view import is_motion
+from dro_grasp.models.checkpoints import describe_weights
 from dro_grasp.planning.animation import Recorder
 from dro_grasp.planning.attempts import Attempt, TabletopConfig
 from dro_grasp.planning.motion import CHOSEN, STAGES, WAITING, PlanNotes, PlanScene
 from dro_grasp.planning.robot_check import robot_shapes, shape_poses
 from dro_grasp.planning.tabletop import write_attempts
 from dro_grasp.planning.timing import Trajectory
+from dro_grasp.viewer import lift_page as pages
 from dro_grasp.viewer.lift_page import EVERY, Film, LiftPage, lift_page
 from tests.helpers.browser import free_port
 
@@ -58,6 +60,39 @@ def test_a_plan_is_played_with_its_object_carried(robot: dro.Robot, plan: dro.Mo
         assert "3 grasps: 1 out of reach" in page.text.content
     finally:
         page.stop()
+
+
+def test_each_attempt_is_played_with_its_own_robot_and_weights(
+    robot: dro.Robot, small_robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other, ran, label = dro.load_robot(small_robot), [], TabletopConfig().label()
+    shipped = describe_weights()["sha256"]
+    stored = [Attempt(robot.name, "can", 0, 0, label, True, "done", robot_file="xarm7_leaphand", weights="multi"),
+              Attempt(other.name, "can", 1, 0, label, True, "done", robot_file=small_robot, weights="more_hands",
+                      robot_sha256=other.sha256, weights_sha256=shipped, object_sha256="that of another can")]
+
+    def ended(used: dro.Robot, obj: object, number: int, seed: int, weights: str, _: object, recorder: Recorder) -> Attempt:
+        ran.append((used.name, number, weights))
+        recorder.frames.append((used.home, used.hand.canonical_joints().double().numpy(), np.zeros((0, 4, 4))))
+        return stored[number]
+
+    monkeypatch.setattr(pages, "attempt", ended)
+    monkeypatch.setattr(pages, "GraspPredictor", lambda weights: weights)
+    write_attempts(stored, tmp_path / "results.parquet")
+    page = lift_page(tmp_path / "results.parquet", port=free_port())
+    try:
+        assert "Not as stored" not in page.text.content
+        page.repeat(1)
+        assert ran == [(robot.name, 0, "multi"), (other.name, 1, "more_hands")]
+        assert page.name.content == f"**{other.name}**"
+        assert len(page._links) == len(robot_shapes(other)) != len(robot_shapes(robot))
+        expected = shape_poses(other, other.home, other.hand.canonical_joints().double().numpy())
+        assert np.allclose([handle.position for handle in page._links], expected[:, :3, 3], atol=1e-6)
+        assert "Not as stored**: with other content than then: object. held" in page.text.content
+    finally:
+        page.stop()
+    lift_page(tmp_path / "results.parquet", 0, small_robot, "more_hands", port=free_port()).stop()
+    assert ran[2:] == [(other.name, 0, "more_hands")], "what is given instead is used"
 
 
 def test_an_attempt_that_cannot_be_repeated_is_told(

@@ -52,8 +52,8 @@ class View:
     """Which of the attempts in the file to run once more and show first."""
     robot: Annotated[str | None, optional("NAME|PATH", "the file's")] = None
     """Robot to use instead of the one named in a plan or an attempt."""
-    weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
-    """Weights for grasps generated on the page, and those of the attempts."""
+    weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights, or the attempts' own")] = None
+    """Weights for grasps generated on the page, or to use instead of those that attempts were made with."""
     device: str = "cpu"
     """Device for the network and the energies of grasps generated on the page: cpu, cuda or cuda:1."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ import viser.transforms
 from jaxtyping import Float
 
 from dro_grasp.errors import DroGraspError, OptionError
+from dro_grasp.models.checkpoints import describe_weights
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.planning.animation import OTHER_COLOUR, VIEW, Recorder
@@ -94,23 +95,30 @@ class LiftPage(ServedPage):
         """Start serving with the robot at home.
 
         Args:
-            robot: The robot.
-            attempts: Stored attempts, which can be picked and are run once more to be played.
-            weights: That they were made with.
+            robot: The robot that is shown first.
+            attempts: Stored attempts, which can be picked and are run once more to be played, each with its own robot.
+            weights: Name or file, where those that they were made with are not meant.
             port: As `ServedPage` takes it; the host likewise.
         """
         self.robot, self.attempts, self.weights = robot, list(attempts), weights
         self.film: Film | None = None
         self._busy = threading.Lock()
         super().__init__(port, host)
-        scene = self.server.scene
+        self._add_controls()
+        self._put(robot)
+
+    def _put(self, robot: Robot) -> None:
+        """Show a robot at home beside its table, in the place of another one."""
+        scene, self.robot = self.server.scene, robot
+        self.name.content = f"**{robot.name}**"
+        for name in ("/robot", "/table"):
+            scene.remove_by_name(name)
         self._links = [
             scene.add_mesh_simple(f"/robot/{i}", mesh.vertices, mesh.faces, color=rgb(mesh.colour), side="double")
             for i, mesh in enumerate(robot_shapes(robot))]
         self._place(robot.home, robot.hand.canonical_joints().double().numpy())
         for i, mesh in enumerate(table_meshes(robot.table)):
             scene.add_mesh_simple(f"/table/{i}", mesh.vertices, mesh.faces, color=rgb(mesh.colour))
-        self._add_controls()
 
     def _place(self, arm: Float[np.ndarray, " n_arm"], hand: Float[np.ndarray, " n_dof"]) -> None:
         for handle, T in zip(self._links, shape_poses(self.robot, arm, hand), strict=True):
@@ -118,7 +126,7 @@ class LiftPage(ServedPage):
 
     def _add_controls(self) -> None:
         gui = self.server.gui
-        gui.add_markdown(f"**{self.robot.name}**")
+        self.name = gui.add_markdown("")
         if self.attempts:
             labels = [f"{i}: {a.object}, {'held' if a.success else a.stage}" for i, a in enumerate(self.attempts)]
             self.picked = gui.add_dropdown("Attempt", labels, initial_value=labels[0])
@@ -147,19 +155,30 @@ class LiftPage(ServedPage):
             self._busy.release()
 
     def repeat(self, index: int) -> None:
-        """Run a stored attempt once more, and show it.
+        """Run a stored attempt once more with its own robot and weights, and show it, and what of these has changed since.
 
         Raises:
             OptionError: There is no such attempt, it is of another version, or the robot did not move.
+            DroGraspError: The robot, the object or the weights cannot be used any more.
         """
         if not 0 <= index < len(self.attempts):
             raise OptionError(f"attempt is {index}; give one of 0 to {len(self.attempts) - 1}")
         stored, recorder = self.attempts[index], Recorder(RATE)
         config = TabletopConfig.from_label(stored.settings)
         self.text.content = f"Running attempt {index} once more: seeing, planning, lifting ..."
+        same = stored.robot_sha256 == self.robot.sha256
+        robot = self.robot if same else load_robot(stored.robot_file or stored.robot)
         obj = load_object(stored.object_file or stored.object)
-        made = attempt(self.robot, obj, stored.number, stored.seed, GraspPredictor(self.weights), config, recorder)
-        self.show(Film.of_attempt(recorder), "held" if made.success else f"**{made.stage}**: {made.reason}")
+        weights = self.weights or stored.weights or None
+        made = attempt(robot, obj, stored.number, stored.seed, GraspPredictor(weights), config, recorder)
+        film, self.film = Film.of_attempt(recorder), None
+        if robot is not self.robot:
+            self._put(robot)
+        others = [name for name, then, now in (
+            ("robot", stored.robot_sha256, robot.sha256), ("object", stored.object_sha256, obj.sha256),
+            ("weights", stored.weights_sha256, describe_weights(weights)["sha256"])) if then not in {"", now}]
+        changed = f"**Not as stored**: with other content than then: {', '.join(others)}. " if others else ""
+        self.show(film, changed + ("held" if made.success else f"**{made.stage}**: {made.reason}"))
 
     def show(self, film: Film, outcome: str = "") -> None:
         """Put a film on the page, and show its first picture."""
@@ -249,8 +268,8 @@ def lift_page(
     Args:
         file: What `dro-grasp plan` or `dro-grasp tabletop` wrote.
         chosen: Number of the attempt.
-        robot: Name or file, where the file's own is not meant.
-        weights: As of the attempts.
+        robot: Name or file, where the file's own are not meant.
+        weights: Likewise.
         port: As `ServedPage` takes it; the host likewise.
 
     Raises:
@@ -266,6 +285,8 @@ def lift_page(
     attempts = read_attempts(file)
     if not 0 <= chosen < len(attempts):
         raise OptionError(f"{file} has attempts 0 to {len(attempts) - 1}; --attempt is {chosen}")
-    page = LiftPage(load_robot(robot or attempts[chosen].robot_file or attempts[chosen].robot), attempts, weights, port, host)
+    if robot is not None:
+        attempts = [replace(a, robot_file=robot, robot_sha256="") for a in attempts]
+    page = LiftPage(load_robot(attempts[chosen].robot_file or attempts[chosen].robot), attempts, weights, port, host)
     page.repeat(chosen)
     return page
