@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from io import BytesIO
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from dro_grasp.cli.main import main
 from dro_grasp.datasets.collections.collection import count_collection, read_collection
 from dro_grasp.datasets.collections.merging import ANGLE_STEP, POSITION_STEP, Merged, compact, file_name, merge, spread
 from dro_grasp.datasets.engine.shards import Shard, Yield, notes_of
-from dro_grasp.errors import GraspFileError
+from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from tests.helpers.loaded_hands import loaded_hand
@@ -103,6 +104,18 @@ def test_nothing_to_merge_is_told(hand, tmp_path, capsys):
     tried(hand, "can", 2, seed=0, failed=2).save(tmp_path / "failed.parquet")
     assert main(["dataset", "merge", str(tmp_path / "failed.parquet"), "--output", str(tmp_path / "c")]) == 0
     assert "no grasp held in a trial" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("number", [0, -3])
+def test_less_than_one_grasp_of_a_pair_is_refused_before_the_work(folders, hand, tmp_path, capsys, number):
+    told = rf"per_pair is {number}; give at least 1, or leave it out to keep all grasps \(--per-pair\)"
+    for name, output in (("merge", tmp_path / "out"), ("bundle", tmp_path / "out.safetensors")):
+        given = ["dataset", name, *map(str, folders), "--output", str(output), f"--per-pair={number}"]
+        assert main(given) == 2
+        assert re.search(told, capsys.readouterr().err)
+        assert not output.exists()
+    with pytest.raises(OptionError, match=told):
+        spread(hand, tried(hand, "can", 3, seed=0), number)
 
 
 def test_compact_numbers_mean_the_same_and_keep_the_limits(hand):

@@ -104,9 +104,10 @@ class Merge(DataSets):
 
     def run(self) -> int:
         """Merge, and write the files."""
-        from dro_grasp.datasets.collections.merging import file_name, merge
+        from dro_grasp.datasets.collections.merging import file_name, merge, require_choice
         from dro_grasp.files import make_folder
 
+        require_choice(self.per_pair)
         folder = make_folder(self.output)
         rows = []
         for merged in merge(self.inputs, self.per_pair, folder):

@@ -11,7 +11,7 @@ import torch
 
 from dro_grasp.datasets.bundle.training_file import SPLITS, Bundle, ObjectCloud, write_bundle
 from dro_grasp.datasets.collections.collection import read_collection
-from dro_grasp.datasets.collections.merging import spread
+from dro_grasp.datasets.collections.merging import require_choice, spread
 from dro_grasp.errors import BundleError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import hand_of, object_of, pair_keys, require_same
@@ -33,10 +33,12 @@ def make_bundle(
         without_grasps: As in `write_bundle`.
 
     Raises:
+        OptionError: `per_pair` is less than 1.
         BundleError: It cannot be made of these grasps.
         GraspFileError: A file is damaged, or a hand or an object has changed since.
         OutputError: It cannot be written.
     """
+    require_choice(per_pair)
     allowed, kept, left_out = SPLITS[split], [], 0
     seen: Counter[str] = Counter()
     hands_seen: set[str] = set()

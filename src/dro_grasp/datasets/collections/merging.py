@@ -16,7 +16,7 @@ from torch import Tensor
 from dro_grasp._version import __version__
 from dro_grasp.datasets.collections.collection import YIELDS, read_collection
 from dro_grasp.datasets.engine.shards import Yield
-from dro_grasp.errors import GraspFileError
+from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.files import check_output, replacing
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.geometry.se3 import compose
@@ -100,13 +100,25 @@ def merge(
         file_bytes: Size of a file from which on the next object goes into another, about.
 
     Raises:
+        OptionError: `per_pair` is less than 1.
         GraspFileError: A path holds no grasps, or a hand or object is not the same in all data sets.
         HandError: A hand cannot be loaded.
         OutputError: There is no space for the grasps that wait.
     """
+    require_choice(per_pair)
     with tempfile.TemporaryDirectory(dir=aside, prefix=".merge-") as name:
         for hand, pairs in sorted(_by_pair(paths, Path(name)).items()):
             yield from _merge_hand(hand, pairs, per_pair, file_bytes)
+
+
+def require_choice(per_pair: int | None) -> None:
+    """Refuse a number of grasps of a pair with which none would be left.
+
+    Raises:
+        OptionError: It is less than 1.
+    """
+    if per_pair is not None and per_pair < 1:
+        raise OptionError(f"per_pair is {per_pair}; give at least 1, or leave it out to keep all grasps (--per-pair)")
 
 
 def file_name(hand: str, number: int = 1) -> str:
@@ -173,7 +185,11 @@ def spread(hand: Hand, grasps: GraspBatch, count: int) -> Int[Tensor, " k"]:
 
     Farthest-first: the choice starts with the first grasp and adds the one whose palm direction is farthest from all
     chosen ones.
+
+    Raises:
+        OptionError: `count` is less than 1.
     """
+    require_choice(count)
     if len(grasps) <= count:
         return torch.arange(len(grasps))
     directions = hand.palm_directions(grasps.T_object_wrist)
