@@ -36,7 +36,7 @@ from dro_grasp.objects.cache import cached_arrays
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.perception.scan import load_scan
 from dro_grasp.training.run_folder import CHECKPOINT, LOG, RunFolder
-from dro_grasp.viewer.uploads import store_upload
+from dro_grasp.web.uploads import store_upload
 
 Rng = random.Random
 TINY = NetworkConfig(

@@ -6,7 +6,6 @@ import dataclasses
 import io
 import threading
 import time
-import zipfile
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,7 +17,7 @@ import viser
 import yaml
 
 from dro_grasp.cli.view import View
-from dro_grasp.errors import HandError, OptionError
+from dro_grasp.errors import HandError
 from dro_grasp.frames import HALF_AXES, half_axis_direction
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import BUILTIN_FOLDER
@@ -30,7 +29,6 @@ from dro_grasp.viewer.grasp_page import EXPORTS, chosen
 from dro_grasp.viewer.shelf import Shelf
 from dro_grasp.viewer.stage import HOST, ServedPage
 from dro_grasp.viewer.studio import Studio, StudioServer
-from dro_grasp.viewer.uploads import MAX_BYTES, store_upload
 from tests.helpers.browser import free_port, page_of
 from tests.helpers.served_studio import served_studio, visited
 from tests.helpers.weights import untrained_weights
@@ -319,20 +317,6 @@ def test_every_browser_has_a_page_and_closing_it_ends_its_work_and_its_uploads(
     assert not any(folder.exists() for folder in folders)
 
 
-def zipped(**files: bytes) -> bytes:
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w") as archive:
-        for name, content in files.items():
-            archive.writestr(name, content)
-    return file.getvalue()
-
-
-def test_a_zip_file_is_unpacked_and_its_description_found(tmp_path: Path) -> None:
-    content = zipped(**{"hand/mine.urdf": b"<robot/>", "hand/meshes/a.stl": b"1", "other.xml": b"<x/>"})
-    assert store_upload("mine.zip", content, tmp_path) == tmp_path / "hand" / "mine.urdf"
-    assert (tmp_path / "hand" / "meshes" / "a.stl").read_bytes() == b"1"
-
-
 def test_a_scene_does_not_take_the_place_of_an_object_of_its_file_name() -> None:
     def box(*size: float) -> bytes:
         return trimesh.creation.box(size).export(file_type="stl")
@@ -345,25 +329,6 @@ def test_a_scene_does_not_take_the_place_of_an_object_of_its_file_name() -> None
     assert shelf.take("part.stl", box(0.06, 0.06, 0.06), "object") == "part.stl"
     assert np.ptp(shelf.obj("part.stl").vertices, axis=0) == pytest.approx([0.06] * 3), "the newer one of its kind"
     shelf.close()
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "word"),
-    [
-        ("a.urdf", b"x" * (MAX_BYTES + 1), "limit is 20"), ("..", b"", "not a file name"),
-        ("a\0b.stl", b"", "not a file name"), ("\u00e9" * 101 + ".stl", b"", "of 1 to 200 bytes"),
-        ("a.zip", b"no zip", "expected a ZIP file"), ("a.zip", zipped(**{"../evil.urdf": b"x"}), "outside the archive"),
-        ("a.zip", zipped(**{"/evil.urdf": b"x"}), "outside the archive"),
-        ("a.zip", zipped(**{"a.stl": b"x"}), "no URDF or MJCF"),
-        ("a.zip", zipped(**{f"{i}.urdf": b"" for i in range(1001)}), "1001 files"),
-    ],
-)
-def test_uploads_that_could_harm_are_refused(name: str, content: bytes, word: str, tmp_path: Path) -> None:
-    folder = tmp_path / "in"
-    folder.mkdir()
-    with pytest.raises(OptionError, match=word):
-        store_upload(name, content, folder)
-    assert [p.name for p in tmp_path.iterdir()] == ["in"]
 
 
 @pytest.mark.slow

@@ -14,8 +14,8 @@ from dro_grasp.onboarding.steps import DATA, PICTURE, REPORT, STRICT, Onboarded
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import evaluate
 from dro_grasp.predictor import GraspPredictor, GraspRequest
-from dro_grasp.viewer.page import image, table, write_page
 from dro_grasp.viewer.pictures import draw_grasps
+from dro_grasp.web.page import image, table, write_page
 
 GRASPS = 8
 """Grasps drawn on each object."""

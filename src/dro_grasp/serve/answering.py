@@ -34,7 +34,7 @@ from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import evaluate
 from dro_grasp.predictor import GraspPredictor, GraspRequest, Prediction, Progress
 from dro_grasp.serve.messages import GraspAnswer, SentCamera, SentGrasp, SentObject, settings_in
-from dro_grasp.viewer.uploads import store_upload
+from dro_grasp.web.uploads import store_upload
 
 KEPT_HANDS = 16
 """Most hands that stay loaded (ours)."""

@@ -23,7 +23,7 @@ from dro_grasp.errors import OptionError, ServerError
 from dro_grasp.serve.computing import Reply, refused
 from dro_grasp.serve.desk import Desk
 from dro_grasp.serve.messages import GraspAnswer, GraspCall, Refusal
-from dro_grasp.viewer.guard import own_names, refusal
+from dro_grasp.web.origins import own_names, refusal
 
 SLOWEST_BODY = 30.0
 """Time within which the whole of a request must arrive [s] (ours)."""

@@ -1,63 +1,20 @@
-"""Who may talk to a page that is served: browsers that show this very page, at an address of this machine.
-
-Any page in a browser may open a WebSocket to a server on the same machine, or give a name of its own to that machine's address.
-"""
+"""What stands before a page of viser: it lets in those alone who may talk to it, and not too many."""
 
 from __future__ import annotations
 
 import http
-import ipaddress
-import socket
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
-from urllib.parse import urlsplit
 
 import websockets.asyncio.server
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
+from dro_grasp.web.origins import own_names, refusal
+
 MOST_CONNECTIONS = 64
 """Most open connections to one page (ours)."""
-
-
-def own_names(served_at: str) -> frozenset[str]:
-    """Names of this machine, in small letters.
-
-    A name server may be asked, which takes seconds where none answers: call it once, before requests come.
-
-    Args:
-        served_at: The address that the page is served at, as the user gave it.
-    """
-    return frozenset(name.lower() for name in ("localhost", served_at, socket.gethostname(), socket.getfqdn()))
-
-
-def refusal(headers: Any, own: Collection[str]) -> str:
-    """Why a request is refused; empty if it is not.
-
-    Args:
-        headers: Of the request, by name.
-        own: Names of this machine; see `own_names`.
-    """
-    host, origin = headers.get("Host", ""), headers.get("Origin")
-    try:
-        name = urlsplit(f"//{host}").hostname or ""
-        theirs = None if origin is None else urlsplit(origin).netloc
-    except ValueError:
-        return "its Host or Origin is no address"
-    if not (_is_address(name) or name in own):
-        return f"it asks for the host '{name}', which is no name of this machine; open the page at the machine's address"
-    if theirs is not None and theirs != host:
-        return f"it comes from a page of '{origin}', not from this one"
-    return ""
-
-
-def _is_address(name: str) -> bool:
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
 
 
 @contextmanager

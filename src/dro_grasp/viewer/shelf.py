@@ -14,7 +14,7 @@ from dro_grasp.hands.library import hand_names, load_hand
 from dro_grasp.objects.catalogue import load_object, object_names
 from dro_grasp.objects.scenery import Scene, load_scene
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.viewer.uploads import store_upload
+from dro_grasp.web.uploads import store_upload
 
 
 class Shelf:

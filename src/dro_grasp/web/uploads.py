@@ -1,4 +1,4 @@
-"""Files uploaded through the browser: limited in size and unpacked safely."""
+"""Files sent by a browser or a client: limited in size and unpacked safely."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def store_upload(name: str, content: bytes, folder: Path) -> Path:
     """Write an upload into an empty folder, and return its path or, for a ZIP file, that of the hand description in it.
 
     Args:
-        name: File name from the browser; folders in it are ignored.
+        name: File name as it was sent; folders in it are ignored.
 
     Raises:
         OptionError: The file is too large, its name is invalid, a ZIP file holds no description or paths outside itself, or a

@@ -1,0 +1,50 @@
+"""Who may talk to what is served: those who know this machine's address or name, and browsers that show this very page.
+
+Any page in a browser may send requests to a server on the same machine, or give a name of its own to that machine's address.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+from collections.abc import Collection, Mapping
+from urllib.parse import urlsplit
+
+
+def own_names(served_at: str) -> frozenset[str]:
+    """Names of this machine, in small letters.
+
+    A name server may be asked, which takes seconds where none answers: call it once, before requests come.
+
+    Args:
+        served_at: The address that is served at, as the user gave it.
+    """
+    return frozenset(name.lower() for name in ("localhost", served_at, socket.gethostname(), socket.getfqdn()))
+
+
+def refusal(headers: Mapping[str, str], own: Collection[str]) -> str:
+    """Why a request is refused; empty if it is not.
+
+    Args:
+        headers: Of the request, by name.
+        own: Names of this machine; see `own_names`.
+    """
+    host, origin = headers.get("Host", ""), headers.get("Origin")
+    try:
+        name = urlsplit(f"//{host}").hostname or ""
+        theirs = None if origin is None else urlsplit(origin).netloc
+    except ValueError:
+        return "its Host or Origin is no address"
+    if not (_is_address(name) or name in own):
+        return f"it asks for the host '{name}', which is no name of this machine; open the page at the machine's address"
+    if theirs is not None and theirs != host:
+        return f"it comes from a page of '{origin}', not from this one"
+    return ""
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
