@@ -24,7 +24,7 @@ from dro_grasp.errors import HandError, RobotError
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand, locate_hand
 from dro_grasp.planning.extent import farthest, farthest_surface
-from dro_grasp.planning.robot_file import CameraMount, RobotFile, Table, locate_robot, read_robot_file
+from dro_grasp.planning.robot_file import CameraMount, RobotFile, Table, is_number, locate_robot, read_robot_file
 from dro_grasp.records import flat
 
 LONGEST_ARM = 5.0
@@ -185,8 +185,9 @@ class _Fit:
         for i, name in enumerate(self.joints):
             if name in stated:
                 ends = stated[name]
-                if not isinstance(ends, list) or len(ends) != 2 or not ends[0] < ends[1]:
-                    raise self.error(f"limits: position of joint '{name}' is {ends!r}; expected [lower, upper]")
+                if not isinstance(ends, list) or len(ends) != 2 or not all(map(is_number, ends)) or not ends[0] < ends[1]:
+                    raise self.error(f"limits: position of joint '{name}' is {ends!r}; expected [lower, upper], numbers in rad "
+                                     "or m")
                 lower[i], upper[i] = ends
                 if np.abs(ends).max() > MOST_TURN:
                     raise self.error(f"limits: position of joint '{name}' is {ends}, which looks like degrees: expected rad")
@@ -206,7 +207,7 @@ class _Fit:
             if value is None:
                 raise self.error(f"joint '{name}' of the arm has no {kind} limit; state it in {self.file.path.name}, for "
                                  f"example limits: {{{kind}: 1.5}}, in rad/s or rad/s^2")
-            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < np.inf:
+            if not is_number(value) or value <= 0:
                 raise self.error(f"limits: {kind} of joint '{name}' is {value!r}; expected a number above 0")
         return np.array([float(values.get(name, default)) for name in self.joints])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -132,6 +133,11 @@ def read_robot_file(path: Path) -> RobotFile:
         read.camera(values.get("camera")), read.table(values.get("table")))
 
 
+def is_number(value: Any) -> bool:
+    """Whether an entry of a robot file is a finite number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+
+
 class _Reader:
     """Reads entries, and names the file and the entry in errors."""
 
@@ -151,7 +157,7 @@ class _Reader:
         return value
 
     def number(self, value: Any, what: str) -> float:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        if not is_number(value):
             raise self.error(f"{what} is {value!r}; expected a number")
         return float(value)
 
