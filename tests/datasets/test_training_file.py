@@ -51,6 +51,12 @@ def test_clouds_come_back_within_half_a_level(path: Path) -> None:
         torch.testing.assert_close(read.normals.norm(dim=-1), torch.ones(len(read.normals)))
 
 
+def test_a_bundle_may_be_named_from_home(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(path.parent))
+    assert tiny_bundle(Path("~") / path.name).n_grasps == 48
+    assert path.is_file()
+
+
 def test_a_flat_cloud_comes_back(path: Path) -> None:
     points = torch.rand(50, 3) * torch.tensor([0.1, 0.1, 0.0]) + 0.3
     flat = ObjectCloud(points, torch.tensor([[0.0, 0.0, 1.0]]).repeat(50, 1))
@@ -222,9 +228,12 @@ def test_dataset_info_counts(dataset: Path, capsys: pytest.CaptureFixture[str]) 
     assert json.loads(capsys.readouterr().out) == expected
 
 
-def test_dataset_bundle_packs_what_is_for_training(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_dataset_bundle_packs_what_is_for_training(
+    dataset: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     output = dataset / "bundle.safetensors"
-    assert main(["dataset", "bundle", str(dataset / "data"), "--output", str(output), "--json"]) == 0
+    monkeypatch.setenv("HOME", str(dataset))
+    assert main(["dataset", "bundle", str(dataset / "data"), "--output", "~/bundle.safetensors", "--json"]) == 0
     said = capsys.readouterr()
     assert "16 grasps outside split 'train' are left out" in said.err
     report = json.loads(said.out)

@@ -10,7 +10,7 @@ import trimesh
 
 import dro_grasp as dro
 from dro_grasp.cli.main import main
-from dro_grasp.errors import HandError
+from dro_grasp.errors import HandError, OutputError
 from dro_grasp.hands.check import check_hand, hand_side, picture
 from tests.helpers.bracket_hand import bracket_hand, bracket_urdf
 from tests.helpers.claw_urdf import LIMIT, claw, joint, link, meshed, written
@@ -114,6 +114,14 @@ def test_four_fingers_all_around_have_no_side(tmp_path: Path) -> None:
 )
 def test_sides_of_real_hands(assets_folder: Path, name: str, side: str) -> None:
     assert hand_side(loaded_hand(f"assets/{name}")) == side
+
+
+def test_the_picture_may_be_named_from_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    picture(loaded_hand("gripper3"), "~/hand.png")
+    assert (tmp_path / "hand.png").read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(OutputError, match="create it first"):
+        picture(loaded_hand("gripper3"), "~/none/hand.png")
 
 
 def test_the_picture_shows_the_hand_open_and_closed(tmp_path: Path) -> None:

@@ -53,6 +53,13 @@ def path(tmp_path: Path, network: DistanceNetwork) -> Path:
     return tmp_path / "mine.safetensors"
 
 
+def test_weights_may_be_named_from_home(tmp_path: Path, network: DistanceNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    save_weights(network, "~/mine.safetensors")
+    assert (tmp_path / "mine.safetensors").is_file()
+    assert load_weights("~/mine.safetensors").config == TINY
+
+
 def test_weights_come_back_in_half_precision(path: Path, network: DistanceNetwork) -> None:
     read = load_weights(path)
     assert (read.config, read.name, read.training) == (TINY, "mine", False)

@@ -71,16 +71,15 @@ class Report(DataSets):
         from dro_grasp.files import check_output
         from dro_grasp.viewer.dataset_pages import write_report
 
-        if self.output is not None:
-            check_output(self.output, ".html")
+        output = None if self.output is None else check_output(self.output, ".html")
         hands = measure_coverage(self.pairs(only_successful=True))
-        if self.output is not None:
+        if output is not None:
             with progress_bar("drawing", self.json) as progress:
-                write_report(hands, self.output, progress)
+                write_report(hands, output, progress)
         rows = [[h.grasps.hand, len(h.grasps), len(h.pairs), h.yields.per_cpu_hour, *h.diversity.values()] for h in hands]
-        values = {"hands": [h.to_dict() for h in hands], "output": None if self.output is None else str(self.output)}
+        values = {"hands": [h.to_dict() for h in hands], "output": None if output is None else str(output)}
         columns = ["hand", "grasps", "objects", "per CPU-hour", "diversity", "of wrist", "of joints"]
-        print_result(self.json, values, "data set", columns, rows, "" if self.output is None else f"page: {self.output}")
+        print_result(self.json, values, "data set", columns, rows, "" if output is None else f"page: {output}")
         for h in hands:
             for pair in h.pairs:
                 if not (pair.grasps or self.json):
@@ -234,13 +233,13 @@ class BundleCommand(DataSets):
         from dro_grasp.files import check_output
         from dro_grasp.hands.library import load_hand
 
-        check_output(self.output, ".safetensors")
+        output = check_output(self.output, ".safetensors")
         further = [load_hand(name) for name in self.hands_without_grasps]
-        bundle, left_out = make_bundle(self.inputs, self.output, self.split, self.hands, self.per_pair, further)
+        bundle, left_out = make_bundle(self.inputs, output, self.split, self.hands, self.per_pair, further)
         if left_out:
             say_aside(f"{left_out} grasps outside split '{self.split}' are left out")
-        report = {"output": str(self.output), "bytes": self.output.stat().st_size, **bundle.summary()}
-        print_result(self.json, report, f"bundle {self.output}", ["hand", "grasps"], [*report["hands"].items()],
+        report = {"output": str(output), "bytes": output.stat().st_size, **bundle.summary()}
+        print_result(self.json, report, f"bundle {output}", ["hand", "grasps"], [*report["hands"].items()],
                      f"{report['objects']} objects, {report['grasps']} grasps, {report['bytes'] / 1e6:.1f} MB")
         return 0
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from dro_grasp.errors import GraspFileError
+from dro_grasp.files import given_path
 from dro_grasp.grasps.batch import GraspBatch
 
 PATTERN = "*.parquet"
@@ -20,7 +21,7 @@ def load_grasps(path: Path | str) -> GraspBatch:
     Raises:
         GraspFileError: There is no file and no grasp, a file is foreign, or the files of the folder are of several hands.
     """
-    path = Path(path)
+    path = given_path(path)
     batch = _folder(path) if path.is_dir() else GraspBatch.load(path)
     if len(batch) == 0:
         raise GraspFileError(f"{path} holds no grasp; generate again, perhaps without --only-successful")

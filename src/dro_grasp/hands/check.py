@@ -15,7 +15,7 @@ from torch import Tensor
 from dro_grasp.descriptions.loader import Description
 from dro_grasp.descriptions.notes import Note
 from dro_grasp.descriptions.part import named
-from dro_grasp.files import replacing
+from dro_grasp.files import check_output, replacing
 from dro_grasp.geometry import se3
 from dro_grasp.geometry.point_clouds import enclosed_volume
 from dro_grasp.hands.anatomy import Finger
@@ -215,9 +215,13 @@ def picture(hand: Hand, path: Path | str) -> None:
     Args:
         hand: From `load_hand` or a report; it needs its description.
         path: PNG to write.
+
+    Raises:
+        OutputError: It cannot be written.
     """
     from PIL import Image, ImageDraw, ImageFont
 
+    path = check_output(path)
     width, height = TILE
     sheet = Image.new("RGB", (2 * width, height + 2 * TEXT), (255, 255, 255))
     pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(15)
@@ -229,7 +233,7 @@ def picture(hand: Hand, path: Path | str) -> None:
     if not torch.equal(hand.open_ends, hand.open_limits):
         legend += "   purple: left out"
     pen.text((12, height + TEXT + 6), legend, fill=(90, 90, 90), font=font)
-    with replacing(Path(path), "picture") as temporary:
+    with replacing(path, "picture") as temporary:
         sheet.save(temporary, format="PNG")
 
 

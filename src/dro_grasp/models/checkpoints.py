@@ -51,7 +51,7 @@ def save_weights(
     Raises:
         OutputError: The file cannot be written.
     """
-    path = Path(path)
+    path = given_path(path)
     tensors = {
         name: value.half().contiguous() if value.is_floating_point() and "running" not in name else value.contiguous()
         for name, value in network.state_dict().items()
