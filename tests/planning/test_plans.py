@@ -27,10 +27,10 @@ from dro_grasp.planning.motion import STAGES, MotionPlan
 from dro_grasp.planning.paths import find_path
 from dro_grasp.planning.plan_config import PlanConfig
 from dro_grasp.planning.planner import plan
-from dro_grasp.planning.reachability import Postures
+from dro_grasp.planning.reachability import Feasible, Postures
 from dro_grasp.planning.robot_file import BUILTIN_ROBOTS
-from dro_grasp.planning.timed_stages import closing
-from dro_grasp.planning.timing import USED, cornered, smooth
+from dro_grasp.planning.timed_stages import closing, timed_stages
+from dro_grasp.planning.timing import USED, Trajectory, cornered, smooth
 from dro_grasp.planning.workcell import arm_addresses, robot_spec
 from dro_grasp.simulation.hand_part import joint_addresses
 from dro_grasp.simulation.protocols import PROTOCOLS
@@ -278,6 +278,33 @@ def test_a_closing_hand_stays_between_its_postures() -> None:
     made, spline = cornered(closing(hand), *limits, 1.0), smooth(closing(hand), *limits, 1.0)
     assert made.position.max(0) == pytest.approx(hand.squeeze, abs=1e-9)
     assert spline.position[:, 0].max() > 1.001
+
+
+@pytest.mark.parametrize("still", ["shape", "approach", "lift"])
+def test_a_stage_in_which_nothing_moves_is_a_stage(robot: dro.Robot, planned: MotionPlan, still: str) -> None:
+    """As when the pregrasp is the posture in which the hand travels."""
+    opened = robot.hand.canonical_joints().double().numpy()
+    bent, turned = opened + (still != "shape") * 0.05 * robot.hand.opening_signs.double().numpy(), np.eye(7)[0]
+    approach, lift = (np.linspace(robot.home + a * turned, robot.home + b * turned, 5) for a, b in (
+        (0.1, 0.1 if still == "approach" else 0.15), (0.15, 0.15 if still == "lift" else 0.2)))
+    made = timed_stages(robot, CollisionChecker(robot), np.stack([robot.home, approach[0]]), Feasible(0, approach, lift),
+                        Postures(opened, bent, opened, opened), PlanConfig())
+    assert made is not None
+    whole = replace(planned, stage=made.stage, arm=made.arm, hand=made.hand)
+    assert f"{still} 0.0 s" in whole.lines()[2]
+    assert (np.diff(whole.arm.time) > 0).all()
+    assert sorted(set(made.stage.tolist())) == list(range(len(STAGES)))
+    assert all(np.ptp(whole.arm.position[whole.part(s)], axis=0).max() > 0 for s in ("reach", "approach", "lift") if s != still)
+
+
+def test_a_plan_file_in_which_a_stage_has_no_rows_is_read(planned: MotionPlan) -> None:
+    """As they were written before."""
+    rows = planned.stage != STAGES.index("shape")
+    arm, hand = (Trajectory(t.time[rows], t.position[rows], t.velocity[rows], t.acceleration[rows])
+                 for t in (planned.arm, planned.hand))
+    old = replace(planned, stage=planned.stage[rows], arm=arm, hand=hand)
+    assert "shape 0.0 s" in old.lines()[2]
+    assert old.part("shape") == slice(old.part("reach").stop - 1, old.part("reach").stop)
 
 
 BAD = {

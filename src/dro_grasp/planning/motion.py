@@ -111,9 +111,9 @@ class MotionPlan:
         return self.arm.seconds
 
     def part(self, stage: str) -> slice:
-        """Rows of a stage, with the last row of the one before."""
-        rows = np.flatnonzero(self.stage == STAGES.index(stage))
-        return slice(max(0, int(rows[0]) - 1), int(rows[-1]) + 1)
+        """Rows of a stage, with the last row of the one before; that alone, where nothing moves and a stage has no rows."""
+        first, end = (int(np.searchsorted(self.stage, STAGES.index(stage), side)) for side in ("left", "right"))
+        return slice(max(0, first - 1), end)
 
     def points(self, rate: float = 100.0) -> Iterator[MotionPoint]:
         """Targets at a rate [1/s], the last one included, for a loop that sends them to a robot."""

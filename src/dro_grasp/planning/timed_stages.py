@@ -12,7 +12,7 @@ from dro_grasp.planning.motion import STAGES
 from dro_grasp.planning.plan_config import PlanConfig
 from dro_grasp.planning.reachability import Feasible, Postures, carried
 from dro_grasp.planning.robot import Robot
-from dro_grasp.planning.timing import Trajectory, cornered, joined, smooth, standing
+from dro_grasp.planning.timing import STEP, Trajectory, cornered, joined, smooth, standing
 
 TRAVEL_CLEARANCE = 0.001
 """Distance that the timed motion keeps while it travels, off the straight edges that were planned [m] (ours)."""
@@ -40,10 +40,10 @@ def timed_stages(
     if not _clear(checker, reach.position, hand.opened):
         reach = cornered(waypoints, *limits)
     standoff, grasp = goal.approach[0], goal.approach[-1]
-    shape = smooth(np.stack([hand.opened, hand.pregrasp]), *fingers)
+    shape = smooth(np.stack([hand.opened, hand.pregrasp]), *fingers, STEP)  # each stage takes time, also if nothing moves
     # A spline through these would swing beyond them, and out of the joints' range.
     close = joined([cornered(closing(hand), *fingers, config.closing_seconds), standing(hand.squeeze, config.grip_seconds)])
-    approach, lift = smooth(goal.approach, *limits), smooth(goal.lift, *limits)
+    approach, lift = smooth(goal.approach, *limits, STEP), smooth(goal.lift, *limits, STEP)
     start = robot.T_world_wrist(grasp)
     free = _clear(checker, reach.position, hand.opened) and all(
         checker.free(standoff, posture, 0.0) for posture in shape.position) and all(
