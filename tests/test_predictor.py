@@ -9,7 +9,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from dro_grasp import predictor as predictor_module
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.models.network import Moves
@@ -80,7 +79,7 @@ def test_nothing_is_found_where_constraints_reject_everything(
     weights: str, ball: ObjectModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also with a share of zero, below which no share is."""
-    monkeypatch.setattr(predictor_module, "permitted", lambda problem, grasps: torch.zeros(len(grasps), dtype=torch.bool))
+    monkeypatch.setattr("dro_grasp.pipeline.pool.permitted", lambda problem, grasps: torch.zeros(len(grasps), dtype=torch.bool))
     strict = GraspPredictor(weights, config=PredictorConfig(least_yield=0.0))
     with pytest.raises(OptionError, match="only 0 of 2 candidates"):
         strict.predict(HAND, ball, num=2, candidates=1, method="network", table=-0.2)
@@ -225,14 +224,14 @@ def test_what_was_found_is_returned_with_a_warning(
     def first_of_each_batch(problem: GraspProblem, grasps: GraspBatch) -> Tensor:
         return torch.arange(len(grasps)) == 0
 
-    monkeypatch.setattr("dro_grasp.predictor.permitted", first_of_each_batch)
+    monkeypatch.setattr("dro_grasp.pipeline.pool.permitted", first_of_each_batch)
     with pytest.warns(UserWarning, match=r"only 1 of 6 candidates on object 'sphere' .* 6 were .* lower table \(now -0.1 m"):
         found = predictor.predict(HAND, ball, num=6, table=-0.1, candidates=1, method="network")
     assert len(found) == 1
 
 
 def test_an_impossible_table_is_told(predictor: GraspPredictor, ball: ObjectModel, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dro_grasp.predictor.permitted", lambda problem, grasps: torch.zeros(len(grasps), dtype=torch.bool))
+    monkeypatch.setattr("dro_grasp.pipeline.pool.permitted", lambda problem, grasps: torch.zeros(len(grasps), dtype=torch.bool))
     with pytest.raises(OptionError, match=r"only 0 of 3 .* 3 were asked for.* lower table .* use the method 'auto'"):
         predictor.predict(
             HAND, ball, num=3, direction=(0.0, 0.0, -1.0), table=-0.04, candidates=1, method="network")

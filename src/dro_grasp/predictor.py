@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
@@ -23,13 +22,11 @@ from dro_grasp.models.checkpoints import load_weights
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.options import by_owner
-from dro_grasp.pipeline.admission import TURNED, permitted, reasons_against
 from dro_grasp.pipeline.constraints import Constraints
+from dro_grasp.pipeline.pool import CandidatePool
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.proposal import Proposal, ProposalConfig, check_temperature, propose
-from dro_grasp.pipeline.settling import best_settled, can_settle
-from dro_grasp.pipeline.shortage import shortage_in_words
-from dro_grasp.pipeline.stages import complete, eased, optimise, refine, scored
+from dro_grasp.pipeline.stages import complete, optimise
 from dro_grasp.stopwatch import Stopwatch
 
 LARGEST_CALL = 100_000
@@ -199,16 +196,21 @@ class GraspPredictor:
             OptionError: No grasp was found.
         """
         watch = Stopwatch("network", "decode", "optimise", "refine", "settle", "rank")
-        pool = _Pool(problem, request, watch)
+        pool = CandidatePool(problem, request.num, request.refine, watch)
         if request.method != "optimise":
-            self._ask_network(pool, progress)
+            self._ask_network(pool, request, progress)
         if request.method != "network":
-            self._ask_optimiser(pool, progress)
-        return pool.best()
+            self._ask_optimiser(pool, request.seed, progress)
+        shortage = pool.shortage(one_source=request.method != "auto")
+        if not len(pool):
+            raise OptionError(str(shortage))
+        grasps, chosen = pool.best()
+        return Prediction(
+            with_own_files(grasps, problem.hand, problem.obj), complete(problem, chosen.grasps), chosen.points, pool.made,
+            dict(pool.dropped), watch.seconds, shortage)
 
-    def _ask_network(self, pool: _Pool, progress: Progress | None) -> None:
+    def _ask_network(self, pool: CandidatePool, request: GraspRequest, progress: Progress | None) -> None:
         """Propose until the pool has the candidates that were asked for."""
-        request = pool.request
         wanted, generator = request.num * request.candidates, torch.Generator().manual_seed(request.seed)
         config = self.config if request.temperature is None else replace(self.config, temperature=request.temperature)
         count = wanted
@@ -220,85 +222,19 @@ class GraspPredictor:
             count = min(wanted, math.ceil(config.reserve * lacking))
         pool.settle()
 
-    def _ask_optimiser(self, pool: _Pool, progress: Progress | None) -> None:
+    def _ask_optimiser(self, pool: CandidatePool, seed: int, progress: Progress | None) -> None:
         """Rivals for each grasp that the score does not trust, again and again for those that it still does not."""
-        problem, request = pool.problem, pool.request
+        problem = pool.problem
         free = problem.surroundings is None
         each = OPTIMISED_PER_GRASP if free else OPTIMISED_IN_SURROUNDINGS
         hand = problem.thinned(self.network.config.n_hand).to("cpu")
         levels = TRUSTED_SCORES if free else TRUSTED_IN_SURROUNDINGS
         # Drawn, not counted up from the request's seed: neighbouring seeds must not share rounds.
-        seeds = np.random.default_rng(request.seed).integers(2**63, size=len(levels)).tolist()
-        for seed, least_score in zip(seeds, levels, strict=True):
+        seeds = np.random.default_rng(seed).integers(2**63, size=len(levels)).tolist()
+        for one, least_score in zip(seeds, levels, strict=True):
             if not (count := each * pool.lacking(least_score)):
                 break
             with pool.watch("optimise"):
-                grasps, turned = optimise(problem, count, seed, progress)
+                grasps, turned = optimise(problem, count, one, progress)
             pool.add(Proposal(grasps, hand.points(grasps.joints, grasps.T_object_wrist)), turned=turned)
             pool.settle()
-
-
-class _Pool:
-    """Candidates of all sources, refined, scored and as the constraints want them, beside what was proposed."""
-
-    def __init__(self, problem: GraspProblem, request: GraspRequest, watch: Stopwatch) -> None:
-        self.problem, self.request, self.watch = problem, request, watch
-        self.made = 0
-        """Candidates made, those that constraints rejected included."""
-        self.dropped: Counter[str] = Counter()
-        """Those that constraints rejected, by reason."""
-        self.proposals: list[Proposal] = []
-        self.grasps: list[GraspBatch] = []
-        self.settled = 0
-        """The first so many parts of the two lists are settled."""
-
-    def __len__(self) -> int:
-        return sum(map(len, self.grasps))
-
-    def add(self, proposal: Proposal, most: int | None = None, turned: int = 0) -> None:
-        """Take in candidates, until there are `most`; `turned` others turned away from the direction as they were made."""
-        problem, request = self.problem, self.request
-        self.made += len(proposal.grasps) + turned
-        self.dropped[TURNED] += turned
-        with self.watch("refine"):
-            grasps = refine(problem, proposal.grasps) if request.refine else complete(problem, proposal.grasps)
-        allowed = permitted(problem, grasps)
-        self.dropped += reasons_against(problem, grasps[~allowed])
-        kept = allowed.nonzero()[:, 0][: None if most is None else most - len(self)]
-        with self.watch("rank"):
-            self.grasps.append(scored(problem, grasps[kept]))
-        self.proposals.append(proposal[kept])
-
-    def settle(self) -> None:
-        """Settle the better half of what is not, and leave out the rest; without the hand's description, everything stays."""
-        fresh = slice(self.settled, None)
-        if self.request.refine and can_settle(self.problem) and self.grasps[fresh]:
-            with self.watch("settle"):
-                best, grasps = best_settled(self.problem, GraspBatch.concatenate(self.grasps[fresh]), self.request.num)
-            self.grasps[fresh], self.proposals[fresh] = [grasps], [Proposal.concatenate(self.proposals[fresh])[best]]
-        self.settled = len(self.grasps)
-
-    def lacking(self, least_score: float) -> int:
-        """How many of the grasps that were asked for are missing, or score no better than `least_score`."""
-        scores = torch.cat([torch.zeros(0), *(g.score for g in self.grasps)])
-        return max(0, self.request.num - int((scores > least_score).sum()))
-
-    def best(self) -> Prediction:
-        """The best grasps by score.
-
-        Raises:
-            OptionError: There is none.
-        """
-        shortage = None
-        if len(self) < self.request.num:
-            alone = self.request.method != "auto"
-            shortage = shortage_in_words(self.problem, self.request.num, len(self), self.made, self.dropped, alone)
-        if not len(self):
-            raise OptionError(str(shortage))
-        grasps = GraspBatch.concatenate(self.grasps)
-        best = (-grasps.score).argsort(stable=True)[: self.request.num]
-        chosen = Proposal.concatenate(self.proposals)[best]
-        proposed = complete(self.problem, chosen.grasps)
-        given = eased(self.problem, grasps[best]) if self.request.refine else grasps[best]
-        grasps = with_own_files(given, self.problem.hand, self.problem.obj)
-        return Prediction(grasps, proposed, chosen.points, self.made, dict(self.dropped), self.watch.seconds, shortage)
