@@ -11,14 +11,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from dro_grasp.cli.main import main
 from dro_grasp.datasets.collections.collection import count_collection, read_collection
 from dro_grasp.datasets.collections.merging import ANGLE_STEP, POSITION_STEP, Merged, compact, file_name, merge, spread
 from dro_grasp.datasets.engine.shards import Shard, Yield, notes_of
 from dro_grasp.errors import GraspFileError, OptionError
+from dro_grasp.frames import NamedMotion
+from dro_grasp.geometry import se3
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.sources import object_of, object_source, with_sources
 from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.catalogue import load_object
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.tiny_bundle import made_up_grasps
 
@@ -133,6 +138,37 @@ def test_compact_numbers_mean_the_same_and_keep_the_limits(hand):
     moved = (hand.points(small.joints, small.T_object_wrist) - hand.points(grasps.joints, grasps.T_object_wrist)).norm(dim=-1)
     assert moved.max() < 1e-4  # [m]
     assert len(small.to_bytes()) < 0.85 * len(grasps.to_bytes())
+
+
+def test_compact_postures_keep_targets_beyond_the_limits_and_unknown_rows(hand):
+    grasps, upper = tried(hand, "sphere", 200, seed=3), hand.tree.upper
+    squeeze = torch.where(torch.rand(200, hand.tree.n_dof) < 0.3, upper, grasps.joints)
+    squeeze[0], squeeze[1] = torch.nan, upper + 0.3
+    pregrasp = grasps.joints + 1e-3
+    small = compact(hand, grasps.replace(squeeze_joints=squeeze, pregrasp_joints=pregrasp))
+    for given, kept in ((squeeze, small.squeeze_joints), (pregrasp, small.pregrasp_joints)):
+        torch.testing.assert_close(kept, given, atol=ANGLE_STEP / 2, rtol=0, equal_nan=True)
+        on_grid = (kept / ANGLE_STEP).frac() == 0
+        assert float(on_grid[2:].float().mean()) > 0.6  # all but those at a limit
+        assert not (kept[2:] > upper).any()
+    assert len(small.to_bytes()) < 0.85 * len(grasps.replace(squeeze_joints=squeeze, pregrasp_joints=pregrasp).to_bytes())
+
+
+def test_merged_grasps_find_their_own_object_again(hand, tmp_path):
+    """A mesh in millimetres, whose scale has no short binary form."""
+    trimesh.creation.icosphere(radius=30.0).export(tmp_path / "ball.stl")
+    obj = load_object(tmp_path / "ball.stl", scale=0.001)
+    grasps = tried(hand, "ball", 4, seed=0).replace(object_sha256=(obj.sha256,) * 4, robustness=torch.full((4,), 0.6))
+    camera = NamedMotion("camera", se3.compose(torch.eye(3), torch.tensor([0.1, -0.3, 0.7])))
+    grasps = with_sources(grasps, "gripper3", str(tmp_path / "ball.stl"), 0.001, camera)
+    grasps.save(tmp_path / "g.parquet")
+    (merged,) = merge([tmp_path / "g.parquet"])
+    back = grasps_in(merged)
+    assert object_source(back) == (str(tmp_path / "ball.stl"), 0.001)
+    assert torch.equal(back.extra["T_frame_camera"], grasps.extra["T_frame_camera"])
+    assert torch.equal(back.robustness, grasps.robustness)
+    extra = {name: column for name, column in back.extra.items() if name not in {"frame", "T_frame_camera"}}
+    assert object_of(back.replace(extra=extra), None, 1.0).sha256 == obj.sha256
 
 
 def test_the_choice_covers_the_sphere_better_than_chance(hand):

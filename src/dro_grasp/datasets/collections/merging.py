@@ -22,7 +22,7 @@ from dro_grasp.geometry.rotations import roma
 from dro_grasp.geometry.se3 import compose
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.codec import encode
-from dro_grasp.grasps.columns import FAILURE, REASON
+from dro_grasp.grasps.columns import CAMERA, FAILURE, OBJECT_SCALE, POSTURES, REASON
 from dro_grasp.grasps.duplicates import distinct
 from dro_grasp.grasps.sources import hand_of
 from dro_grasp.grasps.table import table_bytes
@@ -31,15 +31,17 @@ from dro_grasp.hands.hand import Hand
 POSITION_STEP = 2.0**-16
 """Grid of positions in merged files [m]. Ours: 0.015 mm."""
 ANGLE_STEP = 2.0**-13
-"""Grid of joints in merged files [rad or m]. Ours: 0.12 mrad."""
+"""Grid of joints, pregrasps and squeezes in merged files [rad or m]. Ours: 0.12 mrad."""
 UNIT_STEP = 2.0**-15
 """Grid of quaternions in merged files. Ours: 0.03 mrad."""
 MANTISSA = 10
-"""Bits of the mantissa of scores, energies, what trials measure, and further columns. Ours: three digits."""
+"""Bits of the mantissa of scores, energies, distances and angles of trials, and further columns. Ours: three digits."""
 FILE_BYTES = 100_000_000
 """Size of a merged file from which on the next object goes into another [bytes] (ours)."""
 PLAIN_COLUMNS = (REASON, FAILURE)
 """Columns that are empty for successes."""
+EXACT = (OBJECT_SCALE, CAMERA)
+"""Further columns without which the object is not found again."""
 
 
 @dataclass(frozen=True)
@@ -203,19 +205,23 @@ def spread(hand: Hand, grasps: GraspBatch, count: int) -> Int[Tensor, " k"]:
 
 
 def compact(hand: Hand, grasps: GraspBatch) -> GraspBatch:
-    """The grasps with rounded numbers, so that files compress; joints stay within their limits."""
+    """The grasps with rounded numbers, so that files compress; joints stay within their limits, counts and shares exact."""
     quaternion = _on_grid(roma.rotmat_to_unitquat(grasps.T_object_wrist[:, :3, :3]), UNIT_STEP)
     rotation = roma.unitquat_to_rotmat(quaternion / quaternion.norm(dim=-1, keepdim=True))
     T = compose(rotation, _on_grid(grasps.T_object_wrist[:, :3, 3], POSITION_STEP))
-    joints = _on_grid(grasps.joints, ANGLE_STEP)
-    joints = joints.clamp(hand.tree.lower, hand.tree.upper)
+    lower, upper = hand.tree.lower, hand.tree.upper
+    joints = _on_grid(grasps.joints, ANGLE_STEP).clamp(lower, upper)
+    postures = {}
+    for name in POSTURES:  # targets may lie beyond the limits
+        given = getattr(grasps, name)
+        postures[name] = _on_grid(given, ANGLE_STEP).clamp(torch.minimum(given, lower), torch.maximum(given, upper))
     extra = {
-        name: _short(value) if isinstance(value, Tensor) and value.is_floating_point() else value
+        name: _short(value) if isinstance(value, Tensor) and value.is_floating_point() and name not in EXACT else value
         for name, value in grasps.extra.items() if name not in PLAIN_COLUMNS
     }
     numbers = {name: getattr(grasps, name) for name in ("score", "energy", "displacement", "rotation", "penetration")}
     short = {name: _short(value) for name, value in numbers.items()}
-    return grasps.replace(T_object_wrist=T, joints=joints, extra=extra, **short)
+    return grasps.replace(T_object_wrist=T, joints=joints, extra=extra, **postures, **short)
 
 
 def _on_grid(values: Float[Tensor, "*n"], step: float) -> Float[Tensor, "*n"]:
