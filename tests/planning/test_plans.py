@@ -19,7 +19,7 @@ import yaml
 
 import dro_grasp as dro
 from dro_grasp.cli.main import main
-from dro_grasp.errors import OptionError, PlanError
+from dro_grasp.errors import OptionError, PlanError, RobotError
 from dro_grasp.planning import extra, planner
 from dro_grasp.planning.collisions import CollisionChecker
 from dro_grasp.planning.inverse_kinematics import WristSolver
@@ -325,6 +325,21 @@ def test_a_pose_that_is_none_is_refused_and_not_taken_for_the_table_s_fault(robo
     for T, fault in ((lost, "its matrix holds NaN or infinity"), (mirrored, "not a rotation"), (far, "divide millimetres")):
         with pytest.raises(OptionError, match=f"T_world_object is no pose of 'can'.*{fault}"):
             plan(robot, dro.load_object("can"), T)
+
+
+def test_what_touches_the_robot_at_home_is_named(
+    robot: dro.Robot, wall: dro.ObjectModel, standing: tuple[dro.ObjectModel, np.ndarray]
+) -> None:
+    can, T = standing
+    elbow = trimesh.creation.box((0.2, 0.2, 0.2), trimesh.transformations.translation_matrix((0.0, 0.0, 0.3)))
+    seen = dro.load_scene(trimesh.sample.sample_surface(elbow, 2000, seed=0)[0])
+    config = PlanConfig(constraints=dro.Constraints(avoid=replace(seen, name="cell")))
+    with pytest.raises(PlanError, match=r"obstacle 'cell' collides with arm/link\d .* by .* mm; cut the robot out of"):
+        plan(robot, can, T, [wall], config=config)
+    assert robot.table is not None
+    raised = replace(robot, table=replace(robot.table, height=robot.T_world_wrist(robot.home)[2, 3]))
+    with pytest.raises(RobotError, match=r"(arm|hand)/\w+ and table, by .* mm; correct `table` in the robot file"):
+        plan(raised, can, trimesh.transformations.translation_matrix((0.5, 0.1, 0.6)), [wall])
 
 
 @pytest.mark.parametrize(("options", "said"), BAD.values(), ids=BAD)

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.errors import OptionError, PlanError, RobotError
+from dro_grasp.errors import OptionError, PlanError
 from dro_grasp.frames import motion_fault
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.scenery import load_scene
@@ -20,7 +20,8 @@ from dro_grasp.pipeline.admission import BESIDE, NARROW, SPARED, TURNED, faults
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.planning.candidates import Directions, grasps_in_world
-from dro_grasp.planning.collisions import OBSTACLE, TARGET, CollisionChecker, open_hand
+from dro_grasp.planning.clear_start import refuse_contacts_at_home
+from dro_grasp.planning.collisions import OBSTACLE, CollisionChecker, open_hand
 from dro_grasp.planning.extra import require_arm_extra
 from dro_grasp.planning.few_joints import has_few_joints, reachable_directions
 from dro_grasp.planning.motion import CHOSEN, READY, WAITING, MotionPlan, PlanNotes, PlanScene, grasps_and_dropped
@@ -61,9 +62,9 @@ def plan(
         grasps: Complete grasps with scores, in the world's frame, instead of predicted ones.
 
     Raises:
-        PlanError: The object collides with the robot, lies below the table, or no grasp can be carried out; the message
-            counts what was dropped where.
-        RobotError: The robot collides at home.
+        PlanError: The object or an obstacle collides with the robot at home, the object lies below the table, or no grasp can
+            be carried out; the message counts what was dropped where.
+        RobotError: The robot collides with the table at home.
         OptionError: The extra `[arm]` is not installed, the pose is no rigid motion, or the constraints leave nothing of the
             object.
     """
@@ -133,13 +134,7 @@ class _Task:
         if self._distance() > self.robot.longest_reach:
             raise PlanError(f"object '{self.obj.name}' stands {self._distance():.2f} m from the base, farther than the arm and "
                             f"hand are long ({self.robot.longest_reach:.2f} m); give its place in the robot's world frame [m]")
-        for contact in self.checker.contacts(self.robot.home, self.opened):
-            if TARGET in (contact.first, contact.second):
-                other = contact.first if contact.second == TARGET else contact.second
-                raise PlanError(f"object '{self.obj.name}' collides with {other} while the robot is at home; give its place in "
-                                "the robot's world frame, or another home")
-            raise RobotError(f"robot '{self.robot.name}' collides at home: {contact.first} and {contact.second}, by "
-                             f"{-1e3 * contact.distance:.1f} mm; `dro-grasp robot check` shows it")
+        refuse_contacts_at_home(self.checker, self.obj, self.obstacles)
 
     def wanted(self) -> Constraints:
         """What grasps have to respect, in the world's frame: constraints, table and obstacles."""
