@@ -88,6 +88,23 @@ def test_a_camera_sees_the_object_where_it_is_and_nothing_of_the_table(scene: Li
     assert float(distance.quantile(0.95)) < 0.005
 
 
+def test_a_camera_that_looks_at_the_robot_sees_table_and_object_alone(scene: LiftScene, robot: dro.Robot) -> None:
+    assert robot.camera is not None
+    T, ahead = np.eye(4), np.array([0.1, 0.0, 0.2]) - (1.3, 0.0, 0.7)
+    T[:3, 2], T[:3, 0], T[:3, 3] = ahead / np.linalg.norm(ahead), (0, 1, 0), (1.3, 0.0, 0.7)
+    T[:3, 1] = np.cross(T[:3, 2], T[:3, 0])
+    depth, mask = depth_image(scene, replace(robot.camera, T_world_camera=T), 0.0, 0)
+    points = depth_points(depth, thinned_intrinsics(robot.camera)) @ T[:3, :3].T + T[:3, 3]
+    in_object = (points - scene.pose(0)[:3, 3]) @ scene.pose(0)[:3, :3]
+    on = scene.objects[0].distance_field.distances(torch.from_numpy(in_object).float())[0].abs().numpy() < 2e-3
+    assert (on | (np.abs(points[:, 2]) < 1e-3)).all()
+    assert (on[mask[depth > 0]]).all()
+    assert mask.sum() > 100
+    covered = np.linalg.inv(T) @ robot.T_world_wrist(robot.home)[:, 3]
+    column, row = ((thinned_intrinsics(robot.camera) @ covered[:3])[:2] / covered[2]).round().astype(int)
+    assert depth[row, column] == 0, "the hand is in view"
+
+
 def test_a_plane_is_found_under_noise_and_clutter_and_a_wall_is_none() -> None:
     random = np.random.default_rng(0)
     flat = np.column_stack([random.uniform(-1, 1, (800, 2)), random.normal(0.1, 0.001, 800)])

@@ -6,8 +6,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dro_grasp.planning.physics import SHAPE_GROUP, LiftScene
+from dro_grasp.planning.physics import SHAPE_GROUP, LiftScene, object_name
 from dro_grasp.planning.robot_file import CameraMount
+from dro_grasp.planning.workcell import ARM
 from dro_grasp.simulation.hand_part import PREFIX
 
 STRIDE = 2
@@ -46,8 +47,8 @@ def depth_image(
     mujoco.mj_multiRay(
         scene.model, scene.data, eye, world.ravel().copy(), groups, True, -1, geom, distance, None, len(rays), FARTHEST)
     owner = [scene.model.body(int(b)).name for b in scene.model.geom_bodyid]
-    robot = np.array([name.startswith(("arm/", PREFIX)) for name in owner])
+    robot = np.array([name.startswith((ARM, PREFIX)) for name in owner])
     seen = (geom >= 0) & (distance > 0) & ~robot[np.maximum(geom, 0)]
-    first = np.array([name == "object0-" for name in owner])[np.maximum(geom, 0)] & seen
+    first = np.array([name == object_name(0) for name in owner])[np.maximum(geom, 0)] & seen
     drawn = np.random.default_rng(seed).normal(0.0, noise, len(rays))
     return np.where(seen, distance / length + drawn, 0.0).reshape(row.shape), first.reshape(row.shape)

@@ -53,6 +53,11 @@ HULL_BIT = 4
 """Bit of contacts of its convex hull with the table (ours)."""
 
 
+def object_name(index: int) -> str:
+    """Name of the body and of the free joint of one of the objects in a scene."""
+    return f"object{index}-"
+
+
 class LiftScene:
     """Robot, table and objects, and the state that they are in."""
 
@@ -75,7 +80,7 @@ class LiftScene:
             self.model = scene.compile()
         self.data = mujoco.MjData(self.model)
         self._arm, (self._hand, moving) = arm_addresses(self.model, robot), joint_addresses(self.model, robot.hand)
-        self._objects = [int(self.model.jnt_qposadr[self.model.joint(f"object{i}-").id]) for i in range(len(objects))]
+        self._objects = [int(self.model.jnt_qposadr[self.model.joint(object_name(i)).id]) for i in range(len(objects))]
         names = [self.model.actuator(i).name for i in range(self.model.nu)]
         self._arm_servos = np.array([names.index(ARM + n) for n in robot.arm_joints])
         self._hand_servos, self._driven = servo_joints(self.model, robot.hand)
@@ -95,7 +100,7 @@ class LiftScene:
         """Put an object somewhere, at rest."""
         start, R = self._objects[index], T_world_object[:3, :3]
         self.data.qpos[start:start + 7] = [*(T_world_object[:3, 3] + R @ self._centres[index]), *wxyz(R)]
-        velocity = int(self.model.jnt_dofadr[self.model.joint(f"object{index}-").id])
+        velocity = int(self.model.jnt_dofadr[self.model.joint(object_name(index)).id])
         self.data.qvel[velocity:velocity + 6] = 0.0
         mujoco.mj_forward(self.model, self.data)
 
@@ -110,7 +115,7 @@ class LiftScene:
 
     def speed(self, index: int) -> float:
         """How fast an object moves, its rotation counted at 5 cm from its centre [m/s]."""
-        start = int(self.model.jnt_dofadr[self.model.joint(f"object{index}-").id])
+        start = int(self.model.jnt_dofadr[self.model.joint(object_name(index)).id])
         linear, angular = self.data.qvel[start:start + 3], self.data.qvel[start + 3:start + 6]
         return float(np.linalg.norm(linear) + 0.05 * np.linalg.norm(angular))
 
@@ -150,7 +155,7 @@ class LiftScene:
 
     def touched(self, index: int) -> int:
         """How many links of the hand touch an object."""
-        body = self.model.body(f"object{index}-").id
+        body = self.model.body(object_name(index)).id
         links = set()
         for a, b in self.model.geom_bodyid[self.data.contact.geom].reshape(-1, 2).tolist():
             if body in (a, b):
@@ -169,7 +174,7 @@ def _add_thing(scene: mujoco.MjSpec, obj: ObjectModel, index: int) -> Float[np.n
         return _add_estimate(scene, obj, index)
     assert obj.vertices is not None
     assert obj.faces is not None
-    body = add_object(scene, obj, LIFT_PROTOCOL, f"object{index}-")
+    body = add_object(scene, obj, LIFT_PROTOCOL, object_name(index))
     for geom in body.geoms:
         geom.group = PART_GROUP
     shape = scene.add_mesh(
@@ -183,7 +188,7 @@ def _add_thing(scene: mujoco.MjSpec, obj: ObjectModel, index: int) -> Float[np.n
 def _add_estimate(scene: mujoco.MjSpec, obj: ObjectModel, index: int) -> Float[np.ndarray, "3"]:
     """A bare cloud: the hand touches its balls; its hull stands on the table with a flat foot, so that the object stays put."""
     solid, board = solid_of(obj), scene.geom(TABLE)
-    body = add_object(scene, solid, LIFT_PROTOCOL, f"object{index}-")
+    body = add_object(scene, solid, LIFT_PROTOCOL, object_name(index))
     for ball in body.geoms:
         ball.contype = ball.conaffinity = BALL_BIT
     cloud, height = obj.cloud.astype(float), float(board.pos[2] + board.size[2])
