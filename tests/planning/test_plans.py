@@ -30,7 +30,7 @@ from dro_grasp.planning.planner import plan
 from dro_grasp.planning.reachability import Feasible, Postures
 from dro_grasp.planning.robot_file import BUILTIN_ROBOTS
 from dro_grasp.planning.timed_stages import closing, timed_stages
-from dro_grasp.planning.timing import USED, Trajectory, cornered, smooth
+from dro_grasp.planning.timing import STEP, USED, Trajectory, cornered, smooth, standing as standing_still
 from dro_grasp.planning.workcell import arm_addresses, robot_spec
 from dro_grasp.simulation.hand_part import joint_addresses
 from dro_grasp.simulation.protocols import PROTOCOLS
@@ -269,6 +269,12 @@ def test_corners_are_stops_and_nothing_leaves_the_lines() -> None:
     assert slow.seconds == pytest.approx(20.0, abs=0.05)
     assert np.abs(slow.position[np.abs(slow.time - 10.0).argmin()] - corners[1]).max() < 1e-3
     assert cornered(corners[[0, 0]], np.ones(2), np.ones(2), 0.5).seconds == pytest.approx(0.5)
+
+
+def test_samples_are_at_most_a_step_apart(planned: MotionPlan) -> None:
+    assert np.diff(planned.arm.time).max() < STEP + 1e-9
+    for seconds, count in ((0.0149, 3), (0.5, 51), (0.0, 1)):
+        assert len(standing_still(np.zeros(2), seconds).time) == count
 
 
 def test_a_closing_hand_stays_between_its_postures() -> None:

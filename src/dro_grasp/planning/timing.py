@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from toppra.interpolator import AbstractGeometricPath
 
 STEP = 0.01
-"""Time between samples of a trajectory [s] (ours)."""
+"""Longest time between samples of a trajectory [s] (ours); each of its parts has samples at equal distances."""
 USED = 0.95
 """Share of each limit that is used: they hold at points of a grid, and a motion that exceeds one between is slowed (ours)."""
 SAME = 1e-6
@@ -103,7 +103,7 @@ def cornered(
 
 def standing(q: Float[np.ndarray, " n"], seconds: float) -> Trajectory:
     """No motion for a while."""
-    time = np.linspace(0, seconds, max(2, round(seconds / STEP) + 1)) if seconds > 0 else np.zeros(1)
+    time = np.linspace(0, seconds, max(2, int(np.ceil(seconds / STEP - 1e-9)) + 1)) if seconds > 0 else np.zeros(1)
     still = np.zeros((len(time), len(q)))
     return Trajectory(time, np.tile(q, (len(time), 1)), still, still.copy())
 
