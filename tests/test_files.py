@@ -89,6 +89,13 @@ def test_a_file_that_is_replaced_has_the_permissions_of_a_new_one_and_a_failure_
     assert [(f.name, f.read_text()) for f in tmp_path.iterdir()] == [("new.txt", "new")]
 
 
+def test_a_file_in_the_home_folder_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    with replacing("~/new.txt") as temporary:
+        temporary.write_text("new")
+    assert (tmp_path / "new.txt").read_text() == "new"
+
+
 def test_our_own_errors_and_ctrl_c_pass() -> None:
     for error in (OptionError("mine"), KeyboardInterrupt()):
         with pytest.raises(type(error)), reading("f", GraspFileError, "a file"):

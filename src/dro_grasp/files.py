@@ -119,13 +119,14 @@ def make_folder(path: Path | str) -> Path:
 
 
 @contextmanager
-def replacing(path: Path, what: str = "") -> Iterator[Path]:
+def replacing(path: Path | str, what: str = "") -> Iterator[Path]:
     """A temporary path that replaces `path` when the block ends; a failure leaves `path` as it was, its error names `what`.
 
     Raises:
+        OptionError: The path is none.
         OutputError: The file cannot be written.
     """
-    temporary: Path | None = None
+    path, temporary = given_path(path), None
     try:
         unused = path.absolute().parent / f".{path.name}{secrets.token_hex(4)}.part"
         handle = os.open(unused, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)  # less what the user's umask takes

@@ -40,7 +40,7 @@ def draw_hands(hands: Sequence[Hand], captions: Sequence[str], path: Path | str,
         raise OutputError(f"no hand to draw into {path}; give at least one")
     sheet = contact_sheet([draw_hand(hand) for hand in hands], [(caption, None) for caption in captions], title, columns,
                           outcomes=False)
-    with replacing(Path(path), "picture") as temporary:
+    with replacing(path, "picture") as temporary:
         sheet.save(temporary, format="PNG")
 
 

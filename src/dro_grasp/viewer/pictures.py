@@ -128,7 +128,7 @@ def _save(
     if not tiles:
         raise OutputError(f"no grasp to draw into {path}; ask for at least one")
     sheet = contact_sheet(tiles, captions, title, columns)
-    with replacing(Path(path), "picture") as temporary:
+    with replacing(path, "picture") as temporary:
         sheet.save(temporary, format="PNG")
 
 

@@ -163,7 +163,7 @@ def write_bundle(
     if size > MAX_BYTES:
         raise BundleError(f"the bundle would have {size / 1e6:.1f} MB, at most {MAX_BYTES / 1e6:.0f} MB are allowed; take "
                           "fewer objects or fewer grasps a pair (--per-pair)")
-    with replacing(given_path(path)) as temporary:
+    with replacing(path) as temporary:
         save_file(tensors, temporary, metadata={HEADER: json.dumps(header)})
     return load_bundle(path)
 
