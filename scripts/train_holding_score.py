@@ -51,7 +51,7 @@ def collect(network: DistanceNetwork, name: str, objects: int, num: int, seed: i
         problem = GraspProblem(hand, obj)
         generator = torch.Generator().manual_seed(rng.randrange(10**6))
         found = {"network": propose(problem, network, num, generator).grasps,
-                 "optimiser": optimise(problem, num, rng.randrange(10**6))}
+                 "optimiser": optimise(problem, num, rng.randrange(10**6)).grasps}
         for maker, grasps in found.items():
             grasps = scored(problem, refine(problem, grasps))
             better = grasps[grasps.score.topk(max(1, len(grasps) // 2)).indices]

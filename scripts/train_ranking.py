@@ -117,7 +117,7 @@ def collect(
         # Proposed without ranking: the network in use must neither choose its successor's data nor know its features.
         proposal = propose(problem, network, num, torch.Generator().manual_seed(rng.randrange(10**6)), config=config)
         raw, refined = complete(problem, proposal.grasps), refine(problem, proposal.grasps)
-        best = refine(problem, optimise(problem, num, rng.randrange(10**6)))
+        best = refine(problem, optimise(problem, num, rng.randrange(10**6)).grasps)
         # Closing is simulated with the whole object, as `generate` does; on a bare cloud it is left out.
         whole = GraspProblem(hand, obj)
         closed = {kind: settled(whole, grasps) for kind, grasps in (("settled", refined), ("optimised, settled", best))}
