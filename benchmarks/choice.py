@@ -23,13 +23,13 @@ from dro_grasp.predictor import GraspPredictor
 from dro_grasp.simulation.trial import simulate
 
 OBJECTS = ["jar", "rod", "toy_airplane", "wrench", "vase", "joystick", "brick", "egg"]
-"""Built-in training objects, by which the penalties were chosen."""
+"""Built-in training objects, on which the penalties were chosen."""
 PROTOCOLS = ("dro", "strict")
 """Trials of every grasp."""
 ALL = "all"
 """The row over all hands."""
 BLIND = dataclasses.replace(ChoicePenalties(), imbalance=0.0)
-"""Penalties of before, which do not ask whether the fingers' pushes cancel."""
+"""Today's other penalties, which do not ask whether the fingers' pushes cancel."""
 ROWS = {
     "first draw": ChoiceConfig.first(),
     "1 x 32, without imbalance": ChoiceConfig(1, 32, BLIND),
