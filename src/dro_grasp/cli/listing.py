@@ -44,7 +44,7 @@ class Objects:
 
         names = object_names()
         print_result(self.json, {"objects": names}, "objects", ["name", "split"], [*names.items()],
-                     "also: the path of a mesh or point cloud")
+                     "also: the path of a mesh or point cloud, or procedural_SEED for an object that a seed draws")
         return 0
 
 

@@ -162,10 +162,15 @@ BUILTIN: dict[str, BuiltinObject] = {name: BuiltinObject(make, split) for name, 
 
 
 def make_builtin(name: str, *, scale: float = 1.0) -> ObjectModel:
-    """Build one of the built-in objects: the union of its pieces, and its exact convex parts."""
+    """Build one of the built-in objects."""
     kind = BUILTIN[name]
-    pieces = [piece if isinstance(piece, Solid) else Solid(piece, [piece]) for piece in kind.make()]
-    meshes = [piece.mesh for piece in pieces]
+    return assemble(name, kind.make(), scale=scale, split=kind.split)
+
+
+def assemble(name: str, pieces: Pieces, *, scale: float, split: str) -> ObjectModel:
+    """An object that is the union of its pieces, with their exact convex parts."""
+    solids = [piece if isinstance(piece, Solid) else Solid(piece, [piece]) for piece in pieces]
+    meshes = [solid.mesh for solid in solids]
     mesh = meshes[0] if len(meshes) == 1 else trimesh.boolean.union(meshes, engine="manifold")
-    parts = tuple((np.asarray(part.vertices), np.asarray(part.faces)) for piece in pieces for part in piece.parts)
-    return mesh_object(name, mesh, origin=name, scale=scale, split=kind.split, parts=parts)
+    parts = tuple((np.asarray(part.vertices), np.asarray(part.faces)) for solid in solids for part in solid.parts)
+    return mesh_object(name, mesh, origin=name, scale=scale, split=split, parts=parts)

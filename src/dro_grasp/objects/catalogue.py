@@ -21,12 +21,17 @@ from dro_grasp.objects.convex_parts import Part
 from dro_grasp.objects.in_memory import ObjectSource, object_in_memory
 from dro_grasp.objects.loading import check_scale, load_file, mesh_object, read_geometry
 from dro_grasp.objects.mesh_process import load_processed, processed_folder
+from dro_grasp.objects.procedural import NAME as PROCEDURAL, procedural_object
 from dro_grasp.objects.shape import ObjectModel
 
 ASSET_PREFIX = "assets/"
 """Prefix of a name that forces the asset."""
 GROUP = re.compile(r"(builtin|assets):(\w+)")
 """A group of objects: their source and split."""
+SEEDS = re.compile(r"procedural:(\d{1,9})-(\d{1,9})")
+"""A group of objects that do not exist: their first and last seed."""
+MOST_SEEDS = 100_000
+"""Largest such group (ours)."""
 MESH_SUFFIXES = {".obj", ".stl", ".ply", ".glb", ".gltf", ".off", ".dae", ".npy", ".pcd", ".3mf"}
 """Suffixes of the files in a folder that count as objects."""
 
@@ -37,9 +42,9 @@ def load_object(
     """Load an object by name, from a mesh or point cloud file, or from a mesh or points in memory.
 
     Args:
-        source: A built-in name, an asset's name (`contactdb+apple`), or a path; `assets/NAME` forces the asset. A folder of
-            DexGraspBench is one object, with its convex parts. In memory: a trimesh mesh, cloud or scene, a pair (vertices,
-            faces), or points (n 3), with normals (n 6).
+        source: A built-in name, an asset's name (`contactdb+apple`), `procedural_17` for the object that seed 17 draws, or a
+            path; `assets/NAME` forces the asset. A folder of DexGraspBench is one object, with its convex parts. In memory: a
+            trimesh mesh, cloud or scene, a pair (vertices, faces), or points (n 3), with normals (n 6).
         scale: Multiplies all coordinates; 0.001 for millimetres.
         name: What to call the object, instead of its own name.
         keep_table: Take every point of a bare cloud for the object's. By default a table in it is found and cut off, said in a
@@ -58,6 +63,8 @@ def _load(name: str | Path, scale: float, keep_table: bool) -> ObjectModel:
     text = str(name)
     if text in BUILTIN:
         return make_builtin(text, scale=scale)
+    if (seed := PROCEDURAL.fullmatch(text)) is not None:
+        return procedural_object(int(seed[1]), scale=scale)
     entry = _assets().get(text.removeprefix(ASSET_PREFIX))
     if entry is not None:
         return _load_asset(entry, scale)
@@ -74,7 +81,7 @@ def _load(name: str | Path, scale: float, keep_table: bool) -> ObjectModel:
 def locate_object(name: str) -> tuple[Path, str]:
     """The file or folder of an object, or its bare name where it has none of its own; and what `load_object` calls it."""
     path, bare = given_path(name), name.removeprefix(ASSET_PREFIX)
-    if name in BUILTIN:
+    if name in BUILTIN or PROCEDURAL.fullmatch(name):
         return path, name
     entry = _assets().get(bare)
     if entry is not None:
@@ -90,7 +97,10 @@ def object_names() -> dict[str, str]:
 
 
 def resolve_objects(names: list[str]) -> list[str]:
-    """Names with folders replaced by the object files in them, and groups such as `assets:train` by their members.
+    """Names with folders replaced by the object files in them, and groups by their members.
+
+    Args:
+        names: Names, paths, and groups such as `assets:train` and `procedural:0-99`.
 
     Raises:
         ObjectError: A folder or a group holds no object.
@@ -99,6 +109,9 @@ def resolve_objects(names: list[str]) -> list[str]:
     for name in names:
         if (group := GROUP.fullmatch(name)) is not None:
             found.extend(_members(group[1], group[2]))
+            continue
+        if (seeds := SEEDS.fullmatch(name)) is not None:
+            found.extend(_procedural(int(seeds[1]), int(seeds[2])))
             continue
         folder = given_path(name)
         if name in BUILTIN or not folder.is_dir() or processed_folder(folder) is not None:
@@ -119,6 +132,15 @@ def _members(source: str, split: str) -> list[str]:
         where = "" if source == "builtin" or _assets() else "; set DRO_GRASP_ASSETS to the assets folder"
         raise ObjectError(f"no object is in '{source}:{split}'{where} (`dro-grasp objects` lists all with their split)")
     return members
+
+
+def _procedural(first: int, last: int) -> list[str]:
+    """Names of the objects of a range of seeds, both ends included."""
+    if last < first:
+        raise ObjectError(f"no object is in 'procedural:{first}-{last}'; give the smaller seed first")
+    if last - first >= MOST_SEEDS:
+        raise ObjectError(f"'procedural:{first}-{last}' stands for {last - first + 1:,} objects; give at most {MOST_SEEDS:,}")
+    return [f"procedural_{seed}" for seed in range(first, last + 1)]
 
 
 def _assets() -> dict[str, dict[str, Any]]:

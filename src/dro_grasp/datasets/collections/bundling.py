@@ -18,6 +18,9 @@ from dro_grasp.grasps.sources import hand_of, object_of, pair_keys, require_same
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 
+CLOUD_POINTS = 4096
+"""Points of an object in a bundle (ours), of the 16,384 that it has in memory: a sample has 128 to 512 of them."""
+
 
 def make_bundle(
     inputs: Sequence[Path], output: Path, split: str = "train", hands: Sequence[str] = (), per_pair: int | None = None,
@@ -99,5 +102,6 @@ def sources(batches: list[GraspBatch]) -> tuple[list[Hand], dict[str, ObjectClou
         if double:
             raise BundleError(f"different {kind}s are called {', '.join(double)}; rename them and synthesise again")
     clouds = {
-        name: ObjectCloud(torch.from_numpy(obj.cloud), torch.from_numpy(obj.cloud_normals)) for (name, _), obj in named.items()}
+        name: ObjectCloud(torch.from_numpy(obj.cloud[:CLOUD_POINTS]), torch.from_numpy(obj.cloud_normals[:CLOUD_POINTS]))
+        for (name, _), obj in named.items()}
     return [found[sha256] for sha256 in dict.fromkeys(hand.sha256 for hand in hands.values())], clouds, stated

@@ -1,0 +1,77 @@
+"""Objects drawn from a seed: the same everywhere, solid, of a size that a hand can hold, with parts that fill them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import Delaunay
+
+from dro_grasp.datasets.engine.schedule import require_distinct, require_known
+from dro_grasp.errors import ObjectError
+from dro_grasp.objects.catalogue import load_object, locate_object, resolve_objects
+from dro_grasp.objects.primitives import Solid
+from dro_grasp.objects.procedural import FAMILIES, SIZE, THINNEST, procedural_object
+
+SEEDS = range(16)
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    return [procedural_object(seed) for seed in SEEDS]
+
+
+def test_a_seed_makes_the_same_object_and_others_make_others(drawn) -> None:
+    again = [procedural_object(seed) for seed in (0, 7)]
+    assert [obj.sha256 for obj in again] == [drawn[0].sha256, drawn[7].sha256]
+    assert len({obj.sha256 for obj in drawn}) == len(drawn)
+
+
+def test_they_are_for_training_and_of_a_size_that_a_hand_can_hold(drawn) -> None:
+    extents = np.array([np.ptp(obj.vertices, axis=0) for obj in drawn])
+    assert {obj.split for obj in drawn} == {"train"}
+    assert extents.max(1).min() >= SIZE[0] - 1e-9
+    assert extents.max(1).max() <= SIZE[1] + 1e-9
+    assert extents.min() >= THINNEST - 1e-9
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_convex_parts_fill_the_object_and_nothing_else(drawn, seed: int) -> None:
+    obj = drawn[seed]
+    mesh = trimesh.Trimesh(obj.vertices, obj.faces)
+    assert mesh.is_watertight
+    points = np.random.default_rng(0).uniform(obj.vertices.min(0), obj.vertices.max(0), (2000, 3))
+    by_parts = np.any([Delaunay(vertices).find_simplex(points) >= 0 for vertices, _ in obj.parts], axis=0)
+    by_mesh = np.asarray(trimesh.proximity.signed_distance(mesh, points)) > 0
+    assert np.mean(by_parts != by_mesh) < 0.01
+    assert by_mesh.any()
+
+
+def test_they_are_in_one_piece(drawn) -> None:
+    for seed, obj in zip(SEEDS, drawn, strict=True):
+        assert trimesh.Trimesh(obj.vertices, obj.faces).body_count == 1, seed
+
+
+def test_every_family_makes_solids() -> None:
+    for family in FAMILIES:
+        for piece in family(np.random.default_rng(3)):
+            assert (piece.mesh if isinstance(piece, Solid) else piece).is_watertight, family.__name__
+
+
+def test_a_name_and_a_range_stand_for_them(drawn) -> None:
+    assert load_object("procedural_7").sha256 == drawn[7].sha256
+    assert resolve_objects(["procedural:7-9", "mug"]) == ["procedural_7", "procedural_8", "procedural_9", "mug"]
+    assert locate_object("procedural_7")[1] == "procedural_7"
+    require_known(["barrett"], ["procedural_7"])
+    require_distinct(["barrett"], ["procedural_7", "procedural_8"])
+    half = load_object("procedural_7", scale=0.5)
+    np.testing.assert_allclose(half.extents, drawn[7].extents / 2, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("name", "message"), [
+    ("procedural:9-7", "no object is in 'procedural:9-7'; give the smaller seed first"),
+    ("procedural:0-999999999", "stands for 1,000,000,000 objects; give at most 100,000"),
+])
+def test_a_range_that_is_none_is_refused(name: str, message: str) -> None:
+    with pytest.raises(ObjectError, match=message):
+        resolve_objects([name])
