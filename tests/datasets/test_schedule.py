@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,65 +12,22 @@ import trimesh
 from dro_grasp.cli.main import main
 from dro_grasp.datasets.collections.collection import read_collection
 from dro_grasp.datasets.engine import schedule as engine, worker
-from dro_grasp.datasets.engine.pools import Outcome, Work, failure_of
 from dro_grasp.datasets.engine.schedule import PairState, next_pair, synthesize_dataset
-from dro_grasp.datasets.engine.settings import SETTINGS
 from dro_grasp.datasets.engine.shards import Shard, Yield, find_shards
-from dro_grasp.datasets.engine.worker import EngineConfig, Job, Task, make_shard, shard_seed, valid_grasps
-from dro_grasp.energy.contact_candidates import ContactConfig
-from dro_grasp.errors import GraspFileError, OptionError, OutputError
+from dro_grasp.datasets.engine.worker import EngineConfig, make_shard, shard_seed, valid_grasps
+from dro_grasp.errors import OptionError, OutputError
 from dro_grasp.grasps import table
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.duplicates import DUPLICATE_DISTANCE
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import SynthesisConfig
-from tests.helpers.engine_work import GRASPS, easy
+from tests.helpers.engine_work import GRASPS
+from tests.helpers.here_pool import HerePool, run
 from tests.helpers.loaded_hands import loaded_hand
 
 TINY = EngineConfig(
     candidates=64, min_candidates=64, trial_share=0.5, synthesis=SynthesisConfig(steps=80, batch_size=64))
 SMALL = replace(TINY, candidates=32, min_candidates=32, synthesis=SynthesisConfig(steps=60, batch_size=32))
-
-
-class HerePool:
-    """A pool that does the work in this process, one shard after the other, and remembers the tasks."""
-
-    def __init__(self, job: Job, work: Work = easy) -> None:
-        self.job, self.work = job, work
-        self.waiting: list[Task] = []
-        self.tasks: list[Task] = []
-        self.closed = False
-
-    @property
-    def free(self) -> int:
-        return 1 - len(self.waiting)
-
-    def submit(self, task: Task) -> None:
-        self.waiting.append(task)
-        self.tasks.append(task)
-
-    def wait(self, timeout: float) -> list[Outcome]:
-        task = self.waiting.pop()
-        try:
-            return [(task, self.work(self.job, task))]
-        except Exception as error:
-            return [(task, failure_of(error))]
-
-    def close(self) -> None:
-        self.closed = True
-
-
-def run(folder: Path, hands, objects, goal, work: Work = easy, **options):
-    """A run of the engine here; its report, its tasks, and the lines it said."""
-    pools, lines = [], []
-
-    def make_pool(job: Job) -> HerePool:
-        pools.append(HerePool(job, work))
-        return pools[0]
-
-    report = synthesize_dataset(hands, objects, goal, folder, progress=lines.append, workers=make_pool, **options)
-    assert pools[0].closed
-    return report, pools[0].tasks, lines
 
 
 def test_every_pair_gets_its_first_shard_before_any_gets_its_second(tmp_path):
@@ -93,48 +49,6 @@ def test_a_rerun_does_only_what_is_missing_and_a_higher_goal_extends(tmp_path):
     assert [t.shard.round for t in tasks] == [2, 2, 3, 3]
     assert report.grasps == 40
     assert all(shard.path(tmp_path).read_bytes() == content for shard, content in before.items())
-
-
-@pytest.mark.parametrize(("options", "told"), [
-    ({"config": EngineConfig("dro", scale=0.5)}, r"with protocol strict, scale 1\.0, protocol dro, scale 0\.5 was asked for"),
-    ({"seed": 3}, "begun with seed 0, seed 3 was asked for; use the same to go on, or name another folder"),
-    ({"config": EngineConfig(synthesis=SynthesisConfig(steps=9))}, r"synthesis\.steps 120, synthesis\.steps 9 was asked for"),
-    ({"config": EngineConfig(synthesis=SynthesisConfig(contacts=ContactConfig(level_weights=(1.0,))))}, "level_weights"),
-])
-def test_a_folder_goes_on_only_with_the_settings_that_it_was_begun_with(tmp_path, options, told):
-    run(tmp_path, ["a"], ["x"], 5)
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
-    for goal in (5, 10):
-        with pytest.raises(OptionError, match=told):
-            run(tmp_path, ["a"], ["x"], goal, **options)
-    assert {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()} == before
-    more = EngineConfig(candidates=64, seconds=60.0, shard=(1, 2), max_crashes=9, synthesis=SynthesisConfig(device="cpu"))
-    assert run(tmp_path, ["a"], ["x"], 10, config=more)[0].added == GRASPS
-
-
-def test_a_folder_of_an_earlier_version_goes_on_with_any_settings(tmp_path):
-    run(tmp_path, ["a"], ["x"], 5)
-    (tmp_path / SETTINGS).unlink()
-    for seed in (1, 2):
-        assert run(tmp_path, ["a"], ["x"], 5 * (seed + 1), seed=seed)[0].added == GRASPS
-    assert not (tmp_path / SETTINGS).exists()
-
-
-def test_settings_are_noted_where_the_file_system_has_no_links(tmp_path, monkeypatch):
-    def no_link(*_: object) -> None:
-        raise PermissionError(1, "Operation not permitted")
-
-    monkeypatch.setattr("os.link", no_link)
-    run(tmp_path, ["a"], ["x"], 5)
-    assert json.loads((tmp_path / SETTINGS).read_text())["seed"] == 0
-    assert sorted(path.name for path in tmp_path.glob("*.*")) == [".lock", ".process", SETTINGS]
-
-
-def test_damaged_settings_are_named(tmp_path):
-    run(tmp_path, ["a"], ["x"], 5)
-    (tmp_path / SETTINGS).write_text('{"seed": ')
-    with pytest.raises(GraspFileError, match=r"settings\.json cannot be read .* remove it to go on with any"):
-        run(tmp_path, ["a"], ["x"], 5)
 
 
 def test_later_shards_know_the_earlier_ones_and_are_as_large_as_the_yield_asks(tmp_path):
