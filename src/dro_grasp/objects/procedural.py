@@ -28,7 +28,7 @@ ATTEMPTS = 20
 
 
 def procedural_object(seed: int, *, scale: float = 1.0) -> ObjectModel:
-    """The object of a seed: the same one everywhere.
+    """The object of a seed, the same one every time.
 
     Args:
         seed: From 0 on.
