@@ -18,19 +18,15 @@ import trimesh
 import yaml
 
 import dro_grasp as dro
-from dro_grasp.cli.main import main
-from dro_grasp.errors import OptionError, PlanError, RobotError
-from dro_grasp.planning import extra, planner
+from dro_grasp.errors import PlanError, RobotError
+from dro_grasp.planning import planner
 from dro_grasp.planning.collisions import CollisionChecker
-from dro_grasp.planning.inverse_kinematics import WristSolver
 from dro_grasp.planning.motion import STAGES, MotionPlan
-from dro_grasp.planning.paths import find_path
 from dro_grasp.planning.plan_config import PlanConfig
 from dro_grasp.planning.planner import plan
 from dro_grasp.planning.reachability import Feasible, Postures
-from dro_grasp.planning.robot_file import BUILTIN_ROBOTS
-from dro_grasp.planning.timed_stages import closing, timed_stages
-from dro_grasp.planning.timing import STEP, USED, Trajectory, cornered, smooth, standing as standing_still
+from dro_grasp.planning.timed_stages import timed_stages
+from dro_grasp.planning.timing import STEP, Trajectory, standing as standing_still
 from dro_grasp.planning.workcell import arm_addresses, robot_spec
 from dro_grasp.simulation.hand_part import joint_addresses
 from dro_grasp.simulation.protocols import PROTOCOLS
@@ -217,73 +213,10 @@ def test_drivers_get_every_target_and_controllers_the_same_motion(planned: Motio
     assert float(rows[-1]["arm/joint1"]) == pytest.approx(planned.arm.position[-1, 0], abs=1e-6)
 
 
-def test_inverse_kinematics_reaches_what_forward_kinematics_reached_and_nothing_beyond(robot: dro.Robot) -> None:
-    solver, (lower, upper) = WristSolver(robot), robot.working_range
-    generator = np.random.default_rng(3)
-    seeds = [robot.home, *generator.uniform(lower, upper, (8, 7))]
-    wanted = robot.T_world_wrist(generator.uniform(lower, upper, (10, 7)))
-    found = [solver.solve(T, seeds) for T in wanted]
-    assert sum(q is not None for q in found) >= 8
-    for q, T in zip(found, wanted, strict=True):
-        if q is not None:
-            assert np.abs(robot.T_world_wrist(q) - T)[:3, 3].max() < 1e-3
-            assert ((q >= lower) & (q <= upper)).all()
-    far = np.eye(4)
-    far[0, 3] = robot.longest_reach
-    assert solver.solve(far, seeds[:2]) is None
-
-
-def test_a_path_goes_round_a_wall_to_the_goal_that_can_be_reached() -> None:
-    def free(q: np.ndarray) -> bool:
-        return not (abs(q[0]) < 0.2 and q[1] < 0.6) and not (0.9 < np.abs(q - [0.7, -0.7]).max() * 5 < 1.1)
-
-    low, high = np.array([-1.0, -1.0]), np.array([1.0, 1.0])
-    start, goals = np.array([-0.8, -0.8]), np.array([[0.7, -0.7], [0.8, 0.2]])
-    found = find_path(start, goals, free, low, high, 2.0, 0)
-    assert found is not None
-    assert found.goal == 1  # the other one is walled in
-    assert np.allclose(found.waypoints[[0, -1]], [start, goals[1]])
-    assert all(free(q) for q in found.waypoints)
-    assert found.waypoints[:, 1].max() > 0.6
-    again = find_path(start, goals, free, low, high, 2.0, 0)
-    assert again is not None
-    assert np.array_equal(again.waypoints, found.waypoints)
-    assert find_path(start, goals[:1], free, low, high, 0.3, 0) is None
-
-
-def test_one_joint_takes_the_time_that_a_trapezoid_takes() -> None:
-    velocity, acceleration, way = 1.5, 4.0, 2.0
-    v, a = USED * velocity, USED * acceleration
-    for timed in (smooth, cornered):
-        made = timed(np.linspace(0, way, 9)[:, None], np.array([velocity]), np.array([acceleration]))
-        assert made.seconds == pytest.approx(way / v + v / a, rel=0.02)
-        assert np.allclose(made.velocity[[0, -1]], 0, atol=1e-6)
-
-
-def test_corners_are_stops_and_nothing_leaves_the_lines() -> None:
-    corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
-    made = cornered(corners, np.ones(2), np.ones(2))
-    assert np.abs(made.position - made.position.clip(0, 1)).max() < 1e-9
-    assert np.minimum(np.abs(made.position[:, 1]), np.abs(made.position[:, 0] - 1)).max() < 1e-9
-    slow = cornered(corners, np.ones(2), np.ones(2), 20.0)
-    assert slow.seconds == pytest.approx(20.0, abs=0.05)
-    assert np.abs(slow.position[np.abs(slow.time - 10.0).argmin()] - corners[1]).max() < 1e-3
-    assert cornered(corners[[0, 0]], np.ones(2), np.ones(2), 0.5).seconds == pytest.approx(0.5)
-
-
 def test_samples_are_at_most_a_step_apart(planned: MotionPlan) -> None:
     assert np.diff(planned.arm.time).max() < STEP + 1e-9
     for seconds, count in ((0.0149, 3), (0.5, 51), (0.0, 1)):
         assert len(standing_still(np.zeros(2), seconds).time) == count
-
-
-def test_a_closing_hand_stays_between_its_postures() -> None:
-    """A spline through them overshoots: a finger that stops at the end of its range would leave it."""
-    hand = Postures(np.zeros(2), np.array([0.2, 0.1]), np.array([1.0, 0.4]), np.array([1.0, 0.9]))
-    limits = np.full(2, 2.0), np.full(2, 10.0)
-    made, spline = cornered(closing(hand), *limits, 1.0), smooth(closing(hand), *limits, 1.0)
-    assert made.position.max(0) == pytest.approx(hand.squeeze, abs=1e-9)
-    assert spline.position[:, 0].max() > 1.001
 
 
 @pytest.mark.parametrize("still", ["shape", "approach", "lift"])
@@ -313,26 +246,6 @@ def test_a_plan_file_in_which_a_stage_has_no_rows_is_read(planned: MotionPlan) -
     assert old.part("shape") == slice(old.part("reach").stop - 1, old.part("reach").stop)
 
 
-BAD = {
-    "far away": (["--at", "3", "0"], "farther than the arm and hand are long"),
-    "in the robot": (["--at", "0.0", "0.0"], "while the robot is at home"),
-    "under the table": (["--pose", "low.json"], "below the table"),
-    "no rigid camera": (["--camera", "squashed.json"], "is not a rotation"),
-    "two places": (["--at", "0.5", "0", "--pose", "low.json"], "give one of them"),
-    "no grasps": (["--num", "0"], "num is 0"),
-    "no folder": (["--csv", "nowhere/plan.csv"], "no folder"),
-}
-
-
-def test_a_pose_that_is_none_is_refused_and_not_taken_for_the_table_s_fault(robot: dro.Robot) -> None:
-    lost, mirrored = np.eye(4), np.diag([1.0, 1.0, -1.0, 1.0])
-    far = np.eye(4)
-    lost[0, 3], far[0, 3] = np.nan, 500.0
-    for T, fault in ((lost, "its matrix holds NaN or infinity"), (mirrored, "not a rotation"), (far, "divide millimetres")):
-        with pytest.raises(OptionError, match=f"T_world_object is no pose of 'can'.*{fault}"):
-            plan(robot, dro.load_object("can"), T)
-
-
 def test_what_touches_the_robot_at_home_is_named(
     robot: dro.Robot, wall: dro.ObjectModel, standing: tuple[dro.ObjectModel, np.ndarray]
 ) -> None:
@@ -346,40 +259,6 @@ def test_what_touches_the_robot_at_home_is_named(
     raised = replace(robot, table=replace(robot.table, height=robot.T_world_wrist(robot.home)[2, 3]))
     with pytest.raises(RobotError, match=r"(arm|hand)/\w+ and table, by .* mm; correct `table` in the robot file"):
         plan(raised, can, trimesh.transformations.translation_matrix((0.5, 0.1, 0.6)), [wall])
-
-
-@pytest.mark.parametrize(("options", "said"), BAD.values(), ids=BAD)
-def test_bad_input_is_refused_in_words_and_nothing_is_written(
-    options: list[str], said: str, small_robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    low, squashed = np.eye(4), np.diag([1.0, 2.0, 1.0, 1.0])
-    low[:3, 3] = 0.5, 0.0, -1.0
-    Path("low.json").write_text(json.dumps({"frame": "world", "T_frame_object": low.tolist()}))
-    Path("squashed.json").write_text(json.dumps({"frame": "world", "T_frame_camera": squashed.tolist()}))
-    before = sorted(tmp_path.iterdir())
-    assert main(["plan", "--robot", small_robot, "--object", "can", "--output", "plan.npz", *options]) == 2
-    assert said in capsys.readouterr().err
-    assert sorted(tmp_path.iterdir()) == before
-
-
-@pytest.mark.parametrize(("option", "said"), [("robot.yaml", "link 'link9', which the arm does not have"),
-                                              (None, "nothing stands on the table: 0 points are left")])
-def test_a_robot_and_a_cloud_that_cannot_be_used_leave_nothing_behind(
-    option: str | None, said: str, small_robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    text = (BUILTIN_ROBOTS / "xarm7_leaphand.yaml").read_text()
-    Path("robot.yaml").write_text(text.replace("link: link7", "link: link9").replace("arm: ", f"arm: {BUILTIN_ROBOTS}/"))
-    x, y = np.meshgrid(np.linspace(0, 0.9, 90), np.linspace(-0.6, 0.6, 120))
-    np.save("table.npy", np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3))
-    before = sorted(tmp_path.iterdir())
-    given = ["--robot", option or small_robot, "--object", "table.npy"]
-    assert main(["plan", *given, "--output", "plan.npz", "--csv", "plan.csv"]) == 2
-    assert said in capsys.readouterr().err
-    assert sorted(tmp_path.iterdir()) == before
 
 
 def test_each_batch_of_grasps_is_another_one(
@@ -399,22 +278,3 @@ def test_each_batch_of_grasps_is_another_one(
         plan(robot, *standing, config=PlanConfig(num=2, batches=3), seed=7)
     assert asked[0] == 7
     assert len(set(asked)) == 3
-
-
-def test_without_the_extra_planning_says_what_to_install(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(extra, "find_spec", lambda name: None if name == "ompl" else object())
-    assert main(["plan", "--robot", "xarm7_leaphand", "--object", "can"]) == 2
-    assert "ompl; run pip install '.[arm]' in the folder of the clone" in capsys.readouterr().err
-
-
-def test_every_other_command_works_without_the_extra(small_robot: str) -> None:
-    import subprocess
-    import sys
-
-    blocked = "".join(f"sys.modules[{name!r}] = None; " for name in extra.PACKAGES)
-    code = (f"import sys; {blocked}import dro_grasp as dro; from dro_grasp.cli.main import main; "
-            f"dro.PlanConfig, dro.MotionPlan.load; sys.exit(main(['robot', 'check', {small_robot!r}]))")
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
