@@ -1,6 +1,8 @@
 """The network alone: the first draw, and the choice among several z and placements, with and without their imbalance.
 
-python benchmarks/choice.py [--hands HAND ...] [--objects OBJECT ...] [--num N] [--each] [--json]
+python benchmarks/choice.py [--hands HAND ...] [--objects OBJECT ...] [--num N] [--weights NAME] [--each] [--json]
+
+Diversity is the paper's, over grasps that hold under `dro`, a mean over hands.
 """
 
 from __future__ import annotations
@@ -9,10 +11,13 @@ import argparse
 import dataclasses
 import time
 
+import numpy as np
 import torch
 from report import emit, rate
 
+from dro_grasp.evaluation.metrics import diversity
 from dro_grasp.evaluation.success_rates import pair_seed
+from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.pipeline.choice import ChoiceConfig, ChoicePenalties
@@ -36,6 +41,7 @@ ROWS = {
     "1 x 32": ChoiceConfig(1, 32),
     "2 x 16, without imbalance": ChoiceConfig(2, 16, BLIND),
     "2 x 16": ChoiceConfig(2, 16),
+    "4 x 4": ChoiceConfig(4, 4),
     "4 x 8": ChoiceConfig(4, 8),
 }
 """What each row chooses among: placements x z."""
@@ -43,15 +49,25 @@ ROWS = {
 
 @dataclasses.dataclass
 class Tally:
-    """What was found of one hand, or of all of them."""
+    """What was found of one hand."""
 
     held: dict[str, list[bool]] = dataclasses.field(default_factory=lambda: {name: [] for name in PROTOCOLS})
+    kept: list[GraspBatch] = dataclasses.field(default_factory=list)
+    """Those that hold under the first of the protocols, of each object."""
     seconds: float = 0.0
 
-    def cells(self) -> list[object]:
-        """Number, success with its interval for each protocol, and time."""
-        n = len(self.held[PROTOCOLS[0]])
-        return [n, *map(rate, self.held.values()), 1e3 * self.seconds / n]
+    def diversity(self) -> float:
+        """Of those that hold; NaN if there are too few."""
+        kept = GraspBatch.concatenate(self.kept)
+        return diversity(kept.T_object_wrist, kept.joints)["all"]
+
+
+def cells(tallies: list[Tally]) -> list[object]:
+    """Number, success with its interval for each protocol, diversity, and time, of one hand or of several."""
+    held = [[success for tally in tallies for success in tally.held[name]] for name in PROTOCOLS]
+    n = len(held[0])
+    return [n, *map(rate, held), float(np.mean([tally.diversity() for tally in tallies])),
+            1e3 * sum(tally.seconds for tally in tallies) / n]
 
 
 @torch.no_grad()
@@ -61,11 +77,12 @@ def main() -> None:
     parser.add_argument("--hands", nargs="+", default=["allegro", "barrett", "shadowhand"])
     parser.add_argument("--objects", nargs="+", default=OBJECTS)
     parser.add_argument("--num", type=int, default=20, help="grasps of each hand on each object")
+    parser.add_argument("--weights", help="weights of the network; the default ones without")
     parser.add_argument("--each", action="store_true", help="rows of each hand, too")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    network = GraspPredictor().network
+    network = GraspPredictor(options.weights).network
     found: dict[tuple[str, str], Tally] = {}
     for hand in map(load_hand, options.hands):
         for obj in map(load_object, resolve_objects(options.objects)):
@@ -76,14 +93,20 @@ def main() -> None:
                 generator = torch.Generator().manual_seed(seed)
                 grasps = propose(problem, network, options.num, generator, ProposalConfig(choice=choice)).grasps
                 seconds = time.process_time() - start
-                outcomes = {name: simulate(hand, obj, complete(problem, grasps), name).success.tolist() for name in PROTOCOLS}
-                for tally in (found.setdefault((row, of), Tally()) for of in ((hand.name, ALL) if options.each else (ALL,))):
-                    tally.seconds += seconds
-                    for name, held in outcomes.items():
-                        tally.held[name] += held
-    ordered = sorted(found.items(), key=lambda item: list(ROWS).index(item[0][0]))
-    rows = [[row, name, *tally.cells()] for (row, name), tally in ordered]
-    columns = ["placements x z", "hand", "n", *(f"{name} [%]" for name in PROTOCOLS), "CPU ms a grasp"]
+                tally = found.setdefault((row, hand.name), Tally())
+                tally.seconds += seconds
+                for name in PROTOCOLS:
+                    success = simulate(hand, obj, complete(problem, grasps), name).success
+                    tally.held[name] += success.tolist()
+                    if name == PROTOCOLS[0]:
+                        tally.kept.append(grasps[success])
+    names = list(dict.fromkeys(name for _, name in found))
+    rows: list[list[object]] = []
+    for row in ROWS:
+        of = {name: [found[row, name]] for name in names}
+        shown = {**(of if options.each else {}), ALL: [tally for (tally,) in of.values()]}
+        rows += [[row, name, *cells(tallies)] for name, tallies in shown.items()]
+    columns = ["placements x z", "hand", "n", *(f"{name} [%]" for name in PROTOCOLS), "diversity", "CPU ms a grasp"]
     emit("choice of placement and z", rows, columns,
          {f"{row[0]} / {row[1]}": dict(zip(columns[2:], row[2:], strict=True)) for row in rows}, options.json)
 

@@ -2,8 +2,9 @@
 
     python benchmarks/methods.py [--hands HAND ...] [--objects NAME ...] [--num N] [--weights NAME] [--json]
 
-The best by score of each source are evaluated on the mesh; the processor time counts everything but the trial. The row
-`network, first z` decodes the first z that is drawn, without a choice by geometry. Needs the development assets by default.
+The best by score of each source are evaluated on the mesh; fingers are counted under `strict`, after closing. The processor
+time counts everything but the trial. The row `network, first z` decodes the first z that is drawn, without a choice by
+geometry. Needs the development assets by default.
 """
 
 from __future__ import annotations
@@ -57,17 +58,21 @@ def main() -> None:
                 source, chosen = (first, "network") if method == FIRST_Z else (predictor, method)
                 made = source.run(problem, replace(request, method=chosen))
                 seconds = (time.process_time() - begin) / options.num
-                held = [simulate(hand, obj, made.grasps, name).success.float() for name in PROTOCOLS]
+                trials = [simulate(hand, obj, made.grasps, name) for name in PROTOCOLS]
+                touching = trials[-1].fingers_in_contact / len(hand.fingers)
                 optimised = torch.tensor([float(origin == "optimiser") for origin in made.origin])
-                rows = torch.stack([*held, optimised, torch.full_like(optimised, seconds)], 1).numpy()
+                rows = torch.stack([*(trial.success.float() for trial in trials), touching, touching.eq(1).float(), optimised,
+                                    torch.full_like(optimised, seconds)], 1).numpy()
                 for row in (hand.name, "all"):
                     found.setdefault((row, method), []).append(rows)
     table: list[list[object]] = []
     for (hand_name, method), parts in found.items():
         values = np.concatenate(parts)
+        touching, all_touch, optimised, seconds = values[:, len(PROTOCOLS) :].mean(0)
         table.append([hand_name, method, len(values), *map(rate, values[:, : len(PROTOCOLS)].T),
-                      f"{100 * values[:, -2].mean():.0f}", f"{values[:, -1].mean():.2f}"])
-    columns = ["hand", "method", "n", *(f"{name} [%]" for name in PROTOCOLS), "from the optimiser [%]", "CPU seconds a grasp"]
+                      f"{100 * touching:.0f} ({100 * all_touch:.0f})", f"{100 * optimised:.0f}", f"{seconds:.2f}"])
+    columns = ["hand", "method", "n", *(f"{name} [%]" for name in PROTOCOLS), "fingers in contact (all) [%]",
+               "from the optimiser [%]", "CPU seconds a grasp"]
     emit(f"{options.num} grasps of each hand on each of {' '.join(options.objects)}", table, columns,
          {f"{row[0]} / {row[1]}": dict(zip(columns[2:], row[2:], strict=True)) for row in table}, options.json)
 
