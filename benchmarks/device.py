@@ -24,7 +24,7 @@ from report import emit
 from dro_grasp.datasets.bundle.training_file import Bundle, load_bundle
 from dro_grasp.devices import require_device
 from dro_grasp.hands.library import load_hand
-from dro_grasp.models.checkpoints import save_weights
+from dro_grasp.models.checkpoints import DEFAULT, save_weights
 from dro_grasp.models.network import untrained_network
 from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.objects.catalogue import load_object
@@ -129,7 +129,7 @@ def main() -> None:
         path = Path(folder) / "paper.safetensors"
         save_weights(untrained_network(NetworkConfig.preset("paper"), 0, "paper"), path)
         for device in dict.fromkeys(("cpu", options.device)):
-            rows += predictions(device, {"default weights": "more_hands", "paper size": str(path)}, repetitions)
+            rows += predictions(device, {"default weights": DEFAULT, "paper size": str(path)}, repetitions)
             rows += descents(device, repetitions)
             if options.bundle:
                 rows += training(device, load_bundle(options.bundle))

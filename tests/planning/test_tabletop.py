@@ -15,7 +15,7 @@ from PIL import Image
 import dro_grasp as dro
 from dro_grasp.cli.main import main
 from dro_grasp.errors import OptionError
-from dro_grasp.models.checkpoints import load_weights, save_weights
+from dro_grasp.models.checkpoints import DEFAULT, load_weights, save_weights
 from dro_grasp.perception.scan import depth_points
 from dro_grasp.planning import tabletop
 from dro_grasp.planning.animation import Recorder, draw_animation
@@ -217,7 +217,7 @@ def test_attempts_with_other_weights_or_another_robot_are_no_results_of_these(
     assert run() == [1]
     file.write_text(text)
     assert run() == [1]
-    weights = str(tmp_path / "more_hands.safetensors")
+    weights = str(tmp_path / f"{DEFAULT}.safetensors")
     save_weights(load_weights(), weights, {"trained": "elsewhere"})
     assert run() == [2], "the name is not enough"
     file.write_text(text.replace("velocity: 2.0", "velocity: 1.25"))
@@ -225,7 +225,7 @@ def test_attempts_with_other_weights_or_another_robot_are_no_results_of_these(
     assert run() == [3]
     stored = read_attempts(tmp_path / "results.parquet")
     assert [(a.weights, Path(a.robot_file).name) for a in stored] == [
-        ("more_hands", "robot.yaml"), (weights, "robot.yaml"), (weights, "robot.yaml")]
+        (DEFAULT, "robot.yaml"), (weights, "robot.yaml"), (weights, "robot.yaml")]
     before = tmp_path / "before.parquet"
     known = pq.read_table(tmp_path / "results.parquet")
     pq.write_table(known.drop_columns(["weights", "weights_sha256", "robot_sha256", "object_sha256"]), before)

@@ -10,7 +10,7 @@ import pytest
 import dro_grasp as dro
 from dro_grasp.cli.main import main
 from dro_grasp.cli.view import is_motion
-from dro_grasp.models.checkpoints import describe_weights
+from dro_grasp.models.checkpoints import DEFAULT, describe_weights
 from dro_grasp.planning.animation import Recorder
 from dro_grasp.planning.attempts import Attempt, TabletopConfig
 from dro_grasp.planning.motion import CHOSEN, STAGES, WAITING, PlanNotes, PlanScene
@@ -68,7 +68,7 @@ def test_each_attempt_is_played_with_its_own_robot_and_weights(
     other, ran, label = dro.load_robot(small_robot), [], TabletopConfig().label()
     shipped = describe_weights()["sha256"]
     stored = [Attempt(robot.name, "can", 0, 0, label, True, "done", robot_file="xarm7_leaphand", weights="multi"),
-              Attempt(other.name, "can", 1, 0, label, True, "done", robot_file=small_robot, weights="more_hands",
+              Attempt(other.name, "can", 1, 0, label, True, "done", robot_file=small_robot, weights=DEFAULT,
                       robot_sha256=other.sha256, weights_sha256=shipped, object_sha256="that of another can")]
 
     def ended(used: dro.Robot, obj: object, number: int, seed: int, weights: str, _: object, recorder: Recorder) -> Attempt:
@@ -83,7 +83,7 @@ def test_each_attempt_is_played_with_its_own_robot_and_weights(
     try:
         assert "Not as stored" not in page.text.content
         page.repeat(1)
-        assert ran == [(robot.name, 0, "multi"), (other.name, 1, "more_hands")]
+        assert ran == [(robot.name, 0, "multi"), (other.name, 1, DEFAULT)]
         assert page.name.content == f"**{other.name}**"
         assert len(page._links) == len(robot_shapes(other)) != len(robot_shapes(robot))
         expected = shape_poses(other, other.home, other.hand.canonical_joints().double().numpy())
@@ -91,8 +91,8 @@ def test_each_attempt_is_played_with_its_own_robot_and_weights(
         assert "Not as stored**: with other content than then: object. held" in page.text.content
     finally:
         page.stop()
-    lift_page(tmp_path / "results.parquet", 0, small_robot, "more_hands", port=free_port()).stop()
-    assert ran[2:] == [(other.name, 0, "more_hands")], "what is given instead is used"
+    lift_page(tmp_path / "results.parquet", 0, small_robot, DEFAULT, port=free_port()).stop()
+    assert ran[2:] == [(other.name, 0, DEFAULT)], "what is given instead is used"
 
 
 def test_an_attempt_that_cannot_be_repeated_is_told(

@@ -34,7 +34,7 @@ CHECKSUMS = "SHA256SUMS"
 """File beside the shipped weights with their checksums, as `sha256sum` writes it."""
 SMALL = ("completion/surface", "ranking/quality", "ranking/holding", "baselines/gendexgrasp", "baselines/manifm")
 """Networks that ship beside those that predict D(R,O)."""
-DEFAULT = "more_hands"
+DEFAULT = "more_objects"
 """Name of the default weights."""
 
 
