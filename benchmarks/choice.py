@@ -57,7 +57,7 @@ class Tally:
     seconds: float = 0.0
 
     def diversity(self) -> float:
-        """Of those that hold; NaN if there are too few."""
+        """Of those that hold; 0 if there are fewer than two."""
         kept = GraspBatch.concatenate(self.kept)
         return diversity(kept.T_object_wrist, kept.joints)["all"]
 
