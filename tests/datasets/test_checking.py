@@ -110,6 +110,11 @@ def test_fingers_are_closed_where_the_grasp_holds_and_touches_with_more(lazy):
                     for g in (before, after))
         assert had.keys() <= has.keys()
         assert all(has[key] >= count for key, count in had.items())
+        # `relabelled` marks the ones that another posture replaced; their energies are still those of the first.
+        own = {key: row for row, key in enumerate(pair.grasps.T_object_wrist[:, 0, 3].tolist())}
+        stored = pair.grasps[[own[key] for key in after.T_object_wrist[:, 0, 3].tolist()]]
+        assert torch.equal(after.extra["relabelled"], (after.joints != stored.joints).any(1))
+        assert torch.equal(after.energy.nan_to_num(), stored.energy.nan_to_num())
         gained += sum(count > had.get(key, 0) for key, count in has.items())
     assert gained > 1
 
@@ -142,6 +147,8 @@ def test_commands(stored, tmp_path, capsys):
     kept = GraspBatch.load(tmp_path / "kept" / "barrett.parquet")
     assert told["grasps"] == 24
     assert told["kept"] == len(kept) == sum(pair["kept"] for pair in told["pairs"])
+    made, still = ([pair.made for pair in read_collection(path, only_successful=False)] for path in (stored, tmp_path / "kept"))
+    assert still == made
     assert main(["dataset", "check", str(tmp_path / "none")]) == 2
     assert "no grasps at" in capsys.readouterr().err
 

@@ -185,6 +185,7 @@ class Filter(DataSets):
     def run(self) -> int:
         """Evaluate, and write one file per hand."""
         from dro_grasp.datasets.collections.checking import keep_passing
+        from dro_grasp.datasets.collections.collection import yield_notes
         from dro_grasp.datasets.collections.merging import file_name
         from dro_grasp.files import make_folder
         from dro_grasp.grasps.batch import GraspBatch
@@ -196,7 +197,9 @@ class Filter(DataSets):
         with progress_bar("evaluating", self.json) as progress:
             kept = keep_passing(pairs, rules, progress, self.close_fingers)
         for hand in dict.fromkeys(g.hand for _, g in kept):
-            GraspBatch.concatenate([g for _, g in kept if g.hand == hand]).save(folder / file_name(hand))
+            own = [(pair, grasps) for pair, grasps in kept if grasps.hand == hand]
+            notes = yield_notes({pair.object: pair.made for pair, _ in own})
+            GraspBatch.concatenate([grasps for _, grasps in own]).save(folder / file_name(hand), notes)
         rows = [[pair.hand, pair.object, len(pair.grasps), len(passed)] for pair, passed in kept]
         total, passed = sum(row[2] for row in rows), sum(row[3] for row in rows)
         columns = ["hand", "object", "grasps", "kept"]

@@ -42,6 +42,8 @@ FURTHER = (REASON, FAILURE, CONTACT_LINKS)
 """Further columns that a trial adds."""
 DEPTH = "depth"
 """Further column of synthesised grasps: deepest penetration of a surface point [m]."""
+RELABELLED = "relabelled"
+"""Further column of stored grasps: whether idle fingers were closed after the grasp was made."""
 HAND_FILE = "hand_file"
 """Further column: path of the hand's description, if the hand is a user's own."""
 OBJECT_FILE = "object_file"

@@ -14,6 +14,7 @@ from dro_grasp.datasets.engine.worker import EngineConfig
 from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import RELABELLED
 from dro_grasp.grasps.sources import hand_of, object_of, pair_keys, require_same
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
@@ -100,7 +101,8 @@ def keep_passing(
         rules: The trial.
         progress: Called with (grasps evaluated, grasps in all).
         close_fingers: Also evaluate grasps with their idle fingers closed, and keep these instead where they pass, no fewer
-            fingers touch, and as many links as a synthesised grasp must touch with.
+            fingers touch, and as many links as a synthesised grasp must touch with. Column `relabelled` marks them; their
+            energies stay those by which the grasp was once chosen.
 
     Raises:
         GraspFileError: A hand or an object is not the one the grasps were made for.
@@ -118,15 +120,19 @@ def keep_passing(
 def _closed_where_it_holds(hand: Hand, obj: ObjectModel, evaluated: GraspBatch, rules: Protocol) -> GraspBatch:
     """Evaluated grasps; those with closed fingers instead, where these pass, no fewer fingers touch, and enough links."""
     closed = close_idle_fingers(GraspEnergy.of_object(hand, obj, EnergyConfig(hand_points=hand.n_points)), evaluated)
+    closed = closed.replace(energy=evaluated.energy, extra=evaluated.extra)
     rows = (closed.joints != evaluated.joints).any(1).nonzero()[:, 0]
+    relabelled = evaluated.extra.get(RELABELLED, torch.zeros(len(evaluated), dtype=torch.bool)).clone()
     if not len(rows):
-        return evaluated
+        return evaluated.replace(extra=evaluated.extra | {RELABELLED: relabelled})
     trial = simulate(hand, obj, closed[rows], rules)
     better = trial.success & (trial.contacts >= EngineConfig.min_contact_links)
     better &= trial.fingers_in_contact >= evaluated.fingers_in_contact[rows]
     order = torch.arange(len(evaluated))
     order[rows[better]] = len(evaluated) + better.nonzero()[:, 0]
-    return GraspBatch.concatenate([evaluated, closed[rows].with_trial(trial)])[order]
+    relabelled[rows[better]] = True
+    chosen = GraspBatch.concatenate([evaluated, closed[rows].with_trial(trial)])[order]
+    return chosen.replace(extra=chosen.extra | {RELABELLED: relabelled})
 
 
 def _loaded(parts: Sequence[GraspBatch], progress: Progress | None) -> Iterator[tuple[Hand, ObjectModel]]:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+from dro_grasp._version import __version__
 from dro_grasp.datasets.engine.shards import Yield, find_shards, read_yield
 from dro_grasp.errors import GraspFileError
 from dro_grasp.files import given_path
@@ -30,6 +32,11 @@ class PairGrasps:
     made: Yield
     """Yield of their production. A merged file may hold a choice of the valid grasps; for grasps from elsewhere only
     `valid` is known."""
+
+
+def yield_notes(yields: Mapping[str, Yield]) -> dict[str, Any]:
+    """Notes of a file's header with the yield of each of its objects."""
+    return {YIELDS: {name: made.to_dict() for name, made in yields.items()}, "version": __version__}
 
 
 def read_collection(path: Path | str, only_successful: bool = True) -> Iterator[PairGrasps]:

@@ -13,8 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dro_grasp._version import __version__
-from dro_grasp.datasets.collections.collection import YIELDS, read_collection
+from dro_grasp.datasets.collections.collection import read_collection, yield_notes
 from dro_grasp.datasets.engine.shards import Yield
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.files import check_output, replacing
@@ -67,9 +66,8 @@ class Merged:
 
     def to_bytes(self) -> bytes:
         """The grasp file, with the yields in its notes."""
-        notes = {YIELDS: {name: made.to_dict() for name, made in self.yields.items()}, "version": __version__}
         columns = {name: self.table[name] for name in self.table.column_names}
-        return table_bytes(columns, self.header | {"notes": notes})
+        return table_bytes(columns, self.header | {"notes": yield_notes(self.yields)})
 
     def save(self, path: Path) -> None:
         """Write the grasp file.
