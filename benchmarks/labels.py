@@ -1,8 +1,9 @@
 """Cost and benefit of labels and starts: yield, diversity and penetration of grasps, with and without each choice.
 
 Settled labels are read after the hand has closed on the object in simulation. Wide starts have joints anywhere within
-their limits. Random idle fingers have no contacts. The engine descends for 120 steps and evaluates the better 70 %. Success
-with half the friction, of grasps that pass `strict`, shows whether a choice makes them weaker.
+their limits. Random idle fingers have no contacts in the energy; after the trial they close onto the object. The engine
+descends for 120 steps and evaluates the better 70 %. Success with half the friction, of grasps that pass `strict`, shows
+whether a choice makes them weaker.
 
     python benchmarks/labels.py [--candidates 128] [--json]
 """
@@ -39,6 +40,9 @@ def choices(candidates: int) -> dict[str, EngineConfig]:
     all_hold = ContactConfig(idle=0.0)
     return {
         "the engine's": EngineConfig(candidates=candidates),
+        "idle fingers stay": EngineConfig(candidates=candidates, close_fingers=False),
+        "a finger is idle with 0.3": EngineConfig(
+            candidates=candidates, synthesis=SynthesisConfig(contacts=ContactConfig(idle=0.3))),
         "labels as synthesised": EngineConfig(candidates=candidates, settle=False),
         "400 steps, best third evaluated": EngineConfig(
             candidates=candidates, trial_share=0.34, synthesis=SynthesisConfig(steps=400)),
@@ -49,7 +53,7 @@ def choices(candidates: int) -> dict[str, EngineConfig]:
 
 
 def measure(hand_name: str, objects: list[str], config: EngineConfig) -> list[object]:
-    """Valid grasps, per CPU-hour, diversity with its parts, median penetration [mm], success with less friction [%]."""
+    """Valid grasps, per CPU-hour, fingers, diversity and its parts, median penetration [mm], success with less friction [%]."""
     hand, batches, seconds = load_hand(hand_name), [], 0.0
     for name in objects:
         obj = load_object(name)
@@ -63,7 +67,9 @@ def measure(hand_name: str, objects: list[str], config: EngineConfig) -> list[ob
     depth = float(joined.penetration.median()) * 1e3
     slippery = changed("strict", friction=0.5)
     held = sum(int(simulate(hand, load_object(n), b, slippery).success.sum()) for n, b in zip(objects, batches, strict=True))
-    return [len(joined), 3600 * len(joined) / seconds, *(f"{v:.3f}" for v in spread.values()), depth,
+    touching, n_fingers = joined.fingers_in_contact, len(hand.fingers)
+    fingers = f"{100 * float(touching.mean()) / n_fingers:.0f} ({100 * float((touching == n_fingers).float().mean()):.0f})"
+    return [len(joined), 3600 * len(joined) / seconds, fingers, *(f"{v:.3f}" for v in spread.values()), depth,
             100 * held / max(1, len(joined))]
 
 
@@ -80,7 +86,7 @@ def main() -> None:
         for hand in HANDS for name, config in choices(options.candidates).items()
     ]
     emit(f"{options.candidates} candidates on each of {OBJECTS} training objects", rows,
-         ["hand", "choice", "valid", "per CPU-hour", "diversity", "wrist", "joints", "penetration [mm]",
+         ["hand", "choice", "valid", "per CPU-hour", "fingers", "diversity", "wrist", "joints", "penetration [mm]",
           "friction 0.5 [%]"],
          {"rows": [[str(cell) for cell in row] for row in rows]}, options.json)
 

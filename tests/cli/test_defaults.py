@@ -13,6 +13,9 @@ from dro_grasp.cli.constraint_options import ConstraintOptions
 from dro_grasp.cli.evaluate import Evaluate
 from dro_grasp.cli.generate import Generate
 from dro_grasp.cli.main import PATIENCE, THREADS, main
+from dro_grasp.cli.synthesize import Synthesize
+from dro_grasp.datasets.engine.worker import EngineConfig
+from dro_grasp.energy.contact_candidates import ContactConfig
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.stages import evaluate
@@ -42,6 +45,12 @@ def test_a_request_has_the_same_defaults_everywhere() -> None:
     assert {default(GraspPredictor.predict, name) == REQUESTS[name] for name in ("num", "seed")} == {True}
     for name in ("num", "candidates", "temperature", "method"):
         assert default(Studio.generate, name) == REQUESTS[name], name
+
+
+def test_data_are_made_alike() -> None:
+    assert default(Synthesize, "idle") == ContactConfig().idle
+    assert default(Synthesize, "protocol") == EngineConfig().protocol
+    assert default(Synthesize, "keep_idle_fingers") is not EngineConfig().close_fingers
 
 
 @pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")

@@ -21,6 +21,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.duplicates import DUPLICATE_DISTANCE
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import SynthesisConfig
+from dro_grasp.simulation.trial import simulate
 from tests.helpers.engine_work import GRASPS
 from tests.helpers.here_pool import HerePool, run
 from tests.helpers.loaded_hands import loaded_hand
@@ -217,13 +218,31 @@ def test_a_success_that_hardly_anything_touches_is_not_kept():
     assert len(strict) == sum(n >= 5 for n in held)
 
 
+def test_idle_fingers_of_new_grasps_close():
+    """The same candidates; closing changes which are near-duplicates, so the wrist tells which grasp is which."""
+    hand, can = loaded_hand("allegro"), load_object("can")
+    config = EngineConfig(candidates=48, synthesis=SynthesisConfig(steps=60, batch_size=48))
+    left, closed = (valid_grasps(hand, can, 2, replace(config, close_fingers=close))[0] for close in (False, True))
+    assert "relabelled" not in left.extra
+    marked = closed.extra["relabelled"]
+    assert 0 < int(marked.sum()) < len(closed)
+    before = {tuple(T.flatten().tolist()): row for row, T in enumerate(left.T_object_wrist)}
+    rows = [before[tuple(T.flatten().tolist())] for T in closed.T_object_wrist]
+    was = left[rows]
+    assert torch.equal(marked, (closed.joints != was.joints).any(1))
+    assert bool((closed.fingers_in_contact >= was.fingers_in_contact).all())
+    assert float(closed.fingers_in_contact.mean()) > float(was.fingers_in_contact.mean())
+    again = simulate(hand, can, closed, "strict")
+    assert bool(again.success.all())
+
+
 def test_settled_labels_move_only_joints_that_hold(tmp_path):
     from dro_grasp.simulation.closed_poses import settle
-    from dro_grasp.simulation.trial import simulate
 
     hand, can = loaded_hand("allegro"), load_object("can")
     grasps = valid_grasps(hand, can, 1, EngineConfig(
-        candidates=48, trial_share=0.5, settle=False, synthesis=SynthesisConfig(steps=80, batch_size=48)))[0]
+        candidates=48, trial_share=0.5, settle=False, close_fingers=False,
+        synthesis=SynthesisConfig(steps=80, batch_size=48)))[0]
     settled = settle(hand, can, grasps, "strict")
     held = simulate(hand, can, grasps, "strict").contact_links
     moved = settled.joints != grasps.joints
@@ -281,7 +300,8 @@ def test_a_time_that_is_none_is_refused(tmp_path, seconds):
 @pytest.mark.parametrize(
     ("option", "value"),
     [("--hand", "nowhere.urdf"), ("--hand", "barret"), ("--object", "nope.stl"), ("--object", "mugg"), ("--minutes", "-1"),
-     ("--minutes", "0"), ("--minutes", "nan"), ("--grasps", "0"), ("--workers", "0"), ("--scale", "nan")],
+     ("--minutes", "0"), ("--minutes", "nan"), ("--grasps", "0"), ("--workers", "0"), ("--scale", "nan"), ("--idle", "1.5"),
+     ("--idle", "nan")],
 )
 def test_the_command_refuses_before_it_starts(tmp_path, monkeypatch, capsys, option, value):
     monkeypatch.setattr(engine, "synthesize_dataset", None)
@@ -291,6 +311,16 @@ def test_the_command_refuses_before_it_starts(tmp_path, monkeypatch, capsys, opt
     assert value in told
     assert told.startswith(f"error: {option} is " if option not in {"--hand", "--object"} else "error: no")
     assert not (tmp_path / "sy").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "idle", "closes"), [([], 0.6, True), (["--idle", "0.2", "--keep-idle-fingers"], 0.2, False)])
+def test_the_command_asks_for_idleness(tmp_path, monkeypatch, options, idle, closes):
+    asked = []
+    monkeypatch.setattr(
+        engine, "synthesize_dataset", lambda *given, **_: asked.append(given[6]) or engine.DatasetReport(1, 1, 1, 1.0, {}))
+    assert main(["synthesize", "--hand", "barrett", "--object", "mug", "--output", str(tmp_path / "sy"), *options]) == 0
+    assert (asked[0].synthesis.contacts.idle, asked[0].close_fingers) == (idle, closes)
 
 
 @pytest.mark.parametrize("kind", ["object", "hand"])

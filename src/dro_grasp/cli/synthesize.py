@@ -52,6 +52,10 @@ class Synthesize:
     """The same seed gives the same grasps."""
     protocol: ProtocolName = "strict"
     """Protocol of the trial that grasps must pass."""
+    idle: float = 0.6
+    """Probability that a finger other than the thumb is not asked to touch, 0 to 1; lower makes fuller grasps, and fewer."""
+    keep_idle_fingers: Flag = False
+    """Leave idle fingers as they are. Otherwise they close onto the object where the grasp then passes as well."""
     json: Flag = False
     """Print one JSON object instead of a table."""
 
@@ -59,6 +63,7 @@ class Synthesize:
         """Check numbers and names, then fill the folder; the exit code is 2 if every pair fails and there is no grasp."""
         from dro_grasp.datasets.engine.schedule import require_distinct, require_known, synthesize_dataset
         from dro_grasp.datasets.engine.worker import EngineConfig
+        from dro_grasp.energy.contact_candidates import ContactConfig
         from dro_grasp.objects.catalogue import resolve_objects
         from dro_grasp.optimization.synthesis import SynthesisConfig
 
@@ -68,7 +73,8 @@ class Synthesize:
         require_distinct(self.hand, objects)
         config = EngineConfig(
             self.protocol, self.scale, None if self.minutes is None else 60 * self.minutes, shard=self._part(),
-            synthesis=SynthesisConfig(device=self.device))
+            close_fingers=not self.keep_idle_fingers,
+            synthesis=SynthesisConfig(device=self.device, contacts=ContactConfig(idle=self.idle)))
         report = synthesize_dataset(
             self.hand, objects, self.grasps, self.output, self._ray_pool if self.engine == "ray" else self.workers, self.seed,
             config, say_aside)
@@ -96,6 +102,8 @@ class Synthesize:
             raise OptionError(f"--minutes is {self.minutes}; give a positive number, or leave it out for no limit")
         if not (math.isfinite(self.scale) and self.scale > 0):
             raise OptionError(f"--scale is {self.scale}; give a positive number, for example 0.001 for millimetres")
+        if not 0 <= self.idle <= 1:
+            raise OptionError(f"--idle is {self.idle}; give a probability, from 0 (every finger holds) to 1")
 
     def _part(self) -> tuple[int, int]:
         from dro_grasp.errors import OptionError

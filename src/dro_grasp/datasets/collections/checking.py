@@ -10,15 +10,12 @@ from typing import Any
 import torch
 
 from dro_grasp.datasets.collections.collection import PairGrasps
-from dro_grasp.datasets.engine.worker import EngineConfig
-from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
+from dro_grasp.datasets.engine.finger_labels import closed_where_it_holds
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.columns import RELABELLED
 from dro_grasp.grasps.sources import hand_of, object_of, pair_keys, require_same
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimization.finger_closing import close_idle_fingers
 from dro_grasp.simulation.outcome import TrialResult
 from dro_grasp.simulation.protocols import Protocol
 from dro_grasp.simulation.scene import require_simulable
@@ -112,27 +109,9 @@ def keep_passing(
     for pair, (hand, obj) in zip(parts, _loaded([pair.grasps for pair in parts], progress), strict=True):
         grasps = pair.grasps.with_trial(simulate(hand, obj, pair.grasps, rules))
         if close_fingers:
-            grasps = _closed_where_it_holds(hand, obj, grasps, rules)
+            grasps = closed_where_it_holds(hand, obj, grasps, rules)
         kept.append((pair, grasps[grasps.success.nonzero()[:, 0]]))
     return kept
-
-
-def _closed_where_it_holds(hand: Hand, obj: ObjectModel, evaluated: GraspBatch, rules: Protocol) -> GraspBatch:
-    """Evaluated grasps; those with closed fingers instead, where these pass, no fewer fingers touch, and enough links."""
-    closed = close_idle_fingers(GraspEnergy.of_object(hand, obj, EnergyConfig(hand_points=hand.n_points)), evaluated)
-    closed = closed.replace(energy=evaluated.energy, extra=evaluated.extra)
-    rows = (closed.joints != evaluated.joints).any(1).nonzero()[:, 0]
-    relabelled = evaluated.extra.get(RELABELLED, torch.zeros(len(evaluated), dtype=torch.bool)).clone()
-    if not len(rows):
-        return evaluated.replace(extra=evaluated.extra | {RELABELLED: relabelled})
-    trial = simulate(hand, obj, closed[rows], rules)
-    better = trial.success & (trial.contacts >= EngineConfig.min_contact_links)
-    better &= trial.fingers_in_contact >= evaluated.fingers_in_contact[rows]
-    order = torch.arange(len(evaluated))
-    order[rows[better]] = len(evaluated) + better.nonzero()[:, 0]
-    relabelled[rows[better]] = True
-    chosen = GraspBatch.concatenate([evaluated, closed[rows].with_trial(trial)])[order]
-    return chosen.replace(extra=chosen.extra | {RELABELLED: relabelled})
 
 
 def _loaded(parts: Sequence[GraspBatch], progress: Progress | None) -> Iterator[tuple[Hand, ObjectModel]]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 
 from dro_grasp.datasets.bundle.training_file import split_of
+from dro_grasp.datasets.engine.finger_labels import MIN_CONTACT_LINKS, closed_where_it_holds
 from dro_grasp.datasets.engine.shards import Shard, Yield, notes_of
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
@@ -53,8 +54,10 @@ class EngineConfig:
     """Take the labels after the hand has closed on the object in simulation, which drives out penetration."""
     max_shift: float = 0.03
     """Candidates that closing moves farther relative to the object get no trial [m]."""
-    min_contact_links: int = 2
+    min_contact_links: int = MIN_CONTACT_LINKS
     """Links that must touch the object after closing; with fewer, a success is a cage or luck."""
+    close_fingers: bool = True
+    """Close the idle fingers of valid grasps onto the object, where the grasp then passes as well with no fewer fingers."""
     max_barren_rounds: int = 3
     """A pair is given up after this many rounds in a row without a valid grasp."""
     candidate_budget: int = 8192
@@ -161,6 +164,8 @@ def valid_grasps(
     trial = simulate(hand, obj, grasps, config.protocol, workers=1)
     loose = trial.success & (trial.contacts < config.min_contact_links)
     passed = grasps.with_trial(trial)[trial.success & ~loose]
+    if config.close_fingers and len(passed):
+        passed = closed_where_it_holds(hand, obj, passed, config.protocol, config.min_contact_links, workers=1)
     new = distinct(hand, passed, earlier=earlier)
     failures = Counter(failure.value for failure in trial.failure if failure)
     if loose.any():
