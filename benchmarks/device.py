@@ -70,7 +70,7 @@ def predictions(device: str, weights: dict[str, str], repetitions: int) -> list[
                 parts.append(dict(predictor.run(GraspProblem(hand, obj, device), request).seconds))
 
             whole = median(run, repetitions)
-            network = statistics.median(p["network"] + p["decode"] for p in parts[1:])
+            network = statistics.median(p["network"] + p["choose"] + p["decode"] for p in parts[1:])
             rows.append(said([f"prediction, {label}", device, num, 1e3 * whole / num, 1e3 * network / num, num / whole]))
     return rows
 

@@ -79,8 +79,17 @@ class GraspRequest:
         if not 0 <= self.seed < 2**63:
             raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^63 - 1")
         check_temperature(self.temperature)
-        if self.method not in get_args(Method):
-            raise OptionError(f"method is '{self.method}'; choose {', '.join(get_args(Method))}")
+        check_method(self.method)
+
+
+def check_method(method: str) -> None:
+    """Refuse a method that does not exist.
+
+    Raises:
+        OptionError: As said.
+    """
+    if method not in get_args(Method):
+        raise OptionError(f"method is '{method}'; choose {', '.join(get_args(Method))}")
 
 
 @dataclass(frozen=True)
@@ -110,7 +119,7 @@ class Prediction:
     dropped: dict[str, int]
     """Candidates that constraints rejected, by reason."""
     seconds: dict[str, float]
-    """Time by part: network, decode, optimise, refine, settle, rank [s]."""
+    """Time by part: network, choose, decode, optimise, refine, settle, rank [s]."""
     shortage: str | None = None
     """Why there are fewer grasps than were asked for, and what to do; None if there are as many."""
 
@@ -195,7 +204,7 @@ class GraspPredictor:
         Raises:
             OptionError: No grasp was found.
         """
-        watch = Stopwatch("network", "decode", "optimise", "refine", "settle", "rank")
+        watch = Stopwatch("network", "choose", "decode", "optimise", "refine", "settle", "rank")
         pool = CandidatePool(problem, request.num, request.refine, watch)
         if request.method != "optimise":
             self._ask_network(pool, request, progress)

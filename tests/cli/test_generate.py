@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,8 @@ from dro_grasp.grasps.batch import GraspBatch
 from tests.helpers.loaded_hands import loaded_hand
 
 KEYS = {
-    "hand", "object", "num", "candidates", "origin", "seed", "weights", "protocol", "success", "success_rate", "seconds",
-    "output", "frame",
+    "hand", "object", "num", "candidates", "origin", "origins", "seed", "weights", "protocol", "success", "success_rate",
+    "seconds", "output", "frame",
 }
 
 
@@ -43,7 +44,7 @@ def test_generate_reports_and_saves_what_it_counts(generate, tmp_path: Path) -> 
     report = generate("--output", str(path), method="auto", candidates=4)
     assert report.keys() >= KEYS
     assert set(report["seconds"]) == {
-        "start", "load", "network", "decode", "optimise", "refine", "settle", "rank", "trial", "files", "total"}
+        "start", "load", "network", "choose", "decode", "optimise", "refine", "settle", "rank", "trial", "files", "total"}
     parts = sum(value for name, value in report["seconds"].items() if name != "total")
     assert 0.8 * report["seconds"]["total"] < parts <= report["seconds"]["total"] + 0.01
     assert (report["num"], report["protocol"]) == (3, "strict")
@@ -54,6 +55,8 @@ def test_generate_reports_and_saves_what_it_counts(generate, tmp_path: Path) -> 
     assert int(grasps.success.sum()) == report["success"]
     assert (grasps.score[:-1] >= grasps.score[1:]).all()
     assert "predicted_points" not in grasps.extra
+    assert report["origins"] == ["network" if maker.startswith("network") else "optimiser" for maker in grasps.provenance]
+    assert report["origin"] == Counter(report["origins"])
 
 
 def test_same_seed_same_grasps(generate, tmp_path: Path) -> None:

@@ -58,6 +58,9 @@ def test_a_file_becomes_weights_and_a_report(home: Path, capsys: pytest.CaptureF
         share = f"{told[step]['returned']['strict/1']:.0%} {step} ({told['optimised'][step]:.0%} of them made by the optimiser)"
         assert share in page
     assert " of 3 made by the optimiser" in page
+    for row in json.loads((home / "out" / steps.STATE).read_text())["steps"]["after"]["rows"]:
+        share, everyone = row["fingers"]["strict/1"]
+        assert f"{100 * share:.0f} ({100 * everyone:.0f})" in page
     assert told["weights"] == (told["fine_tuned"] if told["gained"] else str(home / "untrained.safetensors"))
     assert f"--weights {told['weights']}" in page
     assert told["without_grasps"] == []
@@ -71,6 +74,17 @@ def test_the_next_steps_are_commands_for_shells(tmp_path: Path) -> None:
     words = [shlex.split(line) for line in page.splitlines()]
     assert words[0][2:8] == ["--hand", hand, "--object", "my_mesh.stl", "--weights", str(folder / steps.WEIGHTS)]
     assert words[-1] == ["dro-grasp", "dataset", "report", str(folder / steps.DATA), "--output", "data.html"]
+
+
+def test_what_generate_returns_is_of_the_method_that_is_asked_for(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = command(home, "--method", "optimise", "--json")
+    asked[asked.index("--output") + 1] = str(home / "optimised")
+    assert main(asked) == 0
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert told["optimised"] == {"before": 1.0, "after": 1.0}
+    page = (home / "optimised" / "report.html").read_text()
+    assert "3 of 3 made by the optimiser" in page
+    assert "--method optimise --output grasps.parquet" in page
 
 
 def test_a_rerun_does_nothing_again(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -127,7 +141,9 @@ def test_the_folder_of_another_hand_is_refused(home: Path, capsys: pytest.Captur
     assert "belongs to hand 'mine'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("more", "word"), [(["--weights", "multi"], "was begun with weights"), (["--seed", "7"], "with seed")])
+@pytest.mark.parametrize(("more", "word"), [
+    (["--weights", "multi"], "was begun with weights"), (["--seed", "7"], "with seed"),
+    (["--method", "network"], "with method auto, network was asked for")])
 def test_a_folder_that_was_begun_otherwise_is_refused(
     home: Path, more: list[str], word: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

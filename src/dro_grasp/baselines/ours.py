@@ -12,7 +12,7 @@ from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize_with
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.proposal import propose
 from dro_grasp.pipeline.stages import optimise
-from dro_grasp.predictor import GraspPredictor, GraspRequest
+from dro_grasp.predictor import GraspPredictor, GraspRequest, Method as Source
 from dro_grasp.stopwatch import Stopwatch
 
 CANDIDATES = 4
@@ -24,8 +24,11 @@ DESCENT_STEPS = 1200
 class DistanceMethod(Method):
     """The D(R,O) network; it returns what `generate` does, with the optimiser's help where the score asks for it."""
 
-    def __init__(self, predictor: GraspPredictor, name: str = "dro", candidates: int = CANDIDATES) -> None:
+    def __init__(
+        self, predictor: GraspPredictor, name: str = "dro", candidates: int = CANDIDATES, source: Source = "auto"
+    ) -> None:
         self.predictor, self.name, self.candidates = predictor, name, candidates
+        self.source: Source = source
 
     def make(self, problem: GraspProblem, num: int, seed: int) -> GraspBatch:
         """Grasps of the network alone."""
@@ -39,7 +42,7 @@ class DistanceMethod(Method):
 
     def best(self, problem: GraspProblem, num: int, seed: int) -> Made:
         """Grasps as `generate` returns them."""
-        made = self.predictor.run(problem, GraspRequest(num, seed, candidates=self.candidates))
+        made = self.predictor.run(problem, GraspRequest(num, seed, candidates=self.candidates, method=self.source))
         return Made(made.grasps, made.candidates)
 
 

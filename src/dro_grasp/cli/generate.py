@@ -159,7 +159,7 @@ class Generate:
         report = {
             "hand": job.hand.name, "object": obj.name, "num": len(grasps), "asked": self.num, "shortage": made.shortage,
             "candidates": made.candidates, "dropped": made.dropped,
-            "origin": dict(Counter(made.origin)),
+            "origin": dict(Counter(made.origin)), "origins": made.origin,
             "seed": self.seed, "weights": job.predictor.weights_name, "protocol": self._protocol(obj),
             "success": int(grasps.success.sum()) if simulated else None,
             "success_rate": float(grasps.success.float().mean()) if simulated else None,

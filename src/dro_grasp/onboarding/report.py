@@ -62,12 +62,14 @@ def _rates(done: Onboarded) -> str:
     for step in ("before", "after"):
         for row in done.steps[step]["rows"]:
             rates = [f"{100 * p:.0f} % [{100 * low:.0f}-{100 * high:.0f}]" for p, low, high in row["success"].values()]
-            rows.append([step, STAGES[row["stage"]], row["num"], *rates, f"{100 * row['optimised']:.0f} %",
-                         f"{row['diversity']:.2f}"])
+            touching, all_touch = (100 * share for share in row["fingers"][STRICT])
+            rows.append([step, STAGES[row["stage"]], row["num"], *rates, f"{touching:.0f} ({all_touch:.0f})",
+                         f"{100 * row['optimised']:.0f} %", f"{row['diversity']:.2f}"])
     labels = list(done.steps["after"]["rows"][0]["success"])
-    return table(["weights", "grasps", "trials", *labels, "by the optimiser", "diversity"], rows) + (
+    return table(["weights", "grasps", "trials", *labels, "fingers [%]", "by the optimiser", "diversity"], rows) + (
         "<p class=note>Success rates with 95 % intervals. dro is the paper's protocol and lenient; strict also limits "
-        "penetration and how far closing may push the object. The network's rows are what fine-tuning improves. "
+        "penetration and how far closing may push the object. Fingers: the share of the hand's that touch the object, and in "
+        "parentheses of the grasps with all of them. The network's rows are what fine-tuning improves. "
         "<i>generate</i> keeps the best of four of the network's candidates by score, as the row <i>best quarter</i> does, and "
         "asks the optimiser for others where the score does not trust these: slower, and less needed the better the network "
         "is. <i>generate --method network</i> does without.</p>")
@@ -80,7 +82,7 @@ def _drawn(done: Onboarded, held_out: list[str]) -> str:
         obj = load_object(name)
         path = done.folder / f"{Path(name).stem}.png"
         problem = GraspProblem(hand, obj)
-        made = predictor.run(problem, GraspRequest(GRASPS))
+        made = predictor.run(problem, GraspRequest(GRASPS, method=done.method))
         draw_grasps(hand, obj, evaluate(problem, made.grasps, "strict"), path)
         by_optimiser = made.origin.count("optimiser")
         parts.append(image(path.read_bytes(), f"grasps of {name}")
@@ -96,8 +98,9 @@ def _data(step: dict[str, Any]) -> str:
 
 def _commands(done: Onboarded) -> str:
     weights = () if done.weights is None else ("--weights", done.weights)
+    method = () if done.method == "auto" else ("--method", done.method)
     lines = [
-        command("dro-grasp", "generate", "--hand", done.hand, "--object", "my_mesh.stl", *weights)
+        command("dro-grasp", "generate", "--hand", done.hand, "--object", "my_mesh.stl", *weights, *method)
         + " --output grasps.parquet",
         "dro-grasp evaluate grasps.parquet --protocol strict",
         "dro-grasp export grasps.parquet --format isaac_grasp --output grasps.yaml --only-successful",

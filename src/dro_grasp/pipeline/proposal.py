@@ -1,4 +1,4 @@
-"""Candidates from the network: placements of the open hand, D(R,O), link poses, joints.
+"""Candidates from the network: placements of the open hand, z by choice, D(R,O), link poses, joints.
 
 Source: paper section III, figure 2. Differs from the paper: a placement of the open hand is chosen first, by the caller's
 direction or by the learned placement prior. Networks of the paper's form have no such prior: their wrists are turned at
@@ -8,8 +8,9 @@ random, or face the caller's direction at a random roll.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -22,7 +23,7 @@ from dro_grasp.geometry.se3 import apply_to_cloud, compose, rotate
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.proportions import proportions
-from dro_grasp.models.network import DistanceNetwork
+from dro_grasp.models.network import DistanceNetwork, Moves
 from dro_grasp.optimization.palm_directions import CLEAR, Spread, lack_of_room, wrist_rotations
 from dro_grasp.optimization.starts import CHOICES
 from dro_grasp.pipeline.choice import ChoiceConfig, choice_scores
@@ -93,7 +94,7 @@ def propose(
         num: How many.
         generator: Source of randomness, on the CPU; its seed is recorded with the grasps.
         config: Sampling and batches.
-        watch: Counts the seconds of `network` and `decode`.
+        watch: Counts the seconds of `network`, `choose` and `decode`.
         progress: Called with (candidates decoded, candidates wanted).
     """
     config = config or ProposalConfig()
@@ -109,8 +110,7 @@ def propose(
     found: list[tuple[Tensor, Tensor, Tensor]] = []
     for start in range(0, num, config.batch_size):
         part = slice(start, min(start + config.batch_size, num))
-        with watch("network"):
-            distances = _distances(problem, network, cloud, placement[part], joints[part], noise[part], config)
+        distances = _distances(problem, network, cloud, placement[part], joints[part], noise[part], config, watch)
         with watch("decode"), one_thread():
             links = distance_matrix.decode(hand, distances, cloud.expand(len(distances), -1, -1))
             solution = distance_matrix.solve(hand, links, joints[part])
@@ -171,31 +171,40 @@ def _placements(
 
 def _distances(
     problem: GraspProblem, network: DistanceNetwork, cloud: Float[Tensor, "m 3"], placement: Float[Tensor, "b p 4 4"],
-    joints: Float[Tensor, "b n_dof"], noise: Float[Tensor, "b p k latent"], config: ProposalConfig,
+    joints: Float[Tensor, "b n_dof"], noise: Float[Tensor, "b p k latent"], config: ProposalConfig, watch: Stopwatch,
 ) -> Float[Tensor, "b n m"]:
     """D(R,O) of the best of p placements with k draws each of every open hand; the same in every frame."""
     hand = problem.thinned(network.config.n_hand)
     centre, size = cloud.mean(0), config.network_batch_size
     field = problem.field  # made before threads ask for it
+    rivals, draws = noise.shape[1:3]
+    each = side_by_side if len(placement) > size else _one_by_one  # all threads for the one part that there is
 
-    def predict(
-        placement: Float[Tensor, "b p 4 4"], joints: Float[Tensor, "b n_dof"], noise: Float[Tensor, "b p k latent"]
-    ) -> Float[Tensor, "b n m"]:
-        count, rivals = placement.shape[:2]
-        T = placement.flatten(0, 1)
+    def move(
+        T: Float[Tensor, "b p 4 4"], joints: Float[Tensor, "b n_dof"], noise: Float[Tensor, "b p k latent"]
+    ) -> tuple[Moves, Float[Tensor, "c 3 3"]]:
+        T = T.flatten(0, 1)
         axes = T[:, :3, :3] @ network.config.axes(hand.palm_axes_wrist)
         centres = centre.expand(len(T), 3)
         opened = network.to_frame(hand.points(joints.repeat_interleave(rivals, 0), T), centres, axes)
         obj = network.to_frame(cloud.expand(len(T), -1, -1), centres, axes)
-        moves = network.move(opened, obj, noise.flatten(0, 1))
-        draws = moves.z.shape[1]
-        if rivals * draws > 1:
-            points = moves.points @ axes[:, None].mT + centre
-            suits = choice_scores(hand, field, points, config.choice.penalties, problem.room)
-            best = suits.reshape(count, rivals * draws).argmax(-1)
-            moves = moves.pick(torch.arange(count, device=T.device) * rivals + best // draws, best % draws)
-        return network.distances(moves).float()
+        return network.move(opened, obj, noise.flatten(0, 1)), axes
 
-    if len(placement) <= size:  # all threads for the one part that there is
-        return predict(placement, joints, noise)
-    return torch.cat(side_by_side(predict, placement.split(size), joints.split(size), noise.split(size)))
+    def choose(moves: Moves, axes: Float[Tensor, "c 3 3"]) -> Moves:
+        points = moves.points @ axes[:, None].mT + centre
+        suits = choice_scores(hand, field, points, config.choice.penalties, problem.room)
+        best = suits.reshape(-1, rivals * draws).argmax(-1)
+        return moves.pick(torch.arange(len(best), device=best.device) * rivals + best // draws, best % draws)
+
+    with watch("network"):
+        moves, axes = zip(*each(move, placement.split(size), joints.split(size), noise.split(size)), strict=True)
+    if rivals * draws > 1:
+        with watch("choose"):
+            moves = each(choose, moves, axes)
+    with watch("network"):
+        return torch.cat(each(network.distances, moves)).float()
+
+
+def _one_by_one(work: Callable[..., Any], *parts: Iterable[Any]) -> list[Any]:
+    """The results for all parts of a task, with all threads for each."""
+    return [work(*job) for job in zip(*parts, strict=True)]
