@@ -64,6 +64,7 @@ docs-pictures: setup
 	$(BIN)/python -m scripts.draw_studio docs/pictures/studio.png
 
 PAPER_HANDS := assets/barrett_multidex assets/allegro_left assets/shadowhand assets/leaphand
+FULLER_HANDS := assets/allegro_left assets/shadowhand
 OTHER_HANDS := allegro barrett gripper3 leaphand shadowhand assets/allegro_right
 HELD_OUT_HANDS := assets/inspire assets/ability assets/dclaw assets/ezgripper assets/orca
 PAPER_OBJECTS := assets:train assets:validate
@@ -72,7 +73,8 @@ data: setup  # hours; needs DRO_GRASP_ASSETS; can be stopped and started again
 	$(BIN)/dro-grasp synthesize --hand $(PAPER_HANDS) --object $(PAPER_OBJECTS) --grasps 150 --output out/data
 	$(BIN)/dro-grasp synthesize --hand $(OTHER_HANDS) --object $(PAPER_OBJECTS) --grasps 75 --output out/other
 	$(BIN)/dro-grasp synthesize --hand $(HELD_OUT_HANDS) --object $(PAPER_OBJECTS) --grasps 50 --output out/held_out
-	$(BIN)/dro-grasp dataset merge out/data --output data/grasps --per-pair 150
+	$(BIN)/dro-grasp synthesize --hand $(FULLER_HANDS) --object assets:train --grasps 12 --idle 0.2 --seed 7 --output out/fuller
+	$(BIN)/dro-grasp dataset merge out/data out/fuller --output data/grasps --per-pair 190
 	$(BIN)/dro-grasp dataset merge out/other --output data/grasps --per-pair 75
 	$(BIN)/dro-grasp dataset merge out/held_out --output data/grasps --per-pair 50
 

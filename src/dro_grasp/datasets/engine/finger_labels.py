@@ -33,7 +33,8 @@ def closed_where_it_holds(
         min_links: Links that must touch the object after closing.
         workers: As `simulate`.
     """
-    relabelled = torch.as_tensor(evaluated.extra.get(RELABELLED, torch.zeros(len(evaluated)))).bool()
+    known = evaluated.extra.get(RELABELLED, [None] * len(evaluated))
+    relabelled = torch.tensor([bool(mark) for mark in known], dtype=torch.bool)
     energy = GraspEnergy.of_object(hand, obj, EnergyConfig(hand_points=hand.n_points))
     closed = close_idle_fingers(energy, evaluated).replace(energy=evaluated.energy, extra=evaluated.extra)
     rows = (closed.joints != evaluated.joints).any(1).nonzero()[:, 0]
