@@ -119,6 +119,17 @@ def test_fingers_are_closed_where_the_grasp_holds_and_touches_with_more(lazy):
     assert gained > 1
 
 
+def test_marks_of_an_earlier_closing_stay(lazy):
+    """Of grasps that were merged with others, which never were closed, and of which nobody knows."""
+    marks = [None, True] * (len(lazy[0].grasps) // 2)
+    pair = replace(lazy[0], grasps=lazy[0].grasps.replace(extra={"relabelled": marks}))
+    ((_, plain),) = keep_passing(lazy[:1], changed("dro"), close_fingers=True)
+    ((_, marked),) = keep_passing([pair], changed("dro"), close_fingers=True)
+    rows = [int((pair.grasps.T_object_wrist == T).all((1, 2)).nonzero()[0]) for T in marked.T_object_wrist]
+    assert marked.extra["relabelled"].tolist() == [
+        new or marks[row] is True for new, row in zip(plain.extra["relabelled"].tolist(), rows, strict=True)]
+
+
 def test_closed_fingers_are_not_kept_where_one_link_alone_touches(lazy, monkeypatch):
     trials = []
 
