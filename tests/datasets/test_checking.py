@@ -13,6 +13,7 @@ from dro_grasp.cli.main import main
 from dro_grasp.datasets.collections import checking
 from dro_grasp.datasets.collections.checking import check, keep_passing
 from dro_grasp.datasets.collections.collection import PairGrasps, read_collection
+from dro_grasp.datasets.engine import finger_labels
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
@@ -133,14 +134,15 @@ def test_marks_of_an_earlier_closing_stay(lazy):
 def test_closed_fingers_are_not_kept_where_one_link_alone_touches(lazy, monkeypatch):
     trials = []
 
-    def few(hand, obj, grasps, rules):
-        found = simulate(hand, obj, grasps, rules)
+    def few(hand, obj, grasps, rules, **options):
+        found = simulate(hand, obj, grasps, rules, **options)
         if trials:  # the first is that of the grasps as they are stored
             found = replace(found, contact_links=tuple(names[:1] for names in found.contact_links))
         trials.append(found)
         return found
 
-    monkeypatch.setattr(checking, "simulate", few)
+    for module in (checking, finger_labels):
+        monkeypatch.setattr(module, "simulate", few)
     ((pair, kept),) = keep_passing(lazy[:1], changed("dro"), close_fingers=True)
     assert int((trials[1].success & (trials[1].contacts == 1)).sum()) > 1
     assert torch.equal(kept.joints, pair.grasps.joints[trials[0].success])
