@@ -198,9 +198,9 @@ class _Onboarding:
                 if known["asked"].get(name, asked) != asked:  # earlier versions stored none
                     raise OptionError(f"{folder} was begun with {name} {known['asked'][name]}, {asked} was asked for; use the "
                                       "same to resume, or name another folder")
-            # A benchmark of an earlier version, which does not tell what `generate` returns, is made again.
+            # A benchmark of an earlier version, which tells less than what the report needs, is made again.
             self.steps = {name: step for name, step in known["steps"].items()
-                          if "rows" not in step or any(row["stage"] == RETURNED for row in step["rows"])}
+                          if "rows" not in step or any(row["stage"] == RETURNED and "fingers" in row for row in step["rows"])}
 
     def _known(self, state: Path) -> dict[str, Any] | None:
         """What a run before has stored; a damaged file is set aside, and its steps are made again."""
