@@ -21,6 +21,7 @@ from synthesis import HANDS, training_objects
 from dro_grasp.datasets.engine.worker import EngineConfig, valid_grasps
 from dro_grasp.energy.contact_candidates import ContactConfig
 from dro_grasp.evaluation.metrics import diversity
+from dro_grasp.evaluation.rows import finger_contact
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
@@ -67,8 +68,8 @@ def measure(hand_name: str, objects: list[str], config: EngineConfig) -> list[ob
     depth = float(joined.penetration.median()) * 1e3
     slippery = changed("strict", friction=0.5)
     held = sum(int(simulate(hand, load_object(n), b, slippery).success.sum()) for n, b in zip(objects, batches, strict=True))
-    touching, n_fingers = joined.fingers_in_contact, len(hand.fingers)
-    fingers = f"{100 * float(touching.mean()) / n_fingers:.0f} ({100 * float((touching == n_fingers).float().mean()):.0f})"
+    share, everyone = finger_contact(joined.fingers_in_contact, len(hand.fingers))
+    fingers = f"{100 * share:.0f} ({100 * everyone:.0f})"
     return [len(joined), 3600 * len(joined) / seconds, fingers, *(f"{v:.3f}" for v in spread.values()), depth,
             100 * held / max(1, len(joined))]
 
