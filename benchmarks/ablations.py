@@ -23,10 +23,10 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from dro_grasp.baselines.ours import DistanceMethod
 from report import ROOT, emit
 from synthesis import HANDS
 
-from dro_grasp.baselines.ours import DistanceMethod
 from dro_grasp.cli.main import main as command
 from dro_grasp.datasets.bundle.training_file import HELD_OUT_HANDS, Bundle, load_bundle
 from dro_grasp.evaluation.distance_error import distance_errors
@@ -39,7 +39,7 @@ from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.perception.partial_views import View
-from dro_grasp.predictor import GraspPredictor
+from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.simulation.protocols import protocol
 from dro_grasp.training.config import (
     AugmentationConfig,

@@ -21,7 +21,7 @@ from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.loading import cloud_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.partial_views import partial_view, visible_side
-from dro_grasp.predictor import GraspPredictor
+from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.simulation.trial import simulate
 
 PROTOCOLS = ("dro", "strict")

@@ -20,11 +20,11 @@ from dro_grasp.evaluation.success_rates import pair_seed
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
-from dro_grasp.pipeline.choice import ChoiceConfig, ChoicePenalties
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.proposal import ProposalConfig, propose
-from dro_grasp.pipeline.stages import complete
-from dro_grasp.predictor import GraspPredictor
+from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.choice import ChoiceConfig, ChoicePenalties
+from dro_grasp.predict.sources.network import ProposalConfig, propose
+from dro_grasp.predict.stages import complete
 from dro_grasp.simulation.trial import simulate
 
 OBJECTS = ["jar", "rod", "toy_airplane", "wrench", "vase", "joystick", "brick", "egg"]

@@ -23,11 +23,10 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from dro_grasp.baselines.ours import DistanceMethod, SynthesisMethod
 from report import emit, rate
 
 from dro_grasp.baselines.method import Method
-from dro_grasp.baselines.ours import DistanceMethod, SynthesisMethod
-from dro_grasp.baselines.registry import MethodOptions, make_method
 from dro_grasp.datasets.bundle.training_file import load_bundle
 from dro_grasp.evaluation.metrics import diversity, wilson_interval
 from dro_grasp.evaluation.success_rates import pair_seed
@@ -35,7 +34,8 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
-from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.registry import MethodOptions, make_method
 from dro_grasp.simulation.protocols import changed
 from dro_grasp.simulation.trial import simulate
 

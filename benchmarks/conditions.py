@@ -32,9 +32,9 @@ from dro_grasp.models.encoder import SLOPE
 from dro_grasp.models.latent import Condition, FlowPrior
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.catalogue import load_object, resolve_objects
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.proposal import propose
-from dro_grasp.pipeline.stages import complete
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.network import propose
+from dro_grasp.predict.stages import complete
 from dro_grasp.simulation.trial import simulate
 from dro_grasp.training.config import AugmentationConfig
 from dro_grasp.training.samples import HandSamples, SampleSource

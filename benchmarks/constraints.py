@@ -30,9 +30,10 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.scenery import load_scene
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.pipeline.constraints import Constraints
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.predictor import GraspPredictor, GraspRequest
+from dro_grasp.predict.config import GraspRequest
+from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.problem import GraspProblem
 
 ABOVE = (0.0, 0.0, -1.0)
 """Palm direction from above."""

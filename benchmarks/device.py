@@ -29,8 +29,9 @@ from dro_grasp.models.network import untrained_network
 from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.predictor import GraspPredictor, GraspRequest
+from dro_grasp.predict.config import GraspRequest
+from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.training.config import ScheduleConfig, TrainConfig
 from dro_grasp.training.loop import train
 

@@ -27,9 +27,10 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.mesh_process import SCALES, processed_objects
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.stages import evaluate
-from dro_grasp.predictor import GraspPredictor, GraspRequest
+from dro_grasp.predict.config import GraspRequest
+from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.stages import evaluate
 from dro_grasp.simulation.contact_quality import NAMES, with_contacts
 
 PALM = 0.034

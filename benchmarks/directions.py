@@ -21,7 +21,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
-from dro_grasp.predictor import GraspPredictor
+from dro_grasp.predict.predictor import GraspPredictor
 
 KEPT = 20.0
 """Angle within which a direction counts as kept [degrees]."""

@@ -19,7 +19,8 @@ from dro_grasp.evaluation.success_rates import pair_seed
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
-from dro_grasp.predictor import GraspPredictor, PredictorConfig
+from dro_grasp.predict.config import PredictorConfig
+from dro_grasp.predict.predictor import GraspPredictor
 
 
 def main() -> None:

@@ -20,10 +20,11 @@ from dro_grasp.evaluation.success_rates import pair_seed
 from dro_grasp.hands.library import load_hand
 from dro_grasp.models.network import DistanceNetwork, Moves
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.pipeline.choice import ChoiceConfig, choice_scores
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.stages import complete
-from dro_grasp.predictor import GraspPredictor, PredictorConfig
+from dro_grasp.predict.config import PredictorConfig
+from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.choice import ChoiceConfig, choice_scores
+from dro_grasp.predict.stages import complete
 from dro_grasp.simulation.trial import simulate
 
 OBJECTS = ["bottle", "wrench", "bowl", "toy_airplane", "rod", "tall_box"]

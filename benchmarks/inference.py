@@ -33,8 +33,9 @@ from dro_grasp.models.checkpoints import save_weights
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.predictor import GraspPredictor, GraspRequest
+from dro_grasp.predict.config import GraspRequest
+from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.problem import GraspProblem
 
 HANDS = ("barrett", "allegro", "shadowhand")
 """Built-in versions of the paper's hands."""

@@ -18,14 +18,10 @@ import numpy as np
 import torch
 from report import emit
 
-from dro_grasp.baselines.controls import MeanGrasp, mean_grasp, mean_grasps
 from dro_grasp.datasets.bundle.training_file import load_bundle
 from dro_grasp.evaluation.metrics import wilson_interval
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object, resolve_objects
-from dro_grasp.pipeline.choice import ChoiceConfig
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.stages import complete
 from dro_grasp.planning.attempts import Attempt, TabletopConfig, attempt
 from dro_grasp.planning.plan_config import PlanConfig
 from dro_grasp.planning.planner import NO_PATH
@@ -33,7 +29,11 @@ from dro_grasp.planning.robot import load_robot
 from dro_grasp.planning.standing import upright
 from dro_grasp.planning.table_scene import PickedObject
 from dro_grasp.planning.tabletop import TabletopRun, endings, failures, processor_seconds, run_tabletop
-from dro_grasp.predictor import GraspPredictor
+from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.choice import ChoiceConfig
+from dro_grasp.predict.sources.controls import MeanGrasp, mean_grasp, mean_grasps
+from dro_grasp.predict.stages import complete
 
 ROWS = {
     "cloud": TabletopConfig(),

@@ -21,9 +21,10 @@ from dro_grasp.datasets.bundle.training_file import HELD_OUT_HANDS
 from dro_grasp.evaluation.success_rates import pair_seed
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
-from dro_grasp.pipeline.choice import ChoiceConfig
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.predictor import GraspPredictor, GraspRequest, PredictorConfig
+from dro_grasp.predict.config import GraspRequest, PredictorConfig
+from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.choice import ChoiceConfig
 from dro_grasp.simulation.trial import simulate
 
 PROTOCOLS = ("dro", "strict")

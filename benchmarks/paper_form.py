@@ -21,10 +21,10 @@ from statistics import mean, stdev
 from typing import Any
 
 import torch
+from dro_grasp.baselines.ours import DistanceMethod
 from report import emit
 from synthesis import HANDS
 
-from dro_grasp.baselines.ours import DistanceMethod
 from dro_grasp.datasets.bundle.training_file import Bundle, load_bundle
 from dro_grasp.evaluation.distance_error import distance_errors
 from dro_grasp.evaluation.metrics import wilson_interval
@@ -35,7 +35,7 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.models.checkpoints import describe_weights, load_weights, save_weights
 from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.objects.catalogue import load_object, resolve_objects
-from dro_grasp.predictor import GraspPredictor
+from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.simulation.protocols import protocol
 from dro_grasp.training.config import LOSSES, LossConfig, PretrainConfig, ScheduleConfig, TrainConfig
 from dro_grasp.training.loop import train

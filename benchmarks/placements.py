@@ -29,9 +29,9 @@ from dro_grasp.hands.proportions import proportions
 from dro_grasp.models.checkpoints import load_weights
 from dro_grasp.models.network import DistanceNetwork, untrained_network
 from dro_grasp.objects.catalogue import load_object, resolve_objects
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.proposal import propose
-from dro_grasp.pipeline.stages import complete
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.network import propose
+from dro_grasp.predict.stages import complete
 from dro_grasp.simulation.trial import simulate
 from dro_grasp.training.config import AugmentationConfig, PlacementConfig
 from dro_grasp.training.placement_training import train_placement

@@ -27,7 +27,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.predictor import GraspPredictor
+from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.simulation.outcome import TrialResult
 from dro_grasp.simulation.protocols import Perturbations, Protocol, protocol
 from dro_grasp.simulation.trial import simulate

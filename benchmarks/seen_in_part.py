@@ -22,10 +22,11 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.partial_views import View, partial_view
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.proposal import CLOUD_TEMPERATURE
-from dro_grasp.pipeline.stages import refine, scored
-from dro_grasp.predictor import GraspPredictor, PredictorConfig
+from dro_grasp.predict.config import PredictorConfig
+from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.network import CLOUD_TEMPERATURE
+from dro_grasp.predict.stages import refine, scored
 from dro_grasp.simulation.trial import simulate
 
 PROTOCOLS = ("dro", "strict")

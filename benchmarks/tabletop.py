@@ -26,10 +26,11 @@ from dro_grasp.objects.builtin import BUILTIN
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.loading import mesh_object
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.pipeline.constraints import Constraints
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.stages import evaluate
-from dro_grasp.predictor import GraspPredictor, GraspRequest, Method
+from dro_grasp.predict.config import GraspRequest
+from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.stages import evaluate
 
 DIRECTIONS = {"above": (0.0, 0.0, -1.0), "side": (1.0, 0.0, 0.0)}
 """Palm directions."""

@@ -33,10 +33,10 @@ from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.partial_views import View, partial_view
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.proposal import ProposalConfig, propose
-from dro_grasp.pipeline.settling import settled
-from dro_grasp.pipeline.stages import complete, optimise, refine
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.settling import settled
+from dro_grasp.predict.sources.network import ProposalConfig, propose
+from dro_grasp.predict.stages import complete, optimise, refine
 from dro_grasp.ranking.features import feature_names, grasp_features
 from dro_grasp.ranking.score import ScoreConfig
 from dro_grasp.ranking.score_network import SHIPPED, ScoreNetwork, load_score_network, save_score_network

@@ -95,7 +95,7 @@ def small_robot(tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.fixture
 def quick_synthesis(monkeypatch: pytest.MonkeyPatch) -> None:
     """The optimiser beside the network takes a quarter of its steps: its grasps are worse, and made in the same way."""
-    from dro_grasp.pipeline import stages
+    from dro_grasp.predict import stages
 
     monkeypatch.setattr(stages, "SynthesisConfig", functools.partial(stages.SynthesisConfig, steps=30))
 

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from dro_grasp.baselines.ours import CANDIDATES
 from scipy.spatial.transform import Rotation
 from scipy.stats import ttest_rel
 
-from dro_grasp.baselines.ours import CANDIDATES
 from dro_grasp.datasets.bundle.training_file import write_bundle
 from dro_grasp.datasets.collections.importing import read_foreign
 from dro_grasp.models.presets import PRESETS

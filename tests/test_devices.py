@@ -16,7 +16,7 @@ from dro_grasp.errors import OptionError
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.refinement import RefineConfig
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
-from dro_grasp.predictor import GraspPredictor
+from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.records import on_device
 from tests.helpers.claw import ball
 from tests.helpers.toy_hand import toy_hand
@@ -70,9 +70,9 @@ def test_the_optimiser_s_predictions_on_a_device_are_those_of_the_cpu(
     device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Those of the network: `test_predictor.py`."""
-    monkeypatch.setattr("dro_grasp.predictor.OPTIMISED_PER_GRASP", 2)
-    monkeypatch.setattr("dro_grasp.pipeline.stages.SynthesisConfig", functools.partial(SynthesisConfig, steps=10))
-    monkeypatch.setattr("dro_grasp.pipeline.stages.RefineConfig", functools.partial(RefineConfig, steps=10))
+    monkeypatch.setattr("dro_grasp.predict.predictor.OPTIMISED_PER_GRASP", 2)
+    monkeypatch.setattr("dro_grasp.predict.stages.SynthesisConfig", functools.partial(SynthesisConfig, steps=10))
+    monkeypatch.setattr("dro_grasp.predict.stages.RefineConfig", functools.partial(RefineConfig, steps=10))
     weights, obj = str(untrained_weights(tmp_path)), load_object("sphere")
     here, there = (
         GraspPredictor(weights, device=place).predict(toy_hand(), obj, 2, seed=3, method="optimise")

@@ -1,9 +1,7 @@
 """The public names: type checkers read them here, and the package loads each from its module on first use."""
 
 from dro_grasp._version import __version__ as __version__
-from dro_grasp.baselines.controls import palm_facing_starts as palm_facing_starts
 from dro_grasp.baselines.method import Method as Method
-from dro_grasp.baselines.registry import MethodOptions as MethodOptions, make_method as make_method
 from dro_grasp.datasets.bundle.training_file import load_bundle as load_bundle
 from dro_grasp.datasets.collections.bundling import make_bundle as make_bundle
 from dro_grasp.datasets.collections.collection import read_collection as read_collection
@@ -34,10 +32,6 @@ from dro_grasp.optimization.refinement import RefineConfig as RefineConfig
 from dro_grasp.optimization.synthesis import SynthesisConfig as SynthesisConfig, synthesize as synthesize
 from dro_grasp.perception.partial_views import DepthCamera as DepthCamera, visible_points as visible_points
 from dro_grasp.perception.scan import depth_points as depth_points, scanned_object as scanned_object
-from dro_grasp.pipeline.choice import ChoiceConfig as ChoiceConfig, ChoicePenalties as ChoicePenalties
-from dro_grasp.pipeline.constraints import Constraints as Constraints
-from dro_grasp.pipeline.problem import GraspProblem as GraspProblem
-from dro_grasp.pipeline.stages import complete as complete, evaluate as evaluate, rank as rank, refine as refine
 from dro_grasp.planning.attempts import Attempt as Attempt, TabletopConfig as TabletopConfig
 from dro_grasp.planning.motion import MotionPlan as MotionPlan
 from dro_grasp.planning.plan_config import PlanConfig as PlanConfig
@@ -48,12 +42,14 @@ from dro_grasp.planning.robot_check import RobotReport as RobotReport, check_rob
 from dro_grasp.planning.table_scene import PickedObject as PickedObject, pick_object as pick_object
 from dro_grasp.planning.tabletop import TabletopRun as TabletopRun, run_tabletop as run_tabletop
 from dro_grasp.planning.trajectory_files import trajectory_csv as trajectory_csv, trajectory_yaml as trajectory_yaml
-from dro_grasp.predictor import (
-    GraspPredictor as GraspPredictor,
-    GraspRequest as GraspRequest,
-    Prediction as Prediction,
-    PredictorConfig as PredictorConfig,
-)
+from dro_grasp.predict.config import GraspRequest as GraspRequest, PredictorConfig as PredictorConfig
+from dro_grasp.predict.constraints import Constraints as Constraints
+from dro_grasp.predict.predictor import GraspPredictor as GraspPredictor, Prediction as Prediction
+from dro_grasp.predict.problem import GraspProblem as GraspProblem
+from dro_grasp.predict.sources.choice import ChoiceConfig as ChoiceConfig, ChoicePenalties as ChoicePenalties
+from dro_grasp.predict.sources.controls import palm_facing_starts as palm_facing_starts
+from dro_grasp.predict.sources.registry import MethodOptions as MethodOptions, make_method as make_method
+from dro_grasp.predict.stages import complete as complete, evaluate as evaluate, rank as rank, refine as refine
 from dro_grasp.serve.client import GraspClient as GraspClient
 from dro_grasp.simulation.contact_quality import ContactQuality as ContactQuality, measure_contacts as measure_contacts
 from dro_grasp.simulation.outcome import Failure as Failure, TrialResult as TrialResult

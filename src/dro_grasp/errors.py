@@ -43,6 +43,10 @@ class OptionError(DroGraspError):
     """An option or argument has an invalid value."""
 
 
+class NoGraspError(OptionError):
+    """No grasp meets what was asked for; the message says why, and what to change."""
+
+
 class OutputError(DroGraspError):
     """A path cannot be written."""
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from dro_grasp.baselines import registry
 from dro_grasp.baselines.bundle_draws import BundleDraws
 from dro_grasp.baselines.gendexgrasp import contact_maps, map_training
 from dro_grasp.baselines.gendexgrasp.contact_maps import contact_map, sharpened
@@ -23,11 +22,12 @@ from dro_grasp.baselines.gendexgrasp.map_training import (
     map_losses,
     train_contact_maps,
 )
-from dro_grasp.baselines.registry import make_method
 from dro_grasp.cli.main import main
 from dro_grasp.errors import WeightsError
 from dro_grasp.models.checkpoints import save_weights
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.predict.sources import registry
+from dro_grasp.predict.sources.registry import make_method
 from dro_grasp.training.config import ScheduleConfig
 from tests.helpers.toy_hand import toy_hand
 

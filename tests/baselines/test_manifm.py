@@ -15,11 +15,11 @@ from dro_grasp.baselines.manifm.contact_method import ContactMethodConfig, reach
 from dro_grasp.baselines.manifm.contact_network import LATENT, ContactNetwork
 from dro_grasp.baselines.manifm.contact_training import ContactTrainingConfig, contact_losses, draw_contacts, open_hand_cloud
 from dro_grasp.baselines.manifm.fingertip_contacts import REACH, WIDTH, Pads, contact_maps, contacts_of
-from dro_grasp.baselines.registry import make_method
 from dro_grasp.cli.main import main
 from dro_grasp.geometry.se3 import apply
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.registry import make_method
 from tests.helpers.toy_hand import toy_hand
 
 HAND = toy_hand()

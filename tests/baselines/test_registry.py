@@ -8,17 +8,17 @@ from pathlib import Path
 
 import pytest
 import torch
+from dro_grasp.baselines.ours import DescentMethod
 
 from dro_grasp.baselines import ours
-from dro_grasp.baselines.foreign import FileMethod, ForeignMethod
 from dro_grasp.baselines.method import Method
-from dro_grasp.baselines.ours import DescentMethod
-from dro_grasp.baselines.registry import METHODS, WITH_WEIGHTS, MethodOptions, make_method
 from dro_grasp.cli.main import main
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import SynthesisConfig
-from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.own import FileMethod, ForeignMethod
+from dro_grasp.predict.sources.registry import METHODS, WITH_WEIGHTS, MethodOptions, make_method
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.tiny_bundle import made_up_grasps

@@ -17,9 +17,10 @@ from dro_grasp.cli.synthesize import Synthesize
 from dro_grasp.datasets.engine.worker import EngineConfig
 from dro_grasp.energy.contact_candidates import ContactConfig
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.pipeline.constraints import Constraints
-from dro_grasp.pipeline.stages import evaluate
-from dro_grasp.predictor import GraspPredictor, GraspRequest
+from dro_grasp.predict.config import GraspRequest
+from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.stages import evaluate
 from dro_grasp.simulation.closed_poses import settle
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL
 from dro_grasp.simulation.trial import record, simulate

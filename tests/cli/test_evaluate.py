@@ -48,7 +48,7 @@ def test_outcomes_on_another_object_are_not_stored_as_those_on_its_own(
     # The second object of a file is refused before the trials of the first.
     changed = grasps.replace(object=("can",), object_sha256=("old",))
     GraspBatch.concatenate([grasps, changed]).save(path)
-    monkeypatch.setattr("dro_grasp.pipeline.stages.evaluate", None)
+    monkeypatch.setattr("dro_grasp.predict.stages.evaluate", None)
     assert main(["evaluate", str(path), "--output", str(output)]) == 2
     assert "another object 'can'" in capsys.readouterr().err
     assert not output.exists()

@@ -138,9 +138,9 @@ def test_folder_of_objects_needs_a_folder_for_results(weights: str, tmp_path: Pa
 
 def test_table_keeps_hands_above_it(generate, tmp_path: Path) -> None:
     from dro_grasp.objects.catalogue import load_object
-    from dro_grasp.pipeline.admission import permitted
-    from dro_grasp.pipeline.constraints import Constraints
-    from dro_grasp.pipeline.problem import GraspProblem
+    from dro_grasp.predict.admission import permitted
+    from dro_grasp.predict.constraints import Constraints
+    from dro_grasp.predict.problem import GraspProblem
 
     path = tmp_path / "grasps.parquet"
     report = generate("--table", "-0.15", "--protocol", "none", "--output", str(path))
@@ -163,7 +163,7 @@ def test_a_file_without_any_success_is_told(
         none = torch.zeros(len(grasps), dtype=torch.bool)
         return grasps.replace(success=none, protocol=("strict/1",) * len(grasps))
 
-    monkeypatch.setattr("dro_grasp.pipeline.stages.evaluate", failing)
+    monkeypatch.setattr("dro_grasp.predict.stages.evaluate", failing)
     path = tmp_path / "grasps.parquet"
     arguments = ["generate", "--hand", "gripper3", "--object", "sphere", "--num", "2", "--method", "network", "--json"]
     assert main([*arguments, "--only-successful", "--output", str(path)]) == 0

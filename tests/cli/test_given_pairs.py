@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from dro_grasp.baselines.controls import palm_facing_starts
 from dro_grasp.cli.main import main
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import BUILTIN_FOLDER
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.predict.sources.controls import palm_facing_starts
 from dro_grasp.viewer.studio import Studio, StudioServer
 from tests.helpers.browser import free_port
 from tests.helpers.loaded_hands import loaded_hand

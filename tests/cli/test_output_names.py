@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from dro_grasp.baselines.controls import palm_facing_starts
 from dro_grasp.cli.main import main
 from dro_grasp.errors import OutputError
 from dro_grasp.files import check_output
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.predict.sources.controls import palm_facing_starts
 from tests.helpers.loaded_hands import loaded_hand
 
 PLAN = ["plan", "--robot", "no", "--object", "no"]

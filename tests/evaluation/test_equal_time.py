@@ -13,7 +13,7 @@ from dro_grasp.evaluation import equal_time as module
 from dro_grasp.evaluation.equal_time import equal_time, finished_maker
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.predict.problem import GraspProblem
 from tests.helpers.tiny_bundle import made_up_grasps
 from tests.helpers.toy_hand import toy_hand
 

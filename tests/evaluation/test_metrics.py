@@ -10,13 +10,13 @@ import torch
 from scipy.spatial.transform import Rotation
 from scipy.stats import mannwhitneyu
 
-from dro_grasp.baselines.controls import CHOICE_POINTS, mean_grasp, mean_grasps, palm_facing_starts
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.evaluation.metrics import diversity, finger_contact, mean_share, roc_area, wilson_interval
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.pipeline.choice import ChoiceConfig, choice_scores
-from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.choice import ChoiceConfig, choice_scores
+from dro_grasp.predict.sources.controls import CHOICE_POINTS, mean_grasp, mean_grasps, palm_facing_starts
 from tests.helpers.tiny_bundle import SEMIAXES, ellipsoid, made_up_grasps, tiny_bundle
 from tests.helpers.toy_hand import toy_hand
 

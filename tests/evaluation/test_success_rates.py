@@ -9,11 +9,9 @@ from pathlib import Path
 
 import pytest
 import torch
-
-from dro_grasp.baselines.controls import StartMethod
-from dro_grasp.baselines.method import Method
 from dro_grasp.baselines.ours import DistanceMethod, SynthesisMethod
-from dro_grasp.baselines.registry import make_method
+
+from dro_grasp.baselines.method import Method
 from dro_grasp.cli.main import main
 from dro_grasp.evaluation import success_rates as evaluated
 from dro_grasp.evaluation.rows import ALL, Row
@@ -37,10 +35,13 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.mesh_process import SCALES
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.settling import settled
-from dro_grasp.pipeline.stages import refine, scored
-from dro_grasp.predictor import GraspPredictor, GraspRequest
+from dro_grasp.predict.config import GraspRequest
+from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.settling import settled
+from dro_grasp.predict.sources.controls import StartMethod
+from dro_grasp.predict.sources.registry import make_method
+from dro_grasp.predict.stages import refine, scored
 from dro_grasp.simulation.contact_quality import measure_contacts
 from dro_grasp.simulation.outcome import TrialResult
 from dro_grasp.simulation.protocols import Perturbations, protocol
@@ -173,7 +174,7 @@ def test_refined_grasps_cost_time_and_controls_say_what_they_are(rows: list[Row]
 def test_what_generate_returns_and_what_controls_return_in_the_networks_time(
     quick_synthesis: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("dro_grasp.predictor.OPTIMISED_PER_GRASP", 2)
+    monkeypatch.setattr("dro_grasp.predict.predictor.OPTIMISED_PER_GRASP", 2)
     hand, obj, predictor = loaded_hand("gripper3"), load_object("can"), GraspPredictor()
     config = dataclasses.replace(
         CONFIG, num=6, stages=(RETURNED, EQUAL_TIME), protocols=(protocol("strict"),))

@@ -13,9 +13,9 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import BUILTIN_FOLDER, load_hand
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.pipeline.constraints import Constraints
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.proposal import ProposalConfig, _placements
+from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.network import ProposalConfig, _placements
 from tests.helpers.bracket_hand import bracket_hand, bracket_urdf
 from tests.helpers.claw_urdf import joint, written
 from tests.helpers.loaded_hands import loaded_hand

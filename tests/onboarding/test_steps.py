@@ -36,7 +36,7 @@ def small_steps(monkeypatch: pytest.MonkeyPatch, quick_statistics: None) -> None
     monkeypatch.setattr(steps, "EngineConfig", functools.partial(
         EngineConfig, candidates=32, min_candidates=32, synthesis=SynthesisConfig(steps=60, batch_size=32)))
     monkeypatch.setattr(report, "GRASPS", 3)
-    monkeypatch.setattr("dro_grasp.predictor.OPTIMISED_PER_GRASP", 2)
+    monkeypatch.setattr("dro_grasp.predict.predictor.OPTIMISED_PER_GRASP", 2)
 
 
 def command(home: Path, *more: str, hand: str = "mine.urdf") -> list[str]:

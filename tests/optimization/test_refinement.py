@@ -13,8 +13,8 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.refinement import RefineConfig, refine_grasps
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.stages import refine
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.stages import refine
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.loaded_hands import loaded_hand
 

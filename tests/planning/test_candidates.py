@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.pipeline.constraints import Constraints
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.stages import Optimised
 from dro_grasp.planning import candidates
-from dro_grasp.predictor import GraspPredictor
+from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.stages import Optimised
 from tests.helpers.loaded_hands import loaded_hand
 
 

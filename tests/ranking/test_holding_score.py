@@ -12,9 +12,9 @@ from dro_grasp.evaluation.metrics import roc_area
 from dro_grasp.models.checkpoints import save_weights
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import synthesize
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.settling import settled
-from dro_grasp.pipeline.stages import refine, scored
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.settling import settled
+from dro_grasp.predict.stages import refine, scored
 from dro_grasp.ranking.holding_score import FEATURES, SHIPPED, holding_features, holding_score, load_holding_score
 from dro_grasp.simulation.holding import Holding
 from dro_grasp.simulation.trial import simulate

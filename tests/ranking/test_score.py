@@ -13,8 +13,8 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.stages import scored
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.stages import scored
 from dro_grasp.ranking.score import ScoreConfig
 from dro_grasp.simulation.closed_poses import settle
 from dro_grasp.simulation.trial import simulate

@@ -17,8 +17,8 @@ import pytest
 
 from dro_grasp.cli.main import main
 from dro_grasp.errors import OptionError, ServerError
-from dro_grasp.pipeline.constraints import Constraints
-from dro_grasp.predictor import GraspRequest
+from dro_grasp.predict.config import GraspRequest
+from dro_grasp.predict.constraints import Constraints
 
 pytest.importorskip("fastapi", reason="needs the extra [serve]: pip install '.[serve]'")
 pytest.importorskip("uvicorn", reason="needs the extra [serve]: pip install '.[serve]'")

@@ -21,9 +21,9 @@ from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.models.presets import PRESETS, NetworkConfig
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.palm_directions import Direction
-from dro_grasp.pipeline.constraints import Constraints
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.proposal import ProposalConfig, _placements
+from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.network import ProposalConfig, _placements
 from dro_grasp.training import loop
 from dro_grasp.training.config import AugmentationConfig, LossConfig, PretrainConfig, TrainConfig
 from dro_grasp.training.pretraining import contrastive_step

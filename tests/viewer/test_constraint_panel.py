@@ -10,8 +10,8 @@ import trimesh
 import viser
 
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.pipeline.constraints import Constraints
-from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.viewer.constraint_panel import NOTHING
 from dro_grasp.viewer.studio import Studio
 from tests.helpers.served_studio import served_studio

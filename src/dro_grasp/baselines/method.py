@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.settling import best_settled, can_settle
-from dro_grasp.pipeline.stages import eased, refine, scored
-from dro_grasp.stopwatch import Stopwatch
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.settling import best_settled, can_settle
+from dro_grasp.predict.stages import eased, refine, scored
+from dro_grasp.predict.stopwatch import Stopwatch
 
 
 @dataclass(frozen=True)

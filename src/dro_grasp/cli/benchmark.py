@@ -80,7 +80,7 @@ class Benchmark:
         from dro_grasp.evaluation.success_rates import BEST, REFINED, SETTLED, SETTLED_BEST, TOP, BenchmarkConfig, benchmark
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.catalogue import resolve_objects
-        from dro_grasp.predictor import GraspRequest
+        from dro_grasp.predict.config import GraspRequest
         from dro_grasp.simulation.protocols import protocol
 
         if self.quick:
@@ -144,8 +144,8 @@ class Benchmark:
 
     def _methods(self) -> list[Method]:
         """The methods that were named, or the network and its controls."""
-        from dro_grasp.baselines.registry import MethodOptions, make_method
         from dro_grasp.datasets.bundle.training_file import load_bundle
+        from dro_grasp.predict.sources.registry import MethodOptions, make_method
 
         names = self.methods
         if not names:

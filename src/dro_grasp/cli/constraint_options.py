@@ -9,7 +9,7 @@ from dro_grasp.cli.inputs import Ball, optional
 
 if TYPE_CHECKING:
     from dro_grasp.objects.scenery import Scene
-    from dro_grasp.pipeline.constraints import Constraints
+    from dro_grasp.predict.constraints import Constraints
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class PalmOptions:
         Raises:
             OptionError: Something cannot be respected.
         """
-        from dro_grasp.pipeline.constraints import Constraints
+        from dro_grasp.predict.constraints import Constraints
 
         return Constraints(table=table, avoid=avoid, **asdict(self))
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.hands.hand import Hand
     from dro_grasp.objects.shape import ObjectModel
-    from dro_grasp.pipeline.problem import GraspProblem
+    from dro_grasp.predict.problem import GraspProblem
     from dro_grasp.simulation.protocols import Protocol
 
 SHARES = {"trials_held": "held", "fingers_in_contact": "fingers", "all_fingers_in_contact": "all fingers"}
@@ -57,7 +57,7 @@ class Evaluate:
         from dro_grasp.grasps.batch import GraspBatch
         from dro_grasp.grasps.reading import load_grasps
         from dro_grasp.grasps.sources import hand_of, require_one_object
-        from dro_grasp.pipeline.stages import evaluate
+        from dro_grasp.predict.stages import evaluate
         from dro_grasp.simulation.contact_quality import with_contacts
         from dro_grasp.simulation.protocols import changed
 
@@ -91,7 +91,7 @@ class Evaluate:
         """
         from dro_grasp.errors import ObjectError
         from dro_grasp.grasps.sources import object_of
-        from dro_grasp.pipeline.problem import GraspProblem
+        from dro_grasp.predict.problem import GraspProblem
         from dro_grasp.simulation.scene import require_simulable
 
         problems, bare = [], {}

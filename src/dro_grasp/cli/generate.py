@@ -21,9 +21,10 @@ if TYPE_CHECKING:
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.hands.hand import Hand
     from dro_grasp.objects.shape import ObjectModel
-    from dro_grasp.pipeline.constraints import Constraints
-    from dro_grasp.pipeline.problem import GraspProblem
-    from dro_grasp.predictor import GraspPredictor, GraspRequest
+    from dro_grasp.predict.config import GraspRequest
+    from dro_grasp.predict.constraints import Constraints
+    from dro_grasp.predict.predictor import GraspPredictor
+    from dro_grasp.predict.problem import GraspProblem
 
 ROWS_SHOWN = 16
 """Grasps listed in the table."""
@@ -56,9 +57,10 @@ class Generate:
     camera: Annotated[Path | None, optional("JSON", "the object's own frame")] = None
     """File with {"frame": "base", "T_frame_camera": 4x4}: the object is a cloud in that camera's frame; it is cleaned. Grasps,
     direction and table are in the named frame."""
-    method: Literal["auto", "network", "optimise"] = "auto"
-    """Source of candidates: the network; the optimiser that also makes training data (any hand, nothing learned); or auto, the
-    network, and the optimiser for the grasps with which the score does not trust it."""
+    source: str = "auto"
+    """What proposes candidates: network; optimiser, which also makes training data (any hand, nothing learned); auto, the
+    network, and the optimiser for the grasps with which the score does not trust it; module:Class, a source of yours; or a
+    grasp file."""
     refine: bool = True
     """Refine the candidates on the object's geometry, near where the network proposed them."""
     keep_table: Flag = False
@@ -95,10 +97,11 @@ class Generate:
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.catalogue import resolve_objects
         from dro_grasp.objects.scenery import load_scene
-        from dro_grasp.predictor import GraspPredictor, GraspRequest
+        from dro_grasp.predict.config import GraspRequest
+        from dro_grasp.predict.predictor import GraspPredictor
 
         request = GraspRequest(
-            self.num, self.seed, self.candidates, self.refine, self.temperature, self.method)
+            self.num, self.seed, self.candidates, self.refine, self.temperature, self.source)
         constraints = self.constraints.constraints(self.table)
         names = resolve_objects([self.object])
         several = names != [self.object]
@@ -134,7 +137,7 @@ class Generate:
         """One object, start to end."""
         from dro_grasp.errors import OptionError
         from dro_grasp.grasps.sources import with_sources
-        from dro_grasp.pipeline.problem import GraspProblem
+        from dro_grasp.predict.problem import GraspProblem
         from dro_grasp.simulation.diagnosis import count_failures, next_steps
 
         begin = time.perf_counter()
@@ -206,7 +209,7 @@ class Generate:
         return self.protocol or ("none" if obj.is_cloud else DEFAULT_PROTOCOL)
 
     def _evaluate(self, problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
-        from dro_grasp.pipeline.stages import evaluate
+        from dro_grasp.predict.stages import evaluate
 
         protocol = self._protocol(problem.obj)
         if protocol == "none":

@@ -33,8 +33,8 @@ class Onboard:
     """Grasps of the network to evaluate on each held-out object, and a quarter as many that `generate` returns."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Weights to fine-tune."""
-    method: Literal["auto", "network", "optimise"] = "auto"
-    """Source of the grasps that `generate` returns in benchmarks and report: as `generate --method`."""
+    source: str = "auto"
+    """Source of the grasps that `generate` returns in benchmarks and report: as `generate --source`."""
     device: str = "cpu"
     """Device for the network, its training and the energies: cpu, cuda or cuda:1. Trials always run on the CPU."""
     workers: int = 2
@@ -51,7 +51,7 @@ class Onboard:
         from dro_grasp.onboarding.steps import WEIGHTS, OnboardingConfig, onboard
 
         config = OnboardingConfig(
-            self.minutes, self.objects, self.held_out, self.num, self.weights, self.workers, self.method, seed=self.seed,
+            self.minutes, self.objects, self.held_out, self.num, self.weights, self.workers, self.source, seed=self.seed,
             device=self.device)
         done = onboard(self.hand, self.output, config, say_aside)
         report = write_report(done, resolve_objects(list(self.held_out)))

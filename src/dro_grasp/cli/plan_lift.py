@@ -86,7 +86,7 @@ class Plan:
         from dro_grasp.planning.planner import plan
         from dro_grasp.planning.robot import load_robot
         from dro_grasp.planning.trajectory_files import trajectory_csv, trajectory_yaml
-        from dro_grasp.predictor import GraspPredictor
+        from dro_grasp.predict.predictor import GraspPredictor
 
         if not 0 <= self.seed < 2**31:
             raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^31 - 1")

@@ -59,7 +59,7 @@ class View:
 
     def run(self) -> int:
         """Serve the page, with the grasps of the file if there is one."""
-        from dro_grasp.predictor import GraspPredictor
+        from dro_grasp.predict.predictor import GraspPredictor
         from dro_grasp.viewer.stage import serve
         from dro_grasp.viewer.studio import Studio, StudioServer
 
@@ -95,7 +95,7 @@ class View:
         """A page without a file: the hand and the object that are named are picked."""
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.catalogue import load_object
-        from dro_grasp.predictor import GraspPredictor
+        from dro_grasp.predict.predictor import GraspPredictor
         from dro_grasp.viewer.studio import Studio
 
         hand = None if self.hand is None else load_hand(self.hand)

@@ -15,7 +15,7 @@ import torch
 from dro_grasp.baselines.method import Method, finished
 from dro_grasp.devices import one_thread
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.predict.problem import GraspProblem
 
 Maker = Callable[[int, int], GraspBatch]
 """Makes a number of grasps with scores from a seed."""

@@ -18,9 +18,9 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.partial_views import View, partial_view
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.settling import best_settled, can_settle
-from dro_grasp.pipeline.stages import eased, refine, scored
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.settling import best_settled, can_settle
+from dro_grasp.predict.stages import eased, refine, scored
 from dro_grasp.simulation.contact_quality import with_contacts
 from dro_grasp.simulation.protocols import Protocol
 from dro_grasp.simulation.trial import simulate

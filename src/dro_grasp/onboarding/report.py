@@ -11,9 +11,10 @@ from dro_grasp.files import command
 from dro_grasp.hands.library import load_hand, locate_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.onboarding.steps import DATA, PICTURE, REPORT, STRICT, Onboarded
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.stages import evaluate
-from dro_grasp.predictor import GraspPredictor, GraspRequest
+from dro_grasp.predict.config import GraspRequest
+from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.stages import evaluate
 from dro_grasp.viewer.pictures import draw_grasps
 from dro_grasp.web.page import image, table, write_page
 
@@ -72,7 +73,7 @@ def _rates(done: Onboarded) -> str:
         "parentheses of the grasps with all of them. The network's rows are what fine-tuning improves. "
         "<i>generate</i> keeps the best of four of the network's candidates by score, as the row <i>best quarter</i> does, and "
         "asks the optimiser for others where the score does not trust these: slower, and less needed the better the network "
-        "is. <i>generate --method network</i> does without.</p>")
+        "is. <i>generate --source network</i> does without.</p>")
 
 
 def _drawn(done: Onboarded, held_out: list[str]) -> str:
@@ -82,7 +83,7 @@ def _drawn(done: Onboarded, held_out: list[str]) -> str:
         obj = load_object(name)
         path = done.folder / f"{Path(name).stem}.png"
         problem = GraspProblem(hand, obj)
-        made = predictor.run(problem, GraspRequest(GRASPS, method=done.method))
+        made = predictor.run(problem, GraspRequest(GRASPS, source=done.source))
         draw_grasps(hand, obj, evaluate(problem, made.grasps, "strict"), path)
         by_optimiser = made.origin.count("optimiser")
         parts.append(image(path.read_bytes(), f"grasps of {name}")
@@ -98,9 +99,9 @@ def _data(step: dict[str, Any]) -> str:
 
 def _commands(done: Onboarded) -> str:
     weights = () if done.weights is None else ("--weights", done.weights)
-    method = () if done.method == "auto" else ("--method", done.method)
+    source = () if done.source == AUTO else ("--source", done.source)
     lines = [
-        command("dro-grasp", "generate", "--hand", done.hand, "--object", "my_mesh.stl", *weights, *method)
+        command("dro-grasp", "generate", "--hand", done.hand, "--object", "my_mesh.stl", *weights, *source)
         + " --output grasps.parquet",
         "dro-grasp evaluate grasps.parquet --protocol strict",
         "dro-grasp export grasps.parquet --format isaac_grasp --output grasps.yaml --only-successful",

@@ -27,7 +27,7 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.models.checkpoints import DEFAULT, history_of, load_weights, locate_weights, save_weights
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.optimization.synthesis import SynthesisConfig
-from dro_grasp.predictor import GraspPredictor, Method, check_method
+from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.simulation.protocols import PROTOCOLS, protocol
 from dro_grasp.training.config import ScheduleConfig, TrainConfig
 from dro_grasp.training.loop import train
@@ -68,7 +68,7 @@ class OnboardingConfig:
     """Weights to fine-tune; the shipped ones by default."""
     workers: int = 2
     """Processes of the synthesis."""
-    method: Method = "auto"
+    source: str = AUTO
     """Where the grasps that `generate` returns come from, in benchmarks and report."""
     learning_rate: float = 3e-4
     """Peak rate of fine-tuning; the rate of training from scratch overwrites the initial weights (ours)."""
@@ -85,7 +85,8 @@ class OnboardingConfig:
         for name, value in (("num", self.num), ("workers", self.workers)):
             if value < 1:
                 raise OptionError(f"{name} is {value}; give at least 1 (--{name})")
-        check_method(self.method)
+        if self.source not in (AUTO, *source_names()):
+            raise OptionError(f"source is '{self.source}'; choose {', '.join((AUTO, *source_names()))}")
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ class Onboarded:
     """Result of each step by name, with its seconds: check, before, data, training, after."""
     initial: str | None = None
     """Weights that were fine-tuned; None for the shipped ones."""
-    method: Method = "auto"
+    source: str = AUTO
     """Where the grasps that `generate` returned came from."""
 
     @property
@@ -174,7 +175,7 @@ def onboard(
     onboarding = _Onboarding(hand, path, config, objects, held_out, say)
     with sole_run(make_folder(path)):
         onboarding.run()
-    return Onboarded(hand, path, onboarding.steps, config.weights, config.method)
+    return Onboarded(hand, path, onboarding.steps, config.weights, config.source)
 
 
 class _Onboarding:
@@ -216,7 +217,7 @@ class _Onboarding:
     def _asked(self) -> dict[str, Any]:
         """What decides on the results, beside the hand and the time."""
         return {"weights": self.config.weights or DEFAULT, "objects": self.objects, "held_out": self.held_out,
-                "num": self.config.num, "method": self.config.method, "learning_rate": self.config.learning_rate,
+                "num": self.config.num, "source": self.config.source, "learning_rate": self.config.learning_rate,
                 "seed": self.config.seed}
 
     def run(self) -> None:
@@ -254,7 +255,7 @@ class _Onboarding:
         config = BenchmarkConfig(self.config.num, (RAW, REFINED, BEST, RETURNED), rules, seed=self.config.seed,
                                  device=self.config.device)
         objects = [load_object(name) for name in self.held_out]
-        rows = benchmark([self.hand], objects, [DistanceMethod(predictor, source=self.config.method)], config)
+        rows = benchmark([self.hand], objects, [DistanceMethod(predictor, source=self.config.source)], config)
         told = "; ".join(f"{r.stage}: " + ", ".join(f"{k} {v[0]:.0%}" for k, v in r.success.items()) for r in rows)
         share = f"{rows[-1].optimised:.0%} from the optimiser"
         return {"rows": [dataclasses.asdict(row) for row in rows], "said": f"{predictor.weights_name}, {told}, {share}"}

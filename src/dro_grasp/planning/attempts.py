@@ -16,7 +16,6 @@ from dro_grasp.errors import DroGraspError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.scan import depth_points
-from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.planning.clutter import MOST_CLUTTER, Region, other_objects, scatter
 from dro_grasp.planning.depth_images import depth_image, thinned_intrinsics
 from dro_grasp.planning.motion import STAGES, MotionPlan
@@ -27,7 +26,8 @@ from dro_grasp.planning.reachability import ReachConfig
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.standing import moved
 from dro_grasp.planning.table_scene import PickedObject, pick_object
-from dro_grasp.predictor import GraspPredictor
+from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.predictor import GraspPredictor
 
 VERSION = 3
 """Goes up with every change that can change an outcome."""

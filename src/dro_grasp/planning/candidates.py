@@ -14,24 +14,17 @@ from torch import Tensor
 from dro_grasp.devices import fast_products, side_by_side
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
+from dro_grasp.errors import NoGraspError
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.pipeline.constraints import Constraints
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.proposal import propose
-from dro_grasp.pipeline.stages import optimise, refine, scored
-from dro_grasp.predictor import OPTIMISED_IN_SURROUNDINGS, GraspPredictor
+from dro_grasp.predict.config import GraspRequest
+from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.problem import GraspProblem
 
 Directions = Literal["paper", "all"]
 """Palm directions that are asked for."""
 PAPER_DIRECTIONS = 32
 """Palm directions of the paper, from above to the right side."""
-KNOWN = 0.0
-"""Log-odds of holding above which a grasp is likelier to hold than not."""
-KNOWN_SHARE = 0.25
-"""Share of the network's grasps that should be, or the optimiser makes rivals for what is lacking (ours)."""
-PARTS = 2
-"""Parts that grasps from all directions are made in, side by side where there are cores (ours)."""
-
 
 def paper_directions(count: int) -> Float[Tensor, "k 3"]:
     """Unit vectors in the world, at most `count`: from above to the right side, whence the palm looks to the left.
@@ -44,49 +37,45 @@ def paper_directions(count: int) -> Float[Tensor, "k 3"]:
 
 
 def grasps_in_world(
-    predictor: GraspPredictor, hand: Hand, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"], num: int,
-    wanted: Constraints, directions: Directions | Float[Tensor, "k 3"] = "all", seed: int = 0,
+    predictor: GraspPredictor, hand: Hand, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"], request: GraspRequest,
+    wanted: Constraints, directions: Directions | Float[Tensor, "k 3"] = "all",
 ) -> GraspBatch:
-    """Refined grasps with scores, the best first; their frame is the world's.
-
-    Where the score says that the network does not know the hand or the object, the optimiser adds candidates.
+    """Grasps as the predictor returns them for the same request and constraints, the best first; their frame is the world's.
 
     Args:
-        predictor: Its weights propose the grasps.
+        predictor: Proposes and finishes the grasps.
         hand: The hand.
         obj: What is grasped; its z axis points up.
         T_world_object: Where it stands [m].
-        num: How many.
+        request: How many, of which source, from which seed.
         wanted: What they have to respect, in the world's frame.
-        directions: Which palm directions, where none is wanted; unit vectors in the world if they are given.
-        seed: The same seed gives the same grasps.
+        directions: Which palm directions, where none is wanted; unit vectors in the world if they are given. Each of them gets
+            a request of its own, with its share of the grasps.
     """
     T = torch.from_numpy(T_world_object).float()
-    wanted = wanted.moved(np.linalg.inv(T_world_object))
-    problem = GraspProblem(hand, obj, predictor.device, wanted)
-    problem.field  # noqa: B018  (made once, with what is to be avoided, before the threads share it)
-    parts = [problem] * min(num, PARTS)
+    problem = GraspProblem(hand, obj, predictor.device, wanted.moved(np.linalg.inv(T_world_object)))
+    problems, requests = [problem], [request]
     if not isinstance(directions, str) or directions == "paper":
-        asked = paper_directions(num) if isinstance(directions, str) else directions[:num]
-        parts = [replace(problem, constraints=replace(wanted, direction=(x, y, z))) for x, y, z in (asked @ T[:3, :3]).tolist()]
-    seeds = np.random.default_rng(seed).integers(2**31, size=len(parts)).tolist()
+        asked = paper_directions(request.num) if isinstance(directions, str) else directions[:request.num]
+        problems = [replace(problem, constraints=replace(problem.constraints, direction=(x, y, z)))
+                    for x, y, z in (asked @ T[:3, :3]).tolist()]
+        seeds = np.random.default_rng(request.seed).integers(2**31, size=len(problems)).tolist()
+        shares = [request.num * (i + 1) // len(problems) - request.num * i // len(problems) for i in range(len(problems))]
+        requests = [replace(request, num=num, seed=seed) for num, seed in zip(shares, seeds, strict=True)]
 
-    # no_grad, not inference_mode: roma caches a tensor at first use, which training could then not use.
-    @torch.no_grad()
-    def made(i: int) -> GraspBatch:
-        problem = parts[i]
-        count = num * (i + 1) // len(parts) - num * i // len(parts)
-        generator = torch.Generator().manual_seed(seeds[i])
-        proposed = propose(problem, predictor.network, count, generator, predictor.config).grasps
-        grasps = scored(problem, refine(problem, proposed))
-        lacking = math.ceil(KNOWN_SHARE * count) - int((grasps.score > KNOWN).sum())
-        if lacking <= 0:
-            return grasps
-        rivals = scored(problem, refine(problem, optimise(problem, OPTIMISED_IN_SURROUNDINGS * lacking, seeds[i]).grasps))
-        return GraspBatch.concatenate([grasps, rivals]).sorted_by_score()[:count]
+    def made(problem: GraspProblem, request: GraspRequest) -> GraspBatch | None:
+        try:
+            return predictor.run(problem, request).grasps
+        except NoGraspError:
+            return None
 
     with fast_products():
-        ranked = GraspBatch.concatenate(side_by_side(made, range(len(parts)))).sorted_by_score()
+        # Alone, a request uses all threads itself.
+        parts = side_by_side(made, problems, requests) if len(problems) > 1 else [made(problem, request)]
+    found = [grasps for grasps in parts if grasps is not None]
+    if not found:
+        return GraspBatch.create(hand, obj, torch.zeros(0, 4, 4), torch.zeros(0, hand.tree.n_dof))
+    ranked = GraspBatch.concatenate(found).sorted_by_score()
     return ranked.replace(T_object_wrist=T @ ranked.T_object_wrist)
 
 

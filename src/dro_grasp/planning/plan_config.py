@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from dro_grasp.errors import OptionError
-from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.planning.candidates import Directions
 from dro_grasp.planning.reachability import ReachConfig
+from dro_grasp.predict.constraints import Constraints
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,6 @@ from dro_grasp.frames import motion_fault
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.scenery import load_scene
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.pipeline.admission import BESIDE, NARROW, SPARED, TURNED, faults
-from dro_grasp.pipeline.constraints import Constraints
-from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.planning.candidates import Directions, grasps_in_world
 from dro_grasp.planning.clear_start import refuse_contacts_at_home
 from dro_grasp.planning.collisions import OBSTACLE, CollisionChecker, open_hand
@@ -32,8 +29,11 @@ from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.scene_solids import scene_solid
 from dro_grasp.planning.standing import moved, upright
 from dro_grasp.planning.timed_stages import timed_stages
-from dro_grasp.predictor import GraspPredictor
-from dro_grasp.stopwatch import Stopwatch
+from dro_grasp.predict.admission import BESIDE, NARROW, SPARED, TURNED, faults
+from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.stopwatch import Stopwatch
 
 BATCH_SEED = 7919
 """Between the seeds of batches of grasps (ours)."""

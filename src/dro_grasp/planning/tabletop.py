@@ -23,7 +23,7 @@ from dro_grasp.planning.extra import require_arm_extra
 from dro_grasp.planning.motion import MotionPlan
 from dro_grasp.planning.robot import load_robot
 from dro_grasp.planning.table_scene import PickedObject
-from dro_grasp.predictor import GraspPredictor
+from dro_grasp.predict.predictor import GraspPredictor
 
 Progress = Callable[[Attempt], None]
 """Called after each attempt."""

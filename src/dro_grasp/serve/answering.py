@@ -29,10 +29,12 @@ from dro_grasp.objects.loading import check_scale, read_points
 from dro_grasp.objects.scenery import Scene, load_scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.scan import scanned_object
-from dro_grasp.pipeline.constraints import Constraints
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.stages import evaluate
-from dro_grasp.predictor import GraspPredictor, GraspRequest, Prediction, Progress
+from dro_grasp.predict.config import GraspRequest
+from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.predictor import GraspPredictor, Prediction
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.source import Progress
+from dro_grasp.predict.stages import evaluate
 from dro_grasp.serve.messages import GraspAnswer, SentCamera, SentGrasp, SentObject, settings_in
 from dro_grasp.web.uploads import store_upload
 

@@ -9,7 +9,7 @@ import textwrap
 import uuid
 from dataclasses import MISSING, fields
 from itertools import pairwise
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, Literal, TypeVar, get_type_hints
 
 from pydantic import (
     BaseModel,
@@ -22,8 +22,8 @@ from pydantic import (
     model_validator,
 )
 
-from dro_grasp.pipeline.constraints import Constraints
-from dro_grasp.predictor import GraspRequest
+from dro_grasp.predict.config import GraspRequest
+from dro_grasp.predict.constraints import Constraints
 
 MOST_POINTS = 200_000
 """Most points of a cloud that is sent as numbers (ours); files may hold more."""
@@ -102,8 +102,8 @@ class _Call(Message):
     """Name of the request, by which it can be cancelled."""
 
 
-WIRE_TYPES: dict[str, Any] = {"avoid": SentObject | None}
-"""Types as JSON of those fields whose types in Python are none (ours)."""
+WIRE_TYPES: dict[str, Any] = {"avoid": SentObject | None, "source": Literal["auto", "network", "optimiser"]}
+"""Types as JSON of those fields whose types in Python are none, or that must not name modules and files of the server."""
 
 
 def fields_of(settings: type[Any]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from dro_grasp.frames import HALF_AXES, half_axis_direction
 from dro_grasp.geometry.balls import Ball
 from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.pipeline.constraints import Constraints
+from dro_grasp.predict.constraints import Constraints
 from dro_grasp.viewer.stage import Place, rgb
 
 ANY: str = "any"

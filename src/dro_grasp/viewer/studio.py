@@ -20,10 +20,12 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import hand_names
 from dro_grasp.objects.catalogue import object_names
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.pipeline.constraints import Constraints
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.stages import evaluate
-from dro_grasp.predictor import GraspPredictor, GraspRequest, Method
+from dro_grasp.predict.config import AUTO, GraspRequest
+from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.registry import source_names
+from dro_grasp.predict.stages import evaluate
 from dro_grasp.simulation.diagnosis import diagnose
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 from dro_grasp.viewer.appearance import waiting_pose
@@ -110,7 +112,7 @@ class Studio(GraspPage):
     def generate(
         self, hand: str, obj: str, num: int = GraspRequest.num, constraints: Constraints | None = None,
         temperature: float | None = None, protocol: str = DEFAULT_PROTOCOL, candidates: int = GraspRequest.candidates,
-        method: Method = GraspRequest.method,
+        source: str = AUTO,
     ) -> ShownGrasps:
         """Predict, refine, rank and evaluate, then show the best; bare clouds get no trial.
 
@@ -118,14 +120,14 @@ class Studio(GraspPage):
             constraints: What the grasps have to respect.
             temperature: Of z; the weights' own by default.
             candidates: Proposed for each grasp.
-            method: Their source, as in `GraspRequest`.
+            source: What proposes, as in `GraspRequest`.
 
         Raises:
             DroGraspError: An argument cannot be used.
         """
         wanted = constraints or Constraints()
         problem = GraspProblem(self.shelf.hand(hand), self.shelf.obj(obj), self.predictor.device, wanted)
-        request = GraspRequest(num, candidates=candidates, temperature=temperature, method=method)
+        request = GraspRequest(num, candidates=candidates, temperature=temperature, source=source)
         found = self.predictor.run(problem, request, self._counting("proposing"))
         raw, refined = found.proposed, found.grasps
         if not problem.obj.is_cloud:
@@ -171,8 +173,8 @@ class Studio(GraspPage):
             object_file = gui.add_upload_button("Upload an object (STL, OBJ, PLY)", mime_type=kinds)
         with gui.add_folder("Generate"):
             self.num = gui.add_slider("Grasps", 1, LARGEST_CALL, 1, GraspRequest.num)
-            self.method = gui.add_dropdown(
-                "Method", get_args(Method), initial_value=GraspRequest.method,
+            self.source = gui.add_dropdown(
+                "Source", (AUTO, *source_names()), initial_value=AUTO,
                 hint="auto: the optimiser helps where the network is unsure.")
             self.candidates = gui.add_slider(
                 "Candidates", 1, MOST_CANDIDATES, 1, GraspRequest.candidates,
@@ -242,7 +244,7 @@ class Studio(GraspPage):
         temperature = None if self.usual.value else float(self.temperature.value)
         made = self.generate(
             self.hand.value, self.object.value, int(self.num.value), self.panel.constraints(self.shelf.scene), temperature,
-            self.protocol.value, int(self.candidates.value), self.method.value)
+            self.protocol.value, int(self.candidates.value), self.source.value)
         held = "" if made.obj.is_cloud else (
             f", **{int(made.refined.success.sum())}** held under *{self.protocol.value}*")
         short = [] if made.shortage is None else [made.shortage]

@@ -12,7 +12,7 @@ from dro_grasp.baselines.gendexgrasp.map_network import LATENT, ContactMapNetwor
 from dro_grasp.baselines.method import Method
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.models.checkpoints import load_into
-from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.predict.problem import GraspProblem
 
 POINTS = 256
 """Object points of a map, as many as in training (GenDexGrasp: 2,048)."""

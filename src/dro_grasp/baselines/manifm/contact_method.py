@@ -28,7 +28,7 @@ from dro_grasp.kinematics.joint_solver import Targets, solve_joints
 from dro_grasp.models.checkpoints import load_into
 from dro_grasp.optimization.grip import gripping
 from dro_grasp.optimization.refinement import RefineConfig, refine_grasps
-from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.predict.problem import GraspProblem
 
 
 @dataclass(frozen=True)

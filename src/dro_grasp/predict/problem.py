@@ -20,7 +20,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.ball_solid import solid_of
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.palm_directions import APPROACH
-from dro_grasp.pipeline.constraints import Constraints
+from dro_grasp.predict.constraints import Constraints
 
 
 @dataclass(frozen=True, eq=False)

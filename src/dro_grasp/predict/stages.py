@@ -1,10 +1,9 @@
-"""The stages after the proposal: refine, rank, evaluate. Each takes a problem and grasps, and returns new grasps."""
+"""The single steps of finishing: complete, refine, score, ease, evaluate. Each takes a problem and grasps, and returns new ones."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 
@@ -13,19 +12,14 @@ from dro_grasp.energy.grasp_energy import EnergyConfig
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import completed
 from dro_grasp.optimization.finger_closing import close_idle_fingers
-from dro_grasp.optimization.finger_easing import ease_fingers
+from dro_grasp.optimization.finger_easing import EasingConfig, ease_fingers
 from dro_grasp.optimization.grip import gripping
 from dro_grasp.optimization.refinement import RefineConfig, refine_grasps
-from dro_grasp.optimization.starts import StartConfig
-from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize_with
-from dro_grasp.pipeline.admission import facing, opened_wide, permitted
-from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.predict.admission import AdmissionConfig, opened_wide, permitted
+from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.ranking.score import ScoreConfig, score_grasps
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
 from dro_grasp.simulation.trial import simulate
-
-STARTS_PER_CANDIDATE = 4
-"""Grasps that are optimised for each candidate; those of lowest energy are kept (ours)."""
 
 
 def complete(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
@@ -67,7 +61,9 @@ def grip(problem: GraspProblem, grasps: GraspBatch, config: RefineConfig) -> Gra
     return opened_wide(problem, gripping(problem.energy(config.energy), grasps, config.grip))
 
 
-def eased(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
+def ease(
+    problem: GraspProblem, grasps: GraspBatch, config: EasingConfig | None = None, admission: AdmissionConfig | None = None
+) -> GraspBatch:
     """Complete grasps as they are given away: on a bare cloud, fingers leave room; those on a mesh stay.
 
     It comes last. Score and energy judge grasps whose fingers touch, and are kept. Where the constraints forbid the room, as a
@@ -79,8 +75,8 @@ def eased(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
     joints, rows = grasps.joints.clone(), torch.arange(len(grasps))
     for known in (None,) if seen is None else (seen, None):
         with one_thread():
-            apart = ease_fingers(energy, grasps[rows], known)
-        allowed = permitted(problem, apart)
+            apart = ease_fingers(energy, grasps[rows], known, config)
+        allowed = permitted(problem, apart, admission)
         joints[rows[allowed]] = apart.joints[allowed]
         rows = rows[~allowed]
     return grasps.replace(joints=joints)
@@ -122,33 +118,3 @@ def evaluate(
         OptionError: No protocol has the name.
     """
     return grasps.with_trial(simulate(problem.hand, problem.obj, grasps, protocol, workers=workers, progress=progress))
-
-
-class Optimised(NamedTuple):
-    """Candidates from synthesis."""
-
-    grasps: GraspBatch
-    """Without pregrasp, squeeze and score."""
-    turned: int
-    """How many of the wanted ones are missing, because they turned away from the direction."""
-
-
-def optimise(
-    problem: GraspProblem, num: int, seed: int,
-    progress: Callable[[int, int], None] | None = None,
-) -> Optimised:
-    """Candidates from synthesis; no network is asked, so any hand and object will do.
-
-    Args:
-        problem: Hand and object.
-        num: How many, at most.
-        seed: The same seed gives the same candidates.
-        progress: Called with (grasps optimised, grasps to optimise).
-    """
-    wanted = problem.constraints
-    config = SynthesisConfig(starts=StartConfig(direction=wanted.direction, cone=wanted.cone, hold=wanted.hold))
-    energy = problem.energy(config.energy)
-    grasps = synthesize_with(energy, problem.obj, STARTS_PER_CANDIDATE * num, seed, config, progress)
-    kept = facing(problem, grasps)
-    found = grasps[kept][:num].bare()
-    return Optimised(found, min(int((~kept).sum()), num - len(found)))

@@ -14,11 +14,11 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize, synthesize_with
 from dro_grasp.perception.partial_views import partial_view
-from dro_grasp.pipeline import stages
-from dro_grasp.pipeline.constraints import Constraints
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.stages import complete, eased, evaluate, optimise, rank, refine, scored
-from dro_grasp.stopwatch import Stopwatch
+from dro_grasp.predict import stages
+from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.stages import complete, eased, evaluate, optimise, rank, refine, scored
+from dro_grasp.predict.stopwatch import Stopwatch
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.toy_hand import toy_hand
 
@@ -102,7 +102,7 @@ def test_a_stopwatch_adds_up_and_lists_what_never_ran() -> None:
 
 
 def test_optimised_candidates_are_those_of_lowest_energy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dro_grasp.pipeline.stages.STARTS_PER_CANDIDATE", 2)
+    monkeypatch.setattr("dro_grasp.predict.stages.STARTS_PER_CANDIDATE", 2)
     free = synthesize_with(GraspProblem(HAND, CAN).energy(SynthesisConfig().energy), CAN, 6, 0, SynthesisConfig())
     kept, turned = optimise(GraspProblem(HAND, CAN), 3, seed=0)
     assert turned == 0

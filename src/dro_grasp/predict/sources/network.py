@@ -1,4 +1,4 @@
-"""Candidates from the network: placements of the open hand, z by choice, D(R,O), link poses, joints.
+"""The network as a source: placements of the open hand, z by choice, D(R,O), link poses, joints.
 
 Source: paper section III, figure 2. Differs from the paper: a placement of the open hand is chosen first, by the caller's
 direction or by the learned placement prior. Networks of the paper's form have no such prior: their wrists are turned at
@@ -8,12 +8,12 @@ random, or face the caller's direction at a random roll.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp import distance_matrix
@@ -26,16 +26,13 @@ from dro_grasp.hands.proportions import proportions
 from dro_grasp.models.network import DistanceNetwork, Moves
 from dro_grasp.optimization.palm_directions import CLEAR, Spread, lack_of_room, wrist_rotations
 from dro_grasp.optimization.starts import CHOICES
-from dro_grasp.pipeline.choice import ChoiceConfig, choice_scores
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.stopwatch import Stopwatch
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.choice import ChoiceConfig, choice_scores
+from dro_grasp.predict.sources.source import Candidates, Progress, Source
+from dro_grasp.predict.stopwatch import Stopwatch
 
-CLOUD_TEMPERATURE = 0.5
-"""Default temperature for a bare cloud: where less of the object is known, likelier grasps are proposed (ours)."""
 HIGHEST_TEMPERATURE = 2.0
 """Highest temperature that is accepted; 1 is what the weights were trained for (ours)."""
-PRIOR_CHOICES = 2
-"""Wrist rotations among which the placement prior chooses each of those that it offers, at least (ours)."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +47,11 @@ class ProposalConfig:
     """Standard deviation of the palm direction around the given one [rad]."""
     temperature: float | None = None
     """Spread of z: 0 proposes the likeliest grasp of each placement, 1 is as diverse as the training grasps. None takes 1,
-    and CLOUD_TEMPERATURE for a bare cloud."""
+    and `cloud_temperature` for a bare cloud."""
+    cloud_temperature: float = 0.5
+    """Default temperature for a bare cloud: where less of the object is known, likelier grasps are proposed."""
+    prior_choices: int = 2
+    """Wrist rotations among which the placement prior chooses each of those that it offers, at least."""
     choice: ChoiceConfig = field(default_factory=ChoiceConfig)
     """How one of several placements and z is chosen for each candidate."""
     batch_size: int = 16
@@ -63,29 +64,33 @@ class ProposalConfig:
         check_temperature(self.temperature)
 
 
-@dataclass(frozen=True)
-class Proposal:
-    """Candidates and what the network said about them."""
+class NetworkSource(Source):
+    """The D(R,O) network with one set of weights."""
 
-    grasps: GraspBatch
-    """On the CPU; without pregrasp, squeeze and score."""
-    points: Float[Tensor, "n n_points 3"]
-    """Multilaterated hand points of each candidate, on the CPU [m]; the solved hand differs from them."""
+    name = "network"
 
-    def __getitem__(self, rows: slice | Int[Tensor, " k"] | Bool[Tensor, " n"]) -> Proposal:
-        """Some of the candidates."""
-        return Proposal(self.grasps[rows], self.points[rows])
+    def __init__(self, network: DistanceNetwork, config: ProposalConfig | None = None) -> None:
+        """Keep the two.
 
-    @staticmethod
-    def concatenate(parts: Sequence[Proposal]) -> Proposal:
-        """One proposal after the other."""
-        return Proposal(GraspBatch.concatenate([p.grasps for p in parts]), torch.cat([p.points for p in parts]))
+        Args:
+            network: In evaluation mode, on the device of the problems.
+            config: Sampling and batches.
+        """
+        self.network, self.config = network, config or ProposalConfig()
+
+    # no_grad, not inference_mode: roma caches a tensor at first use, which training could then not use.
+    @torch.no_grad()
+    def propose(self, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None) -> Candidates:
+        """See `propose`."""
+        generator, watch = torch.Generator().manual_seed(seed), Stopwatch("network", "choose", "decode")
+        made = propose(problem, self.network, num, generator, self.config, watch, progress)
+        return replace(made, seconds=watch.seconds)
 
 
 def propose(
     problem: GraspProblem, network: DistanceNetwork, num: int, generator: torch.Generator,
-    config: ProposalConfig | None = None, watch: Stopwatch | None = None, progress: Callable[[int, int], None] | None = None,
-) -> Proposal:
+    config: ProposalConfig | None = None, watch: Stopwatch | None = None, progress: Progress | None = None,
+) -> Candidates:
     """Candidates from the network.
 
     Args:
@@ -120,7 +125,7 @@ def propose(
     T, q, points = (torch.cat(part).cpu() for part in zip(*found, strict=True))
     grasps = GraspBatch.create(
         problem.hand, problem.obj, T, q, seed=generator.initial_seed(), provenance=f"network {network.name}")
-    return Proposal(grasps, points)
+    return Candidates(grasps, points)
 
 
 def check_temperature(temperature: float | None) -> None:
@@ -137,7 +142,7 @@ def check_temperature(temperature: float | None) -> None:
 def _temperature(problem: GraspProblem, config: ProposalConfig) -> float:
     if config.temperature is not None:
         return config.temperature
-    return CLOUD_TEMPERATURE if problem.obj.is_cloud else 1.0
+    return config.cloud_temperature if problem.obj.is_cloud else 1.0
 
 
 def _placements(
@@ -155,7 +160,7 @@ def _placements(
     wanted = num * rivals
     offered = wanted if surroundings is None else max(wanted, CHOICES * num)
     count = wanted * (config.rotations_per_grasp if direction is None else config.rolls_per_grasp)
-    rotations = wrist_rotations(hand, max(count, PRIOR_CHOICES * offered), direction, spread, generator, up)
+    rotations = wrist_rotations(hand, max(count, config.prior_choices * offered), direction, spread, generator, up)
     opened = hand.points(hand.canonical_joints())
     shape = proportions(hand, axes) if network.config.placement_hand == "proportions" else None
     rotation, position = network.sample_placements(opened @ axes, cloud, rotations @ axes, offered, generator, shape)

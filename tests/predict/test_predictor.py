@@ -15,12 +15,13 @@ from dro_grasp.models.network import Moves
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.palm_directions import Spread, wrist_rotations
-from dro_grasp.pipeline.admission import TURNED
-from dro_grasp.pipeline.constraints import Constraints
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.proposal import _placements
-from dro_grasp.pipeline.stages import Optimised, optimise, scored
-from dro_grasp.predictor import GraspPredictor, GraspRequest, PredictorConfig
+from dro_grasp.predict.admission import TURNED
+from dro_grasp.predict.config import GraspRequest, PredictorConfig
+from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.network import _placements
+from dro_grasp.predict.stages import Optimised, optimise, scored
 from tests.helpers.toy_hand import toy_hand
 from tests.helpers.weights import untrained_weights
 
@@ -79,7 +80,7 @@ def test_nothing_is_found_where_constraints_reject_everything(
     weights: str, ball: ObjectModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also with a share of zero, below which no share is."""
-    monkeypatch.setattr("dro_grasp.pipeline.pool.permitted", lambda problem, grasps: torch.zeros(len(grasps), dtype=torch.bool))
+    monkeypatch.setattr("dro_grasp.predict.finish.permitted", lambda problem, grasps: torch.zeros(len(grasps), dtype=torch.bool))
     strict = GraspPredictor(weights, config=PredictorConfig(least_yield=0.0))
     with pytest.raises(OptionError, match="only 0 of 2 candidates"):
         strict.predict(HAND, ball, num=2, candidates=1, method="network", table=-0.2)
@@ -224,14 +225,14 @@ def test_what_was_found_is_returned_with_a_warning(
     def first_of_each_batch(problem: GraspProblem, grasps: GraspBatch) -> Tensor:
         return torch.arange(len(grasps)) == 0
 
-    monkeypatch.setattr("dro_grasp.pipeline.pool.permitted", first_of_each_batch)
+    monkeypatch.setattr("dro_grasp.predict.finish.permitted", first_of_each_batch)
     with pytest.warns(UserWarning, match=r"only 1 of 6 candidates on object 'sphere' .* 6 were .* lower table \(now -0.1 m"):
         found = predictor.predict(HAND, ball, num=6, table=-0.1, candidates=1, method="network")
     assert len(found) == 1
 
 
 def test_an_impossible_table_is_told(predictor: GraspPredictor, ball: ObjectModel, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dro_grasp.pipeline.pool.permitted", lambda problem, grasps: torch.zeros(len(grasps), dtype=torch.bool))
+    monkeypatch.setattr("dro_grasp.predict.finish.permitted", lambda problem, grasps: torch.zeros(len(grasps), dtype=torch.bool))
     with pytest.raises(OptionError, match=r"only 0 of 3 .* 3 were asked for.* lower table .* use the method 'auto'"):
         predictor.predict(
             HAND, ball, num=3, direction=(0.0, 0.0, -1.0), table=-0.04, candidates=1, method="network")
@@ -277,35 +278,35 @@ def test_prediction_runs_wholly_on_the_device_it_is_told(
 def test_auto_lets_the_optimiser_help_only_where_the_score_distrusts_the_network(
     predictor: GraspPredictor, ball: ObjectModel, quick_synthesis: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("dro_grasp.predictor.OPTIMISED_PER_GRASP", 3)
+    monkeypatch.setattr("dro_grasp.predict.predictor.OPTIMISED_PER_GRASP", 3)
     problem, alone = GraspProblem(HAND, ball), GraspRequest(4, seed=1, candidates=2, method="network")
     network = predictor.run(problem, alone)
     assert network.origin == ["network"] * 4
     trusted = sorted(network.grasps.score.tolist())[1]  # three of the four best are above it
-    monkeypatch.setattr("dro_grasp.predictor.TRUSTED_SCORES", (trusted - 1e-6, -math.inf))
+    monkeypatch.setattr("dro_grasp.predict.predictor.TRUSTED_SCORES", (trusted - 1e-6, -math.inf))
     helped = predictor.run(problem, dataclasses.replace(alone, method="auto"))
     assert helped.candidates == network.candidates + 3
     assert float(helped.grasps.score.min()) >= float(network.grasps.score.min())
-    monkeypatch.setattr("dro_grasp.predictor.TRUSTED_SCORES", (trusted - 1e-6, math.inf, math.inf))
+    monkeypatch.setattr("dro_grasp.predict.predictor.TRUSTED_SCORES", (trusted - 1e-6, math.inf, math.inf))
     again = predictor.run(problem, dataclasses.replace(alone, method="auto"))
     assert again.candidates == helped.candidates + 2 * 4 * 3, "two rounds more, for all four"
     assert bool((again.grasps.score >= helped.grasps.score).all())
-    monkeypatch.setattr("dro_grasp.predictor.TRUSTED_SCORES", (-math.inf, math.inf))
+    monkeypatch.setattr("dro_grasp.predict.predictor.TRUSTED_SCORES", (-math.inf, math.inf))
     assert predictor.run(problem, dataclasses.replace(alone, method="auto")).candidates == network.candidates
 
 
 def test_seeds_next_to_each_other_share_no_round_of_the_optimiser(
     predictor: GraspPredictor, ball: ObjectModel, quick_synthesis: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("dro_grasp.predictor.TRUSTED_SCORES", (math.inf,) * 3)
-    monkeypatch.setattr("dro_grasp.predictor.OPTIMISED_PER_GRASP", 2)
+    monkeypatch.setattr("dro_grasp.predict.predictor.TRUSTED_SCORES", (math.inf,) * 3)
+    monkeypatch.setattr("dro_grasp.predict.predictor.OPTIMISED_PER_GRASP", 2)
     seeds: list[int] = []
 
     def counted(problem: GraspProblem, num: int, seed: int, *rest: object) -> Optimised:
         seeds.append(seed)
         return optimise(problem, num, seed)
 
-    monkeypatch.setattr("dro_grasp.predictor.optimise", counted)
+    monkeypatch.setattr("dro_grasp.predict.predictor.optimise", counted)
     for first in (0, 1, 2, 2**63 - 1):
         predictor.run(GraspProblem(HAND, ball), GraspRequest(2, seed=first, method="optimise"))
     assert len(set(seeds)) == len(seeds) == 4 * 3
@@ -314,9 +315,9 @@ def test_seeds_next_to_each_other_share_no_round_of_the_optimiser(
 def test_candidates_that_turn_away_as_they_are_made_are_counted(
     predictor: GraspPredictor, ball: ObjectModel, quick_synthesis: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("dro_grasp.predictor.OPTIMISED_PER_GRASP", 4)
-    monkeypatch.setattr("dro_grasp.predictor.TRUSTED_SCORES", (math.inf,))
-    monkeypatch.setattr("dro_grasp.pipeline.stages.facing", lambda problem, grasps: torch.arange(len(grasps)) < 3)
+    monkeypatch.setattr("dro_grasp.predict.predictor.OPTIMISED_PER_GRASP", 4)
+    monkeypatch.setattr("dro_grasp.predict.predictor.TRUSTED_SCORES", (math.inf,))
+    monkeypatch.setattr("dro_grasp.predict.stages.facing", lambda problem, grasps: torch.arange(len(grasps)) < 3)
     problem = GraspProblem(HAND, ball, constraints=Constraints(direction=(0.0, 0.0, -1.0)))
     made = predictor.run(problem, GraspRequest(2, seed=1, method="optimise"))
     assert (made.candidates, made.dropped[TURNED]) == (8, 5)
@@ -325,7 +326,7 @@ def test_candidates_that_turn_away_as_they_are_made_are_counted(
 def test_the_optimiser_alone_asks_no_network(
     predictor: GraspPredictor, ball: ObjectModel, quick_synthesis: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("dro_grasp.predictor.OPTIMISED_PER_GRASP", 4)
+    monkeypatch.setattr("dro_grasp.predict.predictor.OPTIMISED_PER_GRASP", 4)
     monkeypatch.setattr(predictor.network, "move", None)
     cloud = dataclasses.replace(ball, vertices=None, faces=None)
     direction = torch.tensor([0.0, 0.6, -0.8])

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,18 +16,8 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.optimization.grip import GripConfig
 from dro_grasp.optimization.palm_directions import APPROACH, angle_to_arc
-from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.predict.problem import GraspProblem
 
-FARTHEST_DIRECTION = math.radians(20.0)
-"""Largest angle between the palm direction of an optimised grasp and the direction that was asked for [rad] (ours)."""
-LEAST_CLEARANCE = 0.002
-"""Least distance of a hand's surface points to its surroundings [m] (ours); its corners come up to 2 mm nearer."""
-TOUCH = 0.003
-"""Distance at which a hand touches the object [m] (ours): refined grasps keep 1 mm off it."""
-FEWEST_FINGERS = 2
-"""Fingers that touch the place to hold, at least (ours)."""
-REACH = GripConfig.reach
-"""Distance up to which they count as touching [m]: as where forces are balanced."""
 WAYPOINTS = 9
 """Places on the approach at which the hand is checked, both ends included (ours)."""
 OPENINGS = 9
@@ -46,44 +38,64 @@ REASONS = {"plane": PLANE, "obstacles": OBSTACLES, "spared": SPARED}
 """Reason by part of the surroundings."""
 
 
-def permitted(problem: GraspProblem, grasps: GraspBatch) -> Bool[Tensor, " n"]:
+@dataclass(frozen=True)
+class AdmissionConfig:
+    """By how much grasps may miss what the constraints ask (ours)."""
+
+    farthest_direction: float = math.radians(20.0)
+    """Largest angle between the palm direction of an optimised grasp and the direction that was asked for [rad]."""
+    least_clearance: float = 0.002
+    """Least distance of a hand's surface points to its surroundings [m]; its corners come up to 2 mm nearer."""
+    touch: float = 0.003
+    """Distance at which a hand touches the object [m]: refined grasps keep 1 mm off it."""
+    fewest_fingers: int = 2
+    """Fingers that touch the place to hold, at least."""
+    reach: float = GripConfig.reach
+    """Distance up to which they count as touching [m]: as where forces are balanced."""
+
+
+def permitted(problem: GraspProblem, grasps: GraspBatch, config: AdmissionConfig | None = None) -> Bool[Tensor, " n"]:
     """Which complete grasps respect the problem's constraints."""
     kept = torch.ones(len(grasps), dtype=torch.bool)
     if not len(grasps):
         return kept
-    for wrong in faults(problem, grasps, apart=False).values():
+    for wrong in faults(problem, grasps, config, apart=False).values():
         kept &= ~wrong
     return kept
 
 
-def reasons_against(problem: GraspProblem, grasps: GraspBatch) -> Counter[str]:
+def reasons_against(
+    problem: GraspProblem, grasps: GraspBatch, config: AdmissionConfig | None = None
+) -> Counter[str]:
     """How many complete grasps do not respect the constraints, by the first reason."""
     counted: Counter[str] = Counter()
     left = torch.ones(len(grasps), dtype=torch.bool)
     if not len(grasps):
         return counted
-    for reason, wrong in faults(problem, grasps).items():
+    for reason, wrong in faults(problem, grasps, config).items():
         counted[reason] += int((wrong & left).sum())
         left &= ~wrong
     return +counted
 
 
-def faults(problem: GraspProblem, grasps: GraspBatch, apart: bool = True) -> dict[str, Bool[Tensor, " n"]]:
+def faults(
+    problem: GraspProblem, grasps: GraspBatch, config: AdmissionConfig | None = None, apart: bool = True
+) -> dict[str, Bool[Tensor, " n"]]:
     """Which complete grasps do not respect the constraints, by reason; with `apart`, table, scene and spared places apart."""
-    found, constraints = {}, problem.constraints
+    found, constraints, config = {}, problem.constraints, config or AdmissionConfig()
     if problem.surroundings is not None:
         parts = problem.surroundings.parts if apart else {"obstacles": problem.surroundings}
-        found = {REASONS[name]: ~clear(problem, grasps, part) for name, part in parts.items()}
+        found = {REASONS[name]: ~clear(problem, grasps, part, config.least_clearance) for name, part in parts.items()}
     if constraints.cone is not None:
-        found[TURNED] = ~facing(problem, grasps)
+        found[TURNED] = ~facing(problem, grasps, config)
     if constraints.hold:
-        found[BESIDE] = ~holds_in_place(problem, grasps)
+        found[BESIDE] = ~holds_in_place(problem, grasps, config)
     if constraints.opening is not None:
         found[NARROW] = finger_gap(problem, grasps.T_object_wrist, grasps.pregrasp_joints) < constraints.opening
     return found
 
 
-def facing(problem: GraspProblem, grasps: GraspBatch) -> Bool[Tensor, " n"]:
+def facing(problem: GraspProblem, grasps: GraspBatch, config: AdmissionConfig | None = None) -> Bool[Tensor, " n"]:
     """Which grasps have palms in the cone, or near the wanted direction; over a plane, those too that tilt towards it."""
     direction, cone, surroundings = problem.constraints.direction, problem.constraints.cone, problem.surroundings
     if direction is None:
@@ -93,10 +105,12 @@ def facing(problem: GraspProblem, grasps: GraspBatch) -> Bool[Tensor, " n"]:
     if cone is not None:
         return angle_to_arc(palm, wanted, None) <= cone
     up = None if surroundings is None else surroundings.up
-    return angle_to_arc(palm, wanted, None if up is None else up.to(palm)) < FARTHEST_DIRECTION
+    return angle_to_arc(palm, wanted, None if up is None else up.to(palm)) < (config or AdmissionConfig()).farthest_direction
 
 
-def clear(problem: GraspProblem, grasps: GraspBatch, surroundings: Surroundings) -> Bool[Tensor, " n"]:
+def clear(
+    problem: GraspProblem, grasps: GraspBatch, surroundings: Surroundings, least: float = AdmissionConfig.least_clearance
+) -> Bool[Tensor, " n"]:
     """Which complete grasps keep the hand out of surroundings.
 
     The hand is fully open 10 cm back along the palm direction, comes straight in pregrasp, grasps and squeezes.
@@ -113,20 +127,20 @@ def clear(problem: GraspProblem, grasps: GraspBatch, surroundings: Surroundings)
     for pose, q in postures:
         distance = near.distance(pose.to(problem.device), q.to(problem.device), surroundings)
         closest = torch.minimum(closest, distance.cpu())
-    return closest > LEAST_CLEARANCE
+    return closest > least
 
 
-def holds_in_place(problem: GraspProblem, grasps: GraspBatch) -> Bool[Tensor, " n"]:
+def holds_in_place(problem: GraspProblem, grasps: GraspBatch, config: AdmissionConfig) -> Bool[Tensor, " n"]:
     """Which grasps touch the object in the place to hold alone, with two fingers at least."""
     place, hand = problem.room.hold, problem.hand.to(problem.device)
     assert place is not None
     points = hand.points(grasps.joints.to(problem.device), grasps.T_object_wrist.to(problem.device))
     distance, beside = problem.field.distances(points)[0], place.distances(points)[0] > 0
     finger = hand.finger_of_link[hand.link_index]
-    reached = (distance < REACH) & ~beside
+    reached = (distance < config.reach) & ~beside
     touching = sum((reached & (finger == index)).any(-1).int() for index in range(len(hand.fingers)))
-    enough = torch.as_tensor(touching) >= min(FEWEST_FINGERS, len(hand.fingers))
-    return (enough & ~(beside & (distance < TOUCH)).any(-1)).cpu()
+    enough = torch.as_tensor(touching) >= min(config.fewest_fingers, len(hand.fingers))
+    return (enough & ~(beside & (distance < config.touch)).any(-1)).cpu()
 
 
 def finger_gap(problem: GraspProblem, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"]) -> Float[Tensor, " n"]:
@@ -151,3 +165,40 @@ def opened_wide(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
             break
         q = torch.where(tight[:, None], grasps.pregrasp_joints + share * (end - grasps.pregrasp_joints), q)
     return grasps.replace(pregrasp_joints=q)
+
+
+def shortage_in_words(
+    problem: GraspProblem, asked: int, found: int, made: int, dropped: Mapping[str, int], alone: bool
+) -> str:
+    """How many grasps there are, what candidates were dropped for, and what to do.
+
+    Args:
+        problem: With its constraints.
+        asked: Grasps that were asked for.
+        found: Grasps that there are.
+        made: Candidates that were made.
+        dropped: Candidates that the constraints rejected, by reason.
+        alone: Whether one source alone made the candidates.
+    """
+    constraints, low, high = problem.constraints, *problem.height_range
+    advice = {
+        "table": f"lower table (now {constraints.table} m; the object spans z = {low:.3f} to {high:.3f} m)",
+        "cone": f"widen cone (now {constraints.cone} rad)",
+        "direction": "leave out direction, or give another one",
+        "avoid": "check that the scene to avoid is in the object's frame, and leave out what may be touched",
+        "hold": "enlarge the balls of hold",
+        "spare": "make the balls of spare smaller",
+        "opening": f"ask for less opening (now {constraints.opening} m)",
+    }
+    given = [words for name, words in advice.items() if getattr(constraints, name) not in (None, ())]
+    if constraints.table is None and dropped.get(PLANE):
+        given.append("state the table's height if it is lower than the one found in the cloud")
+    given += ["use the source 'auto'"] if alone else []
+    return (f"only {found} of {made} candidates on object '{problem.obj.name}' meet what was asked of them"
+            f"{dropped_in_words(dropped)}; {asked} were asked for. {'; or '.join(['Try another seed', *given])}")
+
+
+def dropped_in_words(dropped: Mapping[str, int]) -> str:
+    """How many candidates were dropped, and why, in brackets; nothing for none."""
+    reasons = ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count)
+    return f" (dropped: {reasons})" if reasons else ""

@@ -18,10 +18,10 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.scenery import Scene, load_scene
-from dro_grasp.pipeline.admission import BESIDE, NARROW, OBSTACLES, PLANE, SPARED, TURNED, permitted, reasons_against
-from dro_grasp.pipeline.constraints import Constraints
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.stages import optimise, refine
+from dro_grasp.predict.admission import BESIDE, NARROW, OBSTACLES, PLANE, SPARED, TURNED, permitted, reasons_against
+from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.stages import optimise, refine
 from tests.helpers.loaded_hands import loaded_hand
 
 HAND = loaded_hand("gripper3")

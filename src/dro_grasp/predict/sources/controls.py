@@ -1,21 +1,21 @@
-"""Controls: methods that ignore the object's shape, or hardly look at it."""
+"""Controls: sources that ignore the object's shape, or hardly look at it."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.baselines.method import Method
-from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.geometry.se3 import apply, apply_to_cloud, compose, random_rotations
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.pipeline.choice import ChoiceConfig, choice_scores
-from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.choice import ChoiceConfig, choice_scores
+from dro_grasp.predict.sources.source import Progress, Source
 
 CHOICE_POINTS = 160
 """Hand points by which a rotation of the mean grasp is chosen; as many as the shipped weights see (ours)."""
@@ -31,42 +31,36 @@ class MeanGrasp:
     """Position of the object's centre in the wrist frame [m]."""
 
 
-class StartMethod(Method):
+class StartSource(Source):
     """Half-closed hands that face the object, never optimised."""
 
     name = "start"
 
-    def make(self, problem: GraspProblem, num: int, seed: int) -> GraspBatch:
+    def propose(self, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None) -> GraspBatch:
         """See `palm_facing_starts`."""
         return palm_facing_starts(problem.hand, problem.obj, num, seed)
 
 
-class MeanGraspMethod(Method):
+class MeanGraspSource(Source):
     """The mean of a hand's training grasps at random rotations, or at rotations chosen by geometry as z is."""
 
-    def __init__(self, bundle: Bundle, chosen: bool = False) -> None:
-        self.bundle, self.config = bundle, ChoiceConfig() if chosen else ChoiceConfig.first()
+    def __init__(self, means: Mapping[str, MeanGrasp], chosen: bool = False) -> None:
+        """Keep the means.
+
+        Args:
+            means: The mean grasp of each hand, by the hand's name.
+            chosen: Whether rotations are chosen.
+        """
+        self.means, self.config = means, ChoiceConfig() if chosen else ChoiceConfig.first()
         self.name = "mean-grasp-chosen" if chosen else "mean-grasp"
 
     def knows(self, hand: Hand) -> bool:
         """Hands with training grasps."""
-        return hand.name in self.bundle.grasps and len(self.bundle.grasps[hand.name].joints) > 0
+        return hand.name in self.means
 
-    def make(self, problem: GraspProblem, num: int, seed: int) -> GraspBatch:
+    def propose(self, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None) -> GraspBatch:
         """See `mean_grasps`."""
-        return mean_grasps(problem, mean_grasp(self.bundle, problem.hand.name), num, seed, self.config)
-
-
-def mean_grasp(bundle: Bundle, hand_name: str) -> MeanGrasp:
-    """The mean grasp of a hand in a training bundle.
-
-    Raises:
-        KeyError: The bundle has no such hand.
-    """
-    grasps = bundle.grasps[hand_name]
-    centres = torch.stack([cloud.points.mean(0) for cloud in bundle.objects.values()])[grasps.object_index]
-    T_wrist_object = torch.linalg.inv(grasps.T_object_wrist)
-    return MeanGrasp(grasps.joints.mean(0), apply(T_wrist_object, centres).mean(0))
+        return mean_grasps(problem, self.means[problem.hand.name], num, seed, self.config)
 
 
 def mean_grasps(

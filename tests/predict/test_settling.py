@@ -17,10 +17,10 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.finger_easing import lacking_room
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
 from dro_grasp.perception.partial_views import partial_view
-from dro_grasp.pipeline import settling
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.settling import ROOM_WORTH, UNHELD_SCORE, Settled, best_settled, can_settle, settled
-from dro_grasp.pipeline.stages import evaluate, refine, scored
+from dro_grasp.predict import settling
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.settling import ROOM_WORTH, UNHELD_SCORE, Settled, best_settled, can_settle, settled
+from dro_grasp.predict.stages import evaluate, refine, scored
 from dro_grasp.simulation.closed_poses import hand_shift
 from dro_grasp.simulation.holding import Holding, holding
 from dro_grasp.simulation.outcome import Failure

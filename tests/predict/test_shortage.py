@@ -9,10 +9,9 @@ import pytest
 
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.pipeline.admission import PLANE, TURNED
-from dro_grasp.pipeline.constraints import Constraints
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.shortage import shortage_in_words
+from dro_grasp.predict.admission import PLANE, TURNED, shortage_in_words
+from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.problem import GraspProblem
 from tests.helpers.toy_hand import toy_hand
 
 BALL = load_object("sphere")

@@ -1,67 +1,68 @@
-"""Methods of others: objects with a `predict` of their own, and grasps that somebody stored in a file."""
+"""Sources of others: objects of yours that propose or predict, and grasps that somebody stored in a file."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 
-from dro_grasp.baselines.method import Method
 from dro_grasp.errors import DroGraspError, GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.reading import load_grasps
 from dro_grasp.hands.hand import Hand
-from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.pipeline.problem import GraspProblem
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.source import Candidates, Progress, Source
 
 
-class Predicts(Protocol):
-    """What a class of yours has to offer."""
+class OwnSource(Source):
+    """An object of yours with `predict(hand, obj, num, seed)` or `propose(problem, num, seed)`, whose grasps are checked."""
 
-    def predict(self, hand: Hand, obj: ObjectModel, num: int, seed: int) -> GraspBatch:
-        """Grasps of an object, as `GraspBatch.create` makes them from wrist poses and joints."""
-        ...
-
-
-class ForeignMethod(Method):
-    """An object of yours as a method."""
-
-    def __init__(self, name: str, predictor: Any) -> None:
-        """Take an object that can predict, as `Predicts` says.
+    def __init__(self, name: str, proposer: Any) -> None:
+        """Take an object that can propose.
 
         Raises:
             OptionError: It cannot.
         """
-        if not callable(getattr(predictor, "predict", None)):
-            raise OptionError(f"method '{name}' has no predict(hand, obj, num, seed); give its class one that returns a "
+        self.name, self.proposer = name, proposer
+        if not any(callable(getattr(proposer, verb, None)) for verb in ("predict", "propose")):
+            raise OptionError(f"source '{name}' has no predict(hand, obj, num, seed); give its class one that returns a "
                               "GraspBatch (GraspBatch.create makes one from wrist poses and joints)")
-        self.name = name
-        self.predictor: Predicts = predictor
 
-    def make(self, problem: GraspProblem, num: int, seed: int) -> GraspBatch:
-        """What it predicts.
+    def propose(
+        self, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None
+    ) -> Candidates | GraspBatch:
+        """What it proposes, `num` at most.
 
         Raises:
             OptionError: It fails, or returns something else than grasps of this hand on this object.
         """
         try:
-            grasps = self.predictor.predict(problem.hand, problem.obj, num, seed)
+            if callable(getattr(self.proposer, "propose", None)):
+                made = self.proposer.propose(problem, num, seed)
+            else:
+                made = self.proposer.predict(problem.hand, problem.obj, num, seed)
         except DroGraspError:
             raise
-        except Exception as error:
-            raise OptionError(f"method '{self.name}' failed: {type(error).__name__}: {error}") from error
+        except Exception as error:  # the code is not ours: any fault of it is the user's to see
+            raise OptionError(f"source '{self.name}' failed: {type(error).__name__}: {error}") from error
+        grasps = made.grasps if isinstance(made, Candidates) else made
         if not isinstance(grasps, GraspBatch):
-            raise OptionError(f"method '{self.name}' returned a {type(grasps).__name__}, expected a GraspBatch; make one with "
+            raise OptionError(f"source '{self.name}' returned a {type(grasps).__name__}, expected a GraspBatch; make one with "
                               "GraspBatch.create(hand, obj, T_object_wrist, joints)")
         grasps.require_hand(problem.hand)
         if set(grasps.object) - {problem.obj.name}:
-            raise OptionError(f"method '{self.name}' returned grasps of {', '.join(sorted(set(grasps.object)))}, asked for was "
+            raise OptionError(f"source '{self.name}' returned grasps of {', '.join(sorted(set(grasps.object)))}, asked for was "
                               f"'{problem.obj.name}'; give GraspBatch.create the object that it was asked for")
-        return grasps[:num]
+        return made[:num]
+
+    def knows(self, hand: Hand) -> bool:
+        """What it says itself; any hand, if it says nothing."""
+        says = getattr(self.proposer, "knows", None)
+        return bool(says(hand)) if callable(says) else True
 
 
-class FileMethod(Method):
+class FileSource(Source):
     """Stored grasps, such as `dataset import` makes of other projects' files; outcomes and scores in them count for nothing."""
 
     def __init__(self, path: Path) -> None:
@@ -76,7 +77,7 @@ class FileMethod(Method):
         """The hand of the file."""
         return hand.name == self.grasps.hand
 
-    def make(self, problem: GraspProblem, num: int, seed: int) -> GraspBatch:
+    def propose(self, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None) -> GraspBatch:
         """Some of the stored grasps of the object, drawn at random; all if there are not enough.
 
         Raises:
@@ -92,5 +93,4 @@ class FileMethod(Method):
             raise GraspFileError(f"'{self.name}' holds grasps of another '{problem.obj.name}' ({wrong.pop()[:12]}, not "
                                  f"{problem.obj.sha256[:12]}); evaluate them on the object that they were made for")
         order = torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))
-        stored = self.grasps[rows[order[:num]]]
-        return stored.without("score").without_trial()
+        return self.grasps[rows[order[:num]]].without("score").without_trial()

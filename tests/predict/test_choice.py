@@ -18,10 +18,10 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.models.network import DistanceNetwork, untrained_network
 from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.pipeline import proposal
-from dro_grasp.pipeline.choice import CROWDING_POINTS, ChoiceConfig, ChoicePenalties, choice_scores
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.proposal import ProposalConfig, propose
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources import network as proposal
+from dro_grasp.predict.sources.choice import CROWDING_POINTS, ChoiceConfig, ChoicePenalties, choice_scores
+from dro_grasp.predict.sources.network import ProposalConfig, propose
 from tests.helpers.loaded_hands import loaded_hand
 
 HAND = loaded_hand("allegro").with_points(160)

@@ -16,10 +16,10 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.palm_directions import LARGEST_TILT, angle_to_arc
-from dro_grasp.pipeline.admission import permitted
-from dro_grasp.pipeline.constraints import Constraints
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.stages import optimise, refine
+from dro_grasp.predict.admission import permitted
+from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.stages import optimise, refine
 from tests.helpers.loaded_hands import loaded_hand
 
 SOAP = load_object("soap")

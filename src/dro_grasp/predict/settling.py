@@ -18,26 +18,26 @@ from dro_grasp.energy.grasp_energy import EnergyConfig
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.optimization.finger_easing import lacking_room
 from dro_grasp.optimization.refinement import RefineConfig
-from dro_grasp.pipeline.admission import permitted
-from dro_grasp.pipeline.problem import GraspProblem
-from dro_grasp.pipeline.stages import complete, grip, refine, scored
+from dro_grasp.predict.admission import AdmissionConfig, permitted
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.stages import complete, grip, refine, scored
 from dro_grasp.ranking.holding_score import holding_score
+from dro_grasp.ranking.score import ScoreConfig
 from dro_grasp.simulation.closed_poses import hand_shift, settle
 from dro_grasp.simulation.contacts import deepest_penetration
 from dro_grasp.simulation.holding import Holding, holding
 
-SHARE = 0.5
-"""Share of scored candidates that are settled, the best ones (ours)."""
-ROOM_WORTH = 80.0
-"""What the score of a grasp on an object seen in part loses for room that the opened hand lacks [log-odds per m] (ours)."""
-UNHELD_SCORE = -4.0
-"""Highest score of a grasp that does not hold still when its closing is simulated [log-odds of holding] (ours)."""
-
 
 @dataclass(frozen=True)
 class SettleConfig:
-    """What counts as holding still while the hand closes (ours)."""
+    """Which grasps settle, what counts as holding still while the hand closes, and what that means for the score (ours)."""
 
+    share: float = 0.5
+    """Share of scored candidates that are settled, the best ones; the others are left out."""
+    room_worth: float = 80.0
+    """What the score of a grasp on an object seen in part loses for room that the opened hand lacks [log-odds per m]."""
+    unstable_score: float = -4.0
+    """Highest score of a grasp that does not hold still when its closing is simulated [log-odds of holding]."""
     still: float = 0.005
     """A grasp that moves the object less than this has settled; others are refined where they stand, and close again [m]."""
     lost: float = 0.05
@@ -68,28 +68,36 @@ def can_settle(problem: GraspProblem) -> bool:
     return problem.hand.description is not None
 
 
-def best_settled(problem: GraspProblem, grasps: GraspBatch, least: int) -> tuple[Int[Tensor, " k"], GraspBatch]:
-    """The better half of scored grasps, settled and scored again, in their order; which rows they are comes first.
+def settle_best(
+    problem: GraspProblem, grasps: GraspBatch, least: int, config: SettleConfig | None = None,
+    score: ScoreConfig | None = None, admission: AdmissionConfig | None = None,
+) -> tuple[Int[Tensor, " k"], GraspBatch]:
+    """The better share of scored grasps, settled and scored again, in their order; which rows they are comes first.
 
     The score counts how the object is held then, and on an object seen in part the room that the opened hand leaves. A grasp
-    that does not hold still, or ends where the problem's constraints forbid, stays as it was and scores at most UNHELD_SCORE.
+    that does not hold still, or ends where the problem's constraints forbid, stays as it was and scores at most
+    `unstable_score`.
 
     Args:
         problem: Hand and object; see `can_settle`.
         grasps: Refined grasps with scores.
         least: Settle as many at least, where there are.
+        config: Which grasps settle, and what becomes of their scores.
+        score: How grasps are scored.
+        admission: What the constraints let pass.
     """
-    count = max(round(SHARE * len(grasps)), min(len(grasps), least))
+    config = config or SettleConfig()
+    count = max(round(config.share * len(grasps)), min(len(grasps), least))
     best = grasps.score.topk(count).indices.sort().values
-    closed, held, state = settled(problem, grasps[best])
-    wrong = ~permitted(problem, closed)
+    closed, held, state = settled(problem, grasps[best], config)
+    wrong = ~permitted(problem, closed, admission)
     closed = replaced(closed, wrong, grasps[best[wrong]])
-    score = scored(problem, closed).score
-    score[held] = holding_score(score[held], state)
-    score = torch.where(held & ~wrong, score, score.clamp_max(UNHELD_SCORE))
+    found = scored(problem, closed, score).score
+    found[held] = holding_score(found[held], state)
+    found = torch.where(held & ~wrong, found, found.clamp_max(config.unstable_score))
     if problem.obj.seen is not None:
-        score = score - ROOM_WORTH * lacking_room(problem.energy(EnergyConfig()), closed, problem.obj.seen)
-    return best, closed.replace(score=score)
+        found = found - config.room_worth * lacking_room(problem.energy(EnergyConfig()), closed, problem.obj.seen)
+    return best, closed.replace(score=found)
 
 
 def settled(problem: GraspProblem, grasps: GraspBatch, config: SettleConfig | None = None) -> Settled:

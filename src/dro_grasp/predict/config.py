@@ -1,0 +1,99 @@
+"""What is asked of a predictor, and everything that decides what comes out: one tree of configurations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from dro_grasp.errors import OptionError
+from dro_grasp.predict.finish import FinishConfig
+from dro_grasp.predict.sources.network import ProposalConfig, check_temperature
+from dro_grasp.predict.sources.optimiser import OptimiserConfig
+from dro_grasp.predict.sources.source import Source
+
+LARGEST_CALL = 100_000
+"""Most candidates of one call; more do not fit memory."""
+AUTO = "auto"
+"""The rule: the network proposes, and the optimiser adds rivals for the grasps that the score does not trust."""
+
+
+@dataclass(frozen=True)
+class GraspRequest:
+    """What is asked of a predictor."""
+
+    num: int = 16
+    """Grasps to return."""
+    seed: int = 0
+    """The same seed gives the same grasps."""
+    candidates: int = 4
+    """Candidates proposed for each grasp returned; the best by score are returned."""
+    refine: bool = True
+    """Refine and settle the candidates on the object's geometry before they are ranked."""
+    temperature: float | None = None
+    """Spread of z; None takes the predictor's."""
+    source: str | Source = AUTO
+    """What proposes: `auto`, `network`, `optimiser`, any other name that `make_source` knows, or a source."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be done, before any work.
+
+        Raises:
+            OptionError: `num` or `candidates` is not positive, or another value is out of range.
+        """
+        if self.num < 1:
+            raise OptionError(f"num is {self.num}; ask for at least one grasp (--num 16)")
+        if self.candidates < 1:
+            raise OptionError(f"candidates is {self.candidates}; propose at least one for each grasp")
+        if self.num * self.candidates > LARGEST_CALL:
+            raise OptionError(f"{self.num} grasps of {self.candidates} candidates each do not fit memory; predict at most "
+                              f"{LARGEST_CALL} at once, with another --seed for more")
+        if not 0 <= self.seed < 2**63:
+            raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^63 - 1")
+        check_temperature(self.temperature)
+
+
+@dataclass(frozen=True)
+class RetryConfig:
+    """How often a source is asked again when constraints reject its candidates (ours)."""
+
+    rounds: int = 4
+    """How often at most it is asked in all."""
+    least_yield: float = 0.2
+    """Share of the candidates up to which it is not asked again."""
+    reserve: float = 1.5
+    """How many times as many candidates it is asked for again as the share that was rejected suggests."""
+
+
+@dataclass(frozen=True)
+class RescueConfig:
+    """How the optimiser helps where the score does not trust what there is (ours)."""
+
+    trusted_scores: tuple[float, ...] = (1.5, 1.0, 1.0, 1.0)
+    """Log-odds of holding from which on a grasp needs no rival, in each round that the optimiser is asked."""
+    per_grasp: int = 8
+    """Candidates in a round for each grasp that needs rivals."""
+    trusted_in_surroundings: tuple[float, ...] = (1.5, 0.5)
+    """The scores where a descent also watches surroundings, which takes twice as long."""
+    per_grasp_in_surroundings: int = 4
+    """The candidates there; as many of the grasps hold."""
+
+    def rounds(self, surrounded: bool) -> tuple[tuple[float, ...], int]:
+        """Trusted score of each round, and candidates for each grasp that needs rivals."""
+        if surrounded:
+            return self.trusted_in_surroundings, self.per_grasp_in_surroundings
+        return self.trusted_scores, self.per_grasp
+
+
+@dataclass(frozen=True)
+class PredictorConfig:
+    """Everything that decides which grasps are returned."""
+
+    network: ProposalConfig = field(default_factory=ProposalConfig)
+    """How the network proposes."""
+    optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
+    """How the optimiser proposes."""
+    retry: RetryConfig = field(default_factory=RetryConfig)
+    """When a source is asked again."""
+    finish: FinishConfig = field(default_factory=FinishConfig)
+    """What becomes of candidates."""
+    rescue: RescueConfig = field(default_factory=RescueConfig)
+    """When the optimiser helps."""

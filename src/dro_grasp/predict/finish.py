@@ -1,0 +1,122 @@
+"""What becomes of candidates, whoever proposed them: refined, admitted, scored, settled, chosen and eased, in one function.
+
+Measurements say that this does most of the work, so predictor, benchmark and arm share it. No trial decides here.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from functools import cached_property
+
+from jaxtyping import Int
+from torch import Tensor
+
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.optimization.finger_easing import EasingConfig
+from dro_grasp.optimization.refinement import RefineConfig
+from dro_grasp.predict.admission import TURNED, AdmissionConfig, permitted, reasons_against
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.settling import SettleConfig, can_settle, settle_best
+from dro_grasp.predict.sources.source import Candidates
+from dro_grasp.predict.stages import complete, ease, refine, scored
+from dro_grasp.predict.stopwatch import Stopwatch
+from dro_grasp.ranking.score import ScoreConfig
+
+
+@dataclass(frozen=True)
+class FinishConfig:
+    """The stages of finishing. A stage that is None is left out."""
+
+    refine: RefineConfig | None = field(default_factory=RefineConfig)
+    """Descent near each candidate; without it candidates get the pregrasp and squeeze of the paper's controller."""
+    admission: AdmissionConfig = field(default_factory=AdmissionConfig)
+    """By how much grasps may miss what the constraints ask."""
+    score: ScoreConfig = field(default_factory=ScoreConfig)
+    """How grasps are ranked."""
+    settle: SettleConfig | None = field(default_factory=SettleConfig)
+    """Simulated closing of the better share; a hand without its description cannot settle."""
+    ease: EasingConfig | None = field(default_factory=EasingConfig)
+    """Room that fingers leave on a bare cloud."""
+
+    @staticmethod
+    def nothing() -> FinishConfig:
+        """Candidates as they come, scored and admitted alone."""
+        return FinishConfig(refine=None, settle=None, ease=None)
+
+
+@dataclass(frozen=True)
+class Finished:
+    """Candidates after all stages, and the best of them."""
+
+    problem: GraspProblem
+    config: FinishConfig
+    keep: int
+    """Grasps that are wanted."""
+    pool: GraspBatch
+    """All that may be chosen, with scores, in the order in which they were proposed."""
+    candidates: Candidates
+    """The same rows as they were proposed."""
+    refined: GraspBatch
+    """What the last call refined, admitted and scored, before it settled any."""
+    made: int
+    """Candidates made, those that constraints rejected included."""
+    dropped: Counter[str]
+    """Those that constraints rejected, by reason."""
+    seconds: dict[str, float]
+    """Time by stage [s]."""
+
+    @cached_property
+    def rows(self) -> Int[Tensor, " k"]:
+        """Rows of the best in the pool, the best score first."""
+        return (-self.pool.score).argsort(stable=True)[: self.keep]
+
+    @cached_property
+    def grasps(self) -> GraspBatch:
+        """The best, as they are given away."""
+        best = self.pool[self.rows]
+        return best if self.config.ease is None else ease(self.problem, best, self.config.ease, self.config.admission)
+
+    @property
+    def proposed(self) -> Candidates:
+        """The best as they were proposed."""
+        return self.candidates[self.rows]
+
+    def lacking(self, least_score: float) -> int:
+        """How many of the wanted grasps are missing, or score no better than `least_score`."""
+        return max(0, self.keep - int((self.pool.score > least_score).sum()))
+
+
+def finish(
+    problem: GraspProblem, candidates: Candidates, config: FinishConfig | None = None, keep: int = 16,
+    rivals: Finished | None = None,
+) -> Finished:
+    """Make grasps of candidates, and choose the best of them and of earlier ones.
+
+    Args:
+        problem: Hand, object and constraints.
+        candidates: Of any source.
+        config: The stages.
+        keep: Grasps that are wanted.
+        rivals: Finished candidates of earlier calls, which stay in the choice.
+    """
+    config, watch = config or FinishConfig(), Stopwatch("refine", "rank", "settle")
+    with watch("refine"):
+        whole = complete(problem, candidates.grasps) if config.refine is None else refine(
+            problem, candidates.grasps, config.refine)
+    allowed = permitted(problem, whole, config.admission)
+    dropped = Counter({TURNED: candidates.turned}) + reasons_against(problem, whole[~allowed], config.admission)
+    candidates, made = candidates[allowed], len(candidates) + candidates.turned
+    with watch("rank"):
+        refined = pool = scored(problem, whole[allowed], config.score)
+    if config.settle is not None and can_settle(problem) and len(refined):
+        with watch("settle"):
+            rows, pool = settle_best(problem, refined, keep, config.settle, config.score, config.admission)
+        candidates = candidates[rows]
+    seconds = watch.seconds
+    if rivals is not None:
+        pool = GraspBatch.concatenate([rivals.pool, pool])
+        candidates = Candidates.concatenate([rivals.candidates, candidates])
+        dropped, made = rivals.dropped + dropped, rivals.made + made
+        seconds = {name: rivals.seconds[name] + spent for name, spent in seconds.items()}
+    return Finished(problem, config, keep, pool, candidates, refined, made, dropped, seconds)

@@ -1,0 +1,1 @@
+"""What proposes candidates: the network, the optimiser, controls, grasp files, and sources of your own."""

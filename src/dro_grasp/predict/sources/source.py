@@ -1,0 +1,108 @@
+"""What every source of grasps looks like: it proposes candidates for a problem, and leaves all that follows to `finish`."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
+from dro_grasp.predict.problem import GraspProblem
+
+Progress = Callable[[int, int], None]
+"""Called with (candidates made so far, candidates wanted)."""
+POINTS = 160
+"""Hand points that are kept beside a candidate whose source states none, as many as the shipped weights see (ours)."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Grasps as a source proposes them."""
+
+    grasps: GraspBatch
+    """On the CPU; pregrasp and squeeze may be unknown, and scores count for nothing."""
+    points: Float[Tensor, "n n_points 3"]
+    """Hand points of each candidate, on the CPU [m]. The network's are multilaterated; the solved hand differs from them."""
+    origin: tuple[str, ...] = ()
+    """Name of the source of each candidate."""
+    turned: int = 0
+    """How many others were lost as they were made, because they turned away from the direction."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Time by part of the source [s]."""
+
+    @staticmethod
+    def of(problem: GraspProblem, grasps: GraspBatch, n_points: int = POINTS) -> Candidates:
+        """Grasps beside the points of their hand."""
+        hand = problem.hand if n_points >= problem.hand.n_points else problem.thinned(n_points).to("cpu")
+        return Candidates(grasps, hand.points(grasps.joints, grasps.T_object_wrist))
+
+    def __len__(self) -> int:
+        return len(self.grasps)
+
+    def __getitem__(self, rows: slice | Int[Tensor, " k"] | Bool[Tensor, " n"]) -> Candidates:
+        """Some of the candidates."""
+        chosen = torch.arange(len(self))[rows].tolist()
+        return replace(self, grasps=self.grasps[rows], points=self.points[rows],
+                       origin=tuple(self.origin[i] for i in chosen) if self.origin else ())
+
+    @staticmethod
+    def concatenate(parts: Sequence[Candidates]) -> Candidates:
+        """The candidates of all parts, one after the other, and the time of all."""
+        seconds: dict[str, float] = {}
+        for part in parts:
+            seconds |= {name: seconds.get(name, 0.0) + spent for name, spent in part.seconds.items()}
+        return Candidates(
+            GraspBatch.concatenate([p.grasps for p in parts]), torch.cat([p.points for p in parts]),
+            tuple(name for p in parts for name in p.origin), sum(p.turned for p in parts), seconds)
+
+
+class Source(ABC):
+    """Proposes grasps of any object by any hand; whatever it has to load is loaded once."""
+
+    name: str
+    """Its name in options, tables and files."""
+
+    @abstractmethod
+    def propose(
+        self, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None
+    ) -> Candidates | GraspBatch:
+        """Candidates, neither refined nor ranked.
+
+        Args:
+            problem: Hand, object, and constraints, which `finish` enforces where a source does not know them.
+            num: How many; a source may propose fewer.
+            seed: The same seed gives the same candidates.
+            progress: See `Progress`.
+        """
+
+    def knows(self, hand: Hand) -> bool:
+        """Whether it proposes grasps of this hand at all."""
+        return True
+
+
+def ask(
+    source: Source, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None, n_points: int = POINTS
+) -> Candidates:
+    """Candidates of a source, each with its points, its origin and the time that it took.
+
+    Args:
+        source: What proposes.
+        problem: See `Source.propose`.
+        num: Likewise.
+        seed: Likewise.
+        progress: Likewise.
+        n_points: Hand points to keep where the source states none.
+    """
+    from dro_grasp.predict.stopwatch import Stopwatch
+
+    watch = Stopwatch()
+    with watch(source.name):
+        made = source.propose(problem, num, seed, progress)
+    if isinstance(made, GraspBatch):
+        made = Candidates.of(problem, made, n_points)
+    return replace(made, origin=(source.name,) * len(made), seconds=made.seconds or watch.seconds)
