@@ -11,7 +11,7 @@ from dro_grasp.files import command
 from dro_grasp.hands.library import load_hand, locate_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.onboarding.steps import DATA, PICTURE, REPORT, STRICT, Onboarded
-from dro_grasp.predict.config import GraspRequest
+from dro_grasp.predict.config import AUTO, GraspRequest
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.stages import evaluate

@@ -27,7 +27,9 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.models.checkpoints import DEFAULT, history_of, load_weights, locate_weights, save_weights
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.optimization.synthesis import SynthesisConfig
+from dro_grasp.predict.config import AUTO
 from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.sources.registry import source_names
 from dro_grasp.simulation.protocols import PROTOCOLS, protocol
 from dro_grasp.training.config import ScheduleConfig, TrainConfig
 from dro_grasp.training.loop import train
