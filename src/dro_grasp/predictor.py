@@ -215,7 +215,7 @@ class GraspPredictor:
             raise OptionError(str(shortage))
         grasps, chosen = pool.best()
         return Prediction(
-            with_own_files(grasps, problem.hand, problem.obj), complete(problem, chosen.grasps), chosen.points, pool.made,
+            with_own_files(grasps, problem.hand, problem.obj).with_asked(request.num), complete(problem, chosen.grasps), chosen.points, pool.made,
             dict(pool.dropped), watch.seconds, shortage)
 
     def _ask_network(self, pool: CandidatePool, request: GraspRequest, progress: Progress | None) -> None:
