@@ -55,9 +55,13 @@ class Method(ABC):
         """Whether it makes grasps of this hand at all."""
         return True
 
+    def asked(self, obj: ObjectModel, num: int) -> int:
+        """How many grasps of an object it can be asked for, of `num`; what it does not return of them are failures."""
+        return num
+
     def predict(self, hand: Hand, obj: ObjectModel, num: int = 16, seed: int = 0) -> GraspBatch:
         """Grasps as `GraspPredictor.predict` returns them: at most `num`, the same for the same seed."""
-        return self.best(GraspProblem(hand, obj), num, seed).grasps
+        return self.best(GraspProblem(hand, obj), num, seed).grasps.with_asked(self.asked(obj, num))
 
 
 def finished(problem: GraspProblem, grasps: GraspBatch, keep: int) -> GraspBatch:

@@ -113,7 +113,7 @@ class Benchmark:
                 "methods": [method.name for method in methods], "weights": self.weights or "default",
                 "objects": [obj.name for obj in objects], "num": self.num,
                 "view": self.view, "views": self.views, "seed": self.seed, "seconds": round(seconds, 1),
-                "rows": [dataclasses.asdict(row) for row in rows],
+                "rows": [row.to_dict() for row in rows],
             })
             return 0
         title = f"{self.num} grasps of each hand on each of {len(objects)} objects"
@@ -126,7 +126,8 @@ class Benchmark:
         columns = ["grasps", "stage", "hand", "n", *rows[0].success, *(f"{label} trials" for label in rows[0].trials_held),
                    "fingers", "shift [mm]", "turn [deg]", "diversity", "ROC area", "candidates", "optimiser [%]", "ms a grasp",
                    *rows[0].contact_quality]
-        say(title + "; success, and trials held where a grasp has several, in % with 95 % intervals; for each protocol fingers "
+        say(title + "; success, and trials held where a grasp has several, in % of the n grasps asked for, those that a method "
+            "did not return included, with 95 % intervals; the average is the mean over hands; for each protocol fingers "
             "in contact (grasps with all of them) in %, and ROC area of the score; candidates made for each pair\n")
         for line in [columns, ["---"] * len(columns), *map(cells, rows)]:
             say("| " + " | ".join(map(str, line)) + " |")
@@ -164,8 +165,9 @@ def cells(row: Row) -> list[object]:
     fingers = " / ".join(f"{100 * share:.0f} ({100 * everyone:.0f})" for share, everyone in row.fingers.values())
     areas = " / ".join("-" if math.isnan(area) else f"{area:.2f}" for area in row.ranking.values())
     parts = " + ".join(f"{1e3 * seconds:.0f} {name}" for name, seconds in row.seconds.items())
+    n = row.asked if row.returned == row.asked else f"{row.asked} ({row.returned} returned)"
     return [
-        row.grasps, row.stage, row.hand, row.num, *rates, fingers, f"{1e3 * row.displacement:.1f}",
+        row.grasps, row.stage, row.hand, n, *rates, fingers, f"{1e3 * row.displacement:.1f}",
         f"{math.degrees(row.rotation):.1f}", f"{row.diversity:.3f}", areas, f"{row.candidates:.0f}",
         f"{100 * row.optimised:.0f}", parts, *(f"{mean:.3g}" for mean in row.contact_quality.values()),
     ]

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from dro_grasp.baselines.method import Method
+from dro_grasp.errors import OptionError
 from dro_grasp.evaluation.equal_time import equal_time, finished_maker
 from dro_grasp.evaluation.rows import EvaluatedGrasps, Row, average, hand_row
 from dro_grasp.grasps.batch import GraspBatch
@@ -86,7 +87,13 @@ def benchmark(
         methods: What makes the grasps.
         config: Numbers, stages and protocols.
         progress: Called with (pairs done, pairs in all).
+
+    Raises:
+        OptionError: Two methods have one name, or a method returns more grasps than it was asked for.
     """
+    names = [method.name for method in methods]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise OptionError(f"two methods are called '{twice[0]}' and would share rows; give one of them another name")
     table: dict[tuple[str, str], list[list[EvaluatedGrasps]]] = {}
     done, pairs = 0, len(hands) * len(objects)
     for hand in hands:
@@ -132,18 +139,22 @@ def _measured(
     for method in methods:
         if set(config.stages) & set(STAGES):
             grasps, parts = method.timed(problem, num, seed)
+            grasps = grasps.with_asked(method.asked(obj, num))
             seconds = {name: total / num for name, total in parts.items()}
             yield from _stages(_Source(method.name, problem, grasps, seconds), obj, config)
         if RETURNED in config.stages:
             begin = time.perf_counter()
             made = method.best(problem, keep, seed)
             seconds = {"make": (time.perf_counter() - begin) / keep}
-            yield method.name, RETURNED, _evaluated(hand, obj, made.grasps, config, seconds, made.candidates)
+            grasps = made.grasps.with_asked(method.asked(obj, keep))
+            yield method.name, RETURNED, _evaluated(hand, obj, grasps, config, seconds, made.candidates)
     if EQUAL_TIME in config.stages and methods:
         makers = {method.name: finished_maker(problem, method, keep) for method in methods}
+        asked = {method.name: method.asked(obj, keep) for method in methods}
         for name, best in equal_time(makers, num, keep, seed).items():
             seconds = {"CPU": best.seconds / max(1, len(best.grasps))}
-            yield name, EQUAL_TIME, _evaluated(hand, obj, best.grasps, config, seconds, best.candidates)
+            grasps = best.grasps.with_asked(asked[name])
+            yield name, EQUAL_TIME, _evaluated(hand, obj, grasps, config, seconds, best.candidates)
 
 
 @dataclass(frozen=True)
@@ -172,8 +183,8 @@ class _Step(NamedTuple):
 def _stages(source: _Source, obj: ObjectModel, config: BenchmarkConfig) -> Iterator[tuple[str, str, EvaluatedGrasps]]:
     """Those stages of a source that are asked for; what several of them share is made once."""
     asked = set(config.stages)
-    problem, grasps, seconds = source.problem, source.grasps, source.seconds
-    quarter = _quarter(len(grasps))
+    problem, grasps, seconds, num = source.problem, source.grasps, source.seconds, source.grasps.out_of
+    quarter = _quarter(num)
     steps = [_Step(RAW, {RANKED: quarter}), _Step(REFINED, {BEST: quarter, **TOP}, "refine", refine)]
     if can_settle(problem):
         steps.append(_Step(SETTLED, {SETTLED_BEST: quarter}, "settle", _settle))
@@ -181,7 +192,7 @@ def _stages(source: _Source, obj: ObjectModel, config: BenchmarkConfig) -> Itera
     for step in steps[: last + 1]:
         if step.make is not None:
             begin = time.perf_counter()
-            grasps = step.make(problem, grasps)
+            grasps = step.make(problem, grasps).with_asked(num)
             seconds = seconds | {step.part: (time.perf_counter() - begin) / max(1, len(grasps))}
         if not asked & {step.stage, *step.best}:
             continue
@@ -193,7 +204,7 @@ def _stages(source: _Source, obj: ObjectModel, config: BenchmarkConfig) -> Itera
             yield source.name, step.stage, evaluated
         for stage, count in step.best.items():
             if stage in asked:
-                yield source.name, stage, evaluated.rows(grasps.score.topk(min(count, len(grasps))).indices)
+                yield source.name, stage, evaluated.best(min(count, num))
 
 
 def _settle(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
