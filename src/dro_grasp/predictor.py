@@ -214,9 +214,9 @@ class GraspPredictor:
         if not len(pool):
             raise OptionError(str(shortage))
         grasps, chosen = pool.best()
-        return Prediction(
-            with_own_files(grasps, problem.hand, problem.obj).with_asked(request.num), complete(problem, chosen.grasps), chosen.points, pool.made,
-            dict(pool.dropped), watch.seconds, shortage)
+        given, proposed = (g.with_asked(request.num) for g in (
+            with_own_files(grasps, problem.hand, problem.obj), complete(problem, chosen.grasps)))
+        return Prediction(given, proposed, chosen.points, pool.made, dict(pool.dropped), watch.seconds, shortage)
 
     def _ask_network(self, pool: CandidatePool, request: GraspRequest, progress: Progress | None) -> None:
         """Propose until the pool has the candidates that were asked for."""

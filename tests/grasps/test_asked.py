@@ -70,7 +70,8 @@ def test_files_keep_it_for_each_object(tmp_path: Path) -> None:
                                {"object": "cube", "object_sha256": "c" * 64, "num": 8}]
 
 
-@pytest.mark.parametrize("asked", [16, [16], [{"object": "ball", "num": 16}], [{"object": "ball", "object_sha256": "", "num": -1}],
+@pytest.mark.parametrize("asked", [16, [16], [{"object": "ball", "num": 16}],
+                                   [{"object": "ball", "object_sha256": "", "num": -1}],
                                    [{"object": "ball", "object_sha256": "", "num": 1.5}]])
 def test_a_garbled_number_is_refused(asked: object, tmp_path: Path) -> None:
     make(2).save(tmp_path / "g.parquet")

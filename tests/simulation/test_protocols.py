@@ -57,7 +57,8 @@ def every_change(rules):
         value = getattr(rules, one.name)
         if is_dataclass(value):
             singles[one.name] = [replace(value, **{inner.name: other}) for inner in fields(value)
-                                 for other in other_values(getattr(value, inner.name)) if inner.name not in {"needed", "coarse"}]
+                                 if inner.name not in {"needed", "coarse"}
+                                 for other in other_values(getattr(value, inner.name))]
         elif one.name != "name":
             singles[one.name] = other_values(value)
     for name, values in singles.items():

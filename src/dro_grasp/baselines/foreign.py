@@ -89,7 +89,8 @@ class FileMethod(Method):
         parts = [part for _, part in self.grasps.by_object() if part.object[0] == obj.name]
         if not parts:
             held = ", ".join(sorted(set(self.grasps.object))[:5])
-            raise GraspFileError(f"'{self.name}' holds no grasp of '{obj.name}', but of {held}; name its objects with --objects")
+            raise GraspFileError(f"'{self.name}' holds no grasp of '{obj.name}', but of {held}; name its objects with "
+                                 "--objects")
         return GraspBatch.concatenate(parts)
 
     def make(self, problem: GraspProblem, num: int, seed: int) -> GraspBatch:

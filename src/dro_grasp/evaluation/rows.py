@@ -133,7 +133,8 @@ def average(rows: Sequence[Row]) -> Row:
     return replace(
         rows[0], hand=ALL, asked=sum(asked), returned=sum(r.returned for r in rows),
         held={label: sum(r.held[label] for r in rows) for label in rows[0].held},
-        success=_average_rates([r.success for r in rows], asked), trials_held=_average_rates([r.trials_held for r in rows], asked),
+        success=_average_rates([r.success for r in rows], asked),
+        trials_held=_average_rates([r.trials_held for r in rows], asked),
         fingers={
             label: (_mean([r.fingers[label][0] for r in rows]), _mean([r.fingers[label][1] for r in rows]))
             for label in rows[0].fingers

@@ -67,9 +67,9 @@ def _rates(done: Onboarded) -> str:
                          f"{100 * row['optimised']:.0f} %", f"{row['diversity']:.2f}"])
     labels = list(done.steps["after"]["rows"][0]["success"])
     return table(["weights", "grasps", "asked", "returned", *labels, "fingers [%]", "by the optimiser", "diversity"], rows) + (
-        "<p class=note>Success rates of the grasps asked for, with 95 % intervals. dro is the paper's protocol and lenient; strict also limits "
-        "penetration and how far closing may push the object. Fingers: the share of the hand's that touch the object, and in "
-        "parentheses of the grasps with all of them. The network's rows are what fine-tuning improves. "
+        "<p class=note>Success rates of the grasps asked for, with 95 % intervals. dro is the paper's protocol and lenient; "
+        "strict also limits penetration and how far closing may push the object. Fingers: the share of the hand's that touch the "
+        "object, and in parentheses of the grasps with all of them. The network's rows are what fine-tuning improves. "
         "<i>generate</i> keeps the best of four of the network's candidates by score, as the row <i>best quarter</i> does, and "
         "asks the optimiser for others where the score does not trust these: slower, and less needed the better the network "
         "is. <i>generate --method network</i> does without.</p>")
@@ -88,7 +88,8 @@ def _drawn(done: Onboarded, held_out: list[str]) -> str:
         if len(made.grasps) < GRASPS:
             short = f"; {len(made.grasps)} of the {GRASPS} asked for were found"
         parts.append(image(path.read_bytes(), f"grasps of {name}")
-                     + f"<p class=note>{html.escape(name)}: {by_optimiser} of {len(made.grasps)} made by the optimiser{short}</p>")
+                     + f"<p class=note>{html.escape(name)}: {by_optimiser} of {len(made.grasps)} made by the optimiser{short}"
+                       "</p>")
     return "".join(parts)
 
 

@@ -130,9 +130,9 @@ class Onboarded:
             better = "No more than all can hold" if held == asked else "To gain, try more --minutes or more --objects"
             if held_after > held:
                 better += "; to tell a small gain from chance, more --num"
-            lines.append(f"Fine-tuning gained nothing beyond chance: {held} of {asked} of the refined grasps hold under {STRICT} "
-                         f"before, {held_after} of {asked_after} after ({100 * low:+.0f} to {100 * high:+.0f} points, 95 %). "
-                         f"Keep the weights from before. {better}.")
+            lines.append(f"Fine-tuning gained nothing beyond chance: {held} of {asked} of the refined grasps hold under "
+                         f"{STRICT} before, {held_after} of {asked_after} after ({100 * low:+.0f} to {100 * high:+.0f} points, "
+                         f"95 %). Keep the weights from before. {better}.")
         if self.without_grasps:
             lines.append(f"No training grasps of {', '.join(self.without_grasps)}: try --objects of a size that suits the "
                          "hand, and look at its picture for a wrong palm side or opening.")
@@ -211,8 +211,9 @@ class _Onboarding:
                     raise OptionError(f"{folder} was begun with {name} {known['asked'][name]}, {asked} was asked for; use the "
                                       "same to resume, or name another folder")
             # A benchmark of an earlier version, which tells less than what the report needs, is made again.
-            self.steps = {name: step for name, step in known["steps"].items()
-                          if "rows" not in step or any(row["stage"] == RETURNED and {"fingers", "asked"} <= row.keys() for row in step["rows"])}
+            self.steps = {
+                name: step for name, step in known["steps"].items() if "rows" not in step
+                or any(row["stage"] == RETURNED and {"fingers", "asked"} <= row.keys() for row in step["rows"])}
 
     def _known(self, state: Path) -> dict[str, Any] | None:
         """What a run before has stored; a damaged file is set aside, and its steps are made again."""
@@ -267,7 +268,7 @@ class _Onboarding:
                                  device=self.config.device)
         objects = [load_object(name) for name in self.held_out]
         rows = benchmark([self.hand], objects, [DistanceMethod(predictor, source=self.config.method)], config)
-        told = "; ".join(f"{r.stage}: " + ", ".join(f"{k} {v[0]:.0%}" for k, v in r.success.items()) + _short(r) for r in rows)
+        told = "; ".join(map(_in_words, rows))
         share = f"{rows[-1].optimised:.0%} from the optimiser"
         return {"rows": [row.to_dict() for row in rows], "said": f"{predictor.weights_name}, {told}, {share}"}
 
@@ -302,6 +303,7 @@ class _Onboarding:
         return {"grasps": bundle.n_grasps, "initial": initial.name, "said": said}
 
 
-def _short(row: Row) -> str:
-    """How many grasps of those asked for were returned, if not all."""
-    return "" if row.returned == row.asked else f" ({row.returned} of {row.asked} returned)"
+def _in_words(row: Row) -> str:
+    """Stage and rates of a row, and how many grasps of those asked for were returned, if not all."""
+    short = "" if row.returned == row.asked else f" ({row.returned} of {row.asked} returned)"
+    return f"{row.stage}: " + ", ".join(f"{label} {rate[0]:.0%}" for label, rate in row.success.items()) + short
