@@ -28,11 +28,11 @@ from report import ROOT, emit
 from synthesis import HANDS
 
 from dro_grasp.cli.main import main as command
+from dro_grasp.compare.distance_error import distance_errors
+from dro_grasp.compare.metrics import wilson_interval
+from dro_grasp.compare.rows import ALL
+from dro_grasp.compare.stages import RAW, REFINED, BenchmarkConfig, benchmark
 from dro_grasp.datasets.bundle.training_file import HELD_OUT_HANDS, Bundle, load_bundle
-from dro_grasp.evaluation.distance_error import distance_errors
-from dro_grasp.evaluation.metrics import wilson_interval
-from dro_grasp.evaluation.rows import ALL
-from dro_grasp.evaluation.success_rates import RAW, REFINED, BenchmarkConfig, benchmark
 from dro_grasp.hands.library import load_hand
 from dro_grasp.models.checkpoints import history_of, load_weights, locate_weights, save_weights
 from dro_grasp.models.network import DistanceNetwork

@@ -15,7 +15,7 @@ import torch
 from report import emit, rate
 from synthesis import HANDS
 
-from dro_grasp.evaluation.success_rates import pair_seed
+from dro_grasp.compare.stages import pair_seed
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.loading import cloud_object

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from report import emit, rate
 
-from dro_grasp.evaluation.metrics import diversity
-from dro_grasp.evaluation.success_rates import pair_seed
+from dro_grasp.compare.metrics import diversity
+from dro_grasp.compare.stages import pair_seed
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects

@@ -26,10 +26,10 @@ import torch
 from dro_grasp.baselines.ours import DistanceMethod, SynthesisMethod
 from report import emit, rate
 
-from dro_grasp.baselines.method import Method
+from dro_grasp.compare.methods import Method
+from dro_grasp.compare.metrics import diversity, success_rate
+from dro_grasp.compare.stages import pair_seed
 from dro_grasp.datasets.bundle.training_file import load_bundle
-from dro_grasp.evaluation.metrics import diversity, wilson_interval
-from dro_grasp.evaluation.success_rates import pair_seed
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
@@ -159,7 +159,8 @@ def made(source: Source, problem: GraspProblem) -> tuple[GraspBatch, float]:
     _ = problem.field, problem.obj.parts
     begin, seed, method = time.process_time(), pair_seed(0, problem.hand, problem.obj), source.method
     grasps = method.make(problem, source.num, seed) if source.raw else method.best(problem, source.num, seed).grasps
-    return grasps, (time.process_time() - begin) / source.num
+    seconds = (time.process_time() - begin) / source.num
+    return grasps.with_asked(method.asked(problem.obj, source.num)), seconds
 
 
 def lines(name: str, per_hand: dict[str, list[Measured]], trials: Sequence[str]) -> list[list[Any]]:
@@ -171,12 +172,14 @@ def lines(name: str, per_hand: dict[str, list[Measured]], trials: Sequence[str])
         spread = diversity(grasps.T_object_wrist, grasps.joints)["all"]
         moved = np.concatenate([p.moved for p in parts], 1)[:, good]
         shift, turn = np.nanmean(moved, 1) if good.any() else (np.nan, np.nan)
-        rows.append([name, hand, len(good), *map(rate, rates), spread, 1e3 * shift, np.degrees(turn),
+        asked = sum(p.grasps.out_of for p in parts)
+        rows.append([name, hand, asked, *(rate(held, asked) for held in rates), spread, 1e3 * shift, np.degrees(turn),
                      float(np.mean([p.seconds for p in parts]))])
     everything = [p for parts in per_hand.values() for p in parts]
     rates = [outcomes(everything, trial) for trial in trials]
     means = [float(np.nanmean([row[k] for row in rows])) for k in range(-4, 0)]
-    return [*rows, [name, "all", sum(row[2] for row in rows), *map(rate, rates), *means]]
+    asked = sum(row[2] for row in rows)
+    return [*rows, [name, "all", asked, *(rate(held, asked) for held in rates), *means]]
 
 
 def outcomes(parts: Sequence[Measured], trial: str) -> np.ndarray:
@@ -191,8 +194,8 @@ def draw(found: dict[str, dict[str, list[Measured]]], path: Path) -> None:
         for name, per_hand in found.items():
             parts = [p for of_hand in per_hand.values() for p in of_hand]
             held = outcomes(parts, trial)
-            low, high = wilson_interval(int(held.sum()), len(held))
-            share, seconds = held.mean(), np.mean([p.seconds for p in parts])
+            share, low, high = success_rate(int(held.sum()), sum(p.grasps.out_of for p in parts))
+            seconds = np.mean([p.seconds for p in parts])
             below, above = (100 * max(0.0, part) for part in (share - low, high - share))
             ax.errorbar(seconds, 100 * share, [[below], [above]], fmt="o", capsize=3, label=name)
         ax.set(xscale="log", title=trial, xlabel="time for a returned grasp [s]", ylim=(0, 104))

@@ -23,8 +23,8 @@ from report import emit
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dro_grasp.compare.stages import pair_seed
 from dro_grasp.datasets.bundle.training_file import load_bundle
-from dro_grasp.evaluation.success_rates import pair_seed
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.models.checkpoints import load_weights

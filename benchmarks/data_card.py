@@ -12,10 +12,10 @@ from pathlib import Path
 
 from report import ROOT
 
+from dro_grasp.compare.coverage import measure_coverage
+from dro_grasp.compare.rows import finger_contact
 from dro_grasp.datasets.collections.collection import read_collection
 from dro_grasp.datasets.engine.shards import Yield
-from dro_grasp.evaluation.coverage import measure_coverage
-from dro_grasp.evaluation.rows import finger_contact
 from dro_grasp.viewer.dataset_pages import charts, grasps_drawn
 
 PICTURED = "assets-shadowhand.parquet"

@@ -15,11 +15,11 @@ import torch
 from report import emit
 from synthesis import HANDS, training_objects
 
+from dro_grasp.compare.coverage import measure_coverage
+from dro_grasp.compare.metrics import wilson_interval
 from dro_grasp.datasets.collections.checking import check
 from dro_grasp.datasets.collections.collection import PairGrasps, read_collection
 from dro_grasp.datasets.engine.shards import Yield
-from dro_grasp.evaluation.coverage import measure_coverage
-from dro_grasp.evaluation.metrics import wilson_interval
 from dro_grasp.simulation.protocols import changed
 
 TRIALS = (

@@ -18,9 +18,9 @@ import numpy as np
 import torch
 from report import emit, rate
 
+from dro_grasp.compare.metrics import wilson_interval
+from dro_grasp.compare.stages import pair_seed
 from dro_grasp.datasets.collections.importing import ForeignGrasp, in_order, read_foreign, read_npy
-from dro_grasp.evaluation.metrics import wilson_interval
-from dro_grasp.evaluation.success_rates import pair_seed
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand

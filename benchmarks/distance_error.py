@@ -19,8 +19,8 @@ from report import ROOT, emit
 from synthesis import HANDS
 
 from dro_grasp.cli.main import main as command
+from dro_grasp.compare.distance_error import distance_errors
 from dro_grasp.datasets.bundle.training_file import Bundle, load_bundle
-from dro_grasp.evaluation.distance_error import distance_errors
 from dro_grasp.models.checkpoints import load_weights
 
 

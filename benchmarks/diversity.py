@@ -13,9 +13,9 @@ import torch
 from report import ROOT, emit
 from synthesis import HANDS
 
+from dro_grasp.compare.metrics import diversity
+from dro_grasp.compare.stages import pair_seed
 from dro_grasp.datasets.collections.merging import file_name
-from dro_grasp.evaluation.metrics import diversity
-from dro_grasp.evaluation.success_rates import pair_seed
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects

@@ -16,7 +16,7 @@ import torch
 from report import emit
 from torch import Tensor
 
-from dro_grasp.evaluation.success_rates import pair_seed
+from dro_grasp.compare.stages import pair_seed
 from dro_grasp.hands.library import load_hand
 from dro_grasp.models.network import DistanceNetwork, Moves
 from dro_grasp.objects.catalogue import load_object

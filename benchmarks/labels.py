@@ -18,10 +18,10 @@ import torch
 from report import emit
 from synthesis import HANDS, training_objects
 
+from dro_grasp.compare.metrics import diversity
+from dro_grasp.compare.rows import finger_contact
 from dro_grasp.datasets.engine.worker import EngineConfig, valid_grasps
 from dro_grasp.energy.contact_candidates import ContactConfig
-from dro_grasp.evaluation.metrics import diversity
-from dro_grasp.evaluation.rows import finger_contact
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object

@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from report import emit
 
+from dro_grasp.compare.metrics import wilson_interval
 from dro_grasp.datasets.bundle.training_file import load_bundle
-from dro_grasp.evaluation.metrics import wilson_interval
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.planning.attempts import Attempt, TabletopConfig, attempt

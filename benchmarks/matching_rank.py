@@ -23,7 +23,7 @@ from synthesis import HANDS
 from torch import Tensor
 from torch.nn import functional
 
-from dro_grasp.evaluation.correspondence import matching_rank, mean_rank
+from dro_grasp.compare.correspondence import matching_rank, mean_rank
 from dro_grasp.models.checkpoints import load_weights
 from dro_grasp.models.encoder import StaticGraphEncoder
 from dro_grasp.rendering.camera import Camera

@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from report import emit, rate
 
+from dro_grasp.compare.stages import pair_seed
 from dro_grasp.datasets.bundle.training_file import HELD_OUT_HANDS
-from dro_grasp.evaluation.success_rates import pair_seed
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.predict.config import GraspRequest, PredictorConfig
@@ -70,7 +70,8 @@ def main() -> None:
     for (hand_name, method), parts in found.items():
         values = np.concatenate(parts)
         touching, all_touch, optimised, seconds = values[:, len(PROTOCOLS) :].mean(0)
-        table.append([hand_name, method, len(values), *map(rate, values[:, : len(PROTOCOLS)].T),
+        asked = options.num * len(parts)
+        table.append([hand_name, method, asked, *(rate(column, asked) for column in values[:, : len(PROTOCOLS)].T),
                       f"{100 * touching:.0f} ({100 * all_touch:.0f})", f"{100 * optimised:.0f}", f"{seconds:.2f}"])
     columns = ["hand", "method", "n", *(f"{name} [%]" for name in PROTOCOLS), "fingers in contact (all) [%]",
                "from the optimiser [%]", "CPU seconds a grasp"]

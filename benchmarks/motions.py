@@ -16,8 +16,8 @@ from pathlib import Path
 import torch
 from report import emit
 
+from dro_grasp.compare.correspondence import mean_rank
 from dro_grasp.datasets.bundle.training_file import Bundle, HandGrasps, ObjectCloud, load_bundle
-from dro_grasp.evaluation.correspondence import mean_rank
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.models.checkpoints import load_weights

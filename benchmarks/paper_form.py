@@ -25,11 +25,11 @@ from dro_grasp.baselines.ours import DistanceMethod
 from report import emit
 from synthesis import HANDS
 
+from dro_grasp.compare.distance_error import distance_errors
+from dro_grasp.compare.metrics import wilson_interval
+from dro_grasp.compare.rows import ALL
+from dro_grasp.compare.stages import BEST, RAW, REFINED, BenchmarkConfig, benchmark
 from dro_grasp.datasets.bundle.training_file import Bundle, load_bundle
-from dro_grasp.evaluation.distance_error import distance_errors
-from dro_grasp.evaluation.metrics import wilson_interval
-from dro_grasp.evaluation.rows import ALL
-from dro_grasp.evaluation.success_rates import BEST, RAW, REFINED, BenchmarkConfig, benchmark
 from dro_grasp.files import replacing
 from dro_grasp.hands.library import load_hand
 from dro_grasp.models.checkpoints import describe_weights, load_weights, save_weights

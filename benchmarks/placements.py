@@ -21,8 +21,8 @@ import torch
 from report import emit, rate
 from torch import Tensor
 
+from dro_grasp.compare.stages import pair_seed
 from dro_grasp.datasets.bundle.training_file import Bundle, load_bundle
-from dro_grasp.evaluation.success_rates import pair_seed
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.hands.proportions import proportions

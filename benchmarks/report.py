@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dro_grasp.evaluation.metrics import wilson_interval
+from dro_grasp.compare.metrics import wilson_interval
 
 ROOT = Path(__file__).resolve().parent.parent
 """Folder of the repository."""
@@ -67,9 +67,9 @@ def emit(
             print(f"{key}: {_cell(value)}")
 
 
-def rate(held: Collection[bool] | np.ndarray | Tensor) -> str:
-    """Success in per cent with its 95 % interval."""
-    success, total = int(sum(map(bool, held))), len(held)
+def rate(held: Collection[bool] | np.ndarray | Tensor, asked: int | None = None) -> str:
+    """Success in per cent of the grasps that were asked for, or else of those that there are, with its 95 % interval."""
+    success, total = int(sum(map(bool, held))), len(held) if asked is None else asked
     low, high = wilson_interval(success, total)
     return f"{100 * success / total:.1f} [{100 * low:.0f}-{100 * high:.0f}]"
 

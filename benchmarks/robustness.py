@@ -20,7 +20,7 @@ from pathlib import Path
 import torch
 from report import ROOT, emit
 
-from dro_grasp.evaluation.metrics import finger_contact, mean_share, wilson_interval
+from dro_grasp.compare.metrics import finger_contact, mean_share, wilson_interval
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import hand_of, object_of
 from dro_grasp.hands.hand import Hand

@@ -15,8 +15,8 @@ import torch
 from report import emit
 from synthesis import HANDS
 
+from dro_grasp.compare.stages import KEPT, pair_seed
 from dro_grasp.energy.grasp_energy import GraspEnergy
-from dro_grasp.evaluation.success_rates import KEPT, pair_seed
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects

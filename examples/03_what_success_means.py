@@ -12,5 +12,5 @@ sets = {
 for protocol in ("dro", "strict", "dexgraspbench"):
     for name, grasps in sets.items():
         success = int(dro.simulate(hand, obj, grasps, protocol).success.sum())
-        low, high = dro.wilson_interval(success, len(grasps))
-        print(f"{protocol:14} {name:22} {success:2} of {len(grasps)}  (95 %: {low:.0%} to {high:.0%})")
+        low, high = dro.wilson_interval(success, grasps.out_of)  # of what was asked for: grasps that were not found have failed
+        print(f"{protocol:14} {name:22} {success:2} of {grasps.out_of}  (95 %: {low:.0%} to {high:.0%})")

@@ -20,7 +20,7 @@ import torch
 from torch.nn import functional
 from train_ranking import HANDS
 
-from dro_grasp.evaluation.metrics import roc_area
+from dro_grasp.compare.metrics import roc_area
 from dro_grasp.hands.library import load_hand
 from dro_grasp.models.checkpoints import load_weights, save_weights
 from dro_grasp.models.network import DistanceNetwork

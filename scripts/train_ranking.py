@@ -22,8 +22,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from dro_grasp.compare.metrics import roc_area
 from dro_grasp.energy.grasp_energy import GraspEnergy
-from dro_grasp.evaluation.metrics import roc_area
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand

@@ -1,14 +1,14 @@
 """The public names: type checkers read them here, and the package loads each from its module on first use."""
 
 from dro_grasp._version import __version__ as __version__
-from dro_grasp.baselines.method import Method as Method
+from dro_grasp.compare.methods import Method as Method, MethodOptions as MethodOptions, make_method as make_method
+from dro_grasp.compare.metrics import wilson_interval as wilson_interval
 from dro_grasp.datasets.bundle.training_file import load_bundle as load_bundle
 from dro_grasp.datasets.collections.bundling import make_bundle as make_bundle
 from dro_grasp.datasets.collections.collection import read_collection as read_collection
 from dro_grasp.datasets.engine.schedule import synthesize_dataset as synthesize_dataset
 from dro_grasp.datasets.engine.worker import EngineConfig as EngineConfig
 from dro_grasp.errors import DroGraspError as DroGraspError
-from dro_grasp.evaluation.metrics import wilson_interval as wilson_interval
 from dro_grasp.export.contents import Frame as Frame
 from dro_grasp.export.csv_table import csv_table as csv_table
 from dro_grasp.export.dexgraspbench import dexgraspbench as dexgraspbench
@@ -42,13 +42,23 @@ from dro_grasp.planning.robot_check import RobotReport as RobotReport, check_rob
 from dro_grasp.planning.table_scene import PickedObject as PickedObject, pick_object as pick_object
 from dro_grasp.planning.tabletop import TabletopRun as TabletopRun, run_tabletop as run_tabletop
 from dro_grasp.planning.trajectory_files import trajectory_csv as trajectory_csv, trajectory_yaml as trajectory_yaml
-from dro_grasp.predict.config import GraspRequest as GraspRequest, PredictorConfig as PredictorConfig
+from dro_grasp.predict.config import (
+    GraspRequest as GraspRequest,
+    PredictorConfig as PredictorConfig,
+    RescueConfig as RescueConfig,
+    RetryConfig as RetryConfig,
+)
 from dro_grasp.predict.constraints import Constraints as Constraints
+from dro_grasp.predict.finish import FinishConfig as FinishConfig, Finished as Finished, finish as finish
 from dro_grasp.predict.predictor import GraspPredictor as GraspPredictor, Prediction as Prediction
 from dro_grasp.predict.problem import GraspProblem as GraspProblem
+from dro_grasp.predict.settling import SettleConfig as SettleConfig
 from dro_grasp.predict.sources.choice import ChoiceConfig as ChoiceConfig, ChoicePenalties as ChoicePenalties
 from dro_grasp.predict.sources.controls import palm_facing_starts as palm_facing_starts
-from dro_grasp.predict.sources.registry import MethodOptions as MethodOptions, make_method as make_method
+from dro_grasp.predict.sources.network import ProposalConfig as ProposalConfig
+from dro_grasp.predict.sources.optimiser import OptimiserConfig as OptimiserConfig
+from dro_grasp.predict.sources.registry import make_source as make_source, register_source as register_source
+from dro_grasp.predict.sources.source import Candidates as Candidates, Source as Source
 from dro_grasp.predict.stages import complete as complete, evaluate as evaluate, rank as rank, refine as refine
 from dro_grasp.serve.client import GraspClient as GraspClient
 from dro_grasp.simulation.contact_quality import ContactQuality as ContactQuality, measure_contacts as measure_contacts

@@ -11,8 +11,8 @@ import torch
 from dro_grasp.baselines.ours import DescentMethod
 
 from dro_grasp.baselines import ours
-from dro_grasp.baselines.method import Method
 from dro_grasp.cli.main import main
+from dro_grasp.compare.methods import Method
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import SynthesisConfig

@@ -9,9 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from dro_grasp.pipeline.problem import GraspProblem
 
 from dro_grasp.cli.main import main
+from dro_grasp.compare.metrics import wilson_interval
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.simulation.trial import simulate
 from tests.helpers.loaded_hands import loaded_hand
 
 KEYS = {
@@ -156,15 +159,79 @@ def test_impossible_table_says_so(weights: str, capsys: pytest.CaptureFixture[st
     assert "leaves nothing of the object" in capsys.readouterr().err
 
 
+def none_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(problem: GraspProblem, grasps: GraspBatch, *_: object) -> GraspBatch:
+        done = grasps.with_trial(simulate(problem.hand, problem.obj, grasps))
+        return done.replace(success=torch.zeros(len(grasps), dtype=torch.bool))
+
+    monkeypatch.setattr("dro_grasp.pipeline.stages.evaluate", failing)
+
+
 def test_a_file_without_any_success_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def failing(problem: object, grasps: GraspBatch, *_: object) -> GraspBatch:
-        none = torch.zeros(len(grasps), dtype=torch.bool)
-        return grasps.replace(success=none, protocol=("strict/1",) * len(grasps))
-
-    monkeypatch.setattr("dro_grasp.predict.stages.evaluate", failing)
+    none_holds(monkeypatch)
     path = tmp_path / "grasps.parquet"
     arguments = ["generate", "--hand", "gripper3", "--object", "sphere", "--num", "2", "--method", "network", "--json"]
     assert main([*arguments, "--only-successful", "--output", str(path)]) == 0
     assert f"no grasp succeeded, so {path} holds none" in capsys.readouterr().err
+
+
+def test_grasps_that_were_not_found_count_as_failures(
+    generate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of 16 that are asked for, constraints leave 2, which hold."""
+    allow_two_that_hold(monkeypatch)
+    path, folder = tmp_path / "grasps.parquet", tmp_path / "folder"
+    folder.mkdir()
+    report = generate("--output", str(path), num=16)
+    assert (report["asked"], report["num"], report["success"]) == (16, 2, 2)
+    assert report["success_rate"] == pytest.approx(2 / 16)
+    low, high = wilson_interval(2, 16)
+    assert report["interval_95"] == pytest.approx([low, high])
+    assert GraspBatch.load(path).asked == 16
+    assert "2 of 16 hold under strict/1" in repr(GraspBatch.load(path))
+    told = generate("--output", str(folder / "few.parquet"), "--only-successful", num=16)
+    assert told["success_rate"] == pytest.approx(2 / 16)
+    assert GraspBatch.load(folder / "few.parquet").asked is None, "what was chosen by its outcome is no answer"
+    capsys.readouterr()
+    assert main(["evaluate", str(path), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    held = told["success"]
+    assert (told["asked"], told["num"], told["success_rate"]) == (16, 2, pytest.approx(held / 16))
+    assert told["interval_95"] == pytest.approx(wilson_interval(held, 16))
+    assert told["objects"]["sphere"] == {"asked": 16, "num": 2, "success": held}
+    assert main(["evaluate", str(path)]) == 0
+    assert f"{held} of 16 succeeded: {held / 16:.1%}" in capsys.readouterr().out
+
+
+def allow_two_that_hold(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken = [0]
+
+    def permitted(problem: object, grasps: GraspBatch) -> torch.Tensor:
+        left = max(0, 2 - taken[0])
+        taken[0] += min(left, len(grasps))
+        return torch.arange(len(grasps)) < left
+
+    def holding(problem: GraspProblem, grasps: GraspBatch, *_: object) -> GraspBatch:
+        taken[0] = 0
+        return grasps.replace(success=torch.ones(len(grasps), dtype=torch.bool), protocol=("strict/1",) * len(grasps))
+
+    monkeypatch.setattr("dro_grasp.pipeline.pool.permitted", permitted)
+    monkeypatch.setattr("dro_grasp.pipeline.stages.evaluate", holding)
+
+
+def test_a_picture_of_successes_shows_no_failures(
+    generate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    none_holds(monkeypatch)
+    monkeypatch.setattr("dro_grasp.viewer.app.view_grasps", lambda *_: pytest.fail("failures are shown"))
+    path, base = tmp_path / "grasps.png", ["generate", "--hand", "gripper3", "--object", "sphere", "--num", "2"]
+    assert main([*base, "--method", "network", "--only-successful", "--picture", str(path), "--view"]) == 0
+    said = capsys.readouterr()
+    assert f"sphere: no grasp succeeded, so {path} is not drawn" in said.err
+    assert "sphere: no grasp succeeded, so there is none to view" in said.err
+    assert "picture:" not in said.out
+    assert "0 of 2 grasps succeeded" in said.out
+    assert not path.exists()
+    assert generate("--only-successful", "--picture", str(path))["picture"] is None

@@ -69,7 +69,7 @@ def test_heavier_objects_and_slippery_hands_are_harder(stored):
     base = check(pairs, 1000, changed("dro")).succeeded
     assert check(pairs, 1000, changed("dro", friction=0.05)).succeeded < base
     assert check(pairs, 1000, changed("dro", mass_factor=100)).succeeded < base
-    assert changed("strict", mass_factor=2).label == "strict+changed/1"
+    assert changed("strict", mass_factor=2).label == "strict+mass_factor=2/1"
     for wrong in ({"friction": 0.0}, {"mass_factor": -1.0}):
         with pytest.raises(OptionError, match="between 0 and"):
             changed("dro", **wrong)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import html
 import json
@@ -9,6 +10,7 @@ import shlex
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from dro_grasp.cli.main import main
@@ -67,9 +69,8 @@ def test_a_file_becomes_weights_and_a_report(home: Path, capsys: pytest.CaptureF
 
 
 def test_the_next_steps_are_commands_for_shells(tmp_path: Path) -> None:
-    rows = [[{"stage": steps.REFINED, "success": {"strict/1": (rate, 0, 1)}}] for rate in (0.3, 0.4)]
     folder, hand = tmp_path / "my hand", "it's $mine; hand.urdf"
-    done = steps.Onboarded(hand, folder, {"before": {"rows": rows[0]}, "after": {"rows": rows[1]}})
+    done = dataclasses.replace(onboarded(folder, 60, 100), hand=hand)
     page = html.unescape(report._commands(done)).removeprefix("<pre>").removesuffix("</pre>")
     words = [shlex.split(line) for line in page.splitlines()]
     assert words[0][2:8] == ["--hand", hand, "--object", "my_mesh.stl", "--weights", str(folder / steps.WEIGHTS)]
@@ -122,17 +123,37 @@ def test_a_benchmark_without_what_generate_returns_is_made_again(home: Path, cap
     assert [row["stage"] for row in rows] == [row["stage"] for row in whole["rows"]]
 
 
-@pytest.mark.parametrize("after", [0.2, 0.3, 0.4])
-def test_what_gained_nothing_says_so_and_keeps_the_weights_from_before(home: Path, after: float) -> None:
-    rows = [[{"stage": stage, "success": {"strict/1": (rate, 0, 1)}} for stage in ("raw", "refined")] for rate in (0.3, after)]
+def onboarded(folder: Path, before: int, after: int, asked: int = 200, **steps_made: dict) -> steps.Onboarded:
+    rows = [[{"stage": stage, "asked": asked, "held": {"strict/1": held}, "success": {"strict/1": (held / asked, 0, 1)}}
+             for stage in ("raw", "refined")] for held in (before, after)]
+    return steps.Onboarded("mine", folder, {"before": {"rows": rows[0]}, "after": {"rows": rows[1]}, **steps_made}, "multi")
+
+
+@pytest.mark.parametrize("after", [40, 60, 61, 90])
+def test_what_gained_nothing_says_so_and_keeps_the_weights_from_before(home: Path, after: int) -> None:
     data = {"counts": {"can": 9, "box": 0}, "failures": {"box": "no contact", "torus": "too thin", "can": "too little time"}}
-    done = steps.Onboarded("mine", home, {"before": {"rows": rows[0]}, "after": {"rows": rows[1]}, "data": data}, "multi")
+    done = onboarded(home, 60, after, data=data)
     told = " ".join(done.verdict())
     assert done.without_grasps == ["box", "torus"]
     assert "No training grasps of box, torus" in told
-    assert done.gained == (after > 0.3)
+    assert done.gained == (after == 90)
     assert done.weights == (str(home / "weights.safetensors") if done.gained else "multi")
-    assert (f"gained nothing: 30% of the refined grasps hold under strict/1 before, {after:.0%} after" in told) != done.gained
+    said = f"gained nothing beyond chance: 60 of 200 of the refined grasps hold under strict/1 before, {after} of 200 after"
+    assert (said in told) != done.gained
+
+
+@pytest.mark.parametrize(("asked", "rate"), [(40, 0.5), (200, 0.3), (200, 0.6), (200, 0.9), (1000, 0.5)])
+def test_weights_that_are_as_good_are_seldom_taken_for_better(home: Path, asked: int, rate: float) -> None:
+    generator = np.random.default_rng(0)
+    before, after = generator.binomial(asked, rate, (2, 4000)).tolist()
+    gained = [onboarded(home, b, a, asked).gained for b, a in zip(before, after, strict=True)]
+    assert sum(gained) / len(gained) <= 0.05
+
+
+def test_weights_that_are_clearly_better_are_taken(home: Path) -> None:
+    generator = np.random.default_rng(0)
+    before, after = (generator.binomial(200, rate, 1000).tolist() for rate in (0.5, 0.7))
+    assert sum(onboarded(home, b, a).gained for b, a in zip(before, after, strict=True)) >= 900
 
 
 def test_the_folder_of_another_hand_is_refused(home: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from dro_grasp.compare.metrics import roc_area
 from dro_grasp.errors import WeightsError
-from dro_grasp.evaluation.metrics import roc_area
 from dro_grasp.models.checkpoints import save_weights
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import synthesize

@@ -7,8 +7,8 @@ import dataclasses
 import pytest
 import torch
 
+from dro_grasp.compare.metrics import roc_area
 from dro_grasp.energy.grasp_energy import GraspEnergy
-from dro_grasp.evaluation.metrics import roc_area
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel

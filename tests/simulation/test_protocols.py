@@ -1,13 +1,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 
 import pytest
 
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.controller import ControllerConfig
-from dro_grasp.simulation.protocols import PROTOCOLS, protocol
+from dro_grasp.simulation.protocols import PROTOCOLS, Protocol, changed, protocol
 
 
 def test_the_paper_s_protocol():
@@ -33,14 +33,60 @@ def test_label_tells_variants_apart():
     dro = protocol("dro")
     assert dro.label == "dro/1"
     assert replace(dro, friction=3.0).label == "dro+friction3/1"
-    assert replace(dro, controller=ControllerConfig(inner=0.2)).label == "dro+changed/1"
+    assert replace(dro, controller=ControllerConfig(inner=0.2)).label == "dro+controller.inner=0.2/1"
+    assert replace(dro, friction=3.0, closing=False, mass=0.1).label == "dro+closing=False+friction3+mass=0.1/1"
     assert len({p.label for p in PROTOCOLS.values()}) == len(PROTOCOLS)
+
+
+def other_values(value):
+    """Two values that a field of this value could have instead."""
+    if isinstance(value, bool):
+        return [not value]
+    if isinstance(value, int):
+        return [value + 1, value + 2]
+    if isinstance(value, float):
+        low = value if 0 < value < math.inf else 1.0
+        return [low * 0.5, low * (1 + 1e-9)]
+    return [0.25, 0.5] if value is None else [(value[0] * 0.5, value[1]), (value[0], value[1] * 2)]
+
+
+def every_change(rules):
+    """The protocol with one or two fields changed, those of what it is made of included."""
+    singles = {}
+    for one in fields(rules):
+        value = getattr(rules, one.name)
+        if is_dataclass(value):
+            singles[one.name] = [replace(value, **{inner.name: other}) for inner in fields(value)
+                                 if inner.name not in {"needed", "coarse"}
+                                 for other in other_values(getattr(value, inner.name))]
+        elif one.name != "name":
+            singles[one.name] = other_values(value)
+    for name, values in singles.items():
+        yield from (replace(rules, **{name: value}) for value in values)
+    yield from (replace(rules, **{a: singles[a][0], b: singles[b][0]}) for a in singles for b in singles if a < b)
+
+
+def test_no_two_protocols_share_a_label():
+    every = [other for rules in PROTOCOLS.values() for other in (rules, *every_change(rules))]
+    assert len(every) > 1000
+    assert len({rules.label for rules in every}) == len(set(every)) == len(every)
+
+
+def test_equal_protocols_share_a_label():
+    assert changed("strict", mass_factor=2).label == changed("strict", mass_factor=2.0).label == "strict+mass_factor=2/1"
 
 
 def test_a_protocol_of_ones_own_passes_through():
     mine = replace(protocol("dro"), name="mine", force=1.0)
     assert protocol(mine) is mine
-    assert mine.label == "mine/1"
+    assert mine.label == "mine+force=1/1"
+    assert Protocol("mine").label == "mine/1"
+
+
+@pytest.mark.parametrize("name", ["dro+friction3", "dro/1", "", "a b"])
+def test_a_name_that_reads_as_a_label_is_refused(name):
+    with pytest.raises(OptionError, match="letters, digits"):
+        Protocol(name)
 
 
 def test_unknown_name_lists_the_choices():
@@ -54,4 +100,4 @@ def test_robust_is_strict_under_perturbations():
     assert strict.perturbations.trials == 1
     assert robust.label == "robust/1"
     fewer = replace(robust, perturbations=replace(robust.perturbations, trials=7))
-    assert fewer.label == "robust+changed/1"
+    assert fewer.label == "robust+perturbations.trials=7/1"

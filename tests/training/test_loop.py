@@ -10,9 +10,9 @@ import pytest
 import torch
 from torch import nn
 
+from dro_grasp.compare.correspondence import matching_rank
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.errors import TrainingError
-from dro_grasp.evaluation.correspondence import matching_rank
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.training import loop
 from dro_grasp.training.config import AugmentationConfig, LossConfig, MotionConfig, PretrainConfig, TrainConfig

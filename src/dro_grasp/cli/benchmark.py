@@ -15,8 +15,8 @@ from dro_grasp.cli.inputs import Flag, ProtocolName, optional
 from dro_grasp.cli.output import print_json, progress_bar, say
 
 if TYPE_CHECKING:
-    from dro_grasp.baselines.method import Method
-    from dro_grasp.evaluation.rows import Row
+    from dro_grasp.compare.methods import Method
+    from dro_grasp.compare.rows import Row
     from dro_grasp.objects.shape import ObjectModel
 
 QUICK: dict[str, Any] = {"num": 16, "stages": ("returned",), "protocols": ("dro", "strict")}
@@ -27,14 +27,13 @@ QUICK: dict[str, Any] = {"num": 16, "stages": ("returned",), "protocols": ("dro"
 class Benchmark:
     """Evaluate grasps of several methods, before and after refinement and ranking: one table.
 
-    Example: dro-grasp benchmark --methods dro synthesise dfc my_module:MyMethod --hands allegro barrett --stages returned
+    Example: dro-grasp benchmark --methods auto optimiser dfc my_module:MySource --hands allegro barrett --stages returned
     """
 
     methods: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--method"], metavar="NAME...", help_behavior_hint=(
-        "(default: dro, start, synthesise, and with a bundle mean-grasp, mean-grasp-chosen)"))] = ()
-    """What makes the grasps: dro, synthesise, dfc, gendexgrasp, gendexgrasp-gamma1, manifm, start, mean-grasp,
-    mean-grasp-chosen; dro@WEIGHTS for other weights, gendexgrasp@WEIGHTS and manifm@WEIGHTS; module:Class for a class of
-    yours that has predict(hand, obj, num, seed); or a grasp file."""
+        "(default: auto, start, optimiser, and with a bundle mean-grasp, mean-grasp-chosen)"))] = ()
+    """What proposes the grasps: auto, network, optimiser, dfc, start, mean-grasp, mean-grasp-chosen; network@WEIGHTS and
+    auto@WEIGHTS for other weights; module:Class for a source of yours; or a grasp file."""
     hands: tuple[str, ...] = ("allegro", "barrett", "shadowhand")
     """Names or paths of hands."""
     objects: tuple[str, ...] = ("builtin:test",)
@@ -47,18 +46,18 @@ class Benchmark:
     stages: tuple[Literal["raw", "ranked", "refined", "settled", "returned", "equal-time"], ...] = (
         "raw", "ranked", "refined")
     """What is done to the grasps before the trials; of refined and of settled grasps, all and the best by score are reported.
-    settled: refined grasps after their closing was simulated. returned: what each method returns to a user, and for dro that
-    is what `generate` returns. equal-time: all methods with as much CPU time for each grasp as the first."""
+    settled: refined grasps after their closing was simulated. returned: what
+    `generate --source` returns. equal-time: all methods with as much CPU time for each grasp as the first."""
     protocols: tuple[ProtocolName, ...] = ("dro", "strict", "dexgraspbench")
     """Trials; displacement, rotation and diversity are means over successes of the first."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
-    """Weights of the method dro."""
+    """Weights of the network."""
     device: str = "cpu"
     """Device for the network and the energies: cpu, cuda or cuda:1. Trials always run on the CPU."""
     temperature: Annotated[float | None, optional("T", "as the weights say")] = None
     """Diversity of the grasps of one placement: 0 proposes the likeliest, 1 is as diverse as the training grasps."""
     controls: bool = True
-    """Without --methods: also evaluate start, synthesise and, with a bundle, the mean grasp."""
+    """Without --methods: also evaluate start, optimiser and, with a bundle, the mean grasp."""
     bundle: Annotated[Path | None, optional("PATH", "no mean grasp")] = None
     """Training bundle whose grasps are averaged to the mean grasp."""
     contact_quality: Flag = False
@@ -76,8 +75,8 @@ class Benchmark:
 
     def run(self) -> int:
         """Load everything, measure, print."""
+        from dro_grasp.compare.stages import BEST, REFINED, SETTLED, SETTLED_BEST, TOP, BenchmarkConfig, benchmark
         from dro_grasp.errors import ObjectError, OptionError
-        from dro_grasp.evaluation.success_rates import BEST, REFINED, SETTLED, SETTLED_BEST, TOP, BenchmarkConfig, benchmark
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.catalogue import resolve_objects
         from dro_grasp.predict.config import GraspRequest
@@ -113,7 +112,7 @@ class Benchmark:
                 "methods": [method.name for method in methods], "weights": self.weights or "default",
                 "objects": [obj.name for obj in objects], "num": self.num,
                 "view": self.view, "views": self.views, "seed": self.seed, "seconds": round(seconds, 1),
-                "rows": [dataclasses.asdict(row) for row in rows],
+                "rows": [row.to_dict() for row in rows],
             })
             return 0
         title = f"{self.num} grasps of each hand on each of {len(objects)} objects"
@@ -126,7 +125,8 @@ class Benchmark:
         columns = ["grasps", "stage", "hand", "n", *rows[0].success, *(f"{label} trials" for label in rows[0].trials_held),
                    "fingers", "shift [mm]", "turn [deg]", "diversity", "ROC area", "candidates", "optimiser [%]", "ms a grasp",
                    *rows[0].contact_quality]
-        say(title + "; success, and trials held where a grasp has several, in % with 95 % intervals; for each protocol fingers "
+        say(title + "; success, and trials held where a grasp has several, in % of the n grasps asked for, those that a method "
+            "did not return included, with 95 % intervals; the average is the mean over hands; for each protocol fingers "
             "in contact (grasps with all of them) in %, and ROC area of the score; candidates made for each pair\n")
         for line in [columns, ["---"] * len(columns), *map(cells, rows)]:
             say("| " + " | ".join(map(str, line)) + " |")
@@ -144,17 +144,16 @@ class Benchmark:
 
     def _methods(self) -> list[Method]:
         """The methods that were named, or the network and its controls."""
+        from dro_grasp.compare.methods import MethodOptions, make_method
         from dro_grasp.datasets.bundle.training_file import load_bundle
-        from dro_grasp.predict.sources.registry import MethodOptions, make_method
 
         names = self.methods
         if not names:
-            controls = ("start", "synthesise", *(("mean-grasp", "mean-grasp-chosen") if self.bundle is not None else ()))
-            names = ("dro", *(controls if self.controls else ()))
+            controls = ("start", "optimiser", *(("mean-grasp", "mean-grasp-chosen") if self.bundle is not None else ()))
+            names = ("auto", *(controls if self.controls else ()))
         bundle = None if self.bundle is None else load_bundle(self.bundle)
-        options = MethodOptions(None, self.device, self.temperature, bundle)
-        own = dataclasses.replace(options, weights=self.weights)
-        return [make_method(name, own if name == "dro" else options) for name in dict.fromkeys(names)]
+        options = MethodOptions(self.weights, self.device, self.temperature, bundle)
+        return [make_method(name, options) for name in dict.fromkeys(names)]
 
 
 def cells(row: Row) -> list[object]:
@@ -164,8 +163,9 @@ def cells(row: Row) -> list[object]:
     fingers = " / ".join(f"{100 * share:.0f} ({100 * everyone:.0f})" for share, everyone in row.fingers.values())
     areas = " / ".join("-" if math.isnan(area) else f"{area:.2f}" for area in row.ranking.values())
     parts = " + ".join(f"{1e3 * seconds:.0f} {name}" for name, seconds in row.seconds.items())
+    n = row.asked if row.returned == row.asked else f"{row.asked} ({row.returned} returned)"
     return [
-        row.grasps, row.stage, row.hand, row.num, *rates, fingers, f"{1e3 * row.displacement:.1f}",
+        row.grasps, row.stage, row.hand, n, *rates, fingers, f"{1e3 * row.displacement:.1f}",
         f"{math.degrees(row.rotation):.1f}", f"{row.diversity:.3f}", areas, f"{row.candidates:.0f}",
         f"{100 * row.optimised:.0f}", parts, *(f"{mean:.3g}" for mean in row.contact_quality.values()),
     ]

@@ -47,8 +47,8 @@ class DataSets:
 
     def pairs(self, only_successful: bool) -> Iterator[PairGrasps]:
         """The grasps of each pair in them; refuses two hands of one name, which cannot join in one file or table."""
+        from dro_grasp.compare.coverage import of_one_version
         from dro_grasp.datasets.collections.collection import read_collection
-        from dro_grasp.evaluation.coverage import of_one_version
 
         return of_one_version((path, pair) for path in self.inputs for pair in read_collection(path, only_successful))
 
@@ -67,7 +67,7 @@ class Report(DataSets):
 
     def run(self) -> int:
         """Measure, print, write the page."""
-        from dro_grasp.evaluation.coverage import measure_coverage
+        from dro_grasp.compare.coverage import measure_coverage
         from dro_grasp.files import check_output
         from dro_grasp.viewer.dataset_pages import write_report
 
@@ -143,8 +143,8 @@ class Check(DataSets):
 
     def run(self) -> int:
         """Draw, evaluate, compare."""
+        from dro_grasp.compare.metrics import wilson_interval
         from dro_grasp.datasets.collections.checking import check
-        from dro_grasp.evaluation.metrics import wilson_interval
         from dro_grasp.simulation.protocols import changed
 
         rules = changed(self.protocol, friction=self.friction, mass_factor=self.mass_factor)

@@ -78,7 +78,8 @@ class Evaluate:
                 evaluated[name] = with_contacts(hand, problem.obj, done, rules) if self.contact_quality else done
         if self.output is not None:
             GraspBatch.concatenate([*evaluated.values(), *bare.values()]).save(self.output)
-        self._report(hand, rules, evaluated, list(bare), time.perf_counter() - begin)
+        lost = {name: num for (name, _), num in grasps.asked_of.items() if name not in grasps.object}
+        self._report(hand, rules, evaluated, lost, list(bare), time.perf_counter() - begin)
         return 0
 
     def _problems(
@@ -112,32 +113,40 @@ class Evaluate:
             say_aside(f"warning: {name}: a bare point cloud has no trial; its {len(part)} grasps are left as they are")
         return problems, bare
 
-    def _report(self, hand: Hand, rules: Protocol, evaluated: dict[str, GraspBatch], bare: list[str], seconds: float) -> None:
-        """Print the rates of each object and of all."""
-        from dro_grasp.evaluation.metrics import mean_share, wilson_interval
+    def _report(
+        self, hand: Hand, rules: Protocol, evaluated: dict[str, GraspBatch], lost: dict[str, int], bare: list[str],
+        seconds: float,
+    ) -> None:
+        """Print the rates of each object and of all; of what is `lost`, grasps were asked for, and none was found."""
+        from dro_grasp.compare.metrics import mean_share, success_rate
         from dro_grasp.grasps.batch import GraspBatch
         from dro_grasp.simulation.diagnosis import count_failures, diagnose, next_steps
 
         rows = []
         for name, part in evaluated.items():
             held = int(part.success.sum())
-            rows.append([name, len(part), held, held / len(part), *shares(part, hand).values()])
+            rows.append([name, part.out_of, len(part), held, held / part.out_of, *shares(part, hand, part.out_of).values()])
+        rows += [[name, num, 0, 0, 0.0] for name, num in lost.items()]
         done = GraspBatch.concatenate(list(evaluated.values()))
-        success, total = int(done.success.sum()), len(done)
-        rate, (low, high), beside = success / total, wilson_interval(success, total), shares(done, hand)
+        success, asked = int(done.success.sum()), sum(row[1] for row in rows)
+        (rate, low, high), beside = success_rate(success, asked), shares(done, hand, asked)
         report = {
-            "file": str(self.file), "hand": hand.name, "protocol": rules.label, "num": total, "success": success,
+            "file": str(self.file), "hand": hand.name, "protocol": rules.label, "asked": asked, "num": len(done),
+            "success": success,
             "success_rate": rate, "interval_95": [low, high],
             **beside, "contact_quality": qualities(done),
-            "objects": {row[0]: {"num": row[1], "success": row[2]} for row in rows}, "bare_clouds": bare,
+            "objects": {row[0]: dict(zip(("asked", "num", "success"), row[1:4], strict=True)) for row in rows},
+            "bare_clouds": bare,
             "reasons": count_failures(done), "next": next_steps(done), "seconds": round(seconds, 3),
             "output": None if self.output is None else str(self.output),
         }
-        note = f"{success} of {total} succeeded: {rate:.1%} (95 %: {low:.1%} to {high:.1%})"
+        note = f"{success} of {asked} succeeded: {rate:.1%} (95 %: {low:.1%} to {high:.1%})"
+        if len(done) < asked:
+            note += f"; {asked - len(done)} of the {asked} that were asked for had not been found"
         if "trials_held" in beside:
-            mean, low, high = mean_share(done.robustness)
+            mean, low, high = mean_share(done.robustness, asked)
             note += f", and held in {mean:.1%} of their trials (95 %: {low:.1%} to {high:.1%})"
-        columns = ["object", "grasps", "success", "rate", *(SHARES[name] for name in beside)]
+        columns = ["object", "asked", "grasps", "success", "rate", *(SHARES[name] for name in beside)]
         means = ", ".join(f"{name.replace('_', ' ')} {mean:.3g}" for name, mean in report["contact_quality"].items())
         notes = [note, *([f"means: {means} (lengths in m)"] if means else []), *diagnose(done)]
         print_result(self.json, report, f"{hand.name}, protocol {rules.label}", columns, rows, *notes)
@@ -161,11 +170,14 @@ def compare(kind: str, name: str, stored: str, given: Hand | ObjectModel, output
     say_aside(made_for_another(name, given.name))
 
 
-def shares(grasps: GraspBatch, hand: Hand) -> dict[str, float]:
-    """Mean shares, as in SHARES: of its trials that a grasp holds in, if it has several, and of fingers in contact."""
-    from dro_grasp.evaluation.metrics import finger_contact
+def shares(grasps: GraspBatch, hand: Hand, asked: int) -> dict[str, float]:
+    """Mean shares, as in SHARES: of its trials that a grasp holds in, if it has several, and of fingers in contact.
 
-    held = [float(grasps.robustness.mean())] if bool(grasps.robustness.isfinite().all()) else []
+    The trials are those of the grasps that were asked for, the fingers those of the grasps that there are.
+    """
+    from dro_grasp.compare.metrics import finger_contact, mean_share
+
+    held = [mean_share(grasps.robustness, asked)[0]] if bool(grasps.robustness.isfinite().all()) else []
     names = list(SHARES)[-2 - len(held):]
     return dict(zip(names, [*held, *finger_contact(grasps.fingers_in_contact, len(hand.fingers))], strict=True))
 

@@ -79,7 +79,7 @@ class Generate:
     ] = None
     """Trial of each grasp."""
     only_successful: Flag = False
-    """Save only the successful grasps; the success rate still counts all."""
+    """Save, draw and view only the successful grasps; the success rate still counts all that were asked for."""
     output: Annotated[Path | None, optional("PATH", "not saved")] = None
     """Parquet file for the grasps; with a folder of objects, an existing folder that gets one file an object."""
     picture: Annotated[Path | None, optional("PNG", "no picture")] = None
@@ -129,12 +129,13 @@ class Generate:
         if self.view:
             from dro_grasp.viewer.app import view_grasps
 
-            for d in done:
+            for d in (d for d in done if len(d.grasps)):
                 view_grasps(hand, d.obj, d.grasps, d.predicted_points)
         return 2 if failed else 0
 
     def _grasp(self, job: Job, name: str, output: Path | None, picture: Path | None) -> ObjectResult:
         """One object, start to end."""
+        from dro_grasp.compare.metrics import success_rate
         from dro_grasp.errors import OptionError
         from dro_grasp.grasps.sources import with_sources
         from dro_grasp.predict.problem import GraspProblem
@@ -159,35 +160,44 @@ class Generate:
         grasps = self._evaluate(problem, made.grasps)
         simulated = bool(grasps.evaluated.any())
         seconds |= {**made.seconds, "trial": time.perf_counter() - middle if simulated else 0.0}
+        success = int(grasps.success.sum()) if simulated else None
+        rate, *interval = success_rate(success or 0, self.num)
         report = {
             "hand": job.hand.name, "object": obj.name, "num": len(grasps), "asked": self.num, "shortage": made.shortage,
             "candidates": made.candidates, "dropped": made.dropped,
             "origin": dict(Counter(made.origin)), "origins": made.origin,
             "seed": self.seed, "weights": job.predictor.weights_name, "protocol": self._protocol(obj),
-            "success": int(grasps.success.sum()) if simulated else None,
-            "success_rate": float(grasps.success.float().mean()) if simulated else None,
+            "success": success, "success_rate": rate if simulated else None, "interval_95": interval if simulated else None,
             "reasons": count_failures(grasps), "next": next_steps(grasps), "seconds": {},
             "output": None if output is None else str(output),
-            "frame": "object" if job.camera is None else job.camera.frame,
+            "picture": None, "frame": "object" if job.camera is None else job.camera.frame,
         }
         middle = time.perf_counter()
-        keep = grasps.success if simulated and self.only_successful else slice(None)
-        kept = grasps[keep]
-        if output is not None and not len(kept):
-            say_aside(f"warning: {obj.name}: no grasp succeeded, so {output} holds none")
+        kept, points = grasps, made.points
+        if self.only_successful:
+            kept, points = grasps[grasps.success], points[grasps.success]
+        if not len(kept):
+            self._say_that_none_is_left(obj.name, output, picture)
         if output is not None:
             with_sources(kept, self.hand, name, self.scale, job.camera).save(output)
-        if picture is not None:
+        if picture is not None and len(kept):
             from dro_grasp.viewer.pictures import draw_grasps
 
             report["picture"] = str(picture)
-            draw_grasps(job.hand, obj, kept if len(kept) else grasps, picture)
+            draw_grasps(job.hand, obj, kept, picture)
         seconds["files"] = time.perf_counter() - middle
         seconds["total"] = sum(job.seconds.values()) + time.perf_counter() - begin
         report["seconds"] |= {k: round(v, 4) for k, v in seconds.items()}
         if not self.json:
             self._show(report, grasps, made.origin)
-        return ObjectResult(report, obj, kept, made.points[keep])
+        return ObjectResult(report, obj, kept, points)
+
+    def _say_that_none_is_left(self, name: str, output: Path | None, picture: Path | None) -> None:
+        """Say what comes of it that no grasp succeeded, of all that was asked for."""
+        for asked, outcome in ((output, f"{output} holds none"), (picture, f"{picture} is not drawn"),
+                               (self.view, "there is none to view")):
+            if asked:
+                say_aside(f"warning: {name}: no grasp succeeded, so {outcome}")
 
     def _load(self, name: str, camera: NamedMotion | None) -> ObjectModel:
         from dro_grasp.files import given_path
@@ -237,7 +247,8 @@ class Generate:
             reasons = ", ".join(f"{count} {reason}" for reason, count in report["dropped"].items())
             say(f"{report['candidates']} candidates; dropped: {reasons}")
         if report["success"] is not None:
-            say(f"{report['success']} of {report['num']} grasps succeeded under protocol {report['protocol']}")
+            found = "" if report["num"] == self.num else f", {report['num']} were found"
+            say(f"{report['success']} of {self.num} grasps succeeded under protocol {report['protocol']}{found}")
             for line in diagnose(grasps):
                 say(line)
         for what, key in (("grasps", "output"), ("picture", "picture")):

@@ -90,7 +90,7 @@ class Tabletop:
         return 0
 
     def _report(self, done: list[Attempt]) -> None:
-        from dro_grasp.evaluation.metrics import wilson_interval
+        from dro_grasp.compare.metrics import wilson_interval
         from dro_grasp.planning.tabletop import endings, failures, processor_seconds
 
         held = sum(a.success for a in done)

@@ -105,8 +105,8 @@ class Pretrain(Stage):
 
         import torch
 
+        from dro_grasp.compare.correspondence import matching_rank
         from dro_grasp.datasets.bundle.training_file import load_bundle
-        from dro_grasp.evaluation.correspondence import matching_rank
         from dro_grasp.files import check_output
         from dro_grasp.models.checkpoints import history_of, load_weights, locate_weights, save_weights
         from dro_grasp.training.config import AugmentationConfig, MotionConfig, PretrainConfig
@@ -205,9 +205,9 @@ class Train(Stage):
         """Train and save."""
         import dataclasses
 
+        from dro_grasp.compare.distance_error import distance_errors
         from dro_grasp.datasets.bundle.training_file import load_bundle
         from dro_grasp.errors import OptionError
-        from dro_grasp.evaluation.distance_error import distance_errors
         from dro_grasp.files import check_output
         from dro_grasp.models.checkpoints import history_of, load_weights, locate_weights, save_weights
         from dro_grasp.training.config import LOSSES, AugmentationConfig, PlacementConfig, TrainConfig

@@ -81,6 +81,8 @@ class GraspBatch:
     """Protocol of each grasp's trial; the empty string where there was none."""
     extra: dict[str, Any] = field(default_factory=dict)
     """Further columns by name: tensors (n) or (n k), or sequences of n values."""
+    asked_of: columns.Asked = field(default_factory=dict)
+    """How many grasps of an object were asked for, by its name and hash, where that is known; see `asked`."""
 
     def __post_init__(self) -> None:
         """Refuse columns of unequal length and successes without a trial.
@@ -119,6 +121,11 @@ class GraspBatch:
         fields = columns.filled(joints, fields, optional)
         return GraspBatch(T_object_wrist=T_object_wrist, joints=joints, **fields)
 
+    @staticmethod
+    def none(hand: Hand, obj: ObjectModel) -> GraspBatch:
+        """No grasp at all."""
+        return GraspBatch.create(hand, obj, torch.zeros(0, 4, 4), torch.zeros(0, hand.tree.n_dof))
+
     def __len__(self) -> int:
         return len(self.joints)
 
@@ -146,11 +153,13 @@ class GraspBatch:
 
     def _take(self, rows: Int[Tensor, " k"]) -> GraspBatch:
         fields = {name: columns.taken(getattr(self, name), rows) for name in columns.COLUMNS}
-        return self.replace(**fields, extra={name: columns.taken(column, rows) for name, column in self.extra.items()})
+        extra = {name: columns.taken(column, rows) for name, column in self.extra.items()}
+        return self.replace(**fields, extra=extra, asked_of={})
 
     def by_object(self) -> Iterator[tuple[str, GraspBatch]]:
         """Each object's name with its grasps, as the objects appear; a second one of its name, by the hash, is `NAME (2)`."""
-        return ((name, self[rows]) for name, rows in columns.places(self.object, self.object_sha256).items())
+        parts = ((name, self[rows]) for name, rows in columns.places(self.object, self.object_sha256).items())
+        return ((name, part.replace(asked_of=columns.asked_among(self.asked_of, part))) for name, part in parts)
 
     def replace(self, **changes: Any) -> GraspBatch:
         """The same batch with other values for some fields."""
@@ -171,6 +180,28 @@ class GraspBatch:
     def evaluated(self) -> Bool[Tensor, " n"]:
         """Which grasps have been through a trial."""
         return torch.tensor([p != columns.NOT_EVALUATED for p in self.protocol], dtype=torch.bool, device=self.success.device)
+
+    @property
+    def asked(self) -> int | None:
+        """How many grasps were asked for, of which these are the ones that were found; None if that is unknown.
+
+        A method that returns fewer grasps than it was asked for has failed with the others, so success rates are of this
+        number. Joined batches were asked for the sum. A selection answers no request.
+        """
+        return columns.asked_in_all(self)
+
+    @property
+    def out_of(self) -> int:
+        """What a success rate of these grasps is of: what was asked for, or, where that is unknown, the grasps there are."""
+        return len(self) if self.asked is None else self.asked
+
+    def with_asked(self, num: int) -> GraspBatch:
+        """The batch as the answer to a request for `num` grasps of its object.
+
+        Raises:
+            OptionError: There are more grasps than that, or they are of several objects; state it for each, then join them.
+        """
+        return self.replace(asked_of=columns.asked_once(self, num))
 
     @property
     def wrist_position(self) -> Float[Tensor, "n 3"]:
@@ -212,15 +243,18 @@ class GraspBatch:
         fields = {name: columns.joined([getattr(b, name) for b in batches], lengths) for name in columns.COLUMNS}
         names = dict.fromkeys(name for b in batches for name in b.extra)
         extra = {name: columns.joined([b.extra.get(name) for b in batches], lengths) for name in names}
-        return first.replace(**fields, extra=extra)
+        return first.replace(**fields, extra=extra, asked_of=columns.asked_joined(batches))
 
     def sorted_by_score(self) -> GraspBatch:
         """Best score first; equal scores keep their order, grasps without score come last."""
-        return self._take((-self.score).nan_to_num(nan=torch.inf).argsort(stable=True))
+        return self._sorted(-self.score)
 
     def sorted_by_energy(self) -> GraspBatch:
         """Lowest energy first; equal energies keep their order, grasps without energy come last."""
-        return self._take(self.energy.nan_to_num(nan=torch.inf).argsort(stable=True))
+        return self._sorted(self.energy)
+
+    def _sorted(self, cost: Float[Tensor, " n"]) -> GraspBatch:
+        return self._take(cost.nan_to_num(nan=torch.inf).argsort(stable=True)).replace(asked_of=self.asked_of)
 
     def bare(self) -> GraspBatch:
         """Poses, joints, objects and their making alone, without outcomes and further columns."""

@@ -17,6 +17,7 @@ from dro_grasp.geometry import se3
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.grasps import columns
 from dro_grasp.grasps.columns import CAMERA, FRAME, OBJECT_SCALE
+from dro_grasp.grasps.schema import ASKED, ASKED_OF
 from dro_grasp.grasps.table import fixed_column, float_column, floats
 
 REQUIRED = ("object", "wrist_position", "wrist_quaternion_wxyz", "joints")
@@ -44,6 +45,8 @@ def encode(batch: Any) -> tuple[dict[str, pa.Array], dict[str, Any]]:
     stored |= {name: _further_column(name, value) for name, value in batch.extra.items()}
     header = {"hand": batch.hand, "hand_sha256": batch.hand_sha256, "wrist_link": batch.wrist_link,
               "joint_names": list(batch.joint_names)}
+    if batch.asked_of:
+        header[ASKED] = [dict(zip(ASKED_OF, (*key, num), strict=True)) for key, num in batch.asked_of.items()]
     return stored, header
 
 
@@ -94,7 +97,8 @@ def decode(table: pa.Table, header: dict[str, Any], path: str) -> dict[str, Any]
         "hand": header["hand"], "hand_sha256": header["hand_sha256"], "wrist_link": header["wrist_link"],
         "joint_names": tuple(header["joint_names"]), "seed": torch.tensor(seed, dtype=torch.int64),
         "success": torch.tensor([bool(s) for s in success], dtype=torch.bool), "protocol": protocol, **fields,
-        "extra": extra,
+        "extra": extra, "asked_of": {(name, sha256): num for name, sha256, num in (
+            (one[key] for key in ASKED_OF) for one in header.get(ASKED, ()))},
     }
 
 

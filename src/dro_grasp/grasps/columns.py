@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import count
 from typing import Any
@@ -56,6 +57,8 @@ CAMERA = "T_frame_camera"
 """Further column of such grasps: pose of the camera in that frame, row by row [m]."""
 ENERGY_TERM = "energy_"
 """How the names of further columns with the terms of the grasp energy begin."""
+Asked = Mapping[tuple[str, str], int]
+"""How many grasps were asked for, by the name and hash of their object."""
 
 
 def require_fit(batch: Any, n_names: int) -> None:
@@ -126,6 +129,45 @@ def places(objects: Sequence[str], hashes: Sequence[str]) -> dict[str, list[int]
             taken_names.add(labels[key])
         rows.setdefault(labels[key], []).append(i)
     return rows
+
+
+def _objects(batch: Any) -> set[tuple[str, str]]:
+    return set(zip(batch.object, batch.object_sha256, strict=True))
+
+
+def asked_once(batch: Any, num: int) -> Asked:
+    """What one request for `num` grasps asked for, of which the batch is what was found.
+
+    Raises:
+        OptionError: There are more grasps, or they are of several objects.
+    """
+    objects = sorted(_objects(batch))
+    if len(objects) > 1:
+        raise OptionError(f"one request is for one object, the grasps are of {', '.join(name for name, _ in objects)}; state "
+                          "for each how many were asked for, then join them")
+    if len(batch) > num:
+        raise OptionError(f"{len(batch)} grasps of a request for {num} are too many; return the best {num}")
+    return {(objects[0] if objects else ("", "")): num}
+
+
+def asked_in_all(batch: Any) -> int | None:
+    """How many grasps of all objects of a batch were asked for; None if that of one of them is unknown."""
+    return None if not batch.asked_of or _objects(batch) - batch.asked_of.keys() else sum(batch.asked_of.values())
+
+
+def asked_among(asked: Asked, batch: Any) -> Asked:
+    """The part that is of the objects of a batch."""
+    own = _objects(batch)
+    return {key: num for key, num in asked.items() if key in own}
+
+
+def asked_joined(batches: Sequence[Any]) -> Asked:
+    """The sum for each object of which every batch with its grasps knows the number."""
+    total = Counter[tuple[str, str]]()
+    for batch in batches:
+        total.update(batch.asked_of)
+    unknown = {key for batch in batches for key in _objects(batch) - batch.asked_of.keys()}
+    return {key: num for key, num in total.items() if key not in unknown}
 
 
 def filled(joints: Float[Tensor, "n n_dof"], known: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:

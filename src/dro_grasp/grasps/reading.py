@@ -30,8 +30,8 @@ def load_grasps(path: Path | str) -> GraspBatch:
 
 def _folder(folder: Path) -> GraspBatch:
     files = sorted(folder.glob(PATTERN))
-    batches = [(file, batch) for file in files if len(batch := GraspBatch.load(file))]
-    if not batches:
+    batches = [(file, batch) for file in files if len(batch := GraspBatch.load(file)) or batch.asked]
+    if not any(len(batch) for _, batch in batches):
         held = "only grasp files without any grasp" if files else "no grasp file (.parquet)"
         raise GraspFileError(f"folder {folder} holds {held}; give a grasp file, or a folder that `generate --output` filled")
     first, one = batches[0]
@@ -49,4 +49,8 @@ def _told_apart(batches: list[tuple[Path, GraspBatch]]) -> Iterator[GraspBatch]:
         for name, sha256 in zip(batch.object, batch.object_sha256, strict=True):
             versions.setdefault(name, set()).add(sha256)
     for file, batch in batches:
-        yield batch.replace(object=tuple(file.stem if len(versions[name]) > 1 else name for name in batch.object))
+        def label(name: str, stem: str = file.stem) -> str:
+            return stem if len(versions.get(name, ())) > 1 else name
+
+        asked_of = {(label(name), sha256): num for (name, sha256), num in batch.asked_of.items()}
+        yield batch.replace(object=tuple(map(label, batch.object)), asked_of=asked_of)

@@ -15,6 +15,10 @@ HEADER = {"hand": "a name", "hand_sha256": "a hash, or ''", "wrist_link": "a nam
 """Texts of the header."""
 JOINTS = "joint_names"
 """Entry of the header with the names of the joints."""
+ASKED = "asked"
+"""Entry of the header with how many grasps of each object were asked for; files that do not know it lack it."""
+ASKED_OF = ("object", "object_sha256", "num")
+"""What it states of each."""
 NOTES = "notes"
 """Entry of the header with plain values about the making, or null."""
 
@@ -57,11 +61,19 @@ def check_header(header: dict[str, Any], path: object) -> None:
     expected = {name: (isinstance(header.get(name), str), what) for name, what in HEADER.items()}
     names, notes = header.get(JOINTS), header.get(NOTES)
     named = isinstance(names, list) and all(isinstance(name, str) for name in names) and len(set(names)) == len(names) > 0
+    expected[ASKED] = _is_asked(header.get(ASKED, [])), "a list of objects with a name, a hash and a number"
     expected |= {JOINTS: (named, "a list of different names"), NOTES: (notes is None or isinstance(notes, dict), "an object")}
     for name, (fits, what) in expected.items():
         if not fits:
             raise GraspFileError(f"{path}: the header's '{name}' is {str(header.get(name))[:60]}, expected {what}; write the "
                                  "file again")
+
+
+def _is_asked(entry: Any) -> bool:
+    """Whether an entry states how many grasps of each object were asked for."""
+    return isinstance(entry, list) and all(
+        isinstance(one, dict) and set(one) >= set(ASKED_OF) and isinstance(one["object"], str)
+        and isinstance(one["object_sha256"], str) and type(one["num"]) is int and one["num"] >= 0 for one in entry)
 
 
 def check_columns(schema: pa.Schema, path: object) -> None:

@@ -22,9 +22,13 @@ def percent(confidence: float) -> str | None:
 
 def sentence(grasps: Any) -> str:
     """Number of grasps, hand, objects, outcome and range of score or energy."""
-    parts = [f"{len(grasps)} grasp{'' if len(grasps) == 1 else 's'}", f"hand '{grasps.hand}'", _objects(grasps)]
-    for protocol, count in Counter(p for p in grasps.protocol if p != NOT_EVALUATED).items():
+    missing = grasps.out_of - len(grasps)
+    short = f" of {grasps.out_of} asked for" if missing else ""
+    parts = [f"{len(grasps)} grasp{'' if len(grasps) == 1 else 's'}{short}", f"hand '{grasps.hand}'", _objects(grasps)]
+    protocols = Counter(p for p in grasps.protocol if p != NOT_EVALUATED)
+    for protocol, count in protocols.items():
         held = sum(s for s, p in zip(grasps.success.tolist(), grasps.protocol, strict=True) if p == protocol)
+        count += missing if len(protocols) == 1 else 0
         parts.append(f"{held} of {count} hold under {protocol}")
     if not grasps.evaluated.all():
         parts.append("not evaluated" if not grasps.evaluated.any() else f"{int((~grasps.evaluated).sum())} not evaluated")

@@ -6,7 +6,7 @@ import html
 from pathlib import Path
 from typing import Any
 
-from dro_grasp.evaluation.success_rates import BEST, RAW, REFINED, RETURNED
+from dro_grasp.compare.stages import BEST, RAW, REFINED, RETURNED
 from dro_grasp.files import command
 from dro_grasp.hands.library import load_hand, locate_hand
 from dro_grasp.objects.catalogue import load_object
@@ -64,13 +64,13 @@ def _rates(done: Onboarded) -> str:
         for row in done.steps[step]["rows"]:
             rates = [f"{100 * p:.0f} % [{100 * low:.0f}-{100 * high:.0f}]" for p, low, high in row["success"].values()]
             touching, all_touch = (100 * share for share in row["fingers"][STRICT])
-            rows.append([step, STAGES[row["stage"]], row["num"], *rates, f"{touching:.0f} ({all_touch:.0f})",
+            rows.append([step, STAGES[row["stage"]], row["asked"], row["returned"], *rates, f"{touching:.0f} ({all_touch:.0f})",
                          f"{100 * row['optimised']:.0f} %", f"{row['diversity']:.2f}"])
     labels = list(done.steps["after"]["rows"][0]["success"])
-    return table(["weights", "grasps", "trials", *labels, "fingers [%]", "by the optimiser", "diversity"], rows) + (
-        "<p class=note>Success rates with 95 % intervals. dro is the paper's protocol and lenient; strict also limits "
-        "penetration and how far closing may push the object. Fingers: the share of the hand's that touch the object, and in "
-        "parentheses of the grasps with all of them. The network's rows are what fine-tuning improves. "
+    return table(["weights", "grasps", "asked", "returned", *labels, "fingers [%]", "by the optimiser", "diversity"], rows) + (
+        "<p class=note>Success rates of the grasps asked for, with 95 % intervals. dro is the paper's protocol and lenient; "
+        "strict also limits penetration and how far closing may push the object. Fingers: the share of the hand's that touch the "
+        "object, and in parentheses of the grasps with all of them. The network's rows are what fine-tuning improves. "
         "<i>generate</i> keeps the best of four of the network's candidates by score, as the row <i>best quarter</i> does, and "
         "asks the optimiser for others where the score does not trust these: slower, and less needed the better the network "
         "is. <i>generate --source network</i> does without.</p>")
@@ -85,9 +85,12 @@ def _drawn(done: Onboarded, held_out: list[str]) -> str:
         problem = GraspProblem(hand, obj)
         made = predictor.run(problem, GraspRequest(GRASPS, source=done.source))
         draw_grasps(hand, obj, evaluate(problem, made.grasps, "strict"), path)
-        by_optimiser = made.origin.count("optimiser")
+        by_optimiser, short = made.origin.count("optimiser"), ""
+        if len(made.grasps) < GRASPS:
+            short = f"; {len(made.grasps)} of the {GRASPS} asked for were found"
         parts.append(image(path.read_bytes(), f"grasps of {name}")
-                     + f"<p class=note>{html.escape(name)}: {by_optimiser} of {GRASPS} made by the optimiser</p>")
+                     + f"<p class=note>{html.escape(name)}: {by_optimiser} of {len(made.grasps)} made by the optimiser{short}"
+                       "</p>")
     return "".join(parts)
 
 

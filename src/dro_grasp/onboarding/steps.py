@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 import time
@@ -11,7 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dro_grasp.baselines.ours import DistanceMethod
+from dro_grasp.compare.methods import Method
+from dro_grasp.compare.metrics import difference_interval
+from dro_grasp.compare.rows import Row
+from dro_grasp.compare.stages import BEST, RAW, REFINED, RETURNED, BenchmarkConfig, benchmark
 from dro_grasp.datasets.bundle.training_file import load_bundle, split_of
 from dro_grasp.datasets.collections.bundling import make_bundle
 from dro_grasp.datasets.collections.collection import count_collection
@@ -20,7 +22,6 @@ from dro_grasp.datasets.engine.shards import sole_run
 from dro_grasp.datasets.engine.worker import EngineConfig
 from dro_grasp.devices import require_device
 from dro_grasp.errors import BundleError, OptionError
-from dro_grasp.evaluation.success_rates import BEST, RAW, REFINED, RETURNED, BenchmarkConfig, benchmark
 from dro_grasp.files import check_folder, make_folder, replacing
 from dro_grasp.hands.check import check_hand, picture
 from dro_grasp.hands.library import load_hand
@@ -106,8 +107,11 @@ class Onboarded:
 
     @property
     def gained(self) -> bool:
-        """Whether more of the network's refined grasps hold after fine-tuning than before."""
-        return self.rate("after", REFINED, STRICT) > self.rate("before", REFINED, STRICT)
+        """Whether more of the network's refined grasps hold after fine-tuning than before, by more than chance.
+
+        The 95 % interval of the difference has to be above 0: of weights that are no better, one in forty passes for better.
+        """
+        return difference_interval(*self.count("before", REFINED, STRICT), *self.count("after", REFINED, STRICT))[0] > 0
 
     @property
     def weights(self) -> str | None:
@@ -122,13 +126,16 @@ class Onboarded:
 
     def verdict(self) -> list[str]:
         """In words: whether fine-tuning gained anything, which objects are without grasps, and what to try."""
-        before, after = (f"{self.rate(step, REFINED, STRICT):.0%}" for step in ("before", "after"))
+        (held, asked), (held_after, asked_after) = (self.count(step, REFINED, STRICT) for step in ("before", "after"))
         lines = []
         if not self.gained:
-            better = "No more than all can hold" if self.rate("before", REFINED, STRICT) == 1 else (
-                "To gain, try more --minutes or more --objects")
-            lines.append(f"Fine-tuning gained nothing: {before} of the refined grasps hold under {STRICT} before, {after} "
-                         f"after. Keep the weights from before. {better}.")
+            low, high = difference_interval(held, asked, held_after, asked_after)
+            better = "No more than all can hold" if held == asked else "To gain, try more --minutes or more --objects"
+            if held_after > held:
+                better += "; to tell a small gain from chance, more --num"
+            lines.append(f"Fine-tuning gained nothing beyond chance: {held} of {asked} of the refined grasps hold under "
+                         f"{STRICT} before, {held_after} of {asked_after} after ({100 * low:+.0f} to {100 * high:+.0f} points, "
+                         f"95 %). Keep the weights from before. {better}.")
         if self.without_grasps:
             lines.append(f"No training grasps of {', '.join(self.without_grasps)}: try --objects of a size that suits the "
                          "hand, and look at its picture for a wrong palm side or opening.")
@@ -137,6 +144,11 @@ class Onboarded:
     def rate(self, step: str, stage: str, label: str) -> float:
         """Success rate on the held-out objects, `before` or `after`."""
         return self._row(step, stage)["success"][label][0]
+
+    def count(self, step: str, stage: str, label: str) -> tuple[int, int]:
+        """How many grasps hold there, of how many that were asked for."""
+        row = self._row(step, stage)
+        return row["held"][label], row["asked"]
 
     def optimised(self, step: str) -> float:
         """Share of the optimiser in what `generate` returns, `before` or `after`."""
@@ -202,8 +214,9 @@ class _Onboarding:
                     raise OptionError(f"{folder} was begun with {name} {known['asked'][name]}, {asked} was asked for; use the "
                                       "same to resume, or name another folder")
             # A benchmark of an earlier version, which tells less than what the report needs, is made again.
-            self.steps = {name: step for name, step in known["steps"].items()
-                          if "rows" not in step or any(row["stage"] == RETURNED and "fingers" in row for row in step["rows"])}
+            self.steps = {
+                name: step for name, step in known["steps"].items() if "rows" not in step
+                or any(row["stage"] == RETURNED and {"fingers", "asked"} <= row.keys() for row in step["rows"])}
 
     def _known(self, state: Path) -> dict[str, Any] | None:
         """What a run before has stored; a damaged file is set aside, and its steps are made again."""
@@ -257,10 +270,10 @@ class _Onboarding:
         config = BenchmarkConfig(self.config.num, (RAW, REFINED, BEST, RETURNED), rules, seed=self.config.seed,
                                  device=self.config.device)
         objects = [load_object(name) for name in self.held_out]
-        rows = benchmark([self.hand], objects, [DistanceMethod(predictor, source=self.config.source)], config)
-        told = "; ".join(f"{r.stage}: " + ", ".join(f"{k} {v[0]:.0%}" for k, v in r.success.items()) for r in rows)
+        rows = benchmark([self.hand], objects, [Method(self.config.source, predictor)], config)
+        told = "; ".join(map(_in_words, rows))
         share = f"{rows[-1].optimised:.0%} from the optimiser"
-        return {"rows": [dataclasses.asdict(row) for row in rows], "said": f"{predictor.weights_name}, {told}, {share}"}
+        return {"rows": [row.to_dict() for row in rows], "said": f"{predictor.weights_name}, {told}, {share}"}
 
     def _data(self) -> dict[str, Any]:
         report = synthesize_dataset(
@@ -291,3 +304,9 @@ class _Onboarding:
         save_weights(model, self.folder / WEIGHTS, about, history_of(locate_weights(self.config.weights)))
         said = f"{initial.name} fine-tuned on {bundle.n_grasps} grasps"
         return {"grasps": bundle.n_grasps, "initial": initial.name, "said": said}
+
+
+def _in_words(row: Row) -> str:
+    """Stage and rates of a row, and how many grasps of those asked for were returned, if not all."""
+    short = "" if row.returned == row.asked else f" ({row.returned} of {row.asked} returned)"
+    return f"{row.stage}: " + ", ".join(f"{label} {rate[0]:.0%}" for label, rate in row.success.items()) + short

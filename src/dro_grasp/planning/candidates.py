@@ -12,9 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.devices import fast_products, side_by_side
+from dro_grasp.errors import NoGraspError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
-from dro_grasp.errors import NoGraspError
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.constraints import Constraints
@@ -74,7 +74,7 @@ def grasps_in_world(
         parts = side_by_side(made, problems, requests) if len(problems) > 1 else [made(problem, request)]
     found = [grasps for grasps in parts if grasps is not None]
     if not found:
-        return GraspBatch.create(hand, obj, torch.zeros(0, 4, 4), torch.zeros(0, hand.tree.n_dof))
+        return GraspBatch.none(hand, obj)
     ranked = GraspBatch.concatenate(found).sorted_by_score()
     return ranked.replace(T_object_wrist=T @ ranked.T_object_wrist)
 

@@ -171,9 +171,10 @@ class GraspPredictor:
         if done is None or not len(done.pool):
             raise NoGraspError(str(shortage))
         proposed = done.proposed
-        return Prediction(
-            with_own_files(done.grasps, problem.hand, problem.obj), complete(problem, proposed.grasps), proposed.points,
-            list(proposed.origin), done.made, dict(done.dropped), asked.seconds, shortage)
+        given, before = (grasps.with_asked(request.num) for grasps in (
+            with_own_files(done.grasps, problem.hand, problem.obj), complete(problem, proposed.grasps)))
+        return Prediction(given, before, proposed.points, list(proposed.origin), done.made, dict(done.dropped), asked.seconds,
+                          shortage)
 
     def source(self, name: str | Source, temperature: float | None = None) -> Source:
         """A source by its name, with the predictor's weights and configuration where it has any.

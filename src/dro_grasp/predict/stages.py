@@ -69,7 +69,7 @@ def ease(
     It comes last. Score and energy judge grasps whose fingers touch, and are kept. Where the constraints forbid the room, as a
     table does, fingers leave as much as on a surface that was seen, or none.
     """
-    if not problem.obj.is_cloud:
+    if not problem.obj.is_cloud or not len(grasps):
         return grasps
     energy, seen = problem.energy(EnergyConfig()), problem.obj.seen
     joints, rows = grasps.joints.clone(), torch.arange(len(grasps))

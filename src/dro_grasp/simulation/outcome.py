@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -73,11 +74,18 @@ class TrialResult:
     """The trial that was measured; 0 is the protocol's own, without perturbation."""
     protocol: str
     """Name and version."""
+    asked: int | None = None
+    """How many grasps were asked for, as `GraspBatch.asked`."""
 
     def __repr__(self) -> str:
         failed = Counter(kind.value for kind in self.failure if kind).most_common()
         told = "".join(f", {count} failed: {reason}" for reason, count in failed)
-        return f"TrialResult({int(self.success.sum())} of {len(self.success)} hold under {self.protocol}{told})"
+        return f"TrialResult({int(self.success.sum())} of {self.out_of} hold under {self.protocol}{told})"
+
+    @property
+    def out_of(self) -> int:
+        """What a success rate is of: the grasps asked for, or, where that is unknown, those that were evaluated."""
+        return len(self.success) if self.asked is None else self.asked
 
     @property
     def contacts(self) -> Int[Tensor, " n"]:
@@ -86,18 +94,18 @@ class TrialResult:
 
     @property
     def success_rate(self) -> float:
-        """Share of successes; NaN without grasps."""
-        return float(self.success.float().mean())
+        """Share of successes among the grasps asked for; NaN without any."""
+        return int(self.success.sum()) / self.out_of if self.out_of else math.nan
 
     def rows(self, index: Int[Tensor, " k"]) -> TrialResult:
         """The outcome of some of the grasps."""
         kept = index.tolist()
         return replace(
-            self, **{name: getattr(self, name)[index] for name in NUMBERS},
+            self, asked=None, **{name: getattr(self, name)[index] for name in NUMBERS},
             **{name: tuple(getattr(self, name)[i] for i in kept) for name in TEXTS})
 
     @staticmethod
-    def join(results: Sequence[TrialResult], label: str) -> TrialResult:
+    def join(results: Sequence[TrialResult], label: str, asked: int | None = None) -> TrialResult:
         """One result after the other, all of the same protocol."""
         columns: dict[str, Any]
         if not results:
@@ -105,10 +113,10 @@ class TrialResult:
             columns = dict.fromkeys(NUMBERS, none) | dict.fromkeys(TEXTS, ())
             columns |= {"success": none > 0, "displacement": six, "rotation": six}
             columns |= {"fingers_in_contact": none.long(), "shown": none.long()}
-            return TrialResult(**columns, protocol=label)
+            return TrialResult(**columns, protocol=label, asked=asked)
         columns = {name: torch.cat([getattr(r, name) for r in results]) for name in NUMBERS}
         columns |= {name: tuple(x for r in results for x in getattr(r, name)) for name in TEXTS}
-        return TrialResult(**columns, protocol=label)
+        return TrialResult(**columns, protocol=label, asked=asked)
 
 
 def verdict(trials: TrialResult, count: int, needed: int) -> TrialResult:
@@ -130,7 +138,7 @@ def verdict(trials: TrialResult, count: int, needed: int) -> TrialResult:
 
 TEXTS = ("contact_links", "failure", "reason")
 """Fields of a TrialResult with one entry a grasp that are no tensors."""
-NUMBERS = tuple(n for n in TrialResult.__dataclass_fields__ if n not in {*TEXTS, "protocol"})
+NUMBERS = tuple(n for n in TrialResult.__dataclass_fields__ if n not in {*TEXTS, "protocol", "asked"})
 """Fields of a TrialResult that are tensors."""
 
 

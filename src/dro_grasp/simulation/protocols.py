@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any
 
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.controller_config import ControllerConfig
+
+NAME = re.compile(r"[\w.-]+")
+"""Names of protocols: nothing that stands between the parts of a label."""
 
 
 @dataclass(frozen=True)
@@ -112,13 +118,41 @@ class Protocol:
     perturbations: Perturbations = field(default_factory=Perturbations)
     """Further trials of each grasp, under other conditions."""
 
+    def __post_init__(self) -> None:
+        """Refuse a name that labels could not be told apart with.
+
+        Raises:
+            OptionError: As said.
+        """
+        if not NAME.fullmatch(self.name):
+            raise OptionError(f"'{self.name}' is no name of a protocol; use letters, digits, '_', '-' and '.'")
+
     @property
     def label(self) -> str:
-        """Name and version, as stored with results, marked if friction or anything else was changed."""
-        named = PROTOCOLS.get(self.name, self)
-        friction = "" if self.friction == named.friction else f"+friction{self.friction:g}"
-        changed = "" if replace(self, friction=named.friction) == named else "+changed"
-        return f"{self.name}{friction}{changed}/{self.version}"
+        """Name and version, as stored with results, with every number that is not the one of its name: no two are alike.
+
+        What differs from the protocol of this name, or from the defaults where there is none, is `+field=value`; friction,
+        as it always was, `+friction3`.
+        """
+        changes = "".join(_differences(self, PROTOCOLS.get(self.name) or Protocol(self.name)))
+        return f"{self.name}{changes.replace('+friction=', '+friction')}/{self.version}"
+
+
+def _differences(rules: Any, named: Any, prefix: str = "+") -> Iterator[str]:
+    """Each field that has another value than the named protocol's, with its value; numbers that are equal look equal."""
+    for one in fields(rules):
+        value, usual = getattr(rules, one.name), getattr(named, one.name)
+        if is_dataclass(value):
+            yield from _differences(value, usual, f"{prefix}{one.name}.")
+        elif value != usual and one.name != "version":
+            yield f"{prefix}{one.name}={','.join(map(_shortly, value)) if isinstance(value, tuple) else _shortly(value)}"
+
+
+def _shortly(value: float | None) -> str:
+    """A number in as few digits as tell it from all others; a truth value or None as it is."""
+    if value is None or isinstance(value, bool):
+        return str(value)
+    return short if float(short := f"{value:g}") == value else repr(float(value))
 
 
 STRICT = Protocol(

@@ -58,7 +58,7 @@ def simulate(
         done += len(part)
         if progress is not None:
             progress(done, len(grasps))
-    return TrialResult.join(results, scene.protocol.label)
+    return TrialResult.join(results, scene.protocol.label, grasps.asked)
 
 
 def record(

@@ -13,7 +13,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dro_grasp.evaluation.coverage import ROLL_BINS, HandCoverage, PairCoverage, grasp_sizes, wrist_rolls
+from dro_grasp.compare.coverage import ROLL_BINS, HandCoverage, PairCoverage, grasp_sizes, wrist_rolls
 from dro_grasp.files import check_output
 from dro_grasp.frames import HALF_AXES
 from dro_grasp.grasps.columns import ENERGY_TERM

@@ -197,7 +197,8 @@ def _told(grasps: GraspBatch) -> str:
     if not bool(grasps.evaluated.any()):
         return text
     protocols = sorted({p for p in grasps.protocol if p})
-    return f"{text}, {int(grasps.success.sum())} of {int(grasps.evaluated.sum())} succeeded ({', '.join(protocols)})"
+    of = int(grasps.evaluated.sum()) + grasps.out_of - len(grasps)
+    return f"{text}, {int(grasps.success.sum())} of {of} succeeded ({', '.join(protocols)})"
 
 
 def outcome(grasps: GraspBatch, index: int) -> bool | None:

@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import get_args
 
 import viser
 
@@ -158,7 +157,8 @@ class Studio(GraspPage):
         self.made = ShownGrasps(hand, obj, grasps, grasps, protocol_name(label))
         self._present()
         held = f", **{int(grasps.success.sum())}** held under *{label}*" if label else ", not evaluated"
-        self._say("  \n".join([f"{len(grasps)} grasps of {obj.name}{held}", *other, *diagnose(grasps)]))
+        short = "" if grasps.out_of == len(grasps) else f" ({grasps.out_of} were asked for)"
+        self._say("  \n".join([f"{len(grasps)} grasps of {obj.name}{short}{held}", *other, *diagnose(grasps)]))
 
     def _plain(self, text: str) -> str:
         return self.shelf.plain(text)

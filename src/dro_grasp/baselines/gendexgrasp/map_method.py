@@ -9,7 +9,7 @@ import torch
 from dro_grasp.baselines.gendexgrasp.contact_maps import sharpened
 from dro_grasp.baselines.gendexgrasp.map_fitting import FittingConfig, MapTarget, fit
 from dro_grasp.baselines.gendexgrasp.map_network import LATENT, ContactMapNetwork
-from dro_grasp.baselines.method import Method
+from dro_grasp.compare.methods import Method
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.models.checkpoints import load_into
 from dro_grasp.predict.problem import GraspProblem

@@ -19,7 +19,7 @@ from torch import Tensor
 from dro_grasp.baselines.manifm.contact_network import LATENT, ContactNetwork
 from dro_grasp.baselines.manifm.contact_training import open_hand_cloud
 from dro_grasp.baselines.manifm.fingertip_contacts import Pads, contacts_of
-from dro_grasp.baselines.method import Method
+from dro_grasp.compare.methods import Method
 from dro_grasp.geometry.registration import register
 from dro_grasp.geometry.se3 import apply, rotate
 from dro_grasp.grasps.batch import GraspBatch

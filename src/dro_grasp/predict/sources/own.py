@@ -11,6 +11,7 @@ from dro_grasp.errors import DroGraspError, GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.reading import load_grasps
 from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.source import Candidates, Progress, Source
 
@@ -77,20 +78,36 @@ class FileSource(Source):
         """The hand of the file."""
         return hand.name == self.grasps.hand
 
+    def asked(self, obj: ObjectModel, num: int) -> int:
+        """As many as the file was asked for, or, where it does not know, as there are."""
+        return min(num, self._stored(obj).out_of)
+
+    def _stored(self, obj: ObjectModel) -> GraspBatch:
+        """The stored grasps of an object.
+
+        Raises:
+            GraspFileError: There is none.
+        """
+        parts = [part for _, part in self.grasps.by_object() if part.object[0] == obj.name]
+        if not parts:
+            held = ", ".join(sorted(set(self.grasps.object))[:5])
+            raise GraspFileError(f"'{self.name}' holds no grasp of '{obj.name}', but of {held}; name its objects with "
+                                 "--objects")
+        return GraspBatch.concatenate(parts)
+
     def propose(self, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None) -> GraspBatch:
         """Some of the stored grasps of the object, drawn at random; all if there are not enough.
+
+        Of an answer with fewer grasps than were asked for, a part of the request is drawn, and with it a part of the grasps.
 
         Raises:
             GraspFileError: There is none, or it is of other geometry.
         """
-        rows = torch.tensor([name == problem.obj.name for name in self.grasps.object]).nonzero()[:, 0]
-        if not len(rows):
-            held = ", ".join(sorted(set(self.grasps.object))[:5])
-            raise GraspFileError(f"'{self.name}' holds no grasp of '{problem.obj.name}', but of {held}; name its objects with "
-                                 "--objects")
+        found = self._stored(problem.obj)
         self.grasps.require_hand(problem.hand)
-        if wrong := set(self.grasps[rows].object_sha256) - {problem.obj.sha256, ""}:
+        if wrong := set(found.object_sha256) - {problem.obj.sha256, ""}:
             raise GraspFileError(f"'{self.name}' holds grasps of another '{problem.obj.name}' ({wrong.pop()[:12]}, not "
                                  f"{problem.obj.sha256[:12]}); evaluate them on the object that they were made for")
-        order = torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))
-        return self.grasps[rows[order[:num]]].without("score").without_trial()
+        drawn = torch.randperm(found.out_of, generator=torch.Generator().manual_seed(seed))[:num]
+        stored = found[drawn[drawn < len(found)]]
+        return stored.without("score").without_trial()

@@ -12,7 +12,9 @@ from torch import Tensor
 
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.stopwatch import Stopwatch
 
 Progress = Callable[[int, int], None]
 """Called with (candidates made so far, candidates wanted)."""
@@ -84,6 +86,10 @@ class Source(ABC):
         """Whether it proposes grasps of this hand at all."""
         return True
 
+    def asked(self, obj: ObjectModel, num: int) -> int:
+        """How many grasps of an object it can be asked for, of `num`; what it does not propose of them are failures."""
+        return num
+
 
 def ask(
     source: Source, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None, n_points: int = POINTS
@@ -98,8 +104,6 @@ def ask(
         progress: Likewise.
         n_points: Hand points to keep where the source states none.
     """
-    from dro_grasp.predict.stopwatch import Stopwatch
-
     watch = Stopwatch()
     with watch(source.name):
         made = source.propose(problem, num, seed, progress)

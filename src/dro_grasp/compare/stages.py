@@ -8,19 +8,20 @@ from __future__ import annotations
 import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
-from dro_grasp.baselines.method import Method
-from dro_grasp.evaluation.equal_time import equal_time, finished_maker
-from dro_grasp.evaluation.rows import EvaluatedGrasps, Row, average, hand_row
+from dro_grasp.compare.equal_time import equal_time, finished_maker
+from dro_grasp.compare.methods import Method
+from dro_grasp.compare.rows import EvaluatedGrasps, Row, average, hand_row
+from dro_grasp.errors import NoGraspError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.partial_views import View, partial_view
+from dro_grasp.predict.finish import finish
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.settling import best_settled, can_settle
-from dro_grasp.predict.stages import eased, refine, scored
+from dro_grasp.predict.settling import can_settle
+from dro_grasp.predict.stages import ease, scored
 from dro_grasp.simulation.contact_quality import with_contacts
 from dro_grasp.simulation.protocols import Protocol
 from dro_grasp.simulation.trial import simulate
@@ -39,7 +40,11 @@ SETTLED_BEST = "settled, ranked"
 """Stage: the best quarter of the settled grasps by score."""
 TOP = {f"refined, top {count}": count for count in (5, 1)}
 """Stages that keep the few best refined grasps of a pair by score, and how many."""
-STAGES = (RAW, RANKED, REFINED, BEST, *TOP, SETTLED, SETTLED_BEST)
+AFTER_REFINEMENT = (REFINED, BEST, *TOP)
+"""Stages of refined grasps."""
+AFTER_SETTLING = (SETTLED, SETTLED_BEST)
+"""Stages of settled grasps."""
+STAGES = (RAW, RANKED, *AFTER_REFINEMENT, *AFTER_SETTLING)
 """Stages of every method."""
 RETURNED = "returned"
 """Stage: what a method returns to a user; `generate`, with candidates of the network and, where the score asks for them, of
@@ -86,7 +91,13 @@ def benchmark(
         methods: What makes the grasps.
         config: Numbers, stages and protocols.
         progress: Called with (pairs done, pairs in all).
+
+    Raises:
+        OptionError: Two methods have one name, or a method returns more grasps than it was asked for.
     """
+    names = [method.name for method in methods]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise OptionError(f"two methods are called '{twice[0]}' and would share rows; give one of them another name")
     table: dict[tuple[str, str], list[list[EvaluatedGrasps]]] = {}
     done, pairs = 0, len(hands) * len(objects)
     for hand in hands:
@@ -131,74 +142,57 @@ def _measured(
     _ = problem.field  # what methods share is prepared before a clock runs
     for method in methods:
         if set(config.stages) & set(STAGES):
-            grasps, parts = method.timed(problem, num, seed)
-            seconds = {name: total / num for name, total in parts.items()}
-            yield from _stages(_Source(method.name, problem, grasps, seconds), obj, config)
+            yield from _stages(method, problem, obj, config, seed)
         if RETURNED in config.stages:
             begin = time.perf_counter()
-            made = method.best(problem, keep, seed)
+            grasps, made = _returned(method, problem, keep, seed)
             seconds = {"make": (time.perf_counter() - begin) / keep}
-            yield method.name, RETURNED, _evaluated(hand, obj, made.grasps, config, seconds, made.candidates)
+            yield method.name, RETURNED, _evaluated(hand, obj, grasps.with_asked(method.asked(obj, keep)), config, seconds, made)
     if EQUAL_TIME in config.stages and methods:
         makers = {method.name: finished_maker(problem, method, keep) for method in methods}
+        asked = {method.name: method.asked(obj, keep) for method in methods}
         for name, best in equal_time(makers, num, keep, seed).items():
             seconds = {"CPU": best.seconds / max(1, len(best.grasps))}
-            yield name, EQUAL_TIME, _evaluated(hand, obj, best.grasps, config, seconds, best.candidates)
+            grasps = best.grasps.with_asked(asked[name])
+            yield name, EQUAL_TIME, _evaluated(hand, obj, grasps, config, seconds, best.candidates)
 
 
-@dataclass(frozen=True)
-class _Source:
-    """Grasps before any stage."""
-
-    name: str
-    problem: GraspProblem
-    """The hand, and what is seen of the object."""
-    grasps: GraspBatch
-    seconds: dict[str, float]
-    """Time to make one of them, by part [s]."""
+def _returned(method: Method, problem: GraspProblem, keep: int, seed: int) -> tuple[GraspBatch, int]:
+    """What a method returns to a user, and how many candidates it made; nothing is an answer, too."""
+    try:
+        made = method.returned(problem, keep, seed)
+        return made.grasps, made.candidates
+    except NoGraspError:
+        return GraspBatch.none(problem.hand, problem.obj), 0
 
 
-class _Step(NamedTuple):
-    """A stage of all grasps of a source, which takes those of the stage before."""
-
-    stage: str
-    best: dict[str, int]
-    """Stages that keep the best of them by score, and how many."""
-    part: str = ""
-    """Name of its time."""
-    make: Callable[[GraspProblem, GraspBatch], GraspBatch] | None = None
-
-
-def _stages(source: _Source, obj: ObjectModel, config: BenchmarkConfig) -> Iterator[tuple[str, str, EvaluatedGrasps]]:
-    """Those stages of a source that are asked for; what several of them share is made once."""
-    asked = set(config.stages)
-    problem, grasps, seconds = source.problem, source.grasps, source.seconds
-    quarter = _quarter(len(grasps))
-    steps = [_Step(RAW, {RANKED: quarter}), _Step(REFINED, {BEST: quarter, **TOP}, "refine", refine)]
-    if can_settle(problem):
-        steps.append(_Step(SETTLED, {SETTLED_BEST: quarter}, "settle", _settle))
-    last = max((i for i, step in enumerate(steps) if asked & {step.stage, *step.best}), default=-1)
-    for step in steps[: last + 1]:
-        if step.make is not None:
-            begin = time.perf_counter()
-            grasps = step.make(problem, grasps)
-            seconds = seconds | {step.part: (time.perf_counter() - begin) / max(1, len(grasps))}
-        if not asked & {step.stage, *step.best}:
+def _stages(
+    method: Method, problem: GraspProblem, obj: ObjectModel, config: BenchmarkConfig, seed: int
+) -> Iterator[tuple[str, str, EvaluatedGrasps]]:
+    """Those stages of a method that are asked for; its candidates are made and finished once for all of them."""
+    asked, rules, per = set(config.stages), method.predictor.config.finish, max(1, config.num)
+    candidates, num = method.propose(problem, config.num, seed), method.asked(obj, config.num)
+    quarter = _quarter(num)
+    seconds = {name: spent / per for name, spent in candidates.seconds.items()}
+    found = [(scored(problem, candidates.grasps, rules.score), seconds, {RAW: num, RANKED: quarter})]
+    if asked & {*AFTER_REFINEMENT, *AFTER_SETTLING}:
+        settling = rules.settle if asked & set(AFTER_SETTLING) and can_settle(problem) else None
+        every = None if settling is None else replace(settling, share=1.0)
+        done = finish(problem, candidates, replace(rules, settle=every), num)
+        seconds = seconds | {"refine": done.seconds["refine"] / per}
+        found.append((done.refined, seconds, {REFINED: num, BEST: quarter, **TOP}))
+        if every is not None:
+            seconds = seconds | {"settle": done.seconds["settle"] / per}
+            found.append((done.pool, seconds, {SETTLED: num, SETTLED_BEST: quarter}))
+    for grasps, seconds, counts in found:
+        if not asked & set(counts):
             continue
-        if grasps.score.isnan().any():
-            grasps = scored(problem, grasps)
-        given = grasps if step.make is None else eased(problem, grasps)
-        evaluated = _evaluated(problem.hand, obj, given, config, seconds, config.num)
-        if step.stage in asked:
-            yield source.name, step.stage, evaluated
-        for stage, count in step.best.items():
+        given = grasps if RAW in counts else ease(problem, grasps, rules.ease, rules.admission)
+        evaluated = _evaluated(problem.hand, obj, given.with_asked(num), config, seconds, config.num)
+        for stage in counts:
             if stage in asked:
-                yield source.name, stage, evaluated.rows(grasps.score.topk(min(count, len(grasps))).indices)
-
-
-def _settle(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
-    """All the grasps settled; those that lose the object stay as they were, with a low score."""
-    return best_settled(problem, scored(problem, grasps), len(grasps))[1]
+                best = evaluated if stage in (RAW, REFINED, SETTLED) else evaluated.best(min(counts[stage], num))
+                yield method.name, stage, best
 
 
 def _quarter(num: int) -> int:

@@ -13,11 +13,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from dro_grasp.cli.main import main
+from dro_grasp.compare.coverage import grasp_sizes, measure_coverage, wrist_rolls
+from dro_grasp.compare.metrics import diversity
 from dro_grasp.datasets.collections.collection import YIELDS, PairGrasps
 from dro_grasp.datasets.engine.shards import Yield
 from dro_grasp.errors import GraspFileError
-from dro_grasp.evaluation.coverage import grasp_sizes, measure_coverage, wrist_rolls
-from dro_grasp.evaluation.metrics import diversity
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import HAND_FILE
 from dro_grasp.hands.hand import Hand

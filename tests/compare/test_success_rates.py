@@ -11,11 +11,11 @@ import pytest
 import torch
 from dro_grasp.baselines.ours import DistanceMethod, SynthesisMethod
 
-from dro_grasp.baselines.method import Method
 from dro_grasp.cli.main import main
-from dro_grasp.evaluation import success_rates as evaluated
-from dro_grasp.evaluation.rows import ALL, Row
-from dro_grasp.evaluation.success_rates import (
+from dro_grasp.compare import stages as evaluated
+from dro_grasp.compare.methods import Method
+from dro_grasp.compare.rows import ALL, Row
+from dro_grasp.compare.stages import (
     BEST,
     EQUAL_TIME,
     RANKED,
@@ -80,9 +80,9 @@ def test_every_source_has_its_stages_for_every_hand_and_on_average(rows: list[Ro
     names = {(r.grasps, r.stage) for r in rows}
     assert names == {(source, stage) for source in (DRO, START) for stage in STAGES}
     assert len(rows) == len(names) * 3
-    assert {r.num for r in rows if r.stage in {RAW, REFINED, SETTLED} and r.hand != ALL} == {6}
-    assert {r.num for r in rows if r.stage in {RANKED, BEST, SETTLED_BEST} and r.hand != ALL} == {2}
-    assert {(r.stage, r.num) for r in rows if r.stage in TOP and r.hand != ALL} == {
+    assert {r.asked for r in rows if r.stage in {RAW, REFINED, SETTLED} and r.hand != ALL} == {6}
+    assert {r.asked for r in rows if r.stage in {RANKED, BEST, SETTLED_BEST} and r.hand != ALL} == {2}
+    assert {(r.stage, r.asked) for r in rows if r.stage in TOP and r.hand != ALL} == {
         ("refined, top 5", 5), ("refined, top 1", 1)}
 
 
@@ -128,7 +128,7 @@ def test_each_view_is_from_another_side_with_grasps_of_its_own(monkeypatch: pyte
     both = benchmark([hand], [obj], [DistanceMethod(predictor)], dataclasses.replace(config, views=2))
     seen_one_by_one = list(shown)
     # The best quarter of each view, not of all of them together.
-    assert both[0].num == 2
+    assert both[0].asked == 2
     assert len({o.sha256 for o in seen_one_by_one}) == 2
     passed = []
     for k in range(2):
@@ -158,7 +158,7 @@ def test_the_average_is_over_hands(rows: list[Row]) -> None:
         for i in range(2):
             assert whole.fingers["dro/1"][i] == pytest.approx(sum(p.fingers["dro/1"][i] for p in parts) / 2)
         assert whole.trials_held == {}
-        assert whole.num == sum(p.num for p in parts)
+        assert whole.asked == sum(p.asked for p in parts)
         assert whole.diversity == pytest.approx(sum(p.diversity for p in parts) / 2)
         assert min(whole.seconds[part] for part in ("network", "choose", "decode")) > 0
 
@@ -189,23 +189,12 @@ def test_what_generate_returns_and_what_controls_return_in_the_networks_time(
     assert returned.candidates == made.candidates
     assert returned.optimised == made.origin.count("optimiser") / 2
     start, synthesised = (find(rows, name, EQUAL_TIME, "gripper3") for name in (START, SYNTHESISED))
-    assert start.candidates >= start.num  # how many depends on the clock; a fake one counts them in test_equal_time
-    assert (start.num, start.optimised) == (2, 0)
-    assert synthesised.num == 2
+    assert start.candidates >= start.asked  # how many depends on the clock; a fake one counts them in test_equal_time
+    assert (start.asked, start.optimised) == (2, 0)
+    assert synthesised.asked == 2
     assert synthesised.optimised == 1
     assert {name for row in (alone, start, synthesised) for name in row.seconds} == {"CPU"}
     assert 0.25 < start.seconds["CPU"] / alone.seconds["CPU"] < 4
-
-
-def test_no_grasp_at_all_has_a_row_without_numbers(untrained: GraspPredictor, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The optimiser may find none that respects a direction."""
-    hand, obj = loaded_hand("gripper3"), load_object("can")
-    none = untrained.predict(hand, obj, num=1, method="network")[:0]
-    monkeypatch.setattr(SynthesisMethod, "make", lambda *_: none.without("score"))
-    config = dataclasses.replace(CONFIG, num=2, protocols=(protocol("strict"),))
-    for row in benchmark([hand], [obj], [DistanceMethod(untrained), SynthesisMethod()], config):
-        assert row.num == 0 or row.grasps == DRO
-        assert math.isnan(row.success["strict/1"][0]) == (row.num == 0)
 
 
 def test_grasps_that_all_fail_have_no_means(untrained: GraspPredictor, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,16 +1,19 @@
-"""Rows of the benchmark's table: grasps of pairs after their trials, and what is told of them."""
+"""Rows of the benchmark's table: grasps of pairs after their trials, and what is told of them.
+
+Every rate is of the grasps that were asked for: what a method did not return has failed. What is measured on grasps, such as
+their fingers in contact, is a mean over those that there are.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import torch
-from jaxtyping import Int
-from torch import Tensor
 
-from dro_grasp.evaluation.metrics import diversity, finger_contact, mean_share, roc_area, wilson_interval
+from dro_grasp.compare.metrics import diversity, finger_contact, mean_of_rates, mean_share, roc_area, success_rate
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.optimization.synthesis import PROVENANCE
 from dro_grasp.simulation.contact_quality import NAMES
@@ -35,9 +38,11 @@ class EvaluatedGrasps:
     candidates: int
     """Grasps that were made, of which these are the best by score."""
 
-    def rows(self, index: Int[Tensor, " k"]) -> EvaluatedGrasps:
-        """Some of the grasps; the outcome of a trial depends on nothing but the grasp."""
-        return replace(self, grasps=self.grasps[index], results=tuple(r.rows(index) for r in self.results))
+    def best(self, num: int) -> EvaluatedGrasps:
+        """The answer to a request for the best `num` by score; the outcome of a trial depends on nothing but the grasp."""
+        index = self.grasps.score.topk(min(num, len(self.grasps))).indices
+        grasps = self.grasps[index].with_asked(num)
+        return replace(self, grasps=grasps, results=tuple(r.rows(index) for r in self.results))
 
 
 @dataclass(frozen=True)
@@ -48,8 +53,12 @@ class Row:
     """Their source."""
     stage: str
     hand: str
-    num: int
-    """Grasps evaluated."""
+    asked: int
+    """Grasps asked for: n, which all rates are of."""
+    returned: int
+    """Grasps that the method returned, all of which were evaluated."""
+    held: dict[str, int]
+    """Per protocol how many of them succeeded."""
     success: dict[str, tuple[float, float, float]]
     """Per protocol the share of successes and its 95 % interval (Wilson); the mean over hands in the row of all."""
     displacement: float
@@ -74,6 +83,10 @@ class Row:
     contact_quality: dict[str, float]
     """Means of the analytic metrics of DexGraspBench, if they were measured."""
 
+    def to_dict(self) -> dict[str, Any]:
+        """The row as plain values; `num` is n."""
+        return {**asdict(self), "num": self.asked}
+
 
 def hand_row(source: str, stage: str, parts: Sequence[EvaluatedGrasps], protocols: Sequence[Protocol]) -> Row:
     """One hand's line.
@@ -81,16 +94,16 @@ def hand_row(source: str, stage: str, parts: Sequence[EvaluatedGrasps], protocol
     Args:
         source: Where the grasps come from.
         stage: What was done to them.
-        parts: The hand's grasps, one entry for each view of each object.
+        parts: The hand's grasps, one entry for each view of each object; each states how many were asked for.
         protocols: Of the results, in their order.
     """
     success = [torch.cat([t.results[i].success for t in parts]) for i in range(len(protocols))]
-    rates, held_in, fingers = {}, {}, {}
+    asked, numbers = sum(t.grasps.out_of for t in parts), {}
+    held_in, fingers = {}, {}
     for i, rules in enumerate(protocols):
-        k, n = int(success[i].sum()), len(success[i])
-        rates[rules.label] = (k / n if n else math.nan, *wilson_interval(k, n))
+        numbers[rules.label] = int(success[i].sum())
         if rules.perturbations.trials > 1:
-            held_in[rules.label] = mean_share(torch.cat([t.results[i].robustness for t in parts]))
+            held_in[rules.label] = mean_share(torch.cat([t.results[i].robustness for t in parts]), asked)
         fingers[rules.label] = finger_contact(torch.cat([t.results[i].fingers_in_contact for t in parts]), parts[0].fingers)
     held = GraspBatch.concatenate([t.grasps.replace(extra={}) for t in parts])[success[0]]
     first = [t.results[0] for t in parts]
@@ -100,7 +113,8 @@ def hand_row(source: str, stage: str, parts: Sequence[EvaluatedGrasps], protocol
     }
     seconds = {name: _mean([t.seconds[name] for t in parts]) for name in parts[0].seconds}
     return Row(
-        source, stage, parts[0].grasps.hand, len(success[0]), rates,
+        source, stage, parts[0].grasps.hand, asked, len(success[0]), numbers,
+        {label: success_rate(k, asked) for label, k in numbers.items()},
         displacement=float(torch.cat([r.displacement[r.success, -1] for r in first]).mean()),
         rotation=float(torch.cat([r.rotation[r.success, -1] for r in first]).mean()),
         diversity=diversity(held.T_object_wrist, held.joints)["all"], trials_held=held_in, fingers=fingers, ranking=areas,
@@ -114,11 +128,13 @@ def hand_row(source: str, stage: str, parts: Sequence[EvaluatedGrasps], protocol
 
 
 def average(rows: Sequence[Row]) -> Row:
-    """The mean over hands; its interval is that of all grasps, of which every hand has the same number."""
-    total = sum(r.num for r in rows)
+    """The mean over hands, each of which counts alike, however many grasps it was asked for; see `mean_of_rates`."""
+    asked = [r.asked for r in rows]
     return replace(
-        rows[0], hand=ALL, num=total, success=_average_rates([r.success for r in rows], total),
-        trials_held=_average_rates([r.trials_held for r in rows], total),
+        rows[0], hand=ALL, asked=sum(asked), returned=sum(r.returned for r in rows),
+        held={label: sum(r.held[label] for r in rows) for label in rows[0].held},
+        success=_average_rates([r.success for r in rows], asked),
+        trials_held=_average_rates([r.trials_held for r in rows], asked),
         fingers={
             label: (_mean([r.fingers[label][0] for r in rows]), _mean([r.fingers[label][1] for r in rows]))
             for label in rows[0].fingers
@@ -132,10 +148,11 @@ def average(rows: Sequence[Row]) -> Row:
     )
 
 
-def _average_rates(rates: list[dict[str, tuple[float, float, float]]], total: int) -> dict[str, tuple[float, float, float]]:
-    """Per protocol the mean over hands, with the interval of as many grasps."""
-    means = {label: _mean([rate[label][0] for rate in rates]) for label in rates[0]}
-    return {label: (mean, *wilson_interval(round(mean * total), total)) for label, mean in means.items()}
+def _average_rates(
+    rates: list[dict[str, tuple[float, float, float]]], asked: Sequence[int]
+) -> dict[str, tuple[float, float, float]]:
+    """Per protocol the mean over hands and its interval."""
+    return {label: mean_of_rates([rate[label][0] for rate in rates], asked) for label in rates[0]}
 
 
 def _mean(values: Sequence[float]) -> float:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from dro_grasp.compare.correspondence import matching_rank, mean_rank
 from dro_grasp.datasets.bundle.training_file import Bundle
-from dro_grasp.evaluation.correspondence import matching_rank, mean_rank
 from dro_grasp.models.encoder import StaticGraphEncoder
 from dro_grasp.training.config import AugmentationConfig
 from dro_grasp.training.samples import SampleSource

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,7 +15,7 @@ NORMAL_95 = 1.959963984540054
 """Standard deviations of a normal distribution within which 95 % of it lie."""
 
 
-def wilson_interval(success: int, total: int) -> tuple[float, float]:
+def wilson_interval(success: float, total: float) -> tuple[float, float]:
     """Wilson's 95 % confidence interval of a success rate; [0, 1] without trials."""
     if total == 0:
         return 0.0, 1.0
@@ -24,13 +25,47 @@ def wilson_interval(success: int, total: int) -> tuple[float, float]:
     return max(0.0, (middle - spread) / (1 + weight)), min(1.0, (middle + spread) / (1 + weight))
 
 
-def mean_share(shares: Float[Tensor, " n"]) -> tuple[float, float, float]:
+def success_rate(success: float, asked: float) -> tuple[float, float, float]:
+    """Share of successes among the grasps asked for, and its 95 % interval (Wilson); NaN and [0, 1] if none was asked for."""
+    return success / asked if asked else math.nan, *wilson_interval(success, asked)
+
+
+def difference_interval(before: int, n_before: int, after: int, n_after: int) -> tuple[float, float]:
+    """95 % interval of how much a success rate is higher after than before; [-1, 1] without trials on one side.
+
+    Source: Newcombe 1998, Statistics in Medicine 17, method 10: the two Wilson intervals are squared and added. The two rates
+    count as independent, which is cautious where they are of the same objects.
+    """
+    if not (n_before and n_after):
+        return -1.0, 1.0
+    p, (p_low, p_high) = before / n_before, wilson_interval(before, n_before)
+    q, (q_low, q_high) = after / n_after, wilson_interval(after, n_after)
+    return q - p - math.hypot(q - q_low, p_high - p), q - p + math.hypot(q_high - q, p - p_low)
+
+
+def mean_of_rates(rates: Sequence[float], asked: Sequence[int]) -> tuple[float, float, float]:
+    """Mean of the success rates of several hands, and its 95 % interval; those of which nothing was asked do not count.
+
+    The mean of k rates of n_i grasps varies as the rate of k^2 / sum(1 / n_i) grasps does, if all have one rate; the interval
+    is Wilson's of as many. With one n for all these are all grasps.
+    """
+    known = [(rate, n) for rate, n in zip(rates, asked, strict=True) if n]
+    if not known:
+        return success_rate(0, 0)
+    total = len(known) ** 2 / sum(1 / n for _, n in known)
+    return success_rate(sum(rate for rate, _ in known) / len(known) * total, total)
+
+
+def mean_share(shares: Float[Tensor, " n"], asked: int | None = None) -> tuple[float, float, float]:
     """Mean of a share that each grasp has, and its 95 % interval; NaN and [0, 1] without grasps.
 
     The interval is Wilson's for as many successes: shares vary less than successes of the same mean, so it is cautious.
+
+    Args:
+        shares: Of the grasps that there are.
+        asked: How many were asked for; the share of the others is 0.
     """
-    mean, total = float(shares.mean()), len(shares)
-    return mean, *wilson_interval(round(mean * total) if total else 0, total)
+    return success_rate(float(shares.double().sum()), len(shares) if asked is None else asked)
 
 
 def finger_contact(counts: Float[Tensor, " n"] | Int[Tensor, " n"], fingers: int) -> tuple[float, float]:

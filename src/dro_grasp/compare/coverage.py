@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dro_grasp.compare.metrics import diversity
 from dro_grasp.datasets.collections.collection import PairGrasps
 from dro_grasp.datasets.engine.shards import Yield
 from dro_grasp.errors import GraspFileError
-from dro_grasp.evaluation.metrics import diversity
 from dro_grasp.frames import HALF_AXES, half_axis
 from dro_grasp.geometry import se3
 from dro_grasp.grasps.batch import GraspBatch

@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 import pytest
 import torch
 
-from dro_grasp.baselines import method as face
-from dro_grasp.baselines.method import Method
-from dro_grasp.evaluation import equal_time as module
-from dro_grasp.evaluation.equal_time import equal_time, finished_maker
+from dro_grasp.compare import equal_time as module, methods as face
+from dro_grasp.compare.equal_time import equal_time, finished_maker
+from dro_grasp.compare.methods import Method
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predict.problem import GraspProblem

@@ -12,10 +12,12 @@ from dataclasses import dataclass
 
 import torch
 
-from dro_grasp.baselines.method import Method, finished
+from dro_grasp.compare.methods import Method
 from dro_grasp.devices import one_thread
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.predict.finish import finish
 from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.stages import ease
 
 Maker = Callable[[int, int], GraspBatch]
 """Makes a number of grasps with scores from a seed."""
@@ -86,8 +88,14 @@ def best_within(budget: float, make: Maker, keep: int, seed: int, clock: Callabl
 
 
 def finished_maker(problem: GraspProblem, method: Method, keep: int) -> Maker:
-    """Candidates of a method, refined, and the better half settled, `keep` at least."""
-    return lambda num, seed: finished(problem, method.make(problem, num, seed), keep)
+    """Candidates of a method, finished; of those that settle, `keep` at least."""
+    config = method.predictor.config.finish
+
+    def make(num: int, seed: int) -> GraspBatch:
+        pool = finish(problem, method.propose(problem, num, seed), config, keep).pool
+        return ease(problem, pool, config.ease, config.admission)
+
+    return make
 
 
 def _best(grasps: GraspBatch, keep: int) -> GraspBatch:

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from dro_grasp.cli.main import main
+from dro_grasp.compare.distance_error import distance_errors
 from dro_grasp.datasets.bundle.training_file import Bundle
-from dro_grasp.evaluation.distance_error import distance_errors
 from dro_grasp.models.checkpoints import load_weights
 from dro_grasp.models.network import DistanceNetwork, NetworkOutput
 from dro_grasp.models.presets import PRESETS

@@ -10,8 +10,15 @@ import torch
 from scipy.spatial.transform import Rotation
 from scipy.stats import mannwhitneyu
 
+from dro_grasp.compare.metrics import (
+    difference_interval,
+    diversity,
+    finger_contact,
+    mean_share,
+    roc_area,
+    wilson_interval,
+)
 from dro_grasp.datasets.bundle.training_file import Bundle
-from dro_grasp.evaluation.metrics import diversity, finger_contact, mean_share, roc_area, wilson_interval
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.problem import GraspProblem
@@ -62,7 +69,20 @@ def test_finger_contact_is_the_mean_share_and_the_share_of_full_hands() -> None:
 
 
 
+@pytest.mark.parametrize(("counts", "interval"), [
+    # Newcombe (1998), Statistics in Medicine 17, 873-890, table II, method 10.
+    ((56, 70, 48, 80), (0.0524, 0.3339)), ((9, 10, 3, 10), (0.1705, 0.8090)), ((6, 7, 2, 7), (0.0582, 0.8062)),
+    ((5, 56, 0, 29), (-0.0381, 0.1926)), ((0, 10, 0, 20), (-0.1611, 0.2775)), ((10, 10, 0, 20), (0.6791, 1.0)),
+])
+def test_the_interval_of_a_difference_is_the_published_one(
+    counts: tuple[int, int, int, int], interval: tuple[float, float]
+) -> None:
+    success, total, success_before, total_before = counts
+    assert difference_interval(success_before, total_before, success, total) == pytest.approx(interval, abs=1e-4)
+
+
 def test_without_trials_nothing_is_known() -> None:
+    assert difference_interval(0, 0, 3, 4) == (-1.0, 1.0)
     assert wilson_interval(0, 0) == (0.0, 1.0)
 
 

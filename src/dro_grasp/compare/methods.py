@@ -1,0 +1,122 @@
+"""Methods that are compared: a source, beside the predictor that returns what becomes of its candidates."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+
+from dro_grasp.geometry.se3 import apply
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.hand import Hand
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.predict.config import AUTO, GraspRequest, PredictorConfig
+from dro_grasp.predict.predictor import GraspPredictor, Prediction
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.controls import MeanGrasp
+from dro_grasp.predict.sources.registry import WITH_DATA, make_source
+from dro_grasp.predict.sources.source import Candidates, Source, ask
+
+if TYPE_CHECKING:
+    from dro_grasp.datasets.bundle.training_file import Bundle
+
+FORMER_NAMES = {"dro": AUTO, "synthesise": "optimiser"}
+"""Names of before, which are still taken."""
+
+
+@dataclass(frozen=True)
+class MethodOptions:
+    """What methods are made with."""
+
+    weights: str | None = None
+    """Name or path of weights; the shipped ones if omitted."""
+    device: str = "cpu"
+    """Where networks run."""
+    temperature: float | None = None
+    """Spread of z of the D(R,O) network."""
+    bundle: Bundle | None = None
+    """Training grasps, for the mean grasp."""
+
+
+class Method:
+    """A source by the name that it has in tables."""
+
+    def __init__(self, source: str | Source, predictor: GraspPredictor, name: str | None = None) -> None:
+        """Find the source.
+
+        Args:
+            source: A source, or its name; `auto` proposes with the network, and returns what that rule does.
+            predictor: Finishes what the source proposes, with the same configuration for every method of a table.
+            name: Its name in tables; the source's if omitted.
+
+        Raises:
+            OptionError: There is no such source.
+        """
+        self.asks, self.predictor, self.source = source, predictor, predictor.source(source)
+        self.name = name or (source if isinstance(source, str) else source.name)
+
+    def knows(self, hand: Hand) -> bool:
+        """Whether it makes grasps of this hand at all."""
+        return self.source.knows(hand)
+
+    def asked(self, obj: ObjectModel, num: int) -> int:
+        """How many grasps of an object it can be asked for, of `num`."""
+        return self.source.asked(obj, num)
+
+    @torch.no_grad()
+    def propose(self, problem: GraspProblem, num: int, seed: int) -> Candidates:
+        """Candidates as the source makes them."""
+        return ask(self.source, problem, num, seed)
+
+    def returned(self, problem: GraspProblem, num: int, seed: int) -> Prediction:
+        """Grasps as `generate --source` returns them.
+
+        Raises:
+            NoGraspError: There is none.
+        """
+        return self.predictor.run(problem, GraspRequest(num, seed, source=self.asks))
+
+    def predict(self, hand: Hand, obj: ObjectModel, num: int = 16, seed: int = 0) -> GraspBatch:
+        """Grasps as `GraspPredictor.predict` returns them: at most `num`, the same for the same seed."""
+        return self.returned(GraspProblem(hand, obj), num, seed).grasps.with_asked(self.asked(obj, num))
+
+
+def make_method(name: str, options: MethodOptions | None = None) -> Method:
+    """A method, ready to make grasps.
+
+    Args:
+        name: A name that `generate --source` takes, or a control that needs training grasps; `auto` and `network` with weights
+            of their own, as `network@my_weights.safetensors`.
+        options: What methods are made with.
+
+    Raises:
+        OptionError: There is no such source, or it lacks what it needs.
+        GraspFileError: The grasp file cannot be read.
+        WeightsError: There are no such weights.
+    """
+    options = options or MethodOptions()
+    plain, at, weights = name.partition("@")
+    if plain in FORMER_NAMES:
+        warnings.warn(f"method '{plain}' is called '{FORMER_NAMES[plain]}' now", DeprecationWarning, stacklevel=2)
+        plain = FORMER_NAMES[plain]
+    own = at and plain in (AUTO, "network")
+    config = PredictorConfig()
+    if options.temperature is not None:
+        config = replace(config, network=replace(config.network, temperature=options.temperature))
+    predictor = GraspPredictor(weights if own else options.weights, options.device, config)
+    if plain in WITH_DATA:
+        return Method(make_source(plain, None if options.bundle is None else mean_grasps_of(options.bundle)), predictor)
+    return Method(plain if own else f"{plain}{at}{weights}", predictor, name)
+
+
+def mean_grasps_of(bundle: Bundle) -> dict[str, MeanGrasp]:
+    """The mean grasp of each hand in a training bundle that has grasps."""
+    clouds = torch.stack([cloud.points.mean(0) for cloud in bundle.objects.values()])
+    means = {}
+    for hand, grasps in bundle.grasps.items():
+        if len(grasps.joints):
+            centres = apply(torch.linalg.inv(grasps.T_object_wrist), clouds[grasps.object_index])
+            means[hand] = MeanGrasp(grasps.joints.mean(0), centres.mean(0))
+    return means

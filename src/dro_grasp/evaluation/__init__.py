@@ -1,1 +1,0 @@
-"""Metrics, controls and benchmark tables."""

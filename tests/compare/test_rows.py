@@ -1,0 +1,143 @@
+"""Rows of the benchmark against numbers worked out by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from dro_grasp.baselines.controls import StartMethod
+from dro_grasp.baselines.foreign import FileMethod
+from dro_grasp.pipeline.problem import GraspProblem
+
+from dro_grasp.cli.benchmark import cells
+from dro_grasp.compare.methods import Method
+from dro_grasp.compare.metrics import wilson_interval
+from dro_grasp.compare.rows import Row, average
+from dro_grasp.compare.stages import (
+    BEST,
+    EQUAL_TIME,
+    RANKED,
+    RAW,
+    REFINED,
+    RETURNED,
+    STAGES,
+    BenchmarkConfig,
+    benchmark,
+)
+from dro_grasp.errors import OptionError
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.simulation.outcome import TrialResult
+from dro_grasp.simulation.protocols import changed, protocol
+from tests.helpers.loaded_hands import loaded_hand
+
+STRICT = "strict/1"
+
+
+class Sparing(Method):
+    """Returns two grasps, however many are asked for."""
+
+    name = "sparing"
+
+    def make(self, problem: GraspProblem, num: int, seed: int) -> GraspBatch:
+        return StartMethod().make(problem, 2, seed)
+
+
+class Lazy(Method):
+    """Returns none."""
+
+    name = "lazy"
+
+    def make(self, problem: GraspProblem, num: int, seed: int) -> GraspBatch:
+        return StartMethod().make(problem, 1, seed)[:0]
+
+
+@pytest.fixture
+def all_hold(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every grasp that is evaluated holds."""
+    from dro_grasp.compare import stages as success_rates
+    from dro_grasp.simulation.trial import simulate
+
+    def holding(*given: object, **options: object) -> TrialResult:
+        result = simulate(*given, **options)
+        return dataclasses.replace(result, success=torch.ones_like(result.success))
+
+    monkeypatch.setattr(success_rates, "simulate", holding)
+
+
+def measured(method: Method, *stages: str, num: int = 16) -> dict[str, Row]:
+    config = BenchmarkConfig(num=num, stages=stages, protocols=(protocol("strict"),))
+    return {row.stage: row for row in benchmark([loaded_hand("gripper3")], [load_object("can")], [method], config)}
+
+
+def test_what_a_method_does_not_return_counts_as_a_failure(all_hold: None) -> None:
+    rows = measured(Sparing(), RAW, RANKED, REFINED, BEST, "refined, top 1", RETURNED, EQUAL_TIME)
+    asked = {RAW: 16, RANKED: 4, REFINED: 16, BEST: 4, "refined, top 1": 1, RETURNED: 4, EQUAL_TIME: 4}
+    for stage, n in asked.items():
+        row, there = rows[stage], min(n, 2)
+        assert (row.asked, row.returned, row.held) == (n, there, {STRICT: there}), stage
+        assert row.success[STRICT] == (there / n, *wilson_interval(there, n)), stage
+        assert row.to_dict()["num"] == n
+        assert cells(row)[3] == (f"{n} ({there} returned)" if there < n else n)
+
+
+def test_a_method_that_returns_nothing_fails_everything() -> None:
+    for stage, row in measured(Lazy(), *STAGES, RETURNED, num=8).items():
+        assert (row.returned, row.held) == (0, {STRICT: 0}), stage
+        assert row.success[STRICT] == (0.0, *wilson_interval(0, row.asked)), stage
+
+
+def test_stored_grasps_are_of_the_request_that_they_answer(tmp_path, all_hold: None) -> None:
+    problem = GraspProblem(loaded_hand("gripper3"), load_object("can"))
+    grasps = StartMethod().make(problem, 3, 0)
+    grasps.save(tmp_path / "unknown.parquet")
+    grasps.with_asked(12).save(tmp_path / "answer.parquet")
+    row = measured(FileMethod(tmp_path / "unknown.parquet"), RAW)[RAW]
+    assert (row.asked, row.returned) == (3, 3)
+    row = measured(FileMethod(tmp_path / "answer.parquet"), RAW)[RAW]
+    assert (row.asked, row.returned, row.held[STRICT]) == (12, 3, 3)
+    # Of a part of the request, a part of the grasps.
+    few = [len(FileMethod(tmp_path / "answer.parquet").make(problem, 4, seed)) for seed in range(40)]
+    assert 0.6 < sum(few) / 40 < 1.4
+    assert measured(FileMethod(tmp_path / "answer.parquet"), RAW, num=4)[RAW].asked == 4
+
+
+def test_a_method_that_returns_too_many_is_refused() -> None:
+    with pytest.raises(OptionError, match="2 grasps of a request for 1"):
+        measured(Sparing(), RAW, num=1)
+
+
+def test_two_changes_of_one_protocol_have_two_columns() -> None:
+    rules = (changed("strict", mass_factor=0.5), changed("strict", mass_factor=2))
+    config = BenchmarkConfig(num=1, stages=(RAW,), protocols=rules)
+    (row,) = benchmark([loaded_hand("gripper3")], [load_object("can")], [StartMethod()], config)
+    assert list(row.success) == list(row.fingers) == ["strict+mass_factor=0.5/1", "strict+mass_factor=2/1"]
+
+
+def test_two_methods_of_one_name_are_refused() -> None:
+    """Their grasps would share a row."""
+    config = BenchmarkConfig(num=1, stages=(RAW,), protocols=(protocol("strict"),))
+    with pytest.raises(OptionError, match="two methods are called 'sparing'"):
+        benchmark([loaded_hand("gripper3")], [load_object("can")], [Sparing(), Sparing()], config)
+
+
+def row(hand: str, held: int, asked: int) -> Row:
+    share = (held / asked if asked else float("nan"), *wilson_interval(held, asked))
+    return Row("dro", RAW, hand, asked, held, {STRICT: held}, {STRICT: share}, 0.0, 0.0, 0.0, {}, {STRICT: (1.0, 1.0)}, {},
+               {}, 1.0, 0.0, {})
+
+
+def test_the_average_of_hands_with_other_numbers_has_an_interval_around_it() -> None:
+    """Hands 4 of 4 and 8 of 16: the mean is 0.75, not 12 of 20. Its variance is p (1 - p) (1/4 + 1/16) / 4, which is that of
+    12.8 grasps, so its interval is Wilson's of 9.6 of 12.8."""
+    whole = average([row("a", 4, 4), row("b", 8, 16)])
+    assert (whole.asked, whole.returned, whole.held) == (20, 12, {STRICT: 12})
+    assert whole.success[STRICT] == pytest.approx((0.75, 0.4764, 0.9082), abs=1e-4)
+
+
+def test_the_average_of_hands_with_one_number_has_the_interval_of_all() -> None:
+    whole = average([row("a", 3, 8), row("b", 8, 8)])
+    assert whole.success[STRICT] == pytest.approx((11 / 16, *wilson_interval(11, 16)))
+    alone = average([row("a", 3, 8), row("b", 0, 0)])
+    assert alone.success[STRICT] == pytest.approx((3 / 8, *wilson_interval(3, 8)))
