@@ -9,7 +9,9 @@ from typing import Literal
 from dro_grasp.errors import OptionError
 from dro_grasp.planning.candidates import Directions
 from dro_grasp.planning.reachability import ReachConfig
+from dro_grasp.predict.config import AUTO
 from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.sources.source import Source
 
 
 @dataclass(frozen=True)
@@ -18,6 +20,10 @@ class PlanConfig:
 
     num: int = 24
     """Grasps to choose from, in each of the batches."""
+    candidates: int = 1
+    """Candidates for each of them, as in `GraspRequest`: which grasps can be reached decides more than the last of the score."""
+    source: str | Source = AUTO
+    """What proposes them, as in `GraspRequest`."""
     top: int = 5
     """Reachable grasps of best score that are given to the planner at once. Source: paper, real-robot experiment."""
     directions: Directions = "all"

@@ -30,6 +30,7 @@ from dro_grasp.planning.scene_solids import scene_solid
 from dro_grasp.planning.standing import moved, upright
 from dro_grasp.planning.timed_stages import timed_stages
 from dro_grasp.predict.admission import BESIDE, NARROW, SPARED, TURNED, faults
+from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
@@ -148,8 +149,9 @@ class _Task:
         for batch in range(self.config.batches):
             with self.watch("grasps"):
                 grasps = grasps_in_world(
-                    predictor, self.robot.hand, self.obj, self.T_world_object, self.config.num, self.wanted(),
-                    directions, self.seed + batch * BATCH_SEED)
+                    predictor, self.robot.hand, self.obj, self.T_world_object,
+                    GraspRequest(self.config.num, self.seed + batch * BATCH_SEED, self.config.candidates, source=self.config.source),
+                    self.wanted(), directions)
             yield grasps
 
     def directions(self) -> Directions | Float[Tensor, "k 3"]:
