@@ -53,7 +53,7 @@ def main() -> None:
             for obj in objects:
                 seed = pair_seed(0, hand, obj)
                 for view, model in shown(obj, seed).items():
-                    grasps = predictor.predict(hand, model, options.num, seed, refine=False, candidates=1, method="network")
+                    grasps = predictor.predict(hand, model, options.num, seed, refine=False, candidates=1, source="network")
                     for name in PROTOCOLS:
                         held = simulate(hand, obj, grasps, name).success.tolist()
                         for row in (hand.name, "average"):

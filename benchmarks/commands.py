@@ -29,10 +29,10 @@ COMMANDS = {
     "1 grasp": (*BUILT_IN, "--num", "1"),
     "16 grasps": (*BUILT_IN, "--num", "16"),
     "16 grasps, no trial": (*BUILT_IN, "--num", "16", "--protocol", "none"),
-    "16 grasps, the network's first": (*BUILT_IN, "--num", "16", "--method", "network", "--candidates", "1"),
+    "16 grasps, the network's first": (*BUILT_IN, "--num", "16", "--source", "network", "--candidates", "1"),
     "16 grasps of a new mesh": NEW,
     "16 grasps of a new mesh, no trial": (*NEW, "--protocol", "none"),
-    "16 grasps of a new mesh, the network's first": (*NEW, "--method", "network", "--candidates", "1"),
+    "16 grasps of a new mesh, the network's first": (*NEW, "--source", "network", "--candidates", "1"),
 }
 """Arguments by row; `import dro_grasp` is no command."""
 SUBDIVISIONS = 5

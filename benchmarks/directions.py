@@ -49,10 +49,10 @@ def main() -> None:
     for name in HANDS:
         hand = load_hand(name)
         asked = torch.cat([
-            palm_angles(hand, predictor.predict(hand, obj, options.num, direction=axis, candidates=1, method="network"), axis)
+            palm_angles(hand, predictor.predict(hand, obj, options.num, direction=axis, candidates=1, source="network"), axis)
             for obj in objects for axis in axes]).rad2deg()
         free = torch.cat([
-            hand.palm_directions(predictor.predict(hand, obj, 6 * options.num, candidates=1, method="network").T_object_wrist)
+            hand.palm_directions(predictor.predict(hand, obj, 6 * options.num, candidates=1, source="network").T_object_wrist)
             for obj in objects])
         shares = 100 * torch.bincount(half_axis(free), minlength=6) / len(free)
         rows.append([name, len(asked), float(asked.median()), float(asked.quantile(0.95)),

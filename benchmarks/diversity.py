@@ -41,7 +41,7 @@ def main() -> None:
         stored = stored[torch.tensor([split == "validate" for split in stored.split])]
         made = GraspBatch.concatenate([
             predictor.predict(
-                hand, obj, options.num, pair_seed(0, hand, obj), candidates=1, refine=False, method="network")
+                hand, obj, options.num, pair_seed(0, hand, obj), candidates=1, refine=False, source="network")
             for obj in objects])
         for kind, grasps in (("stored", stored), ("predicted", made)):
             spread = diversity(grasps.T_object_wrist, grasps.joints)

@@ -124,7 +124,7 @@ def main() -> None:
             assert problem.field is not None  # made before the clock runs
             start = time.process_time()
             grasps = shipped.predict(
-                hand, obj, options.num, pair_seed(0, hand, obj), candidates=1, refine=False, method="network")
+                hand, obj, options.num, pair_seed(0, hand, obj), candidates=1, refine=False, source="network")
             seconds += time.process_time() - start
             for name, found in held.items():
                 found.append(simulate(hand, obj, complete(problem, grasps), name, workers=1).success.double())

@@ -72,10 +72,10 @@ def measure(predictor: GraspPredictor, num: int, runs: int, seed: int) -> dict[s
     obj, times = load_object(OBJECT), defaultdict(list)
     for name in HANDS:
         hand = load_hand(name)
-        predictor.predict(hand, obj, num, seed, candidates=1, method="network")
+        predictor.predict(hand, obj, num, seed, candidates=1, source="network")
         for run in range(runs):
             begin = time.perf_counter()
-            made = predictor.run(GraspProblem(hand, obj), GraspRequest(num, seed + run, candidates=1, method="network"))
+            made = predictor.run(GraspProblem(hand, obj), GraspRequest(num, seed + run, candidates=1, source="network"))
             times["whole"].append(time.perf_counter() - begin)
             for part in PARTS:
                 times[part].append(made.seconds[part])

@@ -40,7 +40,7 @@ def outcomes(
 ) -> dict[str, torch.Tensor]:
     """Outcomes of grasps predicted from what is shown, refined and ranked on what is judged: all, and the best quarter."""
     predictor = GraspPredictor(config=PredictorConfig(temperature=CLOUD_TEMPERATURE))
-    raw = predictor.predict(hand, shown, num, pair_seed(0, hand, obj), candidates=1, refine=False, method="network")
+    raw = predictor.predict(hand, shown, num, pair_seed(0, hand, obj), candidates=1, refine=False, source="network")
     problem = GraspProblem(hand, judged)
     grasps = scored(problem, refine(problem, raw))
     best = grasps.score.topk(round(KEPT * num)).indices

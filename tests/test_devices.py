@@ -75,7 +75,7 @@ def test_the_optimiser_s_predictions_on_a_device_are_those_of_the_cpu(
     monkeypatch.setattr("dro_grasp.predict.stages.RefineConfig", functools.partial(RefineConfig, steps=10))
     weights, obj = str(untrained_weights(tmp_path)), load_object("sphere")
     here, there = (
-        GraspPredictor(weights, device=place).predict(toy_hand(), obj, 2, seed=3, method="optimise")
+        GraspPredictor(weights, device=place).predict(toy_hand(), obj, 2, seed=3, source="optimiser")
         for place in ("cpu", device))
     assert there.joints.device.type == "cpu"
     for name in ("joints", "T_object_wrist", "pregrasp_joints", "squeeze_joints", "score"):

@@ -45,7 +45,7 @@ def test_help_opens_with_an_example_that_runs() -> None:
 
 
 def test_everything_describes_itself_in_one_or_two_lines(hand, obj, predictor) -> None:
-    request = dro.GraspRequest(2, candidates=1, method="network", refine=False)
+    request = dro.GraspRequest(2, candidates=1, source="network", refine=False)
     problem = dro.GraspProblem(hand, obj)
     made = predictor.run(problem, request)
     trial = dro.simulate(hand, obj, made.grasps)
@@ -93,14 +93,14 @@ def test_saved_grasps_find_the_users_own_files_again(predictor, tmp_path: Path) 
 
     trimesh.creation.box((50, 50, 80)).export(tmp_path / "block.stl")
     hand, obj = dro.load_hand(tmp_path / "mine.urdf"), dro.load_object(tmp_path / "block.stl", scale=0.001)
-    predictor.predict(hand, obj, num=1, candidates=1, method="network", refine=False).save(tmp_path / "grasps.parquet")
+    predictor.predict(hand, obj, num=1, candidates=1, source="network", refine=False).save(tmp_path / "grasps.parquet")
     grasps = dro.GraspBatch.load(tmp_path / "grasps.parquet")
     assert hand_of(grasps, None).sha256 == hand.sha256
     assert object_of(grasps, None, 1.0).sha256 == obj.sha256 == grasps.object_sha256[0]
 
 
 def test_names_are_not_saved_as_files(hand, obj, predictor) -> None:
-    grasps = predictor.predict(hand, obj, num=1, candidates=1, method="network", refine=False)
+    grasps = predictor.predict(hand, obj, num=1, candidates=1, source="network", refine=False)
     assert not {"hand_file", "object_file"} & grasps.extra.keys()
 
 

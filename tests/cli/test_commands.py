@@ -261,7 +261,7 @@ def test_own_files_are_found_again(
     (tmp_path / "below").mkdir()
     monkeypatch.chdir(tmp_path)
     assert main(["generate", "--hand", "mine.urdf", "--object", "box.stl", "--scale", "0.001", "--num", "2", "--weights",
-                 weights, "--method", "network", "--output", "grasps.parquet", "--json"]) == 0
+                 weights, "--source", "network", "--output", "grasps.parquet", "--json"]) == 0
     made = json.loads(capsys.readouterr().out)
     monkeypatch.chdir(tmp_path / "below")
     assert main(["evaluate", "../grasps.parquet", "--json"]) == 0

@@ -15,7 +15,7 @@ def test_evaluation_with_another_hand_is_told(weights: str, tmp_path: Path, caps
     (tmp_path / "mine.urdf").write_text((BUILTIN_FOLDER / "gripper3.urdf").read_text())
     path, output = tmp_path / "grasps.parquet", tmp_path / "tried.parquet"
     assert main(["generate", "--hand", str(tmp_path / "mine.urdf"), "--object", "sphere", "--weights", weights, "--num", "1",
-                 "--method", "network", "--protocol", "none", "--output", str(path), "--json"]) == 0
+                 "--source", "network", "--protocol", "none", "--output", str(path), "--json"]) == 0
     assert main(["evaluate", str(path), "--hand", "gripper3"]) == 0
     assert "made for another" not in capsys.readouterr().err
     assert main(["evaluate", str(path), "--hand", "gripper3", "--output", str(output)]) == 0

@@ -44,7 +44,7 @@ def test_outputs_are_checked_before_the_work(monkeypatch: pytest.MonkeyPatch, ca
 
 def test_generate_reports_and_saves_what_it_counts(generate, tmp_path: Path) -> None:
     path = tmp_path / "grasps.parquet"
-    report = generate("--output", str(path), method="auto", candidates=4)
+    report = generate("--output", str(path), source="auto", candidates=4)
     assert report.keys() >= KEYS
     assert set(report["seconds"]) == {
         "start", "load", "network", "choose", "decode", "optimise", "refine", "settle", "rank", "trial", "files", "total"}
@@ -109,7 +109,7 @@ def test_a_bad_object_in_a_folder_costs_only_its_own_grasps(
     trimesh.creation.icosphere(radius=30.0).export(objects / "huge.stl")
     trimesh.creation.box((0.05, 0.05, 0.05)).export(objects / "z.stl")
     base = ["generate", "--hand", "gripper3", "--object", str(objects), "--weights", weights, "--num", "2"]
-    assert main([*base, "--method", "network", "--protocol", "none", "--output", str(results), "--json"]) == 2
+    assert main([*base, "--source", "network", "--protocol", "none", "--output", str(results), "--json"]) == 2
     said = capsys.readouterr()
     report = json.loads(said.out)
     assert [r["object"] for r in report["results"]] == ["a", "z"]
@@ -172,7 +172,7 @@ def test_a_file_without_any_success_is_told(
 ) -> None:
     none_holds(monkeypatch)
     path = tmp_path / "grasps.parquet"
-    arguments = ["generate", "--hand", "gripper3", "--object", "sphere", "--num", "2", "--method", "network", "--json"]
+    arguments = ["generate", "--hand", "gripper3", "--object", "sphere", "--num", "2", "--source", "network", "--json"]
     assert main([*arguments, "--only-successful", "--output", str(path)]) == 0
     assert f"no grasp succeeded, so {path} holds none" in capsys.readouterr().err
 
@@ -227,7 +227,7 @@ def test_a_picture_of_successes_shows_no_failures(
     none_holds(monkeypatch)
     monkeypatch.setattr("dro_grasp.viewer.app.view_grasps", lambda *_: pytest.fail("failures are shown"))
     path, base = tmp_path / "grasps.png", ["generate", "--hand", "gripper3", "--object", "sphere", "--num", "2"]
-    assert main([*base, "--method", "network", "--only-successful", "--picture", str(path), "--view"]) == 0
+    assert main([*base, "--source", "network", "--only-successful", "--picture", str(path), "--view"]) == 0
     said = capsys.readouterr()
     assert f"sphere: no grasp succeeded, so {path} is not drawn" in said.err
     assert "sphere: no grasp succeeded, so there is none to view" in said.err

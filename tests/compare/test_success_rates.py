@@ -90,7 +90,7 @@ def test_raw_and_ranked_rows_are_what_single_trials_say(rows: list[Row]) -> None
     hand, obj, predictor = loaded_hand("gripper3"), load_object(OBJECT), GraspPredictor()
     problem = GraspProblem(hand, obj)
     made = predictor.predict(
-        hand, obj, num=6, seed=pair_seed(0, hand, obj), candidates=1, refine=False, method="network")
+        hand, obj, num=6, seed=pair_seed(0, hand, obj), candidates=1, refine=False, source="network")
     for stage, best in ((RAW, RANKED), (REFINED, BEST), (SETTLED, SETTLED_BEST)):
         grasps, held_still = made if stage == RAW else refine(problem, made), torch.ones(len(made), dtype=torch.bool)
         if stage == SETTLED:
@@ -180,7 +180,7 @@ def test_what_generate_returns_and_what_controls_return_in_the_networks_time(
         CONFIG, num=6, stages=(RETURNED, EQUAL_TIME), protocols=(protocol("strict"),))
     rows, problem = benchmark([hand], [obj], every(predictor), config), GraspProblem(hand, obj)
     alone = find(rows, DRO, EQUAL_TIME, "gripper3")
-    made = predictor.run(problem, GraspRequest(3, pair_seed(0, hand, obj), candidates=2, method="network"))
+    made = predictor.run(problem, GraspRequest(3, pair_seed(0, hand, obj), candidates=2, source="network"))
     assert (alone.candidates, made.candidates) == (6, 6)
     assert alone.success["strict/1"][0] == float(simulate(hand, obj, made.grasps[:2], "strict").success.float().mean())
     returned = find(rows, DRO, RETURNED, "gripper3")
@@ -220,7 +220,7 @@ def test_trials_held_stand_beside_the_success_of_a_protocol_that_perturbs() -> N
     first, second, whole = benchmark(hands, [obj], [DistanceMethod(GraspPredictor())], config)
     for hand, row in zip(hands, (first, second), strict=True):
         grasps = GraspPredictor().predict(
-            hand, obj, num=3, seed=pair_seed(0, hand, obj), candidates=1, refine=False, method="network")
+            hand, obj, num=3, seed=pair_seed(0, hand, obj), candidates=1, refine=False, source="network")
         alone = simulate(hand, obj, grasps, few)
         assert row.success[few.label][0] == pytest.approx(float(alone.success.float().mean()))
         assert set(row.trials_held) == {few.label}

@@ -78,7 +78,7 @@ def test_the_next_steps_are_commands_for_shells(tmp_path: Path) -> None:
 
 
 def test_what_generate_returns_is_of_the_method_that_is_asked_for(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    asked = command(home, "--method", "optimise", "--json")
+    asked = command(home, "--source", "optimiser", "--json")
     asked[asked.index("--output") + 1] = str(home / "optimised")
     assert main(asked) == 0
     told = json.loads(capsys.readouterr().out.splitlines()[-1])
@@ -164,7 +164,7 @@ def test_the_folder_of_another_hand_is_refused(home: Path, capsys: pytest.Captur
 
 @pytest.mark.parametrize(("more", "word"), [
     (["--weights", "multi"], "was begun with weights"), (["--seed", "7"], "with seed"),
-    (["--method", "network"], "with method auto, network was asked for")])
+    (["--source", "network"], "with method auto, network was asked for")])
 def test_a_folder_that_was_begun_otherwise_is_refused(
     home: Path, more: list[str], word: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

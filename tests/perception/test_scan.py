@@ -210,7 +210,7 @@ def command(depth: np.ndarray, T_object_camera: np.ndarray, tmp_path_factory: py
     (folder / "camera.json").write_text(json.dumps({"frame": "base", "T_frame_camera": T_object_camera.tolist()}))
     return ["generate", "--object", str(folder / "scan.npy"), "--camera", str(folder / "camera.json"), "--hand", "gripper3",
             "--num", "3", "--weights", str(untrained_weights(folder)), "--direction", "0", "0", "-1", "--no-refine",
-            "--method", "network", "--json"]
+            "--source", "network", "--json"]
 
 
 @pytest.fixture(scope="module")
@@ -321,7 +321,7 @@ def test_a_cloud_file_loses_its_table(
     assert np.ptp(cut.cloud, axis=0).max() < 0.2 < np.ptp(whole.cloud, axis=0).max()
     np.testing.assert_allclose(cut.table[:3], T_object_camera[2, :3], atol=0.02)
     weights = str(untrained_weights(tmp_path))
-    command = ["generate", "--hand", "gripper3", "--object", str(path), "--num", "1", "--method", "network"]
+    command = ["generate", "--hand", "gripper3", "--object", str(path), "--num", "1", "--source", "network"]
     command += ["--weights", weights]
     assert main([*command, "--table", "0.0"]) == 0
     told = capsys.readouterr().err

@@ -45,7 +45,7 @@ def ball() -> ObjectModel:
 
 @pytest.fixture(scope="module")
 def grasps(predictor: GraspPredictor, ball: ObjectModel) -> GraspBatch:
-    return predictor.predict(HAND, ball, num=7, seed=3, candidates=1, method="network")
+    return predictor.predict(HAND, ball, num=7, seed=3, candidates=1, source="network")
 
 
 def lowest_point(q: Tensor, T: Tensor) -> float:
@@ -59,7 +59,7 @@ def lowest_point(q: Tensor, T: Tensor) -> float:
 
 def test_the_same_seed_gives_the_same_grasps(predictor: GraspPredictor, ball: ObjectModel, grasps: GraspBatch) -> None:
     torch.manual_seed(99)
-    again, other = (predictor.predict(HAND, ball, num=7, seed=seed, candidates=1, method="network") for seed in (3, 4))
+    again, other = (predictor.predict(HAND, ball, num=7, seed=seed, candidates=1, source="network") for seed in (3, 4))
     assert torch.equal(again.T_object_wrist, grasps.T_object_wrist)
     assert torch.equal(again.joints, grasps.joints)
     assert not torch.equal(other.joints, grasps.joints)
@@ -71,7 +71,7 @@ def test_grasps_do_not_depend_on_the_batch_size(
     weights: str, ball: ObjectModel, grasps: GraspBatch, batch_size: int
 ) -> None:
     config = PredictorConfig(batch_size=batch_size, network_batch_size=batch_size)
-    other = GraspPredictor(weights, config=config).predict(HAND, ball, num=7, seed=3, candidates=1, method="network")
+    other = GraspPredictor(weights, config=config).predict(HAND, ball, num=7, seed=3, candidates=1, source="network")
     for name in ("T_object_wrist", "joints", "pregrasp_joints", "squeeze_joints", "score"):
         torch.testing.assert_close(getattr(other, name), getattr(grasps, name), atol=1e-4, rtol=1e-4)
 
@@ -83,7 +83,7 @@ def test_nothing_is_found_where_constraints_reject_everything(
     monkeypatch.setattr("dro_grasp.predict.finish.permitted", lambda problem, grasps: torch.zeros(len(grasps), dtype=torch.bool))
     strict = GraspPredictor(weights, config=PredictorConfig(least_yield=0.0))
     with pytest.raises(OptionError, match="only 0 of 2 candidates"):
-        strict.predict(HAND, ball, num=2, candidates=1, method="network", table=-0.2)
+        strict.predict(HAND, ball, num=2, candidates=1, source="network", table=-0.2)
 
 
 def test_grasps_are_complete_valid_and_sorted(
@@ -103,7 +103,7 @@ def test_grasps_are_complete_valid_and_sorted(
 
 def test_a_run_returns_how_the_grasps_were_made(predictor: GraspPredictor, ball: ObjectModel) -> None:
     steps: list[tuple[int, int]] = []
-    request = GraspRequest(num=10, candidates=2, method="network")
+    request = GraspRequest(num=10, candidates=2, source="network")
     made = predictor.run(GraspProblem(HAND, ball), request, lambda done, wanted: steps.append((done, wanted)))
     assert steps == [(16, 20), (20, 20)]
     assert (len(made.grasps), made.candidates) == (10, 20)
@@ -138,8 +138,8 @@ def test_a_direction_must_point_somewhere(
 
 
 def test_of_several_candidates_the_best_are_kept(predictor: GraspPredictor, ball: ObjectModel) -> None:
-    many = predictor.predict(HAND, ball, num=12, seed=4, candidates=1, method="network")
-    best = predictor.predict(HAND, ball, num=3, seed=4, method="network")
+    many = predictor.predict(HAND, ball, num=12, seed=4, candidates=1, source="network")
+    best = predictor.predict(HAND, ball, num=3, seed=4, source="network")
     torch.testing.assert_close(best.T_object_wrist, many.T_object_wrist[:3])
     torch.testing.assert_close(best.score, many.score[:3])
     with pytest.raises(OptionError, match="candidates is 0"):
@@ -164,7 +164,7 @@ def test_the_temperature_scales_what_z_is_made_of(weights: str, ball: ObjectMode
             return honest(hand, points, noise)
 
         monkeypatch.setattr(predictor.network, "move", move)
-        predictor.predict(HAND, obj, num=3, seed=5, candidates=1, refine=False, method="network")
+        predictor.predict(HAND, obj, num=3, seed=5, candidates=1, refine=False, source="network")
     assert float(drawn[0.0, ball].abs().max()) == 0
     torch.testing.assert_close(drawn[0.5, ball], 0.5 * drawn[None, ball])
     torch.testing.assert_close(drawn[None, cloud], drawn[0.5, ball], msg="bare clouds get surer grasps")
@@ -211,7 +211,7 @@ def test_where_there_is_room_for_all_the_prior_chooses_above_a_table_too(
 def test_hands_stay_above_the_table(predictor: GraspPredictor, ball: ObjectModel) -> None:
     table = -0.06
     problem = GraspProblem(HAND, ball, constraints=Constraints(table=table))
-    run = predictor.run(problem, GraspRequest(num=8, candidates=1, method="network"))
+    run = predictor.run(problem, GraspRequest(num=8, candidates=1, source="network"))
     kept = run.grasps
     assert 0 < len(kept) == len(run.proposed) == len(run.points) <= 8
     assert (run.shortage is None) == (len(kept) == 8)
@@ -227,7 +227,7 @@ def test_what_was_found_is_returned_with_a_warning(
 
     monkeypatch.setattr("dro_grasp.predict.finish.permitted", first_of_each_batch)
     with pytest.warns(UserWarning, match=r"only 1 of 6 candidates on object 'sphere' .* 6 were .* lower table \(now -0.1 m"):
-        found = predictor.predict(HAND, ball, num=6, table=-0.1, candidates=1, method="network")
+        found = predictor.predict(HAND, ball, num=6, table=-0.1, candidates=1, source="network")
     assert len(found) == 1
 
 
@@ -235,7 +235,7 @@ def test_an_impossible_table_is_told(predictor: GraspPredictor, ball: ObjectMode
     monkeypatch.setattr("dro_grasp.predict.finish.permitted", lambda problem, grasps: torch.zeros(len(grasps), dtype=torch.bool))
     with pytest.raises(OptionError, match=r"only 0 of 3 .* 3 were asked for.* lower table .* use the method 'auto'"):
         predictor.predict(
-            HAND, ball, num=3, direction=(0.0, 0.0, -1.0), table=-0.04, candidates=1, method="network")
+            HAND, ball, num=3, direction=(0.0, 0.0, -1.0), table=-0.04, candidates=1, source="network")
     with pytest.raises(OptionError, match="leaves nothing of the object"):
         predictor.predict(HAND, ball, num=3, table=0.05)
 
@@ -243,11 +243,11 @@ def test_an_impossible_table_is_told(predictor: GraspPredictor, ball: ObjectMode
 def test_a_bare_cloud_is_grasped(weights: str, ball: ObjectModel) -> None:
     predictor = GraspPredictor(weights, config=PredictorConfig(temperature=1.0))
     cloud = dataclasses.replace(ball, vertices=None, faces=None)
-    made = predictor.predict(HAND, cloud, num=7, seed=3, candidates=1, method="network")
+    made = predictor.predict(HAND, cloud, num=7, seed=3, candidates=1, source="network")
     assert bool(made.score.isfinite().all())
     # The network sees points alone: the same grasps before refinement, in an order of their own.
     raw = [
-        predictor.predict(HAND, o, num=7, seed=3, candidates=1, refine=False, method="network").joints.tolist()
+        predictor.predict(HAND, o, num=7, seed=3, candidates=1, refine=False, source="network").joints.tolist()
         for o in (cloud, ball)]
     assert sorted(map(tuple, raw[0])) == sorted(map(tuple, raw[1]))
     assert sorted(map(tuple, made.joints.tolist())) != sorted(map(tuple, raw[0]))
@@ -257,7 +257,7 @@ def test_a_cloud_with_too_few_points_is_grasped(predictor: GraspPredictor, ball:
     few = dataclasses.replace(
         ball, cloud=ball.cloud[:40], cloud_normals=ball.cloud_normals[:40], vertices=None, faces=None
     )
-    assert bool(predictor.predict(HAND, few, num=2, method="network").joints.isfinite().all())
+    assert bool(predictor.predict(HAND, few, num=2, source="network").joints.isfinite().all())
 
 
 def test_gradients_are_left_alone(predictor: GraspPredictor, grasps: GraspBatch) -> None:
@@ -269,7 +269,7 @@ def test_gradients_are_left_alone(predictor: GraspPredictor, grasps: GraspBatch)
 def test_prediction_runs_wholly_on_the_device_it_is_told(
     weights: str, ball: ObjectModel, grasps: GraspBatch, device: str
 ) -> None:
-    there = GraspPredictor(weights, device=device).predict(HAND, ball, num=7, seed=3, candidates=1, method="network")
+    there = GraspPredictor(weights, device=device).predict(HAND, ball, num=7, seed=3, candidates=1, source="network")
     for name in ("T_object_wrist", "joints", "pregrasp_joints", "squeeze_joints", "score"):
         assert type(getattr(there, name)) is Tensor, "grasps come back to the CPU"
         torch.testing.assert_close(getattr(there, name), getattr(grasps, name), atol=1e-4, rtol=1e-4)
@@ -279,20 +279,20 @@ def test_auto_lets_the_optimiser_help_only_where_the_score_distrusts_the_network
     predictor: GraspPredictor, ball: ObjectModel, quick_synthesis: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("dro_grasp.predict.predictor.OPTIMISED_PER_GRASP", 3)
-    problem, alone = GraspProblem(HAND, ball), GraspRequest(4, seed=1, candidates=2, method="network")
+    problem, alone = GraspProblem(HAND, ball), GraspRequest(4, seed=1, candidates=2, source="network")
     network = predictor.run(problem, alone)
     assert network.origin == ["network"] * 4
     trusted = sorted(network.grasps.score.tolist())[1]  # three of the four best are above it
     monkeypatch.setattr("dro_grasp.predict.predictor.TRUSTED_SCORES", (trusted - 1e-6, -math.inf))
-    helped = predictor.run(problem, dataclasses.replace(alone, method="auto"))
+    helped = predictor.run(problem, dataclasses.replace(alone, source="auto"))
     assert helped.candidates == network.candidates + 3
     assert float(helped.grasps.score.min()) >= float(network.grasps.score.min())
     monkeypatch.setattr("dro_grasp.predict.predictor.TRUSTED_SCORES", (trusted - 1e-6, math.inf, math.inf))
-    again = predictor.run(problem, dataclasses.replace(alone, method="auto"))
+    again = predictor.run(problem, dataclasses.replace(alone, source="auto"))
     assert again.candidates == helped.candidates + 2 * 4 * 3, "two rounds more, for all four"
     assert bool((again.grasps.score >= helped.grasps.score).all())
     monkeypatch.setattr("dro_grasp.predict.predictor.TRUSTED_SCORES", (-math.inf, math.inf))
-    assert predictor.run(problem, dataclasses.replace(alone, method="auto")).candidates == network.candidates
+    assert predictor.run(problem, dataclasses.replace(alone, source="auto")).candidates == network.candidates
 
 
 def test_seeds_next_to_each_other_share_no_round_of_the_optimiser(
@@ -308,7 +308,7 @@ def test_seeds_next_to_each_other_share_no_round_of_the_optimiser(
 
     monkeypatch.setattr("dro_grasp.predict.predictor.optimise", counted)
     for first in (0, 1, 2, 2**63 - 1):
-        predictor.run(GraspProblem(HAND, ball), GraspRequest(2, seed=first, method="optimise"))
+        predictor.run(GraspProblem(HAND, ball), GraspRequest(2, seed=first, source="optimiser"))
     assert len(set(seeds)) == len(seeds) == 4 * 3
 
 
@@ -319,7 +319,7 @@ def test_candidates_that_turn_away_as_they_are_made_are_counted(
     monkeypatch.setattr("dro_grasp.predict.predictor.TRUSTED_SCORES", (math.inf,))
     monkeypatch.setattr("dro_grasp.predict.stages.facing", lambda problem, grasps: torch.arange(len(grasps)) < 3)
     problem = GraspProblem(HAND, ball, constraints=Constraints(direction=(0.0, 0.0, -1.0)))
-    made = predictor.run(problem, GraspRequest(2, seed=1, method="optimise"))
+    made = predictor.run(problem, GraspRequest(2, seed=1, source="optimiser"))
     assert (made.candidates, made.dropped[TURNED]) == (8, 5)
 
 
@@ -333,7 +333,7 @@ def test_the_optimiser_alone_asks_no_network(
     for obj in (ball, cloud):
         constraints = Constraints(direction=tuple(direction.tolist()))
         problem = GraspProblem(HAND, obj, constraints=constraints)
-        made = predictor.run(problem, GraspRequest(2, seed=1, method="optimise"))
+        made = predictor.run(problem, GraspRequest(2, seed=1, source="optimiser"))
         assert made.origin == ["optimiser"] * 2
         assert made.candidates == 16, "of two rounds; those that the descent turned away count, too"
         assert made.seconds["optimise"] > 0 == made.seconds["network"]

@@ -66,8 +66,8 @@ def test_requests_have_every_field_of_what_is_asked_with_default_and_description
         for field in dataclasses.fields(settings):
             assert schema[field.name]["description"] == field_docs(settings)[field.name]
             assert schema[field.name]["default"] == (list(field.default) if isinstance(field.default, tuple) else field.default)
-    call = GraspCall(**PLAIN, num=3, method="network", direction=(0, 0, -1), table=0.1)
-    assert settings_in(call, GraspRequest) == GraspRequest(3, method="network")
+    call = GraspCall(**PLAIN, num=3, source="network", direction=(0, 0, -1), table=0.1)
+    assert settings_in(call, GraspRequest) == GraspRequest(3, source="network")
     assert settings_in(call, Constraints) == Constraints((0, 0, -1), 0.1)
 
 
