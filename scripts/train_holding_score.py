@@ -28,7 +28,8 @@ from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.settling import settled
 from dro_grasp.predict.sources.network import propose
-from dro_grasp.predict.stages import optimise, refine, scored
+from dro_grasp.predict.sources.optimiser import OptimiserSource
+from dro_grasp.predict.stages import refine, scored
 from dro_grasp.ranking.holding_score import SHIPPED, HoldingScore, holding_features
 from dro_grasp.simulation.holding import Holding
 from dro_grasp.simulation.trial import simulate
@@ -51,7 +52,7 @@ def collect(network: DistanceNetwork, name: str, objects: int, num: int, seed: i
         problem = GraspProblem(hand, obj)
         generator = torch.Generator().manual_seed(rng.randrange(10**6))
         found = {"network": propose(problem, network, num, generator).grasps,
-                 "optimiser": optimise(problem, num, rng.randrange(10**6)).grasps}
+                 "optimiser": OptimiserSource().propose(problem, num, rng.randrange(10**6)).grasps}
         for maker, grasps in found.items():
             grasps = scored(problem, refine(problem, grasps))
             better = grasps[grasps.score.topk(max(1, len(grasps) // 2)).indices]

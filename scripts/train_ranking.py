@@ -36,7 +36,8 @@ from dro_grasp.perception.partial_views import View, partial_view
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.settling import settled
 from dro_grasp.predict.sources.network import ProposalConfig, propose
-from dro_grasp.predict.stages import complete, optimise, refine
+from dro_grasp.predict.sources.optimiser import OptimiserSource
+from dro_grasp.predict.stages import complete, refine
 from dro_grasp.ranking.features import feature_names, grasp_features
 from dro_grasp.ranking.score import ScoreConfig
 from dro_grasp.ranking.score_network import SHIPPED, ScoreNetwork, load_score_network, save_score_network
@@ -117,7 +118,7 @@ def collect(
         # Proposed without ranking: the network in use must neither choose its successor's data nor know its features.
         proposal = propose(problem, network, num, torch.Generator().manual_seed(rng.randrange(10**6)), config=config)
         raw, refined = complete(problem, proposal.grasps), refine(problem, proposal.grasps)
-        best = refine(problem, optimise(problem, num, rng.randrange(10**6)).grasps)
+        best = refine(problem, OptimiserSource().propose(problem, num, rng.randrange(10**6)).grasps)
         # Closing is simulated with the whole object, as `generate` does; on a bare cloud it is left out.
         whole = GraspProblem(hand, obj)
         closed = {kind: settled(whole, grasps) for kind, grasps in (("settled", refined), ("optimised, settled", best))}

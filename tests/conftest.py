@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -90,14 +89,6 @@ def small_robot(tmp_path_factory: pytest.TempPathFactory) -> str:
     path: Path = tmp_path_factory.mktemp("robot") / "small.yaml"
     path.write_text(yaml.safe_dump(values))
     return str(path)
-
-
-@pytest.fixture
-def quick_synthesis(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The optimiser beside the network takes a quarter of its steps: its grasps are worse, and made in the same way."""
-    from dro_grasp.predict import stages
-
-    monkeypatch.setattr(stages, "SynthesisConfig", functools.partial(stages.SynthesisConfig, steps=30))
 
 
 @pytest.fixture

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import tyro
+
 from dro_grasp.cli.constraint_options import ConstraintOptions
 from dro_grasp.cli.inputs import Flag, ProtocolName, optional
 from dro_grasp.cli.output import print_json, print_table, progress_bar, say, say_aside
@@ -57,7 +59,7 @@ class Generate:
     camera: Annotated[Path | None, optional("JSON", "the object's own frame")] = None
     """File with {"frame": "base", "T_frame_camera": 4x4}: the object is a cloud in that camera's frame; it is cleaned. Grasps,
     direction and table are in the named frame."""
-    source: str = "auto"
+    source: Annotated[str, tyro.conf.arg(aliases=["--method"])] = "auto"
     """What proposes candidates: network; optimiser, which also makes training data (any hand, nothing learned); auto, the
     network, and the optimiser for the grasps with which the score does not trust it; module:Class, a source of yours; or a
     grasp file."""

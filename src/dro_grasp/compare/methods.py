@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -12,18 +11,15 @@ from dro_grasp.geometry.se3 import apply
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.predict.config import AUTO, GraspRequest, PredictorConfig
+from dro_grasp.predict.config import GraspRequest, PredictorConfig
 from dro_grasp.predict.predictor import GraspPredictor, Prediction
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.controls import MeanGrasp
-from dro_grasp.predict.sources.registry import WITH_DATA, make_source
-from dro_grasp.predict.sources.source import Candidates, Source, ask
+from dro_grasp.predict.sources.registry import WITH_DATA, make_source, present_name
+from dro_grasp.predict.sources.source import AUTO, Candidates, Source, ask
 
 if TYPE_CHECKING:
     from dro_grasp.datasets.bundle.training_file import Bundle
-
-FORMER_NAMES = {"dro": AUTO, "synthesise": "optimiser"}
-"""Names of before, which are still taken."""
 
 
 @dataclass(frozen=True)
@@ -49,13 +45,15 @@ class Method:
         Args:
             source: A source, or its name; `auto` proposes with the network, and returns what that rule does.
             predictor: Finishes what the source proposes, with the same configuration for every method of a table.
-            name: Its name in tables; the source's if omitted.
+            name: Its name in tables; the source's own if omitted.
 
         Raises:
             OptionError: There is no such source.
         """
-        self.asks, self.predictor, self.source = source, predictor, predictor.source(source)
-        self.name = name or (source if isinstance(source, str) else source.name)
+        source = present_name(source) if isinstance(source, str) else source
+        self.predictor, self.source = predictor, predictor.source(source)
+        self.asks = AUTO if source == AUTO else self.source
+        self.name = name or (AUTO if source == AUTO else self.source.name)
 
     def knows(self, hand: Hand) -> bool:
         """Whether it makes grasps of this hand at all."""
@@ -98,17 +96,15 @@ def make_method(name: str, options: MethodOptions | None = None) -> Method:
     """
     options = options or MethodOptions()
     plain, at, weights = name.partition("@")
-    if plain in FORMER_NAMES:
-        warnings.warn(f"method '{plain}' is called '{FORMER_NAMES[plain]}' now", DeprecationWarning, stacklevel=2)
-        plain = FORMER_NAMES[plain]
-    own = at and plain in (AUTO, "network")
+    plain = present_name(plain)
+    own = bool(at) and plain in (AUTO, "network")
     config = PredictorConfig()
     if options.temperature is not None:
         config = replace(config, network=replace(config.network, temperature=options.temperature))
     predictor = GraspPredictor(weights if own else options.weights, options.device, config)
     if plain in WITH_DATA:
         return Method(make_source(plain, None if options.bundle is None else mean_grasps_of(options.bundle)), predictor)
-    return Method(plain if own else f"{plain}{at}{weights}", predictor, name)
+    return Method(plain, predictor, f"{plain}@{weights}") if own else Method(f"{plain}{at}{weights}", predictor)
 
 
 def mean_grasps_of(bundle: Bundle) -> dict[str, MeanGrasp]:

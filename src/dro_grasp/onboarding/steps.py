@@ -30,7 +30,7 @@ from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.optimization.synthesis import SynthesisConfig
 from dro_grasp.predict.config import AUTO
 from dro_grasp.predict.predictor import GraspPredictor
-from dro_grasp.predict.sources.registry import source_names
+from dro_grasp.predict.sources.registry import source_or_name
 from dro_grasp.simulation.protocols import PROTOCOLS, protocol
 from dro_grasp.training.config import ScheduleConfig, TrainConfig
 from dro_grasp.training.loop import train
@@ -81,15 +81,14 @@ class OnboardingConfig:
     """Device of the network, its training and the energies; trials run on the CPU."""
 
     def __post_init__(self) -> None:
-        """Refuse numbers out of range."""
+        """Refuse numbers out of range, and a source that does not exist."""
         if not (math.isfinite(self.minutes) and self.minutes > 0):
             raise OptionError(f"minutes is {self.minutes}; give a positive number, for example --minutes 30")
         require_device(self.device)
         for name, value in (("num", self.num), ("workers", self.workers)):
             if value < 1:
                 raise OptionError(f"{name} is {value}; give at least 1 (--{name})")
-        if self.source not in (AUTO, *source_names()):
-            raise OptionError(f"source is '{self.source}'; choose {', '.join((AUTO, *source_names()))}")
+        source_or_name(self.source)
 
 
 @dataclass(frozen=True)

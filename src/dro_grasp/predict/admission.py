@@ -42,8 +42,6 @@ REASONS = {"plane": PLANE, "obstacles": OBSTACLES, "spared": SPARED}
 class AdmissionConfig:
     """By how much grasps may miss what the constraints ask (ours)."""
 
-    farthest_direction: float = math.radians(20.0)
-    """Largest angle between the palm direction of an optimised grasp and the direction that was asked for [rad]."""
     least_clearance: float = 0.002
     """Least distance of a hand's surface points to its surroundings [m]; its corners come up to 2 mm nearer."""
     touch: float = 0.003
@@ -87,7 +85,7 @@ def faults(
         parts = problem.surroundings.parts if apart else {"obstacles": problem.surroundings}
         found = {REASONS[name]: ~clear(problem, grasps, part, config.least_clearance) for name, part in parts.items()}
     if constraints.cone is not None:
-        found[TURNED] = ~facing(problem, grasps, config)
+        found[TURNED] = ~facing(problem, grasps)
     if constraints.hold:
         found[BESIDE] = ~holds_in_place(problem, grasps, config)
     if constraints.opening is not None:
@@ -95,8 +93,11 @@ def faults(
     return found
 
 
-def facing(problem: GraspProblem, grasps: GraspBatch, config: AdmissionConfig | None = None) -> Bool[Tensor, " n"]:
-    """Which grasps have palms in the cone, or near the wanted direction; over a plane, those too that tilt towards it."""
+def facing(problem: GraspProblem, grasps: GraspBatch, farthest: float = math.inf) -> Bool[Tensor, " n"]:
+    """Which grasps have palms in the cone, or within an angle of the wanted direction [rad].
+
+    Over a plane, those count too that tilt towards it.
+    """
     direction, cone, surroundings = problem.constraints.direction, problem.constraints.cone, problem.surroundings
     if direction is None:
         return torch.ones(len(grasps), dtype=torch.bool)
@@ -105,7 +106,7 @@ def facing(problem: GraspProblem, grasps: GraspBatch, config: AdmissionConfig | 
     if cone is not None:
         return angle_to_arc(palm, wanted, None) <= cone
     up = None if surroundings is None else surroundings.up
-    return angle_to_arc(palm, wanted, None if up is None else up.to(palm)) < (config or AdmissionConfig()).farthest_direction
+    return angle_to_arc(palm, wanted, None if up is None else up.to(palm)) < farthest
 
 
 def clear(

@@ -8,12 +8,11 @@ from dro_grasp.errors import OptionError
 from dro_grasp.predict.finish import FinishConfig
 from dro_grasp.predict.sources.network import ProposalConfig, check_temperature
 from dro_grasp.predict.sources.optimiser import OptimiserConfig
-from dro_grasp.predict.sources.source import Source
+from dro_grasp.predict.sources.registry import source_or_name
+from dro_grasp.predict.sources.source import AUTO, Source
 
 LARGEST_CALL = 100_000
 """Most candidates of one call; more do not fit memory."""
-AUTO = "auto"
-"""The rule: the network proposes, and the optimiser adds rivals for the grasps that the score does not trust."""
 
 
 @dataclass(frozen=True)
@@ -31,13 +30,15 @@ class GraspRequest:
     temperature: float | None = None
     """Spread of z; None takes the predictor's."""
     source: str | Source = AUTO
-    """What proposes: `auto`, `network`, `optimiser`, any other name that `make_source` knows, or a source."""
+    """What proposes: `auto`, `network`, `optimiser`, any other name that `make_source` knows, or a source.
+    One that no predictor makes is made at once."""
 
     def __post_init__(self) -> None:
         """Refuse what cannot be done, before any work.
 
         Raises:
-            OptionError: `num` or `candidates` is not positive, or another value is out of range.
+            OptionError: `num` or `candidates` is not positive, another value is out of range, or there is no such source.
+            GraspFileError: The source is a grasp file that cannot be read.
         """
         if self.num < 1:
             raise OptionError(f"num is {self.num}; ask for at least one grasp (--num 16)")
@@ -49,6 +50,8 @@ class GraspRequest:
         if not 0 <= self.seed < 2**63:
             raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^63 - 1")
         check_temperature(self.temperature)
+        if isinstance(self.source, str):
+            object.__setattr__(self, "source", source_or_name(self.source))
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from dro_grasp.predict.finish import FinishConfig, Finished, finish
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.network import NetworkSource
 from dro_grasp.predict.sources.optimiser import OptimiserSource
-from dro_grasp.predict.sources.registry import make_source
+from dro_grasp.predict.sources.registry import source_or_name
 from dro_grasp.predict.sources.source import Progress, Source, ask
 from dro_grasp.predict.stages import complete
 
@@ -186,14 +186,13 @@ class GraspPredictor:
         Raises:
             OptionError: There is none of that name.
         """
-        if isinstance(name, Source):
-            return name
-        if name in (AUTO, NetworkSource.name):
+        source = source_or_name(name) if isinstance(name, str) else name
+        if isinstance(source, Source):
+            return source
+        if source in (AUTO, NetworkSource.name):
             config = self.config.network
             return NetworkSource(self.network, config if temperature is None else replace(config, temperature=temperature))
-        if name == OptimiserSource.name:
-            return OptimiserSource(self.config.optimiser, self.network.config.n_hand)
-        return make_source(name)
+        return OptimiserSource(self.config.optimiser, self.network.config.n_hand)
 
     def _roles(self, request: GraspRequest) -> tuple[Source | None, Source | None]:
         """The source that is asked first, and the one that makes rivals for what is not trusted."""
@@ -217,8 +216,10 @@ class _Asking:
         self.seconds: dict[str, float] = dict.fromkeys(PARTS, 0.0)
 
     def ask(self, source: Source, num: int, seed: int) -> Finished:
-        """Candidates of one source, finished beside those of before."""
+        """Candidates of one source that it has not proposed before, finished beside those that it has."""
         made = ask(source, self.problem, num, seed, self.progress, self.n_points)
+        if self.done is not None:
+            made = made.beside(self.done.candidates)
         self.done = done = finish(self.problem, made, self.finishing, self.request.num, self.done)
         self.seconds |= {name: self.seconds.get(name, 0.0) + spent for name, spent in made.seconds.items()} | done.seconds
         return done

@@ -1,4 +1,4 @@
-"""The single steps of finishing: complete, refine, score, ease, evaluate. Each takes a problem and grasps, and returns new ones."""
+"""The single steps of finishing, and the trial: each takes a problem and grasps, and returns new ones."""
 
 from __future__ import annotations
 

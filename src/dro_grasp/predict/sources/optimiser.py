@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 from dro_grasp.energy.contact_candidates import ContactConfig
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.optimization.starts import StartConfig
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize_with
-from dro_grasp.predict.admission import AdmissionConfig, facing
+from dro_grasp.predict.admission import facing
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.source import POINTS, Candidates, Progress, Source
 
@@ -24,8 +25,8 @@ class OptimiserConfig:
     """Grasps that are optimised for each candidate; those of lowest energy are proposed."""
     synthesis: SynthesisConfig = field(default_factory=SynthesisConfig)
     """The descent. The problem's constraints say where it starts."""
-    admission: AdmissionConfig = field(default_factory=AdmissionConfig)
-    """How far palms may point from the direction that was asked for."""
+    farthest_direction: float = math.radians(20.0)
+    """Largest angle between the palm direction of a candidate and the direction that was asked for [rad]."""
 
 
 class OptimiserSource(Source):
@@ -49,7 +50,7 @@ class OptimiserSource(Source):
         synthesis = replace(config.synthesis, starts=starts)
         count = config.starts_per_candidate * num
         grasps = synthesize_with(problem.energy(synthesis.energy), problem.obj, count, seed, synthesis, progress)
-        kept = facing(problem, grasps, config.admission)
+        kept = facing(problem, grasps, config.farthest_direction)
         found = Candidates.of(problem, grasps[kept][:num].bare(), self.n_points)
         return replace(found, turned=min(int((~kept).sum()), num - len(found)))
 

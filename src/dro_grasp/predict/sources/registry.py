@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,12 +13,14 @@ from dro_grasp.errors import OptionError
 from dro_grasp.predict.sources.controls import MeanGrasp, MeanGraspSource, StartSource
 from dro_grasp.predict.sources.optimiser import DescentSource
 from dro_grasp.predict.sources.own import FileSource, OwnSource
-from dro_grasp.predict.sources.source import Source
+from dro_grasp.predict.sources.source import AUTO, Source
 
 SOURCES: dict[str, Callable[[], Any]] = {"dfc": DescentSource, "start": StartSource}
 """What makes each source that needs nothing; `register_source` adds yours. A predictor has `network` and `optimiser` too."""
 OF_THE_PREDICTOR = ("network", "optimiser")
 """Sources that a predictor makes, with its weights and configuration."""
+FORMER_NAMES = {"optimise": "optimiser", "synthesise": "optimiser", "dro": AUTO}
+"""Names of before, which are still taken."""
 WITH_DATA = ("mean-grasp", "mean-grasp-chosen")
 """Controls that need the mean of training grasps."""
 
@@ -33,7 +36,7 @@ def register_source(name: str, factory: Callable[[], Any]) -> None:
     Raises:
         OptionError: The name is taken, or could be mistaken for a file or a class.
     """
-    if name in source_names() or name in ("auto", *WITH_DATA):
+    if name in source_names() or name in (AUTO, *FORMER_NAMES, *WITH_DATA):
         raise OptionError(f"there is a source '{name}' already; choose another name")
     if not name or set(name) & set(":@/\\") or name.endswith(".parquet"):
         raise OptionError(f"'{name}' is no name of a source; give one without : @ / and without .parquet")
@@ -43,6 +46,25 @@ def register_source(name: str, factory: Callable[[], Any]) -> None:
 def source_names() -> tuple[str, ...]:
     """Names of all sources that every predictor knows."""
     return (*OF_THE_PREDICTOR, *SOURCES)
+
+
+def present_name(name: str) -> str:
+    """The name of a source today; a former one is told."""
+    if name not in FORMER_NAMES:
+        return name
+    warnings.warn(f"source '{name}' is called '{FORMER_NAMES[name]}' now", FutureWarning, stacklevel=2)
+    return FORMER_NAMES[name]
+
+
+def source_or_name(name: str) -> str | Source:
+    """A source that needs no predictor; of the others, and of the rule `auto`, the name.
+
+    Raises:
+        OptionError: See `make_source`.
+        GraspFileError: Likewise.
+    """
+    name = present_name(name)
+    return name if name in (AUTO, *OF_THE_PREDICTOR) else make_source(name)
 
 
 def make_source(name: str, means: Mapping[str, MeanGrasp] | None = None) -> Source:
@@ -56,6 +78,9 @@ def make_source(name: str, means: Mapping[str, MeanGrasp] | None = None) -> Sour
         OptionError: There is no such source, or it lacks what it needs.
         GraspFileError: The grasp file cannot be read.
     """
+    name = present_name(name)
+    if name in (AUTO, *OF_THE_PREDICTOR):
+        raise OptionError(f"source '{name}' needs a network and a configuration; GraspPredictor().source('{name}') makes it")
     if name in SOURCES:
         return _as_source(name, SOURCES[name]())
     if name in WITH_DATA:
@@ -67,12 +92,17 @@ def make_source(name: str, means: Mapping[str, MeanGrasp] | None = None) -> Sour
     module, colon, attribute = name.partition(":")
     if colon:
         return _as_source(name, _own_class(module, attribute)())
-    raise OptionError(f"there is no source '{name}'; choose {', '.join(('auto', *source_names(), *WITH_DATA))}, name a class "
+    raise OptionError(f"there is no source '{name}'; choose {', '.join((AUTO, *source_names(), *WITH_DATA))}, name a class "
                       "of your own as module:Class, or give a grasp file (.parquet)")
 
 
 def _as_source(name: str, made: Any) -> Source:
-    return made if isinstance(made, Source) else OwnSource(name, made)
+    """What a factory returned, under its own name or the one that it was asked for by."""
+    if not isinstance(made, Source):
+        return OwnSource(name, made)
+    if not hasattr(made, "name"):
+        made.name = name
+    return made
 
 
 def _own_class(module: str, attribute: str) -> Callable[[], Any]:

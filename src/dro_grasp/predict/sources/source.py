@@ -18,6 +18,8 @@ from dro_grasp.predict.stopwatch import Stopwatch
 
 Progress = Callable[[int, int], None]
 """Called with (candidates made so far, candidates wanted)."""
+AUTO = "auto"
+"""The rule: the network proposes, and the optimiser adds rivals for the grasps that the score does not trust."""
 POINTS = 160
 """Hand points that are kept beside a candidate whose source states none, as many as the shipped weights see (ours)."""
 
@@ -39,7 +41,12 @@ class Candidates:
 
     @staticmethod
     def of(problem: GraspProblem, grasps: GraspBatch, n_points: int = POINTS) -> Candidates:
-        """Grasps beside the points of their hand."""
+        """Grasps beside the points of their hand.
+
+        Raises:
+            GraspFileError: They are of another hand.
+        """
+        grasps.require_hand(problem.hand)
         hand = problem.hand if n_points >= problem.hand.n_points else problem.thinned(n_points).to("cpu")
         return Candidates(grasps, hand.points(grasps.joints, grasps.T_object_wrist))
 
@@ -51,6 +58,16 @@ class Candidates:
         chosen = torch.arange(len(self))[rows].tolist()
         return replace(self, grasps=self.grasps[rows], points=self.points[rows],
                        origin=tuple(self.origin[i] for i in chosen) if self.origin else ())
+
+    def beside(self, others: Candidates) -> Candidates:
+        """Those that are not among the others: a source that has no more, as a file, proposes the same grasp again."""
+        known = {row.numpy().tobytes() for row in others._rows}
+        return self[torch.tensor([row.numpy().tobytes() not in known for row in self._rows], dtype=torch.bool)]
+
+    @property
+    def _rows(self) -> Float[Tensor, "n k"]:
+        """Pose and joints of each."""
+        return torch.cat([self.grasps.T_object_wrist.flatten(1), self.grasps.joints], 1)
 
     @staticmethod
     def concatenate(parts: Sequence[Candidates]) -> Candidates:
