@@ -147,7 +147,8 @@ def _measured(
             begin = time.perf_counter()
             grasps, made = _returned(method, problem, keep, seed)
             seconds = {"make": (time.perf_counter() - begin) / keep}
-            yield method.name, RETURNED, _evaluated(hand, obj, grasps.with_asked(method.asked(obj, keep)), config, seconds, made)
+            grasps = grasps.with_asked(method.asked(obj, keep))
+            yield method.name, RETURNED, _evaluated(hand, obj, grasps, config, seconds, made)
     if EQUAL_TIME in config.stages and methods:
         makers = {method.name: finished_maker(problem, method, keep) for method in methods}
         asked = {method.name: method.asked(obj, keep) for method in methods}

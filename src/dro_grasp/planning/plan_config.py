@@ -21,7 +21,7 @@ class PlanConfig:
     num: int = 24
     """Grasps to choose from, in each of the batches."""
     candidates: int = 1
-    """Candidates for each of them, as in `GraspRequest`: which grasps can be reached decides more than the last of the score."""
+    """Candidates for each of them, as in `GraspRequest`: which grasps can be reached decides more than their score."""
     source: str | Source = AUTO
     """What proposes them, as in `GraspRequest`."""
     top: int = 5

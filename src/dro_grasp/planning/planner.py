@@ -148,10 +148,10 @@ class _Task:
         directions = self.directions()
         for batch in range(self.config.batches):
             with self.watch("grasps"):
+                request = GraspRequest(
+                    self.config.num, self.seed + batch * BATCH_SEED, self.config.candidates, source=self.config.source)
                 grasps = grasps_in_world(
-                    predictor, self.robot.hand, self.obj, self.T_world_object,
-                    GraspRequest(self.config.num, self.seed + batch * BATCH_SEED, self.config.candidates, source=self.config.source),
-                    self.wanted(), directions)
+                    predictor, self.robot.hand, self.obj, self.T_world_object, request, self.wanted(), directions)
             yield grasps
 
     def directions(self) -> Directions | Float[Tensor, "k 3"]:
