@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from functools import cache
 
@@ -18,14 +19,31 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.scenery import Scene, load_scene
-from dro_grasp.predict.admission import BESIDE, NARROW, OBSTACLES, PLANE, SPARED, TURNED, permitted, reasons_against
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.predict.admission import (
+    BESIDE,
+    NARROW,
+    OBSTACLES,
+    PLANE,
+    SPARED,
+    TURNED,
+    AdmissionConfig,
+    clear,
+    permitted,
+    reasons_against,
+    shortage_in_words,
+)
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.stages import optimise, refine
+from dro_grasp.predict.sources.optimiser import OptimiserSource
+from dro_grasp.predict.stages import refine
 from tests.helpers.loaded_hands import loaded_hand
+from tests.helpers.toy_hand import toy_hand
 
 HAND = loaded_hand("gripper3")
 MUG = load_object("mug")
+BALL = load_object("sphere")
+SEEN_ON_A_TABLE = dataclasses.replace(BALL, vertices=None, faces=None, table=np.array([0.0, 0.0, 1.0, -0.2], np.float32))
 FLOOR = float(MUG.cloud[:, 2].min())
 RIM = (0.0, 0.0, 0.045)
 WALL, WALL_CENTRE = np.array([0.02, 0.4, 0.4]), np.array([-0.075, 0.0, 0.0])
@@ -111,13 +129,13 @@ def shortfall(case: str, grasps: GraspBatch, row: int) -> float:
 @pytest.fixture(scope="module")
 def free() -> GraspBatch:
     problem = GraspProblem(HAND, MUG)
-    return refine(problem, optimise(problem, 4, seed=0).grasps)
+    return refine(problem, OptimiserSource().propose(problem, 4, seed=0).grasps)
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_grasps_that_are_permitted_respect_the_constraint(case: str, free: GraspBatch) -> None:
     problem = GraspProblem(HAND, MUG, constraints=CASES[case])
-    found = refine(problem, optimise(problem, 4, seed=0).grasps)
+    found = refine(problem, OptimiserSource().propose(problem, 4, seed=0).grasps)
     kept = found[permitted(problem, found)]
     assert len(kept) >= 1
     worst = max(shortfall(case, kept, row) for row in range(len(kept)))
@@ -214,3 +232,28 @@ def test_scenes_that_are_none_are_refused(tmp_path) -> None:
     moved = read.moved(trimesh.transformations.translation_matrix([0, 0, 1.0]))
     assert isinstance(moved, Scene)
     np.testing.assert_allclose(moved.points[:, 2], read.points[:, 2] + 1.0)
+
+
+def test_how_much_a_grasp_may_miss_is_configured(free: GraspBatch) -> None:
+    """With more room to keep fewer are let pass, and with less room more; a place is held with as many fingers as are asked."""
+    problem = GraspProblem(HAND, MUG, constraints=CASES["spare"])
+    assert problem.surroundings is not None
+    passed = [int(permitted(problem, free, AdmissionConfig(least_clearance=least)).sum()) for least in (-1.0, 0.002, 1.0)]
+    assert passed == [len(free), int(clear(problem, free, problem.surroundings).sum()), 0]
+    around = GraspProblem(HAND, MUG, constraints=Constraints(hold=((0.0, 0.0, 0.0, 1.0),)))
+    enough = [permitted(around, free, AdmissionConfig(fewest_fingers=count)) for count in (0, 1, 2, 3)]
+    assert bool(enough[0].all())
+    assert all(bool((more <= fewer).all()) for fewer, more in zip(enough, enough[1:], strict=False))
+    assert not permitted(around, free, AdmissionConfig(reach=-1.0)).any(), "no finger is as near as that"
+
+
+@pytest.mark.parametrize(
+    ("obj", "table", "reason", "said"),
+    [(SEEN_ON_A_TABLE, None, PLANE, "state the table's height if it is lower than the one found in the cloud"),
+     (SEEN_ON_A_TABLE, -0.3, PLANE, "lower table (now -0.3 m"),
+     (SEEN_ON_A_TABLE, None, TURNED, "Try another seed")])
+def test_a_table_is_named_where_it_was_given_or_found(obj: ObjectModel, table: float | None, reason: str, said: str) -> None:
+    problem = GraspProblem(toy_hand(), obj, constraints=Constraints(table=table))
+    words = shortage_in_words(problem, 2, 1, 2, {reason: 1}, alone=False)
+    assert said in words
+    assert ("found in the cloud" in words) == ("found in the cloud" in said)

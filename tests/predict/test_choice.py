@@ -12,14 +12,11 @@ from dro_grasp.energy.grasp_energy import Room
 from dro_grasp.energy.surroundings import Surroundings
 from dro_grasp.errors import OptionError
 from dro_grasp.geometry.balls import Balls
-from dro_grasp.geometry.se3 import random_rotations
 from dro_grasp.hands.anatomy import PALM
-from dro_grasp.hands.hand import Hand
-from dro_grasp.models.network import DistanceNetwork, untrained_network
+from dro_grasp.models.network import DistanceNetwork, Moves
 from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.sources import network as proposal
 from dro_grasp.predict.sources.choice import CROWDING_POINTS, ChoiceConfig, ChoicePenalties, choice_scores
 from dro_grasp.predict.sources.network import ProposalConfig, propose
 from tests.helpers.loaded_hands import loaded_hand
@@ -102,46 +99,49 @@ def test_fingers_at_the_place_to_hold_are_preferred() -> None:
     assert float(there) > float(elsewhere)
 
 
-def test_the_moved_hands_are_judged_in_the_object_s_frame_and_the_best_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    network = untrained_network(NetworkConfig.preset("multi"), seed=0).eval()
+class Watched(DistanceNetwork):
+    """Untrained, and keeps what it is offered and what it decodes."""
+
+    def __init__(self) -> None:
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            super().__init__(NetworkConfig.preset("multi"))
+        self.offered: list[Moves] = []
+        self.decoded: list[Moves] = []
+        self.eval()
+
+    def move(self, hand: torch.Tensor, obj: torch.Tensor, noise: torch.Tensor) -> Moves:
+        self.offered.append(super().move(hand, obj, noise))
+        return self.offered[-1]
+
+    def distances(self, moves: Moves) -> torch.Tensor:
+        self.decoded.append(moves)
+        return super().distances(moves)
+
+
+def test_of_all_that_is_offered_for_a_candidate_the_hand_that_suits_the_object_best_is_decoded() -> None:
+    network, problem = Watched(), GraspProblem(loaded_hand("allegro"), load_object("mug"))
+    config = ProposalConfig(choice=ChoiceConfig(placements=3, draws=2), batch_size=4, network_batch_size=2)
     with torch.no_grad():
-        network.motion.last.weight.zero_()
-        network.motion.last.bias.zero_()  # nothing moves: the judged points are those of the placed hand
-    T = torch.eye(4).repeat(12, 1, 1)
-    T[:, :3, :3], T[:, :3, 3] = random_rotations(12, torch.Generator().manual_seed(1)), torch.tensor([0.1, 0.2, -0.3])
-    joints = torch.stack([HAND.canonical_joints(share) for share in torch.linspace(0.6, 0.9, 6).tolist()])
-    monkeypatch.setattr(proposal, "_placements", lambda *args: T[: args[4] * args[5]].unflatten(0, args[4:6]))
-    monkeypatch.setattr(type(HAND), "random_open_joints", lambda *_: joints)
-    judged, placed, kept = [], [], []
-
-    def scores(hand: Hand, field: object, points: torch.Tensor, penalties: ChoicePenalties, room: object) -> torch.Tensor:
-        judged.append(points)
-        draw, second = torch.arange(points.shape[1]).remainder(6).float(), torch.arange(len(points)).remainder(2)
-        return draw - 10 * (1 - second[:, None])  # the fifth draw of every second placement is the best
-
-    def head(psi_hand: torch.Tensor, psi_object: torch.Tensor, z: torch.Tensor, *clouds: torch.Tensor) -> torch.Tensor:
-        kept.append(z)
-        placed.append(clouds[0])
-        return plain(psi_hand, psi_object, z, *clouds)
-
-    plain, network._distances = network._distances, head
-    network.prior, network.condition = None, None  # z is the draw itself
-    monkeypatch.setattr(proposal, "choice_scores", scores)
-    problem = GraspProblem(loaded_hand("allegro"), SPHERE)
-    with torch.no_grad():
-        for choice in (ChoiceConfig.first(), ChoiceConfig(placements=2, draws=8)):
-            propose(problem, network, 6, torch.Generator().manual_seed(0), ProposalConfig(choice=choice))
-    points = torch.cat(judged)
-    assert points.shape[:2] == (12, 8)  # nothing is judged where there is one draw
-    expected = HAND.points(joints.repeat_interleave(2, 0), T)
-    torch.testing.assert_close(points, expected[:, None].expand_as(points), atol=1e-5, rtol=1e-4)
-    first, chosen = (torch.cat(part) for part in (kept[:2], kept[2:]))
-    assert first.shape == chosen.shape == (6, network.config.latent)
-    drawn = network.sample_latent(12 * 8, _after_cloud(network)).unflatten(0, (6, 2, 8))
-    torch.testing.assert_close(chosen, drawn[:, 1, 5])
+        made = propose(problem, network, 4, torch.Generator().manual_seed(0), config)
+    assert len(made) == 4
+    assert [moves.points.shape[:2] for moves in network.offered] == [(6, 2)] * 2, "three placements of each of two, twice"
     cloud = problem.cloud(network.config.n_object, torch.Generator().manual_seed(0))
-    second = (expected[1::2] - cloud.mean(0)) @ (T[1::2, :3, :3] @ network.config.axes(HAND.palm_axes_wrist))
-    torch.testing.assert_close(torch.cat(placed[2:]), second, atol=1e-5, rtol=1e-4)
+    thin, chosen = problem.thinned(network.config.n_hand), []
+    for offered, decoded in zip(network.offered, network.decoded, strict=True):
+        # The network's axes, found from what it is shown of the object.
+        axes = torch.linalg.lstsq((cloud - cloud.mean(0)).expand(6, -1, -1), offered.obj).solution
+        points = offered.points @ axes.mT[:, None] + cloud.mean(0)
+        scores = choice_scores(thin, problem.field, points, config.choice.penalties).reshape(2, 6)
+        chosen += scores.argmax(1).tolist()
+        for row, best in enumerate(scores.argmax(1).tolist()):
+            torch.testing.assert_close(decoded.points[row, 0], offered.points[3 * row + best // 2, best % 2])
+            torch.testing.assert_close(decoded.z[row, 0], offered.z[3 * row + best // 2, best % 2])
+    assert len(set(chosen)) > 1
+    network.offered.clear()
+    with torch.no_grad():
+        propose(problem, network, 4, torch.Generator().manual_seed(0), replace(config, choice=ChoiceConfig.first()))
+    assert [moves.points.shape[:2] for moves in network.offered] == [(2, 1)] * 2
 
 
 def test_fingers_on_one_side_are_worse_than_fingers_around() -> None:
@@ -163,10 +163,3 @@ def test_less_than_one_draw_is_refused(wrong: dict[str, int]) -> None:
     (name, value), = wrong.items()
     with pytest.raises(OptionError, match=f"{name} is {value}; draw at least one"):
         ChoiceConfig(**wrong)
-
-
-def _after_cloud(network: DistanceNetwork) -> torch.Generator:
-    """The generator as `propose` leaves it to the draws of z, with placements and joints given."""
-    generator = torch.Generator().manual_seed(0)
-    SPHERE.sample_points(network.config.n_object, generator)
-    return generator

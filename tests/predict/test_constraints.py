@@ -19,7 +19,8 @@ from dro_grasp.optimization.palm_directions import LARGEST_TILT, angle_to_arc
 from dro_grasp.predict.admission import permitted
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.stages import optimise, refine
+from dro_grasp.predict.sources.optimiser import OptimiserSource
+from dro_grasp.predict.stages import refine
 from tests.helpers.loaded_hands import loaded_hand
 
 SOAP = load_object("soap")
@@ -46,7 +47,7 @@ def postures(grasps: GraspBatch, row: int) -> list[Tensor]:
 def test_a_low_object_on_a_table_is_grasped(name: str, direction: tuple[float, float, float]) -> None:
     hand = loaded_hand(name)
     problem = GraspProblem(hand, SOAP, constraints=Constraints(direction, TABLE))
-    found = refine(problem, optimise(problem, 8, seed=0).grasps)
+    found = refine(problem, OptimiserSource().propose(problem, 8, seed=0).grasps)
     kept = found[permitted(problem, found)]
     assert len(kept) >= 3
     off = angle_to_arc(hand.palm_directions(kept.T_object_wrist), torch.tensor(direction), torch.tensor([0.0, 0.0, 1.0]))
@@ -55,7 +56,7 @@ def test_a_low_object_on_a_table_is_grasped(name: str, direction: tuple[float, f
         lowest = min(shapes(hand, kept.T_object_wrist[row].float(), q)[:, 2].min() for q in postures(kept, row))
         assert lowest > TABLE - 0.002, "surface points are sparse, but not that sparse [m]"
     free = GraspProblem(hand, SOAP, constraints=Constraints(direction))
-    below = refine(free, optimise(free, 8, seed=0).grasps)
+    below = refine(free, OptimiserSource().propose(free, 8, seed=0).grasps)
     assert float(permitted(problem, below).float().mean()) < 0.2
 
 

@@ -2,30 +2,43 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
+from typing import Never
 
 import pytest
 import torch
 from torch import Tensor
 
-from dro_grasp.errors import OptionError
+from dro_grasp.errors import NoGraspError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.models.network import Moves
+from dro_grasp.hands.hand import Hand
+from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.palm_directions import Spread, wrist_rotations
-from dro_grasp.predict.admission import TURNED
-from dro_grasp.predict.config import GraspRequest, PredictorConfig
+from dro_grasp.optimization.synthesis import SynthesisConfig
+from dro_grasp.predict.admission import PLANE, TURNED, AdmissionConfig
+from dro_grasp.predict.config import GraspRequest, PredictorConfig, RescueConfig, RetryConfig
 from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.finish import FinishConfig
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.sources.network import _placements
-from dro_grasp.predict.stages import Optimised, optimise, scored
+from dro_grasp.predict.sources.choice import ChoiceConfig
+from dro_grasp.predict.sources.controls import palm_facing_starts
+from dro_grasp.predict.sources.network import ProposalConfig, _placements
+from dro_grasp.predict.sources.optimiser import OptimiserConfig, OptimiserSource
+from dro_grasp.predict.sources.source import Candidates, Progress, Source
+from dro_grasp.predict.stages import scored
 from tests.helpers.toy_hand import toy_hand
 from tests.helpers.weights import untrained_weights
 
 HAND = toy_hand()
+NOWHERE = FinishConfig(admission=AdmissionConfig(least_clearance=1.0))
+"""Above a table: no grasp keeps a metre off it."""
+QUICK = OptimiserConfig(synthesis=SynthesisConfig(steps=30))
+"""A quarter of the steps: worse grasps, made in the same way."""
 
 
 @pytest.fixture(scope="module")
@@ -70,20 +83,20 @@ def test_the_same_seed_gives_the_same_grasps(predictor: GraspPredictor, ball: Ob
 def test_grasps_do_not_depend_on_the_batch_size(
     weights: str, ball: ObjectModel, grasps: GraspBatch, batch_size: int
 ) -> None:
-    config = PredictorConfig(batch_size=batch_size, network_batch_size=batch_size)
+    config = PredictorConfig(network=ProposalConfig(batch_size=batch_size, network_batch_size=batch_size))
     other = GraspPredictor(weights, config=config).predict(HAND, ball, num=7, seed=3, candidates=1, source="network")
     for name in ("T_object_wrist", "joints", "pregrasp_joints", "squeeze_joints", "score"):
         torch.testing.assert_close(getattr(other, name), getattr(grasps, name), atol=1e-4, rtol=1e-4)
 
 
-def test_nothing_is_found_where_constraints_reject_everything(
-    weights: str, ball: ObjectModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("least_yield", [0.0, 0.2])
+def test_nothing_is_found_where_constraints_reject_everything(weights: str, ball: ObjectModel, least_yield: float) -> None:
     """Also with a share of zero, below which no share is."""
-    monkeypatch.setattr("dro_grasp.predict.finish.permitted", lambda problem, grasps: torch.zeros(len(grasps), dtype=torch.bool))
-    strict = GraspPredictor(weights, config=PredictorConfig(least_yield=0.0))
-    with pytest.raises(OptionError, match="only 0 of 2 candidates"):
+    strict = GraspPredictor(weights, config=PredictorConfig(finish=NOWHERE, retry=RetryConfig(least_yield=least_yield)))
+    with pytest.raises(NoGraspError, match=r"only 0 of 2 candidates .*2 were asked for.* lower table .* use the source 'auto'"):
         strict.predict(HAND, ball, num=2, candidates=1, source="network", table=-0.2)
+    with pytest.raises(OptionError, match="leaves nothing of the object"):
+        strict.predict(HAND, ball, num=3, table=0.05)
 
 
 def test_grasps_are_complete_valid_and_sorted(
@@ -107,8 +120,8 @@ def test_a_run_returns_how_the_grasps_were_made(predictor: GraspPredictor, ball:
     made = predictor.run(GraspProblem(HAND, ball), request, lambda done, wanted: steps.append((done, wanted)))
     assert steps == [(16, 20), (20, 20)]
     assert (len(made.grasps), made.candidates) == (10, 20)
-    assert set(made.seconds) == {"network", "choose", "decode", "optimise", "refine", "settle", "rank"}
-    assert {part for part, seconds in made.seconds.items() if seconds == 0} == {"choose", "optimise", "settle"}
+    assert set(made.seconds) == {"network", "choose", "decode", "optimiser", "refine", "settle", "rank"}
+    assert {part for part, seconds in made.seconds.items() if seconds == 0} == {"choose", "optimiser", "settle"}
     # Solved hands stay near the multilaterated points they were fitted to, row by row.
     hand = HAND.with_points(predictor.network.config.n_hand)
     for grasps in (made.proposed, made.grasps):
@@ -125,7 +138,7 @@ def test_no_grasp_cannot_be_asked_for(predictor: GraspPredictor, ball: ObjectMod
 
 
 def test_an_option_that_does_not_exist_is_named(predictor: GraspPredictor, ball: ObjectModel) -> None:
-    with pytest.raises(OptionError, match=r"no option 'tabel'; the options are direction, .*table.*candidates"):
+    with pytest.raises(TypeError, match="tabel"):
         predictor.predict(HAND, ball, num=1, tabel=0.1)
 
 
@@ -147,27 +160,30 @@ def test_of_several_candidates_the_best_are_kept(predictor: GraspPredictor, ball
 
 
 @pytest.mark.parametrize("temperature", [-0.1, math.nan, 3.0])
-def test_a_temperature_out_of_range_is_refused(weights: str, ball: ObjectModel, temperature: float) -> None:
+def test_a_temperature_out_of_range_is_refused(temperature: float) -> None:
     with pytest.raises(OptionError, match=f"temperature is {temperature}; give 0"):
-        GraspPredictor(weights, config=PredictorConfig(temperature=temperature)).predict(HAND, ball, num=1)
+        PredictorConfig(network=ProposalConfig(temperature=temperature))
+    with pytest.raises(OptionError, match=f"temperature is {temperature}; give 0"):
+        GraspRequest(temperature=temperature)
 
 
-def test_the_temperature_scales_what_z_is_made_of(weights: str, ball: ObjectModel, monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn: dict[object, Tensor] = {}
+def test_the_temperature_scales_what_z_is_made_of(weights: str, ball: ObjectModel) -> None:
+    """At 0 all draws are the same, so of one placement one grasp; a request's own temperature goes before the predictor's."""
     cloud = dataclasses.replace(ball, vertices=None, faces=None)
-    for temperature, obj in ((None, ball), (0.0, ball), (0.5, ball), (None, cloud)):
-        predictor = GraspPredictor(weights, config=PredictorConfig(temperature=temperature))
-        honest = predictor.network.move
 
-        def move(hand: Tensor, points: Tensor, noise: Tensor, at=(temperature, obj), honest=honest) -> Moves:
-            drawn[at] = noise
-            return honest(hand, points, noise)
+    def proposed(obj: ObjectModel, own: float | None, asked: float | None) -> Tensor:
+        config = PredictorConfig(network=ProposalConfig(temperature=own, choice=ChoiceConfig.first()))
+        source = GraspPredictor(weights, config=config).source("network", asked)
+        made = source.propose(GraspProblem(HAND, obj), 3, 5)
+        assert isinstance(made, Candidates)
+        return made.points
 
-        monkeypatch.setattr(predictor.network, "move", move)
-        predictor.predict(HAND, obj, num=3, seed=5, candidates=1, refine=False, source="network")
-    assert float(drawn[0.0, ball].abs().max()) == 0
-    torch.testing.assert_close(drawn[0.5, ball], 0.5 * drawn[None, ball])
-    torch.testing.assert_close(drawn[None, cloud], drawn[0.5, ball], msg="bare clouds get surer grasps")
+    cold, mild, plain = (proposed(ball, own, None) for own in (0.0, 0.5, None))
+    torch.testing.assert_close(proposed(ball, 0.3, 0.5), mild)
+    torch.testing.assert_close(proposed(ball, None, 1.0), plain)
+    torch.testing.assert_close(proposed(cloud, None, None), proposed(cloud, 0.5, None), msg="bare clouds get surer grasps")
+    off = [float((points - cold).norm(dim=-1).mean()) for points in (mild, plain)]
+    assert 0 < off[0] < off[1]
 
 
 @pytest.mark.parametrize("direction", [(0, 0, -1), (0.0, 0.0, -5.0), (0.0, 0.0, 1e-3), (1.0, 2.0, 2.0)])
@@ -187,25 +203,30 @@ def test_placements_face_the_direction_at_any_roll(
     assert bool((torch.histc(roll, 4, -math.pi, math.pi) > 70).all())
 
 
-def test_where_there_is_room_for_all_the_prior_chooses_above_a_table_too(
-    predictor: GraspPredictor, ball: ObjectModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    preferred: list[torch.Tensor] = []
-    network = predictor.network
+class Preferring(DistanceNetwork):
+    """Of the rotations that are offered, its prior prefers the last ones."""
 
-    def sample(opened, points, rotations, num, generator, shape):  # type: ignore[no-untyped-def]
+    preferred: Tensor
+
+    def sample_placements(
+        self, hand: Tensor, obj: Tensor, rotations: Tensor, num: int, generator: torch.Generator,
+        proportions: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
         assert len(rotations) >= 2 * num, "the prior has a choice"
-        preferred.append(rotations[-num:].flip(0))
-        return preferred[-1], torch.zeros(num, 3)
+        self.preferred = rotations[-num:].flip(0)
+        return self.preferred, torch.zeros(num, 3)
 
-    monkeypatch.setattr(network, "sample_placements", sample)
-    cloud = torch.from_numpy(ball.cloud)
+
+def test_where_there_is_room_for_all_the_prior_chooses_above_a_table_too(
+    predictor: GraspPredictor, ball: ObjectModel
+) -> None:
+    network, cloud = Preferring(predictor.network.config), torch.from_numpy(ball.cloud)
     for direction in ((0.0, 0.0, -1.0), None):
         problem = GraspProblem(HAND, ball, constraints=Constraints(table=-3.0, direction=direction))
-        T = _placements(problem, HAND, network, cloud, 6, 1, predictor.config, torch.Generator().manual_seed(0))
+        T = _placements(problem, HAND, network, cloud, 6, 1, ProposalConfig(), torch.Generator().manual_seed(0))
         assert T.shape == (6, 1, 4, 4)
     turns = (T[..., :3, :3] @ network.config.axes(HAND.palm_axes_wrist)).flatten(0, 1)
-    torch.testing.assert_close(turns, preferred[-1][:6], atol=1e-5, rtol=0)
+    torch.testing.assert_close(turns, network.preferred[:6], atol=1e-5, rtol=0)
 
 
 def test_hands_stay_above_the_table(predictor: GraspPredictor, ball: ObjectModel) -> None:
@@ -219,29 +240,83 @@ def test_hands_stay_above_the_table(predictor: GraspPredictor, ball: ObjectModel
         assert min(lowest_point(joints, T) for joints in (q, p, s)) > table - 1e-6
 
 
-def test_what_was_found_is_returned_with_a_warning(
-    predictor: GraspPredictor, ball: ObjectModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def first_of_each_batch(problem: GraspProblem, grasps: GraspBatch) -> Tensor:
-        return torch.arange(len(grasps)) == 0
+class Listed(Source):
+    """Proposes what it is given, one list after the other."""
 
-    monkeypatch.setattr("dro_grasp.predict.finish.permitted", first_of_each_batch)
-    with pytest.warns(UserWarning, match=r"only 1 of 6 candidates on object 'sphere' .* 6 were .* lower table \(now -0.1 m"):
-        found = predictor.predict(HAND, ball, num=6, table=-0.1, candidates=1, source="network")
-    assert len(found) == 1
+    def __init__(self, *answers: GraspBatch, name: str = "listed") -> None:
+        self.name, self.answers, self.asked_for = name, answers, list[tuple[int, int]]()
+
+    def propose(self, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None) -> GraspBatch:
+        self.asked_for.append((num, seed))
+        return self.answers[min(len(self.asked_for), len(self.answers)) - 1]
 
 
-def test_an_impossible_table_is_told(predictor: GraspPredictor, ball: ObjectModel, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dro_grasp.predict.finish.permitted", lambda problem, grasps: torch.zeros(len(grasps), dtype=torch.bool))
-    with pytest.raises(OptionError, match=r"only 0 of 3 .* 3 were asked for.* lower table .* use the method 'auto'"):
-        predictor.predict(
-            HAND, ball, num=3, direction=(0.0, 0.0, -1.0), table=-0.04, candidates=1, source="network")
-    with pytest.raises(OptionError, match="leaves nothing of the object"):
-        predictor.predict(HAND, ball, num=3, table=0.05)
+def some(ball: ObjectModel, count: int, seed: int = 0) -> GraspBatch:
+    return palm_facing_starts(HAND, ball, count, seed)
+
+
+def lifted(grasps: GraspBatch, height: float) -> GraspBatch:
+    T = grasps.T_object_wrist.clone()
+    T[:, 2, 3] += height
+    return grasps.replace(T_object_wrist=T)
+
+
+def test_what_was_found_is_returned_with_a_warning(weights: str, ball: ObjectModel) -> None:
+    """Of each answer one candidate is far above the table, and the rest far below."""
+    plain = GraspPredictor(weights, config=PredictorConfig(finish=FinishConfig.nothing(), retry=RetryConfig(least_yield=0.0)))
+    answers = [GraspBatch.concatenate([lifted(part[:1], 1.0), lifted(part[1:], -1.0)])
+               for part in (some(ball, 6, seed) for seed in range(4))]
+    source = Listed(*answers)
+    with pytest.warns(UserWarning, match=r"only 4 of 24 candidates on object 'sphere' .*20 in the table.* 6 were .* "
+                                         r"lower table \(now -0.1 m"):
+        found = plain.predict(HAND, ball, num=6, seed=3, table=-0.1, candidates=1, source=source)
+    assert (len(found), found.asked) == (4, 6)
+    assert [num for num, _ in source.asked_for] == [6, 6, 6, 6], "as many as the share suggests, but never more than at first"
+    assert source.asked_for[0][1] == 3
+    assert len({seed for _, seed in source.asked_for}) == 4
+
+
+def test_a_source_is_asked_again_for_what_was_rejected(weights: str, ball: ObjectModel) -> None:
+    half = GraspBatch.concatenate([lifted(some(ball, 6, 0), 1.0), lifted(some(ball, 2, 1), -1.0)])
+    for retry, counts in ((RetryConfig(), [8, 4]), (RetryConfig(reserve=3.0), [8, 8]), (RetryConfig(rounds=1), [8]),
+                          (RetryConfig(least_yield=0.75), [8])):
+        predictor = GraspPredictor(weights, config=PredictorConfig(finish=FinishConfig.nothing(), retry=retry))
+        source, problem = Listed(half, lifted(some(ball, 4, 2), 1.0)), GraspProblem(HAND, ball, constraints=Constraints(table=-0.1))
+        made = predictor.run(problem, GraspRequest(2, source=source))
+        assert [num for num, _ in source.asked_for] == counts
+        assert made.dropped == {PLANE: 2}
+        assert (len(made.grasps), made.origin) == (2, ["listed"] * 2)
+
+
+def test_a_source_that_has_no_more_does_not_return_the_same_grasp_twice(weights: str, ball: ObjectModel) -> None:
+    predictor = GraspPredictor(weights, config=PredictorConfig(finish=FinishConfig.nothing()))
+    source = Listed(some(ball, 3))
+    made = predictor.run(GraspProblem(HAND, ball), GraspRequest(5, source=source))
+    assert (len(made.grasps), made.candidates, made.grasps.asked) == (3, 3, 5)
+    assert len({tuple(row) for row in made.grasps.T_object_wrist.flatten(1).tolist()}) == 3
+    assert made.shortage is not None
+
+
+def test_a_source_that_proposes_nothing_is_told(weights: str, ball: ObjectModel) -> None:
+    for config in (FinishConfig(), FinishConfig.nothing()):
+        with pytest.raises(NoGraspError, match="only 0 of 0 candidates"):
+            GraspPredictor(weights, config=PredictorConfig(finish=config)).predict(
+                HAND, ball, num=2, source=Listed(some(ball, 1)[:0]))
+
+
+def test_a_source_that_does_not_know_the_hand_is_not_asked(weights: str, ball: ObjectModel) -> None:
+    class Choosy(Listed):
+        def knows(self, hand: Hand) -> bool:
+            return hand.name != HAND.name
+
+    source = Choosy(some(ball, 3), name="choosy")
+    with pytest.raises(OptionError, match="source 'choosy' does not know hand 'toy'"):
+        GraspPredictor(weights).predict(HAND, ball, source=source)
+    assert not source.asked_for
 
 
 def test_a_bare_cloud_is_grasped(weights: str, ball: ObjectModel) -> None:
-    predictor = GraspPredictor(weights, config=PredictorConfig(temperature=1.0))
+    predictor = GraspPredictor(weights, config=PredictorConfig(network=ProposalConfig(temperature=1.0)))
     cloud = dataclasses.replace(ball, vertices=None, faces=None)
     made = predictor.predict(HAND, cloud, num=7, seed=3, candidates=1, source="network")
     assert bool(made.score.isfinite().all())
@@ -275,73 +350,100 @@ def test_prediction_runs_wholly_on_the_device_it_is_told(
         torch.testing.assert_close(getattr(there, name), getattr(grasps, name), atol=1e-4, rtol=1e-4)
 
 
+def rescuing(predictor: GraspPredictor, scores: tuple[float, ...], per_grasp: int) -> GraspPredictor:
+    """The predictor with other rounds of a quick optimiser."""
+    other = copy.copy(predictor)
+    other.config = PredictorConfig(optimiser=QUICK, rescue=RescueConfig(scores, per_grasp))
+    return other
+
+
 def test_auto_lets_the_optimiser_help_only_where_the_score_distrusts_the_network(
-    predictor: GraspPredictor, ball: ObjectModel, quick_synthesis: None, monkeypatch: pytest.MonkeyPatch
+    predictor: GraspPredictor, ball: ObjectModel
 ) -> None:
-    monkeypatch.setattr("dro_grasp.predict.predictor.OPTIMISED_PER_GRASP", 3)
     problem, alone = GraspProblem(HAND, ball), GraspRequest(4, seed=1, candidates=2, source="network")
-    network = predictor.run(problem, alone)
+    auto, network = dataclasses.replace(alone, source="auto"), predictor.run(problem, alone)
     assert network.origin == ["network"] * 4
     trusted = sorted(network.grasps.score.tolist())[1]  # three of the four best are above it
-    monkeypatch.setattr("dro_grasp.predict.predictor.TRUSTED_SCORES", (trusted - 1e-6, -math.inf))
-    helped = predictor.run(problem, dataclasses.replace(alone, source="auto"))
+    helped = rescuing(predictor, (trusted - 1e-6, -math.inf), 3).run(problem, auto)
     assert helped.candidates == network.candidates + 3
     assert float(helped.grasps.score.min()) >= float(network.grasps.score.min())
-    monkeypatch.setattr("dro_grasp.predict.predictor.TRUSTED_SCORES", (trusted - 1e-6, math.inf, math.inf))
-    again = predictor.run(problem, dataclasses.replace(alone, source="auto"))
+    again = rescuing(predictor, (trusted - 1e-6, math.inf, math.inf), 3).run(problem, auto)
     assert again.candidates == helped.candidates + 2 * 4 * 3, "two rounds more, for all four"
     assert bool((again.grasps.score >= helped.grasps.score).all())
-    monkeypatch.setattr("dro_grasp.predict.predictor.TRUSTED_SCORES", (-math.inf, math.inf))
-    assert predictor.run(problem, dataclasses.replace(alone, source="auto")).candidates == network.candidates
+    assert rescuing(predictor, (-math.inf, math.inf), 3).run(problem, auto).candidates == network.candidates
 
 
-def test_seeds_next_to_each_other_share_no_round_of_the_optimiser(
-    predictor: GraspPredictor, ball: ObjectModel, quick_synthesis: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("dro_grasp.predict.predictor.TRUSTED_SCORES", (math.inf,) * 3)
-    monkeypatch.setattr("dro_grasp.predict.predictor.OPTIMISED_PER_GRASP", 2)
-    seeds: list[int] = []
+class Noting(OptimiserSource):
+    """The optimiser, which notes what it is asked for."""
 
-    def counted(problem: GraspProblem, num: int, seed: int, *rest: object) -> Optimised:
-        seeds.append(seed)
-        return optimise(problem, num, seed)
+    def __init__(self) -> None:
+        super().__init__(QUICK)
+        self.asked_for: list[tuple[int, int]] = []
 
-    monkeypatch.setattr("dro_grasp.predict.predictor.optimise", counted)
+    def propose(self, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None) -> Candidates:
+        self.asked_for.append((num, seed))
+        return super().propose(problem, num, seed, progress)
+
+
+def test_seeds_next_to_each_other_share_no_round_of_the_optimiser(predictor: GraspPredictor, ball: ObjectModel) -> None:
+    asked, source = rescuing(predictor, (math.inf,) * 3, 2), Noting()
     for first in (0, 1, 2, 2**63 - 1):
-        predictor.run(GraspProblem(HAND, ball), GraspRequest(2, seed=first, source="optimiser"))
-    assert len(set(seeds)) == len(seeds) == 4 * 3
+        asked.run(GraspProblem(HAND, ball), GraspRequest(2, seed=first, source=source))
+    assert {num for num, _ in source.asked_for} == {4}
+    assert len({seed for _, seed in source.asked_for}) == 4 * 3
 
 
-def test_candidates_that_turn_away_as_they_are_made_are_counted(
-    predictor: GraspPredictor, ball: ObjectModel, quick_synthesis: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("dro_grasp.predict.predictor.OPTIMISED_PER_GRASP", 4)
-    monkeypatch.setattr("dro_grasp.predict.predictor.TRUSTED_SCORES", (math.inf,))
-    monkeypatch.setattr("dro_grasp.predict.stages.facing", lambda problem, grasps: torch.arange(len(grasps)) < 3)
+def test_in_surroundings_fewer_rivals_are_made(predictor: GraspPredictor, ball: ObjectModel) -> None:
+    asked, source = copy.copy(predictor), Noting()
+    rescue = RescueConfig((math.inf,), 3, trusted_in_surroundings=(math.inf, math.inf), per_grasp_in_surroundings=1)
+    asked.config = PredictorConfig(finish=FinishConfig.nothing(), rescue=rescue)
+    for table in (None, -0.1):
+        problem = GraspProblem(HAND, ball, constraints=Constraints(table=table))
+        asked.run(problem, GraspRequest(2, source=source))
+    assert [num for num, _ in source.asked_for] == [6, 2, 2]
+
+
+def test_candidates_that_turn_away_as_they_are_made_are_counted(predictor: GraspPredictor, ball: ObjectModel) -> None:
+    """By a direction of palms that none of them keeps to a thousandth of a degree, and by one that all do."""
     problem = GraspProblem(HAND, ball, constraints=Constraints(direction=(0.0, 0.0, -1.0)))
-    made = predictor.run(problem, GraspRequest(2, seed=1, source="optimiser"))
-    assert (made.candidates, made.dropped[TURNED]) == (8, 5)
+    for farthest, turned in ((1e-5, 8), (math.pi, 0)):
+        source = OptimiserSource(dataclasses.replace(QUICK, starts_per_candidate=1, farthest_direction=farthest))
+        made = source.propose(problem, 8, 1)
+        assert (len(made), made.turned) == (8 - turned, turned)
+    few = OptimiserSource(dataclasses.replace(QUICK, starts_per_candidate=1, farthest_direction=1e-5))
+    with pytest.raises(NoGraspError, match=rf"only 0 of 8 candidates .*8 {TURNED}"):
+        rescuing(predictor, (math.inf,), 4).run(problem, GraspRequest(2, seed=1, source=few))
 
 
-def test_the_optimiser_alone_asks_no_network(
-    predictor: GraspPredictor, ball: ObjectModel, quick_synthesis: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("dro_grasp.predict.predictor.OPTIMISED_PER_GRASP", 4)
-    monkeypatch.setattr(predictor.network, "move", None)
+class Deaf(DistanceNetwork):
+    """Never asked."""
+
+    def move(self, *_: object) -> Never:
+        raise AssertionError("the network was asked")
+
+
+def test_the_optimiser_alone_asks_no_network(predictor: GraspPredictor, ball: ObjectModel) -> None:
+    alone = rescuing(predictor, (math.inf, math.inf), 4)
+    alone.network = Deaf(predictor.network.config)
+    with pytest.raises(AssertionError, match="the network was asked"):
+        alone.predict(HAND, ball, 1, source="network")
     cloud = dataclasses.replace(ball, vertices=None, faces=None)
     direction = torch.tensor([0.0, 0.6, -0.8])
     for obj in (ball, cloud):
         constraints = Constraints(direction=tuple(direction.tolist()))
         problem = GraspProblem(HAND, obj, constraints=constraints)
-        made = predictor.run(problem, GraspRequest(2, seed=1, source="optimiser"))
+        made = alone.run(problem, GraspRequest(2, seed=1, source="optimiser"))
         assert made.origin == ["optimiser"] * 2
         assert made.candidates == 16, "of two rounds; those that the descent turned away count, too"
-        assert made.seconds["optimise"] > 0 == made.seconds["network"]
+        assert made.seconds["optimiser"] > 0 == made.seconds["network"]
         angles = torch.rad2deg(torch.acos(HAND.palm_directions(made.proposed.T_object_wrist) @ direction))
         assert float(angles.max()) < 20
         solved = HAND.with_points(predictor.network.config.n_hand).points(made.proposed.joints, made.proposed.T_object_wrist)
         torch.testing.assert_close(made.points, solved)
-    request = GraspRequest()
-    object.__setattr__(request, "method", "magic")  # past the type checker of the tests
-    with pytest.raises(OptionError, match="method is 'magic'; choose auto, network, optimise"):
-        request.__post_init__()
+
+
+def test_what_is_no_source_is_refused_before_any_work() -> None:
+    with pytest.raises(OptionError, match="there is no source 'magic'; choose auto, network, optimiser, dfc, start"):
+        GraspRequest(source="magic")
+    with pytest.warns(FutureWarning, match="source 'optimise' is called 'optimiser' now"):
+        assert GraspRequest(source="optimise").source == "optimiser"
