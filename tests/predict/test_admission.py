@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from functools import cache
+from itertools import pairwise
 
 import igl
 import numpy as np
@@ -243,7 +244,7 @@ def test_how_much_a_grasp_may_miss_is_configured(free: GraspBatch) -> None:
     around = GraspProblem(HAND, MUG, constraints=Constraints(hold=((0.0, 0.0, 0.0, 1.0),)))
     enough = [permitted(around, free, AdmissionConfig(fewest_fingers=count)) for count in (0, 1, 2, 3)]
     assert bool(enough[0].all())
-    assert all(bool((more <= fewer).all()) for fewer, more in zip(enough, enough[1:], strict=False))
+    assert all(bool((more <= fewer).all()) for fewer, more in pairwise(enough))
     assert not permitted(around, free, AdmissionConfig(reach=-1.0)).any(), "no finger is as near as that"
 
 

@@ -281,7 +281,8 @@ def test_a_source_is_asked_again_for_what_was_rejected(weights: str, ball: Objec
     for retry, counts in ((RetryConfig(), [8, 4]), (RetryConfig(reserve=3.0), [8, 8]), (RetryConfig(rounds=1), [8]),
                           (RetryConfig(least_yield=0.75), [8])):
         predictor = GraspPredictor(weights, config=PredictorConfig(finish=FinishConfig.nothing(), retry=retry))
-        source, problem = Listed(half, lifted(some(ball, 4, 2), 1.0)), GraspProblem(HAND, ball, constraints=Constraints(table=-0.1))
+        source = Listed(half, lifted(some(ball, 4, 2), 1.0))
+        problem = GraspProblem(HAND, ball, constraints=Constraints(table=-0.1))
         made = predictor.run(problem, GraspRequest(2, source=source))
         assert [num for num, _ in source.asked_for] == counts
         assert made.dropped == {PLANE: 2}

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,18 +13,17 @@ from dro_grasp.energy.grasp_energy import EnergyConfig
 from dro_grasp.errors import ObjectError
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.finger_easing import lacking_room
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
 from dro_grasp.perception.partial_views import partial_view
-from dro_grasp.predict import settling
+from dro_grasp.predict.admission import permitted
+from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.settling import ROOM_WORTH, UNHELD_SCORE, Settled, best_settled, can_settle, settled
+from dro_grasp.predict.settling import SettleConfig, Settled, can_settle, settle_best, settled
 from dro_grasp.predict.stages import evaluate, refine, scored
-from dro_grasp.simulation.closed_poses import hand_shift
-from dro_grasp.simulation.holding import Holding, holding
+from dro_grasp.simulation.closed_poses import hand_shift, settle
+from dro_grasp.simulation.contacts import deepest_penetration
 from dro_grasp.simulation.outcome import Failure
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.loaded_hands import loaded_hand
@@ -36,45 +37,71 @@ def grasps() -> GraspBatch:
     return refine(PROBLEM, synthesize(HAND, CAN, 5, 0, SynthesisConfig(batch_size=6, steps=20)))
 
 
+@pytest.fixture(scope="module")
+def many() -> GraspBatch:
+    return refine(PROBLEM, synthesize(HAND, CAN, 24, 1, SynthesisConfig(batch_size=24, steps=20)))
+
+
+@pytest.fixture(scope="module")
+def outcome(many: GraspBatch) -> Settled:
+    return settled(PROBLEM, many)
+
+
 def shifted(grasps: GraspBatch, distances: list[float]) -> GraspBatch:
     T = grasps.T_object_wrist.clone()
     T[:, 2, 3] += torch.tensor(distances)
     return grasps.without("pregrasp_joints", "squeeze_joints").replace(T_object_wrist=T)
 
 
-@pytest.mark.parametrize("deep", [0.0, 0.006])
-def test_still_grasps_squeeze_anew_others_are_refined_and_what_then_moves_or_is_deep_stays_as_it_was(
-    grasps: GraspBatch, monkeypatch: pytest.MonkeyPatch, deep: float
+def test_what_closing_does_to_the_object_decides_what_becomes_of_a_grasp(many: GraspBatch, outcome: Settled) -> None:
+    """Simulated: a grasp of the can that leaves it where it is, one that pushes it away a little, and those that lose it."""
+    closed = settle(HAND, CAN, many)
+    moved = hand_shift(HAND, many, closed)
+    still, lost = moved < 0.004, moved > 0.06
+    pushed = (moved > 0.0055) & (moved < 0.03)
+    assert min(int(rows.sum()) for rows in (still, pushed, lost)) > 0
+    found, held, state = outcome
+    assert bool(held[still].all()), "with this can they are not deep either"
+    torch.testing.assert_close(found.T_object_wrist[still], closed.T_object_wrist[still])
+    torch.testing.assert_close(found.joints[still], closed.joints[still])
+    assert (found.squeeze_joints[still] - many.squeeze_joints[still]).abs().amax(1).min() > 1e-4, "it squeezes anew"
+    assert bool(held[pushed].any())
+    again = refine(PROBLEM, closed[pushed & held])
+    for name in ("T_object_wrist", "joints", "pregrasp_joints", "squeeze_joints"):
+        torch.testing.assert_close(getattr(found, name)[pushed & held], getattr(again, name))
+        assert torch.equal(getattr(found, name)[~held], getattr(many, name)[~held]), "as it was"
+    assert not held[lost].any()
+    assert len(state.shift) == int(held.sum())
+    assert float(state.shift.max()) < 0.02
+
+
+@pytest.mark.parametrize("quantity", ["shift", "turn", "depth"])
+def test_what_moves_turns_or_penetrates_more_than_the_limit_stays_as_it_was(
+    many: GraspBatch, outcome: Settled, quantity: str
 ) -> None:
-    moved, seen = [0.001, 0.01, 0.002, 0.01, 0.3], []
+    found, held, state = outcome
+    rows = held.nonzero()[:, 0]
+    values = deepest_penetration(HAND, CAN, found[held]) if quantity == "depth" else getattr(state, quantity)
+    limit = float(values.sort().values[[0, -1]].mean())
+    field = {"shift": "farthest", "turn": "largest_turn", "depth": "deepest"}[quantity]
+    fewer = settled(PROBLEM, many, SettleConfig(**{field: limit}))
+    passed = rows[values < limit]
+    assert 0 < len(passed) < len(rows)
+    assert fewer.held.nonzero()[:, 0].tolist() == passed.tolist()
+    dropped = rows[values >= limit]
+    assert torch.equal(fewer.grasps.T_object_wrist[dropped], many.T_object_wrist[dropped])
+    torch.testing.assert_close(fewer.holding.shift, state.shift[values < limit])
 
-    def state(shift: list[float], turn: list[float]) -> Holding:
-        n = len(shift)
-        return Holding(torch.tensor(shift), torch.tensor(turn), *(torch.arange(float(n)) for _ in range(6)),
-                       unanswered=torch.zeros(n, 2))
 
-    def close_again(hand: Hand, obj: ObjectModel, some: GraspBatch) -> Holding:
-        seen.append(some)
-        return state([0.001, 0.03, 0.0, 0.0], [0.0, 0.0, 0.6, 0.1])
-
-    monkeypatch.setattr(settling, "settle", lambda hand, obj, some: shifted(some, moved))
-    monkeypatch.setattr(settling, "holding", close_again)
-    depths = torch.tensor([deep, 0.0, 0.0, 0.004])
-    monkeypatch.setattr(settling, "deepest_penetration", lambda hand, obj, some: depths[:len(some)])
-    found, held, kept = settled(PROBLEM, grasps)
-    assert held.tolist() == [not deep, False, False, True, False]
-    assert kept.speed.tolist() == ([3.0] if deep else [0.0, 3.0])
-    T = grasps.T_object_wrist
-    if deep:
-        torch.testing.assert_close(found.T_object_wrist[0], T[0])
-        return
-    assert float(found.T_object_wrist[0, 2, 3] - T[0, 2, 3]) == pytest.approx(0.001, abs=1e-6)
-    assert (found.squeeze_joints[0] - grasps.squeeze_joints[0]).abs().max() > 1e-4
-    expected = refine(PROBLEM, shifted(grasps, moved)[[1, 3]])
-    torch.testing.assert_close(seen[0].T_object_wrist[[1, 3]], expected.T_object_wrist)
-    for name in ("T_object_wrist", "joints", "squeeze_joints"):
-        torch.testing.assert_close(getattr(found, name)[3], getattr(expected, name)[1])
-        torch.testing.assert_close(getattr(found, name)[[1, 2, 4]], getattr(grasps, name)[[1, 2, 4]])
+def test_limits_say_what_is_still_and_what_is_lost(many: GraspBatch) -> None:
+    moved = hand_shift(HAND, many, settle(HAND, CAN, many))
+    none = settled(PROBLEM, many, SettleConfig(lost=0.0))
+    assert not none.held.any()
+    assert torch.equal(none.grasps.T_object_wrist, many.T_object_wrist)
+    refined = settled(PROBLEM, many, SettleConfig(still=0.0))
+    quiet = (moved < 0.005) & refined.held
+    assert bool(quiet.any())
+    assert not torch.allclose(refined.grasps.joints[quiet], settled(PROBLEM, many).grasps.joints[quiet]), "refined as well"
 
 
 def test_a_hand_has_moved_as_far_as_its_grasp_centre(grasps: GraspBatch) -> None:
@@ -83,42 +110,54 @@ def test_a_hand_has_moved_as_far_as_its_grasp_centre(grasps: GraspBatch) -> None
     torch.testing.assert_close(found, torch.tensor(distances), atol=1e-6, rtol=0)
 
 
-def test_settled_grasps_hardly_push_the_object_away(grasps: GraspBatch) -> None:
-    many = refine(PROBLEM, synthesize(HAND, CAN, 24, 1, SynthesisConfig(batch_size=24, steps=20)))
-    found, held, _ = settled(PROBLEM, many)
+def test_settled_grasps_hardly_push_the_object_away(many: GraspBatch, outcome: Settled) -> None:
+    found, held, _ = outcome
     before, after = (simulate(HAND, CAN, g, "strict") for g in (many, found[held]))
     assert before.failure.count(Failure.PUSHED_AWAY) > 2
     assert after.failure.count(Failure.PUSHED_AWAY) <= 1
 
 
-def test_only_the_better_half_is_settled_and_what_is_not_held_scores_low(
-    grasps: GraspBatch, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def none_held(problem: GraspProblem, some: GraspBatch) -> Settled:
-        return Settled(some.without("score"), torch.zeros(len(some), dtype=torch.bool), holding(HAND, CAN, some[:0]))
-
-    monkeypatch.setattr(settling, "settled", none_held)
+def test_only_the_better_share_is_settled_and_what_is_not_held_scores_low(grasps: GraspBatch) -> None:
+    never = SettleConfig(deepest=-1.0)  # every hand is deeper
     known = scored(PROBLEM, grasps).replace(score=torch.tensor([0.0, 3.0, 1.0, 2.0, -1.0]))
-    rows, found = best_settled(PROBLEM, known, 1)
+    rows, found = settle_best(PROBLEM, known, 1, never)
     assert rows.tolist() == [1, 3]
-    assert found.score.amax() <= UNHELD_SCORE
+    assert found.score.amax() <= never.unstable_score
     torch.testing.assert_close(found.T_object_wrist, known.T_object_wrist[[1, 3]])
-    assert len(best_settled(PROBLEM, known, 4)[0]) == 4
-    assert len(best_settled(PROBLEM, known, 9)[0]) == 5
+    for share, least, count in ((0.5, 4, 4), (0.5, 9, 5), (0.2, 0, 1), (1.0, 0, 5)):
+        assert len(settle_best(PROBLEM, known, least, replace(never, share=share))[0]) == count
+    lower = settle_best(PROBLEM, known, 5, replace(never, unstable_score=-9.0))[1]
+    assert lower.score.amax() <= -9.0
 
 
-def test_a_grasp_scores_lower_for_room_that_it_lacks_beside_what_was_not_seen(
-    grasps: GraspBatch, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_ends_where_constraints_forbid_stays_as_it_was_and_scores_low(many: GraspBatch, outcome: Settled) -> None:
+    """A ball to spare where one of the wrists is."""
+    known = scored(PROBLEM, many)
+    _, free = settle_best(PROBLEM, known, 24)
+    ball = (*many.T_object_wrist[outcome.held][0, :3, 3].tolist(), 0.01)
+    forbidden = GraspProblem(HAND, CAN, constraints=Constraints(spare=(ball,)))
+    rows, found = settle_best(forbidden, known, 24)
+    assert rows.tolist() == list(range(24))
+    barred = ~permitted(forbidden, settled(forbidden, known).grasps)
+    assert bool((barred & outcome.held).any())
+    assert float(found.score[barred].max()) <= SettleConfig().unstable_score
+    assert torch.equal(found.T_object_wrist[barred], many.T_object_wrist[barred])
+    assert float(free.score[barred & outcome.held].max()) > SettleConfig().unstable_score
+
+
+def test_a_grasp_scores_lower_for_room_that_it_lacks_beside_what_was_not_seen(grasps: GraspBatch) -> None:
     cloud = partial_view(CAN, "cloud", 0)
     half = dataclasses.replace(cloud, seen=cloud.cloud[cloud.cloud[:, 0] > 0])
-    monkeypatch.setattr(settling, "settle", lambda hand, obj, some: shifted(some, [0.0] * len(some)))
-    (_, whole), (_, guessed) = (best_settled(p, scored(p, grasps), 5) for p in (GraspProblem(HAND, o) for o in (cloud, half)))
+    stays = SettleConfig(lost=0.0, unstable_score=math.inf)
+    (_, whole), (_, guessed) = (
+        settle_best(p, scored(p, grasps), 5, stays) for p in (GraspProblem(HAND, o) for o in (cloud, half)))
     torch.testing.assert_close(whole.joints, guessed.joints)
     problem = GraspProblem(HAND, half)
     lacking = lacking_room(problem.energy(EnergyConfig()), guessed, half.seen)
     assert float(lacking.max()) > 0.002
-    torch.testing.assert_close(whole.score - guessed.score, ROOM_WORTH * lacking)
+    torch.testing.assert_close(whole.score - guessed.score, stays.room_worth * lacking)
+    _, dear = settle_best(problem, scored(problem, grasps), 5, replace(stays, room_worth=200.0))
+    torch.testing.assert_close(whole.score - dear.score, 200.0 * lacking)
 
 
 def test_a_hand_without_description_cannot_settle() -> None:

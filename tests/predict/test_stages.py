@@ -14,10 +14,11 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize, synthesize_with
 from dro_grasp.perception.partial_views import partial_view
-from dro_grasp.predict import stages
+from dro_grasp.predict.admission import AdmissionConfig, permitted
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.stages import complete, eased, evaluate, optimise, rank, refine, scored
+from dro_grasp.predict.sources.optimiser import OptimiserConfig, OptimiserSource
+from dro_grasp.predict.stages import complete, ease, evaluate, rank, refine, scored
 from dro_grasp.predict.stopwatch import Stopwatch
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.toy_hand import toy_hand
@@ -62,34 +63,46 @@ def test_stages_return_new_grasps_and_leave_the_given_ones(grasps: GraspBatch) -
 
 def test_fingers_leave_room_on_a_bare_cloud_where_the_constraints_let_them(grasps: GraspBatch) -> None:
     whole = complete(PROBLEM, grasps)
-    assert eased(PROBLEM, whole) is whole, "a mesh is known"
+    assert ease(PROBLEM, whole) is whole, "a mesh is known"
     cloud = GraspProblem(HAND, partial_view(CAN, "cloud", 0))
     given = whole.replace(score=torch.arange(6.0))
-    apart = eased(cloud, given)
+    apart = ease(cloud, given)
     for name in ("T_object_wrist", "pregrasp_joints", "squeeze_joints", "score"):
         assert torch.equal(getattr(apart, name), getattr(given, name))
     clear = [CAN.distance_field.distances(HAND.points(g.joints, g.T_object_wrist))[0].amin(-1) for g in (given, apart)]
     assert float((clear[1] - clear[0]).max()) > 0.002
     assert float((clear[1] - clear[0]).min()) > -1e-4
     below = GraspProblem(HAND, cloud.obj, constraints=Constraints(cone=0.01, direction=(0.0, 0.0, 1.0)))
-    assert torch.equal(eased(below, given).joints, given.joints), "none of these grasps is permitted"
+    assert torch.equal(ease(below, given).joints, given.joints), "none of these grasps is permitted"
 
 
-def test_where_the_wider_room_is_forbidden_fingers_leave_that_of_a_surface_that_was_seen(
-    grasps: GraspBatch, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_where_the_wider_room_is_forbidden_fingers_leave_that_of_a_surface_that_was_seen(grasps: GraspBatch) -> None:
+    """Forbidden by a place to hold that all fingers have to be near to, farther off than the narrow room and nearer than the
+    wide one."""
     whole = partial_view(PROBLEM.obj, "cloud", 0)
-    plain, half = (GraspProblem(PROBLEM.hand, o) for o in (whole, replace(whole, seen=whole.cloud[whole.cloud[:, 0] > 0])))
+    seen = replace(whole, seen=whole.cloud[whole.cloud[:, 0] > 0])
+    everywhere = Constraints(hold=((0.0, 0.0, 0.0, 1.0),))
+    plain, half = (GraspProblem(HAND, o, constraints=everywhere) for o in (whole, seen))
     given = complete(plain, grasps)
-    narrow, wide = eased(plain, given).joints, eased(half, given).joints
-    other = (narrow != wide).any(1)
-    assert bool(other.any())
+    free = AdmissionConfig(fewest_fingers=0)
+    narrow, wide = (ease(problem, given, None, free) for problem in (plain, half))
+    gaps = [farthest_finger(plain, eased) for eased in (narrow, wide)]
+    row = int((gaps[1] - gaps[0]).argmax())
+    assert float(gaps[1][row] - gaps[0][row]) > 0.001
+    near = AdmissionConfig(fewest_fingers=3, reach=float(gaps[0][row] + gaps[1][row]) / 2)
+    one = slice(row, row + 1)
+    assert permitted(half, narrow[one], near).all()
+    assert not permitted(half, wide[one], near).any()
+    torch.testing.assert_close(ease(half, given[one], None, near).joints, narrow.joints[one])
+    nowhere = replace(near, reach=-1.0)
+    assert torch.equal(ease(half, given[one], None, nowhere).joints, given.joints[one])
 
-    def all_but_the_wide(problem: GraspProblem, some: GraspBatch) -> torch.Tensor:
-        return torch.tensor([not any(torch.equal(row, w) for w in wide[other]) for row in some.joints])
 
-    monkeypatch.setattr(stages, "permitted", all_but_the_wide)
-    torch.testing.assert_close(eased(half, given).joints, torch.where(other[:, None], narrow, wide))
+def farthest_finger(problem: GraspProblem, grasps: GraspBatch) -> torch.Tensor:
+    """Distance of the finger that is farthest from the object [m]."""
+    distance, finger = (problem.field.distances(HAND.points(grasps.joints, grasps.T_object_wrist))[0],
+                        HAND.finger_of_link[HAND.link_index])
+    return torch.stack([distance[:, finger == index].amin(-1) for index in range(len(HAND.fingers))]).amax(0)
 
 
 def test_a_stopwatch_adds_up_and_lists_what_never_ran() -> None:
@@ -101,10 +114,10 @@ def test_a_stopwatch_adds_up_and_lists_what_never_ran() -> None:
     assert watch.seconds["slept"] >= 0.02
 
 
-def test_optimised_candidates_are_those_of_lowest_energy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dro_grasp.predict.stages.STARTS_PER_CANDIDATE", 2)
+def test_optimised_candidates_are_those_of_lowest_energy() -> None:
     free = synthesize_with(GraspProblem(HAND, CAN).energy(SynthesisConfig().energy), CAN, 6, 0, SynthesisConfig())
-    kept, turned = optimise(GraspProblem(HAND, CAN), 3, seed=0)
-    assert turned == 0
-    torch.testing.assert_close(kept.T_object_wrist, free.T_object_wrist[:3])
-    assert not kept.extra
+    made = OptimiserSource(OptimiserConfig(starts_per_candidate=2)).propose(GraspProblem(HAND, CAN), 3, seed=0)
+    assert made.turned == 0
+    torch.testing.assert_close(made.grasps.T_object_wrist, free.T_object_wrist[:3])
+    assert not made.grasps.extra
+    torch.testing.assert_close(made.points, HAND.with_points(160).points(made.grasps.joints, made.grasps.T_object_wrist))
