@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import pytest
 import torch
 
-from dro_grasp.compare import equal_time as module, methods as face
-from dro_grasp.compare.equal_time import equal_time, finished_maker
+from dro_grasp.compare.equal_time import Returned, equal_time, finished_maker
 from dro_grasp.compare.methods import Method
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.predict.config import PredictorConfig
+from dro_grasp.predict.finish import FinishConfig, finish
+from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
+from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.tiny_bundle import made_up_grasps
 from tests.helpers.toy_hand import toy_hand
+from tests.helpers.weights import untrained_weights
 
 HAND = toy_hand()
 NUM, KEEP, COST = 16, 4, 0.5  # the first source takes 8 s for 16 candidates
@@ -56,7 +61,7 @@ class Maker:
         return made_up_grasps(HAND, count=len(self.scores[-1])).replace(score=self.scores[-1])
 
 
-def run(**control: float) -> tuple[Maker, Maker, dict[str, module.Returned]]:
+def run(**control: float) -> tuple[Maker, Maker, dict[str, Returned]]:
     """Maker of the first source, of the control, and what both return."""
     clock = Clock()
     first, other = Maker(clock, COST, preparation=40.0), Maker(clock, **control)
@@ -117,22 +122,13 @@ def test_threads_come_back() -> None:
         torch.set_num_threads(before)
 
 
-def test_every_methods_candidates_are_refined_and_settled(monkeypatch: pytest.MonkeyPatch) -> None:
-    done: list[str] = []
-
-    class Made(Method):
-        name = "made up"
-
-        def make(self, problem: GraspProblem, num: int, seed: int) -> GraspBatch:
-            return made_up_grasps(HAND, count=num, seed=seed)
-
-    def stage(name: str) -> object:
-        return lambda problem, grasps: done.append(name) or grasps
-
-    monkeypatch.setattr(face, "refine", stage("refine"))
-    monkeypatch.setattr(face, "scored", stage("score"))
-    monkeypatch.setattr(face, "can_settle", lambda problem: True)
-    monkeypatch.setattr(face, "best_settled", lambda problem, grasps, least: (None, done.append(f"settle {least}") or grasps))
-    make = finished_maker(GraspProblem(HAND, load_object("sphere")), Made(), 2)
-    assert len(make(3, 1)) == 3
-    assert done == ["refine", "score", "settle 2"]
+def test_every_methods_candidates_are_finished_as_its_predictor_is_told(tmp_path: Path) -> None:
+    problem = GraspProblem(loaded_hand("gripper3"), load_object("can"))
+    weights = str(untrained_weights(tmp_path))
+    for config in (FinishConfig(), FinishConfig.nothing()):
+        method = Method("start", GraspPredictor(weights, config=PredictorConfig(finish=config)))
+        made = finished_maker(problem, method, 2)(5, 1)
+        expected = finish(problem, method.propose(problem, 5, 1), config, 2)
+        assert len(made) == (2 if config.settle is not None else 5)
+        assert torch.equal(made.score, expected.pool.score)
+        assert torch.equal(made.joints, expected.pool.joints)

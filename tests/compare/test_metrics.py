@@ -10,6 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from scipy.stats import mannwhitneyu
 
+from dro_grasp.compare.methods import mean_grasps_of
 from dro_grasp.compare.metrics import (
     difference_interval,
     diversity,
@@ -19,11 +20,10 @@ from dro_grasp.compare.metrics import (
     wilson_interval,
 )
 from dro_grasp.datasets.bundle.training_file import Bundle
-from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.choice import ChoiceConfig, choice_scores
-from dro_grasp.predict.sources.controls import CHOICE_POINTS, mean_grasp, mean_grasps, palm_facing_starts
+from dro_grasp.predict.sources.controls import CHOICE_POINTS, mean_grasps, palm_facing_starts
 from tests.helpers.tiny_bundle import SEMIAXES, ellipsoid, made_up_grasps, tiny_bundle
 from tests.helpers.toy_hand import toy_hand
 
@@ -112,7 +112,7 @@ def test_roc_area_is_mann_whitneys() -> None:
 
 
 def test_mean_grasp_is_the_mean_in_the_wrist_frame(bundle: Bundle) -> None:
-    mean, grasps = mean_grasp(bundle, "toy"), bundle.grasps["toy"]
+    mean, grasps = mean_grasps_of(bundle)["toy"], bundle.grasps["toy"]
     expected = np.zeros(3)
     for T, index in zip(grasps.T_object_wrist.numpy(), grasps.object_index.tolist(), strict=True):
         centre = bundle.objects[bundle.object_names[index]].points.numpy().mean(0)
@@ -122,7 +122,7 @@ def test_mean_grasp_is_the_mean_in_the_wrist_frame(bundle: Bundle) -> None:
 
 
 def test_mean_grasps_ignore_the_shape(bundle: Bundle) -> None:
-    mean, first = mean_grasp(bundle, "toy"), ChoiceConfig.first()
+    mean, first = mean_grasps_of(bundle)["toy"], ChoiceConfig.first()
     ball, egg = (mean_grasps(GraspProblem(HAND, obj), mean, 12, 3, first) for obj in (bare("ball"), bare("egg", 0.5)))
     assert torch.equal(ball.joints, egg.joints)
     assert torch.equal(ball.joints, mean.joints.expand(12, -1))
@@ -134,7 +134,7 @@ def test_mean_grasps_ignore_the_shape(bundle: Bundle) -> None:
 
 
 def test_the_chosen_rotation_of_a_mean_grasp_is_the_best_of_its_draws(bundle: Bundle) -> None:
-    problem, mean, config = GraspProblem(HAND, bare("egg", 0.5)), mean_grasp(bundle, "toy"), ChoiceConfig(placements=2, draws=3)
+    problem, mean, config = GraspProblem(HAND, bare("egg", 0.5)), mean_grasps_of(bundle)["toy"], ChoiceConfig(placements=2, draws=3)
     draws = config.placements * config.draws
     every = mean_grasps(problem, mean, 4 * draws, 3, ChoiceConfig.first())
     thin = problem.thinned(min(CHOICE_POINTS, HAND.n_points))
@@ -158,15 +158,8 @@ def test_palm_facing_starts_face_the_object(name: str) -> None:
         assert np.linalg.norm(across - (across @ direction) * direction) < 1e-5, "the palm's axis meets the centre"
 
 
-def test_controls_know_no_network(bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_starts_differ_by_seed_alone() -> None:
     obj = bare("ball")
-    before = palm_facing_starts(HAND, obj, 8, 1)
-
-    def asked(*_: object) -> None:
-        raise AssertionError("the network was asked")
-
-    monkeypatch.setattr(DistanceNetwork, "__init__", asked)
-    again = palm_facing_starts(HAND, obj, 8, 1)
-    assert torch.equal(before.T_object_wrist, again.T_object_wrist)
-    assert not torch.equal(before.T_object_wrist, palm_facing_starts(HAND, obj, 8, 2).T_object_wrist)
-    mean_grasps(GraspProblem(HAND, obj), mean_grasp(bundle, "toy"), 8, 1, ChoiceConfig.first())
+    first, again, other = (palm_facing_starts(HAND, obj, 8, seed) for seed in (1, 1, 2))
+    assert torch.equal(first.T_object_wrist, again.T_object_wrist)
+    assert not torch.equal(first.T_object_wrist, other.T_object_wrist)

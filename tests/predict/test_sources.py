@@ -1,24 +1,27 @@
-"""Methods by name, and the door for methods of others."""
+"""Sources by name, and the door for sources of others."""
 
 from __future__ import annotations
 
 import json
-import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import torch
-from dro_grasp.baselines.ours import DescentMethod
 
-from dro_grasp.baselines import ours
 from dro_grasp.cli.main import main
-from dro_grasp.compare.methods import Method
+from dro_grasp.compare.methods import MethodOptions, make_method
 from dro_grasp.errors import GraspFileError, OptionError
+from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import SynthesisConfig
+from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.sources.own import FileMethod, ForeignMethod
-from dro_grasp.predict.sources.registry import METHODS, WITH_WEIGHTS, MethodOptions, make_method
+from dro_grasp.predict.sources.network import NetworkSource
+from dro_grasp.predict.sources.optimiser import DescentSource, OptimiserSource
+from dro_grasp.predict.sources.own import FileSource, OwnSource
+from dro_grasp.predict.sources.registry import SOURCES, make_source, register_source, source_names
+from dro_grasp.predict.sources.source import Candidates, Progress, Source, ask
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.tiny_bundle import made_up_grasps
@@ -46,35 +49,58 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_every_name_makes_a_method_that_predicts_as_the_predictor_does(bundle, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ours, "DESCENT_STEPS", 4)
-    hand, obj = toy_hand(), load_object("sphere")
-    for name in sorted(set(METHODS) - {*WITH_WEIGHTS, "synthesise"}):
-        method = make_method(name, MethodOptions(bundle=bundle))
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return str(untrained_weights(tmp_path_factory.mktemp("weights")))
+
+
+@pytest.fixture
+def registering() -> Iterator[Callable[..., None]]:
+    """`register_source`, whose names are gone after the test."""
+    before = dict(SOURCES)
+    yield register_source
+    SOURCES.clear()
+    SOURCES.update(before)
+
+
+def test_every_name_makes_a_source_that_proposes_the_same_for_the_same_seed(bundle, weights: str) -> None:
+    problem, options = GraspProblem(toy_hand(), load_object("sphere")), MethodOptions(weights, bundle=bundle)
+    for name in ("network", "auto", "start", "mean-grasp", "mean-grasp-chosen"):
+        method = make_method(name, options)
         assert method.name == name
-        assert method.knows(hand)
-        grasps = method.predict(hand, obj, 3, seed=5)
-        assert len(grasps) == 3
-        assert grasps.hand == hand.name
-        again = method.predict(hand, obj, 3, seed=5)
-        assert torch.equal(again.T_object_wrist, grasps.T_object_wrist)
-        assert not torch.equal(method.predict(hand, obj, 3, seed=6).T_object_wrist, grasps.T_object_wrist)
+        assert method.knows(problem.hand)
+        first, again, other = (method.propose(problem, 3, seed) for seed in (5, 5, 6))
+        assert (len(first), first.points.shape[0], len(first.origin)) == (3, 3, 3)
+        assert torch.equal(again.grasps.T_object_wrist, first.grasps.T_object_wrist)
+        assert not torch.equal(other.grasps.T_object_wrist, first.grasps.T_object_wrist)
+        assert all(seconds >= 0 for seconds in first.seconds.values())
+    kinds = {"network": NetworkSource, "auto": NetworkSource, "optimiser": OptimiserSource, "dfc": DescentSource}
+    predictor = GraspPredictor(weights)
+    assert {name: type(predictor.source(name)) for name in kinds} == kinds
+    assert set(source_names()) == {"network", "optimiser", "dfc", "start"}
 
 
-def test_weights_of_a_method_stand_behind_its_name(tmp_path: Path) -> None:
-    path = untrained_weights(tmp_path)
-    method = make_method(f"dro@{path}")
-    assert method.name == f"dro@{path}"
-    assert len(method.make(GraspProblem(loaded_hand("gripper3"), load_object("sphere")), 2, 0)) == 2
-    with pytest.raises(OptionError, match="dro@PATH"):
-        make_method(f"dfc@{path}")
+def test_weights_of_a_method_stand_behind_its_name(weights: str) -> None:
+    method = make_method(f"network@{weights}")
+    assert method.name == f"network@{weights}"
+    assert method.predictor.weights_name == "untrained"
+    assert len(method.propose(GraspProblem(loaded_hand("gripper3"), load_object("sphere")), 2, 0)) == 2
+    assert make_method(f"auto@{weights}").asks == "auto"
+    with pytest.raises(OptionError, match="there is no source 'dfc@"):
+        make_method(f"dfc@{weights}")
+
+
+@pytest.mark.parametrize(("former", "name"), [("dro", "auto"), ("synthesise", "optimiser"), ("optimise", "optimiser")])
+def test_former_names_are_taken_with_a_warning(weights: str, former: str, name: str) -> None:
+    with pytest.warns(FutureWarning, match=f"source '{former}' is called '{name}' now"):
+        assert make_method(former, MethodOptions(weights)).name == name
 
 
 def test_a_descent_keeps_whatever_comes_out() -> None:
     """As many grasps as descents: the n of a larger run are those of a smaller one beside others, not the best of them."""
     problem = GraspProblem(toy_hand(), load_object("sphere"))
-    method = DescentMethod(SynthesisConfig(steps=3, batch_size=2))
-    few, more = (method.make(problem, n, 1).T_object_wrist for n in (2, 4))
+    source = DescentSource(SynthesisConfig(steps=3, batch_size=2))
+    few, more = (source.propose(problem, n, 1).T_object_wrist for n in (2, 4))
     assert all(float((more - T).abs().amax((1, 2)).min()) < 1e-6 for T in few)
 
 
@@ -85,17 +111,18 @@ def test_a_class_of_yours_stands_in_the_table(mine: Path, capsys: pytest.Capture
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert [(row["grasps"], row["num"]) for row in rows] == [("start", 2), ("somebodys_module:Mine", 2)]
     hand, obj = loaded_hand("gripper3"), load_object("can")
-    alone = simulate(hand, obj, make_method("somebodys_module:Mine").predict(hand, obj, 2), "dro").success
+    alone = simulate(hand, obj, make_source("somebodys_module:Mine").propose(GraspProblem(hand, obj), 2, 0), "dro").success
     assert rows[1]["success"]["dro/1"][0] == float(alone.float().mean())
 
 
 @pytest.mark.parametrize(("name", "told"), [
-    ("sorcery", "there is no method 'sorcery'"), ("no_such_module:Mine", "cannot be imported"),
+    ("sorcery", "there is no source 'sorcery'; choose auto, network"), ("no_such_module:Mine", "cannot be imported"),
     ("somebodys_module:Yours", "cannot be imported"), ("somebodys_module:Mute", "has no predict"), ("mean-grasp", "--bundle"),
+    ("network", r"GraspPredictor\(\).source\('network'\) makes it"),
 ])
-def test_what_is_no_method_is_explained(mine: Path, name: str, told: str) -> None:
+def test_what_is_no_source_is_explained(mine: Path, name: str, told: str) -> None:
     with pytest.raises(OptionError, match=told):
-        make_method(name)
+        make_source(name)
 
 
 def test_what_a_class_returns_is_checked() -> None:
@@ -106,61 +133,78 @@ def test_what_a_class_returns_is_checked() -> None:
         def predict(self, *_: object) -> object:
             return self.grasps
 
+    class Proposes(Returns):
+        def propose(self, problem: GraspProblem, num: int, seed: int) -> object:
+            return Candidates.of(problem, self.grasps, 50)  # type: ignore[arg-type]
+
     problem = GraspProblem(toy_hand(), load_object("sphere"))
     right = made_up_grasps(toy_hand(), "sphere", 3)
-    assert len(ForeignMethod("mine", Returns(right)).make(problem, 2, 0)) == 2
+    for maker in (Returns, Proposes):
+        assert len(OwnSource("mine", maker(right)).propose(problem, 2, 0)) == 2
+    assert ask(OwnSource("mine", Proposes(right)), problem, 2, 0).points.shape[1] == 50
     for wrong, told in ((None, "a NoneType"), (made_up_grasps(toy_hand(), "ball"), "grasps of ball")):
         with pytest.raises(OptionError, match=told):
-            ForeignMethod("mine", Returns(wrong)).make(problem, 2, 0)
+            OwnSource("mine", Returns(wrong)).propose(problem, 2, 0)
     with pytest.raises(GraspFileError):
-        ForeignMethod("mine", Returns(right)).make(GraspProblem(loaded_hand("gripper3"), load_object("sphere")), 2, 0)
+        OwnSource("mine", Returns(right)).propose(GraspProblem(loaded_hand("gripper3"), load_object("sphere")), 2, 0)
 
 
-def test_a_method_that_fails_is_named_with_its_error() -> None:
+def test_a_source_that_fails_is_named_with_its_error() -> None:
     class Broken:
         def predict(self, *_: object) -> object:
             raise ValueError("my own bug")
 
     problem = GraspProblem(loaded_hand("gripper3"), load_object("sphere"))
-    with pytest.raises(OptionError, match=r"method 'mine' failed: ValueError: my own bug"):
-        ForeignMethod("mine", Broken()).make(problem, 1, 0)
+    with pytest.raises(OptionError, match=r"source 'mine' failed: ValueError: my own bug"):
+        OwnSource("mine", Broken()).propose(problem, 1, 0)
 
 
-def test_stored_grasps_are_a_method_of_their_hand_and_objects(tmp_path: Path) -> None:
+def test_a_source_of_another_hand_is_told_by_whatever_way_it_comes() -> None:
+    class Stubborn(Source):
+        name = "stubborn"
+
+        def propose(self, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None) -> GraspBatch:
+            return made_up_grasps(toy_hand(), "sphere", num)
+
+    with pytest.raises(GraspFileError, match="these grasps are for hand 'toy'"):
+        ask(Stubborn(), GraspProblem(loaded_hand("gripper3"), load_object("sphere")), 2, 0)
+
+
+def test_stored_grasps_are_a_source_of_their_hand_and_objects(tmp_path: Path) -> None:
     hand, obj = toy_hand(), load_object("sphere")
-    stored = make_method("start").predict(hand, obj, 5).replace(score=torch.arange(5.0))
+    stored = make_source("start").propose(GraspProblem(hand, obj), 5, 0)
+    assert isinstance(stored, GraspBatch)
+    stored = stored.replace(score=torch.arange(5.0))
     stored.save(tmp_path / "theirs.parquet")
-    method = make_method(str(tmp_path / "theirs.parquet"))
-    assert isinstance(method, FileMethod)
-    assert method.name == "theirs"
-    assert method.knows(hand)
-    assert not method.knows(loaded_hand("gripper3"))
-    drawn = method.make(GraspProblem(hand, obj), 3, 0)
+    source = make_source(str(tmp_path / "theirs.parquet"))
+    assert isinstance(source, FileSource)
+    assert source.name == "theirs"
+    assert source.knows(hand)
+    assert not source.knows(loaded_hand("gripper3"))
+    drawn = source.propose(GraspProblem(hand, obj), 3, 0)
     assert len(drawn) == 3
     assert bool(drawn.score.isnan().all())
     assert all(float((stored.T_object_wrist - T).abs().amax((1, 2)).min()) < 1e-6 for T in drawn.T_object_wrist)
-    assert len(method.make(GraspProblem(hand, obj), 9, 0)) == 5
+    assert len(source.propose(GraspProblem(hand, obj), 9, 0)) == 5
     with pytest.raises(GraspFileError, match="no grasp of 'can', but of sphere"):
-        method.make(GraspProblem(hand, load_object("can")), 1, 0)
+        source.propose(GraspProblem(hand, load_object("can")), 1, 0)
 
 
-def test_a_method_returns_what_it_makes_unless_it_chooses() -> None:
-    class Counts(Method):
-        name = "counts"
-
-        def make(self, problem: GraspProblem, num: int, seed: int):
-            return made_up_grasps(problem.hand, problem.obj.name, num, seed)
-
-    made = Counts().best(GraspProblem(toy_hand(), load_object("sphere")), 4, 2)
-    assert (len(made.grasps), made.candidates) == (4, 4)
+@pytest.mark.parametrize("name", [
+    "start", "auto", "network", "optimise", "mean-grasp", "", "my:source", "a@b", "a.parquet", "a/b"])
+def test_a_name_that_is_taken_or_means_something_else_is_refused(registering: Callable[..., None], name: str) -> None:
+    with pytest.raises(OptionError, match=r"choose another name|is no name of a source"):
+        registering(name, object)
+    assert name not in SOURCES or name == "start"
 
 
-@pytest.mark.slow
-def test_a_first_look_at_all_methods_is_quick(capsys: pytest.CaptureFixture[str]) -> None:
-    """A sixth of what --quick measures with its defaults, in a sixth of ten minutes."""
-    methods = ["dro", "synthesise", "dfc", "start", "gendexgrasp", "gendexgrasp-gamma1", "manifm"]
-    begin = time.process_time()
-    assert main(["benchmark", "--method", *methods, "--quick", "--hands", "barrett", "--objects", "can", "--json"]) == 0
-    rows = json.loads(capsys.readouterr().out)["rows"]
-    assert [(row["grasps"], row["stage"], row["num"]) for row in rows] == [(name, "returned", 4) for name in methods]
-    assert time.process_time() - begin < 200, "100 s of two cores, whatever else they do"
+def test_a_source_without_a_name_of_its_own_goes_by_the_one_that_it_was_given(registering: Callable[..., None]) -> None:
+    class Nameless(Source):
+        def propose(self, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None) -> GraspBatch:
+            return make_source("start").propose(problem, num, seed)  # type: ignore[return-value]
+
+    registering("mine", Nameless)
+    assert source_names()[-1] == "mine"
+    made = ask(make_source("mine"), GraspProblem(toy_hand(), load_object("sphere")), 2, 0)
+    assert made.origin == ("mine", "mine")
+    assert list(made.seconds) == ["mine"]
