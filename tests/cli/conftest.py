@@ -18,10 +18,10 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.fixture
 def generate(weights: str, capsys: pytest.CaptureFixture[str]):
     def run(
-        *arguments: str, num: int = 3, name: str = "sphere", method: str = "network", candidates: int = 1
+        *arguments: str, num: int = 3, name: str = "sphere", source: str = "network", candidates: int = 1
     ) -> dict:
         base = ["generate", "--hand", "gripper3", "--object", name, "--weights", weights, "--num", str(num), "--json",
-                "--method", method, "--candidates", str(candidates)]
+                "--source", source, "--candidates", str(candidates)]
         assert main([*base, *arguments]) == 0
         return json.loads(capsys.readouterr().out)
 

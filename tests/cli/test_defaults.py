@@ -27,7 +27,7 @@ from dro_grasp.simulation.trial import record, simulate
 from dro_grasp.viewer.studio import Studio
 from tests.helpers.served_studio import served_studio
 
-REQUESTS = {"num": 16, "seed": 0, "candidates": 4, "refine": True, "temperature": None, "method": "auto"}
+REQUESTS = {"num": 16, "seed": 0, "candidates": 4, "refine": True, "temperature": None, "source": "auto"}
 CONSTRAINTS = {"direction": None, "table": None, "cone": None, "avoid": None, "hold": (), "spare": (), "opening": None}
 
 
@@ -44,7 +44,7 @@ def test_a_request_has_the_same_defaults_everywhere() -> None:
         option = default(ConstraintOptions if name in fields else Generate, name)
         assert getattr(Constraints(), name) == option == value, name
     assert {default(GraspPredictor.predict, name) == REQUESTS[name] for name in ("num", "seed")} == {True}
-    for name in ("num", "candidates", "temperature", "method"):
+    for name in ("num", "candidates", "temperature", "source"):
         assert default(Studio.generate, name) == REQUESTS[name], name
 
 

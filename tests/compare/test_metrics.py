@@ -134,7 +134,8 @@ def test_mean_grasps_ignore_the_shape(bundle: Bundle) -> None:
 
 
 def test_the_chosen_rotation_of_a_mean_grasp_is_the_best_of_its_draws(bundle: Bundle) -> None:
-    problem, mean, config = GraspProblem(HAND, bare("egg", 0.5)), mean_grasps_of(bundle)["toy"], ChoiceConfig(placements=2, draws=3)
+    problem, mean = GraspProblem(HAND, bare("egg", 0.5)), mean_grasps_of(bundle)["toy"]
+    config = ChoiceConfig(placements=2, draws=3)
     draws = config.placements * config.draws
     every = mean_grasps(problem, mean, 4 * draws, 3, ChoiceConfig.first())
     thin = problem.thinned(min(CHOICE_POINTS, HAND.n_points))

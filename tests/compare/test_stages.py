@@ -170,7 +170,7 @@ def test_the_average_is_over_hands(rows: list[Row]) -> None:
 def test_refined_grasps_cost_time_and_controls_say_what_they_are(rows: list[Row]) -> None:
     assert "refine" not in find(rows, AUTO, RAW, ALL).seconds
     assert find(rows, AUTO, REFINED, ALL).seconds["refine"] > 0
-    assert find(rows, START, RAW, ALL).seconds["make"] > 0
+    assert find(rows, START, RAW, ALL).seconds[START] > 0
     assert find(rows, START, RAW, ALL).success["strict/1"][0] < find(rows, AUTO, REFINED, ALL).success["strict/1"][0]
 
 

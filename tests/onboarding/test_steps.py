@@ -77,7 +77,7 @@ def test_the_next_steps_are_commands_for_shells(tmp_path: Path) -> None:
     assert words[-1] == ["dro-grasp", "dataset", "report", str(folder / steps.DATA), "--output", "data.html"]
 
 
-def test_what_generate_returns_is_of_the_method_that_is_asked_for(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_generate_returns_is_of_the_source_that_is_asked_for(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
     asked = command(home, "--source", "optimiser", "--json")
     asked[asked.index("--output") + 1] = str(home / "optimised")
     assert main(asked) == 0
@@ -85,7 +85,7 @@ def test_what_generate_returns_is_of_the_method_that_is_asked_for(home: Path, ca
     assert told["optimised"] == {"before": 1.0, "after": 1.0}
     page = (home / "optimised" / "report.html").read_text()
     assert "3 of 3 made by the optimiser" in page
-    assert "--method optimise --output grasps.parquet" in page
+    assert "--source optimiser --output grasps.parquet" in page
 
 
 def test_a_rerun_does_nothing_again(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

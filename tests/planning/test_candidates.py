@@ -48,8 +48,8 @@ def test_the_optimiser_is_asked_for_what_the_network_lacks(trusted: float, optim
 
 
 def test_a_request_for_fewer_grasps_than_directions_asks_for_some_of_them(tmp_path: Path) -> None:
-    asked = predictor(tmp_path, -math.inf)
-    found = grasps_in_world(asked, HAND, CAN, T, GraspRequest(1, 1, 1), Constraints(), torch.eye(3)[1:])
+    asked, request = predictor(tmp_path, math.inf), GraspRequest(1, 1, source="optimiser")
+    found = grasps_in_world(asked, HAND, CAN, T, request, Constraints(), torch.eye(3)[1:])
     assert len(found) == 1
     assert float(HAND.palm_directions(found.T_object_wrist)[0, 1]) > 0.8
     few = paper_directions(2)

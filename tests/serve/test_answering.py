@@ -21,7 +21,7 @@ from dro_grasp.serve.answering import Answerer, Kept, Stock
 from dro_grasp.serve.client import sent_file
 from dro_grasp.serve.messages import GraspAnswer, GraspCall
 
-QUICK: dict[str, Any] = {"method": "network", "candidates": 1, "refine": False}
+QUICK: dict[str, Any] = {"source": "network", "candidates": 1, "refine": False}
 TUBE = trimesh.creation.cylinder(0.03, 0.1)
 
 

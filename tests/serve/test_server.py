@@ -26,7 +26,7 @@ pytest.importorskip("uvicorn", reason="needs the extra [serve]: pip install '.[s
 
 pytestmark = pytest.mark.slow
 
-OPTIONS: dict[str, Any] = {"method": "network", "candidates": 1, "refine": False}
+OPTIONS: dict[str, Any] = {"source": "network", "candidates": 1, "refine": False}
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_the_client_asks_by_name_by_file_and_with_points(client: dro.GraspClient
 
 def test_a_closed_connection_cancels_its_request(client: dro.GraspClient, running) -> None:
     host, port = running[1].removeprefix("http://").split(":")
-    body = b'{"hand": "gripper3", "object": "can", "num": 100, "candidates": 10, "method": "optimise"}'
+    body = b'{"hand": "gripper3", "object": "can", "num": 100, "candidates": 10, "source": "optimiser"}'
     head = f"POST /grasps HTTP/1.1\r\nHost: {host}\r\nContent-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n"
     with socket.create_connection((host, int(port))) as connection:
         connection.sendall(head.encode() + body)
