@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import threading
 from pathlib import Path
 
@@ -16,7 +15,10 @@ from dro_grasp.errors import OptionError
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.refinement import RefineConfig
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
+from dro_grasp.predict.config import PredictorConfig, RescueConfig
+from dro_grasp.predict.finish import FinishConfig
 from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.sources.optimiser import OptimiserConfig
 from dro_grasp.records import on_device
 from tests.helpers.claw import ball
 from tests.helpers.toy_hand import toy_hand
@@ -67,15 +69,15 @@ def test_synthesis_on_a_device_gives_the_grasps_of_the_cpu(device: str) -> None:
 
 @pytest.mark.slow
 def test_the_optimiser_s_predictions_on_a_device_are_those_of_the_cpu(
-    device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    device: str, tmp_path: Path
 ) -> None:
     """Those of the network: `test_predictor.py`."""
-    monkeypatch.setattr("dro_grasp.predict.predictor.OPTIMISED_PER_GRASP", 2)
-    monkeypatch.setattr("dro_grasp.predict.stages.SynthesisConfig", functools.partial(SynthesisConfig, steps=10))
-    monkeypatch.setattr("dro_grasp.predict.stages.RefineConfig", functools.partial(RefineConfig, steps=10))
+    config = PredictorConfig(
+        optimiser=OptimiserConfig(synthesis=SynthesisConfig(steps=10)), rescue=RescueConfig(per_grasp=2),
+        finish=FinishConfig(refine=RefineConfig(steps=10), settle=None))
     weights, obj = str(untrained_weights(tmp_path)), load_object("sphere")
     here, there = (
-        GraspPredictor(weights, device=place).predict(toy_hand(), obj, 2, seed=3, source="optimiser")
+        GraspPredictor(weights, place, config).predict(toy_hand(), obj, 2, seed=3, source="optimiser")
         for place in ("cpu", device))
     assert there.joints.device.type == "cpu"
     for name in ("joints", "T_object_wrist", "pregrasp_joints", "squeeze_joints", "score"):

@@ -34,16 +34,16 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def small_steps(monkeypatch: pytest.MonkeyPatch, quick_statistics: None) -> None:
-    """Small shards, few grasps in the report, and few candidates of the optimiser."""
+    """Small shards, and few grasps in the report."""
     monkeypatch.setattr(steps, "EngineConfig", functools.partial(
         EngineConfig, candidates=32, min_candidates=32, synthesis=SynthesisConfig(steps=60, batch_size=32)))
     monkeypatch.setattr(report, "GRASPS", 3)
-    monkeypatch.setattr("dro_grasp.predict.predictor.OPTIMISED_PER_GRASP", 2)
 
 
 def command(home: Path, *more: str, hand: str = "mine.urdf") -> list[str]:
     return ["onboard", str(home / hand), "--output", str(home / "out"), "--objects", "sphere", "--held-out", "can",
-            "--num", "2", "--minutes", "0.01", "--workers", "1", "--weights", str(home / "untrained.safetensors"), *more]
+            "--num", "2", "--minutes", "0.01", "--workers", "1", "--weights", str(home / "untrained.safetensors"),
+            "--source", "network", *more]
 
 
 def test_a_file_becomes_weights_and_a_report(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
