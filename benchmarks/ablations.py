@@ -180,7 +180,7 @@ def measured(name: str, options: argparse.Namespace) -> dict[str, Any]:
             command(["dataset", "bundle", str(ROOT / "data" / "grasps"), "--split", "validate", "--hands", *HANDS, "--output",
                      str(validate), "--json"])
         errors = [dataclasses.asdict(e) for e in distance_errors(model, load_bundle(validate))]
-    return {"row": name, "seconds": seconds, "rows": [dataclasses.asdict(r) for r in rows], "errors": errors}
+    return {"row": name, "seconds": seconds, "rows": [r.to_dict() for r in rows], "errors": errors}
 
 
 def cells(result: dict[str, Any]) -> list[list[object]]:

@@ -116,7 +116,7 @@ def measured(options: argparse.Namespace, row: str, seed: int, bundle: Bundle) -
             errors = distance_errors(load_weights(weights), part(load_bundle(options.validation), options.hands))
         values = {
             "row": row, "seed": seed, "seconds": describe_weights(weights)["about"]["seconds"],
-            "rows": [dataclasses.asdict(r) for r in rows], "errors": [dataclasses.asdict(e) for e in errors],
+            "rows": [r.to_dict() for r in rows], "errors": [dataclasses.asdict(e) for e in errors],
         }
         with replacing(stored) as temporary:
             temporary.write_text(json.dumps(values))

@@ -68,8 +68,8 @@ def _rates(done: Onboarded) -> str:
     labels = list(done.steps["after"]["rows"][0]["success"])
     return table(["weights", "grasps", "asked", "returned", *labels, "fingers [%]", "by the optimiser", "diversity"], rows) + (
         "<p class=note>Success rates of the grasps asked for, with 95 % intervals. dro is the paper's protocol and lenient; "
-        "strict also limits penetration and how far closing may push the object. Fingers: the share of the hand's that touch the "
-        "object, and in parentheses of the grasps with all of them. The network's rows are what fine-tuning improves. "
+        "strict also limits penetration and how far closing may push the object. Fingers: the share of the hand's that touch "
+        "the object, and in parentheses of the grasps with all of them. The network's rows are what fine-tuning improves. "
         "<i>generate</i> keeps the best of four of the network's candidates by score, as the row <i>best quarter</i> does, and "
         "asks the optimiser for others where the score does not trust these: slower, and less needed the better the network "
         "is. <i>generate --method network</i> does without.</p>")
