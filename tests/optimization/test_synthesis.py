@@ -9,6 +9,7 @@ import torch
 from dro_grasp.energy.contact_candidates import contact_candidates
 from dro_grasp.energy.grasp_energy import GraspEnergy, link_spheres
 from dro_grasp.errors import ObjectError, OptionError
+from dro_grasp.geometry import se3
 from dro_grasp.grasps.duplicates import distinct
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.objects.catalogue import load_object
@@ -49,6 +50,17 @@ def test_spheres_lie_in_their_links_and_may_not_meet_across_fingers():
     pairs = {tuple(sorted(p)) for p in spheres.links[spheres.pairs].tolist()}
     assert (2, 4) in pairs
     assert (1, 2) not in pairs  # neighbours
+
+
+@pytest.mark.parametrize("name", ["allegro", "leaphand"])
+def test_fingers_that_cross_at_their_open_ends_are_to_be_kept_apart(name: str):
+    hand = loaded_hand(name)
+    spheres = link_spheres(hand)
+    first, second = hand.finger_of_link[spheres.links[spheres.pairs]].unbind(1)
+    q = hand.canonical_joints(1.0)
+    placed = se3.apply(hand.tree.forward(q)[spheres.links], spheres.centres)[spheres.pairs]
+    overlap = spheres.radii[spheres.pairs].sum(1) - (placed[:, 0] - placed[:, 1]).norm(dim=-1)
+    assert overlap[(first != second) & (first != PALM) & (second != PALM)].max() > 0.001
 
 
 def test_starts_face_the_object_from_all_sides_and_touch_nothing(ball):

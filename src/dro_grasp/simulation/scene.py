@@ -19,6 +19,7 @@ from dro_grasp.descriptions.collision import collide
 from dro_grasp.errors import HandError, ObjectError
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.opening import open_side_by_side
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.hand_part import HULL_VERTICES, add_servos, attach, hand_spec, joint_addresses, servo_joints
 from dro_grasp.simulation.protocols import Protocol
@@ -174,16 +175,16 @@ def object_mass(obj: ObjectModel, protocol: Protocol) -> float:
 
 
 def _exclude_resting_contacts(scene: mujoco.MjSpec, hand: Hand) -> None:
-    """Exclude contacts of links that touch in the open hand, and of each link with its parent.
+    """Exclude contacts of links that touch in the open hand, fingers side by side, and of each link with its parent.
 
-    MuJoCo's own parent-child filter ignores static parents.
+    Fingers that cross must collide. MuJoCo's own parent-child filter ignores static parents.
     """
     model = scene.compile()
     data = mujoco.MjData(model)
     addresses, moving = joint_addresses(model, hand)
     pairs: set[tuple[str, str]] = set()
     for openness in (0.75, 1.0):
-        q = hand.canonical_joints(openness)
+        q = open_side_by_side(hand, openness)
         data.qpos[addresses] = (hand.tree.coupling @ q + hand.tree.offset).numpy()[moving]
         collide(model, data)
         pairs |= {_pair(model, int(a), int(b)) for a, b in data.contact.geom}
