@@ -30,7 +30,7 @@ class LinkSpheres:
 def link_spheres(hand: Hand) -> LinkSpheres:
     """Spheres along the longest axis of each link, from its surface points.
 
-    Pairs on links of one rigid group or of neighbouring groups, and pairs that overlap in the open hand with its fingers side by side,
+    Pairs on links of one rigid group or of neighbouring groups, and pairs that overlap in the open hand, fingers side by side,
     may touch.
     """
     centres, radii, links = [], [], []
