@@ -7,9 +7,11 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from trimesh.convex import convex_hull
 
 from dro_grasp.descriptions.self_contact import self_penetration
 from dro_grasp.errors import HandError, ObjectError
+from dro_grasp.geometry.balls import Balls
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import ASSET_FILES, load_hand
 from dro_grasp.objects.shape import ObjectModel
@@ -124,11 +126,32 @@ def test_a_scene_is_built_once_for_a_pair_and_a_protocol(hand):
     assert cached_scene(hand, ball(), protocol("dro")) is not first  # the oldest has gone
 
 
+def test_objects_of_one_mesh_that_collide_otherwise_have_scenes_of_their_own(hand):
+    """As a built-in object with exact parts and the same mesh from a user's file, which is cut into others."""
+    whole = ball()
+    vertices, _ = whole.parts[0]
+    halves = tuple((half, convex_hull(half).faces) for half in (vertices[vertices[:, 0] >= 0], vertices[vertices[:, 0] <= 0]))
+    heavy = replace(whole, inertia=2 * whole.inertia)
+    balls = replace(whole, balls=Balls(torch.zeros(1, 3), torch.tensor([0.03])))
+    smaller = replace(whole, balls=Balls(torch.zeros(1, 3), torch.tensor([0.02])))
+    others = [whole, replace(whole, exact_parts=halves), heavy, balls, smaller, whole.coarse]
+    assert {obj.sha256 for obj in others} == {whole.sha256}
+    first = [cached_scene(hand, obj, protocol("dro")) for obj in others]
+    assert len({id(scene) for scene in first}) == len(others)
+    for scene, obj in zip(first, others, strict=True):
+        own = build_scene(hand, obj, protocol("dro")).model
+        assert scene.model.ngeom == own.ngeom
+        np.testing.assert_array_equal(scene.model.geom_size, own.geom_size)
+        np.testing.assert_array_equal(scene.model.body_inertia, own.body_inertia)
+        assert cached_scene(hand, replace(obj), protocol("dro")) is scene
+
+
 def test_a_cloud_has_no_scene(hand):
     points = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
     cloud = ObjectModel(name="scan", cloud=points, cloud_normals=points, centre_of_mass=np.zeros(3), sha256="scan")
-    with pytest.raises(ObjectError, match="'scan' is a bare point cloud; a trial needs a mesh"):
-        build_scene(hand, cloud, protocol("dro"))
+    for make in (build_scene, cached_scene):
+        with pytest.raises(ObjectError, match="'scan' is a bare point cloud; a trial needs a mesh"):
+            make(hand, cloud, protocol("dro"))
 
 
 def test_a_hand_without_description_has_no_scene(hand):

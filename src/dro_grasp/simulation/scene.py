@@ -81,10 +81,10 @@ class TrialScene:
 
 @dataclass(frozen=True)
 class SceneKey:
-    """The pair and protocol of a scene; equal keys, by hashes and protocol, have the same scene."""
+    """The pair and protocol of a scene; equal keys, by hashes of all that is simulated and by protocol, have the same scene."""
 
     hand_sha256: str
-    object_sha256: str
+    solid_sha256: str
     protocol: Protocol
     hand: Hand = field(compare=False)
     obj: ObjectModel = field(compare=False)
@@ -97,7 +97,8 @@ def cached_scene(hand: Hand, obj: ObjectModel, protocol: Protocol) -> TrialScene
         ObjectError: The object is a bare point cloud, without balls that stand for it.
         HandError: The hand came without its description.
     """
-    return _build_once(SceneKey(hand.sha256, obj.sha256, protocol, hand, obj))
+    require_simulable(hand, obj)
+    return _build_once(SceneKey(hand.sha256, obj.solid_sha256, protocol, hand, obj))
 
 
 @lru_cache(maxsize=CACHED_SCENES)
