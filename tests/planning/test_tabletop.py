@@ -193,6 +193,14 @@ def test_two_objects_of_one_name_are_refused_and_one_object_counts_once(
     assert (done.object, done.object_file) == ("textured", box)
     with pytest.raises(OptionError, match=rf"'{other}' is not the object 'textured' .* made with '{box}'.*--output"):
         run_tabletop(TabletopRun(small_robot, (other,), attempts=1, config=QUICK), output)
+    whole, half = dro.load_object(box), trimesh.creation.box((0.025, 0.05, 0.08))
+    halves = tuple((np.add(half.vertices, [x, 0, 0]), half.faces) for x in (-0.0125, 0.0125))
+    with monkeypatch.context() as patch:
+        patch.setattr(tabletop, "load_object", lambda source: replace(whole, exact_parts=halves))
+        with pytest.raises(OptionError, match=rf"'{box}' is not the object 'textured' .* as it was then"):
+            run_tabletop(TabletopRun(small_robot, (box,), attempts=1, config=QUICK), output)
+    write_attempts([replace(done, solid_sha256="")], output)  # a file from before this hash
+    assert len(run_tabletop(TabletopRun(small_robot, (box,), attempts=1, config=QUICK), output)) == 1
     trimesh.creation.box((0.04, 0.05, 0.08)).export(box)
     with pytest.raises(OptionError, match=rf"'{box}' is not the object 'textured' .* as it was then"):
         run_tabletop(TabletopRun(small_robot, (box,), attempts=1, config=QUICK), output)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int
@@ -87,7 +89,7 @@ def closed_surface(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m
     return surface
 
 
-def pack(parts: list[Part]) -> Arrays:
+def pack(parts: Sequence[Part]) -> Arrays:
     """Parts as three arrays: all vertices, all faces, and the counts of each part."""
     return {
         "vertices": np.concatenate([v for v, _ in parts]), "faces": np.concatenate([f for _, f in parts]),

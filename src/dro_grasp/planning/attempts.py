@@ -162,6 +162,8 @@ class Attempt:
     """Hash of the robot, of its arm and hand; empty, as the following, in files from before there was one."""
     object_sha256: str = ""
     weights_sha256: str = ""
+    solid_sha256: str = ""
+    """Hash of what was simulated of the object; one mesh may have other convex parts."""
 
 
 Proposer = Callable[[PickedObject, Float[np.ndarray, "4 4"], int], GraspBatch]

@@ -123,25 +123,25 @@ def _done(
                           "robot, object and weights, so that they may be of others; keep it, and give another --output")
     done = [a for a in alike if (a.robot_sha256, a.weights_sha256) == (robot.sha256, weights)]
     for a in done:
-        source, sha256 = objects.get(a.object, ("", a.object_sha256))
-        if a.object_sha256 != sha256:
+        source, sha256, solid = objects.get(a.object, ("", a.object_sha256, a.solid_sha256))
+        if a.object_sha256 != sha256 or a.solid_sha256 not in {"", solid}:
             raise OptionError(f"'{source}' is not the object '{a.object}' of the attempts in {output}, made with "
                               f"'{a.object_file}' as it was then; rename the file, or attempt it apart, with its own --output "
                               "and --plans")
-    return {(a.object, a.number): a for a in done}, {source: name for name, (source, _) in objects.items()}
+    return {(a.object, a.number): a for a in done}, {source: name for name, (source, *_) in objects.items()}
 
 
-def _objects(given: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """What each object was given as, and its hash, by its name.
+def _objects(given: Sequence[str]) -> dict[str, tuple[str, str, str]]:
+    """What each object was given as, and its hashes, by its name.
 
     Raises:
         OptionError: Two of them differ and have one name.
     """
-    found: dict[str, tuple[str, str]] = {}
+    found: dict[str, tuple[str, str, str]] = {}
     for source in dict.fromkeys(given):
         obj = load_object(source)
-        first, sha256 = found.setdefault(obj.name, (source, obj.sha256))
-        if obj.sha256 != sha256:
+        first, _, solid = found.setdefault(obj.name, (source, obj.sha256, obj.solid_sha256))
+        if obj.solid_sha256 != solid:
             raise OptionError(f"'{first}' and '{source}' are different objects of the name '{obj.name}', under which attempts "
                               "and plans are stored; rename one of the files, or attempt them apart, each with its own "
                               "--output and --plans")
@@ -171,7 +171,8 @@ def _attempts(run: TabletopRun, name: str, numbers: Sequence[int], plans: Path |
         made = attempt(robot, obj, number, run.seed, predictor, run.config, keeper)
         yield replace(
             made, robot_file=str(run.robot), object_file=str(name), weights=str(run.weights or DEFAULT),
-            robot_sha256=robot.sha256, object_sha256=obj.sha256, weights_sha256=weights)
+            robot_sha256=robot.sha256, object_sha256=obj.sha256, weights_sha256=weights,
+            solid_sha256=obj.solid_sha256)
 
 
 def write_attempts(attempts: Sequence[Attempt], path: Path) -> None:

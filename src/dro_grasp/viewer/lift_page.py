@@ -174,8 +174,9 @@ class LiftPage(ServedPage):
         film, self.film = Film.of_attempt(recorder), None
         if robot is not self.robot:
             self._put(robot)
+        of_object = ((stored.solid_sha256, obj.solid_sha256) if stored.solid_sha256 else (stored.object_sha256, obj.sha256))
         others = [name for name, then, now in (
-            ("robot", stored.robot_sha256, robot.sha256), ("object", stored.object_sha256, obj.sha256),
+            ("robot", stored.robot_sha256, robot.sha256), ("object", *of_object),
             ("weights", stored.weights_sha256, describe_weights(weights)["sha256"])) if then not in {"", now}]
         changed = f"**Not as stored**: with other content than then: {', '.join(others)}. " if others else ""
         self.show(film, changed + ("held" if made.success else f"**{made.stage}**: {made.reason}"))
