@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo demo-arm test test-slow lint wheels docs rehearse docs-pictures data clean
+.PHONY: setup demo demo-arm test test-slow golden lint wheels docs rehearse docs-pictures data clean
 
 setup: $(STAMP)
 
@@ -30,6 +30,9 @@ test: setup
 
 test-slow: setup  # what takes more than about 10 s each, such as a Ray cluster that loses a node
 	$(BIN)/python -m pytest -q -m slow
+
+golden: setup  # record anew what tests/golden compares, after a change that is meant to change results
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.golden.cases
 
 lint: setup
 	$(BIN)/ruff check .
