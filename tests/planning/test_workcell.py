@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 import dro_grasp as dro
 from dro_grasp.cli.main import main
-from dro_grasp.errors import RobotError
+from dro_grasp.errors import PlanError, RobotError
 from dro_grasp.planning.attempts import TabletopConfig, attempt
 from dro_grasp.planning.physics import LiftScene
 from dro_grasp.planning.planner import PlanConfig
@@ -113,21 +113,23 @@ def test_an_attempt_compiles_its_table_beside_the_plan(compiled: list[mujoco.MjS
     robot = replace(robot, home=robot.home - 1e-3)
     plan = PlanConfig(num=4, rehearsals=1, batches=1)
     compiled.clear()
-    made = attempt(robot, can, 0, 0, dro.GraspPredictor(), TabletopConfig(see="mesh", hold_seconds=0.1, shake_seconds=0.1, plan=plan))
+    config = TabletopConfig(see="mesh", hold_seconds=0.1, shake_seconds=0.1, plan=plan)
+    made = attempt(robot, can, 0, 0, dro.GraspPredictor(), config)
     assert made.motion_seconds > 0, made.reason
     assert len(compiled) == 5
 
 
 FOOT = """<mujoco><compiler angle="radian"/><worldbody><body name="base"><geom type="cylinder" size="0.08 0.01" pos="0 0 0.01"/>
-<body name="foot"><joint name="pan" axis="0 0 1" range="-3 3"/><geom type="cylinder" size="0.06 {half}" pos="0 0 {half}"/>
-<body name="upper" pos="0 0 0.15"><joint name="lift" axis="0 1 0" range="-0.5 0.5"/><geom type="capsule" fromto="0 0 0 0 0 0.3" size="0.03"/>
-<body name="tip" pos="0 0 0.35"><joint name="bend" axis="0 1 0" range="-0.5 0.5"/><geom size="0.03"/></body></body></body></body>
-</worldbody></mujoco>"""
+<body name="foot"><joint name="pan" axis="0 0 1" range="-3 3"/><geom type="cylinder" size="0.06 0.05" pos="0 0 0.05"/>
+<body name="upper" pos="0 0 0.15"><joint name="lift" axis="0 1 0" range="-0.5 0.5"/>
+<geom type="box" pos="0 0 0.15" size="0.03 0.03 0.15"/>
+<body name="tip" pos="0 0 0.35"><joint name="bend" axis="0 1 0" range="-0.5 0.5"/><geom size="0.03"/></body></body></body>
+</body></worldbody></mujoco>"""
 """An arm whose foot turns on what it stands on."""
 
 
 def standing_arm(folder: Path, **values: Any) -> Path:
-    (folder / "arm.xml").write_text(FOOT.format(half=0.05))
+    (folder / "arm.xml").write_text(FOOT)
     stated = {"arm": "arm.xml", "hand": "gripper3", "mount": {"link": "tip", "position": [0, 0, 0.06]},
               "home": {"pan": 0.0, "lift": 0.1, "bend": 0.1}, "limits": {"velocity": 1.0, "acceleration": 4.0}, "table": {}}
     (folder / "robot.yaml").write_text(yaml.safe_dump(stated | values))
@@ -158,16 +160,19 @@ def test_a_robot_that_is_nowhere_free_is_not_usable_and_what_collides_is_named(
     assert "COLLISION everywhere: " in said
     assert "and arm/upper, in 100%" in said or "arm/upper and table, in 100%" in said or "table and arm/upper, in 100%" in said
     assert "not usable" in said
+    T = np.eye(4)
+    T[:3, 3] = 0.3, 0.0, 0.3
     with pytest.raises(RobotError, match=r"collides at home: arm/upper and table, by .* mm; correct `table`"):
-        dro.plan(load_robot(file), dro.load_object("can"), np.array([[1.0, 0, 0, 0.3], [0, 1, 0, 0], [0, 0, 1, 0.3], [0, 0, 0, 1]]))
+        dro.plan(load_robot(file), dro.load_object("can"), T)
 
 
 def test_a_home_that_is_nearer_than_is_kept_is_refused(robot: dro.Robot) -> None:
     """The planner starts from no such place, so that no advice about the object would help."""
-    assert robot.table is not None
-    lowest = robot.hand.points(robot.hand.canonical_joints(), torch.from_numpy(robot.T_world_wrist(robot.home)).float())[:, 2].min()
-    near = replace(robot, table=replace(robot.table, height=float(lowest) - 0.003))
+    wrist = torch.from_numpy(robot.T_world_wrist(robot.home)).float()
+    points = robot.hand.points(robot.hand.canonical_joints(), wrist).double().numpy()
+    below = trimesh.creation.box((0.05, 0.05, 0.05))
+    below.apply_translation(points[points[:, 2].argmin()] - (0, 0, 0.025 + 0.003))
     can, T = dro.load_object("can"), np.eye(4)
-    T[:3, 3] = 0.5, 0.1, near.table.height - float(can.cloud[:, 2].min())
-    with pytest.raises(RobotError, match=r"and table, \d\.\d mm apart, where 5 mm are kept; correct `table`"):
-        dro.plan(near, can, T)
+    T[:3, 3] = 0.5, 0.3, -float(can.cloud[:, 2].min())
+    with pytest.raises(PlanError, match=r"collides with hand/\w+ while .* at home, [234]\.\d mm apart, where 5 mm are kept"):
+        dro.plan(robot, can, T, [replace(dro.load_object(below), name="block")])

@@ -72,7 +72,7 @@ class PlanKeeper(Watcher):
 
 def run_tabletop(
     run: TabletopRun, output: Path | None = None, workers: int = 1, progress: Progress | None = None,
-    plans: Path | None = None, make: Callable[..., Attempt] = attempt,
+    plans: Path | None = None, make: Callable[..., Attempt] | None = None,
 ) -> list[Attempt]:
     """Run all attempts that `output` does not hold yet; each is stored when it ends.
 
@@ -83,7 +83,7 @@ def run_tabletop(
         workers: Processes, which share out the objects; with several, attempts are stored object by object.
         progress: See `Progress`.
         plans: Folder for the plan of each attempt, ROBOT-OBJECT-NUMBER.npz.
-        make: What makes one; see `attempt`.
+        make: Makes one, instead of `attempt`, with the same arguments.
 
     Raises:
         OptionError: The extra is missing, something cannot be attempted, two objects have one name, or `output` holds such
@@ -100,7 +100,7 @@ def run_tabletop(
     missing = {o: [k for k in range(run.attempts) if (n, k) not in done] for o, n in names.items()}
     if plans is not None:
         make_folder(plans)
-    for result in _results(run, {o: numbers for o, numbers in missing.items() if numbers}, workers, plans, make):
+    for result in _results(run, {o: numbers for o, numbers in missing.items() if numbers}, workers, plans, make or attempt):
         stored.append(result)
         done[result.object, result.number] = result
         if output is not None:
