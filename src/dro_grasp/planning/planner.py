@@ -267,19 +267,20 @@ def candidates(
     if isinstance(given, GraspBatch):
         yield given, True
         return
-    make = given
-    if make is None:
-        predictor, directions, obstacles = predictor or GraspPredictor(), _directions(task), task.cell.obstacles
-        scene = load_scene(np.concatenate([thing.cloud for thing in obstacles]), OBSTACLE) if obstacles else None
-        wanted = replace(task.constraints, table=task.height, avoid=scene)
-
-        def make(seed: int) -> GraspBatch:
-            return grasps_in_world(predictor, task.robot.hand, task.obj, task.T, task.config.num, wanted, directions, seed)
-
+    make = given or _predicted(task, predictor or GraspPredictor())
     for batch in range(task.config.batches):
         with tries.watch("grasps"):
             made = make(task.seed + batch * BATCH_SEED)
         yield made, batch + 1 == task.config.batches
+
+
+def _predicted(task: Task, predictor: GraspPredictor) -> Callable[[int], GraspBatch]:
+    """What makes grasps from a seed."""
+    directions, clouds = _directions(task), [thing.cloud for thing in task.cell.obstacles]
+    wanted = replace(
+        task.constraints, table=task.height, avoid=load_scene(np.concatenate(clouds), OBSTACLE) if clouds else None)
+    return lambda seed: grasps_in_world(
+        predictor, task.robot.hand, task.obj, task.T, task.config.num, wanted, directions, seed)
 
 
 def _directions(task: Task) -> Directions | Float[Tensor, "k 3"]:
