@@ -24,7 +24,7 @@ from dro_grasp.planning.attempts import (
     scatter,
     thinned_intrinsics,
 )
-from dro_grasp.planning.physics import LiftScene
+from dro_grasp.planning.physics import Deviation, LiftScene
 from dro_grasp.planning.planner import PlanConfig
 from dro_grasp.planning.table_scene import sort_out
 from dro_grasp.planning.workcell import Workcell
@@ -134,3 +134,6 @@ def test_attempts_of_no_constraints_are_those_of_before() -> None:
     config = TabletopConfig(plan=dro.PlanConfig(constraints=dro.Constraints((0.0, 0.0, -1.0), cone=0.5, opening=0.01)))
     assert TabletopConfig.from_label(config.label()) == config
     assert config.label() != TabletopConfig().label()
+    heavier = TabletopConfig(plan=dro.PlanConfig(deviations=(Deviation((0.01, 0.0), 0.5, 2.0),)))
+    assert TabletopConfig.from_label(heavier.label()) == heavier
+    assert "deviations" not in TabletopConfig().label()
