@@ -27,12 +27,11 @@ from dro_grasp.pipeline.choice import ChoiceConfig
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import complete
 from dro_grasp.planning.attempts import Attempt, TabletopConfig, attempt
-from dro_grasp.planning.plan_config import PlanConfig
-from dro_grasp.planning.planner import NO_PATH
+from dro_grasp.planning.planner import NO_PATH, PlanConfig
 from dro_grasp.planning.robot import load_robot
-from dro_grasp.planning.standing import upright
 from dro_grasp.planning.table_scene import PickedObject
 from dro_grasp.planning.tabletop import TabletopRun, endings, failures, processor_seconds, run_tabletop
+from dro_grasp.planning.workcell import upright
 from dro_grasp.predictor import GraspPredictor
 
 ROWS = {

@@ -20,10 +20,9 @@ import torch
 from report import emit
 from scipy.spatial import KDTree
 
-from dro_grasp.planning.collisions import CollisionChecker
 from dro_grasp.planning.motion import STAGES, MotionPlan
 from dro_grasp.planning.robot import Robot, load_robot
-from dro_grasp.planning.workcell import arm_addresses, robot_spec
+from dro_grasp.planning.workcell import Workcell, arm_addresses, robot_spec
 from dro_grasp.simulation.hand_part import joint_addresses
 from dro_grasp.simulation.protocols import PROTOCOLS
 
@@ -46,7 +45,7 @@ class Scene:
 
     def __init__(self, robot: Robot) -> None:
         scene = robot_spec(robot, PROTOCOLS["dro"], robot.table)
-        for first, second in CollisionChecker(robot, robot.table).excluded:
+        for first, second in Workcell(robot).excluded:
             scene.add_exclude(bodyname1=first, bodyname2=second)
         self.robot, self.model = robot, scene.compile()
         self.data, self.arm = mujoco.MjData(self.model), arm_addresses(self.model, robot)

@@ -39,15 +39,17 @@ from dro_grasp.pipeline.constraints import Constraints as Constraints
 from dro_grasp.pipeline.problem import GraspProblem as GraspProblem
 from dro_grasp.pipeline.stages import complete as complete, evaluate as evaluate, rank as rank, refine as refine
 from dro_grasp.planning.attempts import Attempt as Attempt, TabletopConfig as TabletopConfig
-from dro_grasp.planning.motion import MotionPlan as MotionPlan
-from dro_grasp.planning.plan_config import PlanConfig as PlanConfig
-from dro_grasp.planning.planner import plan as plan
+from dro_grasp.planning.motion import (
+    MotionPlan as MotionPlan,
+    trajectory_csv as trajectory_csv,
+    trajectory_yaml as trajectory_yaml,
+)
+from dro_grasp.planning.planner import PlanConfig as PlanConfig, plan as plan
 from dro_grasp.planning.reachability import ReachConfig as ReachConfig
 from dro_grasp.planning.robot import Robot as Robot, load_robot as load_robot
 from dro_grasp.planning.robot_check import RobotReport as RobotReport, check_robot as check_robot
 from dro_grasp.planning.table_scene import PickedObject as PickedObject, pick_object as pick_object
 from dro_grasp.planning.tabletop import TabletopRun as TabletopRun, run_tabletop as run_tabletop
-from dro_grasp.planning.trajectory_files import trajectory_csv as trajectory_csv, trajectory_yaml as trajectory_yaml
 from dro_grasp.predictor import (
     GraspPredictor as GraspPredictor,
     GraspRequest as GraspRequest,

@@ -16,8 +16,7 @@ import dro_grasp as dro
 from dro_grasp import predictor
 from dro_grasp.cli.main import main
 from dro_grasp.planning import planner
-from dro_grasp.planning.motion import CHOSEN, STAGES, PlanNotes, PlanScene
-from dro_grasp.planning.timing import Trajectory
+from dro_grasp.planning.motion import CHOSEN, STAGES, PlanNotes, PlanScene, Trajectory
 
 NOTES = PlanNotes("arm", "can", ("a",), ("f",), "world", 0.0, 3, {"out of reach": 2}, 1, 0, 1.5, np.eye(4).tolist(), 7,
                   {"grasps": 0.5})

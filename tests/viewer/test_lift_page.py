@@ -13,10 +13,9 @@ from dro_grasp.cli.view import is_motion
 from dro_grasp.models.checkpoints import DEFAULT, describe_weights
 from dro_grasp.planning.animation import Recorder
 from dro_grasp.planning.attempts import Attempt, TabletopConfig
-from dro_grasp.planning.motion import CHOSEN, STAGES, WAITING, PlanNotes, PlanScene
+from dro_grasp.planning.motion import CHOSEN, STAGES, WAITING, PlanNotes, PlanScene, Trajectory
 from dro_grasp.planning.robot_check import robot_shapes, shape_poses
 from dro_grasp.planning.tabletop import write_attempts
-from dro_grasp.planning.timing import Trajectory
 from dro_grasp.viewer import lift_page as pages
 from dro_grasp.viewer.lift_page import EVERY, Film, LiftPage, lift_page
 from tests.helpers.browser import free_port

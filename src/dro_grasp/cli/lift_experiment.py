@@ -68,8 +68,7 @@ class Tabletop:
         from dro_grasp.objects.catalogue import resolve_objects
         from dro_grasp.planning.animation import check_animation, draw_attempt
         from dro_grasp.planning.attempts import TabletopConfig
-        from dro_grasp.planning.extra import require_arm_extra
-        from dro_grasp.planning.plan_config import PlanConfig
+        from dro_grasp.planning.planner import PlanConfig, require_arm_extra
         from dro_grasp.planning.tabletop import TabletopRun, run_tabletop
 
         require_arm_extra()

@@ -79,15 +79,12 @@ class Plan:
         from dro_grasp.files import check_output, replacing
         from dro_grasp.objects.catalogue import load_object
         from dro_grasp.objects.scenery import load_scene
-        from dro_grasp.planning.extra import require_arm_extra
-
-        require_arm_extra()
-        from dro_grasp.planning.plan_config import PlanConfig
-        from dro_grasp.planning.planner import plan
+        from dro_grasp.planning.motion import trajectory_csv, trajectory_yaml
+        from dro_grasp.planning.planner import PlanConfig, plan, require_arm_extra
         from dro_grasp.planning.robot import load_robot
-        from dro_grasp.planning.trajectory_files import trajectory_csv, trajectory_yaml
         from dro_grasp.predictor import GraspPredictor
 
+        require_arm_extra()
         if not 0 <= self.seed < 2**31:
             raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^31 - 1")
         avoid = None if self.avoid is None else load_scene(self.avoid)
@@ -104,6 +101,9 @@ class Plan:
         obstacles = [load_object(name) for name in self.obstacles]
         picked, T_world_object = self._place(robot)
         robot, obj, obstacles = picked.robot, picked.obj, [*obstacles, *picked.obstacles]
+        if robot.table is None:
+            say_aside(f"robot '{robot.name}' states no table: nothing keeps the hand above what the object stands on; state "
+                      "`table` in the robot file")
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
         made = plan(robot, obj, T_world_object, obstacles, GraspPredictor(self.weights), config, self.seed)
@@ -123,6 +123,8 @@ class Plan:
 
     def _place(self, robot: Robot) -> tuple[PickedObject, Float[np.ndarray, "4 4"]]:
         """The object with what stands around it, and where its frame is in the world."""
+        from dataclasses import replace
+
         import numpy as np
 
         from dro_grasp.errors import OptionError
@@ -131,6 +133,7 @@ class Plan:
         from dro_grasp.objects.catalogue import load_object
         from dro_grasp.objects.loading import read_geometry, read_points
         from dro_grasp.perception.scan import load_scan
+        from dro_grasp.planning.robot_file import Table
         from dro_grasp.planning.table_scene import PickedObject, pick_object, sees_table
 
         if sum(given is not None for given in (self.camera, self.pose, self.at)) > 1:
@@ -153,8 +156,11 @@ class Plan:
         if self.pose is not None:
             T = read_motion(self.pose, "T_frame_object").T.double().numpy()
         elif self.at is not None:
-            height = 0.0 if robot.table is None else robot.table.height
-            T[:3, 3] = *self.at, height - float(obj.cloud[:, 2].min())
+            if robot.table is None:
+                say_aside(f"robot '{robot.name}' states no table: z = 0 is taken for one; state `table` in the robot file")
+                robot = replace(robot, table=Table(0.0, self.at))
+            assert robot.table is not None
+            T[:3, 3] = *self.at, robot.table.height - float(obj.cloud[:, 2].min())
         elif obj.is_cloud and robot.table is not None and obj.table is not None:
             return pick_object(path.stem, read_points(path), robot), T  # a table, perhaps with several things on it
         return PickedObject(obj, [], robot), T

@@ -67,7 +67,7 @@ class View:
             serve(StudioServer(self._picked(), self.port, self.host))
             return 0
         if is_motion(self.file):
-            from dro_grasp.planning.extra import require_arm_extra
+            from dro_grasp.planning.planner import require_arm_extra
             from dro_grasp.viewer.lift_page import lift_page
 
             require_arm_extra()

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -19,8 +20,8 @@ from dro_grasp.files import check_output, make_folder, reading, replacing
 from dro_grasp.models.checkpoints import DEFAULT, describe_weights
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.planning.attempts import Attempt, TabletopConfig, Watcher, attempt
-from dro_grasp.planning.extra import require_arm_extra
 from dro_grasp.planning.motion import MotionPlan
+from dro_grasp.planning.planner import require_arm_extra
 from dro_grasp.planning.robot import load_robot
 from dro_grasp.planning.table_scene import PickedObject
 from dro_grasp.predictor import GraspPredictor
@@ -70,7 +71,8 @@ class PlanKeeper(Watcher):
 
 
 def run_tabletop(
-    run: TabletopRun, output: Path | None = None, workers: int = 1, progress: Progress | None = None, plans: Path | None = None
+    run: TabletopRun, output: Path | None = None, workers: int = 1, progress: Progress | None = None,
+    plans: Path | None = None, make: Callable[..., Attempt] | None = None,
 ) -> list[Attempt]:
     """Run all attempts that `output` does not hold yet; each is stored when it ends.
 
@@ -81,6 +83,7 @@ def run_tabletop(
         workers: Processes, which share out the objects; with several, attempts are stored object by object.
         progress: See `Progress`.
         plans: Folder for the plan of each attempt, ROBOT-OBJECT-NUMBER.npz.
+        make: Makes one, instead of `attempt`, with the same arguments.
 
     Raises:
         OptionError: The extra is missing, something cannot be attempted, two objects have one name, or `output` holds such
@@ -97,7 +100,7 @@ def run_tabletop(
     missing = {o: [k for k in range(run.attempts) if (n, k) not in done] for o, n in names.items()}
     if plans is not None:
         make_folder(plans)
-    for result in _results(run, {o: numbers for o, numbers in missing.items() if numbers}, workers, plans):
+    for result in _results(run, {o: numbers for o, numbers in missing.items() if numbers}, workers, plans, make or attempt):
         stored.append(result)
         done[result.object, result.number] = result
         if output is not None:
@@ -148,27 +151,31 @@ def _objects(given: Sequence[str]) -> dict[str, tuple[str, str, str]]:
     return found
 
 
-def _results(run: TabletopRun, missing: dict[str, list[int]], workers: int, plans: Path | None) -> Iterator[Attempt]:
+def _results(
+    run: TabletopRun, missing: dict[str, list[int]], workers: int, plans: Path | None, make: Callable[..., Attempt]
+) -> Iterator[Attempt]:
     if workers <= 1 or len(missing) <= 1:
         for name, numbers in missing.items():
-            yield from _attempts(run, name, numbers, plans)
+            yield from _attempts(run, name, numbers, plans, make)
         return
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
-        for future in as_completed([pool.submit(_all_attempts, run, *item, plans) for item in missing.items()]):
+        for future in as_completed([pool.submit(_all_attempts, run, *item, plans, make) for item in missing.items()]):
             yield from future.result()
 
 
-def _all_attempts(run: TabletopRun, name: str, numbers: Sequence[int], plans: Path | None) -> list[Attempt]:
+def _all_attempts(*task: Any) -> list[Attempt]:
     with one_thread():
-        return list(_attempts(run, name, numbers, plans))
+        return list(_attempts(*task))
 
 
-def _attempts(run: TabletopRun, name: str, numbers: Sequence[int], plans: Path | None) -> Iterator[Attempt]:
+def _attempts(
+    run: TabletopRun, name: str, numbers: Sequence[int], plans: Path | None, make: Callable[..., Attempt]
+) -> Iterator[Attempt]:
     robot, obj, predictor = load_robot(run.robot), load_object(name), GraspPredictor(run.weights)
     weights = describe_weights(run.weights)["sha256"]
     for number in numbers:
         keeper = None if plans is None else PlanKeeper(plans / f"{robot.name}-{obj.name}-{number}.npz")
-        made = attempt(robot, obj, number, run.seed, predictor, run.config, keeper)
+        made = make(robot, obj, number, run.seed, predictor, run.config, keeper)
         yield replace(
             made, robot_file=str(run.robot), object_file=str(name), weights=str(run.weights or DEFAULT),
             robot_sha256=robot.sha256, object_sha256=obj.sha256, weights_sha256=weights,

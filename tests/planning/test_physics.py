@@ -1,4 +1,4 @@
-"""Rehearsals: balls stand for what a cloud shows, and a grasp that lets go is told from one that holds."""
+"""Lifts in simulation: servos, what rests on the table, and grasps that let go, told by rehearsals from those that hold."""
 
 from __future__ import annotations
 
@@ -12,13 +12,11 @@ import trimesh
 
 import dro_grasp as dro
 from dro_grasp.objects.ball_solid import solid_of
-from dro_grasp.planning import rehearsal as rehearsal_module
 from dro_grasp.planning.candidates import grasps_in_world
-from dro_grasp.planning.physics import MEMORY, LiftScene
-from dro_grasp.planning.plan_config import PlanConfig
-from dro_grasp.planning.planner import LOSES, plan
+from dro_grasp.planning.physics import DEVIATIONS, MEMORY, Deviation, LiftScene, Rehearsal
+from dro_grasp.planning.planner import LOSES, PlanConfig, plan
 from dro_grasp.planning.reachability import Feasible, Postures
-from dro_grasp.planning.rehearsal import DEVIATIONS, Rehearsal
+from dro_grasp.planning.workcell import Workcell
 from tests.helpers.claw import claw_xml
 from tests.helpers.clouds import cloud_of
 
@@ -34,7 +32,7 @@ def ball() -> dro.ObjectModel:
 
 
 def test_an_estimated_object_stands_still_on_the_table(robot: dro.Robot, ball: dro.ObjectModel) -> None:
-    scene = LiftScene(robot, [ball])
+    scene = LiftScene(Workcell(robot), [ball])
     assert scene.model.narena == MEMORY  # MuJoCo's own choice ends in a fatal error where many balls touch the hand
     scene.place(0, np.eye(4))
     scene.advance(1.0)
@@ -54,7 +52,7 @@ def test_joints_above_the_palm_stay_and_the_others_follow(robot: dro.Robot, tmp_
     file.write_text(xml.replace("</worldbody>", "</body></worldbody>"))
     hand = dro.load_hand(file)
     assert hand.movable.tolist() == [False, *8 * [True]]
-    scene, arm = LiftScene(replace(robot, hand=hand), []), robot.home
+    scene, arm = LiftScene(Workcell(replace(robot, hand=hand)), []), robot.home
     before = scene.joints()[1]
     wanted = hand.canonical_joints(0.7).double().numpy()
     scene.command(arm, np.zeros_like(arm), wanted)
@@ -78,7 +76,7 @@ def evenly(robot: dro.Robot, rows: np.ndarray, distance: float) -> np.ndarray:
 
 
 def test_the_chosen_grasp_holds_and_one_that_never_closes_does_not(
-    robot: dro.Robot, ball: dro.ObjectModel, grasps: dro.GraspBatch, monkeypatch: pytest.MonkeyPatch
+    robot: dro.Robot, ball: dro.ObjectModel, grasps: dro.GraspBatch
 ) -> None:
     planned = plan(robot, ball, grasps=grasps)
     rows, closed, hand = planned.part("approach"), planned.part("close"), planned.hand.position
@@ -86,7 +84,8 @@ def test_the_chosen_grasp_holds_and_one_that_never_closes_does_not(
                       planned.arm.position[planned.part("lift")][::10])
     postures = Postures.of(robot, grasps, chosen.index)
     assert np.allclose(postures.squeeze, hand[closed.stop - 1], atol=1e-6)
-    rehearsal = Rehearsal(robot, ball, np.eye(4))
+    cell = Workcell(robot, (), ball)
+    rehearsal = Rehearsal(cell)
     first = rehearsal.share(chosen, postures)
     assert first > 0
     assert rehearsal.share(chosen, replace(postures, grasp=postures.pregrasp, squeeze=postures.pregrasp)) == 0
@@ -95,24 +94,37 @@ def test_the_chosen_grasp_holds_and_one_that_never_closes_does_not(
     for distance in (0.005, 0.02):  # between the poses that were solved; nothing depends on it
         line = replace(chosen, approach=evenly(robot, chosen.approach, distance), lift=evenly(robot, chosen.lift, distance))
         assert rehearsal.holds(line, postures, DEVIATIONS[0])
+    rehearsal = Rehearsal(cell, few_contacts=12)
     seen, scene = [], rehearsal.scene
-    monkeypatch.setattr(rehearsal_module, "FEW_CONTACTS", 12)
     honest = scene.advance
 
     def advance(*arguments: float, **options: float) -> None:
         seen.append((scene.data.ncon > 12, scene.model.opt.noslip_iterations == 0))
         honest(*arguments, **options)
 
-    monkeypatch.setattr(scene, "advance", advance)
+    scene.advance = advance
     rehearsal.holds(chosen, postures, DEVIATIONS[0])
     assert set(seen) == {(False, False), (True, True)}  # many contacts cost no more than in proportion
 
 
 def test_where_none_holds_the_best_score_is_taken_all_the_same(
-    robot: dro.Robot, ball: dro.ObjectModel, grasps: dro.GraspBatch, monkeypatch: pytest.MonkeyPatch
+    robot: dro.Robot, ball: dro.ObjectModel, grasps: dro.GraspBatch
 ) -> None:
-    monkeypatch.setattr(Rehearsal, "holds", lambda *_: False)
-    made = plan(robot, ball, grasps=grasps)
+    heavy = Deviation(weight=100.0)
+    made = plan(robot, ball, config=PlanConfig(deviations=(heavy,)), grasps=grasps)
     assert made.notes.chosen == plan(robot, ball, config=PlanConfig(rehearsals=0), grasps=grasps).notes.chosen
-    monkeypatch.setattr(Rehearsal, "holds", lambda *a: a[-1] is not DEVIATIONS[1])
-    assert LOSES not in plan(robot, ball, grasps=grasps).notes.dropped
+    sometimes = PlanConfig(deviations=(Deviation(), heavy, Deviation()))
+    assert LOSES not in plan(robot, ball, config=sometimes, grasps=grasps).notes.dropped
+
+
+def test_servos_follow_a_trajectory_within_a_degree(robot: dro.Robot) -> None:
+    scene = LiftScene(Workcell(robot), [dro.load_object("can")])
+    hand, worst = scene.joints()[1], 0.0
+    for k in range(100):
+        target, velocity = robot.home.copy(), np.zeros(7)
+        target[0] += 0.3 * (1 - np.cos(np.pi * k / 50))
+        velocity[0] = 0.3 * np.pi * np.sin(np.pi * k / 50)
+        scene.command(target, velocity, hand)
+        scene.advance(0.02)
+        worst = max(worst, float(np.abs(scene.joints()[0] - target).max()))
+    assert worst < np.radians(2)

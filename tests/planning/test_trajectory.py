@@ -1,32 +1,17 @@
-"""What plans are made of: inverse kinematics, paths round obstacles, and the time that a motion takes."""
+"""Paths round obstacles, the time that a motion takes, and its stages."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import dro_grasp as dro
-from dro_grasp.planning.inverse_kinematics import WristSolver
-from dro_grasp.planning.paths import find_path
-from dro_grasp.planning.reachability import Postures
-from dro_grasp.planning.timed_stages import closing
-from dro_grasp.planning.timing import USED, cornered, smooth
-
-
-def test_inverse_kinematics_reaches_what_forward_kinematics_reached_and_nothing_beyond(robot: dro.Robot) -> None:
-    solver, (lower, upper) = WristSolver(robot), robot.working_range
-    generator = np.random.default_rng(3)
-    seeds = [robot.home, *generator.uniform(lower, upper, (8, 7))]
-    wanted = robot.T_world_wrist(generator.uniform(lower, upper, (10, 7)))
-    found = [solver.solve(T, seeds) for T in wanted]
-    assert sum(q is not None for q in found) >= 8
-    for q, T in zip(found, wanted, strict=True):
-        if q is not None:
-            assert np.abs(robot.T_world_wrist(q) - T)[:3, 3].max() < 1e-3
-            assert ((q >= lower) & (q <= upper)).all()
-    far = np.eye(4)
-    far[0, 3] = robot.longest_reach
-    assert solver.solve(far, seeds[:2]) is None
+from dro_grasp.planning.motion import STAGES, MotionPlan
+from dro_grasp.planning.reachability import Feasible, Postures
+from dro_grasp.planning.trajectory import STEP, USED, cornered, find_path, smooth, standing as standing_still, timed_stages
+from dro_grasp.planning.workcell import Workcell
 
 
 def test_a_path_goes_round_a_wall_to_the_goal_that_can_be_reached() -> None:
@@ -71,6 +56,29 @@ def test_a_closing_hand_stays_between_its_postures() -> None:
     """A spline through them overshoots: a finger that stops at the end of its range would leave it."""
     hand = Postures(np.zeros(2), np.array([0.2, 0.1]), np.array([1.0, 0.4]), np.array([1.0, 0.9]))
     limits = np.full(2, 2.0), np.full(2, 10.0)
-    made, spline = cornered(closing(hand), *limits, 1.0), smooth(closing(hand), *limits, 1.0)
+    made, spline = cornered(hand.closing, *limits, 1.0), smooth(hand.closing, *limits, 1.0)
     assert made.position.max(0) == pytest.approx(hand.squeeze, abs=1e-9)
     assert spline.position[:, 0].max() > 1.001
+
+
+def test_samples_are_at_most_a_step_apart(planned: MotionPlan) -> None:
+    assert np.diff(planned.arm.time).max() < STEP + 1e-9
+    for seconds, count in ((0.0149, 3), (0.5, 51), (0.0, 1)):
+        assert len(standing_still(np.zeros(2), seconds).time) == count
+
+
+@pytest.mark.parametrize("still", ["shape", "approach", "lift"])
+def test_a_stage_in_which_nothing_moves_is_a_stage(robot: dro.Robot, planned: MotionPlan, still: str) -> None:
+    """As when the pregrasp is the posture in which the hand travels."""
+    opened = robot.hand.canonical_joints().double().numpy()
+    bent, turned = opened + (still != "shape") * 0.05 * robot.hand.opening_signs.double().numpy(), np.eye(7)[0]
+    approach, lift = (np.linspace(robot.home + a * turned, robot.home + b * turned, 5) for a, b in (
+        (0.1, 0.1 if still == "approach" else 0.15), (0.15, 0.15 if still == "lift" else 0.2)))
+    cell, hand = Workcell(replace(robot, table=None)), Postures(opened, bent, opened, opened)
+    made = timed_stages(cell, np.stack([robot.home, approach[0]]), Feasible(0, approach, lift), hand, 1.0, 0.5)
+    assert made is not None
+    whole = replace(planned, stage=made.stage, arm=made.arm, hand=made.hand)
+    assert f"{still} 0.0 s" in whole.lines()[2]
+    assert (np.diff(whole.arm.time) > 0).all()
+    assert sorted(set(made.stage.tolist())) == list(range(len(STAGES)))
+    assert all(np.ptp(whole.arm.position[whole.part(s)], axis=0).max() > 0 for s in ("reach", "approach", "lift") if s != still)

@@ -1,4 +1,4 @@
-"""Robots: their files, the arms that ship, what collides, and how bad files are refused."""
+"""Robots: their files, the arms that ship, what collides, how far they get, and how bad files are refused."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+import torch
 import yaml
 
+import dro_grasp as dro
 from dro_grasp.cli.main import main
 from dro_grasp.errors import RobotError
-from dro_grasp.planning.collisions import CollisionChecker, open_hand
 from dro_grasp.planning.robot import Robot, load_robot
 from dro_grasp.planning.robot_file import BUILTIN_ROBOTS, robot_names
+from dro_grasp.planning.workcell import Workcell
 from tests.helpers.whole_robot import arm_with_claw, two_arms
 
 
@@ -35,11 +37,11 @@ def written(values: dict[str, Any], folder: Path) -> Path:
 @pytest.mark.parametrize("name", robot_names())
 def test_a_built_in_robot_is_free_at_home_and_its_wrist_is_where_mujoco_has_it(name: str) -> None:
     robot = load_robot(name)
-    checker = CollisionChecker(robot, robot.table)
-    assert not checker.contacts(robot.home, open_hand(robot))
+    cell = Workcell(robot)
+    assert not cell.contacts(robot.home, robot.open_hand)
     q = np.random.default_rng(0).uniform(robot.lower, robot.upper)
-    checker.contacts(q, open_hand(robot))
-    body = checker.data.body(f"hand/{robot.hand.wrist_link}")
+    cell.contacts(q, robot.open_hand)
+    body = cell.data.body(f"hand/{robot.hand.wrist_link}")
     T = robot.T_world_wrist(q)
     assert np.allclose(T[:3, 3], body.xpos, atol=1e-6)
     assert np.allclose(T[:3, :3], body.xmat.reshape(3, 3), atol=1e-6)
@@ -87,7 +89,7 @@ def test_any_arm_and_any_hand_are_one_file(
                "home": {f"joint{i + 1}": 0.5 for i in range(count)}}
     robot = load_robot(written(values, tmp_path))
     assert len(robot.arm_joints) == count
-    assert CollisionChecker(robot, robot.table).excluded
+    assert Workcell(robot).excluded
     if "lite6" in arm:  # what its actuators state
         assert robot.effort.tolist() == [50, 50, 32, 32, 32, 20]
         assert np.allclose(robot.lower[[0, 2]], [-6.28319, -0.061087], atol=1e-4)
@@ -151,16 +153,6 @@ def test_an_unusable_arm_is_named_by_the_path_that_was_given(values: dict[str, A
     arm.write_text('<robot name="x"><link name="a"/></robot>')
     with pytest.raises(RobotError, match=rf"cannot be used: {arm} has no moving joint .*; a robot needs"):
         load_robot(written(values | {"arm": str(arm)}, tmp_path))
-
-
-def test_an_arm_that_dips_into_the_table_collides_with_it_and_with_nothing_else(values: dict[str, Any], tmp_path: Path) -> None:
-    robot = load_robot(written(values, tmp_path))
-    down = robot.home.copy()
-    down[[1, 3]] = 1.2, 1.6
-    found = CollisionChecker(robot, robot.table).contacts(down, open_hand(robot))
-    assert found
-    assert {"table"} == {name for c in found for name in (c.first, c.second) if "/" not in name}
-    assert not CollisionChecker(robot).contacts(down, open_hand(robot))
 
 
 def change(path: str, value: Any) -> Any:
@@ -239,3 +231,40 @@ def test_a_robot_that_collides_at_home_is_not_usable(
     values["home"]["joint2"] = 1.6
     assert main(["robot", "check", str(written(values, tmp_path))]) == 2
     assert "COLLISION at home: " in capsys.readouterr().out
+
+
+ARM = """<mujoco><compiler angle="radian"/><worldbody><body name="base"><geom size="0.05"/>
+<body name="cart" pos="0 0 0.1"><joint name="rail" type="slide" axis="1 0 0" range="0 2"/><geom size="0.05"/>
+<body name="upper" pos="0.1 0 0"><joint name="shoulder" axis="0 1 0" pos="0 0 0.3" range="-3 3"/><geom size="0.03"/>
+<body name="tip" pos="0.3 0 0"><joint name="elbow" axis="0 1 0" range="-3 3"/><geom size="0.03"/></body></body></body></body>
+</worldbody></mujoco>"""
+"""A rail of two metres under two joints, of which one turns about an axis off its link's origin."""
+
+
+@pytest.fixture(scope="module")
+def railed(tmp_path_factory: pytest.TempPathFactory) -> Robot:
+    folder = tmp_path_factory.mktemp("rail")
+    (folder / "arm.xml").write_text(ARM)
+    values = {"arm": "arm.xml", "hand": "gripper3", "mount": {"link": "tip", "position": [0.05, 0, 0]},
+              "home": {"rail": 0.1, "shoulder": 0.2, "elbow": -0.3}, "limits": {"velocity": 1.0, "acceleration": 4.0}}
+    (folder / "robot.yaml").write_text(yaml.safe_dump(values))
+    return load_robot(folder / "robot.yaml")
+
+
+def wrists(robot: Robot) -> torch.Tensor:
+    """Poses of the wrist in the base's frame, at random and with the rail at its end."""
+    arm = np.random.default_rng(0).uniform(*robot.working_range, (4000, len(robot.home)))
+    arm[2000:, 0] = robot.working_range[1][0]
+    return torch.from_numpy(np.linalg.inv(robot.T_world_base) @ robot.T_world_wrist(arm)).float()
+
+
+def test_no_grasp_centre_and_no_fingertip_is_beyond_reach(railed: Robot, robot: dro.Robot) -> None:
+    for one in (railed, robot):
+        T, hand = wrists(one), one.hand
+        centre = hand.grasp_centres(T).norm(dim=-1).max()
+        q = hand.random_joints(len(T), torch.Generator().manual_seed(0))
+        surface = hand.points(q[::20], T[::20]).norm(dim=-1).max()
+        assert centre <= one.longest_reach
+        assert surface <= one.full_reach
+        assert centre < surface, "fingers are longer"
+        assert one.longest_reach < 1.4 * centre, "the bound says something"

@@ -7,18 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 import dro_grasp as dro
 from dro_grasp.cli.main import main
-from dro_grasp.planning.attempts import TabletopConfig
-from dro_grasp.planning.clutter import APART, other_objects, scatter
-from dro_grasp.planning.collisions import CollisionChecker, open_hand
+from dro_grasp.perception.scan import depth_points
+from dro_grasp.planning.attempts import depth_image, thinned_intrinsics
 from dro_grasp.planning.physics import LiftScene
-from dro_grasp.planning.reachability import HITS_OBSTACLE, Reachability, ReachConfig
-from dro_grasp.planning.standing import moved
-from dro_grasp.planning.table_scene import pick_object, sees_table, sort_out
-from dro_grasp.planning.workcell import VOXEL, occupied
+from dro_grasp.planning.table_scene import clusters, fit_plane, pick_object, sees_table, sort_out
+from dro_grasp.planning.workcell import VOXEL, Workcell, moved, occupied
 
 CUBE, BALL, RADIUS = (0.45, 0.1), (0.5, -0.1), 0.04
 
@@ -131,52 +127,24 @@ def test_a_cloud_of_which_it_is_not_clear_what_is_wanted_is_refused(
     assert not output.exists()
 
 
-def test_boxes_of_a_cloud_fill_its_cells_and_nothing_else() -> None:
-    points = np.random.default_rng(0).uniform(0, 0.06, (300, 3))
-    centre, half = occupied(points)
-    cells = np.unique(np.floor(points / VOXEL).astype(int), axis=0)
-    assert (2 * half).prod(1).sum() == pytest.approx(len(cells) * VOXEL**3)
-    beyond = (np.abs(points[:, None] - centre) - half).max(-1)
-    assert beyond.min(1).max() < 1e-9
+def test_a_plane_is_found_under_noise_and_clutter_and_a_wall_is_none() -> None:
+    random = np.random.default_rng(0)
+    flat = np.column_stack([random.uniform(-1, 1, (800, 2)), random.normal(0.1, 0.001, 800)])
+    things = random.uniform([-0.2, -0.2, 0.12], [0.2, 0.2, 0.3], (300, 3))
+    plane = fit_plane(np.concatenate([flat, things]))
+    assert np.allclose(plane, [0, 0, 1, 0.1], atol=(5e-3, 5e-3, 5e-3, 1e-3))
+    with pytest.raises(dro.DroGraspError, match="no level table"):
+        fit_plane(flat[:, [2, 0, 1]])
+    assert len(set(clusters(np.array([[0, 0, 0], [0, 0, 0.01], [0, 0, 0.1]], float)).tolist())) == 2
 
 
-def test_boxes_of_a_plate_are_one() -> None:
-    x, y = np.meshgrid(np.arange(0.005, 0.3, 0.01), np.arange(0.005, 0.2, 0.01))
-    centre, half = occupied(np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.005)]))
-    np.testing.assert_allclose(centre, [[0.15, 0.1, 0.005]])
-    np.testing.assert_allclose(half, [[0.15, 0.1, 0.005]])
-
-
-def test_hands_that_would_meet_an_obstacle_are_dropped(robot: dro.Robot) -> None:
-    obj, T = dro.load_object("can"), np.eye(4)
-    T[:3, 3] = 0.5, 0.1, -float(obj.cloud[:, 2].min())
-    hand = robot.hand
-    wrist = torch.eye(4)[None].repeat(2, 1, 1)
-    wrist[:, :3, 3] = torch.tensor([[0.5, 0.1, 0.4], [0.5, 0.6, 0.4]])
-    opened = torch.from_numpy(open_hand(robot)).float()[None].repeat(2, 1)
-    grasps = dro.GraspBatch.create(hand, obj, wrist, opened).replace(pregrasp_joints=opened, squeeze_joints=opened)
-    middle = hand.points(opened[0], wrist[0]).mean(0).numpy()
-    ball = np.random.default_rng(0).normal(size=(500, 3))
-    obstacle = dro.load_object(middle + 0.03 * ball / np.linalg.norm(ball, axis=1, keepdims=True), keep_table=True)
-    for thing in (obstacle, dro.load_object("cube")):
-        checker = CollisionChecker(robot, robot.table, [thing], obj, T)
-        reach = Reachability(robot, checker, obj, [thing], None, ReachConfig(), 0)
-        assert reach.promising(grasps) == ([1] if thing is obstacle else [0, 1])
-        assert list(reach.reasons.values()) == ([HITS_OBSTACLE] if thing is obstacle else [])
-
-
-def test_clutter_stands_on_the_table_around_the_object(robot: dro.Robot) -> None:
-    can, config = dro.load_object("can"), TabletopConfig(clutter=2)
-    others = other_objects("can", 2, np.random.default_rng(0))
-    assert "can" not in {o.name for o in others}
-    scene = LiftScene(robot, [can, *others])
-    assert scatter(scene, config.region, np.random.default_rng(1))
-    clouds = [o.cloud @ scene.pose(i)[:3, :3].T + scene.pose(i)[:3, 3] for i, o in enumerate(scene.objects)]
-    for i, cloud in enumerate(clouds):
-        assert abs(cloud[:, 2].min()) < 3e-3
-        for other in clouds[:i]:
-            assert np.linalg.norm(cloud[::20, None] - other[None, ::20], axis=-1).min() > APART / 3
-    with pytest.raises(dro.DroGraspError, match="clutter is 9"):
-        TabletopConfig(clutter=9)
-    with pytest.raises(dro.DroGraspError, match=r"region is \(0.5, 0.0, 0.4, 0.1\); give two corners"):
-        TabletopConfig(region=(0.5, 0.0, 0.4, 0.1))
+def test_an_empty_table_is_refused_in_words(robot: dro.Robot) -> None:
+    scene = LiftScene(Workcell(robot), [dro.load_object("can")])
+    aside = np.eye(4)
+    aside[:3, 3] = 3.0, 3.0, 0.5
+    scene.place(0, aside)
+    assert robot.camera is not None
+    assert robot.table is not None
+    points = depth_points(depth_image(scene, robot.camera, 0.0015, 0)[0], thinned_intrinsics(robot.camera))
+    with pytest.raises(dro.DroGraspError, match="nothing stands on the table"):
+        sort_out(points, robot.camera.T_world_camera, robot.table)
