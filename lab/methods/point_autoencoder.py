@@ -11,12 +11,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from dro_grasp.baselines.bundle_draws import BundleDraws
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.training.config import ScheduleConfig
 from dro_grasp.training.reports import Report
 from dro_grasp.training.run_plan import run_plan
 from dro_grasp.training.runs import Losses, TrainingRun, begin, recalibrate
+from lab.methods.bundle_draws import BundleDraws
 
 Network = TypeVar("Network", bound=nn.Module)
 Config = TypeVar("Config", bound="AutoencoderConfig")

@@ -9,13 +9,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.baselines.bundle_draws import BundleDraws
-from dro_grasp.baselines.gendexgrasp.contact_maps import TRAINING_GAMMA, contact_map
-from dro_grasp.baselines.gendexgrasp.map_network import LATENT, ContactMapNetwork, MapOutput
-from dro_grasp.baselines.point_autoencoder import AutoencoderConfig, divergence, train_autoencoder
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.training.reports import Report, console_report
 from dro_grasp.training.runs import Losses
+from lab.methods.bundle_draws import BundleDraws
+from lab.methods.gendexgrasp.contact_maps import TRAINING_GAMMA, contact_map
+from lab.methods.gendexgrasp.map_network import LATENT, ContactMapNetwork, MapOutput
+from lab.methods.point_autoencoder import AutoencoderConfig, divergence, train_autoencoder
 
 
 @dataclass(frozen=True)

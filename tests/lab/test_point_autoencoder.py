@@ -10,12 +10,12 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from dro_grasp.baselines.bundle_draws import BundleDraws
-from dro_grasp.baselines.point_autoencoder import AutoencoderConfig, divergence, each, layer, train_autoencoder
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.errors import BundleError, TrainingError
 from dro_grasp.training.config import ScheduleConfig
 from dro_grasp.training.run_folder import RunFolder
+from lab.methods.bundle_draws import BundleDraws
+from lab.methods.point_autoencoder import AutoencoderConfig, divergence, each, layer, train_autoencoder
 
 SCHEDULE = ScheduleConfig(steps=40, learning_rate=0.03, warmup_steps=1, recalibration=3, log_every=10, average_decay=0.9)
 CONFIG = AutoencoderConfig(SCHEDULE, points=16, hand_points=12)

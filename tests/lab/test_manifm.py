@@ -9,17 +9,16 @@ from pathlib import Path
 import pytest
 import torch
 
-from dro_grasp.baselines.bundle_draws import BundleDraws
-from dro_grasp.baselines.manifm import contact_training
-from dro_grasp.baselines.manifm.contact_method import ContactMethodConfig, reached
-from dro_grasp.baselines.manifm.contact_network import LATENT, ContactNetwork
-from dro_grasp.baselines.manifm.contact_training import ContactTrainingConfig, contact_losses, draw_contacts, open_hand_cloud
-from dro_grasp.baselines.manifm.fingertip_contacts import REACH, WIDTH, Pads, contact_maps, contacts_of
 from dro_grasp.baselines.registry import make_method
-from dro_grasp.cli.main import main
 from dro_grasp.geometry.se3 import apply
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.pipeline.problem import GraspProblem
+from lab.methods import train
+from lab.methods.bundle_draws import BundleDraws
+from lab.methods.manifm.contact_method import ContactMethod, ContactMethodConfig, reached
+from lab.methods.manifm.contact_network import LATENT, ContactNetwork
+from lab.methods.manifm.contact_training import ContactTrainingConfig, contact_losses, draw_contacts, open_hand_cloud
+from lab.methods.manifm.fingertip_contacts import REACH, WIDTH, Pads, contact_maps, contacts_of
 from tests.helpers.toy_hand import toy_hand
 
 HAND = toy_hand()
@@ -105,16 +104,16 @@ def test_losses_fall(bundle) -> None:
 
 
 @pytest.mark.slow
-def test_the_command_trains_a_method_that_the_benchmark_takes(
+def test_training_makes_a_method_that_the_benchmark_takes(
     bundle, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(contact_training, "ContactTrainingConfig", functools.partial(
+    monkeypatch.setattr(train, "ContactTrainingConfig", functools.partial(
         ContactTrainingConfig, batch=4, points=16, hand_points=48))
     weights = tmp_path / "contacts.safetensors"
-    assert main(["train", "--method", "manifm", "--bundle", str(home / "bundle.safetensors"), "--run-folder",
-                 str(tmp_path / "run"), "--output", str(weights), "--steps", "2"]) == 0
+    train.train("manifm", home / "bundle.safetensors", tmp_path / "run", weights, steps=2)
     assert weights.stat().st_size < 3_000_000
-    method = make_method(f"manifm@{weights}")
+    assert make_method("lab.methods.manifm:ContactMethod").name == "manifm"
+    method = ContactMethod(weights)
     grasps = method.predict(HAND, load_object("sphere"), 2, 3)
     assert len(grasps) == 2
     assert bool(grasps.states_closing.all())

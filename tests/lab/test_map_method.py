@@ -9,14 +9,14 @@ import pytest
 import torch
 import trimesh
 
-from dro_grasp.baselines.gendexgrasp.map_fitting import FittingConfig
-from dro_grasp.baselines.gendexgrasp.map_method import ContactMapMethod
-from dro_grasp.baselines.gendexgrasp.map_network import LATENT, ContactMapNetwork
 from dro_grasp.errors import WeightsError
 from dro_grasp.models.checkpoints import save_weights
 from dro_grasp.objects.in_memory import object_in_memory
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.training.runs import recalibrate
+from lab.methods.gendexgrasp.map_fitting import FittingConfig
+from lab.methods.gendexgrasp.map_method import ContactMapMethod
+from lab.methods.gendexgrasp.map_network import LATENT, ContactMapNetwork
 from tests.helpers.toy_hand import toy_hand
 
 SHIFT = np.array([0.25, -0.125, 0.5])  # exact in binary, so that the object keeps its shape to the last digit

@@ -6,13 +6,14 @@ from pathlib import Path
 
 import torch
 
-from dro_grasp.baselines.gendexgrasp.contact_maps import sharpened
-from dro_grasp.baselines.gendexgrasp.map_fitting import FittingConfig, MapTarget, fit
-from dro_grasp.baselines.gendexgrasp.map_network import LATENT, ContactMapNetwork
 from dro_grasp.baselines.method import Method
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.models.checkpoints import load_into
 from dro_grasp.pipeline.problem import GraspProblem
+from lab.methods import WEIGHTS
+from lab.methods.gendexgrasp.contact_maps import FITTING_GAMMA, TRAINING_GAMMA, sharpened
+from lab.methods.gendexgrasp.map_fitting import FittingConfig, MapTarget, fit
+from lab.methods.gendexgrasp.map_network import LATENT, ContactMapNetwork
 
 POINTS = 256
 """Object points of a map, as many as in training (GenDexGrasp: 2,048)."""
@@ -43,3 +44,17 @@ class ContactMapMethod(Method):
         T, q, energy = fit(hand, MapTarget(points, normals, goals, problem.obj.distance_field), self.config, generator)
         return GraspBatch.create(
             problem.hand, problem.obj, T, q, energy=energy, seed=seed, provenance=f"GenDexGrasp {self.name}")
+
+
+class GenDexGrasp(ContactMapMethod):
+    """The method with a gamma of 2, as GenDexGrasp's optimiser has it."""
+
+    def __init__(self, weights: Path = WEIGHTS / "gendexgrasp.safetensors") -> None:
+        super().__init__(weights, "gendexgrasp", FittingConfig(gamma=FITTING_GAMMA))
+
+
+class GenDexGraspGamma1(ContactMapMethod):
+    """The method with a gamma of 1, as in its training."""
+
+    def __init__(self, weights: Path = WEIGHTS / "gendexgrasp.safetensors") -> None:
+        super().__init__(weights, "gendexgrasp-gamma1", FittingConfig(gamma=TRAINING_GAMMA))

@@ -10,14 +10,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.baselines.bundle_draws import BundleDraws
-from dro_grasp.baselines.manifm.contact_network import LATENT, ContactNetwork, ContactOutput
-from dro_grasp.baselines.manifm.fingertip_contacts import ContactMaps, contact_maps
-from dro_grasp.baselines.point_autoencoder import AutoencoderConfig, divergence, train_autoencoder
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.hands.hand import Hand
 from dro_grasp.training.reports import Report, console_report
 from dro_grasp.training.runs import Losses
+from lab.methods.bundle_draws import BundleDraws
+from lab.methods.manifm.contact_network import LATENT, ContactNetwork, ContactOutput
+from lab.methods.manifm.fingertip_contacts import ContactMaps, contact_maps
+from lab.methods.point_autoencoder import AutoencoderConfig, divergence, train_autoencoder
 
 HAND_POINTS = 64
 """Points of the open hand that the network is told (ours)."""

@@ -16,9 +16,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.baselines.manifm.contact_network import LATENT, ContactNetwork
-from dro_grasp.baselines.manifm.contact_training import open_hand_cloud
-from dro_grasp.baselines.manifm.fingertip_contacts import Pads, contacts_of
 from dro_grasp.baselines.method import Method
 from dro_grasp.geometry.registration import register
 from dro_grasp.geometry.se3 import apply, rotate
@@ -29,6 +26,10 @@ from dro_grasp.models.checkpoints import load_into
 from dro_grasp.optimization.grip import gripping
 from dro_grasp.optimization.refinement import RefineConfig, refine_grasps
 from dro_grasp.pipeline.problem import GraspProblem
+from lab.methods import WEIGHTS
+from lab.methods.manifm.contact_network import LATENT, ContactNetwork
+from lab.methods.manifm.contact_training import open_hand_cloud
+from lab.methods.manifm.fingertip_contacts import Pads, contacts_of
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class ContactMethod(Method):
 
     name = "manifm"
 
-    def __init__(self, weights: Path, config: ContactMethodConfig | None = None) -> None:
+    def __init__(self, weights: Path = WEIGHTS / "manifm.safetensors", config: ContactMethodConfig | None = None) -> None:
         """Load the weights.
 
         Raises:

@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from dro_grasp.baselines.manifm.fingertip_contacts import ContactMaps
-from dro_grasp.baselines.point_autoencoder import each, layer
+from lab.methods.manifm.fingertip_contacts import ContactMaps
+from lab.methods.point_autoencoder import each, layer
 
 LATENT = 64
 """Numbers in z. Source: ManiFM."""

@@ -11,24 +11,23 @@ from pathlib import Path
 import pytest
 import torch
 
-from dro_grasp.baselines import registry
-from dro_grasp.baselines.bundle_draws import BundleDraws
-from dro_grasp.baselines.gendexgrasp import contact_maps, map_training
-from dro_grasp.baselines.gendexgrasp.contact_maps import contact_map, sharpened
-from dro_grasp.baselines.gendexgrasp.map_fitting import FittingConfig, MapTarget, fit, map_energy
-from dro_grasp.baselines.gendexgrasp.map_network import LATENT, ContactMapNetwork
-from dro_grasp.baselines.gendexgrasp.map_training import (
+from dro_grasp.baselines.registry import make_method
+from dro_grasp.errors import WeightsError
+from dro_grasp.models.checkpoints import save_weights
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.training.config import ScheduleConfig
+from lab.methods import train
+from lab.methods.bundle_draws import BundleDraws
+from lab.methods.gendexgrasp import contact_maps, map_method
+from lab.methods.gendexgrasp.contact_maps import contact_map, sharpened
+from lab.methods.gendexgrasp.map_fitting import FittingConfig, MapTarget, fit, map_energy
+from lab.methods.gendexgrasp.map_network import LATENT, ContactMapNetwork
+from lab.methods.gendexgrasp.map_training import (
     MapTrainingConfig,
     draw_maps,
     map_losses,
     train_contact_maps,
 )
-from dro_grasp.baselines.registry import make_method
-from dro_grasp.cli.main import main
-from dro_grasp.errors import WeightsError
-from dro_grasp.models.checkpoints import save_weights
-from dro_grasp.objects.catalogue import load_object
-from dro_grasp.training.config import ScheduleConfig
 from tests.helpers.toy_hand import toy_hand
 
 SMALL = MapTrainingConfig(ScheduleConfig(steps=6, recalibration=2, log_every=1), batch=4, points=32, hand_points=24)
@@ -156,14 +155,14 @@ def test_a_hand_finds_back_to_the_map_of_a_known_grasp() -> None:
     assert torch.allclose(rotation @ rotation.mT, torch.eye(3), atol=1e-4)
 
 
-def test_the_command_trains_a_method_that_the_benchmark_takes(bundle, home: Path, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(registry, "FittingConfig", lambda **_: FittingConfig(particles=2, steps=2))
-    monkeypatch.setattr(map_training, "MapTrainingConfig", functools.partial(MapTrainingConfig, batch=4, points=16))
+def test_training_makes_a_method_that_the_benchmark_takes(bundle, home: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(map_method, "FittingConfig", lambda **_: FittingConfig(particles=2, steps=2))
+    monkeypatch.setattr(train, "MapTrainingConfig", functools.partial(MapTrainingConfig, batch=4, points=16))
     weights = tmp_path / "maps.safetensors"
-    assert main(["train", "--method", "gendexgrasp", "--bundle", str(home / "bundle.safetensors"), "--run-folder",
-                 str(tmp_path / "run"), "--output", str(weights), "--steps", "1"]) == 0
+    train.train("gendexgrasp", home / "bundle.safetensors", tmp_path / "run", weights, steps=1)
     assert weights.stat().st_size < 3_000_000
-    method = make_method(f"gendexgrasp@{weights}")
+    assert make_method("lab.methods.gendexgrasp:GenDexGraspGamma1").name == "gendexgrasp-gamma1"
+    method = map_method.GenDexGrasp(weights)
     grasps = method.predict(toy_hand(), load_object("sphere"), 2, 3)
     assert len(grasps) == 2
     assert bool(grasps.energy.isfinite().all())
@@ -173,4 +172,4 @@ def test_the_command_trains_a_method_that_the_benchmark_takes(bundle, home: Path
 def test_foreign_weights_are_refused(tmp_path: Path) -> None:
     save_weights(torch.nn.Linear(2, 2), tmp_path / "other.safetensors")
     with pytest.raises(WeightsError, match="use weights made with this version"):
-        make_method(f"gendexgrasp@{tmp_path / 'other.safetensors'}")
+        map_method.GenDexGrasp(tmp_path / "other.safetensors")

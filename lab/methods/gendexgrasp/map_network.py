@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from dro_grasp.baselines.point_autoencoder import each, layer
+from lab.methods.point_autoencoder import each, layer
 
 LATENT = 128
 """Numbers in z. Source: GenDexGrasp."""
