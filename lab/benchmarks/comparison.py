@@ -26,7 +26,7 @@ import torch
 
 from dro_grasp.baselines.method import Method
 from dro_grasp.baselines.ours import DistanceMethod, SynthesisMethod
-from dro_grasp.baselines.registry import MethodOptions, make_method
+from dro_grasp.baselines.registry import MOVED, MethodOptions, make_method
 from dro_grasp.datasets.bundle.training_file import load_bundle
 from dro_grasp.evaluation.metrics import diversity, wilson_interval
 from dro_grasp.evaluation.success_rates import pair_seed
@@ -106,7 +106,7 @@ class Source:
         """A method by its name in the table, such as `dro`, `dro:raw`, `dro:16` or `dfc=4`."""
         name, _, num = name.partition("=")
         plain, _, count = name.rpartition(":") if name.endswith(RAW) or name.rpartition(":")[2].isdigit() else (name, "", "")
-        method = make_method(plain, MethodOptions(bundle=options.bundle))
+        method = make_method(MOVED.get(plain, plain), MethodOptions(bundle=options.bundle))
         if count.isdigit():
             assert isinstance(method, DistanceMethod | SynthesisMethod), f"{plain} chooses none of its candidates"
             method.candidates = int(count)

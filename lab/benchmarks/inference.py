@@ -123,5 +123,5 @@ def main() -> None:
 
 if __name__ == "__main__":
     if PATIENCE[0] not in os.environ:  # it counts only before PyTorch is loaded
-        os.execve(sys.executable, [sys.executable, *sys.argv], os.environ | dict([PATIENCE]))
+        os.execve(sys.executable, sys.orig_argv, os.environ | dict([PATIENCE]))
     main()
