@@ -13,7 +13,7 @@ from dro_grasp.baselines import ours
 from dro_grasp.baselines.foreign import FileMethod, ForeignMethod
 from dro_grasp.baselines.method import Method
 from dro_grasp.baselines.ours import DescentMethod
-from dro_grasp.baselines.registry import METHODS, WITH_WEIGHTS, MethodOptions, make_method
+from dro_grasp.baselines.registry import METHODS, MethodOptions, make_method
 from dro_grasp.cli.main import main
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.objects.catalogue import load_object
@@ -49,7 +49,7 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_every_name_makes_a_method_that_predicts_as_the_predictor_does(bundle, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ours, "DESCENT_STEPS", 4)
     hand, obj = toy_hand(), load_object("sphere")
-    for name in sorted(set(METHODS) - {*WITH_WEIGHTS, "synthesise"}):
+    for name in sorted(set(METHODS) - {"dro", "synthesise"}):
         method = make_method(name, MethodOptions(bundle=bundle))
         assert method.name == name
         assert method.knows(hand)
@@ -92,6 +92,7 @@ def test_a_class_of_yours_stands_in_the_table(mine: Path, capsys: pytest.Capture
 @pytest.mark.parametrize(("name", "told"), [
     ("sorcery", "there is no method 'sorcery'"), ("no_such_module:Mine", "cannot be imported"),
     ("somebodys_module:Yours", "cannot be imported"), ("somebodys_module:Mute", "has no predict"), ("mean-grasp", "--bundle"),
+    ("gendexgrasp", "name it as lab.methods.gendexgrasp:GenDexGrasp"), ("manifm@mine.safetensors", "lab.methods.manifm:"),
 ])
 def test_what_is_no_method_is_explained(mine: Path, name: str, told: str) -> None:
     with pytest.raises(OptionError, match=told):
@@ -157,10 +158,9 @@ def test_a_method_returns_what_it_makes_unless_it_chooses() -> None:
 
 @pytest.mark.slow
 def test_a_first_look_at_all_methods_is_quick(capsys: pytest.CaptureFixture[str]) -> None:
-    """A sixth of what --quick measures with its defaults, in a sixth of ten minutes."""
-    methods = ["dro", "synthesise", "dfc", "start", "gendexgrasp", "gendexgrasp-gamma1", "manifm"]
+    methods = ["dro", "synthesise", "dfc", "start"]
     begin = time.process_time()
     assert main(["benchmark", "--method", *methods, "--quick", "--hands", "barrett", "--objects", "can", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert [(row["grasps"], row["stage"], row["num"]) for row in rows] == [(name, "returned", 4) for name in methods]
-    assert time.process_time() - begin < 200, "100 s of two cores, whatever else they do"
+    assert time.process_time() - begin < 120, "a minute of two cores, whatever else they do"

@@ -163,7 +163,7 @@ def test_the_folder_of_another_hand_is_refused(home: Path, capsys: pytest.Captur
 
 
 @pytest.mark.parametrize(("more", "word"), [
-    (["--weights", "multi"], "was begun with weights"), (["--seed", "7"], "with seed"),
+    (["--seed", "7"], "with seed"),
     (["--method", "network"], "with method auto, network was asked for")])
 def test_a_folder_that_was_begun_otherwise_is_refused(
     home: Path, more: list[str], word: str, capsys: pytest.CaptureFixture[str]
@@ -171,6 +171,13 @@ def test_a_folder_that_was_begun_otherwise_is_refused(
     """Its finished steps would be given for those that were asked for."""
     assert main([*command(home), *more]) == 2
     assert word in capsys.readouterr().err
+
+
+def test_a_folder_that_was_begun_with_other_weights_is_refused(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*command(home), "--weights", str(untrained_weights(tmp_path))]) == 2
+    assert "was begun with weights" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -6,21 +6,15 @@ import importlib
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from dro_grasp.baselines.controls import MeanGraspMethod, StartMethod
 from dro_grasp.baselines.foreign import FileMethod, ForeignMethod
-from dro_grasp.baselines.gendexgrasp.contact_maps import FITTING_GAMMA, TRAINING_GAMMA
-from dro_grasp.baselines.gendexgrasp.map_fitting import FittingConfig
-from dro_grasp.baselines.gendexgrasp.map_method import ContactMapMethod
-from dro_grasp.baselines.manifm.contact_method import ContactMethod
 from dro_grasp.baselines.method import Method
 from dro_grasp.baselines.ours import DescentMethod, DistanceMethod, SynthesisMethod
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.errors import OptionError
-from dro_grasp.models.checkpoints import SHIPPED_FOLDER
 from dro_grasp.predictor import GraspPredictor, PredictorConfig
 
 
@@ -49,40 +43,27 @@ def _mean(chosen: bool, options: MethodOptions) -> Method:
     return MeanGraspMethod(options.bundle, chosen)
 
 
-def _contact_maps(gamma: float, name: str, options: MethodOptions) -> Method:
-    return ContactMapMethod(baseline_weights("gendexgrasp", options.weights), name, FittingConfig(gamma=gamma))
-
-
-def _contacts(options: MethodOptions) -> Method:
-    return ContactMethod(baseline_weights("manifm", options.weights))
-
-
-def baseline_weights(name: str, given: str | None) -> Path:
-    """The weights of a method beside D(R,O): those given, or those that ship."""
-    return SHIPPED_FOLDER / "baselines" / f"{name}.safetensors" if given is None else Path(given)
-
-
 METHODS: dict[str, Callable[[MethodOptions], Method]] = {
     "dro": _dro,
     "synthesise": lambda options: SynthesisMethod(),
     "dfc": lambda options: DescentMethod(),
-    "gendexgrasp": partial(_contact_maps, FITTING_GAMMA, "gendexgrasp"),
-    "gendexgrasp-gamma1": partial(_contact_maps, TRAINING_GAMMA, "gendexgrasp-gamma1"),
-    "manifm": _contacts,
     "start": lambda options: StartMethod(),
     "mean-grasp": lambda options: _mean(False, options),
     "mean-grasp-chosen": lambda options: _mean(True, options),
 }
 """Methods of this package."""
-WITH_WEIGHTS = ("dro", "gendexgrasp", "gendexgrasp-gamma1", "manifm")
-"""Those that have weights."""
+MOVED = {
+    "gendexgrasp": "lab.methods.gendexgrasp:GenDexGrasp", "gendexgrasp-gamma1": "lab.methods.gendexgrasp:GenDexGraspGamma1",
+    "manifm": "lab.methods.manifm:ContactMethod",
+}
+"""Methods that were of this package, and are classes in its repository now."""
 
 
 def make_method(name: str, options: MethodOptions | None = None) -> Method:
     """A method, ready to make grasps.
 
     Args:
-        name: One of METHODS; one of WITH_WEIGHTS with weights of its own, as `dro@my_weights.safetensors`; `module:Class`,
+        name: One of METHODS; `dro` with weights of its own, as `dro@my_weights.safetensors`; `module:Class`,
             a class without arguments whose objects have `predict(hand, obj, num, seed)`; or a grasp file.
         options: What methods are made with.
 
@@ -92,7 +73,7 @@ def make_method(name: str, options: MethodOptions | None = None) -> Method:
     """
     options = options or MethodOptions()
     plain, at, weights = name.partition("@")
-    if plain in METHODS and (not at or plain in WITH_WEIGHTS):
+    if plain in METHODS and (not at or plain == "dro"):
         method = METHODS[plain](replace(options, weights=weights) if at else options)
         if at:
             method.name = name
@@ -103,8 +84,11 @@ def make_method(name: str, options: MethodOptions | None = None) -> Method:
     if colon:
         made = _foreign_class(module, attribute)()
         return made if isinstance(made, Method) else ForeignMethod(name, made)
-    raise OptionError(f"there is no method '{name}'; choose {', '.join(METHODS)}, give {' or '.join(WITH_WEIGHTS)} weights as "
-                      "dro@PATH, name a class of your own as module:Class, or give a grasp file (.parquet)")
+    if plain in MOVED:
+        raise OptionError(f"method '{plain}' is not part of the package any more; in a clone of the repository, name it as "
+                          f"{MOVED[plain]}")
+    raise OptionError(f"there is no method '{name}'; choose {', '.join(METHODS)}, give dro weights as dro@PATH, "
+                      "name a class of your own as module:Class, or give a grasp file (.parquet)")
 
 
 def _foreign_class(module: str, attribute: str) -> Callable[[], Any]:

@@ -32,9 +32,8 @@ class Benchmark:
 
     methods: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--method"], metavar="NAME...", help_behavior_hint=(
         "(default: dro, start, synthesise, and with a bundle mean-grasp, mean-grasp-chosen)"))] = ()
-    """What makes the grasps: dro, synthesise, dfc, gendexgrasp, gendexgrasp-gamma1, manifm, start, mean-grasp,
-    mean-grasp-chosen; dro@WEIGHTS for other weights, gendexgrasp@WEIGHTS and manifm@WEIGHTS; module:Class for a class of
-    yours that has predict(hand, obj, num, seed); or a grasp file."""
+    """What makes the grasps: dro, synthesise, dfc, start, mean-grasp, mean-grasp-chosen; dro@WEIGHTS for other weights;
+    module:Class for a class of yours that has predict(hand, obj, num, seed); or a grasp file."""
     hands: tuple[str, ...] = ("allegro", "barrett", "shadowhand")
     """Names or paths of hands."""
     objects: tuple[str, ...] = ("builtin:test",)

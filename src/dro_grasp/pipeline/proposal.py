@@ -157,8 +157,8 @@ def _placements(
     count = wanted * (config.rotations_per_grasp if direction is None else config.rolls_per_grasp)
     rotations = wrist_rotations(hand, max(count, PRIOR_CHOICES * offered), direction, spread, generator, up)
     opened = hand.points(hand.canonical_joints())
-    shape = proportions(hand, axes) if network.config.placement_hand == "proportions" else None
-    rotation, position = network.sample_placements(opened @ axes, cloud, rotations @ axes, offered, generator, shape)
+    rotation, position = network.sample_placements(
+        cloud, rotations @ axes, offered, generator, proportions(hand, axes))
     offset = cloud.mean(0) + rotate(rotation, position - hand.grasp_centre_wrist @ axes)
     placed = compose(rotation @ axes.mT, offset)
     if surroundings is not None:

@@ -25,8 +25,8 @@ class AugmentationConfig:
     rotation, about an axis perpendicular to the direction from the wrist to the object [rad]. Source: the official
     release."""
     proportions: float = 0.1
-    """Standard deviation of the noise on a hand's proportions, in their spreads over hands; for placement priors that take
-    them: a few dozen hands are few. Source: ours."""
+    """Standard deviation of the noise on a hand's proportions, in their spreads over hands, for the placement prior: a few
+    dozen hands are few. Source: ours."""
     partial: float = 0.0
     """Share of samples in which half of the object is seen. Source: appendix."""
 
@@ -47,9 +47,9 @@ class LossConfig:
     free_bits: float = 0.0
     """Divergence of each latent dimension that costs nothing [nat]."""
     motion: float = 1.0
-    """Weight of the mean distance between the hand as z moves it and the true grasp; for latent_form `motion`."""
+    """Weight of the mean distance between the hand as z moves it and the true grasp; not in the paper's form."""
     flow: float = 0.01
-    """Weight of the flow's loss; for prior `flow`."""
+    """Weight of the flow's loss; not in the paper's form."""
     drawn: float = 0.0
     """Weight of penetration and contact of the hands that a z drawn from its prior gives, as at inference. Source: ours."""
     drawn_share: float = 0.5
