@@ -129,8 +129,8 @@ def test_nobody_reads_the_output() -> None:
     reader, writer = os.pipe()
     os.close(reader)
     for arguments in ("hands", "--help", "objects --json"):
-        done = subprocess.run(
-            [sys.executable, "-m", "dro_grasp", *arguments.split()], stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+        command = [sys.executable, "-m", "dro_grasp", *arguments.split()]
+        done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
         assert (done.returncode, done.stderr) == (1, ""), arguments
     os.close(writer)
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import dro_grasp as dro
+from dro_grasp import extras
 from dro_grasp.cli.main import main
 from dro_grasp.errors import OptionError
-from dro_grasp.planning import extra
 from dro_grasp.planning.planner import plan
 from dro_grasp.planning.robot_file import BUILTIN_ROBOTS
 
@@ -74,13 +74,13 @@ def test_a_robot_and_a_cloud_that_cannot_be_used_leave_nothing_behind(
 def test_without_the_extra_planning_says_what_to_install(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(extra, "find_spec", lambda name: None if name == "ompl" else object())
+    monkeypatch.setattr(extras, "find_spec", lambda name: None if name == "ompl" else object())
     assert main(["plan", "--robot", "xarm7_leaphand", "--object", "can"]) == 2
-    assert "ompl; run pip install '.[arm]' in the folder of the clone" in capsys.readouterr().err
+    assert "ompl; run pip install 'dro-grasp[arm]'" in capsys.readouterr().err
 
 
 def test_every_other_command_works_without_the_extra(small_robot: str) -> None:
-    blocked = "".join(f"sys.modules[{name!r}] = None; " for name in extra.PACKAGES)
+    blocked = "".join(f"sys.modules[{name!r}] = None; " for name in extras.EXTRAS["arm"])
     code = (f"import sys; {blocked}import dro_grasp as dro; from dro_grasp.cli.main import main; "
             f"dro.PlanConfig, dro.MotionPlan.load; sys.exit(main(['robot', 'check', {small_robot!r}]))")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

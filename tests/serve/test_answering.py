@@ -15,7 +15,7 @@ from dro_grasp.errors import OptionError
 from tests.helpers.claw_urdf import claw, written
 from tests.helpers.weights import untrained_weights
 
-pytest.importorskip("pydantic", reason="needs the extra [serve]: pip install '.[serve]'")
+pytest.importorskip("pydantic", reason="needs the extra [apps]: pip install '.[apps]'")
 
 from dro_grasp.serve.answering import Answerer, Kept, Stock
 from dro_grasp.serve.client import sent_file

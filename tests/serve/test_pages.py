@@ -20,8 +20,8 @@ from dro_grasp.errors import OptionError, ServerError
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.predictor import GraspRequest
 
-pytest.importorskip("fastapi", reason="needs the extra [serve]: pip install '.[serve]'")
-pytest.importorskip("uvicorn", reason="needs the extra [serve]: pip install '.[serve]'")
+pytest.importorskip("fastapi", reason="needs the extra [apps]: pip install '.[apps]'")
+pytest.importorskip("uvicorn", reason="needs the extra [apps]: pip install '.[apps]'")
 
 from dro_grasp.serve import http_server
 from dro_grasp.serve.computing import Ready, Reply

@@ -65,14 +65,15 @@ class Tabletop:
 
     def run(self) -> int:
         """Run what is missing, store and print."""
+        from dro_grasp.extras import require_extra
+
+        require_extra("arm")
         from dro_grasp.objects.catalogue import resolve_objects
         from dro_grasp.planning.animation import check_animation, draw_attempt
         from dro_grasp.planning.attempts import TabletopConfig
-        from dro_grasp.planning.extra import require_arm_extra
         from dro_grasp.planning.plan_config import PlanConfig
         from dro_grasp.planning.tabletop import TabletopRun, run_tabletop
 
-        require_arm_extra()
         if self.video is not None:
             check_animation(self.video)
         config = TabletopConfig(

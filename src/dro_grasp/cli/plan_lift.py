@@ -76,12 +76,12 @@ class Plan:
         from dataclasses import asdict
 
         from dro_grasp.errors import OptionError
+        from dro_grasp.extras import require_extra
         from dro_grasp.files import check_output, replacing
         from dro_grasp.objects.catalogue import load_object
         from dro_grasp.objects.scenery import load_scene
-        from dro_grasp.planning.extra import require_arm_extra
 
-        require_arm_extra()
+        require_extra("arm")
         from dro_grasp.planning.plan_config import PlanConfig
         from dro_grasp.planning.planner import plan
         from dro_grasp.planning.robot import load_robot

@@ -15,7 +15,7 @@ TOKEN = "DRO_GRASP_TOKEN"
 
 @dataclass(frozen=True)
 class Serve:
-    """Answer requests for grasps over HTTP, without the seconds that every start costs. Needs the extra `serve`.
+    """Answer requests for grasps over HTTP, without the seconds that every start costs. Needs the extra `[apps]`.
 
     Example: dro-grasp serve --hand my_hand.urdf --port 8090
     """
@@ -43,9 +43,9 @@ class Serve:
 
     def run(self) -> int:
         """Check, load, and serve until Ctrl-C or SIGTERM."""
-        from dro_grasp.serve.web_extra import require_serve_extra
+        from dro_grasp.extras import require_extra
 
-        require_serve_extra()
+        require_extra("apps")
         from dro_grasp.serve.answering import Stock
         from dro_grasp.serve.desk import Desk
         from dro_grasp.serve.http_server import Access, listening_socket, serve_grasps

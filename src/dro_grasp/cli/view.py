@@ -30,7 +30,7 @@ LISTED = 8
 
 @dataclass(frozen=True)
 class View:
-    """View grasps, the plan of a lift, or attempts of an arm in the browser, or generate grasps there.
+    """View grasps, the plan of a lift, or attempts of an arm in the browser, or make grasps there. Needs the extra `[apps]`.
 
     Example: dro-grasp view grasps.parquet
     """
@@ -59,6 +59,9 @@ class View:
 
     def run(self) -> int:
         """Serve the page, with the grasps of the file if there is one."""
+        from dro_grasp.extras import require_extra
+
+        require_extra("apps")
         from dro_grasp.predictor import GraspPredictor
         from dro_grasp.viewer.stage import serve
         from dro_grasp.viewer.studio import Studio, StudioServer
@@ -67,10 +70,9 @@ class View:
             serve(StudioServer(self._picked(), self.port, self.host))
             return 0
         if is_motion(self.file):
-            from dro_grasp.planning.extra import require_arm_extra
+            require_extra("arm")
             from dro_grasp.viewer.lift_page import lift_page
 
-            require_arm_extra()
             serve(lift_page(self.file, self.attempt, self.robot, self.weights, self.port, self.host))
             return 0
         from dro_grasp.grasps.reading import load_grasps

@@ -3,25 +3,39 @@
 from __future__ import annotations
 
 import contextlib
+import http
 import math
 import socket
 import sys
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import torch
-import viser
-import viser.transforms
 from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
+from dro_grasp.extras import require_extra
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.rendering.meshes import OBJECT_COLOUR, Colour
 from dro_grasp.viewer import appearance
-from dro_grasp.viewer.guard import guarded_server
+from dro_grasp.web.origins import own_names, refusal
 
+try:
+    import viser
+    import viser.transforms
+    import websockets.asyncio.server
+    from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request, Response
+except ModuleNotFoundError:
+    require_extra("apps")
+    raise
+
+MAX_CONNECTIONS = 64
+"""Most open connections to one page (ours)."""
 HOST = "127.0.0.1"
 """Default address: only this machine can connect."""
 PORTS = range(1, 65536)
@@ -164,6 +178,31 @@ def rgb(colour: Colour) -> tuple[int, int, int]:
     """Red, green and blue as whole numbers to 255."""
     red, green, blue = (round(255 * c) for c in colour)
     return red, green, blue
+
+
+@contextlib.contextmanager
+def guarded_server(served_at: str) -> Iterator[None]:
+    """Servers of viser that start within the block refuse foreign requests, and more than MAX_CONNECTIONS.
+
+    viser has no switch for it; it passes a function that sees every request to websockets, and this one is put before it.
+    """
+    serve, own = websockets.asyncio.server.serve, own_names(served_at)
+
+    def guarded(*args: Any, process_request: Callable[..., Any] | None = None, **options: Any) -> Any:
+        def check(connection: ServerConnection, request: Request) -> Response | None:
+            crowd = len(getattr(connection.server, "connections", ())) > MAX_CONNECTIONS
+            why = "too many browsers show it; close some" if crowd else refusal(request.headers, own)
+            if why:
+                return connection.respond(http.HTTPStatus.FORBIDDEN, f"This page refuses the request: {why}.\n")
+            return None if process_request is None else process_request(connection, request)
+
+        return serve(*args, process_request=check, **options)
+
+    websockets.asyncio.server.serve = guarded  # type: ignore[assignment,misc]
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = serve  # type: ignore[misc]
 
 
 class ServedPage:
