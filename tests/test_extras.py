@@ -16,7 +16,7 @@ from tests.helpers.weights import untrained_weights
 CORE = """
 import json, sys
 
-for name in ("viser", "websockets", "fastapi", "uvicorn", "pydantic", "starlette"):
+for name in ("viser", "websockets", "fastapi", "uvicorn", "pydantic", "starlette", "cachetools"):
     sys.modules[name] = None
 from dro_grasp.cli.main import main
 
@@ -40,7 +40,7 @@ def test_the_core_needs_no_extra_and_the_pages_say_what_to_install(tmp_path: Pat
         ["view", grasps], ["view"], ["serve"]]
     done = subprocess.run([sys.executable, "-c", CORE, json.dumps(commands)], capture_output=True, text=True, check=False)
     assert "codes [0, 0, 0, 0, 2, 2, 2]\n" in done.stdout, done.stderr
-    assert done.stderr.count("viser, fastapi, uvicorn; run pip install 'dro-grasp[apps]'") == 3
+    assert done.stderr.count("viser, fastapi, uvicorn, cachetools; run pip install 'dro-grasp[apps]'") == 3
     assert "run pip install 'dro-grasp[apps]'" in done.stdout, "in Python too"
     assert (tmp_path / "grasps.csv").exists()
     assert (tmp_path / "sheet.png").exists()

@@ -6,7 +6,7 @@ from importlib.util import find_spec
 
 from dro_grasp.errors import OptionError
 
-EXTRAS = {"apps": ("viser", "fastapi", "uvicorn"), "arm": ("mink", "daqp", "ompl", "toppra")}
+EXTRAS = {"apps": ("viser", "fastapi", "uvicorn", "cachetools"), "arm": ("mink", "daqp", "ompl", "toppra")}
 """What an extra installs: pages in the browser and the grasp server; or kinematics, its solver, motion planning and timing."""
 
 

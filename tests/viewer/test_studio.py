@@ -26,7 +26,6 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.viewer import grasp_page as module
 from dro_grasp.viewer.app import postures_of
 from dro_grasp.viewer.grasp_page import EXPORTS, chosen
-from dro_grasp.viewer.shelf import Shelf
 from dro_grasp.viewer.stage import HOST, ServedPage
 from dro_grasp.viewer.studio import Studio, StudioServer
 from tests.helpers.browser import free_port, page_of
@@ -258,7 +257,7 @@ def test_the_page_starts_with_the_hand_and_the_mesh_that_the_command_names(tmp_p
     try:
         assert (studio.hand.value, studio.object.value) == ("my claw", "my egg")
         assert "my claw above my egg" in studio.status.content
-        assert float(np.ptp(studio.shelf.obj("my egg").cloud, axis=0).max()) == pytest.approx(0.06, abs=1e-3)
+        assert float(np.ptp(studio.library.obj("my egg").cloud, axis=0).max()) == pytest.approx(0.06, abs=1e-3)
         assert studio.object.options[0] == "my egg"
         assert set(BUILTIN) <= set(studio.object.options)
     finally:
@@ -292,7 +291,7 @@ def test_every_browser_has_a_page_and_closing_it_ends_its_work_and_its_uploads(
             page._take(viser.UploadedFile(name=name, content=text), "hand", page.hand, page._preview)
         assert "mine.urdf" not in made[1].hand.options
         assert "theirs.urdf" not in made[0].hand.options
-        folders = [Path(page.shelf._folder.name) for page in made]
+        folders = [Path(page.library.folder.name) for page in made]
         begun, steps = threading.Event(), []
 
         def endless(*arguments, **_):
@@ -315,20 +314,6 @@ def test_every_browser_has_a_page_and_closing_it_ends_its_work_and_its_uploads(
     finally:
         served.stop()
     assert not any(folder.exists() for folder in folders)
-
-
-def test_a_scene_does_not_take_the_place_of_an_object_of_its_file_name() -> None:
-    def box(*size: float) -> bytes:
-        return trimesh.creation.box(size).export(file_type="stl")
-
-    shelf = Shelf()
-    assert shelf.take("part.stl", box(0.05, 0.05, 0.05), "object") == "part.stl"
-    assert shelf.take("part.stl", box(0.5, 0.5, 0.02), "scene") == "part (2).stl"
-    assert np.ptp(shelf.obj("part.stl").vertices, axis=0) == pytest.approx([0.05] * 3)
-    assert shelf.scene("part (2).stl") is not None
-    assert shelf.take("part.stl", box(0.06, 0.06, 0.06), "object") == "part.stl"
-    assert np.ptp(shelf.obj("part.stl").vertices, axis=0) == pytest.approx([0.06] * 3), "the newer one of its kind"
-    shelf.close()
 
 
 @pytest.mark.slow
