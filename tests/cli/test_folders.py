@@ -68,7 +68,7 @@ def test_picture_takes_a_folder(folder: Path, tmp_path: Path, more: list[str], t
 @pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")
 def test_view_takes_a_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     servers: list[StudioServer] = []
-    monkeypatch.setattr("dro_grasp.viewer.stage.serve", servers.append)
+    monkeypatch.setattr("dro_grasp.viewer.scene_view.serve", servers.append)
     for more in ([], ["--object", "sphere"]):
         assert main(["view", str(folder), "--port", str(free_port()), *more]) == 0
     try:

@@ -31,18 +31,18 @@ from dro_grasp.viewer.appearance import waiting_pose
 from dro_grasp.viewer.constraint_panel import ConstraintPanel
 from dro_grasp.viewer.grasp_page import Closed, GraspPage, ShownGrasps
 from dro_grasp.viewer.pictures import protocol_name
-from dro_grasp.viewer.stage import HOST, Place, ServedPage
+from dro_grasp.viewer.scene_view import HOST, Client, ServedPage, escaped
 from dro_grasp.web.library import Kind, Library
 
-LARGEST_CALL = 64
+MAX_GRASPS = 64
 """Most grasps of one click (ours)."""
-MOST_CANDIDATES = 8
+MAX_CANDIDATES = 8
 """Most candidates for each of them (ours)."""
-PATIENCE = 0.5
+TURN_POLL = 0.5
 """Time after which a page that waits for another looks whether it is still open [s] (ours)."""
-UPLOAD_PATIENCE = 10.0
+UPLOAD_TIMEOUT = 10.0
 """Time that an upload waits to be picked while the page does other work, such as loading its first pair [s] (ours)."""
-GRACE = 5.0
+CLOSE_TIMEOUT = 5.0
 """Time that a closed page has to end what it does before its uploads are deleted [s] (ours)."""
 
 
@@ -55,13 +55,13 @@ class Studio(GraspPage):
     """
 
     def __init__(
-        self, place: Place, predictor: GraspPredictor, hand: str = "allegro", obj: str = "rubber_duck",
+        self, client: Client, predictor: GraspPredictor, hand: str = "allegro", obj: str = "rubber_duck",
         turn: threading.Lock | None = None, preview: bool = True,
     ) -> None:
         """Start with a hand and an object chosen.
 
         Args:
-            place: Where the page is.
+            client: Where the page is.
             predictor: May be that of other pages too.
             hand: Name or path; the object likewise.
             turn: Held while grasps are made, for pages that share a machine.
@@ -71,14 +71,14 @@ class Studio(GraspPage):
         self._turn = turn or threading.Lock()
         self._batches: dict[str, GraspBatch] = {}  # grasps of a file, by the name of their object
         self._given: dict[str, Hand] = {}  # the hand that came with a file's grasps, by the name of their object
-        super().__init__(place)
+        super().__init__(client)
         if preview:
             self._guarded(self._preview)
 
     def close(self) -> None:
         """End what the page does, and delete its uploads."""
         self.closed.set()
-        self._busy.acquire(timeout=GRACE)  # never released: nothing is done on this page any more
+        self._busy.acquire(timeout=CLOSE_TIMEOUT)  # never released: nothing is done on this page any more
         self.library.close()
 
     def open(self, hand: Hand, grasps: GraspBatch, obj: ObjectModel | None = None, first: str | None = None) -> None:
@@ -150,8 +150,8 @@ class Studio(GraspPage):
         self.made, self.shown, self.text.content = None, [], ""
         self.slider.disabled = self.play.disabled = self.download.disabled = True
         self._forget_film()
-        self.stage.set_pair(hand, obj, hand.canonical_joints(), waiting_pose(hand, obj))
-        self._say(f"{hand.name} above {obj.name}. Press *Generate*, or pick or upload others.")
+        self.view.set_pair(hand, obj, hand.canonical_joints(), waiting_pose(hand, obj))
+        self._say(f"{escaped(hand.name)} above {escaped(obj.name)}. Press *Generate*, or pick or upload others.")
 
     def _pick_object(self) -> None:
         """Show the grasps of the chosen object if a file has some of the chosen hand, and the pair alone otherwise."""
@@ -164,14 +164,15 @@ class Studio(GraspPage):
         obj, label = self.library.obj(self.object.value), next(filter(None, grasps.protocol), "")
         self.made = ShownGrasps(hand, obj, grasps, grasps, protocol_name(label))
         self._present()
-        held = f", **{int(grasps.success.sum())}** held under *{label}*" if label else ", not evaluated"
-        self._say("  \n".join([f"{len(grasps)} grasps of {obj.name}{held}", *other, *diagnose(grasps)]))
+        held = f", **{int(grasps.success.sum())}** held under *{escaped(label)}*" if label else ", not evaluated"
+        remarks = map(escaped, [*other, *diagnose(grasps)])
+        self._say("  \n".join([f"{len(grasps)} grasps of {escaped(obj.name)}{held}", *remarks]))
 
     def _plain(self, text: str) -> str:
         return self.library.plain(text)
 
     def _add_choices(self) -> None:
-        (hand, obj), gui = self._first, self.place.gui
+        (hand, obj), gui = self._first, self.client.gui
         with gui.add_folder("Hand and object"):
             self.hand = gui.add_dropdown("Hand", tuple(dict.fromkeys([*hand_names(), hand])), initial_value=hand)
             hand_file = gui.add_upload_button("Upload a hand (URDF, MJCF, ZIP)", mime_type=".urdf,.xml,.zip")
@@ -179,19 +180,19 @@ class Studio(GraspPage):
             kinds = ".stl,.obj,.ply,.glb,.off,.npy,.pcd"
             object_file = gui.add_upload_button("Upload an object (STL, OBJ, PLY)", mime_type=kinds)
         with gui.add_folder("Generate"):
-            self.num = gui.add_slider("Grasps", 1, LARGEST_CALL, 1, GraspRequest.num)
+            self.num = gui.add_slider("Grasps", 1, MAX_GRASPS, 1, GraspRequest.num)
             self.method = gui.add_dropdown(
                 "Method", get_args(Method), initial_value=GraspRequest.method,
                 hint="auto: the optimiser helps where the network is unsure.")
             self.candidates = gui.add_slider(
-                "Candidates", 1, MOST_CANDIDATES, 1, GraspRequest.candidates,
+                "Candidates", 1, MAX_CANDIDATES, 1, GraspRequest.candidates,
                 hint="Candidates proposed for each grasp; the best by score are kept.")
             self.usual = gui.add_checkbox("Usual diversity", True, hint="1 for a mesh, less for a bare point cloud.")
             self.temperature = gui.add_slider(
                 "Diversity", 0.0, 1.0, 0.05, 1.0, disabled=True, hint="0: the likeliest grasp of each placement.")
             self.protocol = gui.add_dropdown("Trial", tuple(PROTOCOLS), initial_value=DEFAULT_PROTOCOL)
             self.button = gui.add_button("Generate", color="green")
-        self.panel = panel = ConstraintPanel(self.place, lambda: self._guarded(self._draw_constraints))
+        self.panel = panel = ConstraintPanel(self.client, lambda: self._guarded(self._draw_constraints))
         hand_file.on_upload(lambda _: self._take(hand_file.value, "hand", self.hand, self._preview))
         object_file.on_upload(lambda _: self._take(object_file.value, "object", self.object, self._preview))
         panel.upload.on_upload(lambda _: self._take(panel.upload.value, "scene", panel.avoid, self._draw_constraints))
@@ -216,14 +217,14 @@ class Studio(GraspPage):
             if kind == "object":
                 self._batches.pop(label, None)
             choice.options = tuple(dict.fromkeys([*choice.options, label]))
-            later = f"Busy. {label} is stored; pick it afterwards."
-            self._guarded(lambda: self._pick_upload(label, choice, show), UPLOAD_PATIENCE, later)
+            later = f"Busy. {escaped(label)} is stored; pick it afterwards."
+            self._guarded(lambda: self._pick_upload(label, choice, show), UPLOAD_TIMEOUT, later)
 
     def _pick_upload(self, label: str, choice: viser.GuiDropdownHandle[str], show: Callable[[], None]) -> None:
         """Pick an upload and show it."""
         choice.value = label
         show()
-        self._say(f"{label} is picked. {self.status.content}")
+        self._say(f"{escaped(label)} is picked. {self.status.content}")
 
     def _table_under(self) -> None:
         """Put the table under the chosen object."""
@@ -240,7 +241,7 @@ class Studio(GraspPage):
         return lambda done, total: self._say(f"{what}: {done} of {total}")
 
     def _generate(self) -> None:
-        while not self._turn.acquire(timeout=PATIENCE):
+        while not self._turn.acquire(timeout=TURN_POLL):
             self._say("Grasps of another page are made; these are next.")
         try:
             self._generate_now()
@@ -255,9 +256,10 @@ class Studio(GraspPage):
             self.hand.value, self.object.value, int(self.num.value), self.panel.constraints(self.library.scene), temperature,
             self.protocol.value, int(self.candidates.value), self.method.value)
         held = "" if made.obj.is_cloud else (
-            f", **{int(made.refined.success.sum())}** held under *{self.protocol.value}*")
-        short = [] if made.shortage is None else [made.shortage]
-        lines = [f"{len(made.refined)} grasps{held}; {time.perf_counter() - begin:.1f} s", *short, *diagnose(made.refined)]
+            f", **{int(made.refined.success.sum())}** held under *{escaped(self.protocol.value)}*")
+        remarks = [] if made.shortage is None else [made.shortage]
+        remarks += diagnose(made.refined)
+        lines = [f"{len(made.refined)} grasps{held}; {time.perf_counter() - begin:.1f} s", *map(escaped, remarks)]
         self._say("  \n".join(lines))
 
 
@@ -265,10 +267,10 @@ class StudioServer(ServedPage):
     """A server that gives every browser a page of its own; `stop()` ends it.
 
     Examples:
-        >>> server = StudioServer(lambda place, turn: Studio(place, predictor, turn=turn))
+        >>> server = StudioServer(lambda client, turn: Studio(client, predictor, turn=turn))
     """
 
-    def __init__(self, make: Callable[[Place, threading.Lock], Studio], port: int = 8080, host: str = HOST) -> None:
+    def __init__(self, make: Callable[[Client, threading.Lock], Studio], port: int = 8080, host: str = HOST) -> None:
         """Start serving.
 
         Args:

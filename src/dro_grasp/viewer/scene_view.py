@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import http
 import math
+import re
 import socket
 import sys
 from collections.abc import Callable, Iterator
@@ -58,21 +59,21 @@ GRID_DEPTH = 0.12
 
 Point = tuple[float, float, float]
 """A place [m]."""
-Place = viser.ViserServer | viser.ClientHandle
+Client = viser.ViserServer | viser.ClientHandle
 """Whose page it is: that of all browsers, or of one."""
 
 
-class Stage:
+class SceneView:
     """One hand and one object on a page; `set_pair` replaces them."""
 
-    def __init__(self, place: Place) -> None:
+    def __init__(self, client: Client) -> None:
         """Start with an empty scene."""
-        self.place = place
+        self.client = client
         self.hand: Hand | None = None
-        place.scene.set_up_direction("+z")
+        client.scene.set_up_direction("+z")
         self._camera: Camera | None = None
-        if isinstance(place, viser.ViserServer):
-            place.on_client_connect(self._turn)
+        if isinstance(client, viser.ViserServer):
+            client.on_client_connect(self._turn)
         self._root = 0
 
     def set_pair(
@@ -85,7 +86,7 @@ class Stage:
             T: Initial wrist pose in the object's frame [m].
             on_table: Look from above.
         """
-        scene, name = self.place.scene, f"/pair{self._root}"
+        scene, name = self.client.scene, f"/pair{self._root}"
         if self.hand is not None:
             scene.remove_by_name(name)
             self._root += 1
@@ -109,12 +110,12 @@ class Stage:
     def aim(self, camera: Camera) -> None:
         """Turn the cameras of all browsers that show the page, also of those that connect later."""
         self._camera = camera
-        if isinstance(self.place, viser.ClientHandle):
-            self._turn(self.place)
+        if isinstance(self.client, viser.ClientHandle):
+            self._turn(self.client)
             return
-        initial = self.place.initial_camera
+        initial = self.client.initial_camera
         (initial.position, initial.look_at), initial.fov = viewpoint(camera), camera.field_of_view
-        for client in self.place.get_clients().values():
+        for client in self.client.get_clients().values():
             self._turn(client)
 
     def _turn(self, client: viser.ClientHandle) -> None:
@@ -127,7 +128,7 @@ class Stage:
         self, name: str, points: Float[np.ndarray, "n 3"], colour: Colour, size: float = POINT_SIZE
     ) -> viser.PointCloudHandle:
         """Add points of a size [m], hidden at first."""
-        return self.place.scene.add_point_cloud(
+        return self.client.scene.add_point_cloud(
             f"/pair{self._root}/{name}", points.astype(np.float32), colors=rgb(colour), point_size=size,
             point_shape="circle", precision="float32", visible=False,
         )
@@ -141,7 +142,7 @@ class Stage:
             poses = (T @ self.hand.tree.forward(joints)).double().numpy()
             points = self.hand.points(joints, T).numpy()
         moved = np.eye(4) if T_object is None else T_object.double().numpy()
-        with self.place.atomic():
+        with self.client.atomic():
             for frame, pose in zip([self._object, *self.links], [moved, *poses], strict=True):
                 frame.position = pose[:3, 3]
                 frame.wxyz = viser.transforms.SO3.from_matrix(pose[:3, :3]).wxyz
@@ -153,7 +154,7 @@ class Stage:
 
     def show_shapes(self, visible: bool) -> None:
         """Show or hide the hand's shapes."""
-        with self.place.atomic():
+        with self.client.atomic():
             for frame in self.links:
                 frame.visible = visible
 
@@ -205,6 +206,11 @@ def guarded_server(served_at: str) -> Iterator[None]:
         websockets.asyncio.server.serve = serve  # type: ignore[misc]
 
 
+def escaped(text: object) -> str:
+    """Text that is shown as it is within Markdown, of which viser's browser renders HTML, JSX and links."""
+    return re.sub(r"[&<>{}\[\]*`\\!#|~$\n]", lambda sign: f"&#{ord(sign.group())};", str(text))
+
+
 class ServedPage:
     """A page with a stage that is being served; `stop()` ends it."""
 
@@ -234,7 +240,7 @@ class ServedPage:
         # A panel at the side leaves the hand in sight; narrow windows get it at the bottom.
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         self.server.gui.main_panel.dock_right()
-        self.stage = Stage(self.server)
+        self.view = SceneView(self.server)
 
     @property
     def url(self) -> str:
