@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from dro_grasp.cli.constraint_options import ConstraintOptions
 from dro_grasp.cli.evaluate import Evaluate
 from dro_grasp.cli.generate import Generate
+from dro_grasp.cli.inputs import ConstraintOptions
 from dro_grasp.cli.main import THREADS, WAIT_POLICY, main
 from dro_grasp.cli.synthesize import Synthesize
 from dro_grasp.datasets.engine.worker import EngineConfig

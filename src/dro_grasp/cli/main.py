@@ -16,13 +16,14 @@ from dro_grasp.cli.dataset import Dataset
 from dro_grasp.cli.evaluate import Evaluate
 from dro_grasp.cli.export import Export
 from dro_grasp.cli.generate import Generate
-from dro_grasp.cli.lift_experiment import Tabletop
-from dro_grasp.cli.listing import HandCommand, Hands, Objects
+from dro_grasp.cli.hand import HandCommand
+from dro_grasp.cli.listing import Hands, Objects
 from dro_grasp.cli.onboard import Onboard
-from dro_grasp.cli.plan_lift import Plan
+from dro_grasp.cli.plan import Plan
 from dro_grasp.cli.robots import RobotCommand
 from dro_grasp.cli.serve import Serve
 from dro_grasp.cli.synthesize import Synthesize
+from dro_grasp.cli.tabletop import Tabletop
 from dro_grasp.cli.train import Pretrain, Train
 from dro_grasp.cli.view import Picture, View
 from dro_grasp.cli.weights import Weights

@@ -109,7 +109,9 @@ class Studio(GraspPage):
 
     def _choose(self, hand: Hand | None, obj: ObjectModel | None) -> None:
         """Add a hand, an object or both to what can be picked, and pick them."""
-        for kind, model, choice in (("hand", hand, self.hand), ("object", obj, self.object)):
+        choices: tuple[tuple[Kind, Hand | ObjectModel | None, viser.GuiDropdownHandle[str]], ...] = (
+            ("hand", hand, self.hand), ("object", obj, self.object))
+        for kind, model, choice in choices:
             if model is not None:
                 self.library.add(kind, model.name, model)
             choice.options = self.library.names(kind)

@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from dro_grasp.cli.constraint_options import ConstraintOptions
-from dro_grasp.cli.inputs import Flag, optional
+from dro_grasp.cli.inputs import ConstraintOptions, Flag, optional
 from dro_grasp.cli.output import print_json, say, say_aside
 
 if TYPE_CHECKING:

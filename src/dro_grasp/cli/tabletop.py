@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from dro_grasp.cli.constraint_options import PalmOptions
-from dro_grasp.cli.inputs import Flag, optional
+from dro_grasp.cli.inputs import Flag, PalmOptions, optional
 from dro_grasp.cli.output import print_json, print_table, say, say_aside
 
 if TYPE_CHECKING:
