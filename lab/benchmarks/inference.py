@@ -25,7 +25,7 @@ from pathlib import Path
 
 import torch
 
-from dro_grasp.cli.main import PATIENCE
+from dro_grasp.cli.main import WAIT_POLICY
 from dro_grasp.devices import cores
 from dro_grasp.hands.library import load_hand
 from dro_grasp.models.checkpoints import save_weights
@@ -122,6 +122,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    if PATIENCE[0] not in os.environ:  # it counts only before PyTorch is loaded
-        os.execve(sys.executable, sys.orig_argv, os.environ | dict([PATIENCE]))
+    if WAIT_POLICY[0] not in os.environ:  # it counts only before PyTorch is loaded
+        os.execve(sys.executable, sys.orig_argv, os.environ | dict([WAIT_POLICY]))
     main()

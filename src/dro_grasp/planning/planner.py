@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from importlib.util import find_spec
 from typing import Literal
 
 import numpy as np
@@ -19,6 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.errors import OptionError, PlanError
+from dro_grasp.extras import require_extra
 from dro_grasp.frames import motion_fault
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.scenery import load_scene
@@ -36,25 +36,12 @@ from dro_grasp.planning.workcell import OBSTACLE, Workcell, moved, scene_solid, 
 from dro_grasp.predictor import GraspPredictor
 from dro_grasp.stopwatch import Stopwatch
 
-PACKAGES = ("mink", "daqp", "ompl", "toppra")
-"""What the extra `[arm]` installs: inverse kinematics, its solver, motion planning, timing."""
 BATCH_SEED = 7919
 """Between the seeds of batches of grasps (ours)."""
 NO_PATH = "without a path"
 """The planner connects none of the goals, or a timed motion would touch something."""
 LOSES = "losing the object when rehearsed"
 """The simulated hand does not lift the object as it is known."""
-
-
-def require_arm_extra() -> None:
-    """Refuse to plan without the extra `[arm]`.
-
-    Raises:
-        OptionError: A package is missing.
-    """
-    if missing := [name for name in PACKAGES if find_spec(name) is None]:
-        raise OptionError(f"planning needs packages that are not installed: {', '.join(missing)}; run "
-                          "pip install '.[arm]' in the folder of the clone")
 
 
 @dataclass(frozen=True)
@@ -133,7 +120,7 @@ def plan(
         OptionError: The extra `[arm]` is not installed, the pose is no rigid motion, or the constraints leave nothing of the
             object.
     """
-    require_arm_extra()
+    require_extra("arm")
     T = np.eye(4) if T_world_object is None else T_world_object
     if (fault := motion_fault(torch.as_tensor(T).float())) is not None:
         raise OptionError(f"T_world_object is no pose of '{obj.name}' in metres; {fault}")

@@ -16,12 +16,12 @@ import pyarrow.parquet as pq
 
 from dro_grasp.devices import one_thread
 from dro_grasp.errors import GraspFileError, OptionError
+from dro_grasp.extras import require_extra
 from dro_grasp.files import check_output, make_folder, reading, replacing
 from dro_grasp.models.checkpoints import DEFAULT, describe_weights
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.planning.attempts import Attempt, TabletopConfig, Watcher, attempt
 from dro_grasp.planning.motion import MotionPlan
-from dro_grasp.planning.planner import require_arm_extra
 from dro_grasp.planning.robot import load_robot
 from dro_grasp.planning.table_scene import PickedObject
 from dro_grasp.predictor import GraspPredictor
@@ -94,7 +94,7 @@ def run_tabletop(
         GraspFileError: `output` is there and is no such file.
         OutputError: `output` or `plans` cannot be written.
     """
-    require_arm_extra()
+    require_extra("arm")
     stored = read_attempts(output) if output is not None and check_output(output, ".parquet").exists() else []
     done, names = _done(run, stored, output)
     missing = {o: [k for k in range(run.attempts) if (n, k) not in done] for o, n in names.items()}

@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from dro_grasp.cli.constraint_options import PalmOptions
-from dro_grasp.cli.inputs import Flag, optional
+from dro_grasp.cli.inputs import Flag, PalmOptions, optional
 from dro_grasp.cli.output import print_json, print_table, say, say_aside
 
 if TYPE_CHECKING:
@@ -65,13 +64,15 @@ class Tabletop:
 
     def run(self) -> int:
         """Run what is missing, store and print."""
+        from dro_grasp.extras import require_extra
+
+        require_extra("arm")
         from dro_grasp.objects.catalogue import resolve_objects
         from dro_grasp.planning.animation import check_animation, draw_attempt
         from dro_grasp.planning.attempts import TabletopConfig
-        from dro_grasp.planning.planner import PlanConfig, require_arm_extra
+        from dro_grasp.planning.planner import PlanConfig
         from dro_grasp.planning.tabletop import TabletopRun, run_tabletop
 
-        require_arm_extra()
         if self.video is not None:
             check_animation(self.video)
         config = TabletopConfig(

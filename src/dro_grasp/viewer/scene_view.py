@@ -3,25 +3,40 @@
 from __future__ import annotations
 
 import contextlib
+import http
 import math
+import re
 import socket
 import sys
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import torch
-import viser
-import viser.transforms
 from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
+from dro_grasp.extras import require_extra
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.rendering.meshes import OBJECT_COLOUR, Colour
 from dro_grasp.viewer import appearance
-from dro_grasp.viewer.guard import guarded_server
+from dro_grasp.web.origins import own_names, refusal
 
+try:
+    import viser
+    import viser.transforms
+    import websockets.asyncio.server
+    from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request, Response
+except ModuleNotFoundError:
+    require_extra("apps")
+    raise
+
+MAX_CONNECTIONS = 64
+"""Most open connections to one page (ours)."""
 HOST = "127.0.0.1"
 """Default address: only this machine can connect."""
 PORTS = range(1, 65536)
@@ -44,21 +59,21 @@ GRID_DEPTH = 0.12
 
 Point = tuple[float, float, float]
 """A place [m]."""
-Place = viser.ViserServer | viser.ClientHandle
+Client = viser.ViserServer | viser.ClientHandle
 """Whose page it is: that of all browsers, or of one."""
 
 
-class Stage:
+class SceneView:
     """One hand and one object on a page; `set_pair` replaces them."""
 
-    def __init__(self, place: Place) -> None:
+    def __init__(self, client: Client) -> None:
         """Start with an empty scene."""
-        self.place = place
+        self.client = client
         self.hand: Hand | None = None
-        place.scene.set_up_direction("+z")
+        client.scene.set_up_direction("+z")
         self._camera: Camera | None = None
-        if isinstance(place, viser.ViserServer):
-            place.on_client_connect(self._turn)
+        if isinstance(client, viser.ViserServer):
+            client.on_client_connect(self._turn)
         self._root = 0
 
     def set_pair(
@@ -71,7 +86,7 @@ class Stage:
             T: Initial wrist pose in the object's frame [m].
             on_table: Look from above.
         """
-        scene, name = self.place.scene, f"/pair{self._root}"
+        scene, name = self.client.scene, f"/pair{self._root}"
         if self.hand is not None:
             scene.remove_by_name(name)
             self._root += 1
@@ -95,12 +110,12 @@ class Stage:
     def aim(self, camera: Camera) -> None:
         """Turn the cameras of all browsers that show the page, also of those that connect later."""
         self._camera = camera
-        if isinstance(self.place, viser.ClientHandle):
-            self._turn(self.place)
+        if isinstance(self.client, viser.ClientHandle):
+            self._turn(self.client)
             return
-        initial = self.place.initial_camera
+        initial = self.client.initial_camera
         (initial.position, initial.look_at), initial.fov = viewpoint(camera), camera.field_of_view
-        for client in self.place.get_clients().values():
+        for client in self.client.get_clients().values():
             self._turn(client)
 
     def _turn(self, client: viser.ClientHandle) -> None:
@@ -113,7 +128,7 @@ class Stage:
         self, name: str, points: Float[np.ndarray, "n 3"], colour: Colour, size: float = POINT_SIZE
     ) -> viser.PointCloudHandle:
         """Add points of a size [m], hidden at first."""
-        return self.place.scene.add_point_cloud(
+        return self.client.scene.add_point_cloud(
             f"/pair{self._root}/{name}", points.astype(np.float32), colors=rgb(colour), point_size=size,
             point_shape="circle", precision="float32", visible=False,
         )
@@ -127,7 +142,7 @@ class Stage:
             poses = (T @ self.hand.tree.forward(joints)).double().numpy()
             points = self.hand.points(joints, T).numpy()
         moved = np.eye(4) if T_object is None else T_object.double().numpy()
-        with self.place.atomic():
+        with self.client.atomic():
             for frame, pose in zip([self._object, *self.links], [moved, *poses], strict=True):
                 frame.position = pose[:3, 3]
                 frame.wxyz = viser.transforms.SO3.from_matrix(pose[:3, :3]).wxyz
@@ -139,7 +154,7 @@ class Stage:
 
     def show_shapes(self, visible: bool) -> None:
         """Show or hide the hand's shapes."""
-        with self.place.atomic():
+        with self.client.atomic():
             for frame in self.links:
                 frame.visible = visible
 
@@ -164,6 +179,36 @@ def rgb(colour: Colour) -> tuple[int, int, int]:
     """Red, green and blue as whole numbers to 255."""
     red, green, blue = (round(255 * c) for c in colour)
     return red, green, blue
+
+
+@contextlib.contextmanager
+def guarded_server(served_at: str) -> Iterator[None]:
+    """Servers of viser that start within the block refuse foreign requests, and more than MAX_CONNECTIONS.
+
+    viser has no switch for it; it passes a function that sees every request to websockets, and this one is put before it.
+    """
+    serve, own = websockets.asyncio.server.serve, own_names(served_at)
+
+    def guarded(*args: Any, process_request: Callable[..., Any] | None = None, **options: Any) -> Any:
+        def check(connection: ServerConnection, request: Request) -> Response | None:
+            crowd = len(getattr(connection.server, "connections", ())) > MAX_CONNECTIONS
+            why = "too many browsers show it; close some" if crowd else refusal(request.headers, own)
+            if why:
+                return connection.respond(http.HTTPStatus.FORBIDDEN, f"This page refuses the request: {why}.\n")
+            return None if process_request is None else process_request(connection, request)
+
+        return serve(*args, process_request=check, **options)
+
+    websockets.asyncio.server.serve = guarded  # type: ignore[assignment,misc]
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = serve  # type: ignore[misc]
+
+
+def escaped(text: object) -> str:
+    """Text that is shown as it is within Markdown, of which viser's browser renders HTML, JSX and links."""
+    return re.sub(r"[&<>{}\[\]*`\\!#|~$\n]", lambda sign: f"&#{ord(sign.group())};", str(text))
 
 
 class ServedPage:
@@ -195,7 +240,7 @@ class ServedPage:
         # A panel at the side leaves the hand in sight; narrow windows get it at the bottom.
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         self.server.gui.main_panel.dock_right()
-        self.stage = Stage(self.server)
+        self.view = SceneView(self.server)
 
     @property
     def url(self) -> str:

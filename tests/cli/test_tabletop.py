@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import pytest
 
 import dro_grasp as dro
+from dro_grasp import extras
 from dro_grasp.cli.main import main
 from dro_grasp.planning import tabletop
 from dro_grasp.planning.attempts import Attempt, TabletopConfig
@@ -95,7 +95,7 @@ def test_what_cannot_be_attempted_is_refused_in_words(
 def test_without_the_extra_it_says_what_to_install(
     done: list[Attempt], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setitem(sys.modules, "mink", None)
+    monkeypatch.setattr(extras, "find_spec", lambda name: None)
     assert lifted() == 2
     assert "pip install '.[arm]' in the folder of the clone" in capsys.readouterr().err
     assert not done

@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from dro_grasp.cli.constraint_options import ConstraintOptions
-from dro_grasp.cli.inputs import Flag, optional
+from dro_grasp.cli.inputs import ConstraintOptions, Flag, optional
 from dro_grasp.cli.output import print_json, say, say_aside
 
 if TYPE_CHECKING:
@@ -76,15 +75,16 @@ class Plan:
         from dataclasses import asdict
 
         from dro_grasp.errors import OptionError
+        from dro_grasp.extras import require_extra
         from dro_grasp.files import check_output, replacing
         from dro_grasp.objects.catalogue import load_object
         from dro_grasp.objects.scenery import load_scene
         from dro_grasp.planning.motion import trajectory_csv, trajectory_yaml
-        from dro_grasp.planning.planner import PlanConfig, plan, require_arm_extra
+        from dro_grasp.planning.planner import PlanConfig, plan
         from dro_grasp.planning.robot import load_robot
         from dro_grasp.predictor import GraspPredictor
 
-        require_arm_extra()
+        require_extra("arm")
         if not 0 <= self.seed < 2**31:
             raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^31 - 1")
         avoid = None if self.avoid is None else load_scene(self.avoid)

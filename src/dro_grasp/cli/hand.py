@@ -1,4 +1,4 @@
-"""`dro-grasp hand make`: hands that do not exist."""
+"""`dro-grasp hand`: hands checked, mirrored or scaled, and made."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import tyro
+
 from dro_grasp.cli.inputs import Flag, optional
+from dro_grasp.cli.listing import Hands
 from dro_grasp.cli.output import print_json, print_table, progress_bar, say
 
 if TYPE_CHECKING:
@@ -121,3 +124,90 @@ def _draw(files: list[Path], made: list[MadeHand], path: Path) -> None:
         f" + {hand.plan.followers}" if hand.plan.followers else "") for hand in made]
     title = f"Procedural hands, seeds {made[0].seed} to {made[-1].seed}: independent joints + joints that follow"
     draw_hands([load_hand(file) for file in files], captions, path, title)
+
+
+@dataclass(frozen=True)
+class Vary:
+    """Write the URDF of a hand's mirror image, or of a larger or smaller hand.
+
+    Example: dro-grasp hand vary leaphand --mirrored --scale 0.95 --output leap_left_small.urdf
+    """
+
+    hand: tyro.conf.Positional[str]
+    """Name of a hand, or path of a URDF file."""
+    output: Path
+    """URDF file to write. It names the hand's meshes by their absolute paths."""
+    mirrored: Flag = False
+    """Mirror it: a right hand becomes a left one. Equal joint values give mirrored poses."""
+    scale: float = 1.0
+    """Factor for all lengths; masses grow with its cube."""
+    json: Flag = False
+    """Print one JSON object instead of text."""
+
+    def run(self) -> int:
+        """Read, change, write."""
+        from dro_grasp.errors import OptionError
+        from dro_grasp.files import check_output, command, replacing
+        from dro_grasp.hands.library import locate_hand
+        from dro_grasp.hands.variants import vary_hand
+
+        if not self.mirrored and self.scale == 1:
+            raise OptionError("nothing would change; give --mirrored, --scale, or both")
+        path = check_output(self.output, ".urdf")
+        if path.exists() and path.samefile(locate_hand(self.hand).path):
+            raise OptionError(f"{path} is the hand itself, which would be lost; give --output another name")
+        text = vary_hand(self.hand, mirrored=self.mirrored, factor=self.scale)
+        with replacing(path) as temporary:
+            temporary.write_text(text)
+        if self.json:
+            print_json({"hand": self.hand, "mirrored": self.mirrored, "scale": self.scale, "output": str(self.output)})
+        else:
+            shown = command("dro-grasp", "hand", "check", self.output, "--picture", "hand.png")
+            say(f"{self.output}; see it with: {shown}")
+        return 0
+
+
+@dataclass(frozen=True)
+class Check:
+    """Check a hand description: report what is derived from it and what is wrong with it, and draw it.
+
+    Example: dro-grasp hand check my_hand.urdf --picture my_hand.png
+    """
+
+    hand: tyro.conf.Positional[str]
+    """Name of a hand, or path of a URDF or MJCF file; FILE#LINK for the hand of a whole robot, by its first link."""
+    picture: Annotated[Path | None, optional("PNG", "none")] = None
+    """PNG file with the hand open and closed, its palm direction and its contact links."""
+    json: Flag = False
+    """Print one JSON object instead of text."""
+
+    def run(self) -> int:
+        """Check, print, draw."""
+        from dro_grasp.files import check_output
+        from dro_grasp.hands.check import check_hand, picture
+
+        if self.picture is not None:
+            check_output(self.picture, ".png")
+        report = check_hand(self.hand)
+        if self.picture is not None:
+            picture(report.hand, self.picture)
+        if self.json:
+            print_json({**report.to_dict(), "picture": None if self.picture is None else str(self.picture)})
+            return 0
+        for line in report.lines():
+            say(line)
+        if self.picture is not None:
+            say(f"picture: {self.picture}")
+        return 0
+
+
+@dataclass(frozen=True)
+class HandCommand:
+    """Check, make, vary and list hands."""
+
+    command: (
+        Annotated[Check, tyro.conf.subcommand("check")]
+        | Annotated[Make, tyro.conf.subcommand("make")]
+        | Annotated[Vary, tyro.conf.subcommand("vary")]
+        | Annotated[Hands, tyro.conf.subcommand("list")]
+    )
