@@ -24,7 +24,7 @@ def sentence(grasps: Any) -> str:
     """Number of grasps, hand, objects, outcome and range of score or energy."""
     parts = [f"{len(grasps)} grasp{'' if len(grasps) == 1 else 's'}", f"hand '{grasps.hand}'", _objects(grasps)]
     for protocol, count in Counter(p for p in grasps.protocol if p != NOT_EVALUATED).items():
-        held = sum(s for s, p in zip(grasps.success.tolist(), grasps.protocol, strict=True) if p == protocol)
+        held = sum(s for s, p in zip(grasps.trial_success.tolist(), grasps.protocol, strict=True) if p == protocol)
         parts.append(f"{held} of {count} hold under {protocol}")
     if not grasps.evaluated.all():
         parts.append("not evaluated" if not grasps.evaluated.any() else f"{int((~grasps.evaluated).sum())} not evaluated")

@@ -62,7 +62,7 @@ def read_collection(path: Path | str, only_successful: bool = True) -> Iterator[
     empty = True
     for pair in pairs:
         empty = False
-        yield replace(pair, grasps=pair.grasps[pair.grasps.success.nonzero()[:, 0]]) if only_successful else pair
+        yield replace(pair, grasps=pair.grasps[pair.grasps.trial_success]) if only_successful else pair
     if empty:
         raise GraspFileError(f"{path} holds no grasp; leave it out, or generate again without --only-successful")
 
