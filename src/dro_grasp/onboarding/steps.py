@@ -21,7 +21,7 @@ from dro_grasp.datasets.engine.worker import EngineConfig
 from dro_grasp.devices import require_device
 from dro_grasp.errors import BundleError, OptionError
 from dro_grasp.evaluation.success_rates import BEST, RAW, REFINED, RETURNED, BenchmarkConfig, benchmark
-from dro_grasp.files import check_folder, make_folder, replacing
+from dro_grasp.files import check_folder, make_folder, replacing, set_aside
 from dro_grasp.hands.check import check_hand, picture
 from dro_grasp.hands.library import load_hand
 from dro_grasp.models.checkpoints import DEFAULT, history_of, load_weights, locate_weights, save_weights
@@ -209,7 +209,7 @@ class _Onboarding:
             return {"hand": str(known["hand"]), "sha256": str(known["sha256"]), "steps": dict(known["steps"]),
                     "asked": dict(known.get("asked", {}))}
         except (ValueError, LookupError, TypeError) as error:
-            aside = state.replace(state.with_name(f"{state.name}.damaged"))
+            aside = set_aside(state)
             self.say(f"{state} is damaged ({type(error).__name__}) and set aside as {aside.name}; its steps are made again")
             return None
 
