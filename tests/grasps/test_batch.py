@@ -127,7 +127,8 @@ def test_a_single_truth_value_is_no_grasp():
         make(3)[True]
 
 
-@pytest.mark.parametrize(("count", "subject"), [(1, "grasp 1 has"), (2, "grasp 1 and 1 more have"), (3, "grasp 1 and 2 more have")])
+@pytest.mark.parametrize(("count", "subject"), [
+    (1, "grasp 1 has"), (2, "grasp 1 and 1 more have"), (3, "grasp 1 and 2 more have")])
 def test_how_many_poses_are_wrong_is_said_in_english(count, subject):
     given = make(4)
     T, joints = given.T_object_wrist.clone(), given.joints.clone()

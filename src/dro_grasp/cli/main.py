@@ -180,7 +180,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         return INTERRUPTED
-    except Exception as error:
+    except Exception as error:  # the end of the program: whatever gets here is a fault of ours, and told as one
         if reader_left():
             return READER_LEFT
         if verbose:

@@ -123,7 +123,7 @@ def rows_at(index: Any, n: int) -> Int[Tensor, " k"]:
     if chosen is None or chosen.is_floating_point() or chosen.is_complex() or (mask and chosen.ndim != 1):
         raise OptionError(f"{str(index)[:TOLD]} chooses no grasps; give an index, a slice, a list of indices, or a mask with "
                           "one truth value a grasp")
-    if not mask and bool(((chosen < -n) | (chosen >= n)).any()) or (mask and len(chosen) != n):
+    if (not mask and bool(((chosen < -n) | (chosen >= n)).any())) or (mask and len(chosen) != n):
         raise IndexError(f"mask of {len(chosen)} for a batch of {n}" if mask else f"grasp {index} of a batch of {n}")
     return torch.arange(n)[chosen].reshape(-1)
 

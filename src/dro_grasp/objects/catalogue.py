@@ -145,7 +145,7 @@ def _procedural(first: int, last: int) -> list[str]:
 
 def _assets() -> dict[str, dict[str, Any]]:
     root = os.environ.get("DRO_GRASP_ASSETS")
-    return _manifest(Path(root) / "objects" / "manifest.json") if root else {}
+    return _manifest(given_path(root) / "objects" / "manifest.json") if root else {}
 
 
 @cache

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dro_grasp.errors import PlanError
-from dro_grasp.files import check_output, reading, replacing
+from dro_grasp.files import UNTYPED, check_output, given_path, reading, replacing
 from dro_grasp.planning.timing import Trajectory
 
 STAGES = ("reach", "shape", "approach", "close", "lift")
@@ -156,7 +156,8 @@ class MotionPlan:
         Raises:
             PlanError: No such file, or a truncated or foreign one, or one of another version.
         """
-        with reading(path, PlanError, EXPECTED), Path(path).open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+        path = given_path(path)
+        with reading(path, PlanError, EXPECTED, *UNTYPED), path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             header: dict[str, Any] = json.loads(str(file["header"]))
             if header.pop("format_version", None) != FORMAT or tuple(header.pop("stages", ())) != STAGES:
                 raise PlanError(f"{path} is a plan file of another version; plan again")

@@ -6,7 +6,7 @@ import multiprocessing
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import MISSING, asdict, dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -187,9 +187,12 @@ def read_attempts(path: Path) -> list[Attempt]:
         GraspFileError: It is another file.
     """
     known = {f.name for f in fields(Attempt)}
-    with reading(path, GraspFileError, "a file of attempts; name another one, or move this one away"):
+    needed = {f.name for f in fields(Attempt) if f.default is MISSING and f.default_factory is MISSING}
+    with reading(path, GraspFileError, "a file of attempts; name another one, or move this one away", pa.ArrowException):
         rows = pq.read_table(path).to_pylist()
-        return [Attempt(**{k: v for k, v in row.items() if k in known}) for row in rows]
+        if lacking := needed - {*(rows[0] if rows else needed)}:
+            raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
+    return [Attempt(**{k: v for k, v in row.items() if k in known}) for row in rows]
 
 
 def endings(attempts: Sequence[Attempt]) -> dict[str, int]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dro_grasp.errors import OptionError, ServerError
+from dro_grasp.files import given_path
 
 
 class GraspClient:
@@ -102,7 +103,8 @@ def sent_object(obj: str | Path | ArrayLike) -> dict[str, Any]:
         OptionError: It is none of these.
     """
     if isinstance(obj, str | Path):
-        return sent_file(Path(obj).name, Path(obj).read_bytes()) if Path(obj).is_file() else {"name": str(obj)}
+        path = given_path(obj)
+        return sent_file(path.name, path.read_bytes()) if path.is_file() else {"name": str(obj)}
     try:
         points = np.asarray(obj if isinstance(obj, np.ndarray) else listed(obj))
     except ValueError:  # rows of several lengths

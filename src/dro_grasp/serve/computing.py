@@ -72,5 +72,5 @@ def _reply(answerer: Any, pipe: Connection, call: Any) -> Reply:
         return refused(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
     except Cancelled:
         return refused(HTTPStatus.CONFLICT, "the request was cancelled")
-    except Exception as error:
+    except Exception as error:  # the server must survive a fault of ours, and the client is told that it is one
         return refused(HTTPStatus.INTERNAL_SERVER_ERROR, f"{type(error).__name__}: {error}; this is a fault of dro-grasp")

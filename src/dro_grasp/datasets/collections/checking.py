@@ -50,10 +50,10 @@ class Agreement:
     def extended(self, grasps: GraspBatch, trial: TrialResult) -> Agreement:
         """With the new trials of more grasps."""
         failed = Counter(f.value for f, held in zip(trial.failure, grasps.trial_success.tolist(), strict=True) if f and held)
-        success = int(trial.success.sum())
+        success, agreed = int(trial.success.sum()), int((trial.success == grasps.trial_success).sum())
         of_hand = self.hands.get(grasps.hand, (0, 0))
         return replace(
-            self, evaluated=self.evaluated + len(grasps), agreed=self.agreed + int((trial.success == grasps.trial_success).sum()),
+            self, evaluated=self.evaluated + len(grasps), agreed=self.agreed + agreed,
             succeeded=self.succeeded + success, reasons=self.reasons + failed,
             hands=self.hands | {grasps.hand: (of_hand[0] + len(grasps), of_hand[1] + success)},
         )
