@@ -263,6 +263,13 @@ def test_every_column_may_be_an_array_of_any_precision():
 @pytest.mark.parametrize(("column", "told"), [
     ({"pregrasp_joints": np.zeros((3, 1))}, r"pregrasp_joints has shape \(3, 1\); expected \(3, 2\)"),
     ({"score": np.zeros((3, 1))}, r"score has shape \(3, 1\); expected \(3,\)"),
+    ({"scores": [1.0, 2.0, 3.0]}, "no column 'scores'; they have .*success, .*score, .*, and in extra"),
+    ({"seed": 1.5}, "seed is no array of numbers .it has fractions."), ({"seed": "0"}, "seed is no array of numbers"),
+    ({"success": [0.5, 1.0, 0.0]}, "success is no array of numbers .it has fractions."),
+    ({"score": ["1", "2", "3"]}, "score is no array of numbers"),
+    ({"protocol": "strict/1"}, "protocol is 'strict/1'; give one text for each of the 3 grasps"),
+    ({"protocol": ["strict/1"] * 2}, "protocol has 2 texts; give one for each of the 3 grasps"),
+    ({"split": [1, 2, 3]}, "split is .*; give one text"),
     ({"success": True}, r"success has shape \(\); expected \(3,\)"),
     ({"seed": [1, 2]}, r"seed has shape \(2,\); expected \(3,\)"),
     ({"energy": ["low"] * 3}, "energy is no array of numbers"),

@@ -21,12 +21,13 @@ from dro_grasp.baselines.ours import DescentMethod, DistanceMethod, SynthesisMet
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.errors import OptionError
 from dro_grasp.files import given_path
+from dro_grasp.kinds import Checked
 from dro_grasp.models.checkpoints import SHIPPED_FOLDER
 from dro_grasp.predictor import GraspPredictor, PredictorConfig
 
 
 @dataclass(frozen=True)
-class MethodOptions:
+class MethodOptions(Checked):
     """What methods are made with."""
 
     weights: str | None = None

@@ -151,10 +151,14 @@ def filled(joints: Float[Tensor, "n n_dof"], known: Mapping[str, Any], given: Ma
     """All fields of a batch but poses and joints: those known, those given, and the others unknown.
 
     Raises:
-        OptionError: A given column of numbers holds something else, or has another shape.
+        OptionError: There is no such column, or one holds something else, or has another shape.
     """
     n = len(joints)
     fields: dict[str, Any] = {name: unknown(name, joints) for name in COLUMNS[2:]} | dict(known)
+    names = [name.replace("trial_success", "success") for name in fields]
+    if wrong := [name for name in given if name not in {*names, "extra"}]:
+        raise OptionError(f"grasps have no column '{wrong[0]}'; they have {', '.join(names)}, and in extra, a dictionary, what "
+                          "you like")
     if "success" in given:
         fields["protocol"] = (UNKNOWN_PROTOCOL,) * n
         fields["trial_success"] = _numbers("success", given["success"], fields["trial_success"])
@@ -169,13 +173,22 @@ def filled(joints: Float[Tensor, "n n_dof"], known: Mapping[str, Any], given: Ma
             fields[name] = tuple(value.tolist()) if isinstance(value, np.ndarray) else value
     if isinstance(fields["provenance"], str):
         fields["provenance"] = (fields["provenance"],) * n
+    for name in (*TEXTS, "protocol"):
+        if not isinstance(texts := fields[name], list | tuple) or not all(isinstance(text, str) for text in texts):
+            raise OptionError(f"{name} is {str(texts)[:TOLD]!r}; give one text for each of the {n} grasps")
+        if len(texts) != n:
+            raise OptionError(f"{name} has {len(texts)} texts; give one for each of the {n} grasps")
+        fields[name] = tuple(texts)
     return fields
 
 
 def _numbers(name: str, value: Any, like: Shaped[Tensor, "n *k"]) -> Shaped[Tensor, "n *k"]:
     """A given column in type, shape and place of an unknown one; one seed stands for all."""
     try:
-        column = torch.as_tensor(_own(value), dtype=like.dtype, device=like.device)
+        column = torch.as_tensor(_own(value))
+        if column.is_floating_point() and not like.is_floating_point():
+            raise ValueError("it has fractions")
+        column = column.to(like.device, like.dtype)
     except (TypeError, ValueError, RuntimeError) as error:
         raise OptionError(f"{name} is no array of numbers ({error}); give one of shape {tuple(like.shape)}, or leave it "
                           "out") from error

@@ -14,6 +14,7 @@ from dro_grasp.errors import HandError
 from dro_grasp.files import given_path
 from dro_grasp.hands.build import build_hand
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import checked
 
 BUILTIN_FOLDER = Path(__file__).parent / "builtin"
 """Folder of the built-in descriptions."""
@@ -35,6 +36,7 @@ ASSET_PREFIX = "assets/"
 """Prefix that forces a name to be that of a development asset."""
 
 
+@checked
 def load_hand(name: str | Path, *, seed: int = 0, n_points: int = 512) -> Hand:
     """Load a hand by name or from a URDF or MJCF file; nothing needs to be annotated.
 

@@ -24,6 +24,7 @@ from dro_grasp.evaluation.success_rates import BEST, RAW, REFINED, RETURNED, Ben
 from dro_grasp.files import check_folder, make_folder, replacing, set_aside
 from dro_grasp.hands.check import check_hand, picture
 from dro_grasp.hands.library import load_hand
+from dro_grasp.kinds import Checked
 from dro_grasp.models.checkpoints import DEFAULT, history_of, load_weights, locate_weights, save_weights
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.optimization.synthesis import SynthesisConfig
@@ -53,7 +54,7 @@ MOST_GRASPS = 400
 
 
 @dataclass(frozen=True)
-class OnboardingConfig:
+class OnboardingConfig(Checked):
     """How long onboarding takes, and on which objects."""
 
     minutes: float = 30.0
@@ -79,6 +80,7 @@ class OnboardingConfig:
 
     def __post_init__(self) -> None:
         """Refuse numbers out of range."""
+        super().__post_init__()
         if not (math.isfinite(self.minutes) and self.minutes > 0):
             raise OptionError(f"minutes is {self.minutes}; give a positive number, for example --minutes 30")
         require_device(self.device)

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from dro_grasp.errors import DroGraspError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.kinds import Checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.scan import depth_points
 from dro_grasp.pipeline.constraints import Constraints
@@ -46,7 +47,7 @@ SHAKE_ANGLE = 0.04
 
 
 @dataclass(frozen=True)
-class TabletopConfig:
+class TabletopConfig(Checked):
     """How an attempt runs. Values without a source are ours."""
 
     see: Literal["cloud", "mesh"] = "cloud"
@@ -73,6 +74,7 @@ class TabletopConfig:
             OptionError: Too many other objects, or fewer than none, noise that is none, a region that is none, or constraints
                 on places.
         """
+        super().__post_init__()
         wanted = self.plan.constraints
         if wanted.avoid is not None or wanted.hold or wanted.spare:
             raise OptionError("objects of attempts come to rest anywhere, so that avoid, hold and spare say nothing there; "

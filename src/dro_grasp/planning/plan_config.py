@@ -7,13 +7,14 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from dro_grasp.errors import OptionError
+from dro_grasp.kinds import Checked
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.planning.candidates import Directions
 from dro_grasp.planning.reachability import ReachConfig
 
 
 @dataclass(frozen=True)
-class PlanConfig:
+class PlanConfig(Checked):
     """How a motion is planned. Values without a source are ours."""
 
     num: int = 24
@@ -53,6 +54,7 @@ class PlanConfig:
         Raises:
             OptionError: A number is not positive or not finite, or something is stated twice.
         """
+        super().__post_init__()
         if self.constraints.table is not None:
             raise OptionError("the table is the robot's: state its height in the robot file, and not in constraints")
         if self.constraints.direction is not None and self.directions != "all":

@@ -14,6 +14,7 @@ from torch import Tensor
 from dro_grasp.errors import OptionError, PlanError
 from dro_grasp.frames import motion_fault
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.kinds import checked
 from dro_grasp.objects.scenery import load_scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pipeline.admission import BESIDE, NARROW, SPARED, TURNED, faults
@@ -44,6 +45,7 @@ LOSES = "losing the object when rehearsed"
 """The simulated hand does not lift the object as it is known."""
 
 
+@checked
 def plan(
     robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"] | None = None,
     obstacles: Sequence[ObjectModel] = (), predictor: GraspPredictor | None = None, config: PlanConfig | None = None,

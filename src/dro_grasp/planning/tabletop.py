@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 from dro_grasp.devices import one_thread
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.files import check_output, make_folder, reading, replacing
+from dro_grasp.kinds import Checked, checked
 from dro_grasp.models.checkpoints import DEFAULT, describe_weights
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.planning.attempts import Attempt, TabletopConfig, Watcher, attempt
@@ -30,7 +31,7 @@ Progress = Callable[[Attempt], None]
 
 
 @dataclass(frozen=True)
-class TabletopRun:
+class TabletopRun(Checked):
     """What is attempted."""
 
     robot: str
@@ -52,6 +53,7 @@ class TabletopRun:
         Raises:
             OptionError: No attempts, or no objects, or a seed that is none.
         """
+        super().__post_init__()
         if not 0 <= self.seed < 2**31:
             raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^31 - 1")
         if self.attempts < 1 or not self.objects:
@@ -69,6 +71,7 @@ class PlanKeeper(Watcher):
         made.save(self.path)
 
 
+@checked
 def run_tabletop(
     run: TabletopRun, output: Path | None = None, workers: int = 1, progress: Progress | None = None, plans: Path | None = None
 ) -> list[Attempt]:

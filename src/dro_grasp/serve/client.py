@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from dro_grasp.errors import OptionError, ServerError
 from dro_grasp.files import given_path
+from dro_grasp.kinds import checked
 
 
 class GraspClient:
@@ -25,6 +26,7 @@ class GraspClient:
         >>> answer["grasps"][0]["wrist_position"]
     """
 
+    @checked
     def __init__(self, url: str = "http://127.0.0.1:8090", token: str | None = None, timeout: float = 120.0) -> None:
         """Remember where to ask; nothing is sent yet.
 
@@ -36,6 +38,7 @@ class GraspClient:
         self.url, self.timeout = url.rstrip("/"), timeout
         self.headers = {"Content-Type": "application/json"} | ({"Authorization": f"Bearer {token}"} if token else {})
 
+    @checked
     def predict(self, hand: str, obj: str | Path | ArrayLike, num: int = 16, **options: Any) -> dict[str, Any]:
         """The server's answer: its list `grasps`, the best first, and all that is known of it.
 

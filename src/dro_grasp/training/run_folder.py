@@ -15,14 +15,12 @@ from typing import Any
 import torch
 
 from dro_grasp.errors import OutputError, TrainingError
-from dro_grasp.files import FOREIGN, is_unread, reason_of, replacing, set_aside
+from dro_grasp.files import FOREIGN, UNTYPED, is_unread, reason_of, replacing, set_aside
 
 CHECKPOINT = "checkpoint.pt"
 """File with everything that a run needs to resume."""
 LOG = "log.jsonl"
 """File with one JSON object a line: step, seconds, learning rate and mean losses."""
-DAMAGE = (*FOREIGN, AttributeError)
-"""What reading a damaged checkpoint raises: PyTorch's reader takes entries of the wrong type for others."""
 ENTRIES = ("step", "seconds", "model", "average", "optimiser", "plan")
 """Entries of a checkpoint."""
 
@@ -59,7 +57,7 @@ class RunFolder:
             return None
         try:
             state = _state(path)
-        except DAMAGE as error:
+        except FOREIGN as error:
             if is_unread(error):
                 raise TrainingError(f"{path} cannot be read ({reason_of(error)}); nothing was changed. Start again once it can "
                                     "be, or use another folder") from error
@@ -119,7 +117,11 @@ def _state(path: Path) -> dict[str, Any]:
     Raises:
         ValueError: It lacks some, or holds something else.
     """
-    state = torch.load(io.BytesIO(path.read_bytes()), weights_only=True, map_location="cpu")
+    content = io.BytesIO(path.read_bytes())
+    try:
+        state = torch.load(content, weights_only=True, map_location="cpu")
+    except UNTYPED as error:  # PyTorch takes a damaged pickle's entries for what they should be
+        raise ValueError(str(error)) from error
     kinds = {"step": int, "seconds": (int, float), "plan": dict}
     if not isinstance(state, dict) or not set(ENTRIES) <= state.keys() or not all(
             isinstance(state[name], kind) for name, kind in kinds.items()):

@@ -278,7 +278,10 @@ def _grasp_tensors(key: str, T: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n
 
 
 def _unpack_grasps(key: str, tensors: Tensors) -> HandGrasps:
-    quaternion = roma.quat_wxyz_to_xyzw(tensors[f"{key}.quaternion_wxyz"])
+    quaternion = tensors[f"{key}.quaternion_wxyz"]
+    if quaternion.shape[-1:] != (4,) or not quaternion.is_floating_point():
+        raise ValueError(f"'{key}.quaternion_wxyz' is {quaternion.dtype} of shape {tuple(quaternion.shape)}")
+    quaternion = roma.quat_wxyz_to_xyzw(quaternion)
     if not len(quaternion):
         return HandGrasps(torch.zeros(0, 4, 4), tensors[f"{key}.joints"], tensors[f"{key}.object"].long())
     rotation = roma.unitquat_to_rotmat(torch.nn.functional.normalize(quaternion, dim=-1))

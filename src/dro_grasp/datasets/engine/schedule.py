@@ -23,6 +23,7 @@ from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.files import given_path, is_unread, make_folder, set_aside
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand, locate_hand
+from dro_grasp.kinds import checked
 from dro_grasp.objects.catalogue import ASSET_PREFIX, load_object, locate_object, object_names
 
 REPORT_EVERY = 10.0
@@ -94,6 +95,7 @@ class DatasetReport:
     """Pairs that were given up, and why."""
 
 
+@checked
 def synthesize_dataset(
     hands: Sequence[str], objects: Sequence[str], grasps_per_pair: int, output_dir: Path | str,
     workers: int | Callable[[Job], Pool] = 2, seed: int = 0, config: EngineConfig | None = None,
