@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from dro_grasp.datasets.bundle.training_file import Bundle
+from dro_grasp.kinds import Checked
 from dro_grasp.training.config import ScheduleConfig
 from dro_grasp.training.reports import Report
 from dro_grasp.training.run_plan import run_plan
@@ -25,7 +26,7 @@ Passed = TypeVar("Passed")
 
 
 @dataclass(frozen=True)
-class AutoencoderConfig:
+class AutoencoderConfig(Checked):
     """Settings of both."""
 
     schedule: ScheduleConfig = field(default_factory=lambda: ScheduleConfig(steps=10_000))

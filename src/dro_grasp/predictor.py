@@ -18,6 +18,7 @@ from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import with_own_files
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import Checked
 from dro_grasp.models.checkpoints import load_weights
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.shape import ObjectModel
@@ -46,7 +47,7 @@ OPTIMISED_IN_SURROUNDINGS = 4
 
 
 @dataclass(frozen=True)
-class GraspRequest:
+class GraspRequest(Checked):
     """What is asked of a predictor."""
 
     num: int = 16
@@ -69,6 +70,7 @@ class GraspRequest:
         Raises:
             OptionError: `num` or `candidates` is not positive, or another value is out of range.
         """
+        super().__post_init__()
         if self.num < 1:
             raise OptionError(f"num is {self.num}; ask for at least one grasp (--num 16)")
         if self.candidates < 1:

@@ -236,11 +236,11 @@ def test_a_damaged_state_is_set_aside_and_a_second_run_kept_out(
 ) -> None:
     told: list[str] = []
     monkeypatch.setattr(steps._Onboarding, "run", lambda self: None)
-    for content in ("{", "[]", '{"hand": "mine", "sha256": "x", "steps": 5}', '{"hand": "mine"}'):
+    for number, content in enumerate(("{", "[]", '{"hand": "mine", "sha256": "x", "steps": 5}', '{"hand": "mine"}'), 1):
         (tmp_path / steps.STATE).write_text(content)
         made = steps.onboard(str(home / "mine.urdf"), tmp_path, say=told.append)
         assert made.steps == {}
-        assert (tmp_path / f"{steps.STATE}.damaged").read_text() == content
+        assert (tmp_path / f"{steps.STATE}.damaged{'' if number == 1 else f'.{number}'}").read_text() == content
     assert len(told) == 4
     assert all("is damaged" in line and "made again" in line for line in told)
     with sole_run(tmp_path), pytest.raises(OutputError, match="another run is filling"):

@@ -15,11 +15,12 @@ from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.geometry.se3 import apply_to_cloud, compose, random_rotations, rotate
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import Checked
 from lab.methods.gendexgrasp.contact_maps import FITTING_GAMMA, contact_map
 
 
 @dataclass(frozen=True)
-class FittingConfig:
+class FittingConfig(Checked):
     """The descent; the numbers are GenDexGrasp's, unless stated otherwise."""
 
     gamma: float = FITTING_GAMMA

@@ -21,6 +21,7 @@ from dro_grasp.geometry.registration import register
 from dro_grasp.geometry.se3 import apply, rotate
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import Checked
 from dro_grasp.kinematics.joint_solver import Targets, solve_joints
 from dro_grasp.models.checkpoints import load_into
 from dro_grasp.optimization.grip import gripping
@@ -33,7 +34,7 @@ from lab.methods.manifm.fingertip_contacts import Pads, contacts_of
 
 
 @dataclass(frozen=True)
-class ContactMethodConfig:
+class ContactMethodConfig(Checked):
     """From contacts to grasps; the numbers are ManiFM's, unless stated otherwise."""
 
     points: int = 256

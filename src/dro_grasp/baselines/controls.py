@@ -13,6 +13,7 @@ from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.geometry.se3 import apply, apply_to_cloud, compose, random_rotations
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pipeline.choice import ChoiceConfig, choice_scores
 from dro_grasp.pipeline.problem import GraspProblem
@@ -90,6 +91,7 @@ def mean_grasps(
     return GraspBatch.create(hand, obj, T, joints, seed=seed, provenance="control: mean grasp")
 
 
+@checked
 def palm_facing_starts(hand: Hand, obj: ObjectModel, num: int, seed: int) -> GraspBatch:
     """Half-closed hands that face the object, with the palm at its surface; never optimised.
 

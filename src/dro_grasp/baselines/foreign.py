@@ -49,7 +49,7 @@ class ForeignMethod(Method):
             grasps = self.predictor.predict(problem.hand, problem.obj, num, seed)
         except DroGraspError:
             raise
-        except Exception as error:
+        except Exception as error:  # code of the user's runs here: its faults are told with the method's name
             raise OptionError(f"method '{self.name}' failed: {type(error).__name__}: {error}") from error
         if not isinstance(grasps, GraspBatch):
             raise OptionError(f"method '{self.name}' returned a {type(grasps).__name__}, expected a GraspBatch; make one with "

@@ -15,11 +15,13 @@ from dro_grasp.baselines.method import Method
 from dro_grasp.baselines.ours import DescentMethod, DistanceMethod, SynthesisMethod
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.errors import OptionError
+from dro_grasp.files import given_path
+from dro_grasp.kinds import Checked
 from dro_grasp.predictor import GraspPredictor, PredictorConfig
 
 
 @dataclass(frozen=True)
-class MethodOptions:
+class MethodOptions(Checked):
     """What methods are made with."""
 
     weights: str | None = None
@@ -78,8 +80,8 @@ def make_method(name: str, options: MethodOptions | None = None) -> Method:
         if at:
             method.name = name
         return method
-    if name.endswith(".parquet") or Path(name).is_dir():
-        return FileMethod(Path(name))
+    if name.endswith(".parquet") or given_path(name).is_dir():
+        return FileMethod(given_path(name))
     module, colon, attribute = name.partition(":")
     if colon:
         made = _foreign_class(module, attribute)()

@@ -128,7 +128,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             traceback.print_exc()
         print(f"error: {error}", file=sys.stderr)
         return BAD_INPUT
-    except Exception as error:
+    except Exception as error:  # the end of the program: whatever gets here is a fault of ours, and told as one
         if verbose:
             traceback.print_exc()
         else:

@@ -173,7 +173,7 @@ class Picture:
         from dro_grasp.errors import GraspFileError
 
         def wanted(own: GraspBatch) -> GraspBatch:
-            return own if not self.only_successful else own[own.success.nonzero()[:, 0]]
+            return own if not self.only_successful else own[own.trial_success]
 
         names = [self.object] if self.object is not None else [
             name for name, own in grasps.by_object() if len(wanted(own))]

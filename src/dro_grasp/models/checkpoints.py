@@ -17,7 +17,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from dro_grasp.errors import WeightsError
-from dro_grasp.files import given_path, reading, replacing
+from dro_grasp.files import UNTYPED, given_path, reading, replacing
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.models.presets import LAST_WITH_OTHERS, NetworkConfig
 
@@ -75,7 +75,7 @@ def load_weights(name: str | Path | None = None) -> DistanceNetwork:
     """
     path = locate_weights(name)
     entry, tensors = _read(path)
-    with reading(path, WeightsError, "weights of this version of the network"):
+    with reading(path, WeightsError, "weights of this version of the network", *UNTYPED):
         config = NetworkConfig.from_dict(entry["config"])
         with torch.device("meta"):  # a network of the wrong size is never made
             _check_tensors(DistanceNetwork(config).state_dict(), tensors, path)

@@ -23,6 +23,7 @@ from dro_grasp.geometry.se3 import apply_to_cloud, compose, rotate
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.proportions import proportions
+from dro_grasp.kinds import Checked
 from dro_grasp.models.network import DistanceNetwork, Moves
 from dro_grasp.optimization.palm_directions import CLEAR, Spread, lack_of_room, wrist_rotations
 from dro_grasp.optimization.starts import CHOICES
@@ -39,7 +40,7 @@ PRIOR_CHOICES = 2
 
 
 @dataclass(frozen=True)
-class ProposalConfig:
+class ProposalConfig(Checked):
     """How candidates are sampled and decoded."""
 
     rotations_per_grasp: int = 16
@@ -60,6 +61,7 @@ class ProposalConfig:
 
     def __post_init__(self) -> None:
         """Refuse a temperature out of range."""
+        super().__post_init__()
         check_temperature(self.temperature)
 
 

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from dro_grasp.energy.grasp_energy import EnergyConfig
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.kinds import Checked
 from dro_grasp.optimization.finger_easing import lacking_room
 from dro_grasp.optimization.refinement import RefineConfig
 from dro_grasp.pipeline.admission import permitted
@@ -35,7 +36,7 @@ UNHELD_SCORE = -4.0
 
 
 @dataclass(frozen=True)
-class SettleConfig:
+class SettleConfig(Checked):
     """What counts as holding still while the hand closes (ours)."""
 
     still: float = 0.005

@@ -18,6 +18,7 @@ from scipy.spatial import KDTree
 from dro_grasp.errors import DroGraspError, OptionError
 from dro_grasp.geometry.se3 import random_rotations
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.kinds import Checked
 from dro_grasp.objects.builtin import BUILTIN
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
@@ -74,7 +75,7 @@ Region = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
-class TabletopConfig:
+class TabletopConfig(Checked):
     """How an attempt runs. Values without a source are ours."""
 
     see: Literal["cloud", "mesh"] = "cloud"
@@ -101,6 +102,7 @@ class TabletopConfig:
             OptionError: Too many other objects, or fewer than none, noise that is none, a region that is none, or constraints
                 on places.
         """
+        super().__post_init__()
         wanted = self.plan.constraints
         if wanted.avoid is not None or wanted.hold or wanted.spare:
             raise OptionError("objects of attempts come to rest anywhere, so that avoid, hold and spare say nothing there; "

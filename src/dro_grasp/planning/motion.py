@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from dro_grasp.errors import PlanError
 from dro_grasp.export.contents import yaml_text
-from dro_grasp.files import check_output, reading, replacing
+from dro_grasp.files import UNTYPED, check_output, given_path, reading, replacing
 
 STAGES = ("reach", "shape", "approach", "close", "lift")
 """The arm travels with the hand open; the hand takes the pregrasp; straight to the grasp; the hand closes; straight up."""
@@ -179,7 +179,8 @@ class MotionPlan:
         Raises:
             PlanError: No such file, or a truncated or foreign one, or one of another version.
         """
-        with reading(path, PlanError, EXPECTED), Path(path).open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+        path = given_path(path)
+        with reading(path, PlanError, EXPECTED, *UNTYPED), path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             header: dict[str, Any] = json.loads(str(file["header"]))
             if header.pop("format_version", None) != FORMAT or tuple(header.pop("stages", ())) != STAGES:
                 raise PlanError(f"{path} is a plan file of another version; plan again")

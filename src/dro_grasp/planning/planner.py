@@ -21,6 +21,7 @@ from dro_grasp.errors import OptionError, PlanError
 from dro_grasp.extras import require_extra
 from dro_grasp.frames import motion_fault
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.kinds import Checked, checked
 from dro_grasp.objects.scenery import load_scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pipeline.admission import BESIDE, NARROW, SPARED, TURNED, faults
@@ -45,7 +46,7 @@ LOSES = "losing the object when rehearsed"
 
 
 @dataclass(frozen=True)
-class PlanConfig:
+class PlanConfig(Checked):
     """How a motion is planned. Values without a source are ours."""
 
     num: int = 24
@@ -87,6 +88,7 @@ class PlanConfig:
         Raises:
             OptionError: A number is not positive or not finite, or something is stated twice.
         """
+        super().__post_init__()
         if self.constraints.table is not None:
             raise OptionError("the table is the robot's: state its height in the robot file, and not in constraints")
         if self.constraints.direction is not None and self.directions != "all":
@@ -96,6 +98,7 @@ class PlanConfig:
                 raise OptionError(f"{name} is {getattr(self, name)}; give a number above 0")
 
 
+@checked
 def plan(
     robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"] | None = None,
     obstacles: Sequence[ObjectModel] = (), predictor: GraspPredictor | None = None, config: PlanConfig | None = None,

@@ -18,6 +18,7 @@ from torch import Tensor
 from dro_grasp.geometry.point_clouds import farthest_points
 from dro_grasp.geometry.se3 import apply_to_cloud
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.kinds import Checked
 from dro_grasp.planning.candidates import lowest_points
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.workcell import VOXEL, Workcell, arm_addresses
@@ -67,7 +68,7 @@ SMALL_LIFT = 0.08
 
 
 @dataclass(frozen=True)
-class ReachConfig:
+class ReachConfig(Checked):
     """How grasps are approached and lifted. Values are ours."""
 
     standoff: float = 0.10

@@ -6,7 +6,7 @@ import multiprocessing
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import MISSING, asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from dro_grasp.devices import one_thread
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.extras import require_extra
 from dro_grasp.files import check_output, make_folder, reading, replacing
+from dro_grasp.kinds import Checked, checked
 from dro_grasp.models.checkpoints import DEFAULT, describe_weights
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.planning.attempts import Attempt, TabletopConfig, Watcher, attempt
@@ -31,7 +32,7 @@ Progress = Callable[[Attempt], None]
 
 
 @dataclass(frozen=True)
-class TabletopRun:
+class TabletopRun(Checked):
     """What is attempted."""
 
     robot: str
@@ -53,6 +54,7 @@ class TabletopRun:
         Raises:
             OptionError: No attempts, or no objects, or a seed that is none.
         """
+        super().__post_init__()
         if not 0 <= self.seed < 2**31:
             raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^31 - 1")
         if self.attempts < 1 or not self.objects:
@@ -70,6 +72,7 @@ class PlanKeeper(Watcher):
         made.save(self.path)
 
 
+@checked
 def run_tabletop(
     run: TabletopRun, output: Path | None = None, workers: int = 1, progress: Progress | None = None,
     plans: Path | None = None, make: Callable[..., Attempt] | None = None,
@@ -195,9 +198,12 @@ def read_attempts(path: Path) -> list[Attempt]:
         GraspFileError: It is another file.
     """
     known = {f.name for f in fields(Attempt)}
-    with reading(path, GraspFileError, "a file of attempts; name another one, or move this one away"):
+    needed = {f.name for f in fields(Attempt) if f.default is MISSING and f.default_factory is MISSING}
+    with reading(path, GraspFileError, "a file of attempts; name another one, or move this one away", pa.ArrowException):
         rows = pq.read_table(path).to_pylist()
-        return [Attempt(**{k: v for k, v in row.items() if k in known}) for row in rows]
+        if lacking := needed - {*(rows[0] if rows else needed)}:
+            raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
+    return [Attempt(**{k: v for k, v in row.items() if k in known}) for row in rows]
 
 
 def endings(attempts: Sequence[Attempt]) -> dict[str, int]:

@@ -14,6 +14,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import CONTACT_LINKS, REASON
 from dro_grasp.grasps.controller import completed
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.viewer.appearance import PREDICTED_COLOUR
 from dro_grasp.viewer.pictures import outcome
@@ -92,6 +93,7 @@ class GraspViewer(ServedPage):
         predicted.on_update(lambda _: setattr(self._predicted, "visible", predicted.value))
 
 
+@checked
 def view_grasps(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, predicted_points: Float[Tensor, "n n_points 3"] | None = None,
     port: int = 8080, host: str = HOST,

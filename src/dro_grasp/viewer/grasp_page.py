@@ -275,7 +275,7 @@ def chosen(hand: Hand, grasps: GraspBatch, success: str, palm: str) -> Bool[Tens
     """Grasps with an outcome (`all`, `succeeded`, `failed`) whose palm points along a half-axis (or `any`)."""
     keep = torch.ones(len(grasps), dtype=torch.bool)
     if success != "all":
-        keep &= grasps.success if success == "succeeded" else grasps.evaluated & ~grasps.success
+        keep &= grasps.evaluated & (grasps.trial_success == (success == "succeeded"))
     if palm != ANY:
         keep &= half_axis(hand.palm_directions(grasps.T_object_wrist)) == HALF_AXES.index(palm)
     return keep
