@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo demo-arm test test-slow lint wheels docs rehearse docs-pictures data clean
+.PHONY: setup demo demo-arm test test-slow golden lint wheels docs rehearse docs-pictures data clean
 
 setup: $(STAMP)
 
@@ -31,6 +31,9 @@ test: setup
 test-slow: setup  # what takes more than about 10 s each, such as a Ray cluster that loses a node
 	$(BIN)/python -m pytest -q -m slow
 
+golden: setup  # record anew what tests/golden compares, after a change that is meant to change results
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.golden.cases
+
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports --no-logo
@@ -50,7 +53,7 @@ rehearse: setup  # the training of a GPU machine with the slim network, in two m
 	$(BIN)/dro-grasp dataset bundle $(REHEARSAL)/data --output $(REHEARSAL)/bundle.safetensors
 	export PATH=$(abspath $(BIN)):$$PATH OMP_NUM_THREADS=1 PROCESSES=2 RUNS=$(REHEARSAL)/runs OUT=$(REHEARSAL)/out \
 		BUNDLE=$(REHEARSAL)/bundle.safetensors VALIDATION=$(REHEARSAL)/bundle.safetensors \
-		PRETRAIN='--size slim --steps 4' TRAIN='--size slim --steps 10 --validation-samples 20'; \
+		PRETRAIN='--size slim --steps 4 --motion-steps 4' TRAIN='--size slim --steps 10 --validation-samples 20'; \
 	timeout --signal KILL 20 scripts/train_on_bare_machine.sh; scripts/train_on_bare_machine.sh
 	cd $(REHEARSAL)/out && cat multi.safetensors.* > multi.safetensors && sha256sum --check multi.sha256
 	$(BIN)/dro-grasp weights verify $(REHEARSAL)/out/multi.safetensors

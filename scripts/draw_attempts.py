@@ -23,6 +23,7 @@ from dro_grasp.planning.physics import LiftScene
 from dro_grasp.planning.robot import Robot, load_robot
 from dro_grasp.planning.robot_check import robot_meshes, table_meshes
 from dro_grasp.planning.tabletop import read_attempts
+from dro_grasp.planning.workcell import Workcell
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.rendering.meshes import Mesh
 from dro_grasp.rendering.rasterizer import render
@@ -46,7 +47,7 @@ COLOURS = 128
 def pictures(robot: Robot, one: Attempt, made: MotionPlan) -> tuple[list[Image.Image], str]:
     """The hand once it has closed and at the end, and what became of it; the attempt is carried out once more."""
     obj, recorder = load_object(one.object_file), Recorder()
-    scene = LiftScene(robot, [obj])
+    scene = LiftScene(Workcell(robot), [obj])
     scene.place(0, np.array(json.loads(one.place)))
     stage, reason = carry_out(scene, made, TabletopConfig(), recorder)
     closed = round(float(made.arm.time[made.part("close").stop - 1]) * recorder.rate)

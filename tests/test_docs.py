@@ -21,7 +21,7 @@ BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 # The development assets have folders hands/ and objects/ as well.
 ROOMS = {path.name for path in (ROOT / "src" / "dro_grasp").iterdir() if path.is_dir()} - {"hands", "objects"}
-FOLDERS = ["benchmarks", "docs", "scripts", "tests", "src", *ROOMS]
+FOLDERS = ["lab", "docs", "scripts", "tests", "src", *ROOMS]
 FILE = re.compile(rf"`((?:{'|'.join(FOLDERS)})/[\w/.-]+\.\w+)`")
 MAKE_TARGET = re.compile(r"^([\w-]+):", re.MULTILINE)
 
@@ -60,6 +60,8 @@ def test_commands_are_understood(command: str) -> None:
         assert words[1] in MAKE_TARGET.findall((ROOT / "Makefile").read_text())
     elif words[0] == "dro-grasp":
         assert_folders_exist(parse(words[1:]))
+    elif words[:2] == ["python", "-m"]:
+        assert (ROOT / f"{words[2].replace('.', '/')}.py").exists(), words[2]
     elif words[0].startswith("scripts/"):
         assert (ROOT / words[0]).stat().st_mode & 0o100, "not executable"
         assert variables.keys() <= set(re.findall(r"^#   ([A-Z]+) ", (ROOT / words[0]).read_text(), re.MULTILINE))

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shlex
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from dro_grasp.errors import GraspFileError, OptionError, OutputError
-from dro_grasp.files import check_folder, check_output, given_path, make_folder, reading, replacing
+from dro_grasp.files import check_folder, check_output, given_path, is_unread, make_folder, reading, replacing, set_aside
 
 
 @pytest.mark.parametrize("name", ["run", "runs/main/motion"])
@@ -100,3 +102,75 @@ def test_our_own_errors_and_ctrl_c_pass() -> None:
     for error in (OptionError("mine"), KeyboardInterrupt()):
         with pytest.raises(type(error)), reading("f", GraspFileError, "a file"):
             raise error
+
+
+@pytest.mark.parametrize("fault", [NameError("no_such_name"), AttributeError("no such attribute"), TypeError("wrong call")])
+def test_a_fault_of_ours_is_not_taken_for_a_damaged_file(fault: Exception) -> None:
+    with pytest.raises(type(fault)), reading("a.parquet", GraspFileError, "a grasp file"):
+        raise fault
+
+
+def test_a_fault_of_ours_in_the_decoder_of_grasp_files_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from dro_grasp.grasps import codec
+    from tests.helpers.toy_batches import make
+
+    make(2).save(tmp_path / "a.parquet")
+
+    def broken(*_: object) -> None:
+        raise NameError("no_such_name")
+
+    monkeypatch.setattr(codec, "decode", broken)
+    with pytest.raises(NameError):
+        type(make(1)).load(tmp_path / "a.parquet")
+
+
+@pytest.mark.parametrize(("error", "unread"), [
+    (OSError(errno.EIO, "Input/output error"), True), (PermissionError(errno.EACCES, "Permission denied"), True),
+    (MemoryError(), True), (OSError("ZSTD decompression failed"), False), (ValueError("no Parquet"), False)])
+def test_whether_a_file_could_be_read_at_all_is_known_of_the_error(error: Exception, unread: bool) -> None:
+    with pytest.raises(GraspFileError) as told, reading("a.parquet", GraspFileError, "a grasp file"):
+        raise error
+    assert is_unread(error) == is_unread(told.value) == unread
+
+
+def test_files_set_aside_keep_their_content_and_what_belongs_together_its_number(tmp_path: Path) -> None:
+    state, log = tmp_path / "state", tmp_path / "log"
+    for number in range(3):
+        state.write_text(f"state {number}")
+        if number != 1:
+            log.write_text(f"log {number}")
+        set_aside(state, log)
+    assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {
+        "state.damaged": "state 0", "log.damaged": "log 0", "state.damaged.2": "state 1", "state.damaged.3": "state 2",
+        "log.damaged.3": "log 2"}
+
+
+def test_every_reader_expands_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import dro_grasp as dro
+    from dro_grasp.frames import read_motion
+    from dro_grasp.hands.library import locate_hand
+    from dro_grasp.objects.cache import cache_folder
+    from dro_grasp.planning.motion import MotionPlan
+    from dro_grasp.predict.sources.registry import make_method
+    from dro_grasp.serve.client import sent_object
+
+    monkeypatch.setenv("HOME", str(tmp_path))
+    readers: list[tuple[Callable[[str], object], str]] = [
+        (MotionPlan.load, "x.npz"), (dro.GraspBatch.load, "x.parquet"), (make_method, "x.parquet"), (dro.load_object, "x.obj"),
+        (dro.load_hand, "x.urdf"), (dro.load_robot, "x.yaml"), (lambda p: read_motion(Path(p), "T_frame_camera"), "x.json"),
+        (sent_object, "x.obj")]
+    for read, name in readers:
+        (tmp_path / name).write_text("{}")
+        if read is sent_object:
+            assert str(sent_object(f"~/{name}")).count("x.obj") == 1, name
+            assert sent_object(f"~/{name}") == sent_object(tmp_path / name)
+            continue
+        with pytest.raises(dro.DroGraspError) as refusal:
+            read(f"~/{name}")
+        assert str(tmp_path / name) in str(refusal.value), name
+    monkeypatch.setenv("DRO_GRASP_CACHE", "~/cache")
+    monkeypatch.setenv("DRO_GRASP_ASSETS", "~/assets")
+    (tmp_path / "assets/hands/ezgripper").mkdir(parents=True)
+    file = tmp_path / "assets/hands/ezgripper/ezgripper.urdf"
+    file.touch()
+    assert (cache_folder(), locate_hand("assets/ezgripper").path) == (tmp_path / "cache", file)

@@ -16,6 +16,7 @@ from tests.helpers.weights import untrained_weights
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+STUB = [node for node in ast.parse(Path(dro.__file__).with_suffix(".pyi").read_text()).body if isinstance(node, ast.ImportFrom)]
 NAMES = sorted(set(dro.__all__) - {"__version__"})
 
 
@@ -29,15 +30,28 @@ def test_every_public_name_has_a_docstring_of_its_own(name: str) -> None:
 
 
 def test_the_list_of_names_states_each_once_and_for_type_checkers() -> None:
-    aliases = [alias for node in ast.parse((Path(dro.__file__).with_suffix(".pyi")).read_text()).body
-               if isinstance(node, ast.ImportFrom) for alias in node.names]
+    aliases = [alias for node in STUB for alias in node.names]
     assert all(alias.asname == alias.name for alias in aliases), "a type checker takes only an import with an alias for public"
     assert sorted(alias.name for alias in aliases) == sorted(dro.__all__) == dir(dro), "a name is stated twice"
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_the_list_names_the_module_that_defines_it(name: str) -> None:
-    assert getattr(dro, name).__module__ == dro._EXPORTS[name]
+def test_the_list_names_the_module_that_defines_each() -> None:
+    for node in STUB:
+        for alias in node.names:
+            if alias.name != "__version__":
+                assert getattr(dro, alias.name).__module__ == f"dro_grasp.{node.module}"
+
+
+def test_the_package_shows_its_public_names_only_before_and_after_their_use() -> None:
+    code = ("import dro_grasp as dro; known = set(dir(dro)); dro.load_hand; assert set(dir(dro)) == known == set(dro.__all__); "
+            "print(*[n for n in vars(dro) if not n.startswith('_')])")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert {"load_hand"} <= set(done.stdout.split()) <= known_rooms() | {"load_hand"}, "no module that the package itself needs"
+
+
+def known_rooms() -> set[str]:
+    """Modules and packages of the package, which appear in it once something in them was loaded."""
+    return {path.stem for path in Path(dro.__file__).parent.iterdir()}
 
 
 def test_the_python_page_documents_every_public_name_and_no_other() -> None:

@@ -14,26 +14,7 @@ Public names are loaded on first use, so that importing the package costs nothin
 listed once, in `__init__.pyi`, which type checkers read as well.
 """
 
-from __future__ import annotations
+import lazy_loader
 
-import ast
-import pkgutil
-from importlib import import_module
-from typing import Any
-
-from dro_grasp._version import __version__ as __version__
-
-_EXPORTS = {alias.name: str(node.module) for node in ast.parse(pkgutil.get_data(__name__, "__init__.pyi") or b"").body
-            if isinstance(node, ast.ImportFrom) for alias in node.names}
-"""Module of each public name."""
-__all__ = list(_EXPORTS)  # pyright: ignore[reportUnsupportedDunderAll]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _EXPORTS:
-        raise AttributeError(f"module 'dro_grasp' has no attribute '{name}'")
-    return getattr(import_module(_EXPORTS[name]), name)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+del lazy_loader

@@ -1,71 +1,73 @@
 """The public names: type checkers read them here, and the package loads each from its module on first use."""
 
-from dro_grasp._version import __version__ as __version__
-from dro_grasp.compare.methods import Method as Method, MethodOptions as MethodOptions, make_method as make_method
-from dro_grasp.compare.metrics import wilson_interval as wilson_interval
-from dro_grasp.datasets.bundle.training_file import load_bundle as load_bundle
-from dro_grasp.datasets.collections.bundling import make_bundle as make_bundle
-from dro_grasp.datasets.collections.collection import read_collection as read_collection
-from dro_grasp.datasets.engine.schedule import synthesize_dataset as synthesize_dataset
-from dro_grasp.datasets.engine.worker import EngineConfig as EngineConfig
-from dro_grasp.errors import DroGraspError as DroGraspError
-from dro_grasp.export.contents import Frame as Frame
-from dro_grasp.export.csv_table import csv_table as csv_table
-from dro_grasp.export.dexgraspbench import dexgraspbench as dexgraspbench
-from dro_grasp.export.isaac_grasp import isaac_grasp as isaac_grasp
-from dro_grasp.export.moveit import moveit_grasps as moveit_grasps
-from dro_grasp.grasps.batch import GraspBatch as GraspBatch
-from dro_grasp.grasps.reading import load_grasps as load_grasps
-from dro_grasp.hands.check import HandReport as HandReport, check_hand as check_hand
-from dro_grasp.hands.hand import Hand as Hand
-from dro_grasp.hands.library import hand_names as hand_names, load_hand as load_hand
-from dro_grasp.hands.procedural.making import MadeHand as MadeHand, make_hand as make_hand
-from dro_grasp.hands.variants import vary_hand as vary_hand
-from dro_grasp.models.checkpoints import load_weights as load_weights, save_weights as save_weights
-from dro_grasp.models.presets import NetworkConfig as NetworkConfig
-from dro_grasp.objects.catalogue import load_object as load_object, object_names as object_names
-from dro_grasp.objects.scenery import Scene as Scene, load_scene as load_scene
-from dro_grasp.objects.shape import ObjectModel as ObjectModel
-from dro_grasp.optimization.finger_closing import ClosingConfig as ClosingConfig
-from dro_grasp.optimization.grip import GripConfig as GripConfig
-from dro_grasp.optimization.refinement import RefineConfig as RefineConfig
-from dro_grasp.optimization.synthesis import SynthesisConfig as SynthesisConfig, synthesize as synthesize
-from dro_grasp.perception.partial_views import DepthCamera as DepthCamera, visible_points as visible_points
-from dro_grasp.perception.scan import depth_points as depth_points, scanned_object as scanned_object
-from dro_grasp.planning.attempts import Attempt as Attempt, TabletopConfig as TabletopConfig
-from dro_grasp.planning.motion import MotionPlan as MotionPlan
-from dro_grasp.planning.plan_config import PlanConfig as PlanConfig
-from dro_grasp.planning.planner import plan as plan
-from dro_grasp.planning.reachability import ReachConfig as ReachConfig
-from dro_grasp.planning.robot import Robot as Robot, load_robot as load_robot
-from dro_grasp.planning.robot_check import RobotReport as RobotReport, check_robot as check_robot
-from dro_grasp.planning.table_scene import PickedObject as PickedObject, pick_object as pick_object
-from dro_grasp.planning.tabletop import TabletopRun as TabletopRun, run_tabletop as run_tabletop
-from dro_grasp.planning.trajectory_files import trajectory_csv as trajectory_csv, trajectory_yaml as trajectory_yaml
-from dro_grasp.predict.config import (
+from ._version import __version__ as __version__
+from .compare.methods import Method as Method, MethodOptions as MethodOptions, make_method as make_method
+from .compare.metrics import wilson_interval as wilson_interval
+from .datasets.bundle.training_file import load_bundle as load_bundle
+from .datasets.collections.bundling import make_bundle as make_bundle
+from .datasets.collections.collection import read_collection as read_collection
+from .datasets.engine.schedule import synthesize_dataset as synthesize_dataset
+from .datasets.engine.worker import EngineConfig as EngineConfig
+from .errors import DroGraspError as DroGraspError
+from .export.contents import Frame as Frame
+from .export.csv_table import csv_table as csv_table
+from .export.dexgraspbench import dexgraspbench as dexgraspbench
+from .export.isaac_grasp import isaac_grasp as isaac_grasp
+from .export.moveit import moveit_grasps as moveit_grasps
+from .grasps.batch import GraspBatch as GraspBatch
+from .grasps.reading import load_grasps as load_grasps
+from .hands.check import HandReport as HandReport, check_hand as check_hand
+from .hands.hand import Hand as Hand
+from .hands.library import hand_names as hand_names, load_hand as load_hand
+from .hands.procedural.making import MadeHand as MadeHand, make_hand as make_hand
+from .hands.variants import vary_hand as vary_hand
+from .models.checkpoints import load_weights as load_weights, save_weights as save_weights
+from .models.presets import NetworkConfig as NetworkConfig
+from .objects.catalogue import load_object as load_object, object_names as object_names
+from .objects.scenery import Scene as Scene, load_scene as load_scene
+from .objects.shape import ObjectModel as ObjectModel
+from .optimization.finger_closing import ClosingConfig as ClosingConfig
+from .optimization.grip import GripConfig as GripConfig
+from .optimization.refinement import RefineConfig as RefineConfig
+from .optimization.synthesis import SynthesisConfig as SynthesisConfig, synthesize as synthesize
+from .perception.partial_views import DepthCamera as DepthCamera, visible_points as visible_points
+from .perception.scan import depth_points as depth_points, scanned_object as scanned_object
+from .planning.attempts import Attempt as Attempt, TabletopConfig as TabletopConfig
+from .planning.motion import (
+    MotionPlan as MotionPlan,
+    trajectory_csv as trajectory_csv,
+    trajectory_yaml as trajectory_yaml,
+)
+from .planning.planner import PlanConfig as PlanConfig, plan as plan
+from .planning.reachability import ReachConfig as ReachConfig
+from .planning.robot import Robot as Robot, load_robot as load_robot
+from .planning.robot_check import RobotReport as RobotReport, check_robot as check_robot
+from .planning.table_scene import PickedObject as PickedObject, pick_object as pick_object
+from .planning.tabletop import TabletopRun as TabletopRun, run_tabletop as run_tabletop
+from .predict.config import (
     GraspRequest as GraspRequest,
     PredictorConfig as PredictorConfig,
     RescueConfig as RescueConfig,
     RetryConfig as RetryConfig,
 )
-from dro_grasp.predict.constraints import Constraints as Constraints
-from dro_grasp.predict.finish import FinishConfig as FinishConfig, Finished as Finished, finish as finish
-from dro_grasp.predict.predictor import GraspPredictor as GraspPredictor, Prediction as Prediction
-from dro_grasp.predict.problem import GraspProblem as GraspProblem
-from dro_grasp.predict.settling import SettleConfig as SettleConfig
-from dro_grasp.predict.sources.choice import ChoiceConfig as ChoiceConfig, ChoicePenalties as ChoicePenalties
-from dro_grasp.predict.sources.controls import palm_facing_starts as palm_facing_starts
-from dro_grasp.predict.sources.network import ProposalConfig as ProposalConfig
-from dro_grasp.predict.sources.optimiser import OptimiserConfig as OptimiserConfig
-from dro_grasp.predict.sources.registry import make_source as make_source, register_source as register_source
-from dro_grasp.predict.sources.source import Candidates as Candidates, Source as Source
-from dro_grasp.predict.stages import complete as complete, evaluate as evaluate, rank as rank, refine as refine
-from dro_grasp.serve.client import GraspClient as GraspClient
-from dro_grasp.simulation.contact_quality import ContactQuality as ContactQuality, measure_contacts as measure_contacts
-from dro_grasp.simulation.outcome import Failure as Failure, TrialResult as TrialResult
-from dro_grasp.simulation.protocols import Perturbations as Perturbations, Protocol as Protocol
-from dro_grasp.simulation.trial import simulate as simulate
-from dro_grasp.training.config import (
+from .predict.constraints import Constraints as Constraints
+from .predict.finish import FinishConfig as FinishConfig, Finished as Finished, finish as finish
+from .predict.predictor import GraspPredictor as GraspPredictor, Prediction as Prediction
+from .predict.problem import GraspProblem as GraspProblem
+from .predict.settling import SettleConfig as SettleConfig
+from .predict.sources.choice import ChoiceConfig as ChoiceConfig, ChoicePenalties as ChoicePenalties
+from .predict.sources.controls import palm_facing_starts as palm_facing_starts
+from .predict.sources.network import ProposalConfig as ProposalConfig
+from .predict.sources.optimiser import OptimiserConfig as OptimiserConfig
+from .predict.sources.registry import make_source as make_source, register_source as register_source
+from .predict.sources.source import Candidates as Candidates, Source as Source
+from .predict.stages import complete as complete, evaluate as evaluate, rank as rank, refine as refine
+from .serve.client import GraspClient as GraspClient
+from .simulation.contact_quality import ContactQuality as ContactQuality, measure_contacts as measure_contacts
+from .simulation.outcome import Failure as Failure, TrialResult as TrialResult
+from .simulation.protocols import Perturbations as Perturbations, Protocol as Protocol
+from .simulation.trial import simulate as simulate
+from .training.config import (
     AugmentationConfig as AugmentationConfig,
     LossConfig as LossConfig,
     MotionConfig as MotionConfig,
@@ -73,7 +75,7 @@ from dro_grasp.training.config import (
     ScheduleConfig as ScheduleConfig,
     TrainConfig as TrainConfig,
 )
-from dro_grasp.training.loop import train as train
-from dro_grasp.training.pretraining import pretrain as pretrain, pretrain_motion as pretrain_motion
-from dro_grasp.viewer.app import view_grasps as view_grasps
-from dro_grasp.viewer.pictures import PictureStyle as PictureStyle, draw_grasps as draw_grasps
+from .training.loop import train as train
+from .training.pretraining import pretrain as pretrain, pretrain_motion as pretrain_motion
+from .viewer.app import view_grasps as view_grasps
+from .viewer.pictures import PictureStyle as PictureStyle, draw_grasps as draw_grasps

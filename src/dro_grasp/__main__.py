@@ -1,9 +1,9 @@
 """`dro-grasp` and `python -m dro_grasp`: the command, which Ctrl-C ends by one line even while it is still being imported."""
 
-from __future__ import annotations
-
-import signal
 import sys
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C: 128 plus the number of SIGINT, as shells have it."""
 
 
 def run() -> int:
@@ -11,14 +11,10 @@ def run() -> int:
     try:
         from dro_grasp.cli.main import main
 
-        code = main()
-        # All is written: while Python ends, Ctrl-C would kill it as if it were not.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        return code
+        return main()
     except KeyboardInterrupt:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
         print("stopped", file=sys.stderr)
-        return 130
+        return INTERRUPTED
 
 
 if __name__ == "__main__":

@@ -17,12 +17,13 @@ from dro_grasp.geometry.point_clouds import point_distances
 from dro_grasp.geometry.registration import register
 from dro_grasp.geometry.se3 import apply, apply_to_cloud
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import Checked
 from dro_grasp.kinematics.joint_reading import read_joints
 from dro_grasp.kinematics.joint_solver import JointSolution, JointSolverConfig, Targets, solve_joints
 
 
 @dataclass(frozen=True)
-class DecodeConfig:
+class DecodeConfig(Checked):
     """Settings of the decoding."""
 
     multilateration: MultilaterationConfig = field(default_factory=MultilaterationConfig)

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import lzma
 import os
 import secrets
 import shlex
+import struct
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from itertools import count
 from pathlib import Path
+from pickle import UnpicklingError
+from tokenize import TokenError
+from zipfile import BadZipFile
 
 from safetensors import SafetensorError
 
@@ -18,6 +25,18 @@ TOLD = 200
 
 SAME = {".yaml": ".yml", ".html": ".htm"}
 """Endings of file names, and others that mean the same."""
+
+
+FOREIGN = (
+    OSError, MemoryError, ValueError, LookupError, ArithmeticError, EOFError, RuntimeError, UnpicklingError, struct.error,
+    zlib.error, lzma.LZMAError, BadZipFile, TokenError, SafetensorError)
+"""What decoders raise over damaged or foreign bytes; JSON, Unicode and Arrow mostly raise ValueErrors,
+NumPy a TokenError over the header of an array.
+
+A TypeError, AttributeError or NameError is missing on purpose: in a decoder of ours it is our fault, and must be seen.
+"""
+UNTYPED = (TypeError, AttributeError)
+"""What taking apart a tree of foreign values (JSON, pickles) raises too: an entry is of another type than it should be."""
 
 
 def given_path(name: Path | str) -> Path:
@@ -43,21 +62,54 @@ def command(*words: object) -> str:
 
 
 @contextmanager
-def reading(path: object, refuse: type[DroGraspError], expected: str) -> Iterator[None]:
-    """Turn whatever a library raises over a damaged file into one error that names the file; our own errors pass.
+def reading(
+    path: object, refuse: type[DroGraspError], expected: str, *others: type[Exception]
+) -> Iterator[None]:
+    """Turn what damaged or foreign bytes raise into one error that names the file; our own errors and our faults pass.
 
-    Every library behind the readers raises errors of its own, and new ones with each release.
+    Args:
+        path: The file, or its name in words.
+        refuse: Kind of the error.
+        expected: What the file should be, in words.
+        others: What the library behind this reader raises beside FOREIGN.
 
     Raises:
-        refuse: The block raised.
+        refuse: The block raised one of FOREIGN or of `others`.
     """
     try:
         yield
     except DroGraspError:
         raise
-    except Exception as error:
-        reason = getattr(error, "strerror", None) or next(iter(str(error).splitlines()), "") or type(error).__name__
-        raise refuse(f"{path} cannot be read ({reason[:TOLD]}); expected {expected}") from error
+    except (*FOREIGN, *others) as error:
+        raise refuse(f"{path} cannot be read ({reason_of(error)}); expected {expected}") from error
+
+
+def reason_of(error: Exception) -> str:
+    """Why something failed, in one short line."""
+    return (getattr(error, "strerror", None) or next(iter(str(error).splitlines()), "") or type(error).__name__)[:TOLD]
+
+
+def is_unread(error: BaseException | None) -> bool:
+    """Whether an error, or the one that `reading` met, tells of disk or memory, and nothing of the file's content."""
+    if isinstance(error, DroGraspError):
+        error = error.__cause__
+    # Arrow raises an OSError without a number over damaged content, PyTorch a RuntimeError where memory ends.
+    return (isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno is not None)
+            or (isinstance(error, RuntimeError) and "allocate memory" in str(error)))
+
+
+def set_aside(path: Path, *beside: Path) -> Path:
+    """Rename a file that is damaged, so that it counts no longer and nothing in it is lost; returns its new path.
+
+    Earlier ones keep their names: the next is `.damaged.2`. Files that belong to it go with it, where they exist, under
+    the same number.
+    """
+    endings = (".damaged" if number == 1 else f".damaged.{number}" for number in count(1))
+    ending = next(e for e in endings if not any(p.with_name(p.name + e).exists() for p in (path, *beside)))
+    for each in beside:
+        if each.exists():
+            each.replace(each.with_name(each.name + ending))
+    return path.replace(path.with_name(path.name + ending))
 
 
 def check_output(path: Path | str, *endings: str) -> Path:

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
+from dro_grasp.files import given_path
 
 HALF_AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
 """Names of the half-axes, in the order of the indices of `half_axis`."""
@@ -48,6 +49,7 @@ def read_motion(path: Path, key: str) -> NamedMotion:
     Raises:
         OptionError: No such file, no such content, or no rigid motion.
     """
+    path = given_path(path)
     wanted = f'{path} must hold {{"frame": NAME, "{key}": [4 rows of 4 numbers]}}, in metres'
     if not os.path.isfile(path):  # nothing is read from devices and pipes
         raise OptionError(f"{wanted}; there is no such file")

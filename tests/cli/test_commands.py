@@ -15,6 +15,7 @@ from typing import Any, get_args, get_type_hints
 import pytest
 import torch
 
+from dro_grasp.__main__ import run
 from dro_grasp._version import __version__
 from dro_grasp.cli import main as cli
 from dro_grasp.cli.main import main
@@ -123,15 +124,24 @@ def test_our_fault_is_status_1(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     assert "Traceback" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("arguments", ["hands", "--help", "objects --json", "--version"])
-def test_nobody_reads_the_output(arguments: str) -> None:
-    """As in `dro-grasp hands | head -1`: silence, and the exit code of programs that SIGPIPE ends."""
+def test_nobody_reads_the_output() -> None:
+    """As in `dro-grasp objects | head -1`: silence, and the exit code that rich has for it; of a table, of text and of JSON."""
     reader, writer = os.pipe()
     os.close(reader)
-    done = subprocess.run(
-        [sys.executable, "-m", "dro_grasp", *arguments.split()], stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+    for arguments in ("hands", "--help", "objects --json"):
+        command = [sys.executable, "-m", "dro_grasp", *arguments.split()]
+        done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+        assert (done.returncode, done.stderr) == (1, ""), arguments
     os.close(writer)
-    assert (done.returncode, done.stderr) == (141, "")
+
+
+def test_ctrl_c_ends_a_command_with_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted(_: Any) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "run", interrupted)
+    assert run() == 130
+    assert capsys.readouterr() == ("", "stopped\n")
 
 
 def test_evaluate_and_view_take_the_file_that_generate_wrote(generate, tmp_path: Path, capsys) -> None:

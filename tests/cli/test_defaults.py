@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from dro_grasp.cli.constraint_options import ConstraintOptions
 from dro_grasp.cli.evaluate import Evaluate
 from dro_grasp.cli.generate import Generate
-from dro_grasp.cli.main import PATIENCE, THREADS, main
+from dro_grasp.cli.inputs import ConstraintOptions
+from dro_grasp.cli.main import THREADS, WAIT_POLICY, main
 from dro_grasp.cli.synthesize import Synthesize
 from dro_grasp.datasets.engine.worker import EngineConfig
 from dro_grasp.energy.contact_candidates import ContactConfig
@@ -75,12 +75,12 @@ def test_so_are_those_of_generate() -> None:
 
 
 def test_waiting_threads_sleep_unless_the_user_says_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(PATIENCE[0], raising=False)
+    monkeypatch.delenv(WAIT_POLICY[0], raising=False)
     assert main(["hands", "--json"]) == 0
-    assert os.environ[PATIENCE[0]] == "PASSIVE"
-    monkeypatch.setenv(PATIENCE[0], "ACTIVE")
+    assert os.environ[WAIT_POLICY[0]] == "PASSIVE"
+    monkeypatch.setenv(WAIT_POLICY[0], "ACTIVE")
     assert main(["hands", "--json"]) == 0
-    assert os.environ[PATIENCE[0]] == "ACTIVE"
+    assert os.environ[WAIT_POLICY[0]] == "ACTIVE"
 
 
 @pytest.mark.parametrize("given", [["--threads", "3", "hands"], ["hands", "--threads=3"], ["hands"]])

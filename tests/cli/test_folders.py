@@ -15,11 +15,10 @@ from dro_grasp.cli.main import main
 from dro_grasp.errors import GraspFileError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.reading import load_grasps
-from dro_grasp.grasps.sources import with_own_files
+from dro_grasp.grasps.sources import object_of, with_own_files
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predict.sources.controls import palm_facing_starts
 from dro_grasp.viewer.pictures import CAPTION, HEADER, TILE
-from dro_grasp.viewer.shelf import Shelf
 from dro_grasp.viewer.studio import StudioServer
 from tests.helpers.browser import free_port
 from tests.helpers.loaded_hands import loaded_hand
@@ -69,7 +68,7 @@ def test_picture_takes_a_folder(folder: Path, tmp_path: Path, more: list[str], t
 @pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")
 def test_view_takes_a_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     servers: list[StudioServer] = []
-    monkeypatch.setattr("dro_grasp.viewer.stage.serve", servers.append)
+    monkeypatch.setattr("dro_grasp.viewer.scene_view.serve", servers.append)
     for more in ([], ["--object", "sphere"]):
         assert main(["view", str(folder), "--port", str(free_port()), *more]) == 0
     try:
@@ -125,10 +124,8 @@ def test_objects_of_one_name_in_one_file_are_told_apart_by_every_command(
     for more in ([], ["--object", "textured (2)"]):
         assert main(["picture", str(file), "--output", str(sheet), *more]) == 0
     assert drawn == [[(objects[0].sha256, 1), (objects[1].sha256, 2)], [(objects[1].sha256, 2)]]
-    shelf = Shelf()
-    shelf.put(hand, GraspBatch.load(file))
-    assert [shelf.obj(name).sha256 for name in ("textured", "textured (2)")] == [obj.sha256 for obj in objects]
-    shelf.close()
+    parts = dict(GraspBatch.load(file).by_object())
+    assert [object_of(parts[name], None, 1.0).sha256 for name in ("textured", "textured (2)")] == [o.sha256 for o in objects]
 
 
 @pytest.fixture

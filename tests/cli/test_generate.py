@@ -225,6 +225,14 @@ def test_grasps_that_were_not_found_count_as_failures(
     assert told["objects"]["sphere"] == {"asked": 16, "num": 2, "success": 2}
     assert main(["evaluate", str(path)]) == 0
     assert f"2 of 16 succeeded: {2 / 16:.1%}" in capsys.readouterr().out
+    # An object of which no grasp at all was found counts, too.
+    grasps = GraspBatch.load(path)
+    grasps.replace(asked_of={**grasps.asked_of, ("can", "unseen"): 4}).save(path)
+    assert main(["evaluate", str(path)]) == 0
+    assert "2 of 20 succeeded" in capsys.readouterr().out
+    assert main(["evaluate", str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["objects"]["can"] == {"asked": 4, "num": 0, "success": 0}
+
 
 
 def test_a_picture_of_successes_shows_no_failures(

@@ -25,7 +25,6 @@ OUTPUTS = {
     "dataset bundle": (["dataset", "bundle", "no", "--output"], ".safetensors"),
     "pretrain": (["pretrain", *TRAINING, "--output"], ".safetensors"),
     "train": (["train", *TRAINING, "--output"], ".safetensors"),
-    "train manifm": (["train", "--method", "manifm", *TRAINING, "--output"], ".safetensors"),
     "hand check": (["hand", "check", "no", "--picture"], ".png"),
     "hand make": (["hand", "make", "--output", "no", "--picture"], ".png"),
     "hand vary": (["hand", "vary", "no", "--mirrored", "--output"], ".urdf"),

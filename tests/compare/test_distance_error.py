@@ -28,7 +28,7 @@ class Off(DistanceNetwork):
         zero = torch.zeros(len(obj), TINY.latent)
         mean = zero.clone()
         mean[:, 0] = 2.0
-        return NetworkOutput(self.true + 0.004, mean, zero, zero, zero, zero[:, 0], hand, torch.zeros(len(obj), TINY.width))
+        return NetworkOutput(self.true + 0.004, mean, zero, zero[:, 0], hand)
 
     def predict(self, hand: Tensor, obj: Tensor, noise: Tensor) -> Tensor:
         assert noise.shape == (len(obj), TINY.latent)

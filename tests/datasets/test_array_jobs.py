@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import repeat
 from pathlib import Path
 
+import pyarrow.parquet as pq
 import pytest
 
 from dro_grasp.cli.main import main
@@ -167,6 +168,21 @@ def test_a_damaged_shard_is_set_aside_whole(tmp_path: Path, where: str) -> None:
     assert path.with_name("00001.parquet.damaged").read_bytes() == damaged
     assert content(tmp_path)[Shard("a", "x", 1)] == content(tmp_path)[Shard("a", "x", 0)]
     assert len(content(tmp_path)) == 18
+
+
+def test_a_shard_that_cannot_be_read_now_is_left_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fill(tmp_path)
+    before = content(tmp_path)
+
+    def fail(*_: object) -> None:
+        raise OSError(5, "Input/output error")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pq, "read_metadata", fail)
+        with pytest.raises(GraspFileError, match="Input/output error"):
+            synthesize_dataset(HANDS, OBJECTS, GOAL, tmp_path, lambda job: HerePool(job, easy))
+    assert content(tmp_path) == before
+    assert not list(tmp_path.rglob("*.damaged"))
 
 
 def test_what_disappears_while_a_folder_is_listed_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -180,10 +180,8 @@ def test_output_that_cannot_be_written_leaves_nothing(path: Path, monkeypatch: p
     assert [p.name for p in path.parent.iterdir()] == ["folder"]
 
 
-@pytest.mark.parametrize("frame", ["wrist", "palm"])
-def test_samples_are_what_the_bundle_says(path: Path, frame: str) -> None:
-    network = dataclasses.replace(TINY, frame=frame)
-    source = SampleSource(tiny_bundle(path), network, AugmentationConfig(object_noise=0.0))
+def test_samples_are_what_the_bundle_says(path: Path) -> None:
+    source = SampleSource(tiny_bundle(path), TINY, AugmentationConfig(object_noise=0.0))
     drawn = source.draw("toy", 8, torch.Generator().manual_seed(0))
     assert drawn.grasp.shape == (8, TINY.n_hand, 3)
     assert drawn.obj.shape == drawn.normals.shape == drawn.obj_hand.shape == (8, TINY.n_object, 3)
@@ -195,7 +193,7 @@ def test_samples_are_what_the_bundle_says(path: Path, frame: str) -> None:
     torch.testing.assert_close(drawn.obj.mean(1), torch.zeros(8, 3), atol=1e-6, rtol=0)
     T_wrist = drawn.T_frame_link[:, 0]
     centre = (T_wrist[:, :3, :3] @ hand.grasp_centre_wrist) + T_wrist[:, :3, 3]
-    axes = T_wrist[:, :3, :3] @ (hand.palm_axes_wrist if frame == "palm" else torch.eye(3))
+    axes = T_wrist[:, :3, :3] @ hand.palm_axes_wrist
     torch.testing.assert_close((centre[:, None] @ axes)[:, 0], drawn.position, atol=1e-6, rtol=0)
     torch.testing.assert_close(drawn.obj @ axes, drawn.obj_hand, atol=1e-6, rtol=0)
     # Placed hands differ from the true ones by a few degrees, so the frame's axes are nearly those of the hand.

@@ -11,6 +11,7 @@ import torch
 
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import rows_at
 from tests.helpers.claw import ball
 from tests.helpers.tiny_bundle import made_up_grasps
 from tests.helpers.toy_batches import BALL, CUBE, HAND, evaluated, make
@@ -77,7 +78,7 @@ def test_every_column_exists_and_says_what_is_unknown():
         assert getattr(grasps, name).isnan().tolist() == [True] * 3, name
     for name in ("pregrasp_joints", "squeeze_joints"):
         assert getattr(grasps, name).isnan().sum() == grasps.joints.numel(), name
-    assert not (grasps.success | grasps.evaluated).any()
+    assert not (grasps.trial_success | grasps.evaluated).any()
     assert grasps.protocol == ("",) * 3
 
 
@@ -90,6 +91,53 @@ def test_a_success_without_a_trial_and_columns_that_cannot_be_left_out_are_refus
         with pytest.raises(ValueError, match=name):
             make(2).without(name)
     assert make(2, success=torch.tensor([True, False])).protocol == ("unknown",) * 2
+
+
+@pytest.mark.parametrize("ask", [
+    lambda g: g[g.success], lambda g: g[~g.success], lambda g: g[g.success & g.evaluated], lambda g: g.success.numpy(),
+    lambda g: int(g.success.sum())])
+def test_whether_untried_grasps_hold_is_not_known_however_it_is_asked(ask):
+    with pytest.raises(OptionError, match="have not been tried"):
+        ask(make(3))
+    ask(evaluated(3))
+    ask(make(0))
+
+
+def test_of_grasps_of_which_some_were_tried_the_others_did_not_hold():
+    both = GraspBatch.concatenate([make(2), evaluated(3)])
+    assert both.success.tolist() == [False, False, True, False, True]
+    with pytest.raises(ValueError, match="'success'"):
+        both.replace(extra={"success": torch.zeros(5)})
+
+
+@pytest.mark.parametrize("index", [True, False, np.True_, torch.tensor(True), 1.0, [0.5], "1", None, [[True, False, True]]])
+def test_what_chooses_no_grasps_is_refused(index):
+    with pytest.raises(OptionError, match="chooses no grasps"):
+        rows_at(index, 3)
+
+
+@pytest.mark.parametrize("index", [3, -4, np.int64(3), [0, 3], [True, False], torch.tensor([True] * 4)])
+def test_grasps_that_do_not_exist_are_an_index_error(index):
+    with pytest.raises(IndexError, match="batch of 3"):
+        rows_at(index, 3)
+
+
+def test_a_single_truth_value_is_no_grasp():
+    with pytest.raises(OptionError, match="True chooses no grasps"):
+        make(3)[True]
+
+
+@pytest.mark.parametrize(("count", "subject"), [
+    (1, "grasp 1 has"), (2, "grasp 1 and 1 more have"), (3, "grasp 1 and 2 more have")])
+def test_how_many_poses_are_wrong_is_said_in_english(count, subject):
+    given = make(4)
+    T, joints = given.T_object_wrist.clone(), given.joints.clone()
+    joints[1 : 1 + count, 0] = torch.nan
+    with pytest.raises(OptionError, match=f"^{subject} a pose or joints that are not finite"):
+        GraspBatch.create(HAND, BALL, T, joints)
+    T[1 : 1 + count, :3, :3] *= 2
+    with pytest.raises(OptionError, match=f"^{subject} a wrist pose that is no rigid motion"):
+        GraspBatch.create(HAND, BALL, T, given.joints)
 
 
 def test_leaving_out_a_trial_leaves_the_rest():
@@ -215,6 +263,13 @@ def test_every_column_may_be_an_array_of_any_precision():
 @pytest.mark.parametrize(("column", "told"), [
     ({"pregrasp_joints": np.zeros((3, 1))}, r"pregrasp_joints has shape \(3, 1\); expected \(3, 2\)"),
     ({"score": np.zeros((3, 1))}, r"score has shape \(3, 1\); expected \(3,\)"),
+    ({"scores": [1.0, 2.0, 3.0]}, "no column 'scores'; they have .*success, .*score, .*, and in extra"),
+    ({"seed": 1.5}, "seed is no array of numbers .it has fractions."), ({"seed": "0"}, "seed is no array of numbers"),
+    ({"success": [0.5, 1.0, 0.0]}, "success is no array of numbers .it has fractions."),
+    ({"score": ["1", "2", "3"]}, "score is no array of numbers"),
+    ({"protocol": "strict/1"}, "protocol is 'strict/1'; give one text for each of the 3 grasps"),
+    ({"protocol": ["strict/1"] * 2}, "protocol has 2 texts; give one for each of the 3 grasps"),
+    ({"split": [1, 2, 3]}, "split is .*; give one text"),
     ({"success": True}, r"success has shape \(\); expected \(3,\)"),
     ({"seed": [1, 2]}, r"seed has shape \(2,\); expected \(3,\)"),
     ({"energy": ["low"] * 3}, "energy is no array of numbers"),
@@ -227,10 +282,10 @@ def test_columns_that_do_not_fit_are_refused(column, told):
 @pytest.mark.parametrize(("change", "told"), [
     (lambda T, q: (T[:, :3, :3], q), r"poses of shape \(3, 3, 3\).*expected \(n, 4, 4\)"),
     (lambda T, q: (T, q[:, 1:]), r"joints of shape \(3, 5\).*\(n, 6\) for this hand"),
-    (lambda T, q: (T * torch.tensor([2.0, 2, 2, 1]), q), "grasp 0 is no rigid motion, and 2 more"),
-    (lambda T, q: (T * torch.tensor([-1.0, 1, 1, 1]), q), "grasp 0 is no rigid motion"),
+    (lambda T, q: (T * torch.tensor([2.0, 2, 2, 1]), q), "grasp 0 and 2 more have a wrist pose that is no rigid motion"),
+    (lambda T, q: (T * torch.tensor([-1.0, 1, 1, 1]), q), "grasp 0 and 2 more have a wrist pose that is no rigid motion"),
     (lambda T, q: ([[1.0], [2.0, 3.0]], q), "no arrays of numbers"),
-    (lambda T, q: (T, torch.full_like(q, torch.nan)), "grasp 0 has a pose or joints that are not finite, and 2 more"),
+    (lambda T, q: (T, torch.full_like(q, torch.nan)), "grasp 0 and 2 more have a pose or joints that are not finite"),
 ])
 def test_poses_and_joints_that_are_none_are_refused(change, told):
     given = made_up_grasps(toy_hand(), count=3)

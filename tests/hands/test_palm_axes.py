@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import pytest
@@ -11,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import BUILTIN_FOLDER, load_hand
+from dro_grasp.hands.proportions import proportions
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predict.constraints import Constraints
@@ -72,26 +72,21 @@ def test_the_open_hand_looks_alike_however_its_wrist_is_turned(name: str, tmp_pa
         torch.testing.assert_close(*same, atol=1e-3, rtol=0)
 
 
-@pytest.mark.parametrize("frame", ["wrist", "palm"])
-def test_placements_put_the_grasp_centre_where_the_prior_says(
-    frame: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    network = DistanceNetwork(dataclasses.replace(TINY, frame=frame))
+def test_placements_put_the_grasp_centre_where_the_prior_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    network = DistanceNetwork(TINY)
     hand, obj = on_a_flange("leaphand", tmp_path).with_points(TINY.n_hand), load_object("mug")
     offset = torch.tensor([0.01, -0.02, 0.03])
     given: list[torch.Tensor] = []
 
-    def sample(opened, points, rotations, num, generator, proportions):  # type: ignore[no-untyped-def]
-        assert proportions is None, "the prior takes features"
-        given.append(opened)
+    def sample(points, rotations, num, generator, shape):  # type: ignore[no-untyped-def]
+        given.append(shape)
         return rotations[:num], offset.expand(num, 3)
 
     monkeypatch.setattr(network, "sample_placements", sample)
     points = torch.from_numpy(obj.cloud)
     problem = GraspProblem(hand, obj, constraints=Constraints(direction=(0.0, 1.0, 0.0)))
     T = _placements(problem, hand, network, points, 5, 1, ProposalConfig(), torch.Generator().manual_seed(0))[:, 0]
-    axes = T[:, :3, :3] @ (hand.palm_axes_wrist if frame == "palm" else torch.eye(3))
+    axes = T[:, :3, :3] @ hand.palm_axes_wrist
     torch.testing.assert_close(hand.grasp_centres(T), points.mean(0) + (axes @ offset), atol=1e-5, rtol=0)
     assert float(hand.palm_directions(T)[:, 1].min()) > 0.9
-    if frame == "palm":
-        torch.testing.assert_close(given[0], hand.points(hand.canonical_joints()) @ hand.palm_axes_wrist)
+    torch.testing.assert_close(given[0], proportions(hand, hand.palm_axes_wrist))

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import viser
 
 from dro_grasp.predict.predictor import GraspPredictor
-from dro_grasp.viewer.stage import HOST, ServedPage
+from dro_grasp.viewer.scene_view import HOST, ServedPage
 from dro_grasp.viewer.studio import Studio, StudioServer
 from tests.helpers.browser import free_port
 from tests.helpers.weights import untrained_weights

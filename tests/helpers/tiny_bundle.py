@@ -17,7 +17,7 @@ from tests.helpers.toy_hand import toy_hand
 
 TINY = NetworkConfig(
     n_hand=48, n_object=32, width=16, encoder_widths=(8, 16), neighbours=6, attention_hidden=16, latent=4,
-    latent_widths=(8, 16), latent_head=(16, 16), latent_neighbours=6, kernel_hidden=(16, 8), frame="wrist",
+    latent_widths=(8, 16), latent_head=(16, 16), latent_neighbours=6, kernel_hidden=(16, 8), frame="palm",
     placement_width=16,
 )
 SEMIAXES = {"ball": (0.03, 0.03, 0.03), "egg": (0.02, 0.025, 0.04)}

@@ -93,6 +93,8 @@ def test_rounding_hardly_changes_the_prediction(path: Path, network: DistanceNet
 CHANGED = {
     "unknown setting": {"magic": 1}, "hand not placed": {"placed": False}, "kernel alone": {"residual": False},
     "colder z": {"latent_temperature": 0.5}, "contradiction": {"frame": "object", "latent_form": "motion"},
+    "wrist": {"frame": "wrist"}, "gaussian": {"prior": "learned"}, "features": {"placement_hand": "features"},
+    "oldest": {"latent_form": "motion"},
 }
 """Settings that a file may not have."""
 
@@ -135,7 +137,12 @@ def change(path: Path, how: str) -> None:
         ("other sizes", "has shape|of shape"),
         ("impossible sizes", "expected weights of this version"), ("unknown setting", "unknown settings magic"),
         ("hand not placed", "placed is no longer a choice"), ("kernel alone", "residual is no longer a choice"),
-        ("colder z", "latent_temperature is no longer a choice"), ("contradiction", "knows no placement"),
+        ("colder z", "latent_temperature is no longer a choice"),
+        ("contradiction", "latent_form is no longer a choice; in frame 'object' it is kernel now, and motion in the file"),
+        ("wrist", "frame 'wrist' is no longer a choice; networks of commit e1ba941 had it"),
+        ("gaussian", "prior is no longer a choice; in frame 'palm' it is flow now, and learned in the file"),
+        ("features", "placement_hand is no longer a choice; in frame 'palm' it is proportions now, and features in the file"),
+        ("oldest", "placement_hand is no longer a choice; in frame 'palm' it is proportions now, and features in the file"),
         ("another version", "version 99, expected 1"), ("zipped pickle", "can run code"), ("bare pickle", "can run code"),
     ],
 )
@@ -185,18 +192,26 @@ def test_weights_remember_every_training_before(path: Path, network: DistanceNet
     save_weights(torch.nn.Linear(2, 1), tmp_path / "small.safetensors", {"stage": "third"}, history_of(later))
     stages = [entry["stage"] for entry in history_of(tmp_path / "small.safetensors")]
     assert stages == ["test", "second", "third"]
-    assert [entry["initial"] for entry in history_of(locate_weights("multi"))] == ["multi"]
+    assert [entry["stage"] for entry in history_of(locate_weights())][-1] == "training"
     small = {"ranking/quality": "ranking", "ranking/holding": "ranking of settled grasps", "completion/surface": "completion"}
     for name, stage in small.items():
         assert {entry["stage"] for entry in history_of(SHIPPED_FOLDER / f"{name}.safetensors")} == {stage}
 
 
 def test_shipped_weights_load() -> None:
-    assert {"multi", DEFAULT} <= set(weights_names())
+    assert weights_names() == [DEFAULT]
     assert locate_weights(None) == locate_weights(DEFAULT) == SHIPPED_FOLDER / f"{DEFAULT}.safetensors"
     assert load_weights().name == DEFAULT
-    for name in weights_names():
-        assert all(bool(v.isfinite().all()) for v in load_weights(name).state_dict().values())
+    assert all(bool(v.isfinite().all()) for v in load_weights().state_dict().values())
+
+
+@pytest.mark.parametrize("name", ["multi", "more_hands"])
+def test_weights_that_shipped_before_are_refused_with_the_state_that_had_them(name: str, tmp_path: Path, monkeypatch) -> None:
+    with pytest.raises(WeightsError, match=f"'{name}' no longer ship.* commit e1ba941.*use 'more_objects'"):
+        load_weights(name)
+    monkeypatch.chdir(tmp_path)
+    save_weights(untrained_network(TINY, 0), Path(name))
+    assert load_weights(name).config == TINY, "a file of yours with this name"
 
 
 def test_shipped_weights_are_as_they_were_shipped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -210,9 +225,9 @@ def test_shipped_weights_are_as_they_were_shipped(monkeypatch: pytest.MonkeyPatc
     folder = tmp_path / "weights"
     shutil.copytree(SHIPPED_FOLDER, folder)
     monkeypatch.setattr(checkpoints, "SHIPPED_FOLDER", folder)
-    save_weights(load_weights("multi"), folder / "multi.safetensors", {"about": "made anew"})
+    save_weights(load_weights(), folder / f"{DEFAULT}.safetensors", {"about": "made anew"})
     with pytest.raises(WeightsError, match="shipped was"):
-        verify_weights("multi")
+        verify_weights(DEFAULT)
     harmed = bytearray((folder / "ranking" / "quality.safetensors").read_bytes())
     harmed[-1] ^= 1
     (folder / "ranking" / "quality.safetensors").write_bytes(harmed)
@@ -227,10 +242,10 @@ def test_verify_checks_files_of_the_user_as_well(path: Path, capsys: pytest.Capt
     assert main(["weights", "verify", str(path), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["weights"][0]["sha256"] == describe_weights(path)["sha256"]
     path.write_bytes(path.read_bytes()[:-100])
-    assert main(["weights", "verify", str(path), "multi"]) == 2
+    assert main(["weights", "verify", str(path), DEFAULT]) == 2
     said = capsys.readouterr()
     assert "cut short" in said.err
-    assert "multi" in said.out
+    assert DEFAULT in said.out
     assert main(["weights", "verify"]) == 0
 
 

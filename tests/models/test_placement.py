@@ -7,16 +7,16 @@ import torch
 from torch import Tensor
 from torch.distributions import Categorical, Independent, MixtureSameFamily, Normal
 
-from dro_grasp.models.placement import PlacementPrior
+from dro_grasp.models.placement import PROPORTIONS, PlacementPrior
 
-COMPONENTS, FEATURES = 3, 8
+COMPONENTS = 3
 
 
 @pytest.fixture
 def prior() -> PlacementPrior:
     """Untrained, with outputs large enough to tell components and rotations apart."""
     torch.manual_seed(0)
-    made = PlacementPrior(FEATURES, 16, COMPONENTS)
+    made = PlacementPrior(16, COMPONENTS)
     torch.nn.init.normal_(made.head[-1].weight, std=1.0)
     return made.requires_grad_(False)
 
@@ -26,7 +26,7 @@ def obj() -> Tensor:
     return torch.randn(20, 3, generator=torch.Generator().manual_seed(1)) * torch.tensor([0.05, 0.02, 0.1])
 
 
-HAND = torch.randn(FEATURES, generator=torch.Generator().manual_seed(2))
+HAND = torch.randn(PROPORTIONS, generator=torch.Generator().manual_seed(2))
 
 
 def mixture(prior: PlacementPrior, obj: Tensor, hand: Tensor) -> MixtureSameFamily:

@@ -95,5 +95,5 @@ def test_a_mesh_is_its_own_solid_and_other_normals_are_another_solid(sphere: Obj
     solid = solid_of(sphere)
     assert solid_of(solid) is solid
     turned = replace(sphere, cloud_normals=-sphere.cloud_normals)
-    assert len({sphere.sha256, solid.sha256, solid_of(turned).sha256}) == 3
-    assert turned.sha256 == sphere.sha256
+    assert len({obj.solid_sha256 for obj in (sphere, turned, solid, solid_of(turned))}) == 4
+    assert solid_of(turned).sha256 == turned.sha256 == sphere.sha256

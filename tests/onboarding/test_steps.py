@@ -163,7 +163,7 @@ def test_the_folder_of_another_hand_is_refused(home: Path, capsys: pytest.Captur
 
 
 @pytest.mark.parametrize(("more", "word"), [
-    (["--weights", "multi"], "was begun with weights"), (["--seed", "7"], "with seed"),
+    (["--seed", "7"], "with seed"),
     (["--source", "network"], "with method auto, network was asked for")])
 def test_a_folder_that_was_begun_otherwise_is_refused(
     home: Path, more: list[str], word: str, capsys: pytest.CaptureFixture[str]
@@ -171,6 +171,13 @@ def test_a_folder_that_was_begun_otherwise_is_refused(
     """Its finished steps would be given for those that were asked for."""
     assert main([*command(home), *more]) == 2
     assert word in capsys.readouterr().err
+
+
+def test_a_folder_that_was_begun_with_other_weights_is_refused(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*command(home), "--weights", str(untrained_weights(tmp_path))]) == 2
+    assert "was begun with weights" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -229,11 +236,11 @@ def test_a_damaged_state_is_set_aside_and_a_second_run_kept_out(
 ) -> None:
     told: list[str] = []
     monkeypatch.setattr(steps._Onboarding, "run", lambda self: None)
-    for content in ("{", "[]", '{"hand": "mine", "sha256": "x", "steps": 5}', '{"hand": "mine"}'):
+    for number, content in enumerate(("{", "[]", '{"hand": "mine", "sha256": "x", "steps": 5}', '{"hand": "mine"}'), 1):
         (tmp_path / steps.STATE).write_text(content)
         made = steps.onboard(str(home / "mine.urdf"), tmp_path, say=told.append)
         assert made.steps == {}
-        assert (tmp_path / f"{steps.STATE}.damaged").read_text() == content
+        assert (tmp_path / f"{steps.STATE}.damaged{'' if number == 1 else f'.{number}'}").read_text() == content
     assert len(told) == 4
     assert all("is damaged" in line and "made again" in line for line in told)
     with sole_run(tmp_path), pytest.raises(OutputError, match="another run is filling"):

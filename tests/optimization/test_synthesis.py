@@ -51,6 +51,22 @@ def test_spheres_lie_in_their_links_and_may_not_meet_across_fingers():
     assert (1, 2) not in pairs  # neighbours
 
 
+@pytest.mark.parametrize("name", ["allegro", "leaphand", pytest.param("assets/allegro_left", marks=pytest.mark.assets)])
+def test_all_spheres_of_two_fingers_are_to_be_kept_apart(name: str, request: pytest.FixtureRequest):
+    """Also those that overlap at the open ends, where fingers of these hands cross."""
+    if name.startswith("assets/"):
+        request.getfixturevalue("assets_folder")
+    hand = loaded_hand(name)
+    spheres = link_spheres(hand)
+    finger = hand.finger_of_link[spheres.links]
+
+    def across(pairs: torch.Tensor) -> int:
+        first, second = finger[pairs].unbind(1)
+        return int(((first != second) & (first != PALM) & (second != PALM)).sum())
+
+    assert across(spheres.pairs) == across(torch.combinations(torch.arange(len(finger)), 2)) > 100
+
+
 def test_starts_face_the_object_from_all_sides_and_touch_nothing(ball):
     hand = toy_hand()
     energy = GraspEnergy.of_object(hand, ball)

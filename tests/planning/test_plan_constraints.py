@@ -16,16 +16,16 @@ import dro_grasp as dro
 from dro_grasp.errors import OptionError
 from dro_grasp.planning.attempts import TabletopConfig
 from dro_grasp.planning.candidates import grasps_in_world
-from dro_grasp.planning.collisions import CollisionChecker
 from dro_grasp.planning.motion import MotionPlan
 from dro_grasp.planning.planner import plan
-from dro_grasp.planning.scene_solids import scene_solid
-from dro_grasp.planning.workcell import arm_addresses, robot_spec
+from dro_grasp.planning.workcell import Workcell, arm_addresses, robot_spec
 from dro_grasp.simulation.hand_part import joint_addresses
 from dro_grasp.simulation.protocols import PROTOCOLS
 
 SHELF = ((0.62, 0.1, 0.5), (0.02, 2.0, 2.0))
 """Centre and size of a board beside the object, larger than any object that is loaded [m]."""
+
+
 CONE = 0.6
 
 
@@ -72,7 +72,7 @@ def test_the_palm_is_in_the_cone_and_fingers_touch_the_place_alone(
 def test_hand_and_arm_stay_clear_of_the_scene(planned: MotionPlan, robot: dro.Robot) -> None:
     """The board is one box in MuJoCo; the planner has cells around points of its surface."""
     spec = robot_spec(robot, PROTOCOLS["dro"], None)
-    for a, b in CollisionChecker(robot).excluded:
+    for a, b in Workcell(robot).excluded:
         spec.add_exclude(bodyname1=a, bodyname2=b)
     spec.worldbody.add_geom(name="board", type=mujoco.mjtGeom.mjGEOM_BOX, pos=SHELF[0], size=np.array(SHELF[1]) / 2)
     model = spec.compile()
@@ -90,18 +90,6 @@ def test_hand_and_arm_stay_clear_of_the_scene(planned: MotionPlan, robot: dro.Ro
     assert not any(hits(arm, joints) for arm, joints in zip(planned.arm.position, full, strict=True))
     draws = np.random.default_rng(0).uniform(-1.5, 1.5, (50, len(robot.home)))
     assert any(hits(arm, full[0]) for arm in draws), "the check sees an arm that is in the board"
-
-
-def test_a_mesh_of_any_size_is_solid_where_the_robot_gets(robot: dro.Robot, wanted: dro.Constraints) -> None:
-    assert wanted.avoid is not None
-    base, reach = robot.T_world_base[:3, 3], robot.longest_reach
-    (thing,) = scene_solid(wanted.avoid, base, reach)
-    assert np.linalg.norm(thing.cloud - base, axis=1).max() <= reach
-    draw = np.random.default_rng(0).uniform(-0.5, 0.5, (500, 3)) * SHELF[1] + SHELF[0]
-    draw[:, 0] = SHELF[0][0] - SHELF[1][0] / 2
-    near = draw[np.linalg.norm(draw - base, axis=1) < reach - 0.02]
-    assert KDTree(thing.cloud).query(near)[0].max() < 0.01, "no hole in its face [m]"
-    assert scene_solid(wanted.avoid, np.array([50.0, 0, 0]), reach) == []
 
 
 def test_a_frame_turns_directions_and_places_and_lifts_the_table() -> None:
@@ -142,10 +130,3 @@ def test_what_says_nothing_or_says_it_twice_is_refused(
         plan(robot, *standing, config=dro.PlanConfig(constraints=dro.Constraints(hold=((0.0, 0.0, 0.0, 0.05),))))
     with pytest.raises(OptionError, match="objects of attempts come to rest anywhere"):
         TabletopConfig(plan=dro.PlanConfig(constraints=dro.Constraints(spare=((0.0, 0.0, 0.0, 0.05),))))
-
-
-def test_attempts_of_no_constraints_are_those_of_before() -> None:
-    assert "constraints" not in TabletopConfig().label()
-    config = TabletopConfig(plan=dro.PlanConfig(constraints=dro.Constraints((0.0, 0.0, -1.0), cone=0.5, opening=0.01)))
-    assert TabletopConfig.from_label(config.label()) == config
-    assert config.label() != TabletopConfig().label()

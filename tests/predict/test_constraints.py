@@ -104,7 +104,8 @@ def test_vectors_of_any_kind_become_plain_numbers() -> None:
         assert given(hold=nothing, spare=nothing) == Constraints()
 
 
-@pytest.mark.parametrize("direction", [(0, -1), (0, 0, -1, 0), (), 3.0, "up", (0, 0, "x"), np.eye(3), torch.eye(3)])
+@pytest.mark.parametrize("direction", [
+    (0, -1), (0, 0, -1, 0), (), 3.0, "up", "001", ("0", "0", "1"), (0, 0, "x"), np.eye(3), torch.eye(3)])
 def test_a_direction_that_is_no_vector_is_refused(direction: object) -> None:
     with pytest.raises(OptionError, match=r"direction is .*; give three numbers, .*--direction 0 0 -1"):
         given(direction=direction)
@@ -118,7 +119,8 @@ def test_a_vector_without_a_direction_is_refused(direction: object) -> None:
 
 @pytest.mark.parametrize("name", ["hold", "spare"])
 @pytest.mark.parametrize("balls", [
-    (0, 0, 0.1, 0.03), 1.0, np.zeros(4), [(0, 0, "x", 1)], ["ball"], [(0, 0, 0.1)], [(0, 0, math.nan, 1)], [(0, 0, 0, 0)]])
+    (0, 0, 0.1, 0.03), 1.0, np.zeros(4), [(0, 0, "x", 1)], ["ball"], ["0123"],
+    [("0", "0", "0", "1")], [(0, 0, 0.1)], [(0, 0, math.nan, 1)], [(0, 0, 0, 0)]])
 def test_balls_that_are_none_are_refused(name: str, balls: object) -> None:
     with pytest.raises(OptionError, match=f"{name} .*; give .*x, y, z and a radius above 0 in metres, .*--{name} 0 0 0.1"):
         given(**{name: balls})

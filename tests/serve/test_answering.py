@@ -15,9 +15,9 @@ from dro_grasp.errors import OptionError
 from tests.helpers.claw_urdf import claw, written
 from tests.helpers.weights import untrained_weights
 
-pytest.importorskip("pydantic", reason="needs the extra [serve]: pip install '.[serve]'")
+pytest.importorskip("pydantic", reason="needs the extra [apps]: pip install '.[apps]'")
 
-from dro_grasp.serve.answering import Answerer, Kept, Stock
+from dro_grasp.serve.answering import Answerer, ServerConfig
 from dro_grasp.serve.client import sent_file
 from dro_grasp.serve.messages import GraspAnswer, GraspCall
 
@@ -30,7 +30,7 @@ def answerer(tmp_path_factory: pytest.TempPathFactory) -> Answerer:
     weights = untrained_weights(tmp_path_factory.mktemp("weights"))
     own = tmp_path_factory.mktemp("own") / "own_tube.stl"
     TUBE.export(own)
-    return Answerer(Stock(str(weights), hands=("gripper3",), objects=(str(own),)))
+    return Answerer(ServerConfig(str(weights), hands=("gripper3",), objects=(str(own),)))
 
 
 def ask(answerer: Answerer, obj: Any, **options: Any) -> GraspAnswer:
@@ -96,19 +96,11 @@ def test_hands_and_objects_that_could_not_be_told_apart_are_refused(tmp_path: Pa
         written(tmp_path / folder, claw())
     first, second = (str(tmp_path / folder / "textured.stl") for folder in ("003", "004"))
     with pytest.raises(OptionError, match=f"objects '{first}' and '{second}' .* by the name 'textured'; rename one"):
-        Answerer(Stock(weights, objects=(first, second)))
+        Answerer(ServerConfig(weights, objects=(first, second)))
     with pytest.raises(OptionError, match=r"hands '.*003/claw.urdf' and '.*004/claw.urdf' .* by the name 'claw'; rename one"):
-        Answerer(Stock(weights, hands=tuple(str(tmp_path / folder / "claw.urdf") for folder in ("003", "004"))))
-    once = Answerer(Stock(weights, hands=("gripper3", "gripper3"), objects=(first, str(tmp_path / "003"))))
-    assert (list(once.own_hands), list(once.own_objects)) == (["gripper3"], ["textured"])
-
-
-def test_only_the_values_used_last_are_kept() -> None:
-    kept, made = Kept(2), []
-    for key in "abacab":
-        assert kept.get(key, lambda key=key: made.append(key) or key) == key
-    assert made == ["a", "b", "c", "b"]
-    assert len(kept) == 2
+        Answerer(ServerConfig(weights, hands=tuple(str(tmp_path / folder / "claw.urdf") for folder in ("003", "004"))))
+    once = Answerer(ServerConfig(weights, hands=("gripper3", "gripper3"), objects=(first, str(tmp_path / "003"))))
+    assert [list(once.library.own[kind]) for kind in ("hand", "object")] == [["gripper3"], ["textured"]]
 
 
 GLTF = b'{"asset": {"version": "2.0"}, "buffers": [{"uri": "/etc/passwd", "byteLength": 9}]}'

@@ -13,7 +13,7 @@ import torch
 import dro_grasp as dro
 from dro_grasp.errors import OptionError
 
-pytest.importorskip("pydantic", reason="needs the extra [serve]: pip install '.[serve]'")
+pytest.importorskip("pydantic", reason="needs the extra [apps]: pip install '.[apps]'")
 
 from dro_grasp.serve import client as module
 from dro_grasp.serve.messages import GraspCall

@@ -20,27 +20,26 @@ from dro_grasp.errors import OptionError, ServerError
 from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.constraints import Constraints
 
-pytest.importorskip("fastapi", reason="needs the extra [serve]: pip install '.[serve]'")
-pytest.importorskip("uvicorn", reason="needs the extra [serve]: pip install '.[serve]'")
+pytest.importorskip("fastapi", reason="needs the extra [apps]: pip install '.[apps]'")
+pytest.importorskip("uvicorn", reason="needs the extra [apps]: pip install '.[apps]'")
 
 from dro_grasp.serve import http_server
-from dro_grasp.serve.computing import Ready, Reply
-from dro_grasp.serve.desk import Desk, Tally
 from dro_grasp.serve.http_server import Access, application, listening_socket
 from dro_grasp.serve.messages import GraspCall, field_docs, settings_in
+from dro_grasp.serve.request_queue import Metrics, Ready, Reply, RequestQueue
 from tests.helpers.asgi import Caller, live
 
 HERE = "http://127.0.0.1:8090"
 PLAIN: dict[str, Any] = {"hand": "claw", "object": "can"}
 
 
-class Echo(Desk):
-    """A desk that answers with what it was asked."""
+class Echo(RequestQueue):
+    """A queue that answers with what it was asked."""
 
-    waiting, computing, memory, ready = 0, False, 1, Ready(["claw"], ["can"])
+    waiting, computing, memory, ready = 0, False, 1, Ready(["claw"], ["can"], 0)
 
     def __init__(self) -> None:
-        self.tally, self.closed, self.cancelled = Tally(Counter({200: 3})), False, []
+        self.metrics, self.closed = Metrics(Counter({200: 3})), False
 
     def submit(self, call: Any) -> Any:
         if call.id == "full":
@@ -155,7 +154,7 @@ def test_large_bodies_are_refused_whether_they_tell_their_size_or_not() -> None:
 
 
 def test_slow_bodies_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(http_server, "SLOWEST_BODY", 0.05)
+    monkeypatch.setattr(http_server, "BODY_TIMEOUT", 0.05)
     assert Caller(application(Echo(), Access()), delay=0.2)("POST", "/grasps", PLAIN).status == 408
 
 
@@ -169,9 +168,9 @@ def test_a_full_queue_asks_to_come_again_and_a_request_can_be_cancelled() -> Non
 
 
 def test_the_desk_is_closed_when_the_server_stops() -> None:
-    desk = Echo()
-    asyncio.run(live(application(desk, Access())))
-    assert desk.closed
+    queue = Echo()
+    asyncio.run(live(application(queue, Access())))
+    assert queue.closed
 
 
 def test_an_address_that_is_taken_or_foreign_is_refused() -> None:

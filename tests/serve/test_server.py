@@ -21,8 +21,8 @@ import trimesh
 import dro_grasp as dro
 from tests.helpers.weights import untrained_weights
 
-pytest.importorskip("fastapi", reason="needs the extra [serve]: pip install '.[serve]'")
-pytest.importorskip("uvicorn", reason="needs the extra [serve]: pip install '.[serve]'")
+pytest.importorskip("fastapi", reason="needs the extra [apps]: pip install '.[apps]'")
+pytest.importorskip("uvicorn", reason="needs the extra [apps]: pip install '.[apps]'")
 
 pytestmark = pytest.mark.slow
 

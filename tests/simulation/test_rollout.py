@@ -24,6 +24,23 @@ def test_shift_and_turn_between_two_states():
     np.testing.assert_allclose(a.turn(a), 0, atol=1e-15)
 
 
+def test_quiet_blocks_that_overlap_give_the_warnings_back_with_the_last() -> None:
+    def handler(_: str) -> None: ...
+
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(handler)
+    try:
+        first, second = quiet(), quiet()
+        first.__enter__()
+        second.__enter__()
+        first.__exit__(None, None, None)
+        assert mujoco.get_mju_user_warning() is not handler
+        second.__exit__(None, None, None)
+        assert mujoco.get_mju_user_warning() is handler
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
 def test_warnings_of_the_simulator_are_kept_quiet_and_heard_again_afterwards() -> None:
     heard: list[str] = []
     before = mujoco.get_mju_user_warning()

@@ -7,8 +7,11 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from trimesh.convex import convex_hull
 
+from dro_grasp.descriptions.self_contact import self_penetration
 from dro_grasp.errors import HandError, ObjectError
+from dro_grasp.geometry.balls import Balls
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import ASSET_FILES, load_hand
 from dro_grasp.objects.shape import ObjectModel
@@ -123,11 +126,32 @@ def test_a_scene_is_built_once_for_a_pair_and_a_protocol(hand):
     assert cached_scene(hand, ball(), protocol("dro")) is not first  # the oldest has gone
 
 
+def test_objects_of_one_mesh_that_collide_otherwise_have_scenes_of_their_own(hand):
+    """As a built-in object with exact parts and the same mesh from a user's file, which is cut into others."""
+    whole = ball()
+    vertices, _ = whole.parts[0]
+    halves = tuple((half, convex_hull(half).faces) for half in (vertices[vertices[:, 0] >= 0], vertices[vertices[:, 0] <= 0]))
+    heavy = replace(whole, inertia=2 * whole.inertia)
+    balls = replace(whole, balls=Balls(torch.zeros(1, 3), torch.tensor([0.03])))
+    smaller = replace(whole, balls=Balls(torch.zeros(1, 3), torch.tensor([0.02])))
+    others = [whole, replace(whole, exact_parts=halves), heavy, balls, smaller, whole.coarse]
+    assert {obj.sha256 for obj in others} == {whole.sha256}
+    first = [cached_scene(hand, obj, protocol("dro")) for obj in others]
+    assert len({id(scene) for scene in first}) == len(others)
+    for scene, obj in zip(first, others, strict=True):
+        own = build_scene(hand, obj, protocol("dro")).model
+        assert scene.model.ngeom == own.ngeom
+        np.testing.assert_array_equal(scene.model.geom_size, own.geom_size)
+        np.testing.assert_array_equal(scene.model.body_inertia, own.body_inertia)
+        assert cached_scene(hand, replace(obj), protocol("dro")) is scene
+
+
 def test_a_cloud_has_no_scene(hand):
     points = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
     cloud = ObjectModel(name="scan", cloud=points, cloud_normals=points, centre_of_mass=np.zeros(3), sha256="scan")
-    with pytest.raises(ObjectError, match="'scan' is a bare point cloud; a trial needs a mesh"):
-        build_scene(hand, cloud, protocol("dro"))
+    for make in (build_scene, cached_scene):
+        with pytest.raises(ObjectError, match="'scan' is a bare point cloud; a trial needs a mesh"):
+            make(hand, cloud, protocol("dro"))
 
 
 def test_a_hand_without_description_has_no_scene(hand):
@@ -201,6 +225,72 @@ def test_every_link_collides_and_the_hand_closes(name: str, assets_folder: Path)
     assert np.median(np.abs(data.qpos - expected)[addresses]) < 0.03
     held = [n for n, m in zip(hand.tree.joint_names, hand.movable, strict=True) if not m]
     assert not any(f"hand/{n}" == scene.model.actuator(i).name for n in held for i in range(scene.model.nu))
+
+
+def finger_pairs(hand: Hand, pairs: set[tuple[str, str]]) -> set[tuple[str, str]]:
+    """Those pairs of links that belong to two different fingers."""
+    finger = dict(zip(hand.tree.link_names, hand.finger_of_link.tolist(), strict=True))
+    return {p for p in pairs if -1 != finger[p[0]] != finger[p[1]] != -1}
+
+
+def own_contacts(scene: TrialScene, q: torch.Tensor) -> set[tuple[str, str]]:
+    """The two links of each contact of the hand with itself, far from the object."""
+    data = mujoco.MjData(scene.model)
+    data.qpos[:] = scene.qpos(wrist_below(1.0), q[None])[0]
+    mujoco.mj_fwdPosition(scene.model, data)
+    bodies = scene.model.geom_bodyid[data.contact.geom].reshape(-1, 2).tolist()
+    names = [sorted(scene.model.body(b).name.removeprefix("hand/") for b in pair) for pair in bodies]
+    return {(first, second) for first, second in names}
+
+
+SPREADING = {
+    "allegro": ("index_joint_0", "middle_joint_0", "ring_joint_0"),
+    "leaphand": ("index_joint_0", "middle_joint_0", "ring_joint_0"),
+    "assets/allegro_left": ("joint_0.0", "joint_4.0", "joint_8.0"),
+    "assets/allegro_right": ("joint_0.0", "joint_4.0", "joint_8.0"),
+    "assets/leaphand": ("0", "4", "8"),
+}
+"""Joints that only spread fingers, all of a symmetric range, as the makers' drawings have them."""
+EVERY_HAND = [
+    "allegro", "barrett", "gripper3", "leaphand", "shadowhand",
+    *(pytest.param(f"assets/{name}", marks=pytest.mark.assets) for name in sorted(ASSET_FILES))]
+
+
+@pytest.mark.parametrize("name", EVERY_HAND)
+def test_fingers_collide_wherever_their_shapes_overlap(name: str, request: pytest.FixtureRequest):
+    """Against the description's own model, which nothing is excluded from: also where neighbours cross at their limits."""
+    if name.startswith("assets/"):
+        request.getfixturevalue("assets_folder")
+    hand = loaded_hand(name)
+    assert hand.description is not None
+    scene, seen = build_scene(hand, ball(0.005), protocol("dro")), set[tuple[str, str]]()
+    drawn = hand.random_joints(100, torch.Generator().manual_seed(0))
+    for q in [hand.canonical_joints(1.0), *drawn]:
+        depths = self_penetration(hand.description, q)
+        deep = finger_pairs(hand, {(min(p), max(p)) for p, depth in depths.items() if depth > 0.002})
+        assert deep <= own_contacts(scene, q)
+        own = float(measure_penetration(scene, grasps_of(hand, scene.obj, wrist_below(1.0), q[None])).own[0])
+        assert own >= 0.8 * sum(depth for p, depth in depths.items() if (min(p), max(p)) in deep)
+        seen |= deep
+    assert len(seen) > 0 or len(hand.fingers) < 3
+
+
+@pytest.mark.parametrize("name", EVERY_HAND)
+def test_open_hands_do_not_jam(name: str, request: pytest.FixtureRequest):
+    if name.startswith("assets/"):
+        request.getfixturevalue("assets_folder")
+    hand = loaded_hand(name)
+    scene = build_scene(hand, ball(0.005), protocol("dro"))
+    for openness in (0.75, 1.0):
+        q = hand.canonical_joints(openness)
+        q[[hand.tree.joint_names.index(n) for n in SPREADING.get(name, ())]] = 0.0
+        assert own_contacts(scene, q) == set()
+        data = mujoco.MjData(scene.model)
+        data.qpos[:] = scene.qpos(wrist_below(1.0), q[None])[0]
+        before, data.ctrl[:] = data.qpos.copy(), q.numpy()[scene.actuated]
+        mujoco.mj_step(scene.model, data, nstep=100)
+        addresses, _ = scene.hand_qpos
+        np.testing.assert_allclose(data.qpos[addresses], before[addresses], atol=0.015)  # limits are soft
 
 
 def test_what_is_attached_with_options_of_its_own_takes_the_scenes_without_a_warning() -> None:

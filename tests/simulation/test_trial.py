@@ -14,7 +14,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import ControllerConfig
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.planning.standing import moved
+from dro_grasp.planning.workcell import moved
 from dro_grasp.simulation import rollout as rollouts
 from dro_grasp.simulation.closed_poses import held, settle
 from dro_grasp.simulation.holding import holding

@@ -11,17 +11,18 @@ import torch
 
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.models.network import untrained_network
+from dro_grasp.models.placement import PROPORTIONS
 from dro_grasp.training.config import MotionConfig, TrainConfig
 from dro_grasp.training.loop import train
 from dro_grasp.training.pretraining import pretrain_motion
 from tests.helpers.tiny_bundle import TINY
 from tests.helpers.training_stages import SCHEDULE, STAGES, curve, quiet, run_stage
 
-MOVING = dataclasses.replace(TINY, latent_form="motion", prior="flow", frame="palm")
+PAPER = dataclasses.replace(TINY, frame="object")
 SHORT = dataclasses.replace(SCHEDULE, steps=2, log_every=1, recalibration=2)
 
 
-@pytest.mark.parametrize("network", [TINY, MOVING, dataclasses.replace(TINY, prior="learned")], ids=["z", "motion", "learned"])
+@pytest.mark.parametrize("network", [TINY, PAPER], ids=["ours", "paper"])
 @torch.no_grad()
 def test_a_network_predicts_where_it_is_with_random_numbers_of_the_cpu(network, device: str) -> None:
     def predicted(where: str) -> list[torch.Tensor]:
@@ -29,7 +30,7 @@ def test_a_network_predicts_where_it_is_with_random_numbers_of_the_cpu(network, 
         hand, obj = (torch.randn(3, n, 3, generator=generator).to(where) * 0.05 for n in (TINY.n_hand, TINY.n_object))
         axes = network.axes(torch.eye(3).to(where)).expand(6, 3, 3)
         distances = model.predict(hand, obj, model.sample_latent(3, generator))
-        found = [distances, *model.sample_placements(hand[0], obj[0], axes, 4, generator)]
+        found = [distances, *model.sample_placements(obj[0], axes, 4, generator, torch.zeros(PROPORTIONS, device=where))]
         assert {value.device.type for value in found} == {torch.device(where).type}
         return [value.cpu() for value in found]
 
@@ -51,8 +52,8 @@ def test_a_stage_descends_on_a_device(stage: str, device: str, bundle: Bundle, t
 def test_a_motion_and_fine_tuning_descend_on_a_device(device: str, bundle: Bundle, tmp_path: Path) -> None:
     schedule = dataclasses.replace(SHORT, device=device)
     moving = pretrain_motion(
-        untrained_network(MOVING, seed=0), bundle, MotionConfig(schedule, hands_per_step=1), tmp_path / "motion", quiet)
+        untrained_network(TINY, seed=0), bundle, MotionConfig(schedule, hands_per_step=1), tmp_path / "motion", quiet)
     config = TrainConfig(schedule, hands_per_step=1, columns=24)
-    tuned = train(bundle, MOVING, config, tmp_path / "run", report=quiet, initial=moving)
+    tuned = train(bundle, TINY, config, tmp_path / "run", report=quiet, initial=moving)
     assert {value.device.type for value in [*moving.state_dict().values(), *tuned.state_dict().values()]} == {"cpu"}
     assert all(torch.isfinite(value).all() for value in tuned.state_dict().values())

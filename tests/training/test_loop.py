@@ -120,9 +120,8 @@ def test_total_is_the_weighted_sum(bundle: Bundle, form: str) -> None:
 
 def test_drawn_hands_teach_the_prior_in_their_share_of_the_steps(bundle: Bundle) -> None:
     torch.manual_seed(0)
-    network = dataclasses.replace(TINY, prior="flow", latent_form="motion")
-    source, generator = SampleSource(bundle, network, AugmentationConfig()), torch.Generator().manual_seed(0)
-    model = DistanceNetwork(network)
+    source, generator = SampleSource(bundle, TINY, AugmentationConfig()), torch.Generator().manual_seed(0)
+    model = DistanceNetwork(TINY)
     weights = LossConfig(drawn=1.0)
     values = []
     for _ in range(24):
@@ -135,21 +134,19 @@ def test_drawn_hands_teach_the_prior_in_their_share_of_the_steps(bundle: Bundle)
     assert 4 <= sum(value > 0 for value in values) <= 20
 
 
-def test_a_learned_prior_learns(bundle: Bundle) -> None:
+def test_prior_and_motion_learn(bundle: Bundle) -> None:
     torch.manual_seed(0)
-    network = dataclasses.replace(TINY, prior="learned", latent_form="motion")
-    source, generator = SampleSource(bundle, network, AugmentationConfig()), torch.Generator().manual_seed(0)
-    model = DistanceNetwork(network)
+    source, generator = SampleSource(bundle, TINY, AugmentationConfig()), torch.Generator().manual_seed(0)
+    model = DistanceNetwork(TINY)
     loop.step_losses(model, [source.draw("toy", 3, generator)], TrainConfig(columns=24), generator)["total"].backward()
-    assert model.prior.last.weight.grad.abs().max() > 0
+    assert model.prior.leave.weight.grad.abs().max() > 0
     assert model.motion.last.weight.grad.abs().max() > 0
 
 
 def test_a_placement_prior_learns_from_proportions(bundle: Bundle) -> None:
     torch.manual_seed(0)
-    network = dataclasses.replace(TINY, placement_hand="proportions")
-    source, generator = SampleSource(bundle, network, AugmentationConfig()), torch.Generator().manual_seed(0)
-    model = DistanceNetwork(network)
+    source, generator = SampleSource(bundle, TINY, AugmentationConfig()), torch.Generator().manual_seed(0)
+    model = DistanceNetwork(TINY)
     measure_hands(model, source)
     state = torch.get_rng_state()
     loop.step_losses(model, [source.draw("toy", 3, generator)], TrainConfig(columns=24), generator)["total"].backward()
@@ -157,14 +154,13 @@ def test_a_placement_prior_learns_from_proportions(bundle: Bundle) -> None:
     assert model.placement.hand.weight.grad.abs().max() > 0, "noise tells a single hand's rows apart"
     assert all(p.grad is None or not p.grad.any() for name, p in model.hand_encoder.named_parameters() if "place" in name)
     turns = torch.linalg.qr(torch.randn(9, 3, 3, generator=generator))[0]
-    hand, obj = source.draw("toy", 1, generator).placed[0], source.points[0]
-    placed = [model.sample_placements(hand, obj, turns, 9, torch.Generator().manual_seed(1), shape)[1]
+    placed = [model.sample_placements(source.points[0], turns, 9, torch.Generator().manual_seed(1), shape)[1]
               for shape in (source.proportions["toy"], source.proportions["toy"] + 0.1)]
     assert not torch.equal(*placed)
 
 
 def test_a_motion_is_learned_before_objects_are_seen(bundle: Bundle, tmp_path: Path) -> None:
-    network = dataclasses.replace(TINY, prior="flow", latent_form="motion", latent=8)
+    network = dataclasses.replace(TINY, latent=8)
     fresh = DistanceNetwork(network)
     encoder = copy.deepcopy(fresh.hand_encoder.state_dict())
     schedule = dataclasses.replace(SCHEDULE, steps=200, log_every=10)
@@ -176,5 +172,6 @@ def test_a_motion_is_learned_before_objects_are_seen(bundle: Bundle, tmp_path: P
     train(bundle, network, config, tmp_path / "fresh", report=quiet)
     train(bundle, network, config, tmp_path / "taken", learnt, quiet)
     assert curve(tmp_path / "taken")[0]["motion"] < 0.7 * curve(tmp_path / "fresh")[0]["motion"]
-    with pytest.raises(TrainingError, match="latent_form is 'kernel', which has no motion"):
-        pretrain_motion(DistanceNetwork(TINY), bundle, MotionConfig(schedule), tmp_path / "none", quiet)
+    paper = DistanceNetwork(dataclasses.replace(TINY, frame="object"))
+    with pytest.raises(TrainingError, match="frame 'object' has no motion"):
+        pretrain_motion(paper, bundle, MotionConfig(schedule), tmp_path / "none", quiet)

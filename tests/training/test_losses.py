@@ -113,12 +113,10 @@ def test_contact_draws_a_near_finger_and_neither_a_far_one_nor_one_that_touches(
 
 
 def test_divergence_equals_pytorchs() -> None:
-    mean, log_variance, prior_mean, prior_log_variance = torch.randn(4, 3, 5)
+    mean, log_variance = torch.randn(2, 3, 5)
     posterior = Normal(mean, (0.5 * log_variance).exp())
     standard = kl_divergence(posterior, Normal(0.0, 1.0))
     torch.testing.assert_close(divergence(mean, log_variance), standard, rtol=1e-5, atol=1e-6)
-    learned = kl_divergence(posterior, Normal(prior_mean, (0.5 * prior_log_variance).exp()))
-    torch.testing.assert_close(divergence(mean, log_variance, prior_mean, prior_log_variance), learned, rtol=1e-4, atol=1e-5)
 
 
 def test_forms_of_the_divergence_loss() -> None:

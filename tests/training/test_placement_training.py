@@ -14,7 +14,7 @@ from dro_grasp.errors import TrainingError
 from dro_grasp.models.checkpoints import describe_weights, load_weights, save_weights
 from dro_grasp.models.network import DistanceNetwork, untrained_network
 from dro_grasp.training.config import AugmentationConfig, PlacementConfig
-from dro_grasp.training.placement_training import mean_features, placement_losses, train_placement
+from dro_grasp.training.placement_training import placement_losses, train_placement
 from dro_grasp.training.samples import SampleSource
 from tests.helpers.tiny_bundle import TINY
 from tests.helpers.training_stages import SCHEDULE, curve, quiet
@@ -27,17 +27,15 @@ def given() -> DistanceNetwork:
     return untrained_network(TINY, seed=5)
 
 
-@pytest.mark.parametrize("form", ["features", "proportions"])
-def test_the_prior_learns_and_all_else_stays(bundle: Bundle, given: DistanceNetwork, form: str, tmp_path: Path) -> None:
-    network = dataclasses.replace(TINY, placement_hand=form)
-    learnt = train_placement(bundle, network, SHORT, tmp_path / "run", given, quiet)
+def test_the_prior_learns_and_all_else_stays(bundle: Bundle, given: DistanceNetwork, tmp_path: Path) -> None:
+    learnt = train_placement(bundle, TINY, SHORT, tmp_path / "run", given, quiet)
     lines = curve(tmp_path / "run")
     assert lines[-1]["log_density"] > lines[0]["log_density"] + 1
-    assert learnt.config == network
+    assert learnt.config == TINY
     for name, value in given.state_dict().items():
         if not name.startswith("placement."):
             assert torch.equal(learnt.state_dict()[name], value), name
-    again = train_placement(bundle, network, SHORT, tmp_path / "run", given, quiet)
+    again = train_placement(bundle, TINY, SHORT, tmp_path / "run", given, quiet)
     assert all(torch.equal(a, b) for a, b in zip(again.state_dict().values(), learnt.state_dict().values(), strict=True))
 
 
@@ -49,7 +47,7 @@ def test_the_likeliest_position_comes_near_the_true_one(bundle: Bundle, given: D
         errors = []
         for model in (given, learnt):
             assert model.placement is not None
-            logits, mean, _, _ = model.placement(group.obj_hand, mean_features(model, [group]))
+            logits, mean, _, _ = model.placement(group.obj_hand, group.proportions.expand(64, -1))
             likeliest = mean[torch.arange(64), logits.argmax(-1)]
             errors.append(float((likeliest - group.position).norm(dim=-1).median()))
     assert errors[1] < 0.5 * errors[0]
@@ -60,11 +58,11 @@ def test_preferred_is_the_area_under_the_roc_curve(bundle: Bundle, given: Distan
 
     source = SampleSource(bundle, TINY, AugmentationConfig())
     group = source.draw("toy", 40, torch.Generator().manual_seed(2))
-    prior, features = given.placement, mean_features(given, [group])
+    prior, hand = given.placement, group.proportions.expand(40, -1)
     assert prior is not None
     with torch.no_grad():
-        found = placement_losses(prior, [group], features, 0.0, torch.Generator())
-        true, other = prior(group.obj_hand, features)[3], prior(group.obj_random, features)[3]
+        found = placement_losses(prior, [group], 0.0, torch.Generator())
+        true, other = prior(group.obj_hand, hand)[3], prior(group.obj_random, hand)[3]
     expected = mannwhitneyu(true.numpy(), other.numpy()).statistic / 40**2
     assert float(found["preferred"]) == pytest.approx(expected, abs=1e-6)
 
@@ -87,8 +85,8 @@ def test_the_command_trains_the_placement_alone(
     assert main([*command, "--initial", str(first), "--pretrained", str(first)]) == 2
     assert capsys.readouterr().err.count("name them with --initial") == 2
     assert not (tmp_path / "run").exists()
-    assert main([*command, "--initial", str(first), "--placement-hand", "proportions"]) == 0
-    assert load_weights(output).config.placement_hand == "proportions"
+    assert main([*command, "--initial", str(first)]) == 0
+    assert load_weights(output).config == TINY
     about = describe_weights(output)
     assert (about["about"]["stage"], about["about"]["steps"]) == ("placement", 3)
     assert about["history"] == [{"stage": "training"}]

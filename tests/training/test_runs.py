@@ -147,11 +147,57 @@ def test_a_damaged_checkpoint_is_set_aside_and_the_run_begins_anew(
     folder = RunFolder(tmp_path / "run")
     assert folder.read_checkpoint({"steps": 10}) is None
     assert f"{path} is damaged" in (told := capsys.readouterr().err)
-    assert "set aside as checkpoint.pt.damaged; the training begins anew" in told
+    assert "set aside as checkpoint.pt.damaged, its log beside it; the training begins anew" in told
     assert not path.exists()
     assert path.with_name("checkpoint.pt.damaged").exists()
     assert folder.read_checkpoint({"steps": 10}) is None
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("error", [
+    OSError(errno.EIO, "Input/output error"), PermissionError(errno.EACCES, "Permission denied"), MemoryError(),
+    RuntimeError("[enforce fail at alloc_cpu.cpp:117] . DefaultCPUAllocator: can't allocate memory")])
+def test_a_checkpoint_that_cannot_be_read_now_is_left_alone(
+    finished: dict[str, Path], tmp_path: Path, error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for file in (CHECKPOINT, LOG):
+        (tmp_path / file).write_bytes((finished["train"] / file).read_bytes())
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    with monkeypatch.context() as patch:
+        patch.setattr(torch, "load", fail)
+        patch.setattr(Path, "read_bytes", fail if isinstance(error, OSError) else Path.read_bytes)
+        with pytest.raises(TrainingError, match=r"checkpoint\.pt cannot be read .*nothing was changed"):
+            RunFolder(tmp_path).read_checkpoint({"steps": 10})
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_fault_of_ours_is_no_damage(finished: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / CHECKPOINT).write_bytes((finished["train"] / CHECKPOINT).read_bytes())
+
+    def fail(*_: object, **__: object) -> None:
+        raise NameError("no_such_name")
+
+    monkeypatch.setattr(torch, "load", fail)
+    with pytest.raises(NameError):
+        RunFolder(tmp_path).read_checkpoint({"steps": 10})
+    assert [path.name for path in tmp_path.iterdir()] == [CHECKPOINT]
+
+
+def test_what_is_set_aside_is_never_lost(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    for number in (1, 2, 3):
+        (tmp_path / CHECKPOINT).write_text(f"checkpoint {number}")
+        folder.append_to_log({"step": 9000 + number})
+        assert folder.read_checkpoint({}) is None
+        folder.cut_log(0)
+    for number, ending in ((1, ".damaged"), (2, ".damaged.2"), (3, ".damaged.3")):
+        assert (tmp_path / f"{CHECKPOINT}{ending}").read_text() == f"checkpoint {number}"
+        assert json.loads((tmp_path / f"{LOG}{ending}").read_text()) == {"step": 9000 + number}
+    assert not (tmp_path / LOG).exists()
 
 
 def test_a_finished_run_with_other_settings_data_or_weights_is_refused(

@@ -17,7 +17,7 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.viewer.app import GraspViewer, describe
 from dro_grasp.viewer.appearance import success_colour
-from dro_grasp.viewer.stage import HOST, ServedPage, viewpoint
+from dro_grasp.viewer.scene_view import HOST, ServedPage, viewpoint
 from tests.helpers.browser import free_port, page_of
 from tests.helpers.loaded_hands import loaded_hand
 
@@ -54,7 +54,7 @@ def test_links_stand_where_kinematics_puts_them(viewer: GraspViewer, grasps: Gra
         viewer.show(1, posture)
         q = viewer._joints[posture][1]
         poses = grasps.T_object_wrist[1] @ viewer.hand.tree.forward(q)
-        for frame, pose in zip(viewer.stage.links, poses, strict=True):
+        for frame, pose in zip(viewer.view.links, poses, strict=True):
             assert np.allclose(frame.position, pose[:3, 3], atol=1e-6)
             shown = roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(torch.tensor(np.asarray(frame.wxyz)).float()))
             assert torch.allclose(shown, pose[:3, :3], atol=1e-5)
@@ -64,10 +64,10 @@ def test_points_and_colours_follow_the_grasp(viewer: GraspViewer, grasps: GraspB
     for index in (0, 1):
         viewer.show(index, "grasp")
         solved = viewer.hand.points(grasps.joints[index], grasps.T_object_wrist[index])
-        assert np.allclose(viewer.stage.solved.points, solved, atol=1e-5)
+        assert np.allclose(viewer.view.solved.points, solved, atol=1e-5)
         assert np.allclose(viewer._predicted.points, solved + 0.001, atol=1e-5)
         wanted = tuple(round(255 * c) for c in success_colour(bool(grasps.success[index])))
-        assert tuple(viewer.stage._grid.cell_color) == wanted
+        assert tuple(viewer.view._grid.cell_color) == wanted
         assert f"Grasp {index}" in viewer._text.content
 
 

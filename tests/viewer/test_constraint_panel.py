@@ -46,7 +46,7 @@ def test_fields_become_constraints_and_are_drawn(studio: Studio, monkeypatch: py
     upload = viser.UploadedFile(name="shelf.stl", content=file.getvalue())
     studio._take(upload, "scene", studio.panel.avoid, studio._draw_constraints)
     drawn: list[str] = []
-    scene = studio.place.scene
+    scene = studio.client.scene
     for kind in ("add_box", "add_icosphere", "add_mesh_simple"):
         monkeypatch.setattr(scene, kind, lambda name, *_, **__: drawn.append(name))
     studio._draw_constraints()

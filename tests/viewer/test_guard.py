@@ -12,7 +12,7 @@ import viser
 import websockets
 
 from dro_grasp.errors import OptionError
-from dro_grasp.viewer.stage import ServedPage
+from dro_grasp.viewer.scene_view import ServedPage
 
 
 @pytest.fixture(scope="module")

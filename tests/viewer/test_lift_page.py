@@ -13,13 +13,13 @@ from dro_grasp.cli.view import is_motion
 from dro_grasp.models.checkpoints import DEFAULT, describe_weights
 from dro_grasp.planning.animation import Recorder
 from dro_grasp.planning.attempts import Attempt, TabletopConfig
-from dro_grasp.planning.motion import CHOSEN, STAGES, WAITING, PlanNotes, PlanScene
+from dro_grasp.planning.motion import CHOSEN, STAGES, WAITING, PlanNotes, PlanScene, Trajectory
 from dro_grasp.planning.robot_check import robot_shapes, shape_poses
 from dro_grasp.planning.tabletop import write_attempts
-from dro_grasp.planning.timing import Trajectory
 from dro_grasp.viewer import lift_page as pages
 from dro_grasp.viewer.lift_page import EVERY, Film, LiftPage, lift_page
 from tests.helpers.browser import free_port
+from tests.helpers.weights import untrained_weights
 
 
 @pytest.fixture(scope="module")
@@ -66,8 +66,8 @@ def test_each_attempt_is_played_with_its_own_robot_and_weights(
     robot: dro.Robot, small_robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other, ran, label = dro.load_robot(small_robot), [], TabletopConfig().label()
-    shipped = describe_weights()["sha256"]
-    stored = [Attempt(robot.name, "can", 0, 0, label, True, "done", robot_file="xarm7_leaphand", weights="multi"),
+    shipped, own = describe_weights()["sha256"], str(untrained_weights(tmp_path))
+    stored = [Attempt(robot.name, "can", 0, 0, label, True, "done", robot_file="xarm7_leaphand", weights=own),
               Attempt(other.name, "can", 1, 0, label, True, "done", robot_file=small_robot, weights=DEFAULT,
                       robot_sha256=other.sha256, weights_sha256=shipped, object_sha256="that of another can")]
 
@@ -83,7 +83,7 @@ def test_each_attempt_is_played_with_its_own_robot_and_weights(
     try:
         assert "Not as stored" not in page.text.content
         page.repeat(1)
-        assert ran == [(robot.name, 0, "multi"), (other.name, 1, DEFAULT)]
+        assert ran == [(robot.name, 0, own), (other.name, 1, DEFAULT)]
         assert page.name.content == f"**{other.name}**"
         assert len(page._links) == len(robot_shapes(other)) != len(robot_shapes(robot))
         expected = shape_poses(other, other.home, other.hand.canonical_joints().double().numpy())

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import threading
 import time
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,14 +20,14 @@ from dro_grasp.cli.view import View
 from dro_grasp.errors import HandError
 from dro_grasp.frames import HALF_AXES, half_axis_direction
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import CONTACT_LINKS, REASON
 from dro_grasp.hands.library import BUILTIN_FOLDER
 from dro_grasp.objects.builtin import BUILTIN
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.viewer import grasp_page as module
-from dro_grasp.viewer.app import postures_of
+from dro_grasp.viewer.app import GraspViewer, postures_of
 from dro_grasp.viewer.grasp_page import EXPORTS, chosen
-from dro_grasp.viewer.shelf import Shelf
-from dro_grasp.viewer.stage import HOST, ServedPage
+from dro_grasp.viewer.scene_view import HOST, ServedPage
 from dro_grasp.viewer.studio import Studio, StudioServer
 from tests.helpers.browser import free_port, page_of
 from tests.helpers.served_studio import served_studio, visited
@@ -51,11 +51,11 @@ def made(studio: Studio) -> module.ShownGrasps:
 
 
 def test_it_starts_empty_and_for_this_machine_alone(studio: Studio) -> None:
-    assert isinstance(studio.place, viser.ViserServer)
-    assert studio.place.get_host() == "127.0.0.1"
+    assert isinstance(studio.client, viser.ViserServer)
+    assert studio.client.get_host() == "127.0.0.1"
     if studio.made is None:
         assert "gripper3 above sphere" in studio.status.content
-        assert studio.stage.hand is not None, "the hand is shown at once"
+        assert studio.view.hand is not None, "the hand is shown at once"
 
 
 def test_generating_shows_the_best_and_says_what_held(studio: Studio, made: module.ShownGrasps) -> None:
@@ -68,10 +68,10 @@ def test_generating_shows_the_best_and_says_what_held(studio: Studio, made: modu
     studio.posture.value = "grasp"
     assert "posture: grasp" in studio.text.content
     expected = made.refined.T_object_wrist[0] @ made.hand.tree.forward(made.refined.joints[0])
-    np.testing.assert_allclose(studio.stage.links[0].position, expected[0, :3, 3], atol=1e-5)
+    np.testing.assert_allclose(studio.view.links[0].position, expected[0, :3, 3], atol=1e-5)
     studio.stage_of.value = "network"
     studio._show()
-    np.testing.assert_allclose(studio.stage.links[0].position, made.raw.T_object_wrist[0, :3, 3], atol=1e-5)
+    np.testing.assert_allclose(studio.view.links[0].position, made.raw.T_object_wrist[0, :3, 3], atol=1e-5)
     studio.stage_of.value = "refined"
 
 
@@ -97,16 +97,16 @@ def test_filters_keep_what_they_say(studio: Studio, made: module.ShownGrasps) ->
 
 
 def test_contacts_are_marked_where_the_hand_touches_and_only_when_asked(studio: Studio, made: module.ShownGrasps) -> None:
-    assert not studio.stage.contacts.visible
+    assert not studio.view.contacts.visible
     studio.contacts.value = True
     try:
-        points = torch.as_tensor(np.asarray(studio.stage.contacts.points)).float()
+        points = torch.as_tensor(np.asarray(studio.view.contacts.points)).float()
         if len(points):
             assert float(made.obj.distance_field.distances(points)[0].abs().max()) < 0.003
-        assert studio.stage.contacts.visible
+        assert studio.view.contacts.visible
     finally:
         studio.contacts.value = False
-    assert not studio.stage.contacts.visible
+    assert not studio.view.contacts.visible
 
 
 def test_a_trial_plays_and_ends_where_it_began(
@@ -114,13 +114,13 @@ def test_a_trial_plays_and_ends_where_it_began(
 ) -> None:
     monkeypatch.setattr(module.time, "sleep", lambda _: None)
     seen = []
-    honest = studio.stage.show
+    honest = studio.view.show
 
     def show(joints, T, T_object=None):
         seen.append(T_object)
         honest(joints, T, T_object)
 
-    monkeypatch.setattr(studio.stage, "show", show)
+    monkeypatch.setattr(studio.view, "show", show)
     studio._guarded(studio._play)
     assert (studio.moment.max, studio.moment.disabled) == (len(seen) - 1, False)
     studio._show_moment(7)
@@ -179,11 +179,11 @@ def test_grasps_that_state_no_pregrasp_are_taken_away_with_the_one_that_is_shown
 ) -> None:
     unknown = torch.full_like(made.refined.joints, float("nan"))
     bare = made.refined.replace(pregrasp_joints=unknown, squeeze_joints=unknown)
-    monkeypatch.setattr(studio, "made", dataclasses.replace(made, refined=bare))
+    monkeypatch.setattr(studio, "made", replace(made, refined=bare))
     name, content = studio.exported(kind)
     shown = postures_of(made.hand, made.obj, bare)
     stated = made.refined.replace(pregrasp_joints=shown["pregrasp"], squeeze_joints=shown["squeeze"])
-    monkeypatch.setattr(studio, "made", dataclasses.replace(made, refined=stated))
+    monkeypatch.setattr(studio, "made", replace(made, refined=stated))
     assert (name, content) == studio.exported(kind)
 
 
@@ -191,8 +191,8 @@ def test_uploads_are_picked_and_errors_are_shown(studio: Studio) -> None:
     text = (BUILTIN_FOLDER / "gripper3.urdf").read_bytes()
     studio._take(viser.UploadedFile(name="../mine.urdf", content=text), "hand", studio.hand, studio._preview)
     assert studio.hand.value == "mine.urdf", "no path of a temporary folder"
-    assert studio.stage.hand is not None
-    assert studio.stage.hand.name == "mine", "the uploaded hand is shown at once"
+    assert studio.view.hand is not None
+    assert studio.view.hand.name == "mine", "the uploaded hand is shown at once"
     studio._take(viser.UploadedFile(name="bad.urdf", content=b"<robot"), "hand", studio.hand, studio._preview)
     assert studio.status.content.startswith("**Error:**")
     assert "bad.urdf" in studio.status.content
@@ -218,7 +218,7 @@ def test_an_upload_waits_for_other_work_and_is_never_lost(studio: Studio, monkey
     assert studio.hand.value == "early.urdf"
     assert "early.urdf is picked" in studio.status.content
     studio.hand.value = "gripper3"
-    monkeypatch.setattr("dro_grasp.viewer.studio.UPLOAD_PATIENCE", 0.1)
+    monkeypatch.setattr("dro_grasp.viewer.studio.UPLOAD_TIMEOUT", 0.1)
     with studio._busy:
         upload("late.urdf").join(20)
     assert studio.hand.value == "gripper3"
@@ -229,7 +229,7 @@ def test_an_upload_waits_for_other_work_and_is_never_lost(studio: Studio, monkey
 def test_no_control_is_sent_before_all_are_connected(studio: Studio, monkeypatch: pytest.MonkeyPatch) -> None:
     """A browser must not be able to upload a file that nothing takes."""
     within: list[str] = []
-    honest = studio.place.atomic
+    honest = studio.client.atomic
 
     @contextmanager
     def atomic():
@@ -243,8 +243,8 @@ def test_no_control_is_sent_before_all_are_connected(studio: Studio, monkeypatch
             within.append("last controls")
             super()._add_display()
 
-    monkeypatch.setattr(studio.place, "atomic", atomic)
-    Watched(studio.place, studio.predictor, "gripper3", "sphere", preview=False).close()
+    monkeypatch.setattr(studio.client, "atomic", atomic)
+    Watched(studio.client, studio.predictor, "gripper3", "sphere", preview=False).close()
     assert within[:3] == ["held back", "last controls", "sent"]
 
 
@@ -258,7 +258,7 @@ def test_the_page_starts_with_the_hand_and_the_mesh_that_the_command_names(tmp_p
     try:
         assert (studio.hand.value, studio.object.value) == ("my claw", "my egg")
         assert "my claw above my egg" in studio.status.content
-        assert float(np.ptp(studio.shelf.obj("my egg").cloud, axis=0).max()) == pytest.approx(0.06, abs=1e-3)
+        assert float(np.ptp(studio.library.obj("my egg").cloud, axis=0).max()) == pytest.approx(0.06, abs=1e-3)
         assert studio.object.options[0] == "my egg"
         assert set(BUILTIN) <= set(studio.object.options)
     finally:
@@ -280,8 +280,8 @@ def test_every_browser_has_a_page_and_closing_it_ends_its_work_and_its_uploads(
     """Two browsers come, one leaves while it works, the other stays as it was."""
     made: list[Studio] = []
 
-    def make(place, turn):
-        made.append(Studio(place, studio.predictor, "gripper3", "sphere", turn))
+    def make(client, turn):
+        made.append(Studio(client, studio.predictor, "gripper3", "sphere", turn))
         return made[-1]
 
     served = StudioServer(make, free_port())
@@ -292,7 +292,7 @@ def test_every_browser_has_a_page_and_closing_it_ends_its_work_and_its_uploads(
             page._take(viser.UploadedFile(name=name, content=text), "hand", page.hand, page._preview)
         assert "mine.urdf" not in made[1].hand.options
         assert "theirs.urdf" not in made[0].hand.options
-        folders = [Path(page.shelf._folder.name) for page in made]
+        folders = [Path(page.library.folder.name) for page in made]
         begun, steps = threading.Event(), []
 
         def endless(*arguments, **_):
@@ -317,18 +317,40 @@ def test_every_browser_has_a_page_and_closing_it_ends_its_work_and_its_uploads(
     assert not any(folder.exists() for folder in folders)
 
 
-def test_a_scene_does_not_take_the_place_of_an_object_of_its_file_name() -> None:
-    def box(*size: float) -> bytes:
-        return trimesh.creation.box(size).export(file_type="stl")
-
-    shelf = Shelf()
-    assert shelf.take("part.stl", box(0.05, 0.05, 0.05), "object") == "part.stl"
-    assert shelf.take("part.stl", box(0.5, 0.5, 0.02), "scene") == "part (2).stl"
-    assert np.ptp(shelf.obj("part.stl").vertices, axis=0) == pytest.approx([0.05] * 3)
-    assert shelf.scene("part (2).stl") is not None
-    assert shelf.take("part.stl", box(0.06, 0.06, 0.06), "object") == "part.stl"
-    assert np.ptp(shelf.obj("part.stl").vertices, axis=0) == pytest.approx([0.06] * 3), "the newer one of its kind"
-    shelf.close()
+def test_what_a_file_states_is_shown_as_text_and_never_as_html(studio: Studio, monkeypatch: pytest.MonkeyPatch) -> None:
+    """viser's browser shows raw HTML in Markdown."""
+    attack = "<img src=x onerror=alert(1)>{alert(1)}[a](javascript:alert(1))**b**"
+    hand, obj = replace(studio.library.hand("gripper3"), name=f"hand{attack}"), load_object("sphere")
+    T = torch.eye(4)[None]
+    T[0, :3, 3] = -hand.grasp_centre_wrist
+    grasps = GraspBatch.create(
+        hand, obj, T, hand.canonical_joints(0.6)[None], success=torch.tensor([False]), protocol=(attack,)).replace(
+        object=(attack,), extra={REASON: [attack], CONTACT_LINKS: [[attack]]})
+    shown: list[str] = []
+    titles: list[str] = []
+    add_markdown = viser.GuiApi.add_markdown
+    monkeypatch.setattr(viser.GuiApi, "add_markdown", lambda gui, text: titles.append(text) or add_markdown(gui, text))
+    page = Studio(studio.client, studio.predictor, "gripper3", "sphere", preview=False)
+    try:
+        page.open(hand, grasps, replace(obj, name=attack))
+        shown += [page.status.content, page.text.content]
+        page.offer(hand, None)
+        shown.append(page.status.content)
+        page._complain(HandError(attack))
+        shown.append(page.status.content)
+        upload = viser.UploadedFile(name=f"{attack}.urdf", content=b"<robot")
+        page._take(upload, "hand", page.hand, page._preview)
+        shown.append(page.status.content)
+    finally:
+        page.close()
+    viewer = GraspViewer(hand, replace(obj, name=attack), grasps, port=free_port())
+    viewer.stop()
+    texts = [*shown, *titles, viewer._text.content]
+    assert sum("onerror" in text for text in texts) == 7
+    for text in filter(None, texts):
+        assert not set("<{[`") & set(text), text
+        assert "**b" not in text
+        assert "b**" not in text
 
 
 @pytest.mark.slow

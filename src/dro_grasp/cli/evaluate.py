@@ -78,7 +78,8 @@ class Evaluate:
                 evaluated[name] = with_contacts(hand, problem.obj, done, rules) if self.contact_quality else done
         if self.output is not None:
             GraspBatch.concatenate([*evaluated.values(), *bare.values()]).save(self.output)
-        lost = {name: num for (name, _), num in grasps.asked_of.items() if name not in grasps.object}
+        there = set(zip(grasps.object, grasps.object_sha256, strict=True))
+        lost = {key[0]: num for key, num in grasps.asked_of.items() if key not in there}
         self._report(hand, rules, evaluated, lost, list(bare), time.perf_counter() - begin)
         return 0
 
@@ -126,7 +127,7 @@ class Evaluate:
         for name, part in evaluated.items():
             held = int(part.success.sum())
             rows.append([name, part.out_of, len(part), held, held / part.out_of, *shares(part, hand, part.out_of).values()])
-        rows += [[name, num, 0, 0, 0.0] for name, num in lost.items()]
+        rows += [[name, num, 0, 0, 0.0, *[None] * (len(rows[0]) - 5)] for name, num in lost.items()]
         done = GraspBatch.concatenate(list(evaluated.values()))
         success, asked = int(done.success.sum()), sum(row[1] for row in rows)
         (rate, low, high), beside = success_rate(success, asked), shares(done, hand, asked)

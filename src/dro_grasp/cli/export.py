@@ -77,7 +77,7 @@ class Export:
         grasps = load_grasps(self.file)
         if not self.only_successful:
             return grasps
-        if not bool(grasps.success.any()):
+        if not bool(grasps.trial_success.any()):
             raise GraspFileError(f"no grasp in {self.file} has passed a trial; run trials with `dro-grasp evaluate`, or "
                                  "leave out --only-successful")
         return grasps[grasps.success]

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from dro_grasp.cli.constraint_options import ConstraintOptions
-from dro_grasp.cli.inputs import Flag, ProtocolName, optional
+from dro_grasp.cli.inputs import ConstraintOptions, Flag, ProtocolName, optional
 from dro_grasp.cli.output import print_json, print_table, progress_bar, say, say_aside
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 

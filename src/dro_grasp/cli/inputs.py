@@ -1,14 +1,18 @@
-"""What commands are given: switches and options, protocols by name."""
+"""What commands are given: switches and options, protocols by name, and what grasps have to respect."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from dro_grasp.simulation.protocols import PROTOCOLS
 
 if TYPE_CHECKING:
+    from dro_grasp.objects.scenery import Scene
+    from dro_grasp.predict.constraints import Constraints
+
     ProtocolName = str
 else:
     ProtocolName = Literal[tuple(PROTOCOLS)]
@@ -22,3 +26,35 @@ Flag = tyro.conf.FlagCreatePairsOff[bool]
 def optional(metavar: str, default: str) -> Any:
     """Help settings of an option without a default value: its metavar, and a description of the default."""
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})")
+
+
+@dataclass(frozen=True)
+class PalmOptions:
+    """Where palms point, and how far hands open."""
+
+    direction: Annotated[tuple[float, float, float] | None, optional("X Y Z", "any direction")] = None
+    """Palm direction: 0 0 -1 grasps from above. Over a table, palms tilt towards it as far as the hand needs room."""
+    cone: Annotated[float | None, optional("RAD", "roughly along the direction")] = None
+    """Largest angle [rad] between palm direction and --direction; palms are spread evenly within it."""
+    opening: Annotated[float | None, optional("M", "a quarter of what is left")] = None
+    """Least distance [m] between the object and every link that closes, in pregrasp."""
+
+    def constraints(self, table: float | None = None, avoid: Scene | None = None) -> Constraints:
+        """These options, with a table's height [m] and what stands around.
+
+        Raises:
+            OptionError: Something cannot be respected.
+        """
+        from dro_grasp.predict.constraints import Constraints
+
+        return Constraints(table=table, avoid=avoid, **asdict(self))
+
+
+@dataclass(frozen=True)
+class ConstraintOptions(PalmOptions):
+    """Where palms point, how far hands open, and where they touch."""
+
+    hold: Annotated[tuple[Ball, ...], optional("X Y Z RADIUS", "anywhere")] = ()
+    """Balls [m]: in the grasp, the hand touches the object nowhere else. Four numbers for each ball."""
+    spare: Annotated[tuple[Ball, ...], optional("X Y Z RADIUS", "nothing")] = ()
+    """Balls [m] that the hand stays out of."""

@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import os
-import select
-import signal
 import sys
-import threading
 import traceback
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import tyro
@@ -20,13 +16,14 @@ from dro_grasp.cli.dataset import Dataset
 from dro_grasp.cli.evaluate import Evaluate
 from dro_grasp.cli.export import Export
 from dro_grasp.cli.generate import Generate
-from dro_grasp.cli.lift_experiment import Tabletop
-from dro_grasp.cli.listing import HandCommand, Hands, Objects
+from dro_grasp.cli.hand import HandCommand
+from dro_grasp.cli.listing import Hands, Objects
 from dro_grasp.cli.onboard import Onboard
-from dro_grasp.cli.plan_lift import Plan
+from dro_grasp.cli.plan import Plan
 from dro_grasp.cli.robots import RobotCommand
 from dro_grasp.cli.serve import Serve
 from dro_grasp.cli.synthesize import Synthesize
+from dro_grasp.cli.tabletop import Tabletop
 from dro_grasp.cli.train import Pretrain, Train
 from dro_grasp.cli.view import Picture, View
 from dro_grasp.cli.weights import Weights
@@ -34,17 +31,11 @@ from dro_grasp.errors import DroGraspError, OptionError
 
 DONE = 0
 """Exit code of a command that succeeded."""
-INTERNAL_ERROR = 1
-"""Exit code after a fault of dro-grasp."""
+FAILED = 1
+"""Exit code after a fault of dro-grasp, or when nobody reads the output any more, as in `dro-grasp hands | head -1`."""
 BAD_INPUT = 2
 """Exit code after invalid input."""
-INTERRUPTED = 130
-"""Exit code after Ctrl-C: 128 plus the number of SIGINT, as shells have it."""
-READER_LEFT = 141
-"""Exit code when nobody reads the output any more, as in `dro-grasp hands | head -1`: 128 plus the number of SIGPIPE."""
-INSISTENCE = 5.0
-"""Time after which Ctrl-C is repeated if the command still runs [s] (ours); workers stop in less."""
-PATIENCE = ("OMP_WAIT_POLICY", "PASSIVE")
+WAIT_POLICY = ("OMP_WAIT_POLICY", "PASSIVE")
 """Environment variable that lets PyTorch's threads sleep while they wait, which they otherwise spend spinning: beside other
 programs at work that takes several times as long. It counts if it is set before PyTorch is loaded."""
 THREADS = "OMP_NUM_THREADS"
@@ -110,52 +101,15 @@ def without_threads(arguments: Sequence[str]) -> list[str]:
     return rest
 
 
-@contextmanager
-def insistent_interrupts() -> Iterator[None]:
-    """Ctrl-C raises KeyboardInterrupt again every few seconds until the block ends: now and then a library swallows it."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def interrupt(*_: Any) -> None:
-        signal.setitimer(signal.ITIMER_REAL, INSISTENCE)
-        raise KeyboardInterrupt
-
-    before = [signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGALRM)]
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        for number, handler in zip((signal.SIGINT, signal.SIGALRM), before, strict=True):
-            signal.signal(number, handler)
-
-
 def run(arguments: Sequence[str]) -> int:
     """Run one command, and return its exit code, unless it raises."""
-    if arguments in (["--version"], ["-V"]):
-        print(f"dro-grasp {__version__}")
-        return DONE
-    return parse(without_threads(arguments)).run()
-
-
-def reader_left() -> bool:
-    """Whether nobody reads the output any more; what is still to be written is dropped then."""
-    if sys.stdout is None:
-        return False
-    with suppress(BrokenPipeError):  # the data is lost, and flushing again would not tell
-        sys.stdout.flush()
     try:
-        output = sys.stdout.fileno()
-    except OSError:  # no file: somebody has replaced it
-        return False
-    poll = select.poll()
-    poll.register(output, 0)
-    if not any(event & select.POLLERR for _, event in poll.poll(0)):
-        return False
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, output)
-    os.close(nowhere)
-    return True
+        if arguments in (["--version"], ["-V"]):
+            print(f"dro-grasp {__version__}")
+            return DONE
+        return parse(without_threads(arguments)).run()
+    finally:
+        print(end="", flush=True)  # what nobody reads fails here rather than while Python ends
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -163,29 +117,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     verbose = "--verbose" in arguments
     arguments = [a for a in arguments if a != "--verbose"] or ["--help"]
-    os.environ.setdefault(*PATIENCE)
+    os.environ.setdefault(*WAIT_POLICY)
     try:
-        with insistent_interrupts():
-            code = run(arguments)
-        return READER_LEFT if reader_left() else code
-    except SystemExit as end:  # 1 is rich's, which ends the program when nobody reads; others are `parse`'s
-        if end.code == 1 or (not end.code and reader_left()):
-            return READER_LEFT
-        raise
+        return run(arguments)
+    except BrokenPipeError:  # as in `| head`; rich ends its own output in the same way
+        sys.stdout = None  # type: ignore[assignment]
+        return FAILED
     except DroGraspError as error:
         if verbose:
             traceback.print_exc()
         print(f"error: {error}", file=sys.stderr)
         return BAD_INPUT
-    except KeyboardInterrupt:
-        print("stopped", file=sys.stderr)
-        return INTERRUPTED
-    except Exception as error:
-        if reader_left():
-            return READER_LEFT
+    except Exception as error:  # the end of the program: whatever gets here is a fault of ours, and told as one
         if verbose:
             traceback.print_exc()
         else:
             print(f"internal error: {type(error).__name__}: {error}\nThis is a bug in dro-grasp, not in your input. "
                   "Run again with --verbose and report the traceback.", file=sys.stderr)
-        return INTERNAL_ERROR
+        return FAILED

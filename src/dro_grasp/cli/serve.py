@@ -15,7 +15,7 @@ TOKEN = "DRO_GRASP_TOKEN"
 
 @dataclass(frozen=True)
 class Serve:
-    """Answer requests for grasps over HTTP, without the seconds that every start costs. Needs the extra `serve`.
+    """Answer requests for grasps over HTTP, without the seconds that every start costs. Needs the extra `[apps]`.
 
     Example: dro-grasp serve --hand my_hand.urdf --port 8090
     """
@@ -43,18 +43,19 @@ class Serve:
 
     def run(self) -> int:
         """Check, load, and serve until Ctrl-C or SIGTERM."""
-        from dro_grasp.serve.web_extra import require_serve_extra
+        from dro_grasp.extras import require_extra
 
-        require_serve_extra()
-        from dro_grasp.serve.answering import Stock
-        from dro_grasp.serve.desk import Desk
+        require_extra("apps")
+        from dro_grasp.serve.answering import ServerConfig
         from dro_grasp.serve.http_server import Access, listening_socket, serve_grasps
+        from dro_grasp.serve.request_queue import RequestQueue
 
         access = Access(self.host, self.token or os.environ.get(TOKEN), self.megabytes)
         with listening_socket(self.host, self.port) as listener:
-            desk = Desk(Stock(self.weights, self.device, self.hand, self.object), self.queue, self.time_limit)
+            config = ServerConfig(self.weights, self.device, self.hand, self.object)
+            queue = RequestQueue(config, self.queue, self.time_limit)
             host, port = listener.getsockname()[:2]
             print(f"grasp server: http://{f'[{host}]' if ':' in host else host}:{port}, requests at /docs (Ctrl-C stops it)",
                   file=sys.stderr, flush=True)
-            serve_grasps(desk, access, listener)
+            serve_grasps(queue, access, listener)
         return 0

@@ -9,12 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from dro_grasp.cli.inputs import Flag, optional
-from dro_grasp.cli.output import print_result, print_table
+from dro_grasp.cli.output import print_result, print_table, say_aside
 
 if TYPE_CHECKING:
     from dro_grasp.models.network import DistanceNetwork
     from dro_grasp.models.presets import NetworkConfig
     from dro_grasp.training.config import ScheduleConfig
+
+
+FORMER_OPTION = optional("NAME", "not given")
+"""Help of an option that is still read, so that commands of before are answered with more than that it is unknown."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,13 +33,14 @@ class Stage:
     """Weights file to write."""
     preset: Annotated[
         Literal["slim", "paper", "paper-slim", "multi"] | None,
-        tyro.conf.arg(aliases=["--size"], metavar="{slim,paper,paper-slim,multi}", help_behavior_hint="(default: slim)"),
+        tyro.conf.arg(aliases=["--size"], metavar="{slim,paper,paper-slim,multi}", help_behavior_hint="(default: multi)"),
     ] = None
-    """Network: slim (narrow, told the placement), paper, paper-slim (the paper's, narrow), or multi (the default weights')."""
+    """Network: multi, or slim (that of the default weights: narrow, told the placement), paper, or paper-slim (the paper's,
+    as narrow)."""
     latent: Annotated[int | None, optional("N", "the preset's")] = None
     """Numbers in z."""
-    latent_form: Annotated[Literal["kernel", "motion"] | None, optional("{kernel,motion}", "the preset's")] = None
-    """kernel: z enters the kernel alone, the paper's form; motion: z also moves the open hand, as pretraining taught it."""
+    latent_form: Annotated[str | None, FORMER_OPTION] = None
+    """No longer a choice: the preset decides."""
     initial: Annotated[str | None, optional("NAME|PATH", "none")] = None
     """Weights to begin with. They decide the network; `train` keeps their hand encoder as it is."""
     learning_rate: float = 1e-3
@@ -69,22 +74,36 @@ class Stage:
         return schedule
 
 
-def network_config(preset: str | None, initial: DistanceNetwork | None = None, **options: Any) -> NetworkConfig:
-    """The configuration of a preset, else of the initial weights, with the options that are given (not None).
+def network_config(
+    preset: str | None, latent: int | None, initial: DistanceNetwork | None = None, **former: str | None
+) -> NetworkConfig:
+    """The configuration of a preset, else of the initial weights, with numbers in z if they are given.
+
+    Args:
+        preset: Its name; None takes that of the initial weights, or `multi`.
+        latent: Numbers in z.
+        initial: Weights to begin with.
+        former: Options that are no longer a choice, by the names of the settings they were.
 
     Raises:
-        OptionError: A value is out of range.
+        OptionError: There is no number in z, or a former option asks for something else than the network is.
     """
     import dataclasses
 
     from dro_grasp.errors import OptionError
-    from dro_grasp.models.presets import NetworkConfig
+    from dro_grasp.models.presets import FORMER, LAST_WITH_OTHERS, NetworkConfig
 
-    asked = {name: value for name, value in options.items() if value is not None}
-    if asked.get("latent", 1) < 1:
-        raise OptionError(f"latent is {asked['latent']}; z needs at least one number")
-    network = NetworkConfig.preset(preset or "slim") if initial is None or preset is not None else initial.config
-    return dataclasses.replace(network, **asked)
+    if latent is not None and latent < 1:
+        raise OptionError(f"latent is {latent}; z needs at least one number")
+    network = NetworkConfig.preset(preset or "multi") if initial is None or preset is not None else initial.config
+    for name, asked in former.items():
+        option, fixed = f"--{name.replace('_', '-')}", FORMER[network.frame][name]
+        if asked not in (None, fixed):
+            raise OptionError(f"{option} is no longer a choice: it is {fixed} in frame '{network.frame}', and {asked} was last "
+                              f"possible in {LAST_WITH_OTHERS}; leave it out, or choose another --preset")
+        if asked is not None:
+            say_aside(f"warning: {option} is no longer a choice; {fixed} is what this network has, so leave the option out")
+    return network if latent is None else dataclasses.replace(network, latent=latent)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,19 +135,19 @@ class Pretrain(Stage):
 
         check_output(self.output, ".safetensors")
         initial = None if self.initial is None else load_weights(self.initial)
-        network = network_config(self.preset, initial, latent=self.latent, latent_form=self.latent_form)
+        network = network_config(self.preset, self.latent, initial, latent_form=self.latent_form)
         schedule = self.schedule(steps=self.steps, learning_rate=self.learning_rate)
         bundle = load_bundle(self.bundle)
         config = PretrainConfig(schedule)
         motion = MotionConfig(dataclasses.replace(schedule, steps=self.motion_steps))
         model = pretrain(bundle, network, config, self.run_folder, initial=initial)
-        if network.latent_form == "motion":
+        if network.placed:
             model = pretrain_motion(model, bundle, motion, self.run_folder / "motion")
         if not is_first():
             return 0
         settings: dict[str, Any] = {"encoder": config}
         took = how_long(self.run_folder)
-        if network.latent_form == "motion":
+        if network.placed:
             settings["motion"] = motion
             took["seconds"] += how_long(self.run_folder / "motion")["seconds"]
         about = took | {
@@ -152,9 +171,6 @@ class Train(Stage):
     --output my_weights.safetensors
     """
 
-    method: Literal["dro", "gendexgrasp", "manifm"] = "dro"
-    """What is trained: the D(R,O) network, or that of GenDexGrasp or in the style of ManiFM, to which only bundle, folder,
-    output, steps, minutes, learning rate, device and seed apply."""
     part: Literal["all", "placement"] = "all"
     """placement: train the placement prior of --initial further, alone: it shares nothing with the rest, and wants more
     grasps (steps of 96, hands by the square root of their grasps). Options of z, losses, samples and columns do not apply."""
@@ -162,12 +178,12 @@ class Train(Stage):
     """Weights from `dro-grasp pretrain`; without them, and without --initial, the hand encoder is trained along."""
     steps: Annotated[int | None, optional("N", "10000, or 1300 of the placement prior")] = None
     """Optimiser steps."""
-    prior: Annotated[
-        Literal["standard", "learned", "flow"] | None, optional("{standard,learned,flow}", "the preset's")] = None
-    """Distribution of z: standard (N(0, I), the paper's form), or a Gaussian or a flow learned from hand and object."""
-    placement_hand: Annotated[
-        Literal["features", "proportions"] | None, optional("{features,proportions}", "the preset's")] = None
-    """What the placement prior knows of a hand: the encoder's features, or proportions, which serve hands never seen better."""
+    prior: Annotated[str | None, FORMER_OPTION] = None
+    """No longer a choice: the preset decides."""
+    placement_hand: Annotated[str | None, FORMER_OPTION] = None
+    """No longer a choice: the preset decides."""
+    method: Annotated[str | None, FORMER_OPTION] = None
+    """No longer a choice: other methods are trained outside of the package."""
     losses: Literal["ours", "release"] = "ours"
     """Weights of the losses and form of the KL divergence: ours, or those of the official release."""
     divergence: Annotated[float | None, optional("WEIGHT", "0.01")] = None
@@ -216,15 +232,16 @@ class Train(Stage):
         from dro_grasp.training.processes import is_first
 
         check_output(self.output, ".safetensors")
-        if self.method != "dro":
-            return self._baseline()
+        if self.method not in (None, "dro"):
+            raise OptionError(f"train trains the D(R,O) network alone, not {self.method}; in a clone of the repository, "
+                              "`python -m lab.methods.train` trains GenDexGrasp's and ManiFM's")
         if self.part == "placement" and (self.initial is None or self.pretrained is not None):
             raise OptionError("--part placement trains the placement prior of given weights further: name them with --initial, "
                               "and leave out --pretrained")
         given = [name for name in (self.initial, self.pretrained) if name is not None]
         pretrained, initial = (None if name is None else load_weights(name) for name in (self.pretrained, self.initial))
         network = network_config(
-            self.preset, initial, latent=self.latent, prior=self.prior, latent_form=self.latent_form,
+            self.preset, self.latent, initial, prior=self.prior, latent_form=self.latent_form,
             placement_hand=self.placement_hand)
         losses = dataclasses.replace(LOSSES[self.losses], divergence_warmup=self.divergence_warmup, free_bits=self.free_bits,
                                      drawn=self.drawn)
@@ -258,32 +275,6 @@ class Train(Stage):
         if errors and not self.json:
             rows = [[e.hand, 1e3 * e.posterior, 1e3 * e.prior, e.divergence] for e in errors]
             print_table("distance error", ["hand", "posterior z [mm]", "prior z [mm]", "divergence [nat]"], rows)
-        return 0
-
-    def _baseline(self) -> int:
-        """Train the network of a method beside D(R,O)."""
-        import dataclasses
-
-        from dro_grasp.baselines.gendexgrasp.map_training import MapTrainingConfig, train_contact_maps
-        from dro_grasp.baselines.manifm.contact_training import ContactTrainingConfig, train_contacts
-        from dro_grasp.datasets.bundle.training_file import load_bundle
-        from dro_grasp.models.checkpoints import save_weights
-        from dro_grasp.training.processes import is_first
-
-        schedule, bundle = self.schedule(steps=self.all_steps, learning_rate=self.learning_rate), load_bundle(self.bundle)
-        if self.method == "manifm":
-            config: Any = ContactTrainingConfig(schedule)
-            model: Any = train_contacts(bundle, config, self.run_folder)
-        else:
-            config = MapTrainingConfig(schedule)
-            model = train_contact_maps(bundle, config, self.run_folder)
-        if not is_first():
-            return 0
-        about = how_long(self.run_folder) | {
-            "stage": self.method, "data": bundle.summary(), "settings": dataclasses.asdict(config)}
-        save_weights(model, self.output, about)
-        report = {"output": str(self.output), "steps": about["steps"], "log": str(self.run_folder / "log.jsonl")}
-        print_result(self.json, report, "training", ["weights", "steps", "log"], [[*report.values()]])
         return 0
 
 

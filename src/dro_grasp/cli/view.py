@@ -17,20 +17,20 @@ if TYPE_CHECKING:
 
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.objects.shape import ObjectModel
-    from dro_grasp.viewer.stage import Place
+    from dro_grasp.viewer.scene_view import Client
     from dro_grasp.viewer.studio import Studio
 
 MAX_SIDE = 4096
 """Largest width and height of one picture [pixels]."""
 MAX_PIXELS = 50_000_000
 """Most pixels of all pictures on a sheet together."""
-LISTED = 8
+MAX_LISTED = 8
 """Most objects that an error names."""
 
 
 @dataclass(frozen=True)
 class View:
-    """View grasps, the plan of a lift, or attempts of an arm in the browser, or generate grasps there.
+    """View grasps, the plan of a lift, or attempts of an arm in the browser, or make grasps there. Needs the extra `[apps]`.
 
     Example: dro-grasp view grasps.parquet
     """
@@ -59,18 +59,20 @@ class View:
 
     def run(self) -> int:
         """Serve the page, with the grasps of the file if there is one."""
+        from dro_grasp.extras import require_extra
+
+        require_extra("apps")
         from dro_grasp.predict.predictor import GraspPredictor
-        from dro_grasp.viewer.stage import serve
+        from dro_grasp.viewer.scene_view import serve
         from dro_grasp.viewer.studio import Studio, StudioServer
 
         if self.file is None:
             serve(StudioServer(self._picked(), self.port, self.host))
             return 0
         if is_motion(self.file):
-            from dro_grasp.planning.extra import require_arm_extra
+            require_extra("arm")
             from dro_grasp.viewer.lift_page import lift_page
 
-            require_arm_extra()
             serve(lift_page(self.file, self.attempt, self.robot, self.weights, self.port, self.host))
             return 0
         from dro_grasp.grasps.reading import load_grasps
@@ -83,15 +85,15 @@ class View:
         given = self.object is not None and self.object not in dict(grasps.by_object())
         predictor = GraspPredictor(self.weights, self.device)
 
-        def opened(place: Place, turn: Lock) -> Studio:
-            studio = Studio(place, predictor, turn=turn, preview=False)
+        def opened(client: Client, turn: Lock) -> Studio:
+            studio = Studio(client, predictor, turn=turn, preview=False)
             studio.open(hand, chosen if given else grasps, obj if given else None, self.object)
             return studio
 
         serve(StudioServer(opened, self.port, self.host))
         return 0
 
-    def _picked(self) -> Callable[[Place, Lock], Studio]:
+    def _picked(self) -> Callable[[Client, Lock], Studio]:
         """A page without a file: the hand and the object that are named are picked."""
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.catalogue import load_object
@@ -102,8 +104,8 @@ class View:
         obj = None if self.object is None else load_object(self.object, scale=self.scale)
         predictor = GraspPredictor(self.weights, self.device)
 
-        def opened(place: Place, turn: Lock) -> Studio:
-            studio = Studio(place, predictor, turn=turn, preview=hand is None and obj is None)
+        def opened(client: Client, turn: Lock) -> Studio:
+            studio = Studio(client, predictor, turn=turn, preview=hand is None and obj is None)
             if hand is not None or obj is not None:
                 studio.offer(hand, obj)
             return studio
@@ -171,7 +173,7 @@ class Picture:
         from dro_grasp.errors import GraspFileError
 
         def wanted(own: GraspBatch) -> GraspBatch:
-            return own if not self.only_successful else own[own.success.nonzero()[:, 0]]
+            return own if not self.only_successful else own[own.trial_success]
 
         names = [self.object] if self.object is not None else [
             name for name, own in grasps.by_object() if len(wanted(own))]
@@ -223,7 +225,7 @@ def of_object(grasps: GraspBatch, name: str | None, scale: float) -> tuple[Objec
 
     parts = dict(grasps.by_object())
     if name is not None and name not in parts and len(parts) > 1:
-        listed = ", ".join(list(parts)[:LISTED]) + (", ..." if len(parts) > LISTED else "")
+        listed = ", ".join(list(parts)[:MAX_LISTED]) + (", ..." if len(parts) > MAX_LISTED else "")
         raise OptionError(f"--object is '{name}', but the grasps are of {len(parts)} objects ({listed}); give one of these "
                           "names: another object fits only a file of one object")
     own = name if name in parts else grasps.object[0]

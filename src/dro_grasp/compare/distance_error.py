@@ -57,7 +57,7 @@ def distance_errors(network: DistanceNetwork, bundle: Bundle, samples: int = SAM
             true = distance_matrix.build(drawn.grasp, drawn.obj)
             output = network(drawn.placed, drawn.obj, drawn.grasp, posterior)
             prior = network.predict(drawn.placed, drawn.obj, network.sample_latent(count, generator))
-            nats = divergence(output.mean, output.log_variance, output.prior_mean, output.prior_log_variance).sum(-1)
+            nats = divergence(output.mean, output.log_variance).sum(-1)
             errors = [(d - true).abs().mean((1, 2)) for d in (output.distances, prior)]
             parts.append(torch.stack([*errors, nats]))
             left -= count

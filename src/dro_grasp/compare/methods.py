@@ -10,6 +10,7 @@ import torch
 from dro_grasp.geometry.se3 import apply
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import Checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.config import GraspRequest, PredictorConfig
 from dro_grasp.predict.predictor import GraspPredictor, Prediction
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class MethodOptions:
+class MethodOptions(Checked):
     """What methods are made with."""
 
     weights: str | None = None
@@ -34,24 +35,29 @@ class MethodOptions:
     """Spread of z of the D(R,O) network."""
     bundle: Bundle | None = None
     """Training grasps, for the mean grasp."""
+    candidates: int = GraspRequest.candidates
+    """Candidates for each grasp that a method returns."""
 
 
 class Method:
     """A source by the name that it has in tables."""
 
-    def __init__(self, source: str | Source, predictor: GraspPredictor, name: str | None = None) -> None:
+    def __init__(
+        self, source: str | Source, predictor: GraspPredictor, name: str | None = None, candidates: int = GraspRequest.candidates
+    ) -> None:
         """Find the source.
 
         Args:
             source: A source, or its name; `auto` proposes with the network, and returns what that rule does.
             predictor: Finishes what the source proposes, with the same configuration for every method of a table.
             name: Its name in tables; the source's own if omitted.
+            candidates: Made for each grasp that is returned.
 
         Raises:
             OptionError: There is no such source.
         """
         source = present_name(source) if isinstance(source, str) else source
-        self.predictor, self.source = predictor, predictor.source(source)
+        self.predictor, self.source, self.candidates = predictor, predictor.source(source), candidates
         self.asks = AUTO if source == AUTO else self.source
         self.name = name or (AUTO if source == AUTO else self.source.name)
 
@@ -74,7 +80,7 @@ class Method:
         Raises:
             NoGraspError: There is none.
         """
-        return self.predictor.run(problem, GraspRequest(num, seed, source=self.asks))
+        return self.predictor.run(problem, GraspRequest(num, seed, self.candidates, source=self.asks))
 
     def predict(self, hand: Hand, obj: ObjectModel, num: int = 16, seed: int = 0) -> GraspBatch:
         """Grasps as `GraspPredictor.predict` returns them: at most `num`, the same for the same seed."""
@@ -103,8 +109,10 @@ def make_method(name: str, options: MethodOptions | None = None) -> Method:
         config = replace(config, network=replace(config.network, temperature=options.temperature))
     predictor = GraspPredictor(weights if own else options.weights, options.device, config)
     if plain in WITH_DATA:
-        return Method(make_source(plain, None if options.bundle is None else mean_grasps_of(options.bundle)), predictor)
-    return Method(plain, predictor, f"{plain}@{weights}") if own else Method(f"{plain}{at}{weights}", predictor)
+        means = None if options.bundle is None else mean_grasps_of(options.bundle)
+        return Method(make_source(plain, means), predictor, candidates=options.candidates)
+    source, label = (plain, f"{plain}@{weights}") if own else (f"{plain}{at}{weights}", None)
+    return Method(source, predictor, label, options.candidates)
 
 
 def mean_grasps_of(bundle: Bundle) -> dict[str, MeanGrasp]:

@@ -16,6 +16,7 @@ from dro_grasp.compare.rows import EvaluatedGrasps, Row, average, hand_row
 from dro_grasp.errors import NoGraspError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import Checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.partial_views import View, partial_view
 from dro_grasp.predict.finish import finish
@@ -56,7 +57,7 @@ KEPT = 0.25
 
 
 @dataclass(frozen=True)
-class BenchmarkConfig:
+class BenchmarkConfig(Checked):
     """What is measured."""
 
     num: int = 100

@@ -66,7 +66,8 @@ def as_obj(file: Path) -> bytes:
     """A mesh in any format trimesh reads, as OBJ text."""
     import trimesh
 
-    with reading(f"mesh {file}", HandError, "STL, OBJ, GLB, DAE or PLY, whole"):
+    # trimesh alone is called here, and its many readers raise whatever they stumble over.
+    with reading(f"mesh {file}", HandError, "STL, OBJ, GLB, DAE or PLY, whole", Exception):
         loaded = open_mesh(file)
         mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
         return trimesh.exchange.obj.export_obj(mesh, include_normals=False, include_texture=False).encode()

@@ -10,10 +10,11 @@ from torch import Tensor
 
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import Checked
 
 
 @dataclass(frozen=True)
-class ContactConfig:
+class ContactConfig(Checked):
     """Selection of contact candidates."""
 
     closing: float = 0.55

@@ -21,6 +21,7 @@ from dro_grasp.geometry import se3
 from dro_grasp.geometry.balls import Balls
 from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import Checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.records import on_device
 
@@ -29,7 +30,7 @@ TERMS = ("force_closure", "distance", "penetration", "self_penetration", "alignm
 
 
 @dataclass(frozen=True)
-class EnergyConfig:
+class EnergyConfig(Checked):
     """Weights and geometry of the energy. Source: DexGraspNet, unless stated otherwise."""
 
     force_closure: float = 1.0

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dro_grasp.geometry import se3
 from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.opening import open_side_by_side
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,8 @@ class LinkSpheres:
 def link_spheres(hand: Hand) -> LinkSpheres:
     """Spheres along the longest axis of each link, from its surface points.
 
-    Pairs on links of one rigid group or of neighbouring groups, and pairs that overlap in the open hand, may touch.
+    Pairs on links of one rigid group or of neighbouring groups, and pairs that overlap in the open hand, fingers side by side,
+    may touch.
     """
     centres, radii, links = [], [], []
     for link in hand.link_index.unique().tolist():
@@ -44,7 +46,7 @@ def link_spheres(hand: Hand) -> LinkSpheres:
     pairs = torch.combinations(torch.arange(len(links)), 2)
     near = _neighbours(hand)
     pairs = pairs[~near[link_of[pairs[:, 0]], link_of[pairs[:, 1]]]]
-    poses = hand.tree.forward(hand.canonical_joints(0.9))[link_of]
+    poses = hand.tree.forward(open_side_by_side(hand, 0.9))[link_of]
     placed = se3.apply(poses, centre)
     apart = (placed[pairs[:, 0]] - placed[pairs[:, 1]]).norm(dim=-1)
     pairs = pairs[apart > radius[pairs[:, 0]] + radius[pairs[:, 1]]]

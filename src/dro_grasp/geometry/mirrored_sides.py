@@ -14,10 +14,11 @@ from torch import Tensor
 
 from dro_grasp.geometry.registration import register
 from dro_grasp.geometry.se3 import apply_to_cloud
+from dro_grasp.kinds import Checked
 
 
 @dataclass(frozen=True)
-class SideConfig:
+class SideConfig(Checked):
     """Settings of the choice. Values are ours."""
 
     rounds: int = 4

@@ -11,9 +11,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from dro_grasp.kinds import Checked
+
 
 @dataclass(frozen=True)
-class MultilaterationConfig:
+class MultilaterationConfig(Checked):
     """Settings of the closed form and of the refinement. Values are ours."""
 
     ridge: float = 1e-8

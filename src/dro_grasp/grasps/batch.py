@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from dro_grasp.errors import GraspFileError
+from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.files import check_output, reading, replacing
 from dro_grasp.grasps import codec, columns, summary
 from dro_grasp.grasps.table import EXPECTED, read_table, table_bytes
@@ -65,8 +65,8 @@ class GraspBatch:
     """Predicted log-odds that the grasp holds; higher is better."""
     energy: Float[Tensor, " n"]
     """Grasp energy; lower is better."""
-    success: Bool[Tensor, " n"]
-    """Whether the grasp held in its trial; False for grasps that were not evaluated."""
+    trial_success: Bool[Tensor, " n"]
+    """What `success` returns; also there while no grasp has been evaluated, and then False."""
     displacement: Float[Tensor, " n"]
     """Largest displacement of the object in the trial [m]."""
     rotation: Float[Tensor, " n"]
@@ -138,23 +138,27 @@ class GraspBatch:
         """The grasps at an index, slice, list of indices, index tensor or mask; always a batch.
 
         Raises:
-            OptionError: The mask is `success`, and no grasp has been evaluated.
+            OptionError: It is none of these, such as a single True.
             IndexError: There is no such grasp.
         """
-        if index is self.success:
-            columns.require_outcomes(self)
-        if isinstance(index, int) and not -len(self) <= index < len(self):
-            raise IndexError(f"grasp {index} of a batch of {len(self)}")
-        if isinstance(index, slice):
-            return self._take(torch.tensor(range(len(self))[index], dtype=torch.long))
-        rows = torch.arange(len(self))
-        chosen = torch.as_tensor(index).cpu()
-        return self._take(rows[chosen if chosen.numel() else chosen.long()].reshape(-1))
+        return self._take(columns.rows_at(index, len(self)))
 
     def _take(self, rows: Int[Tensor, " k"]) -> GraspBatch:
         fields = {name: columns.taken(getattr(self, name), rows) for name in columns.COLUMNS}
         extra = {name: columns.taken(column, rows) for name, column in self.extra.items()}
         return self.replace(**fields, extra=extra, asked_of={})
+
+    @property
+    def success(self) -> Bool[Tensor, " n"]:
+        """Whether each grasp held in its trial; False for those without one where others have had theirs (`evaluated`).
+
+        Raises:
+            OptionError: No grasp has been evaluated, so that nothing is known of any.
+        """
+        if len(self) and not self.evaluated.any():
+            raise OptionError("these grasps have not been tried, so none is known to hold; run trials first: "
+                              "grasps = dro_grasp.evaluate(dro_grasp.GraspProblem(hand, obj), grasps), or grasps.with_trial")
+        return self.trial_success
 
     def by_object(self) -> Iterator[tuple[str, GraspBatch]]:
         """Each object's name with its grasps, as the objects appear; a second one of its name, by the hash, is `NAME (2)`."""
@@ -162,7 +166,9 @@ class GraspBatch:
         return ((name, part.replace(asked_of=columns.asked_among(self.asked_of, part))) for name, part in parts)
 
     def replace(self, **changes: Any) -> GraspBatch:
-        """The same batch with other values for some fields."""
+        """The same batch with other values for some fields, `success` among them."""
+        if "success" in changes:
+            changes["trial_success"] = changes.pop("success")
         return dataclasses.replace(self, **changes)
 
     def without(self, *names: str) -> GraspBatch:
@@ -179,7 +185,7 @@ class GraspBatch:
     @cached_property
     def evaluated(self) -> Bool[Tensor, " n"]:
         """Which grasps have been through a trial."""
-        return torch.tensor([p != columns.NOT_EVALUATED for p in self.protocol], dtype=torch.bool, device=self.success.device)
+        return torch.tensor([p != columns.NOT_EVALUATED for p in self.protocol], dtype=torch.bool, device=self.joints.device)
 
     @property
     def asked(self) -> int | None:

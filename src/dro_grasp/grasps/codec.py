@@ -37,7 +37,7 @@ def encode(batch: Any) -> tuple[dict[str, pa.Array], dict[str, Any]]:
         "joints": float_column(batch.joints),
     }
     stored |= {name: float_column(getattr(batch, name)) for name in (*columns.POSTURES, *columns.FLOATS)}
-    stored["success"] = pa.array(batch.success.cpu().numpy(), mask=(~batch.evaluated).cpu().numpy())
+    stored["success"] = pa.array(batch.trial_success.cpu().numpy(), mask=(~batch.evaluated).cpu().numpy())
     stored["protocol"] = pa.array([p or None for p in batch.protocol], pa.string())
     for name in columns.TEXTS[1:]:
         stored[name] = pa.array(list(getattr(batch, name)), pa.string())
@@ -86,7 +86,7 @@ def decode(table: pa.Table, header: dict[str, Any], path: str) -> dict[str, Any]
     fields |= {name: numbers(name, n_dof) for name in columns.POSTURES} | {name: numbers(name, None) for name in columns.FLOATS}
     if "energy" not in table.column_names:
         fields |= _energy_apart(fields["score"], fields["provenance"], table)
-    known = {*columns.COLUMNS, *REQUIRED}
+    known = {*columns.COLUMNS, *REQUIRED, "success"}
     extra = {name: _decode_further(table[name]) for name in table.column_names if name not in known}
     if not isinstance(extra.get(OBJECT_SCALE), Tensor):  # null for every grasp
         extra.pop(OBJECT_SCALE, None)
@@ -96,7 +96,7 @@ def decode(table: pa.Table, header: dict[str, Any], path: str) -> dict[str, Any]
         "T_object_wrist": T, "joints": joints,
         "hand": header["hand"], "hand_sha256": header["hand_sha256"], "wrist_link": header["wrist_link"],
         "joint_names": tuple(header["joint_names"]), "seed": torch.tensor(seed, dtype=torch.int64),
-        "success": torch.tensor([bool(s) for s in success], dtype=torch.bool), "protocol": protocol, **fields,
+        "trial_success": torch.tensor([bool(s) for s in success], dtype=torch.bool), "protocol": protocol, **fields,
         "extra": extra, "asked_of": {(name, sha256): num for name, sha256, num in (
             (one[key] for key in ASKED_OF) for one in header.get(ASKED, ()))},
     }

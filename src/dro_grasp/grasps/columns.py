@@ -13,6 +13,7 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
+from dro_grasp.files import TOLD
 from dro_grasp.frames import ROUNDING, are_rotations
 
 TRIAL_FLOATS = ("displacement", "rotation", "penetration", "robustness", "fingers_in_contact")
@@ -23,7 +24,7 @@ POSTURES = ("pregrasp_joints", "squeeze_joints")
 """Columns of one number per joint; a row of NaN is not stated."""
 TEXTS = ("object", "object_sha256", "split", "provenance")
 """Columns of one string per grasp; the empty string is unknown."""
-COLUMNS = ("T_object_wrist", "joints", "seed", "success", "protocol", *FLOATS, *POSTURES, *TEXTS)
+COLUMNS = ("T_object_wrist", "joints", "seed", "trial_success", "protocol", *FLOATS, *POSTURES, *TEXTS)
 """Fields of a batch with one entry per grasp."""
 MAY_BE_UNKNOWN = ("score", "energy", *POSTURES)
 """Columns that say nothing about a grasp until somebody fills them; those of its trial are the others."""
@@ -31,7 +32,7 @@ NOT_EVALUATED = ""
 """Protocol of a grasp without a trial."""
 UNKNOWN_PROTOCOL = "unknown"
 """Protocol of a grasp whose outcome is known without its protocol."""
-MEASURED = ("success", "protocol", *TRIAL_FLOATS)
+MEASURED = ("trial_success", "protocol", *TRIAL_FLOATS)
 """Fields of a batch that a trial fills."""
 REASON = "reason"
 """Further column: why a grasp failed, in words; empty for a success."""
@@ -72,9 +73,9 @@ def require_fit(batch: Any, n_names: int) -> None:
         raise ValueError(f"a batch of {len(batch)} grasps has columns of other lengths: {wrong}")
     if batch.joints.shape[1] != n_names:
         raise ValueError(f"{batch.joints.shape[1]} values for {n_names} joint names")
-    if taken_names := sorted(batch.extra.keys() & set(COLUMNS)):
+    if taken_names := sorted(batch.extra.keys() & {*COLUMNS, "success"}):
         raise ValueError(f"further columns have the names of fields: {taken_names}; set the fields instead")
-    if bool((batch.success & ~batch.evaluated).any()):
+    if bool((batch.trial_success & ~batch.evaluated).any()):
         raise ValueError("some grasps succeeded without a protocol; name the protocol of their trial")
 
 
@@ -92,24 +93,42 @@ def placed(T_object_wrist: Any, joints: Any, n_dof: int) -> tuple[Float[Tensor, 
         raise OptionError(f"wrist poses of shape {tuple(T.shape)} and joints of shape {tuple(q.shape)}; expected (n, 4, 4) and "
                           f"(n, {n_dof}) for this hand")
     if wrong := (~(T.isfinite().all(-1).all(-1) & q.isfinite().all(-1))).nonzero()[:, 0].tolist():
-        raise OptionError(f"grasp {wrong[0]} has a pose or joints that are not finite, and {len(wrong) - 1} more have; leave "
-                          "them out")
+        raise OptionError(f"{_named(wrong)} a pose or joints that are not finite; leave out what is not finite")
     rigid = are_rotations(T[:, :3, :3]) & ((T[:, 3] - T.new_tensor([0, 0, 0, 1])).abs() <= ROUNDING).all(-1)
     if wrong := (~rigid).nonzero()[:, 0].tolist():
-        raise OptionError(f"the wrist pose of grasp {wrong[0]} is no rigid motion, and {len(wrong) - 1} more; give rotation "
-                          "matrices, and metres beside them")
+        raise OptionError(f"{_named(wrong)} a wrist pose that is no rigid motion; give rotation matrices, and metres beside "
+                          "them")
     return T, q
 
 
-def require_outcomes(batch: Any) -> None:
-    """Refuse grasps without any trial where successes are asked for.
+def _named(wrong: Sequence[int]) -> str:
+    """The first of some grasps by number and the count of the others, as the subject of a sentence, with its verb."""
+    others = len(wrong) - 1
+    return f"grasp {wrong[0]}{f' and {others} more have' if others else ' has'}"
+
+
+def rows_at(index: Any, n: int) -> Int[Tensor, " k"]:
+    """The rows of a batch of n grasps that an index, slice, list, index tensor or mask chooses.
 
     Raises:
-        OptionError: No grasp has been evaluated.
+        OptionError: It is none of these. True and False are no rows: as masks without axes they would choose all or none.
+        IndexError: There is no such grasp.
     """
-    if len(batch) and not batch.evaluated.any():
-        raise OptionError("no grasp has been evaluated, so none is known to hold; run trials first: "
-                          "grasps = dro_grasp.evaluate(dro_grasp.GraspProblem(hand, obj), grasps)")
+    if isinstance(index, slice):
+        return torch.tensor(range(n)[index], dtype=torch.long)
+    try:
+        chosen = torch.as_tensor(_own(index)).cpu()
+    except (TypeError, ValueError, RuntimeError):  # what PyTorch raises for things that are no arrays of numbers
+        chosen = None
+    if chosen is not None and not chosen.numel():
+        return torch.empty(0, dtype=torch.long)
+    mask = chosen is not None and chosen.dtype == torch.bool
+    if chosen is None or chosen.is_floating_point() or chosen.is_complex() or (mask and chosen.ndim != 1):
+        raise OptionError(f"{str(index)[:TOLD]} chooses no grasps; give an index, a slice, a list of indices, or a mask with "
+                          "one truth value a grasp")
+    if (not mask and bool(((chosen < -n) | (chosen >= n)).any())) or (mask and len(chosen) != n):
+        raise IndexError(f"mask of {len(chosen)} for a batch of {n}" if mask else f"grasp {index} of a batch of {n}")
+    return torch.arange(n)[chosen].reshape(-1)
 
 
 def places(objects: Sequence[str], hashes: Sequence[str]) -> dict[str, list[int]]:
@@ -174,13 +193,20 @@ def filled(joints: Float[Tensor, "n n_dof"], known: Mapping[str, Any], given: Ma
     """All fields of a batch but poses and joints: those known, those given, and the others unknown.
 
     Raises:
-        OptionError: A given column of numbers holds something else, or has another shape.
+        OptionError: There is no such column, or one holds something else, or has another shape.
     """
     n = len(joints)
     fields: dict[str, Any] = {name: unknown(name, joints) for name in COLUMNS[2:]} | dict(known)
+    names = [name.replace("trial_success", "success") for name in fields]
+    if wrong := [name for name in given if name not in {*names, "extra"}]:
+        raise OptionError(f"grasps have no column '{wrong[0]}'; they have {', '.join(names)}, and in extra, a dictionary, what "
+                          "you like")
     if "success" in given:
         fields["protocol"] = (UNKNOWN_PROTOCOL,) * n
+        fields["trial_success"] = _numbers("success", given["success"], fields["trial_success"])
     for name, value in given.items():
+        if name == "success":
+            continue
         if isinstance(fields.get(name), Tensor):
             fields[name] = _numbers(name, value, fields[name])
         elif name == "extra":
@@ -189,13 +215,22 @@ def filled(joints: Float[Tensor, "n n_dof"], known: Mapping[str, Any], given: Ma
             fields[name] = tuple(value.tolist()) if isinstance(value, np.ndarray) else value
     if isinstance(fields["provenance"], str):
         fields["provenance"] = (fields["provenance"],) * n
+    for name in (*TEXTS, "protocol"):
+        if not isinstance(texts := fields[name], list | tuple) or not all(isinstance(text, str) for text in texts):
+            raise OptionError(f"{name} is {str(texts)[:TOLD]!r}; give one text for each of the {n} grasps")
+        if len(texts) != n:
+            raise OptionError(f"{name} has {len(texts)} texts; give one for each of the {n} grasps")
+        fields[name] = tuple(texts)
     return fields
 
 
 def _numbers(name: str, value: Any, like: Shaped[Tensor, "n *k"]) -> Shaped[Tensor, "n *k"]:
     """A given column in type, shape and place of an unknown one; one seed stands for all."""
     try:
-        column = torch.as_tensor(_own(value), dtype=like.dtype, device=like.device)
+        column = torch.as_tensor(_own(value))
+        if column.is_floating_point() and not like.is_floating_point():
+            raise ValueError("it has fractions")
+        column = column.to(like.device, like.dtype)
     except (TypeError, ValueError, RuntimeError) as error:
         raise OptionError(f"{name} is no array of numbers ({error}); give one of shape {tuple(like.shape)}, or leave it "
                           "out") from error
@@ -227,7 +262,7 @@ def outcomes(trial: Any, n: int, extra: Mapping[str, Any]) -> dict[str, Any]:
         FAILURE: [failure.name if failure else None for failure in trial.failure],
     }
     return {
-        "success": trial.success, "displacement": trial.displacement.amax(-1), "rotation": trial.rotation.amax(-1),
+        "trial_success": trial.success, "displacement": trial.displacement.amax(-1), "rotation": trial.rotation.amax(-1),
         "penetration": trial.penetration, "robustness": trial.robustness,
         "fingers_in_contact": trial.fingers_in_contact.float(), "protocol": (trial.protocol,) * n,
         "extra": {**extra, **further},
@@ -241,7 +276,7 @@ def unknown(name: str, joints: Float[Tensor, "n n_dof"]) -> Any:
         return torch.full((n,), torch.nan, device=joints.device)
     if name in POSTURES:
         return torch.full_like(joints, torch.nan)
-    if name in {"seed", "success"}:
+    if name in {"seed", "trial_success"}:
         return torch.zeros(n, dtype=torch.int64 if name == "seed" else torch.bool, device=joints.device)
     return ("",) * n
 

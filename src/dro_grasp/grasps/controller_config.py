@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from dro_grasp.kinds import Checked
+
 
 @dataclass(frozen=True)
-class ControllerConfig:
+class ControllerConfig(Checked):
     """How far joints move from a grasp."""
 
     outer: float = 0.25

@@ -27,7 +27,7 @@ def sentence(grasps: Any) -> str:
     parts = [f"{len(grasps)} grasp{'' if len(grasps) == 1 else 's'}{short}", f"hand '{grasps.hand}'", _objects(grasps)]
     protocols = Counter(p for p in grasps.protocol if p != NOT_EVALUATED)
     for protocol, count in protocols.items():
-        held = sum(s for s, p in zip(grasps.success.tolist(), grasps.protocol, strict=True) if p == protocol)
+        held = sum(s for s, p in zip(grasps.trial_success.tolist(), grasps.protocol, strict=True) if p == protocol)
         count += missing if len(protocols) == 1 else 0
         parts.append(f"{held} of {count} hold under {protocol}")
     if not grasps.evaluated.all():

@@ -58,7 +58,7 @@ def read_table(path: Path | str | io.BytesIO) -> tuple[pa.Table, dict[str, Any]]
     Raises:
         GraspFileError: No such file, a truncated or foreign one, or one of another version.
     """
-    with reading(path, GraspFileError, EXPECTED):
+    with reading(path, GraspFileError, EXPECTED, pa.ArrowException):
         table = pq.read_table(_existing(path))
         header = read_header(path, table.schema)
         check_columns(table.schema, path)
@@ -71,7 +71,7 @@ def read_footer(path: Path | str) -> tuple[int, dict[str, Any]]:
     Raises:
         GraspFileError: As `read_table`.
     """
-    with reading(path, GraspFileError, EXPECTED):
+    with reading(path, GraspFileError, EXPECTED, pa.ArrowException):
         footer = pq.read_metadata(_existing(path))
         return footer.num_rows, read_header(path, footer.schema.to_arrow_schema())
 
@@ -96,6 +96,8 @@ def read_header(path: Path | str | io.BytesIO, schema: pa.Schema) -> dict[str, A
         raise GraspFileError(f"{path} is Parquet, but no grasp file: its schema has no 'dro_grasp' metadata")
     with reading(path, GraspFileError, "a 'dro_grasp' header, which is garbled; write the file again"):
         header = json.loads(raw)
+        if not isinstance(header, dict):
+            raise ValueError(f"it holds a {type(header).__name__}")
         version = header["format_version"]
     if version != FORMAT_VERSION:
         raise GraspFileError(

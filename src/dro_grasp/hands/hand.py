@@ -125,6 +125,12 @@ class Hand:
         """Greatest value of each joint in use [rad or m]: its upper limit, or its open end."""
         return torch.maximum(self.open_ends, self.closed_ends)
 
+    @cached_tensor
+    def neutral(self) -> Float[Tensor, " n_dof"]:
+        """Zero, or what is nearest to it a quarter of a joint's range inside its limits [rad or m]."""
+        margin = 0.25 * (self.tree.upper - self.tree.lower)
+        return torch.zeros_like(margin).clamp(self.tree.lower + margin, self.tree.upper - margin)
+
     @property
     def n_points(self) -> int:
         """Number of surface points."""
@@ -161,10 +167,8 @@ class Hand:
         return torch.where(self.movable, self.lower + share * (self.upper - self.lower), self.rest)
 
     def _spread_evenly(self, q: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_dof"]:
-        """Put joints that only spread the fingers at zero, or a quarter of their range inside their limits."""
-        margin = 0.25 * (self.tree.upper - self.tree.lower)
-        neutral = torch.zeros_like(margin).clamp(self.tree.lower + margin, self.tree.upper - margin)
-        return torch.where(self.abduction & self.movable, neutral, q)
+        """Put joints that only spread the fingers where they are neutral."""
+        return torch.where(self.abduction & self.movable, self.neutral, q)
 
     def _between(self, share: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_dof"]:
         """Joints this share of the way from closed to open; held joints at rest."""

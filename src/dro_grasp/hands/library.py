@@ -14,6 +14,7 @@ from dro_grasp.errors import HandError
 from dro_grasp.files import given_path
 from dro_grasp.hands.build import build_hand
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import checked
 
 BUILTIN_FOLDER = Path(__file__).parent / "builtin"
 """Folder of the built-in descriptions."""
@@ -35,6 +36,7 @@ ASSET_PREFIX = "assets/"
 """Prefix that forces a name to be that of a development asset."""
 
 
+@checked
 def load_hand(name: str | Path, *, seed: int = 0, n_points: int = 512) -> Hand:
     """Load a hand by name or from a URDF or MJCF file; nothing needs to be annotated.
 
@@ -110,7 +112,7 @@ def _locate(text: str) -> tuple[Path, str]:
 
 def _asset_folder() -> Path | None:
     root = os.environ.get("DRO_GRASP_ASSETS")
-    return Path(root) / "hands" if root else None
+    return given_path(root) / "hands" if root else None
 
 
 def _asset_file(name: str) -> Path | None:
@@ -130,11 +132,15 @@ def _robot_description(name: str) -> Path | None:
             found = importlib.import_module(f"robot_descriptions.{module}")
         except ImportError:
             continue
-        except Exception as error:  # git, the network and the disk each raise their own errors
+        except Exception as error:  # importing runs the module of others, and git: it may raise anything
             reason = str(error).strip().splitlines()[-1:] or [type(error).__name__]
             raise HandError(f"robot_descriptions could not fetch '{module}' ({reason[0].strip()}); connect to the network, or "
                             "give the path of a URDF or MJCF file") from error
-        return Path(getattr(found, "URDF_PATH", None) or found.MJCF_PATH)
+        file = getattr(found, "URDF_PATH", None) or getattr(found, "MJCF_PATH", None)
+        if file is None:
+            raise HandError(f"robot_descriptions has '{module}' as neither URDF nor MJCF file; convert it, for example with "
+                            "xacro, and give the path of what you get")
+        return Path(file)
     return None
 
 

@@ -40,6 +40,8 @@ ACROSS = 0.3
 ROLLING_UP = 8.0
 """Range of all joints of a finger together from which it may roll up [rad] (ours): 1.3 turns; Allegro's have 6.5. Limits that
 say little are often half a turn for each joint."""
+SPREADING = (1.0, 0.75)
+"""Openness at which joints that move a finger sideways are looked for (ours): bent farther, they move it to the palm, too."""
 STILL = 5e-3
 """Slower fingertips do not move with a joint [m/rad or m/m] (ours)."""
 
@@ -194,6 +196,17 @@ class FingerMotion:
         reach = self.reaches(path, bends)
         then = reach[at, torch.arange(len(self.fingers))]
         return (reach * then).sum(-1) / then.square().sum(-1).clamp_min(1e-12)
+
+
+def open_side_by_side(hand: Hand, openness: float) -> Float[Tensor, " n_dof"]:
+    """`Hand.canonical_joints`, but all joints that move a finger sideways are neutral, so that no fingers cross [rad or m].
+
+    Joints that turn a finger about its length, or sit beyond its knuckle, count as bending: they spread it only where it bends.
+    At their open ends neighbours cross.
+    """
+    q, motion, palm = hand.canonical_joints(openness), FingerMotion.of(hand), hand.palm_direction_wrist
+    spreads = [motion.sideways(hand.canonical_joints(share), hand.movable, palm) for share in SPREADING]
+    return torch.where(torch.stack(spreads).any(0) & hand.movable, hand.neutral, q)
 
 
 def main_axis(vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:

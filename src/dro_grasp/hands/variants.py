@@ -13,8 +13,10 @@ from dro_grasp.descriptions.xml_files import parse_xml
 from dro_grasp.errors import HandError, OptionError
 from dro_grasp.files import command
 from dro_grasp.hands.library import locate_hand
+from dro_grasp.kinds import checked
 
 
+@checked
 def vary_hand(name: str | Path, *, mirrored: bool = False, factor: float = 1.0) -> str:
     """The URDF of a hand's mirror image, of a scaled hand, or of both.
 

@@ -23,6 +23,7 @@ from torch import Tensor
 from dro_grasp.errors import OptionError
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.geometry.se3 import apply, compose
+from dro_grasp.kinds import Checked
 from dro_grasp.kinematics.joint_step import StepConfig, best_step, point_norms, smoothed_norms
 from dro_grasp.kinematics.tree import KinematicTree
 
@@ -40,7 +41,7 @@ class Targets:
 
 
 @dataclass(frozen=True)
-class JointSolverConfig:
+class JointSolverConfig(Checked):
     """Stopping, step limits and damping. Values are ours unless a source is given."""
 
     max_iterations: int = 32

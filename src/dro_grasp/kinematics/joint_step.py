@@ -20,9 +20,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dro_grasp.kinds import Checked
+
 
 @dataclass(frozen=True)
-class StepConfig:
+class StepConfig(Checked):
     """How precisely one step is solved. Values are ours."""
 
     active_set_passes: int = 3

@@ -17,9 +17,9 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from dro_grasp.errors import WeightsError
-from dro_grasp.files import given_path, reading, replacing
+from dro_grasp.files import UNTYPED, given_path, reading, replacing
 from dro_grasp.models.network import DistanceNetwork
-from dro_grasp.models.presets import NetworkConfig
+from dro_grasp.models.presets import LAST_WITH_OTHERS, NetworkConfig
 
 Network = TypeVar("Network", bound=nn.Module)
 SHIPPED_FOLDER = Path(__file__).parent.parent / "weights"
@@ -32,10 +32,12 @@ PICKLES = (b"PK", b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")
 """First two bytes of zipped and of bare pickles."""
 CHECKSUMS = "SHA256SUMS"
 """File beside the shipped weights with their checksums, as `sha256sum` writes it."""
-SMALL = ("completion/surface", "ranking/quality", "ranking/holding", "baselines/gendexgrasp", "baselines/manifm")
+SMALL = ("completion/surface", "ranking/quality", "ranking/holding")
 """Networks that ship beside those that predict D(R,O)."""
 DEFAULT = "more_objects"
 """Name of the default weights."""
+FORMER_WEIGHTS = ("multi", "more_hands")
+"""Names of weights that shipped before."""
 
 
 def save_weights(
@@ -73,7 +75,7 @@ def load_weights(name: str | Path | None = None) -> DistanceNetwork:
     """
     path = locate_weights(name)
     entry, tensors = _read(path)
-    with reading(path, WeightsError, "weights of this version of the network"):
+    with reading(path, WeightsError, "weights of this version of the network", *UNTYPED):
         config = NetworkConfig.from_dict(entry["config"])
         with torch.device("meta"):  # a network of the wrong size is never made
             _check_tensors(DistanceNetwork(config).state_dict(), tensors, path)
@@ -145,6 +147,9 @@ def locate_weights(name: str | Path | None = None) -> Path:
     path = given_path(text)
     if path.is_file():
         return path
+    if text in FORMER_WEIGHTS:
+        raise WeightsError(f"the weights '{text}' no longer ship: the last state with them is {LAST_WITH_OTHERS}, in "
+                           f"src/dro_grasp/weights; use '{DEFAULT}', the default, instead")
     raise WeightsError(f"no weights at '{text}'; shipped weights are {', '.join(weights_names()) or 'none'}, or give the "
                        "path of a .safetensors file that `dro-grasp train` wrote")
 

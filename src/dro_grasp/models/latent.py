@@ -1,4 +1,4 @@
-"""The latent variable z of the CVAE: its encoders, its priors, and how it is drawn. Source: paper section III-C."""
+"""The latent variable z of the CVAE: its encoders, its prior, and how it is drawn. Source: paper section III-C."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class LatentEncoder(nn.Module):
 
 
 class Condition(nn.Module):
-    """Input of a learned prior of z: the object relative to the placed open hand, and the hand's features."""
+    """Input of the flow to z: the object relative to the placed open hand, and the hand's features."""
 
     SCALE = 0.1
     """Unit of length inside the network, about the size of a cloud [m]. Source: ours."""
@@ -62,30 +62,6 @@ class Condition(nn.Module):
         """One vector from the encoders' features and both clouds [m], which share a frame."""
         x = self.points(torch.cat([obj_features, (obj - hand.mean(1, keepdim=True)) / self.SCALE], -1))
         return self.join(torch.cat([x.amax(1), x.mean(1), hand_features.amax(1), hand_features.mean(1)], -1))
-
-
-class GaussianPrior(nn.Module):
-    """p(z | hand, object) as a Gaussian; N(0, I) before training.
-
-    Differs from the paper, whose prior is N(0, I) whatever hand and object are.
-    """
-
-    def __init__(self, latent: int, width: int) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(nn.LeakyReLU(SLOPE), nn.Linear(width, width), nn.LeakyReLU(SLOPE))
-        self.last = nn.Linear(width, 2 * latent)
-        nn.init.zeros_(self.last.weight)
-        nn.init.zeros_(self.last.bias)
-
-    def moments(self, condition: Float[Tensor, "b width"]) -> tuple[Float[Tensor, "b latent"], Float[Tensor, "b latent"]]:
-        """Mean and log-variance."""
-        mean, log_variance = self.last(self.layers(condition)).chunk(2, -1)
-        return mean, log_variance.clamp(-MAX_LOG_VARIANCE, MAX_LOG_VARIANCE)
-
-    def forward(self, noise: Float[Tensor, "b latent"], condition: Float[Tensor, "b width"]) -> Float[Tensor, "b latent"]:
-        """Turn standard normal noise into z."""
-        mean, log_variance = self.moments(condition)
-        return mean + (0.5 * log_variance).exp() * noise
 
 
 class FlowPrior(nn.Module):

@@ -54,16 +54,10 @@ class NetworkOutput:
     """Mean of the posterior of z."""
     log_variance: Float[Tensor, "b latent"]
     """Its log-variance."""
-    prior_mean: Float[Tensor, "b latent"]
-    """Mean of the prior of z; zero in the paper's form."""
-    prior_log_variance: Float[Tensor, "b latent"]
-    """Its log-variance; zero in the paper's form."""
     flow_error: Float[Tensor, " b"]
-    """Squared velocity error of the flow to z; zero without a flow."""
+    """Squared velocity error of the flow to z; zero in the paper's form."""
     moved: Float[Tensor, "b n 3"]
     """The placed hand, moved by z if z moves it [m]."""
-    hand_feature: Float[Tensor, "b width"]
-    """Mean feature of the open hand, for the placement prior."""
     drawn: Float[Tensor, "b n columns"] | None = None
     """D(R,O) of a z that was drawn from its prior [m]; None if none was asked for."""
 
@@ -82,18 +76,14 @@ class DistanceNetwork(nn.Module):
         self.hand_transformer = CrossTransformer(c.width, c.heads, c.attention_hidden)
         self.object_transformer = CrossTransformer(c.width, c.heads, c.attention_hidden)
         latent_width = c.latent_head[0]
-        self.motion = latent.HandMotion(c.width, c.latent, latent_width) if c.latent_form == "motion" else None
-        self.latent_encoder = None if self.motion is not None else latent.LatentEncoder(
+        self.motion = latent.HandMotion(c.width, c.latent, latent_width) if c.placed else None
+        self.latent_encoder = None if c.placed else latent.LatentEncoder(
             c.width, c.latent, c.latent_widths, c.latent_head, c.latent_neighbours)
-        self.condition = None if c.prior == "standard" else latent.Condition(c.width, latent_width)
-        self.prior = (
-            latent.FlowPrior(c.latent, latent_width) if c.prior == "flow"
-            else latent.GaussianPrior(c.latent, latent_width) if c.prior == "learned" else None)
+        self.condition = latent.Condition(c.width, latent_width) if c.placed else None
+        self.prior = latent.FlowPrior(c.latent, latent_width) if c.placed else None
         self.head = DistanceHead(c.width + c.latent, c.kernel_hidden, c.initial_distance)
         self.place = nn.Linear(3, c.width) if c.placed else None
-        self.placement = PlacementPrior(
-            None if c.placement_hand == "proportions" else c.width, c.placement_width, c.placement_components,
-        ) if c.placed else None
+        self.placement = PlacementPrior(c.placement_width, c.placement_components) if c.placed else None
 
     def encode(
         self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"]
@@ -106,7 +96,7 @@ class DistanceNetwork(nn.Module):
     def relate(
         self, hand_features: Float[Tensor, "b n width"], obj_features: Float[Tensor, "b m width"], hand: Float[Tensor, "b n 3"]
     ) -> tuple[Float[Tensor, "b n width"], Float[Tensor, "b m width"]]:
-        """Features that know the other cloud, and the place of the hand [m] if the configuration says so."""
+        """Features that know the other cloud, and the place of the hand [m] if the network knows it."""
         if self.place is not None:
             hand_features = hand_features + self.place(hand * PLACE_SCALE)
         with self._products(hand):
@@ -132,39 +122,41 @@ class DistanceNetwork(nn.Module):
             draw: Also predict with a z that is drawn as at inference.
         """
         phi_hand, phi_object = self.encode(hand, obj)
-        moved, psi = hand, None
+        psi = None  # in the paper's form z moves nothing, so that one relation serves every z
         if self.motion is not None:
             mean, log_variance = self.motion.encode(phi_hand, hand, grasp)
-            z = latent.sample_posterior(mean, log_variance, generator)
-            moved = self.motion(phi_hand, hand, z[:, None])[:, 0]
         else:
             psi = self.relate(phi_hand, phi_object, hand)
             assert self.latent_encoder is not None
             with self._products(hand):
                 mean, log_variance = self.latent_encoder(torch.cat([grasp, obj], 1), torch.cat(psi, 1))
             mean, log_variance = mean.float(), log_variance.float()
-            z = latent.sample_posterior(mean, log_variance, generator)
+        z = latent.sample_posterior(mean, log_variance, generator)
 
-        def predicted(z: Float[Tensor, "b latent"], moved: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n columns"]:
+        def predicted(moved: Float[Tensor, "b n 3"], z: Float[Tensor, "b latent"]) -> Float[Tensor, "b n columns"]:
             psi_hand, psi_object = psi or self.relate(phi_hand, phi_object, moved)
             return self._distances(psi_hand, psi_object[:, :columns], z, moved, obj[:, :columns])
 
-        distances = predicted(z, moved)
-        prior_mean, prior_log_variance, flow_error = torch.zeros_like(z), torch.zeros_like(z), z.new_zeros(len(z))
-        condition = None if self.condition is None else self.condition(phi_hand, phi_object, hand, obj)
-        if condition is not None:
-            if isinstance(self.prior, latent.FlowPrior):
-                flow_error = self.prior.loss(z, condition, generator)
-            elif self.prior is not None:
-                prior_mean, prior_log_variance = self.prior.moments(condition)
+        moved = self._moved(phi_hand, hand, z[:, None])[:, 0]
+        distances, flow_error, condition = predicted(moved, z), z.new_zeros(len(z)), None
+        if self.prior is not None and self.condition is not None:
+            condition = self.condition(phi_hand, phi_object, hand, obj)
+            flow_error = self.prior.loss(z, condition, generator)
         drawn = None
         if draw:
             other = torch.randn(z.shape, generator=generator, device=z.device)
-            if condition is not None and self.prior is not None:
+            if self.prior is not None and condition is not None:
                 other = self.prior(other, condition)
-            drawn = predicted(other, hand if self.motion is None else self.motion(phi_hand, hand, other[:, None])[:, 0])
-        return NetworkOutput(
-            distances, mean, log_variance, prior_mean, prior_log_variance, flow_error, moved, phi_hand.mean(1), drawn)
+            drawn = predicted(self._moved(phi_hand, hand, other[:, None])[:, 0], other)
+        return NetworkOutput(distances, mean, log_variance, flow_error, moved, drawn)
+
+    def _moved(
+        self, features: Float[Tensor, "b n width"], hand: Float[Tensor, "b n 3"], z: Float[Tensor, "b k latent"]
+    ) -> Float[Tensor, "b k n 3"]:
+        """The hand as each z moves it [m]; as it is where z moves nothing."""
+        if self.motion is None:
+            return hand[:, None].expand(-1, z.shape[1], -1, -1)
+        return self.motion(features, hand, z)
 
     @property
     def z_moves(self) -> bool:
@@ -193,8 +185,7 @@ class DistanceNetwork(nn.Module):
             if self.condition is not None and self.prior is not None:
                 condition = self.condition(phi_hand, phi_object, hand, obj)[:, None].expand(-1, noise.shape[1], -1)
                 z = self.prior(noise.flatten(0, 1), condition.flatten(0, 1)).unflatten(0, noise.shape[:2])
-            points = hand[:, None].expand(-1, noise.shape[1], -1, -1) if self.motion is None else self.motion(phi_hand, hand, z)
-            return Moves(phi_hand, phi_object, obj, z, points)
+            return Moves(phi_hand, phi_object, obj, z, self._moved(phi_hand, hand, z))
 
     def distances(self, moves: Moves) -> Float[Tensor, "b n m"]:
         """D(R,O) [m] of hands with one draw of z each."""
@@ -226,7 +217,7 @@ class DistanceNetwork(nn.Module):
     def sample_latent(
         self, num: int, generator: torch.Generator, temperature: float = 1.0
     ) -> Float[Tensor, "num latent"]:
-        """Draws that `predict` and `move` turn into z, on the network's device; without a learned prior they are z.
+        """Draws that `predict` and `move` turn into z, on the network's device; in the paper's form they are z.
 
         Their standard deviation is `temperature`: 1 as in training, 0 for the likeliest z.
         """
@@ -234,8 +225,8 @@ class DistanceNetwork(nn.Module):
         return noise.to(self.head.first.weight.device)
 
     def sample_placements(
-        self, hand: Float[Tensor, "n 3"], obj: Float[Tensor, "m 3"], rotations: Float[Tensor, "r 3 3"], num: int,
-        generator: torch.Generator, proportions: Float[Tensor, " f"] | None = None,
+        self, obj: Float[Tensor, "m 3"], rotations: Float[Tensor, "r 3 3"], num: int, generator: torch.Generator,
+        proportions: Float[Tensor, " f"],
     ) -> tuple[Float[Tensor, "num 3 3"], Float[Tensor, "num 3"]]:
         """Rotations of the hand's axes, and positions of the grasp centre in them about the object's centre [m].
 
@@ -243,23 +234,16 @@ class DistanceNetwork(nn.Module):
         object: it has no prior, and does not see the position.
 
         Args:
-            hand: The open hand in its axes (`NetworkConfig.axes`) [m].
             obj: The object's cloud in its own frame [m].
-            rotations: Candidate rotations of these axes, in random order.
+            rotations: Candidate rotations of the hand's axes (`NetworkConfig.axes`), in random order.
             num: How many.
             generator: Source of randomness, on the CPU.
-            proportions: Of the hand in these axes; for networks whose prior takes them.
+            proportions: Of the hand in these axes.
         """
         if self.placement is None:
             return rotations[:num], rotations.new_zeros(num, 3)
-        if self.config.placement_hand == "proportions":
-            assert proportions is not None
-            feature = proportions
-        else:
-            feature = self.hand_encoder((hand - hand.mean(0))[None]).mean(1)[0]
         return self.placement.sample(
-            obj - obj.mean(0), feature, rotations, num, generator, self.config.placement_temperature
-        )
+            obj - obj.mean(0), proportions, rotations, num, generator, self.config.placement_temperature)
 
 
 def untrained_network(config: NetworkConfig, seed: int, name: str = "untrained") -> DistanceNetwork:

@@ -57,38 +57,32 @@ class Standardised(nn.Module):
 
 
 class PlacementPrior(nn.Module):
-    """A point network over the object in wrist axes, with a hand feature, to a mixture density and a rotation score."""
+    """A point network over the object in the hand's axes, with the hand's proportions, to a mixture density and a score.
 
-    def __init__(self, hand_features: int | None, width: int, components: int) -> None:
-        """Untrained.
+    Source: ours, as is what it knows of the hand: its proportions serve hands never seen better than learned features.
+    """
 
-        Args:
-            hand_features: Width of the encoder's features; None takes proportions.
-            width: Of hidden layers.
-            components: Of the mixture.
-        """
+    def __init__(self, width: int, components: int) -> None:
+        """Untrained, with hidden layers of a `width` and a mixture of `components`."""
         super().__init__()
         self.components = components
-        self.standardised = Standardised() if hand_features is None else None
-        """Of proportions; None where features are taken."""
+        self.standardised = Standardised()
         self.points = nn.Sequential(nn.Linear(3, width // 2), nn.ReLU(), nn.Linear(width // 2, width), nn.ReLU(),
                                     nn.Linear(width, 2 * width))
-        self.hand = nn.Linear(hand_features or PROPORTIONS, width)
+        self.hand = nn.Linear(PROPORTIONS, width)
         self.head = nn.Sequential(nn.Linear(3 * width, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(),
                                   nn.Linear(width, components * 7 + 1))
 
     def forward(
-        self, obj: Float[Tensor, "b m 3"], hand: Float[Tensor, "b c"]
+        self, obj: Float[Tensor, "b m 3"], hand: Float[Tensor, "b f"]
     ) -> tuple[Float[Tensor, "b k"], Float[Tensor, "b k 3"], Float[Tensor, "b k 3"], Float[Tensor, " b"]]:
         """Mixture logits, means [m], standard deviations [m], and the score of the rotation.
 
         Args:
-            obj: Object points in wrist axes about the object's centre [m].
-            hand: Mean feature of the open hand's points, or its proportions.
+            obj: Object points in the hand's axes about the object's centre [m].
+            hand: Proportions of the hand.
         """
-        if self.standardised is not None:
-            hand = self.standardised(hand)
-        x = torch.cat([self.points(obj * (1 / LENGTH)).amax(1), self.hand(hand)], -1)
+        x = torch.cat([self.points(obj * (1 / LENGTH)).amax(1), self.hand(self.standardised(hand))], -1)
         out = self.head(x)
         logits, mean, scale = out[:, :-1].split([self.components, 3 * self.components, 3 * self.components], -1)
         mean = mean.unflatten(-1, (self.components, 3)) * LENGTH
@@ -96,7 +90,7 @@ class PlacementPrior(nn.Module):
         return logits, mean, scale, out[:, -1]
 
     def log_density(
-        self, obj: Float[Tensor, "b m 3"], hand: Float[Tensor, "b c"], position: Float[Tensor, "b 3"]
+        self, obj: Float[Tensor, "b m 3"], hand: Float[Tensor, "b f"], position: Float[Tensor, "b 3"]
     ) -> tuple[Float[Tensor, " b"], Float[Tensor, " b"]]:
         """Log density of a position of the grasp centre, and the score of the rotation."""
         logits, mean, scale, score = self(obj, hand)
@@ -104,7 +98,7 @@ class PlacementPrior(nn.Module):
         return torch.logsumexp(torch.log_softmax(logits, -1) + normal.sum(-1), -1), score
 
     def sample(
-        self, obj: Float[Tensor, "m 3"], hand: Float[Tensor, " c"], rotations: Float[Tensor, "r 3 3"], num: int,
+        self, obj: Float[Tensor, "m 3"], hand: Float[Tensor, " f"], rotations: Float[Tensor, "r 3 3"], num: int,
         generator: torch.Generator, temperature: float,
     ) -> tuple[Float[Tensor, "num 3 3"], Float[Tensor, "num 3"]]:
         """Choose rotations by their scores and draw a position of the grasp centre for each.
@@ -112,12 +106,12 @@ class PlacementPrior(nn.Module):
         Args:
             obj: Object points about the object's centre, in the object's axes [m].
             hand: As in `forward`.
-            rotations: Candidate wrist rotations in the object's axes.
+            rotations: Candidate rotations of the hand's axes in the object's.
             num: How many to choose, without repetition.
             temperature: Scales the spread of the drawn positions.
 
         Returns:
-            Rotations, and positions in wrist axes about the object's centre [m].
+            Rotations, and positions in the hand's axes about the object's centre [m].
         """
         parts = side_by_side(
             lambda some: self(obj @ some, hand.expand(len(some), -1)), rotations.split(ROTATIONS_PER_PART))

@@ -18,6 +18,15 @@ MOST_LAYERS = 16
 """Most layers of a part of the network (ours)."""
 LARGEST = 10.0
 """Largest distance [m] and temperature (ours)."""
+LAST_WITH_OTHERS = "commit e1ba941"
+"""Last state of the package whose networks had other forms, and that shipped other weights."""
+FORMER: dict[str, dict[str, Any]] = {
+    "object": {"placed": False, "residual": False, "latent_temperature": 1.0, "latent_form": "kernel", "prior": "standard",
+               "placement_hand": "features"},
+    "palm": {"placed": True, "residual": True, "latent_temperature": 1.0, "latent_form": "motion", "prior": "flow",
+             "placement_hand": "proportions"},
+}
+"""Settings of older files that the frame decides now, with what it decides."""
 
 
 @dataclass(frozen=True)
@@ -46,21 +55,16 @@ class NetworkConfig:
     """Fully connected layers of the latent encoder."""
     latent_neighbours: int = 20
     """K of the latent encoder's graph."""
-    frame: Literal["object", "wrist", "palm"] = "object"
-    """Axes of both clouds. With `object`, the paper's form, the hand is zero-centred: the network sees which way it is turned,
-    not where it is, and any wrist rotation is as good as another. With `wrist` or `palm` the network knows the placement, adds
-    the kernel to the distances of the placed open hand, and has a learned prior of placements. The wrist's axes are those
-    that each description chooses; the palm's mean the same for every hand."""
-    latent_form: Literal["kernel", "motion"] = "kernel"
-    """z enters the kernel alone (the paper's form), or also moves the placed open hand."""
-    prior: Literal["standard", "learned", "flow"] = "standard"
-    """Distribution of z at inference: N(0, I) (the paper's form), or a Gaussian or a flow learned from hand and object."""
+    frame: Literal["object", "palm"] = "object"
+    """Axes of both clouds, and with them the form of the network. With `object`, the paper's, the hand is zero-centred: the
+    network sees which way it is turned, not where it is, and any wrist rotation is as good as another; z enters the kernel
+    alone, and is drawn from N(0, I). With `palm`, whose axes mean the same for every hand, the network knows the placement: it
+    has a learned prior of placements, z also moves the placed open hand and is drawn by a flow that knows hand and object,
+    and the kernel is added to the distances of the hand that z has moved."""
     kernel_hidden: tuple[int, int] = (300, 100)
     """Hidden layers of the kernel."""
     initial_distance: float = 0.1
     """Distance that an untrained kernel predicts [m]; softplus alone starts at 0.69."""
-    placement_hand: Literal["features", "proportions"] = "features"
-    """What the placement prior knows of the hand: the encoder's mean feature, or its proportions."""
     placement_width: int = 128
     """Width of the placement prior."""
     placement_components: int = 8
@@ -69,7 +73,7 @@ class NetworkConfig:
     """Scale of the spread of placements drawn at inference."""
 
     def __post_init__(self) -> None:
-        """Refuse sizes that no network has, unknown forms, and forms that contradict each other."""
+        """Refuse sizes that no network has, and unknown forms."""
         for name, kind in get_type_hints(NetworkConfig).items():
             if not _fits(value := getattr(self, name), kind):
                 raise OptionError(f"{name} is {str(value)[:60]}, which no network has; the paper's is "
@@ -77,9 +81,6 @@ class NetworkConfig:
         if self.width % self.heads or self.neighbours > min(self.n_hand, self.n_object):
             raise OptionError(f"width is {self.width}, heads {self.heads}, neighbours {self.neighbours}; expected a width "
                               "that is a multiple of the heads, and no more neighbours than points")
-        if self.latent_form == "motion" and not self.placed:
-            raise OptionError("latent_form 'motion' moves the placed open hand, but in frame 'object' the network knows no "
-                              "placement; choose frame 'palm', as the presets slim and multi do")
 
     @property
     def placed(self) -> bool:
@@ -100,8 +101,8 @@ class NetworkConfig:
         """A named configuration.
 
         Args:
-            name: `paper` (14 M parameters), `paper-slim`, the same form as narrow as `slim`, `slim`, or `multi`, that of the
-                default weights (1.5 M).
+            name: `paper` (14 M parameters), `paper-slim`, the same form as narrow as the default weights, or `multi`, that of
+                the default weights (1.5 M), which is also called `slim`.
 
         Raises:
             OptionError: No configuration has the name.
@@ -118,10 +119,15 @@ class NetworkConfig:
             ValueError: A setting is unknown or impossible, or one that is no longer a choice has another value than it has now.
         """
         plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-        placed = plain.get("frame", "object") != "object"
-        for name, fixed in {"placed": placed, "residual": placed, "latent_temperature": 1.0}.items():
-            if plain.pop(name, fixed) != fixed:
-                raise ValueError(f"{name} is no longer a choice; it is {fixed} now, and {values[name]} in the file")
+        form = str(plain.get("frame", "object"))
+        if form == "wrist":
+            raise ValueError(f"frame 'wrist' is no longer a choice; networks of {LAST_WITH_OTHERS} had it")
+        if "latent_form" in plain:  # the oldest of these files do not name what was then the only choice
+            plain.setdefault("placement_hand", "features")
+        for name, fixed in FORMER.get(form, {}).items():
+            if (found := plain.pop(name, fixed)) != fixed:
+                raise ValueError(f"{name} is no longer a choice; in frame '{form}' it is {fixed} now, and {found} in the file, "
+                                 f"as networks of {LAST_WITH_OTHERS} could have it")
         if unknown := sorted(plain.keys() - {f.name for f in dataclasses.fields(NetworkConfig)}):
             raise ValueError(f"unknown settings {', '.join(unknown)}")
         try:
@@ -144,15 +150,15 @@ def _fits(value: Any, kind: Any) -> bool:
 
 
 SLIM = NetworkConfig(
-    n_hand=160, n_object=128, width=128, encoder_widths=(32, 32, 64, 128), neighbours=16, attention_hidden=256,
+    n_hand=160, n_object=128, width=128, encoder_widths=(32, 32, 64, 128), neighbours=16, attention_hidden=256, latent=32,
     latent_widths=(32, 32, 64), latent_head=(128, 128), latent_neighbours=12, kernel_hidden=(128, 64), frame="palm",
     placement_temperature=0.3,
 )
-"""A network narrow enough to train on a CPU, with the paper's latent; it knows the placement. Source: ours."""
+"""A network narrow enough to train on a CPU; it knows the placement. Source: ours."""
 PRESETS = {
     "paper": NetworkConfig(),
-    "paper-slim": dataclasses.replace(SLIM, frame="object"),
+    "paper-slim": dataclasses.replace(SLIM, frame="object", latent=64),
     "slim": SLIM,
-    "multi": dataclasses.replace(SLIM, latent=32, latent_form="motion", prior="flow", placement_hand="proportions"),
+    "multi": SLIM,
 }
 """Configurations by name (`NetworkConfig.preset`)."""

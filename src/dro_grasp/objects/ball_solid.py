@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float, Int
 
 from dro_grasp.geometry.balls import Balls
-from dro_grasp.objects.cache import content_hash
 from dro_grasp.objects.shape import ObjectModel
 
 RADII = (0.008, 0.006, 0.004, 0.003, 0.002)
@@ -39,7 +38,6 @@ def solid_of(obj: ObjectModel) -> ObjectModel:
     products = cell * apart.T @ apart
     return replace(
         obj, balls=_balls(obj), volume=cell * len(inside), centre_of_mass=centre,
-        sha256=f"{content_hash(obj.cloud, obj.cloud_normals)}-balls",  # the same points may have other normals
         inertia=np.trace(products) * np.eye(3) - products + ROUND * np.eye(3))
 
 

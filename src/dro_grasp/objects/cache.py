@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Num
 
 from dro_grasp.errors import OutputError
-from dro_grasp.files import replacing
+from dro_grasp.files import FOREIGN, given_path, replacing
 
 Arrays = dict[str, Num[np.ndarray, "..."]]
 """Arrays by name, as in an NPZ file."""
@@ -21,7 +21,7 @@ Arrays = dict[str, Num[np.ndarray, "..."]]
 def cache_folder() -> Path:
     """The folder of derived geometry: `DRO_GRASP_CACHE`, or the user's cache folder."""
     root = os.environ.get("DRO_GRASP_CACHE")
-    return Path(root) if root else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "dro-grasp"
+    return given_path(root) if root else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "dro-grasp"
 
 
 def cached_arrays(key: str, make: Callable[[], Arrays]) -> Arrays:
@@ -33,7 +33,7 @@ def cached_arrays(key: str, make: Callable[[], Arrays]) -> Arrays:
     try:
         with path.open("rb") as file, np.load(file) as stored:
             return {name: stored[name] for name in stored.files}
-    except Exception:  # missing, truncated, or no archive of arrays: NumPy and zlib each raise their own errors
+    except FOREIGN:  # missing, truncated, or no archive of arrays
         made = make()
     with contextlib.suppress(OSError, OutputError):
         path.parent.mkdir(parents=True, exist_ok=True)

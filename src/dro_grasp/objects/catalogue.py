@@ -16,6 +16,7 @@ import trimesh
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.files import given_path
+from dro_grasp.kinds import checked
 from dro_grasp.objects.builtin import BUILTIN, make_builtin
 from dro_grasp.objects.convex_parts import Part
 from dro_grasp.objects.in_memory import ObjectSource, object_in_memory
@@ -36,6 +37,7 @@ MESH_SUFFIXES = {".obj", ".stl", ".ply", ".glb", ".gltf", ".off", ".dae", ".npy"
 """Suffixes of the files in a folder that count as objects."""
 
 
+@checked
 def load_object(
     source: ObjectSource, *, scale: float = 1.0, name: str | None = None, keep_table: bool = False
 ) -> ObjectModel:
@@ -145,7 +147,7 @@ def _procedural(first: int, last: int) -> list[str]:
 
 def _assets() -> dict[str, dict[str, Any]]:
     root = os.environ.get("DRO_GRASP_ASSETS")
-    return _manifest(Path(root) / "objects" / "manifest.json") if root else {}
+    return _manifest(given_path(root) / "objects" / "manifest.json") if root else {}
 
 
 @cache

@@ -24,7 +24,10 @@ def read_cloud(path: Path) -> Float[np.ndarray, "..."]:
             check_bytes(path)
             _check_npy(path)
             # A mapped file is never larger than it is, whatever its header says.
-            mapped = np.load(path, mmap_mode="r", allow_pickle=False)
+            try:
+                mapped = np.load(path, mmap_mode="r", allow_pickle=False)
+            except TypeError as error:  # its header is a dictionary of other things than NumPy wrote
+                raise ValueError(str(error)) from error
             if mapped.size > path.stat().st_size:  # entries of no size
                 raise ValueError(f"its header promises {mapped.size} numbers")
             return np.array(mapped, np.float64)
@@ -61,7 +64,10 @@ def _read_pcd(path: Path) -> Float[np.ndarray, "n columns"]:
         table = np.array(lines, dtype=np.float64).reshape(len(lines), -1)[:, columns]
     elif kind == "binary":
         sizes = zip(header["TYPE"], header["SIZE"], widths, strict=True)
-        layout = np.dtype([(f"{i}", f"<{PCD_KINDS[t]}{s}", (c,)) for i, (t, s, c) in enumerate(sizes)])
+        try:
+            layout = np.dtype([(f"{i}", f"<{PCD_KINDS[t]}{s}", (c,)) for i, (t, s, c) in enumerate(sizes)])
+        except TypeError as error:  # there is no number of such a size
+            raise ValueError(str(error)) from error
         rows = np.frombuffer(raw, layout, count=count, offset=start)
         table = np.stack([rows[f"{fields.index(name)}"][:, 0].astype(np.float64) for name in names], 1)
     else:

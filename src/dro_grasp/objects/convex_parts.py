@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int
@@ -58,7 +60,7 @@ def _run(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> l
             coacd.Mesh(mesh.vertices, mesh.faces), threshold=THRESHOLD, max_convex_hull=MAX_PARTS,
             mcts_iterations=SEARCH, resolution=RESOLUTION, decimate=True, max_ch_vertex=MAX_VERTICES, seed=0,
         )
-    except Exception as error:  # the library's bindings raise what they like
+    except (RuntimeError, ValueError, MemoryError) as error:  # C++ errors, as its bindings translate them
         raise ObjectError(f"the mesh cannot be cut into convex parts ({error}); repair or simplify it") from error
     if not parts:
         raise ObjectError("the mesh cannot be cut into convex parts (CoACD found none); repair or simplify it")
@@ -87,7 +89,7 @@ def closed_surface(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m
     return surface
 
 
-def pack(parts: list[Part]) -> Arrays:
+def pack(parts: Sequence[Part]) -> Arrays:
     """Parts as three arrays: all vertices, all faces, and the counts of each part."""
     return {
         "vertices": np.concatenate([v for v, _ in parts]), "faces": np.concatenate([f for _, f in parts]),

@@ -80,7 +80,8 @@ def read_geometry(path: Path) -> tuple[trimesh.Trimesh | Float[np.ndarray, "..."
     """One mesh, scenes merged, or the points of a file without faces; and the file's unit [m], 1 if it states none."""
     if path.suffix.lower() in CLOUD_SUFFIXES:
         return read_cloud(path), 1.0
-    with reading(path, ObjectError, "a mesh or cloud that trimesh reads (STL, OBJ, PLY, GLB, OFF, ...), NPY or PCD"):
+    # trimesh alone is called here, and its many readers raise whatever they stumble over.
+    with reading(path, ObjectError, "a mesh or cloud that trimesh reads (STL, OBJ, PLY, GLB, OFF, ...), NPY or PCD", Exception):
         loaded = open_mesh(path, process=False)
         unit = trimesh.units.unit_conversion(loaded.units, "meters") if loaded.units else 1.0
         geometry = merge_scene(loaded) if isinstance(loaded, trimesh.Scene) else loaded

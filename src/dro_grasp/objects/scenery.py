@@ -16,6 +16,7 @@ from scipy.spatial import KDTree
 from dro_grasp.errors import ObjectError
 from dro_grasp.files import given_path
 from dro_grasp.geometry.distance_field import DistanceField
+from dro_grasp.kinds import checked
 from dro_grasp.objects.in_memory import ObjectSource, geometry_in_memory
 from dro_grasp.objects.loading import FARTHEST, check_scale, read_geometry
 from dro_grasp.objects.shape import ObjectModel
@@ -97,6 +98,7 @@ class Scene:
                               "both are in one frame and in metres")
 
 
+@checked
 def load_scene(source: ObjectSource, name: str | None = None, scale: float = 1.0) -> Scene:
     """What a hand is to avoid, from the path of a mesh or cloud, a trimesh mesh or cloud, (vertices, faces), or points (n 3).
 

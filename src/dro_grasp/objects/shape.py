@@ -14,9 +14,9 @@ from dro_grasp.errors import ObjectError
 from dro_grasp.geometry.balls import Balls
 from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.geometry.point_clouds import random_half
-from dro_grasp.objects.cache import cached_arrays
+from dro_grasp.objects.cache import cached_arrays, content_hash
 from dro_grasp.objects.coarse_parts import coarse_parts
-from dro_grasp.objects.convex_parts import Part, decompose
+from dro_grasp.objects.convex_parts import Part, decompose, pack
 from dro_grasp.objects.surface_distances import GRID_SPACING, bake_grid, closed_cloud_distances, signed_distances
 
 DENSITY = 500.0
@@ -37,7 +37,7 @@ class ObjectModel:
     centre_of_mass: Float[np.ndarray, "3"]
     """Centre of mass [m]; the mean of the points for a bare cloud."""
     sha256: str
-    """Hash of the geometry."""
+    """Hash of the mesh's vertices and faces, or of a bare cloud's points, which grasp files state; see `solid_sha256`."""
     vertices: Float[np.ndarray, "n 3"] | None = None
     """Vertices of the mesh [m], or None for a bare cloud."""
     faces: Int[np.ndarray, "m 3"] | None = None
@@ -94,8 +94,22 @@ class ObjectModel:
 
     @cached_property
     def coarse(self) -> ObjectModel:
-        """The same object with fewer and simpler convex parts, as another tool might cut it; its hash is another."""
-        return replace(self, exact_parts=coarse_parts(self.parts), sha256=f"{self.sha256}-coarse")
+        """The same object with fewer and simpler convex parts, as another tool might cut it."""
+        return replace(self, exact_parts=coarse_parts(self.parts))
+
+    @cached_property
+    def solid_sha256(self) -> str:
+        """Hash of all that a simulation sees of it: shape, mass properties, and its convex parts or balls.
+
+        One mesh may have other parts: a built-in object's are exact, those of the same mesh in a user's file are cut.
+        """
+        mass = np.array([self.volume, *self.centre_of_mass, *self.inertia.ravel()])
+        if self.balls is not None:
+            solid = [self.balls.centres.numpy(), self.balls.radii.numpy()]
+        else:
+            solid = [] if self.is_cloud else list(pack(self.parts).values())
+        shape = np.frombuffer(self.sha256.encode(), np.uint8)
+        return content_hash(shape, *([self.cloud, self.cloud_normals] if self.is_cloud else []), mass, *solid)
 
     @cached_property
     def distance_field(self) -> DistanceField:

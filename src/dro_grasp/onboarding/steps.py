@@ -22,9 +22,10 @@ from dro_grasp.datasets.engine.shards import sole_run
 from dro_grasp.datasets.engine.worker import EngineConfig
 from dro_grasp.devices import require_device
 from dro_grasp.errors import BundleError, OptionError
-from dro_grasp.files import check_folder, make_folder, replacing
+from dro_grasp.files import check_folder, make_folder, replacing, set_aside
 from dro_grasp.hands.check import check_hand, picture
 from dro_grasp.hands.library import load_hand
+from dro_grasp.kinds import Checked
 from dro_grasp.models.checkpoints import DEFAULT, history_of, load_weights, locate_weights, save_weights
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.optimization.synthesis import SynthesisConfig
@@ -56,7 +57,7 @@ MOST_GRASPS = 400
 
 
 @dataclass(frozen=True)
-class OnboardingConfig:
+class OnboardingConfig(Checked):
     """How long onboarding takes, and on which objects."""
 
     minutes: float = 30.0
@@ -82,6 +83,7 @@ class OnboardingConfig:
 
     def __post_init__(self) -> None:
         """Refuse numbers out of range, and a source that does not exist."""
+        super().__post_init__()
         if not (math.isfinite(self.minutes) and self.minutes > 0):
             raise OptionError(f"minutes is {self.minutes}; give a positive number, for example --minutes 30")
         require_device(self.device)
@@ -224,7 +226,7 @@ class _Onboarding:
             return {"hand": str(known["hand"]), "sha256": str(known["sha256"]), "steps": dict(known["steps"]),
                     "asked": dict(known.get("asked", {}))}
         except (ValueError, LookupError, TypeError) as error:
-            aside = state.replace(state.with_name(f"{state.name}.damaged"))
+            aside = set_aside(state)
             self.say(f"{state} is damaged ({type(error).__name__}) and set aside as {aside.name}; its steps are made again")
             return None
 

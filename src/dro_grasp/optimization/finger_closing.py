@@ -17,10 +17,11 @@ from dro_grasp.energy import terms as energies
 from dro_grasp.energy.grasp_energy import GraspEnergy
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import Checked
 
 
 @dataclass(frozen=True)
-class ClosingConfig:
+class ClosingConfig(Checked):
     """When a finger is idle, and how far it closes (ours)."""
 
     idle: float = 0.003

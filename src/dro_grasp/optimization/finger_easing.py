@@ -16,11 +16,12 @@ from torch import Tensor
 
 from dro_grasp.energy.grasp_energy import GraspEnergy
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.kinds import Checked
 from dro_grasp.optimization.finger_closing import body_points, finger_joints, least_by_finger
 
 
 @dataclass(frozen=True)
-class EasingConfig:
+class EasingConfig(Checked):
     """How much room fingers leave (ours)."""
 
     clearance: float = 0.004

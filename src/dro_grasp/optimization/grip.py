@@ -20,11 +20,12 @@ from dro_grasp.energy.nearest_points import NearestPoints
 from dro_grasp.geometry.contact_forces import friction_cone, nonnegative_least_squares
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
+from dro_grasp.kinds import Checked
 from dro_grasp.optimization.finger_closing import finger_joints
 
 
 @dataclass(frozen=True)
-class GripConfig:
+class GripConfig(Checked):
     """Contacts, their forces, and servos (ours)."""
 
     reach: float = 0.006

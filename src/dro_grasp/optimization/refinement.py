@@ -17,12 +17,13 @@ from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.geometry.se3 import turned_about
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.kinds import Checked
 from dro_grasp.optimization.finger_closing import ClosingConfig
 from dro_grasp.optimization.grip import GripConfig
 
 
 @dataclass(frozen=True)
-class RefineConfig:
+class RefineConfig(Checked):
     """Steps of the descent, and how far a grasp may move (ours)."""
 
     steps: int = 40

@@ -14,6 +14,7 @@ from dro_grasp.geometry.balls import Ball, Balls
 from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.geometry.se3 import compose, rotate
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import Checked
 from dro_grasp.optimization.palm_directions import CLEAR, Direction, Spread, lack_of_room, wrist_rotations
 
 CHOICES = 8
@@ -21,7 +22,7 @@ CHOICES = 8
 
 
 @dataclass(frozen=True)
-class StartConfig:
+class StartConfig(Checked):
     """Distribution of the starts. Source of the scheme: DexGraspNet; the numbers are ours."""
 
     openness: tuple[float, float] = (0.0, 1.0)

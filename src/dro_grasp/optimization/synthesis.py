@@ -18,6 +18,7 @@ from dro_grasp.geometry.se3 import turned_about
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import DEPTH, ENERGY_TERM
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import Checked, checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.starts import StartConfig, starts
 
@@ -26,7 +27,7 @@ PROVENANCE = f"dro-grasp {__version__}, synthesis 2"
 
 
 @dataclass(frozen=True)
-class SynthesisConfig:
+class SynthesisConfig(Checked):
     """The optimiser. Source of the scheme: DexGraspNet's annealed Langevin steps; the numbers are ours."""
 
     steps: int = 120
@@ -82,6 +83,7 @@ class State:
         return State(T, q, torch.where(row, other.contacts, self.contacts), self.slots, result)
 
 
+@checked
 def synthesize(hand: Hand, obj: ObjectModel, num: int, seed: int = 0, config: SynthesisConfig | None = None) -> GraspBatch:
     """Synthesise grasps of an object by a hand, lowest energy first, not evaluated.
 

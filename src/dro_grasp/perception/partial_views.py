@@ -14,6 +14,7 @@ from scipy.spatial import ConvexHull
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
+from dro_grasp.kinds import Checked
 from dro_grasp.objects.in_memory import numbers
 from dro_grasp.objects.loading import cloud_object, estimate_normals
 from dro_grasp.objects.shape import ObjectModel
@@ -69,7 +70,7 @@ def visible_side(
 
 
 @dataclass(frozen=True)
-class DepthCamera:
+class DepthCamera(Checked):
     """A pinhole depth camera that looks at the middle of the object."""
 
     distance: float = 0.5
@@ -85,6 +86,7 @@ class DepthCamera:
 
     def __post_init__(self) -> None:
         """Refuse impossible settings."""
+        super().__post_init__()
         if min(self.distance, self.pixel) <= 0 or self.noise < 0 or not 0 <= self.lost < 1:
             raise OptionError(f"{self} is no possible camera: distance and pixel must be positive, noise at least 0, and lost "
                               "at least 0 and below 1")

@@ -15,6 +15,7 @@ from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.frames import motion_fault
 from dro_grasp.geometry.point_clouds import distinct_points
 from dro_grasp.geometry.table_plane import above_plane, moved_plane, table_plane
+from dro_grasp.kinds import checked
 from dro_grasp.objects.in_memory import numbers
 from dro_grasp.objects.loading import check_extent, check_scale, cloud_object, estimate_normals, read_points, table_note
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
@@ -78,6 +79,7 @@ def load_scan(
     return scanned_object(path.stem, read_points(path) * scale, T_frame_camera, keep_table=keep_table)
 
 
+@checked
 def scanned_object(
     name: str, points: ArrayLike, T_frame_camera: ArrayLike | None = None, denoise: bool = True, complete: bool = True,
     keep_table: bool = False,

@@ -9,25 +9,31 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Literal
 
+import mujoco
 import numpy as np
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
 
 from dro_grasp.errors import DroGraspError, OptionError
+from dro_grasp.geometry.se3 import random_rotations
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.kinds import Checked
+from dro_grasp.objects.builtin import BUILTIN
+from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.scan import depth_points
-from dro_grasp.planning.clutter import MOST_CLUTTER, Region, other_objects, scatter
-from dro_grasp.planning.depth_images import depth_image, thinned_intrinsics
 from dro_grasp.planning.motion import STAGES, MotionPlan
-from dro_grasp.planning.physics import TICK, LiftScene
-from dro_grasp.planning.plan_config import PlanConfig
-from dro_grasp.planning.planner import plan
+from dro_grasp.planning.physics import SHAPE_GROUP, TICK, Deviation, LiftScene, object_name
+from dro_grasp.planning.planner import PlanConfig, plan
 from dro_grasp.planning.reachability import ReachConfig
 from dro_grasp.planning.robot import Robot
-from dro_grasp.planning.standing import moved
+from dro_grasp.planning.robot_file import CameraMount, Table
 from dro_grasp.planning.table_scene import PickedObject, pick_object
+from dro_grasp.planning.workcell import ARM, Workcell, moved
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.simulation.hand_part import PREFIX
 
 VERSION = 3
 """Goes up with every change that can change an outcome."""
@@ -43,10 +49,33 @@ SHAKE_FREQUENCY = 1.5
 """[1/s] (ours)"""
 SHAKE_ANGLE = 0.04
 """Amplitude of the arm's first joint [rad] (ours): 2 cm at half a metre, 1.8 m/s^2."""
+DROP = 0.005
+"""Height above the table from which an object comes to rest [m] (ours)."""
+REST_SECONDS = 4.0
+"""Longest time in which it comes to rest [s] (ours)."""
+REST_SPEED = 0.002
+"""Speed below which it rests [m/s] (ours)."""
+DRAWS = 20
+"""How often it is put down anew if it rolls off the region (ours)."""
+PLACES = 100
+"""Places that are tried until one is free (ours)."""
+APART = 0.03
+"""Distance between the outlines of objects as they are put down [m] (ours)."""
+MOST_CLUTTER = 8
+"""Most other objects that there is room for (ours)."""
+AROUND = 0.10
+"""Other objects stand at most this far beyond the region of the one that is asked for [m] (ours)."""
+STRIDE = 2
+"""Every so many pixels, in both directions, one ray is cast (ours)."""
+FARTHEST = 3.0
+"""Longest ray [m] (ours)."""
+
+Region = tuple[float, float, float, float]
+"""Least x and y, greatest x and y, from the arm's base [m]."""
 
 
 @dataclass(frozen=True)
-class TabletopConfig:
+class TabletopConfig(Checked):
     """How an attempt runs. Values without a source are ours."""
 
     see: Literal["cloud", "mesh"] = "cloud"
@@ -73,6 +102,7 @@ class TabletopConfig:
             OptionError: Too many other objects, or fewer than none, noise that is none, a region that is none, or constraints
                 on places.
         """
+        super().__post_init__()
         wanted = self.plan.constraints
         if wanted.avoid is not None or wanted.hold or wanted.spare:
             raise OptionError("objects of attempts come to rest anywhere, so that avoid, hold and spare say nothing there; "
@@ -90,6 +120,8 @@ class TabletopConfig:
         values = asdict(self)
         if self.plan.constraints == Constraints():
             del values["plan"]["constraints"]  # results from before there were any are of the same settings
+        if self.plan.deviations == PlanConfig.deviations:
+            del values["plan"]["deviations"]  # likewise
         return LABEL + json.dumps(values, sort_keys=True)
 
     @staticmethod
@@ -106,6 +138,9 @@ class TabletopConfig:
             direction = wanted.get("direction")
             constraints = Constraints(
                 None if direction is None else tuple(direction), cone=wanted.get("cone"), opening=wanted.get("opening"))
+            if "deviations" in values["plan"]:
+                values["plan"]["deviations"] = tuple(
+                    Deviation(tuple(d.pop("shift")), **d) for d in values["plan"]["deviations"])
             config = TabletopConfig(**values | {"plan": PlanConfig(**values["plan"], reach=reach, constraints=constraints),
                                                 "region": tuple(values["region"])})
         except (ValueError, TypeError, KeyError) as error:
@@ -162,6 +197,8 @@ class Attempt:
     """Hash of the robot, of its arm and hand; empty, as the following, in files from before there was one."""
     object_sha256: str = ""
     weights_sha256: str = ""
+    solid_sha256: str = ""
+    """Hash of what was simulated of the object; one mesh may have other convex parts."""
 
 
 Proposer = Callable[[PickedObject, Float[np.ndarray, "4 4"], int], GraspBatch]
@@ -199,12 +236,13 @@ def attempt(
     """
     config = config or TabletopConfig()
     _check(robot, obj, config)
-    scene = LiftScene(robot, [obj, *other_objects(obj.name, config.clutter, np.random.default_rng([seed, number, 1]))])
+    others = other_objects(obj.name, config.clutter, np.random.default_rng([seed, number, 1]))
+    scene = LiftScene(Workcell(robot), [obj, *others])
     result = Attempt(robot.name, obj.name, number, seed, config.label())
     draw = np.random.default_rng([seed, number])
     if not scatter(scene, config.region, draw):
         return replace(result, stage="see", reason="an object rolls off the region wherever it is put")
-    start, *others = (scene.pose(i) for i in range(len(scene.objects)))
+    start, *beside = (scene.pose(i) for i in range(len(scene.objects)))
     result = replace(result, place=json.dumps(start.round(6).tolist()))
     begin, processor = time.perf_counter(), time.process_time()
     try:
@@ -224,7 +262,7 @@ def attempt(
         watch.planned(seen, made)
     stage, reason = carry_out(scene, made, config, watch)
     raised = float(scene.pose(0)[2, 3] - start[2, 3])
-    pushed = max((_apart(scene.pose(i), T) for i, T in enumerate(others, 1)), default=0.0)
+    pushed = max((_apart(scene.pose(i), T) for i, T in enumerate(beside, 1)), default=0.0)
     return replace(result, stage=stage, reason=reason, success=not reason, raised=raised, pushed=pushed)
 
 
@@ -257,6 +295,91 @@ def carry_out(scene: LiftScene, made: MotionPlan, config: TabletopConfig, watch:
         if slip > SLIPPED or not scene.touched(0):
             return stage, f"the object slipped by {100 * slip:.0f} cm out of the hand"
     return "done", ""
+
+
+def other_objects(name: str, count: int, draw: np.random.Generator) -> list[ObjectModel]:
+    """Some of the built-in objects, without the one that is asked for."""
+    return [load_object(str(other)) for other in draw.permutation(sorted(set(BUILTIN) - {name}))[:count]]
+
+
+def scatter(scene: LiftScene, region: Region, draw: np.random.Generator) -> bool:
+    """Put all objects down, the first one in the region and the others around it; False if one of them never comes to rest."""
+    wide = (region[0] - AROUND / 2, region[1] - AROUND, region[2] + AROUND, region[3] + AROUND)
+    return all(rest(scene, index, wide if index else region, draw) for index in range(len(scene.objects)))
+
+
+def rest(scene: LiftScene, index: int, region: Region, draw: np.random.Generator) -> bool:
+    """Drop an object in a random orientation at a random place, and wait until it rests there; False if it never does."""
+    low, high = np.array(region[:2]), np.array(region[2:])
+    table, obj = scene.robot.table or Table(), scene.objects[index]
+    assert obj.vertices is not None
+    for _ in range(DRAWS):
+        generator = torch.Generator().manual_seed(int(draw.integers(2**31)))
+        T = np.eye(4)
+        T[:3, :3] = random_rotations(1, generator)[0].double().numpy()
+        T[:2, 3] = _free_place(scene, index, T, region, draw)
+        T[2, 3] = table.height + DROP - float((obj.vertices @ T[2, :3]).min())
+        scene.place(index, T)
+        for _ in range(round(REST_SECONDS / 0.5)):
+            scene.advance(0.5)
+            if scene.speed(index) < REST_SPEED:
+                break
+        place = scene.pose(index)[:2, 3] - scene.robot.T_world_base[:2, 3]
+        if scene.speed(index) < REST_SPEED and (place > low - 0.05).all() and (place < high + 0.05).all():
+            return True
+    return False
+
+
+def _free_place(
+    scene: LiftScene, index: int, T: Float[np.ndarray, "4 4"], region: Region, draw: np.random.Generator
+) -> Float[np.ndarray, "2"]:
+    """Where an object in this orientation stands APART from those before it; the last place that was tried if there is none."""
+    base, outline = scene.robot.T_world_base[:2, 3], scene.objects[index].cloud @ T[:2, :3].T
+    poses = [scene.pose(i) for i in range(index)]
+    others = [obj.cloud @ T[:2, :3].T + T[:2, 3] for obj, T in zip(scene.objects, poses, strict=False)]
+    tree, place = KDTree(np.concatenate(others)) if others else None, base
+    for _ in range(PLACES):
+        place = base + draw.uniform(region[:2], region[2:])
+        if tree is None or tree.query(outline + place)[0].min() > APART:
+            break
+    return place
+
+
+def thinned_intrinsics(camera: CameraMount) -> Float[np.ndarray, "3 3"]:
+    """Those of the images that `depth_image` makes, whose pixels are STRIDE apart [pixels]."""
+    return camera.intrinsics / np.array([[STRIDE], [STRIDE], [1.0]])
+
+
+def depth_image(
+    scene: LiftScene, camera: CameraMount, noise: float, seed: int
+) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Depth along the camera's z axis [m], and which pixels show the scene's first object.
+
+    Depth is zero where nothing is near, and where the robot's model covers the view.
+
+    Args:
+        scene: Its objects are seen as their true meshes.
+        camera: Pose and intrinsics.
+        noise: Standard deviation of depth [m].
+        seed: Of the noise.
+    """
+    row, column = np.meshgrid(np.arange(0, camera.height, STRIDE), np.arange(0, camera.width, STRIDE), indexing="ij")
+    pixels = np.stack([column, row, np.ones_like(row)], -1).reshape(-1, 3).astype(float)
+    rays = np.linalg.solve(camera.intrinsics, pixels.T).T
+    length = np.linalg.norm(rays, axis=1)
+    world = (rays / length[:, None]) @ camera.T_world_camera[:3, :3].T
+    groups = np.array([1, 1, 1, 0, 1, 0], np.uint8)  # true shapes in, convex parts out
+    assert groups[SHAPE_GROUP]
+    geom, distance = np.full(len(rays), -1, np.int32), np.full(len(rays), -1.0)
+    eye = camera.T_world_camera[:3, 3].copy()
+    mujoco.mj_multiRay(
+        scene.model, scene.data, eye, world.ravel().copy(), groups, True, -1, geom, distance, None, len(rays), FARTHEST)
+    owner = [scene.model.body(int(b)).name for b in scene.model.geom_bodyid]
+    robot = np.array([name.startswith((ARM, PREFIX)) for name in owner])
+    seen = (geom >= 0) & (distance > 0) & ~robot[np.maximum(geom, 0)]
+    first = np.array([name == object_name(0) for name in owner])[np.maximum(geom, 0)] & seen
+    drawn = np.random.default_rng(seed).normal(0.0, noise, len(rays))
+    return np.where(seen, distance / length + drawn, 0.0).reshape(row.shape), first.reshape(row.shape)
 
 
 def _see(scene: LiftScene, config: TabletopConfig, seed: int) -> tuple[PickedObject, Float[np.ndarray, "4 4"]]:

@@ -1,7 +1,9 @@
-"""A motion of arm and hand, from home to the lifted object, as it is planned, stored and consumed by drivers."""
+"""A motion of arm and hand, from home to the lifted object: in memory, as a plan file, and as trajectories for controllers."""
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -12,8 +14,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dro_grasp.errors import PlanError
-from dro_grasp.files import check_output, reading, replacing
-from dro_grasp.planning.timing import Trajectory
+from dro_grasp.export.contents import yaml_text
+from dro_grasp.files import UNTYPED, check_output, given_path, reading, replacing
 
 STAGES = ("reach", "shape", "approach", "close", "lift")
 """The arm travels with the hand open; the hand takes the pregrasp; straight to the grasp; the hand closes; straight up."""
@@ -31,6 +33,27 @@ COLUMNS = ("time", "stage", "arm", "arm_velocity", "arm_acceleration", "hand", "
 """Arrays of a plan file."""
 SCENE = ("points", "others", "T_world_wrist", "joints", "score")
 """Further arrays of it, what was planned for; their names begin with `scene_`."""
+DIGITS = 6
+"""Decimals of joint values in trajectories: micrometres and microradians (ours)."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Joints over time, from rest to rest."""
+
+    time: Float[np.ndarray, " k"]
+    """From zero [s]."""
+    position: Float[np.ndarray, "k n"]
+    """[rad or m]"""
+    velocity: Float[np.ndarray, "k n"]
+    """[rad/s or m/s]"""
+    acceleration: Float[np.ndarray, "k n"]
+    """[rad/s^2 or m/s^2]"""
+
+    @property
+    def seconds(self) -> float:
+        """Duration [s]."""
+        return float(self.time[-1])
 
 
 @dataclass(frozen=True)
@@ -156,7 +179,8 @@ class MotionPlan:
         Raises:
             PlanError: No such file, or a truncated or foreign one, or one of another version.
         """
-        with reading(path, PlanError, EXPECTED), Path(path).open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+        path = given_path(path)
+        with reading(path, PlanError, EXPECTED, *UNTYPED), path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             header: dict[str, Any] = json.loads(str(file["header"]))
             if header.pop("format_version", None) != FORMAT or tuple(header.pop("stages", ())) != STAGES:
                 raise PlanError(f"{path} is a plan file of another version; plan again")
@@ -172,3 +196,43 @@ def grasps_and_dropped(grasps: int, dropped: dict[str, int]) -> str:
     """How many grasps were dropped, and why."""
     reasons = ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count)
     return f"{grasps} grasps: {reasons or 'none dropped'}"
+
+
+def trajectory_yaml(plan: MotionPlan) -> str:
+    """One trajectory_msgs/JointTrajectory each for arm and hand, with the same times. Source: ROS 2 common_interfaces."""
+    notes, times = plan.notes, {name: round(float(plan.arm.time[plan.part(name)][-1]), DIGITS) for name in STAGES}
+    lines = [
+        f"# Robot '{notes.robot}' lifts object '{notes.object}'. Joints in rad or m, time in s.",
+        f"# The wrist pose of the grasp is in frame '{notes.frame}'. Stages end at (s): {times}",
+    ]
+    messages = {"arm": _message(notes.frame, notes.arm_joints, plan.arm), "hand": _message(
+        notes.frame, notes.hand_joints, plan.hand)}
+    return "\n".join([*lines, yaml_text(messages)])
+
+
+def trajectory_csv(plan: MotionPlan) -> str:
+    """One row for each sample: time, stage, and the target of every joint, arm before hand."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    joints = [f"arm/{n}" for n in plan.notes.arm_joints] + [f"hand/{n}" for n in plan.notes.hand_joints]
+    table.writerow(["time", "stage", *joints])
+    for i, time in enumerate(plan.arm.time.tolist()):
+        values = _plain(np.concatenate([plan.arm.position[i], plan.hand.position[i]]))
+        table.writerow([round(time, DIGITS), STAGES[int(plan.stage[i])], *values])
+    return text.getvalue()
+
+
+def _message(frame: str, names: tuple[str, ...], part: Trajectory) -> dict[str, object]:
+    points = []
+    for i, time in enumerate(part.time.tolist()):
+        second, nanosecond = divmod(round(time * 1e9), 10**9)
+        points.append({
+            "positions": _plain(part.position[i]), "velocities": _plain(part.velocity[i]),
+            "accelerations": _plain(part.acceleration[i]), "effort": [],
+            "time_from_start": {"sec": second, "nanosec": nanosecond}})
+    header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": frame}
+    return {"header": header, "joint_names": list(names), "points": points}
+
+
+def _plain(values: Float[np.ndarray, " n"]) -> list[float]:
+    return np.round(values, DIGITS).tolist()

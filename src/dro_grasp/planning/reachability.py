@@ -1,8 +1,12 @@
-"""Which grasps the arm can carry out: wrist poses and configurations from the standoff to the end of the lift."""
+"""Which grasps the arm can carry out: inverse kinematics, and configurations from the standoff to the end of the lift.
+
+An arm with fewer than six joints brings its wrist to few poses: its palms face a few ways only, mostly in the plane of its
+links. Grasps are asked for from there, and a wrist may be turned a little from what was asked. Ours.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,13 +15,13 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from dro_grasp.geometry.point_clouds import farthest_points
 from dro_grasp.geometry.se3 import apply_to_cloud
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.kinds import Checked
 from dro_grasp.planning.candidates import lowest_points
-from dro_grasp.planning.collisions import CollisionChecker, open_hand
 from dro_grasp.planning.robot import Robot
-from dro_grasp.planning.workcell import VOXEL
+from dro_grasp.planning.workcell import VOXEL, Workcell, arm_addresses
 
 BELOW_TABLE = "below the table"
 """A finger, or the palm, would be in the table."""
@@ -33,8 +37,28 @@ NO_LINE = "without a straight approach"
 """Between standoff and grasp."""
 NO_LIFT = "without a straight lift"
 """The arm cannot raise the object so far, or hits something with it."""
-
-
+POSITION_TOLERANCE = 5e-4
+"""Largest error of the wrist's position [m] (ours)."""
+ROTATION_TOLERANCE = 2e-3
+"""Largest error of its rotation [rad] (ours)."""
+ROTATION_COST = 0.3
+"""Weight of a radian against that of a metre (ours)."""
+LITTLE_COST = 0.01
+"""The same for arms that cannot reach every rotation, so that they are exact in position (ours)."""
+ITERATIONS = 25
+"""Most steps towards a pose (ours)."""
+LARGEST_STEP = 0.25
+"""Largest change of a joint between neighbouring poses of a straight line [rad or m]: beyond, the arm flips over (ours)."""
+TURNED = 0.12
+"""Farthest that a wrist is turned about the grasp centre from what was asked [rad] (ours)."""
+DRAWS = 50_000
+"""Random configurations among which palm directions are looked for (ours)."""
+NEAREST = 64
+"""Configurations whose grasp centre is nearest to the place (ours)."""
+DIRECTIONS = 8
+"""Palm directions that grasps are asked for from (ours)."""
+STEEPEST = 0.2
+"""Sine of the angle above the horizontal up to which a palm may face upwards (ours): the table is below."""
 SMALL_ARM = 0.7
 """Length of arm and hand below which an arm is small [m] (ours)."""
 SMALL_STANDOFF = 0.05
@@ -44,7 +68,7 @@ SMALL_LIFT = 0.08
 
 
 @dataclass(frozen=True)
-class ReachConfig:
+class ReachConfig(Checked):
     """How grasps are approached and lifted. Values are ours."""
 
     standoff: float = 0.10
@@ -97,49 +121,44 @@ class Postures:
     def of(robot: Robot, grasps: GraspBatch, index: int) -> Postures:
         """Those of one grasp of a complete batch."""
         rows = (grasps.pregrasp_joints, grasps.joints, grasps.squeeze_joints)
-        return Postures(open_hand(robot), *(r[index].double().numpy() for r in rows))
+        return Postures(robot.open_hand, *(r[index].double().numpy() for r in rows))
+
+    @property
+    def closing(self) -> Float[np.ndarray, "3 n_dof"]:
+        """While the hand closes: pregrasp, grasp, squeeze."""
+        return np.stack([self.pregrasp, self.grasp, self.squeeze])
 
 
 class Reachability:
-    """Goes through grasps of one object, and counts why it drops them."""
+    """Finds out how the arm carries out grasps of a workcell's object, or why it does not."""
 
-    def __init__(
-        self, robot: Robot, checker: CollisionChecker, obj: ObjectModel, obstacles: Sequence[ObjectModel], table: float | None,
-        config: ReachConfig, seed: int,
-    ) -> None:
-        """Prepare the solver; `table` is the height of the table [m], the object stands where the checker has it."""
-        from dro_grasp.planning.inverse_kinematics import WristSolver
-
-        self.robot, self.checker, self.obj, self.table, self.config = robot, checker, obj, table, config.within(robot)
-        self.solver, self.random = WristSolver(robot), np.random.default_rng(seed)
-        self.reasons: dict[int, str] = {}
-        """Why grasps were dropped, by their number."""
-        clouds = [thing.cloud for thing in obstacles if thing.is_cloud]
+    def __init__(self, cell: Workcell, config: ReachConfig, seed: int) -> None:
+        """Prepare the solver, whose random starts follow from the seed."""
+        self.cell, self.config = cell, config.within(cell.robot)
+        self.solver, self.random = WristSolver(cell), np.random.default_rng(seed)
+        clouds = [thing.cloud for thing in cell.obstacles if thing.is_cloud]
         self._cloud = KDTree(np.concatenate(clouds)) if clouds else None
-        self._fields = [thing.distance_field for thing in obstacles if not thing.is_cloud]
+        self._fields = [thing.distance_field for thing in cell.obstacles if not thing.is_cloud]
 
-    def promising(self, grasps: GraspBatch, first: int = 0) -> list[int]:
-        """Numbers of the grasps that are worth inverse kinematics: geometry of the hand alone decides.
-
-        Args:
-            grasps: Complete grasps in the world.
-            first: Number of the first of them.
-        """
-        hand, T = self.robot.hand, grasps.T_object_wrist
+    def hopeless(self, grasps: GraspBatch) -> dict[int, str]:
+        """Rows of complete grasps in the world that need no inverse kinematics, and why: geometry of the hand alone decides."""
+        hand, T, cell = self.cell.robot.hand, grasps.T_object_wrist, self.cell
+        assert cell.target is not None
         way = torch.linspace(0, self.config.standoff, 5)
         line = T[:, None].repeat(1, len(way), 1, 1)
         line[..., :3, 3] -= way[:, None] * hand.palm_directions(T)[:, None]
         points = hand.points(grasps.pregrasp_joints[:, None].expand(-1, len(way), -1), line).flatten(1, 2)
-        T_object_world = torch.from_numpy(np.linalg.inv(self.checker.T_world_target)).to(T)
-        depth = -self.obj.distance_field.distances(apply_to_cloud(T_object_world.expand(len(T), 4, 4), points))[0].amin(-1)
+        T_object_world = torch.from_numpy(np.linalg.inv(cell.T_world_target)).to(T)
+        depth = -cell.target.distance_field.distances(apply_to_cloud(T_object_world.expand(len(T), 4, 4), points))[0].amin(-1)
         tests = [(HITS_OBSTACLE, self._obstacle_distance(points) < self.config.obstacle_margin),
                  (HITS_OBJECT, depth > self.config.deepest)]
-        if self.table is not None:
-            tests.insert(0, (BELOW_TABLE, lowest_points(hand, grasps) <= self.table + self.config.table_margin))
+        if (table := cell.robot.table) is not None:
+            tests.insert(0, (BELOW_TABLE, lowest_points(hand, grasps) <= table.height + self.config.table_margin))
+        found: dict[int, str] = {}
         for reason, failed in tests:
             for row in failed.nonzero()[:, 0].tolist():
-                self.reasons.setdefault(first + row, reason)
-        return [first + row for row in range(len(grasps)) if first + row not in self.reasons]
+                found.setdefault(row, reason)
+        return found
 
     def _obstacle_distance(self, points: Float[Tensor, "n k 3"]) -> Float[Tensor, " n"]:
         """Distance of the nearest of some points to the obstacles [m]."""
@@ -151,31 +170,28 @@ class Reachability:
             nearest = torch.minimum(nearest, torch.from_numpy(apart).to(nearest) - VOXEL / 2)
         return nearest
 
-    def feasible(self, grasps: GraspBatch, index: int) -> Feasible | None:
-        """One grasp with configurations from standoff to lift; None, with the reason noted, if there are none."""
-        postures = Postures.of(self.robot, grasps, index)
+    def ways(self, grasps: GraspBatch, index: int) -> Feasible | str:
+        """One grasp with configurations from standoff to lift, or why there are none."""
+        robot = self.cell.robot
         T = grasps.T_object_wrist[index].double().numpy()
-        ahead = self.robot.hand.palm_directions(grasps.T_object_wrist[index:index + 1])[0].double().numpy()
+        ahead = robot.hand.palm_directions(grasps.T_object_wrist[index:index + 1])[0].double().numpy()
         back, up = self._line(T, -self.config.standoff * ahead), self._line(T, np.array([0, 0, self.config.lift]))
-        reasons = [OUT_OF_REACH]
-        lower, upper = self.solver.lower, self.solver.upper
-        for seed in [self.robot.home, *self.random.uniform(lower, upper, (self.config.seeds - 1, len(lower)))]:
+        postures, reasons, (lower, upper) = Postures.of(robot, grasps, index), [OUT_OF_REACH], robot.working_range
+        for seed in [robot.home, *self.random.uniform(lower, upper, (self.config.seeds - 1, len(lower)))]:
             q = self.solver.solve(T, [seed])
             if q is None:
                 continue
-            outcome = self._ways(q, back, up, postures)
+            outcome = self._through(q, back, up, postures)
             if not isinstance(outcome, str):
                 return Feasible(index, *outcome)
             reasons.append(outcome)
-        order = (OUT_OF_REACH, COLLIDES, NO_LINE, NO_LIFT)
-        self.reasons[index] = max(reasons, key=order.index)
-        return None
+        return max(reasons, key=(OUT_OF_REACH, COLLIDES, NO_LINE, NO_LIFT).index)
 
-    def _ways(
+    def _through(
         self, q: Float[np.ndarray, " n_arm"], back: Float[np.ndarray, "k 4 4"], up: Float[np.ndarray, "m 4 4"], hand: Postures
     ) -> tuple[Float[np.ndarray, "k n_arm"], Float[np.ndarray, "m n_arm"]] | str:
         """Approach and lift through one configuration of the grasp, or why there are none."""
-        free, clearance = self.checker.free, self.config.clearance
+        free, clearance = self.cell.free, self.config.clearance
         if not all(free(q, posture, clearance, touch=True) for posture in (hand.pregrasp, hand.grasp, hand.squeeze)):
             return COLLIDES
         retreat = self.solver.follow(back, q)
@@ -195,6 +211,91 @@ class Reachability:
         poses = np.tile(T, (count, 1, 1))
         poses[:, :3, 3] += np.linspace(0, 1, count)[:, None] * motion
         return poses
+
+
+class WristSolver:
+    """Solves for one robot; it knows no obstacles.
+
+    An arm with few joints brings the grasp centre to its place, and turns the wrist as nearly as it can.
+    """
+
+    def __init__(self, cell: Workcell) -> None:
+        """Aim with the frame of the cell's arm."""
+        import mink
+
+        few = cell.robot.has_few_joints
+        self._T_wrist_aim, self._turned = cell.robot.T_wrist_aim, TURNED if few else ROTATION_TOLERANCE
+        self.model, self.addresses = cell.arm, arm_addresses(cell.arm, cell.robot)
+        self.lower, self.upper = cell.robot.working_range
+        self._configuration = mink.Configuration(self.model)
+        self._task = mink.FrameTask(
+            "wrist", "site", position_cost=1.0, orientation_cost=LITTLE_COST if few else ROTATION_COST, lm_damping=1e-4)
+        self._limit = mink.ConfigurationLimit(self.model)
+
+    def solve(
+        self, T_world_wrist: Float[np.ndarray, "4 4"], seeds: Iterable[Float[np.ndarray, " n_arm"]],
+        iterations: int = ITERATIONS,
+    ) -> Float[np.ndarray, " n_arm"] | None:
+        """The configuration that the first successful seed leads to; None if none does.
+
+        Args:
+            T_world_wrist: Wanted pose [m].
+            seeds: Where to start [rad or m].
+            iterations: Most steps from each.
+        """
+        import mink
+
+        self._task.set_target(mink.SE3.from_matrix(T_world_wrist @ self._T_wrist_aim))
+        for seed in seeds:
+            q = np.zeros(self.model.nq)
+            q[self.addresses] = np.clip(seed, self.lower, self.upper)
+            self._configuration.update(q)
+            for _ in range(iterations):
+                if self._arrived():
+                    break
+                try:
+                    velocity = mink.solve_ik(
+                        self._configuration, [self._task], 1.0, "daqp", damping=1e-6, limits=[self._limit])
+                except mink.NoSolutionFound:
+                    break
+                self._configuration.integrate_inplace(velocity, 1.0)
+            if self._arrived():
+                return np.clip(self._configuration.q[self.addresses], self.lower, self.upper)
+        return None
+
+    def follow(
+        self, poses: Float[np.ndarray, "k 4 4"], start: Float[np.ndarray, " n_arm"]
+    ) -> Float[np.ndarray, "k n_arm"] | None:
+        """Configurations along a line of neighbouring poses, without a jump; None if there are none."""
+        found = []
+        for T in poses:
+            q = self.solve(T, [start], 10)
+            if q is None or float(np.abs(q - start).max()) > LARGEST_STEP:
+                return None
+            found.append(q)
+            start = q
+        return np.stack(found)
+
+    def _arrived(self) -> bool:
+        error = self._task.compute_error(self._configuration)
+        return bool(np.linalg.norm(error[:3]) < POSITION_TOLERANCE and np.linalg.norm(error[3:]) < self._turned)
+
+
+def reachable_directions(robot: Robot, place: Float[np.ndarray, "3"], seed: int = 0) -> Float[Tensor, "k 3"]:
+    """Palm directions with which the arm brings its grasp centre to a place, spread evenly.
+
+    Args:
+        robot: The robot.
+        place: In the world [m].
+        seed: The same seed gives the same directions.
+    """
+    arm = np.random.default_rng(seed).uniform(*robot.working_range, (DRAWS, len(robot.home)))
+    T = torch.from_numpy(robot.T_world_wrist(arm)).float()
+    away = (robot.hand.grasp_centres(T) - torch.from_numpy(place).float()).norm(dim=-1)
+    directions = robot.hand.palm_directions(T)
+    away = torch.where(directions[:, 2] < STEEPEST, away, torch.inf)
+    near = directions[away.topk(NEAREST, largest=False).indices]
+    return near[farthest_points(near, DIRECTIONS)]
 
 
 def carried(T_world_wrist: Float[np.ndarray, "4 4"], T_at_grasp: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:

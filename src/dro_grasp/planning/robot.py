@@ -23,7 +23,7 @@ from dro_grasp.descriptions.xml_files import parse_xml
 from dro_grasp.errors import HandError, RobotError
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand, locate_hand
-from dro_grasp.planning.extent import farthest, farthest_surface
+from dro_grasp.kinematics.tree import PRISMATIC, REVOLUTE, KinematicTree
 from dro_grasp.planning.robot_file import CameraMount, RobotFile, Table, is_number, locate_robot, read_robot_file
 from dro_grasp.records import flat
 
@@ -33,6 +33,8 @@ TURN = np.pi
 """Planned motions stay this near home, so that configurations a whole turn apart count once [rad] (ours)."""
 HASHED_DIGITS = 9
 """Decimals of poses and limits that count for a robot's hash (ours)."""
+FULL = 6
+"""Joints of an arm that brings its wrist to any pose in reach."""
 DEFAULT_EFFORT = 50.0
 """Largest torque of an arm's joint that states none [Nm]; only simulated servos use it (ours)."""
 
@@ -92,6 +94,25 @@ class Robot:
         return np.maximum(self.lower, self.home - TURN), np.minimum(self.upper, self.home + TURN)
 
     @property
+    def open_hand(self) -> Float[np.ndarray, " n_dof"]:
+        """The posture in which the hand travels [rad or m]."""
+        with torch.no_grad():
+            return self.hand.canonical_joints().double().numpy()
+
+    @property
+    def has_few_joints(self) -> bool:
+        """Whether the arm brings its wrist to some poses only."""
+        return len(self.home) < FULL
+
+    @property
+    def T_wrist_aim(self) -> Float[np.ndarray, "4 4"]:
+        """Pose in the hand's root link of the frame that is brought to its place, of few joints the grasp centre's [m]."""
+        T = np.eye(4)
+        if self.has_few_joints:
+            T[:3, 3] = self.hand.grasp_centre_wrist.double().numpy()
+        return T
+
+    @property
     def longest_reach(self) -> float:
         """No grasp centre gets farther from the base than this [m]: all distances between joints, and the travel of slides."""
         return self._wrist_reach + float(self.hand.grasp_centre_wrist.norm())
@@ -101,13 +122,13 @@ class Robot:
         """No part of arm or hand gets farther from the base than this [m]."""
         assert self.hand.description is not None
         limits = self.hand.tree.lower.double().numpy(), self.hand.tree.upper.double().numpy()
-        return max(farthest_surface(self.arm, *self.working_range),
-                   self._wrist_reach + farthest_surface(self.hand.description, *limits))
+        return max(_farthest_surface(self.arm, *self.working_range),
+                   self._wrist_reach + _farthest_surface(self.hand.description, *limits))
 
     @property
     def _wrist_reach(self) -> float:
         tree = self.arm.tree
-        return farthest(tree, *self.working_range, tree.link_names.index(self.mount_link), self.T_link_wrist[None, :3, 3])
+        return _farthest(tree, *self.working_range, tree.link_names.index(self.mount_link), self.T_link_wrist[None, :3, 3])
 
     def T_world_wrist(self, arm: Float[np.ndarray, "*batch n_arm"]) -> Float[np.ndarray, "*batch 4 4"]:
         """Pose of the hand's root link [m]."""
@@ -115,6 +136,41 @@ class Robot:
         links = tree.forward(torch.from_numpy(np.ascontiguousarray(arm, np.float64)))
         mount = links[..., tree.link_names.index(self.mount_link), :, :]
         return self.T_world_base @ mount.numpy() @ self.T_link_wrist
+
+
+def _farthest(
+    tree: KinematicTree, lower: Float[np.ndarray, " n_dof"], upper: Float[np.ndarray, " n_dof"], link: int,
+    points: Float[np.ndarray, "n 3"],
+) -> float:
+    """No point that is fixed to a link gets farther from the root link's origin than this [m], by the triangle inequality.
+
+    Args:
+        tree: The links.
+        lower: Least value of each independent joint [rad or m].
+        upper: Greatest value of each independent joint [rad or m].
+        link: Index of the link.
+        points: In the link's frame [m].
+    """
+    tree = tree.double
+    coupling, offset = tree.link_coupling, tree.link_offset
+    ends = torch.stack([coupling * torch.from_numpy(end).double() for end in (lower, upper)])
+    travel = torch.stack([ends.amin(0).sum(-1), ends.amax(0).sum(-1)]).add(offset).abs().amax(0)
+    reach, held = 0.0, torch.from_numpy(points).double()
+    while link >= 0:
+        turns = tree.kind[link] == REVOLUTE
+        centre = tree.anchor[link] if turns else torch.zeros_like(tree.anchor[link])  # a turn keeps distances to this point
+        reach += float((held - centre).norm(dim=-1).max()) + (float(travel[link]) if tree.kind[link] == PRISMATIC else 0.0)
+        held = (tree.origin[link, :3, :3] @ centre + tree.origin[link, :3, 3])[None]
+        link = tree.parent[link]
+    return reach + float(held.norm())
+
+
+def _farthest_surface(
+    description: Description, lower: Float[np.ndarray, " n_dof"], upper: Float[np.ndarray, " n_dof"]
+) -> float:
+    """No shape of a description gets farther from its root link's origin than this [m]; limits are as for `_farthest`."""
+    tree = description.tree
+    return max((_farthest(tree, lower, upper, shape.link, shape.vertices) for shape in description.geometry), default=0.0)
 
 
 def _rounded(values: Float[np.ndarray, "..."]) -> list[Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,9 @@ from PIL import Image
 
 from dro_grasp.descriptions.loader import Description
 from dro_grasp.files import check_output, replacing
-from dro_grasp.planning.collisions import CollisionChecker, open_hand
 from dro_grasp.planning.robot import Robot, load_robot
 from dro_grasp.planning.robot_file import Table
+from dro_grasp.planning.workcell import CLEARANCE, TABLE, WORLD, Workcell
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.rendering.meshes import Colour, Mesh, arrow
 from dro_grasp.rendering.rasterizer import render
@@ -52,11 +53,13 @@ class RobotReport:
     """Horizontal distances from the base at which the grasp centre gets to within 10 cm above the table [m]."""
     free_share: float
     """Share of random configurations that do not collide."""
+    blocking: str | None = None
+    """Where all of them collide: what collides in most, in words."""
 
     @property
     def usable(self) -> bool:
-        """Whether plans can start: nothing collides at home."""
-        return not self.home_contacts
+        """Whether plans can start and go somewhere: nothing collides at home, nor everywhere."""
+        return not self.home_contacts and self.free_share > 0
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -66,15 +69,16 @@ class RobotReport:
         return {"robot": r.name, "joints": joints, "hand": r.hand.name, "hand_joints": list(r.hand_joints),
                 "mount_link": r.mount_link, "wrist_at_home": r.T_world_wrist(r.home).tolist(), "camera": r.camera is not None,
                 "table": None if r.table is None else r.table.height, "reach": list(self.reach), "free_share": self.free_share,
-                "excluded": [list(p) for p in self.excluded], "home_contacts": list(self.home_contacts), "usable": self.usable}
+                "excluded": [list(p) for p in self.excluded], "home_contacts": list(self.home_contacts),
+                "blocking": self.blocking, "usable": self.usable}
 
     def lines(self) -> list[str]:
         """In words."""
         r = self.robot
         place = r.T_world_wrist(r.home)[:3, 3]
         of_arm = [pair for pair in self.excluded if not all(name.startswith(PREFIX) for name in pair)]
-        between = [" and ".join(name.partition("/")[2] for name in pair) for pair in of_arm]
-        table = "no table" if r.table is None else (
+        between = [" and ".join(TABLE if name == WORLD else name.partition("/")[2] for name in pair) for pair in of_arm]
+        table = "no table, so that nothing keeps plans above one" if r.table is None else (
             f"table at z = {r.table.height:g} m, {r.table.size[0]:g} x {r.table.size[1]:g} m")
         camera = "no camera" if r.camera is None else (
             "camera at ({:.2f}, {:.2f}, {:.2f}) m".format(*r.camera.T_world_camera[:3, 3]))
@@ -89,7 +93,9 @@ class RobotReport:
             f"{self.free_share:.0%} of random configurations are free of collisions",
             f"not checked, since they always touch: {', '.join(between) or 'nothing'}",
             *(f"COLLISION at home: {text}" for text in self.home_contacts),
-            "usable" if self.usable else "not usable: change `home` or the mount until nothing collides at home",
+            *([f"COLLISION everywhere: {self.blocking}"] if self.blocking else []),
+            "usable" if self.usable else "not usable: change `home` or the mount until nothing collides at home"
+            if self.home_contacts else "not usable: change `table`, `base` or the mount until the arm can move",
         ]
 
 
@@ -100,15 +106,19 @@ def check_robot(name: str | Path) -> RobotReport:
         RobotError: The robot cannot be loaded.
     """
     robot = load_robot(name)
-    checker, opened = CollisionChecker(robot, robot.table), open_hand(robot)
-    contacts = [f"{c.first} and {c.second} ({-1e3 * c.distance:.1f} mm)" for c in checker.contacts(robot.home, opened)]
+    cell, opened = Workcell(robot), robot.open_hand
+    contacts = [f"{c.first} and {c.second} ({c.depth})" for c in cell.contacts(robot.home, opened, CLEARANCE)]
     draws = np.random.default_rng(0).uniform(robot.lower, robot.upper, (REACH_SAMPLES, len(robot.home)))
-    free = np.array([checker.free(q, opened) for q in draws])
+    free, blocking = np.array([cell.free(q, opened) for q in draws]), None
+    if not free.any():
+        met = Counter(pair for q in draws for pair in {(c.first, c.second) for c in cell.contacts(q, opened, CLEARANCE)})
+        (pair, count), *_ = met.most_common(1)
+        blocking = f"{pair[0]} and {pair[1]}, in {count / len(draws):.0%} of random configurations"
     centre = robot.hand.grasp_centres(torch.from_numpy(robot.T_world_wrist(draws)).float()).double().numpy()
     height = centre[:, 2] - (robot.table or Table()).height
     distance = np.linalg.norm(centre[:, :2] - robot.T_world_base[:2, 3], axis=1)[free & (height > 0) & (height < 0.1)]
     reach = (float(distance.min()), float(distance.max())) if len(distance) else (float("nan"), float("nan"))
-    return RobotReport(robot, checker.excluded, tuple(contacts), reach, float(free.mean()))
+    return RobotReport(robot, cell.excluded, tuple(contacts), reach, float(free.mean()), blocking)
 
 
 def draw_robot(robot: Robot, path: Path) -> None:
@@ -117,7 +127,7 @@ def draw_robot(robot: Robot, path: Path) -> None:
     Raises:
         OutputError: The path cannot be written.
     """
-    meshes = [*robot_meshes(robot, robot.home, open_hand(robot)), *table_meshes(robot.table)]
+    meshes = [*robot_meshes(robot, robot.home, robot.open_hand), *table_meshes(robot.table)]
     if robot.camera is not None:
         T = robot.camera.T_world_camera
         meshes.append(arrow(T[:3, 3], T[:3, 3] + 0.15 * T[:3, 2], CAMERA_COLOUR, radius=0.008))

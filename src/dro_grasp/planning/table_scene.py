@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 
 from dro_grasp.errors import ObjectError, RobotError
 from dro_grasp.geometry.table_plane import largest_plane
+from dro_grasp.kinds import checked
 from dro_grasp.objects.in_memory import numbers
 from dro_grasp.objects.loading import MIN_CLOUD, cloud_object
 from dro_grasp.objects.shape import ObjectModel
@@ -69,6 +70,7 @@ class PickedObject:
     """With its table at the height that was seen."""
 
 
+@checked
 def pick_object(
     name: str, points: ArrayLike, robot: Robot, T_world_camera: ArrayLike | None = None,
     near: tuple[float, float] | None = None, mask: ArrayLike | None = None,

@@ -6,8 +6,9 @@ import multiprocessing
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import MISSING, asdict, dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -15,11 +16,12 @@ import pyarrow.parquet as pq
 
 from dro_grasp.devices import one_thread
 from dro_grasp.errors import GraspFileError, OptionError
+from dro_grasp.extras import require_extra
 from dro_grasp.files import check_output, make_folder, reading, replacing
+from dro_grasp.kinds import Checked, checked
 from dro_grasp.models.checkpoints import DEFAULT, describe_weights
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.planning.attempts import Attempt, TabletopConfig, Watcher, attempt
-from dro_grasp.planning.extra import require_arm_extra
 from dro_grasp.planning.motion import MotionPlan
 from dro_grasp.planning.robot import load_robot
 from dro_grasp.planning.table_scene import PickedObject
@@ -30,7 +32,7 @@ Progress = Callable[[Attempt], None]
 
 
 @dataclass(frozen=True)
-class TabletopRun:
+class TabletopRun(Checked):
     """What is attempted."""
 
     robot: str
@@ -52,6 +54,7 @@ class TabletopRun:
         Raises:
             OptionError: No attempts, or no objects, or a seed that is none.
         """
+        super().__post_init__()
         if not 0 <= self.seed < 2**31:
             raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^31 - 1")
         if self.attempts < 1 or not self.objects:
@@ -69,8 +72,10 @@ class PlanKeeper(Watcher):
         made.save(self.path)
 
 
+@checked
 def run_tabletop(
-    run: TabletopRun, output: Path | None = None, workers: int = 1, progress: Progress | None = None, plans: Path | None = None
+    run: TabletopRun, output: Path | None = None, workers: int = 1, progress: Progress | None = None,
+    plans: Path | None = None, make: Callable[..., Attempt] | None = None,
 ) -> list[Attempt]:
     """Run all attempts that `output` does not hold yet; each is stored when it ends.
 
@@ -81,6 +86,7 @@ def run_tabletop(
         workers: Processes, which share out the objects; with several, attempts are stored object by object.
         progress: See `Progress`.
         plans: Folder for the plan of each attempt, ROBOT-OBJECT-NUMBER.npz.
+        make: Makes one, instead of `attempt`, with the same arguments.
 
     Raises:
         OptionError: The extra is missing, something cannot be attempted, two objects have one name, or `output` holds such
@@ -91,13 +97,13 @@ def run_tabletop(
         GraspFileError: `output` is there and is no such file.
         OutputError: `output` or `plans` cannot be written.
     """
-    require_arm_extra()
+    require_extra("arm")
     stored = read_attempts(output) if output is not None and check_output(output, ".parquet").exists() else []
     done, names = _done(run, stored, output)
     missing = {o: [k for k in range(run.attempts) if (n, k) not in done] for o, n in names.items()}
     if plans is not None:
         make_folder(plans)
-    for result in _results(run, {o: numbers for o, numbers in missing.items() if numbers}, workers, plans):
+    for result in _results(run, {o: numbers for o, numbers in missing.items() if numbers}, workers, plans, make or attempt):
         stored.append(result)
         done[result.object, result.number] = result
         if output is not None:
@@ -123,55 +129,60 @@ def _done(
                           "robot, object and weights, so that they may be of others; keep it, and give another --output")
     done = [a for a in alike if (a.robot_sha256, a.weights_sha256) == (robot.sha256, weights)]
     for a in done:
-        source, sha256 = objects.get(a.object, ("", a.object_sha256))
-        if a.object_sha256 != sha256:
+        source, sha256, solid = objects.get(a.object, ("", a.object_sha256, a.solid_sha256))
+        if a.object_sha256 != sha256 or a.solid_sha256 not in {"", solid}:
             raise OptionError(f"'{source}' is not the object '{a.object}' of the attempts in {output}, made with "
                               f"'{a.object_file}' as it was then; rename the file, or attempt it apart, with its own --output "
                               "and --plans")
-    return {(a.object, a.number): a for a in done}, {source: name for name, (source, _) in objects.items()}
+    return {(a.object, a.number): a for a in done}, {source: name for name, (source, *_) in objects.items()}
 
 
-def _objects(given: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """What each object was given as, and its hash, by its name.
+def _objects(given: Sequence[str]) -> dict[str, tuple[str, str, str]]:
+    """What each object was given as, and its hashes, by its name.
 
     Raises:
         OptionError: Two of them differ and have one name.
     """
-    found: dict[str, tuple[str, str]] = {}
+    found: dict[str, tuple[str, str, str]] = {}
     for source in dict.fromkeys(given):
         obj = load_object(source)
-        first, sha256 = found.setdefault(obj.name, (source, obj.sha256))
-        if obj.sha256 != sha256:
+        first, _, solid = found.setdefault(obj.name, (source, obj.sha256, obj.solid_sha256))
+        if obj.solid_sha256 != solid:
             raise OptionError(f"'{first}' and '{source}' are different objects of the name '{obj.name}', under which attempts "
                               "and plans are stored; rename one of the files, or attempt them apart, each with its own "
                               "--output and --plans")
     return found
 
 
-def _results(run: TabletopRun, missing: dict[str, list[int]], workers: int, plans: Path | None) -> Iterator[Attempt]:
+def _results(
+    run: TabletopRun, missing: dict[str, list[int]], workers: int, plans: Path | None, make: Callable[..., Attempt]
+) -> Iterator[Attempt]:
     if workers <= 1 or len(missing) <= 1:
         for name, numbers in missing.items():
-            yield from _attempts(run, name, numbers, plans)
+            yield from _attempts(run, name, numbers, plans, make)
         return
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
-        for future in as_completed([pool.submit(_all_attempts, run, *item, plans) for item in missing.items()]):
+        for future in as_completed([pool.submit(_all_attempts, run, *item, plans, make) for item in missing.items()]):
             yield from future.result()
 
 
-def _all_attempts(run: TabletopRun, name: str, numbers: Sequence[int], plans: Path | None) -> list[Attempt]:
+def _all_attempts(*task: Any) -> list[Attempt]:
     with one_thread():
-        return list(_attempts(run, name, numbers, plans))
+        return list(_attempts(*task))
 
 
-def _attempts(run: TabletopRun, name: str, numbers: Sequence[int], plans: Path | None) -> Iterator[Attempt]:
+def _attempts(
+    run: TabletopRun, name: str, numbers: Sequence[int], plans: Path | None, make: Callable[..., Attempt]
+) -> Iterator[Attempt]:
     robot, obj, predictor = load_robot(run.robot), load_object(name), GraspPredictor(run.weights)
     weights = describe_weights(run.weights)["sha256"]
     for number in numbers:
         keeper = None if plans is None else PlanKeeper(plans / f"{robot.name}-{obj.name}-{number}.npz")
-        made = attempt(robot, obj, number, run.seed, predictor, run.config, keeper)
+        made = make(robot, obj, number, run.seed, predictor, run.config, keeper)
         yield replace(
             made, robot_file=str(run.robot), object_file=str(name), weights=str(run.weights or DEFAULT),
-            robot_sha256=robot.sha256, object_sha256=obj.sha256, weights_sha256=weights)
+            robot_sha256=robot.sha256, object_sha256=obj.sha256, weights_sha256=weights,
+            solid_sha256=obj.solid_sha256)
 
 
 def write_attempts(attempts: Sequence[Attempt], path: Path) -> None:
@@ -187,9 +198,12 @@ def read_attempts(path: Path) -> list[Attempt]:
         GraspFileError: It is another file.
     """
     known = {f.name for f in fields(Attempt)}
-    with reading(path, GraspFileError, "a file of attempts; name another one, or move this one away"):
+    needed = {f.name for f in fields(Attempt) if f.default is MISSING and f.default_factory is MISSING}
+    with reading(path, GraspFileError, "a file of attempts; name another one, or move this one away", pa.ArrowException):
         rows = pq.read_table(path).to_pylist()
-        return [Attempt(**{k: v for k, v in row.items() if k in known}) for row in rows]
+        if lacking := needed - {*(rows[0] if rows else needed)}:
+            raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
+    return [Attempt(**{k: v for k, v in row.items() if k in known}) for row in rows]
 
 
 def endings(attempts: Sequence[Attempt]) -> dict[str, int]:

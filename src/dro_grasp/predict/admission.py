@@ -14,6 +14,7 @@ from torch import Tensor
 from dro_grasp.energy.surroundings import Surroundings
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.anatomy import PALM
+from dro_grasp.kinds import Checked
 from dro_grasp.optimization.grip import GripConfig
 from dro_grasp.optimization.palm_directions import APPROACH, angle_to_arc
 from dro_grasp.predict.problem import GraspProblem
@@ -39,7 +40,7 @@ REASONS = {"plane": PLANE, "obstacles": OBSTACLES, "spared": SPARED}
 
 
 @dataclass(frozen=True)
-class AdmissionConfig:
+class AdmissionConfig(Checked):
     """By how much grasps may miss what the constraints ask (ours)."""
 
     least_clearance: float = 0.002

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from dro_grasp.errors import OptionError
+from dro_grasp.kinds import Checked
 from dro_grasp.predict.finish import FinishConfig
 from dro_grasp.predict.sources.network import ProposalConfig, check_temperature
 from dro_grasp.predict.sources.optimiser import OptimiserConfig
@@ -16,7 +17,7 @@ LARGEST_CALL = 100_000
 
 
 @dataclass(frozen=True)
-class GraspRequest:
+class GraspRequest(Checked):
     """What is asked of a predictor."""
 
     num: int = 16
@@ -55,7 +56,7 @@ class GraspRequest:
 
 
 @dataclass(frozen=True)
-class RetryConfig:
+class RetryConfig(Checked):
     """How often a source is asked again when constraints reject its candidates (ours)."""
 
     rounds: int = 4
@@ -67,7 +68,7 @@ class RetryConfig:
 
 
 @dataclass(frozen=True)
-class RescueConfig:
+class RescueConfig(Checked):
     """How the optimiser helps where the score does not trust what there is (ours)."""
 
     trusted_scores: tuple[float, ...] = (1.5, 1.0, 1.0, 1.0)
@@ -87,7 +88,7 @@ class RescueConfig:
 
 
 @dataclass(frozen=True)
-class PredictorConfig:
+class PredictorConfig(Checked):
     """Everything that decides which grasps are returned."""
 
     network: ProposalConfig = field(default_factory=ProposalConfig)

@@ -15,6 +15,7 @@ from dro_grasp.energy.surroundings import Surroundings
 from dro_grasp.errors import OptionError
 from dro_grasp.files import TOLD
 from dro_grasp.geometry.balls import Ball, Balls
+from dro_grasp.kinds import Checked, plain
 from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.palm_directions import Direction
@@ -36,7 +37,7 @@ FEWEST_HELD = 16
 
 
 @dataclass(frozen=True)
-class Constraints:
+class Constraints(Checked):
     """What grasps have to respect; nothing by default. All in the object's frame.
 
     Examples:
@@ -75,6 +76,7 @@ class Constraints:
             object.__setattr__(self, "direction", _vector(self.direction))
         for name, balls in (("hold", self.hold), ("spare", self.spare)):
             object.__setattr__(self, name, _balls(name, balls))
+        super().__post_init__()  # after these, whose errors say more
         if self.direction is not None and not 1e-9 <= math.hypot(*self.direction) < math.inf:
             raise OptionError(f"direction {self.direction} has no direction; give the palm direction in the object's frame, "
                               "for example --direction 0 0 -1 to grasp from above")
@@ -169,8 +171,8 @@ def _vector(given: Any) -> Direction:
         OptionError: It is none of three numbers.
     """
     try:
-        x, y, z = map(float, given)
-    except (TypeError, ValueError, RuntimeError) as error:  # PyTorch raises the last one
+        x, y, z = _numbers(given)
+    except (TypeError, ValueError, RuntimeError, OptionError) as error:  # PyTorch raises the third
         raise OptionError(f"direction is {_shortly(given)}; give three numbers, the palm direction in the object's frame, for "
                           "example --direction 0 0 -1 to grasp from above") from error
     return x, y, z
@@ -184,8 +186,8 @@ def _balls(name: str, given: Any) -> tuple[Ball, ...]:
     """
     example = f"x, y, z and a radius above 0 in metres, for example --{name} 0 0 0.1 0.03"
     try:
-        rows = [tuple(map(float, ball)) for ball in given]
-    except (TypeError, ValueError, RuntimeError) as error:
+        rows = [_numbers(ball) for ball in given]
+    except (TypeError, ValueError, RuntimeError, OptionError) as error:
         raise OptionError(f"{name} is {_shortly(given)}; give a list of balls, each of {example}") from error
     if len(rows) > MOST_BALLS:
         raise OptionError(f"{name} has {len(rows)} balls; give at most {MOST_BALLS}, with a larger radius")
@@ -195,6 +197,11 @@ def _balls(name: str, given: Any) -> tuple[Ball, ...]:
             raise OptionError(f"{name} has the ball {row}; give {example}")
         balls.append(row)
     return tuple(balls)
+
+
+def _numbers(given: Any) -> tuple[float, ...]:
+    """The numbers of any kind of vector; digits in a text are none."""
+    return tuple(map(float, plain("", list(given), tuple[float, ...])))
 
 
 def _shortly(given: Any) -> str:

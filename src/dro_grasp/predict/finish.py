@@ -13,6 +13,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.kinds import Checked
 from dro_grasp.optimization.finger_easing import EasingConfig
 from dro_grasp.optimization.refinement import RefineConfig
 from dro_grasp.predict.admission import TURNED, AdmissionConfig, permitted, reasons_against
@@ -25,7 +26,7 @@ from dro_grasp.ranking.score import ScoreConfig
 
 
 @dataclass(frozen=True)
-class FinishConfig:
+class FinishConfig(Checked):
     """The stages of finishing. A stage that is None is left out."""
 
     refine: RefineConfig | None = field(default_factory=RefineConfig)

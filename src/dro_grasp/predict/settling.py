@@ -16,6 +16,7 @@ from torch import Tensor
 
 from dro_grasp.energy.grasp_energy import EnergyConfig
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.kinds import Checked
 from dro_grasp.optimization.finger_easing import lacking_room
 from dro_grasp.optimization.refinement import RefineConfig
 from dro_grasp.predict.admission import AdmissionConfig, permitted
@@ -29,7 +30,7 @@ from dro_grasp.simulation.holding import Holding, holding
 
 
 @dataclass(frozen=True)
-class SettleConfig:
+class SettleConfig(Checked):
     """Which grasps settle, what counts as holding still while the hand closes, and what that means for the score (ours)."""
 
     share: float = 0.5

@@ -11,6 +11,7 @@ from dro_grasp.devices import one_thread
 from dro_grasp.energy.grasp_energy import EnergyConfig
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import completed
+from dro_grasp.kinds import checked
 from dro_grasp.optimization.finger_closing import close_idle_fingers
 from dro_grasp.optimization.finger_easing import EasingConfig, ease_fingers
 from dro_grasp.optimization.grip import gripping
@@ -100,6 +101,7 @@ def scored(problem: GraspProblem, grasps: GraspBatch, config: ScoreConfig | None
     return grasps.replace(score=score_grasps(problem.energy(config.energy), grasps, config))
 
 
+@checked
 def evaluate(
     problem: GraspProblem, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL,
     progress: Callable[[int, int], None] | None = None, workers: int | None = None,

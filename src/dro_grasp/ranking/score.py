@@ -13,12 +13,13 @@ from torch import Tensor
 
 from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.kinds import Checked
 from dro_grasp.ranking.features import grasp_features
 from dro_grasp.ranking.score_network import shipped_score_network
 
 
 @dataclass(frozen=True)
-class ScoreConfig:
+class ScoreConfig(Checked):
     """How grasps are scored."""
 
     energy: EnergyConfig = field(default_factory=lambda: EnergyConfig(penetration=30.0))

@@ -5,15 +5,15 @@ from __future__ import annotations
 import hashlib
 import tempfile
 import time
-from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
+from cachetools import LRUCache
 from jaxtyping import Float
 from torch import Tensor
 
@@ -23,8 +23,8 @@ from dro_grasp.frames import is_name, motion_fault
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import REASON
 from dro_grasp.hands.hand import Hand
-from dro_grasp.hands.library import hand_names, load_hand
-from dro_grasp.objects.catalogue import load_object, object_names, resolve_objects
+from dro_grasp.hands.library import load_hand
+from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.loading import check_scale, read_points
 from dro_grasp.objects.scenery import Scene, load_scene
 from dro_grasp.objects.shape import ObjectModel
@@ -36,23 +36,17 @@ from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.source import Progress
 from dro_grasp.predict.stages import evaluate
 from dro_grasp.serve.messages import GraspAnswer, SentCamera, SentGrasp, SentObject, settings_in
+from dro_grasp.web.library import Library
 from dro_grasp.web.uploads import store_upload
 
-KEPT_HANDS = 16
-"""Most hands that stay loaded (ours)."""
-KEPT_OBJECTS = 32
-"""Most objects that stay loaded (ours); sent ones count."""
-KEPT_SCENES = 8
-"""Most scenes to avoid that stay loaded (ours)."""
-KEPT_PROBLEMS = 8
+MAX_PROBLEMS = 8
 """Most pairs of hand and object, with constraints, of which all that was derived stays (ours)."""
-LARGEST_REQUEST = 1_000
+MAX_CANDIDATES = 1_000
 """Most candidates of one request (ours): a server answers robots, `generate` fills files."""
-Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
-class Stock:
+class ServerConfig:
     """What a server computes with."""
 
     weights: str | None = None
@@ -65,47 +59,25 @@ class Stock:
     """Files and folders of objects that can be asked for by the names of the files; built-in ones can be besides."""
 
 
-class Kept(Generic[Value]):
-    """The values used last, each made at its first use."""
-
-    def __init__(self, most: int) -> None:
-        """Keep at most so many."""
-        self.most = most
-        self._values: OrderedDict[Hashable, Value] = OrderedDict()
-
-    def __len__(self) -> int:
-        return len(self._values)
-
-    def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
-        """The value of a key."""
-        if key not in self._values:
-            self._values[key] = make()
-            while len(self._values) > self.most:
-                self._values.popitem(last=False)
-        self._values.move_to_end(key)
-        return self._values[key]
-
-
 class Answerer:
     """Answers requests one by one, with hands and objects that stay loaded; nothing is read but what it was given and sent."""
 
-    def __init__(self, stock: Stock) -> None:
+    def __init__(self, config: ServerConfig) -> None:
         """Load the weights and the hands.
 
         Raises:
             OptionError: Two files of hands or of objects have one name.
             DroGraspError: Something cannot be used.
         """
-        objects = [(Path(source).stem, source) for source in resolve_objects(list(stock.objects))]
-        self.own_objects = by_name("objects", objects)
-        hands = {source: load_hand(source) for source in stock.hands}
-        sources = by_name("hands", [(hand.name, source) for source, hand in hands.items()])
-        self.own_hands = {name: hands[source] for name, source in sources.items()}
-        self.predictor = GraspPredictor(stock.weights, stock.device)
-        self.hands: Kept[Hand] = Kept(KEPT_HANDS)
-        self.objects: Kept[ObjectModel] = Kept(KEPT_OBJECTS)
-        self.scenes: Kept[Scene] = Kept(KEPT_SCENES)
-        self.problems: Kept[GraspProblem] = Kept(KEPT_PROBLEMS)
+        self.library = Library()
+        objects = [(Path(source).stem, source) for source in resolve_objects(list(config.objects))]
+        for name, source in by_name("objects", objects).items():
+            self.library.add("object", name, source)
+        hands = {source: load_hand(source) for source in config.hands}
+        for name, source in by_name("hands", [(hand.name, source) for source, hand in hands.items()]).items():
+            self.library.add("hand", name, hands[source])
+        self.predictor = GraspPredictor(config.weights, config.device)
+        self.problems: LRUCache[Hashable, GraspProblem] = LRUCache(MAX_PROBLEMS)
 
     def answer(self, call: Any, progress: Progress | None = None) -> GraspAnswer:
         """The answer to a GraspCall.
@@ -120,14 +92,13 @@ class Answerer:
         begin = time.perf_counter()
         request = settings_in(call, GraspRequest)
         constraints = settings_in(call, Constraints, avoid=self.scene(call.avoid, call.camera))
-        if request.num * request.candidates > LARGEST_REQUEST:
+        if request.num * request.candidates > MAX_CANDIDATES:
             raise OptionError(f"{request.num} grasps of {request.candidates} candidates each are asked for; a server makes at "
-                              f"most {LARGEST_REQUEST} candidates at once, `dro-grasp generate` more")
+                              f"most {MAX_CANDIDATES} candidates at once, `dro-grasp generate` more")
         hand, (key, obj) = self.hand(call.hand), self.object(call.object, call.camera)
         if call.protocol is not None and obj.is_cloud:
             raise OptionError(f"protocol is '{call.protocol}', and a bare cloud gets no trial; send a mesh, or leave it out")
-        problem = self.problems.get(
-            (hand.name, key, constraints), lambda: GraspProblem(hand, obj, self.predictor.device, constraints))
+        problem = self._problem(hand, key, obj, constraints)
         loaded = time.perf_counter() - begin
         made = self.predictor.run(problem, request, progress)
         middle = time.perf_counter()
@@ -143,11 +114,11 @@ class Answerer:
 
     def hand_names(self) -> list[str]:
         """Names of the hands that can be asked for."""
-        return list({**self.own_hands, **hand_names()})
+        return list(self.library.names("hand"))
 
     def object_names(self) -> list[str]:
         """Names of the objects that can be asked for."""
-        return list({**self.own_objects, **object_names()})
+        return list(self.library.names("object"))
 
     def hand(self, name: str) -> Hand:
         """A hand by its name.
@@ -155,12 +126,10 @@ class Answerer:
         Raises:
             HandError: The server knows no such hand.
         """
-        if name in self.own_hands:
-            return self.own_hands[name]
-        if name not in hand_names():
-            raise HandError(f"this server knows no hand '{name}'; it knows {', '.join(self.hand_names())}. Start it with "
-                            "--hand FILE for another one")
-        return self.hands.get(name, lambda: load_hand(name))
+        if name not in (known := self.hand_names()):
+            raise HandError(f"this server knows no hand '{name}'; it knows {', '.join(known)}. Start it with --hand FILE for "
+                            "another one")
+        return self.library.hand(name)
 
     def object(self, sent: SentObject, camera: SentCamera | None) -> tuple[Hashable, ObjectModel]:
         """An object that was named or sent, and the key under which it is kept.
@@ -175,7 +144,7 @@ class Answerer:
             raise ObjectError(f"this server knows no object '{sent.name}', but {', '.join(known[:12])} and others (page "
                               "/objects); send the mesh or cloud, or start the server with --object FILE")
         key = content_key(sent, camera)
-        return key, self.objects.get(key, lambda: self._load(sent, camera))
+        return key, self.library.loaded("object", key, lambda: self._load(sent, camera))
 
     def scene(self, sent: SentObject | None, camera: SentCamera | None) -> Scene | None:
         """What the hand is to avoid, in the frame of the grasps: what was sent, or an object that the server was started with.
@@ -185,18 +154,25 @@ class Answerer:
         """
         if sent is None:
             return None
-        if sent.name is not None and sent.name not in self.own_objects:
+        if sent.name is not None and sent.name not in self.library.own["object"]:
             raise ObjectError(f"avoid names '{sent.name}', which the server was not started with; send the mesh or cloud")
 
         def load() -> Scene:
-            with unpacked(sent, self.own_objects) as source:
+            with unpacked(sent, self.library.own["object"]) as source:
                 scene = load_scene(source, scale=sent.scale)
                 return scene if camera is None else scene.moved(sent_pose(camera).numpy())
 
-        return self.scenes.get(content_key(sent, camera), load)
+        return self.library.loaded("scene", content_key(sent, camera), load)
+
+    def _problem(self, hand: Hand, key: Hashable, obj: ObjectModel, constraints: Constraints) -> GraspProblem:
+        """The pair of a hand and the object of a key, with what was derived from it before."""
+        pair = hand.name, key, constraints
+        if (problem := self.problems.get(pair)) is None:
+            problem = self.problems[pair] = GraspProblem(hand, obj, self.predictor.device, constraints)
+        return problem
 
     def _load(self, sent: SentObject, camera: SentCamera | None) -> ObjectModel:
-        with unpacked(sent, self.own_objects) as source:
+        with unpacked(sent, self.library.own["object"]) as source:
             if camera is None:
                 return replace(load_object(source, scale=sent.scale, keep_table=sent.keep_table), file=None)
             check_scale(sent.scale)

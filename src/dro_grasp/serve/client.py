@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dro_grasp.errors import OptionError, ServerError
+from dro_grasp.files import given_path
+from dro_grasp.kinds import checked
 
 
 class GraspClient:
@@ -24,6 +26,7 @@ class GraspClient:
         >>> answer["grasps"][0]["wrist_position"]
     """
 
+    @checked
     def __init__(self, url: str = "http://127.0.0.1:8090", token: str | None = None, timeout: float = 120.0) -> None:
         """Remember where to ask; nothing is sent yet.
 
@@ -35,6 +38,7 @@ class GraspClient:
         self.url, self.timeout = url.rstrip("/"), timeout
         self.headers = {"Content-Type": "application/json"} | ({"Authorization": f"Bearer {token}"} if token else {})
 
+    @checked
     def predict(self, hand: str, obj: str | Path | ArrayLike, num: int = 16, **options: Any) -> dict[str, Any]:
         """The server's answer: its list `grasps`, the best first, and all that is known of it.
 
@@ -102,7 +106,8 @@ def sent_object(obj: str | Path | ArrayLike) -> dict[str, Any]:
         OptionError: It is none of these.
     """
     if isinstance(obj, str | Path):
-        return sent_file(Path(obj).name, Path(obj).read_bytes()) if Path(obj).is_file() else {"name": str(obj)}
+        path = given_path(obj)
+        return sent_file(path.name, path.read_bytes()) if path.is_file() else {"name": str(obj)}
     try:
         points = np.asarray(obj if isinstance(obj, np.ndarray) else listed(obj))
     except ValueError:  # rows of several lengths

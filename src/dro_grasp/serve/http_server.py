@@ -20,18 +20,17 @@ from starlette.exceptions import HTTPException as AnyHTTPException
 
 from dro_grasp._version import __version__
 from dro_grasp.errors import OptionError, ServerError
-from dro_grasp.serve.computing import Reply, refused
-from dro_grasp.serve.desk import Desk
 from dro_grasp.serve.messages import GraspAnswer, GraspCall, Refusal
+from dro_grasp.serve.request_queue import Reply, RequestQueue, refused
 from dro_grasp.web.origins import own_names, refusal
 
-SLOWEST_BODY = 30.0
+BODY_TIMEOUT = 30.0
 """Time within which the whole of a request must arrive [s] (ours)."""
-FAREWELL = 10.0
+SHUTDOWN_TIMEOUT = 10.0
 """Time that requests under way get to end when the server is stopped [s] (ours)."""
-MOST_CONNECTIONS = 128
+MAX_CONNECTIONS = 128
 """Most open connections (ours)."""
-OPEN = ("/health",)
+OPEN_PAGES = ("/health",)
 """Pages that need no token."""
 THIS_MACHINE = ("127.0.0.1", "localhost", "::1")
 """Addresses at which only this machine can connect."""
@@ -84,7 +83,7 @@ class Gate:
         if why := refusal(headers, self.own):
             return refused(HTTPStatus.FORBIDDEN, f"the request is refused: {why}")
         borne = headers.get("Authorization", "").removeprefix("Bearer ").encode()
-        if self.access.token and path not in OPEN and not secrets.compare_digest(borne, self.access.token.encode()):
+        if self.access.token and path not in OPEN_PAGES and not secrets.compare_digest(borne, self.access.token.encode()):
             return refused(HTTPStatus.UNAUTHORIZED, "the request bears no token, or another one than the server's; send the "
                                                     "header 'Authorization: Bearer TOKEN'")
         length = headers.get("Content-Length", "0")
@@ -98,7 +97,7 @@ class Gate:
 
     def _limited(self, receive: Any) -> Any:
         """The request's parts, until there are too many or they come too slowly."""
-        size, whole, deadline = 0, False, asyncio.get_running_loop().time() + SLOWEST_BODY
+        size, whole, deadline = 0, False, asyncio.get_running_loop().time() + BODY_TIMEOUT
 
         async def part() -> Any:
             nonlocal size, whole
@@ -107,7 +106,7 @@ class Gate:
             try:
                 message = await asyncio.wait_for(receive(), deadline - asyncio.get_running_loop().time())
             except TimeoutError:
-                raise HTTPException(HTTPStatus.REQUEST_TIMEOUT, f"the request did not arrive in {SLOWEST_BODY:g} s") from None
+                raise HTTPException(HTTPStatus.REQUEST_TIMEOUT, f"the request did not arrive in {BODY_TIMEOUT:g} s") from None
             size += len(message.get("body", b""))
             whole = not message.get("more_body", False)
             if size > 1e6 * self.access.megabytes:
@@ -117,13 +116,13 @@ class Gate:
         return part
 
 
-def application(desk: Desk, access: Access) -> FastAPI:
-    """The pages of a server; the desk is closed when it stops."""
+def application(queue: RequestQueue, access: Access) -> FastAPI:
+    """The pages of a server; the queue is closed when it stops."""
 
     @asynccontextmanager
     async def life(_: Any) -> AsyncIterator[None]:
         yield
-        await asyncio.to_thread(desk.close)
+        await asyncio.to_thread(queue.close)
 
     app = FastAPI(title="dro-grasp", version=__version__, lifespan=life,
                   description="Grasps of any object by any hand. Lengths are metres, angles radians, quaternions WXYZ.")
@@ -135,45 +134,45 @@ def application(desk: Desk, access: Access) -> FastAPI:
     @app.post("/grasps", response_model=GraspAnswer, responses=told)
     async def grasps(call: GraspCall, request: Request) -> Any:  # pyright: ignore[reportInvalidTypeForm]
         """Grasps of an object by a hand, the best first. Closing the connection cancels the request."""
-        reply = await _answered(desk, call, request)
+        reply = await _answered(queue, call, request)
         return Response(reply.body, reply.status, media_type="application/json")
 
     @app.delete("/grasps/{id}", responses={404: {"model": Refusal}})
     async def cancel(id: str) -> dict[str, str]:
         """Cancel a request, in the queue or under way."""
-        if not desk.cancel(id):
+        if not queue.cancel(id):
             raise HTTPException(HTTPStatus.NOT_FOUND, f"no request '{id}' is under way")
         return {"cancelled": id}
 
     @app.get("/health")
     async def health() -> dict[str, Any]:
         """Whether the server answers, and how busy it is."""
-        return {"status": "ok", "version": __version__, "waiting": desk.waiting, "computing": desk.computing}
+        return {"status": "ok", "version": __version__, "waiting": queue.waiting, "computing": queue.computing}
 
     @app.get("/hands")
     async def hands() -> list[str]:
         """Names of hands that can be asked for."""
-        return desk.ready.hands
+        return queue.ready.hands
 
     @app.get("/objects")
     async def objects() -> list[str]:
         """Names of objects that can be asked for."""
-        return desk.ready.objects
+        return queue.ready.objects
 
     @app.get("/metrics", response_class=PlainTextResponse)
     async def metrics() -> str:
         """Counts and times in the text format of Prometheus."""
-        return metrics_text(desk)
+        return metrics_text(queue)
 
     return app
 
 
-async def _answered(desk: Desk, call: Any, request: Request) -> Reply:
+async def _answered(queue: RequestQueue, call: Any, request: Request) -> Reply:
     """The reply to a call, which is cancelled when its connection closes."""
     try:
-        taken = desk.submit(call)
+        taken = queue.submit(call)
     except ServerError as error:
-        desk.tally.replies[int(HTTPStatus.SERVICE_UNAVAILABLE)] += 1
+        queue.metrics.replies[int(HTTPStatus.SERVICE_UNAVAILABLE)] += 1
         return refused(HTTPStatus.SERVICE_UNAVAILABLE, str(error))
     reply, gone = asyncio.wrap_future(taken.reply), asyncio.ensure_future(_left(request))
     try:
@@ -181,7 +180,7 @@ async def _answered(desk: Desk, call: Any, request: Request) -> Reply:
     finally:
         gone.cancel()
         if not taken.reply.done():
-            desk.cancel(call.id)
+            queue.cancel(call.id)
     return await reply
 
 
@@ -203,16 +202,16 @@ async def _failed(_: Any, error: Any) -> Response:
     return Response(refused(HTTPStatus(error.status_code), error.detail).body, error.status_code, media_type="application/json")
 
 
-def metrics_text(desk: Desk) -> str:
-    """What a desk has done, in the text format of Prometheus."""
-    tally = desk.tally
+def metrics_text(queue: RequestQueue) -> str:
+    """What a queue has done, in the text format of Prometheus."""
+    metrics = queue.metrics
     lines = ["# TYPE dro_grasp_replies_total counter"]
-    lines += [f'dro_grasp_replies_total{{status="{status}"}} {count}' for status, count in sorted(tally.replies.items())]
+    lines += [f'dro_grasp_replies_total{{status="{status}"}} {count}' for status, count in sorted(metrics.replies.items())]
     for name, kind, value in (
-        ("waiting", "gauge", desk.waiting), ("computing", "gauge", int(desk.computing)),
-        ("waiting_seconds_total", "counter", round(tally.waiting_seconds, 3)),
-        ("computing_seconds_total", "counter", round(tally.computing_seconds, 3)),
-        ("process_starts_total", "counter", tally.starts), ("process_memory_bytes", "gauge", desk.memory),
+        ("waiting", "gauge", queue.waiting), ("computing", "gauge", int(queue.computing)),
+        ("waiting_seconds_total", "counter", round(metrics.waiting_seconds, 3)),
+        ("computing_seconds_total", "counter", round(metrics.computing_seconds, 3)),
+        ("process_starts_total", "counter", metrics.starts), ("process_memory_bytes", "gauge", queue.memory),
     ):
         lines += [f"# TYPE dro_grasp_{name} {kind}", f"dro_grasp_{name} {value}"]
     return "\n".join(lines) + "\n"
@@ -228,21 +227,21 @@ def listening_socket(host: str, port: int) -> socket.socket:
         raise OptionError(f"port is {port}; give a number up to 65535, for example --port 8090, or 0 for any that is free")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        return socket.create_server((host, port), family=family, backlog=MOST_CONNECTIONS)
+        return socket.create_server((host, port), family=family, backlog=MAX_CONNECTIONS)
     except OSError as error:
         raise OptionError(f"this machine cannot serve at '{host}', port {port} ({error}); give another --port, or --host "
                           "127.0.0.1 for this machine only") from error
 
 
-def serve_grasps(desk: Desk, access: Access, listener: socket.socket) -> None:
-    """Serve until SIGTERM or Ctrl-C; requests under way get FAREWELL to end, and the desk is closed."""
+def serve_grasps(queue: RequestQueue, access: Access, listener: socket.socket) -> None:
+    """Serve until SIGTERM or Ctrl-C; requests under way get SHUTDOWN_TIMEOUT to end, and the queue is closed."""
     signal.signal(signal.SIGTERM, lambda *_: None)  # uvicorn raises it again once it has stopped
     config = uvicorn.Config(
-        application(desk, access), log_level="warning", access_log=False, limit_concurrency=MOST_CONNECTIONS,
-        timeout_graceful_shutdown=int(FAREWELL), server_header=False)
+        application(queue, access), log_level="warning", access_log=False, limit_concurrency=MAX_CONNECTIONS,
+        timeout_graceful_shutdown=int(SHUTDOWN_TIMEOUT), server_header=False)
     try:
         uvicorn.Server(config).run(sockets=[listener])
     except KeyboardInterrupt:
         pass
     finally:
-        desk.close()
+        queue.close()

@@ -25,7 +25,7 @@ from pydantic import (
 from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.constraints import Constraints
 
-MOST_POINTS = 200_000
+MAX_POINTS = 200_000
 """Most points of a cloud that is sent as numbers (ours); files may hold more."""
 Point = tuple[float, float, float]
 Row = tuple[float, float, float, float]
@@ -61,7 +61,7 @@ class SentObject(Message):
     """Name of an object that the server knows."""
     file: SentFile | None = None
     """A mesh or cloud file, whole; it cannot name other files."""
-    points: list[Point] | None = Field(None, max_length=MOST_POINTS)
+    points: list[Point] | None = Field(None, max_length=MAX_POINTS)
     """A point cloud [m]."""
     scale: float = 1.0
     """Multiplies the coordinates; 0.001 for millimetres."""

@@ -40,7 +40,7 @@ def diagnose(grasps: GraspBatch) -> list[str]:
 def next_steps(grasps: GraspBatch) -> list[str]:
     """What to try where fewer than FEW of the evaluated grasps held: the remedies of the two most frequent failures."""
     failures, evaluated = _failures(grasps), int(grasps.evaluated.sum())
-    if int(grasps.success.sum()) >= FEW * evaluated:
+    if int(grasps.trial_success.sum()) >= FEW * evaluated:
         return []
     return list(dict.fromkeys(REMEDIES[kind] for kind, _ in failures.most_common(2)))
 

@@ -10,13 +10,14 @@ from typing import Any
 
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.controller_config import ControllerConfig
+from dro_grasp.kinds import Checked
 
 NAME = re.compile(r"[\w.-]+")
 """Names of protocols: nothing that stands between the parts of a label."""
 
 
 @dataclass(frozen=True)
-class Perturbations:
+class Perturbations(Checked):
     """How a grasp is evaluated several times under other conditions; by default it is not.
 
     The first trial is the protocol's own. The conditions of each other trial are drawn for this grasp alone: where the
@@ -46,6 +47,7 @@ class Perturbations:
         Raises:
             OptionError: A value is out of range.
         """
+        super().__post_init__()
         if not (1 <= self.needed <= self.trials and 0 <= self.coarse < self.trials):
             raise OptionError(f"{self.trials} trials, {self.needed} of them needed and {self.coarse} coarse; "
                               "need at least 1 and at most all, and make fewer coarse than all")
@@ -56,7 +58,7 @@ class Perturbations:
 
 
 @dataclass(frozen=True)
-class Protocol:
+class Protocol(Checked):
     """How a trial runs and when it counts as a success."""
 
     name: str

@@ -19,6 +19,7 @@ from dro_grasp.descriptions.collision import collide
 from dro_grasp.errors import HandError, ObjectError
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.opening import open_side_by_side
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.hand_part import HULL_VERTICES, add_servos, attach, hand_spec, joint_addresses, servo_joints
 from dro_grasp.simulation.protocols import Protocol
@@ -80,10 +81,10 @@ class TrialScene:
 
 @dataclass(frozen=True)
 class SceneKey:
-    """The pair and protocol of a scene; equal keys, by hashes and protocol, have the same scene."""
+    """The pair and protocol of a scene; equal keys, by hashes of all that is simulated and by protocol, have the same scene."""
 
     hand_sha256: str
-    object_sha256: str
+    solid_sha256: str
     protocol: Protocol
     hand: Hand = field(compare=False)
     obj: ObjectModel = field(compare=False)
@@ -96,7 +97,8 @@ def cached_scene(hand: Hand, obj: ObjectModel, protocol: Protocol) -> TrialScene
         ObjectError: The object is a bare point cloud, without balls that stand for it.
         HandError: The hand came without its description.
     """
-    return _build_once(SceneKey(hand.sha256, obj.sha256, protocol, hand, obj))
+    require_simulable(hand, obj)
+    return _build_once(SceneKey(hand.sha256, obj.solid_sha256, protocol, hand, obj))
 
 
 @lru_cache(maxsize=CACHED_SCENES)
@@ -174,16 +176,16 @@ def object_mass(obj: ObjectModel, protocol: Protocol) -> float:
 
 
 def _exclude_resting_contacts(scene: mujoco.MjSpec, hand: Hand) -> None:
-    """Exclude contacts of links that touch in the open hand, and of each link with its parent.
+    """Exclude contacts of links that touch in the open hand, fingers side by side, and of each link with its parent.
 
-    MuJoCo's own parent-child filter ignores static parents.
+    Fingers that cross must collide. MuJoCo's own parent-child filter ignores static parents.
     """
     model = scene.compile()
     data = mujoco.MjData(model)
     addresses, moving = joint_addresses(model, hand)
     pairs: set[tuple[str, str]] = set()
     for openness in (0.75, 1.0):
-        q = hand.canonical_joints(openness)
+        q = open_side_by_side(hand, openness)
         data.qpos[addresses] = (hand.tree.coupling @ q + hand.tree.offset).numpy()[moving]
         collide(model, data)
         pairs |= {_pair(model, int(a), int(b)) for a, b in data.contact.geom}

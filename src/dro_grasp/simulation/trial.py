@@ -16,6 +16,7 @@ from torch import Tensor
 from dro_grasp.devices import cores
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.contacts import Penetration, count_fingers, find_contact_links, measure_penetration
 from dro_grasp.simulation.outcome import DIRECTIONS, GIVE_UP, Failure, Measurements, TrialResult, verdict
@@ -27,6 +28,7 @@ from dro_grasp.simulation.scene import TrialScene, cached_scene
 __all__ = ["DIRECTIONS", "Failure", "TrialResult", "record", "simulate"]
 
 
+@checked
 def simulate(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *,
     workers: int | None = None, progress: Callable[[int, int], None] | None = None,

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 from dro_grasp.errors import OptionError
+from dro_grasp.kinds import Checked
 
 
 @dataclass(frozen=True)
-class AugmentationConfig:
+class AugmentationConfig(Checked):
     """How a training sample differs from the stored grasp."""
 
     object_noise: float = 0.002
@@ -25,14 +26,14 @@ class AugmentationConfig:
     rotation, about an axis perpendicular to the direction from the wrist to the object [rad]. Source: the official
     release."""
     proportions: float = 0.1
-    """Standard deviation of the noise on a hand's proportions, in their spreads over hands; for placement priors that take
-    them: a few dozen hands are few. Source: ours."""
+    """Standard deviation of the noise on a hand's proportions, in their spreads over hands, for the placement prior: a few
+    dozen hands are few. Source: ours."""
     partial: float = 0.0
     """Share of samples in which half of the object is seen. Source: appendix."""
 
 
 @dataclass(frozen=True)
-class LossConfig:
+class LossConfig(Checked):
     """Weights of the four terms, and of those that are ours. Source: the official release, where nothing else is said."""
 
     distance: float = 1.0
@@ -47,9 +48,9 @@ class LossConfig:
     free_bits: float = 0.0
     """Divergence of each latent dimension that costs nothing [nat]."""
     motion: float = 1.0
-    """Weight of the mean distance between the hand as z moves it and the true grasp; for latent_form `motion`."""
+    """Weight of the mean distance between the hand as z moves it and the true grasp; not in the paper's form."""
     flow: float = 0.01
-    """Weight of the flow's loss; for prior `flow`."""
+    """Weight of the flow's loss; not in the paper's form."""
     drawn: float = 0.0
     """Weight of penetration and contact of the hands that a z drawn from its prior gives, as at inference. Source: ours."""
     drawn_share: float = 0.5
@@ -67,7 +68,7 @@ LOSSES = {"ours": LossConfig(), "release": LossConfig(penetration=1.0, divergenc
 
 
 @dataclass(frozen=True)
-class ScheduleConfig:
+class ScheduleConfig(Checked):
     """Optimiser and bookkeeping of both loops."""
 
     steps: int = 10_000
@@ -101,7 +102,7 @@ class ScheduleConfig:
 
 
 @dataclass(frozen=True)
-class TrainConfig:
+class TrainConfig(Checked):
     """Main training."""
 
     schedule: ScheduleConfig = ScheduleConfig()
@@ -124,6 +125,7 @@ class TrainConfig:
         Raises:
             OptionError: `by_count` is not between 0 and 1, or the weight of drawn hands is negative or not finite.
         """
+        super().__post_init__()
         if not 0 <= self.by_count <= 1:
             raise OptionError(f"by_count is {self.by_count}; give 0 to draw all hands equally often, 1 to draw them by their "
                               "grasps, or a number between")
@@ -132,7 +134,7 @@ class TrainConfig:
 
 
 @dataclass(frozen=True)
-class PlacementConfig:
+class PlacementConfig(Checked):
     """Training of the placement prior alone. Source: ours."""
 
     schedule: ScheduleConfig = ScheduleConfig(steps=1_300)
@@ -144,7 +146,7 @@ class PlacementConfig:
 
 
 @dataclass(frozen=True)
-class PretrainConfig:
+class PretrainConfig(Checked):
     """Configuration-invariant pretraining of the hand encoder."""
 
     schedule: ScheduleConfig = ScheduleConfig(steps=3_000)
@@ -160,7 +162,7 @@ class PretrainConfig:
 
 
 @dataclass(frozen=True)
-class MotionConfig:
+class MotionConfig(Checked):
     """Pretraining of the z that encodes how hands move."""
 
     schedule: ScheduleConfig = ScheduleConfig(steps=5_000)

@@ -12,22 +12,16 @@ NAMED = 4
 
 
 def take_initial(model: DistanceNetwork, initial: DistanceNetwork) -> None:
-    """Copy all weights of a network of the same configuration; a placement prior that knows hands in another form begins anew.
+    """Copy all weights of a network of the same configuration.
 
     Raises:
         WeightsError: The configurations differ. Settings such as the frame change what the weights mean, but no shape.
     """
-    other = model.config.differences(initial.config)
-    fresh = other.pop("placement_hand", None) is not None
-    if other:
+    if other := model.config.differences(initial.config):
         told = ", ".join(f"{name} {mine} instead of {theirs}" for name, (mine, theirs) in other.items())
         raise WeightsError(f"the initial weights '{initial.name}' have another configuration than is asked for: {told}; train "
-                           "with theirs, which `train --initial` does without --preset and the options of the latent")
-    given = initial.state_dict()
-    if fresh and model.placement is not None:
-        own = {f"placement.{name}": value for name, value in model.placement.state_dict().items()}
-        given = {name: value for name, value in given.items() if not name.startswith("placement.")} | own
-    model.load_state_dict(given)
+                           "with theirs, which `train --initial` does without --preset and --latent")
+    model.load_state_dict(initial.state_dict())
 
 
 def take_weights(model: nn.Module, given: nn.Module, name: str) -> None:
@@ -60,6 +54,6 @@ def take_pretrained(model: DistanceNetwork, pretrained: DistanceNetwork) -> None
     take_weights(model.hand_encoder, pretrained.hand_encoder, pretrained.name)
     if pretrained.motion is not None and model.motion is None:
         raise WeightsError(f"weights '{pretrained.name}' hold a pretrained motion, but z does not move the hand in this "
-                           "network; train with latent_form 'motion' (--latent-form motion)")
+                           "network; train in frame 'palm' (--preset multi)")
     if pretrained.motion is not None and model.motion is not None:
         take_weights(model.motion, pretrained.motion, pretrained.name)

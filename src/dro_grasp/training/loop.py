@@ -56,7 +56,7 @@ def train(
     model.mixed = config.schedule.mixed
     generator = torch.Generator(device)
     source = SampleSource(bundle, network, config.augmentation, device)
-    if initial is None or initial.config.placement_hand != network.placement_hand:
+    if initial is None:
         measure_hands(model, source)
     plan = run_plan(config, bundle, network, initial=initial, pretrained=pretrained)
     run = TrainingRun(folder, model, config.schedule, generator, processes, plan)
@@ -107,14 +107,12 @@ def step_losses(
     parts["penetration"] = torch.cat(penetrations).mean()
     if config.losses.drawn > 0:
         parts["drawn"] = torch.cat(drawn).mean() if drawn else output.distances.new_zeros(())
-    nats = losses.divergence(output.mean, output.log_variance, output.prior_mean, output.prior_log_variance)
+    nats = losses.divergence(output.mean, output.log_variance)
     parts["divergence"] = losses.divergence_loss(nats, config.losses.divergence_form, config.losses.free_bits)
-    if model.motion is not None:
-        parts["motion"] = (output.moved - grasp).norm(dim=-1).mean()
-    parts["flow"] = output.flow_error.mean()
     if model.placement is not None:
-        noise = config.augmentation.proportions
-        parts["placement"] = placement_losses(model.placement, groups, output.hand_feature, noise, generator)["total"]
+        parts["motion"] = (output.moved - grasp).norm(dim=-1).mean()
+        parts["flow"] = output.flow_error.mean()
+        parts["placement"] = placement_losses(model.placement, groups, config.augmentation.proportions, generator)["total"]
     weights = {name: getattr(config.losses, name) for name in parts}
     if progress < config.losses.divergence_warmup:
         weights["divergence"] *= progress / config.losses.divergence_warmup

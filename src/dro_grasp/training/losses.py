@@ -73,13 +73,10 @@ def contact_loss(
 
 
 def divergence(
-    mean: Float[Tensor, "b d"], log_variance: Float[Tensor, "b d"], prior_mean: Float[Tensor, "b d"] | float = 0.0,
-    prior_log_variance: Float[Tensor, "b d"] | float = 0.0,
+    mean: Float[Tensor, "b d"], log_variance: Float[Tensor, "b d"]
 ) -> Float[Tensor, "b d"]:
-    """KL divergence of the posterior from the prior, N(0, I) by default [nat], per grasp and latent dimension."""
-    log_ratio = log_variance - prior_log_variance
-    shift = (mean - prior_mean).square() * torch.exp(-torch.as_tensor(prior_log_variance))
-    return 0.5 * (log_ratio.exp() + shift - 1 - log_ratio)
+    """KL divergence of the posterior from N(0, I) [nat], per grasp and latent dimension."""
+    return 0.5 * (log_variance.exp() + mean.square() - 1 - log_variance)
 
 
 def divergence_loss(

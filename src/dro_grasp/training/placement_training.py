@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.errors import TrainingError
@@ -30,8 +28,7 @@ def train_placement(
 
     Args:
         folder: Run folder; a checkpoint in it is resumed.
-        initial: Weights to begin with; `network` must be their configuration, but for what the prior knows of a hand. If that
-            is another, the prior begins anew.
+        initial: Weights to begin with; `network` must be their configuration.
         report: Called every few steps; the console by default.
 
     Returns:
@@ -51,16 +48,13 @@ def train_placement(
         raise TrainingError(
             f"'{initial.name}' has no placement prior: in frame '{network.frame}' the network knows no placement")
     source = SampleSource(bundle, network, config.augmentation, device)
-    if initial.config.placement_hand != network.placement_hand:
-        measure_hands(model, source)
     plan = run_plan(config, bundle, network, initial=initial)
     run = TrainingRun(folder, prior, config.schedule, generator, processes, plan)
 
     def step() -> Losses:
         names = source.draw_hands(config.hands_per_step, generator, config.by_count)
         groups = [source.draw(hand, config.samples_per_hand, generator) for hand in names]
-        features = mean_features(model, groups) if prior.standardised is None else None
-        return placement_losses(prior, groups, features, config.augmentation.proportions, generator)
+        return placement_losses(prior, groups, config.augmentation.proportions, generator)
 
     run.train(step, report or console_report("placement"))
     prior.load_state_dict(run.average.module.state_dict())
@@ -68,21 +62,13 @@ def train_placement(
 
 
 def measure_hands(model: DistanceNetwork, source: SampleSource) -> None:
-    """Let a placement prior that takes proportions know those of the hands in training."""
-    if model.placement is not None and model.placement.standardised is not None:
+    """Let a placement prior know the proportions of the hands in training."""
+    if model.placement is not None:
         model.placement.standardised.measure(torch.stack([source.proportions[name] for name in source.names]))
 
 
-@torch.no_grad()
-def mean_features(model: DistanceNetwork, groups: list[HandSamples]) -> Float[Tensor, "b width"]:
-    """Mean feature of each open hand."""
-    placed = torch.cat([group.placed for group in groups])
-    return model.hand_encoder(placed - placed.mean(1, keepdim=True)).mean(1)
-
-
 def placement_losses(
-    prior: PlacementPrior, groups: list[HandSamples], features: Float[Tensor, "b width"] | None, noise: float,
-    generator: torch.Generator,
+    prior: PlacementPrior, groups: list[HandSamples], noise: float, generator: torch.Generator
 ) -> Losses:
     """The prior's loss as `total`, and what it has learned.
 
@@ -90,18 +76,13 @@ def placement_losses(
     true one has the higher score.
 
     Args:
-        prior: Takes features or proportions.
+        prior: In training.
         groups: Samples.
-        features: Mean feature of each open hand; no gradient reaches them. A prior that takes proportions needs none.
         noise: Standard deviation of the noise on proportions, in their spreads.
         generator: Source of the noise.
     """
-    if prior.standardised is None:
-        assert features is not None
-        hand = features.detach()
-    else:
-        rows = torch.cat([group.proportions.expand(len(group.placed), -1) for group in groups])
-        hand = rows + noise * prior.standardised.spread * torch.randn(rows.shape, generator=generator, device=rows.device)
+    rows = torch.cat([group.proportions.expand(len(group.placed), -1) for group in groups])
+    hand = rows + noise * prior.standardised.spread * torch.randn(rows.shape, generator=generator, device=rows.device)
     obj, other, position = (
         torch.cat([getattr(g, n) for g in groups]) for n in ("obj_hand", "obj_random", "position")
     )

@@ -82,7 +82,7 @@ def pretrain_motion(
         TrainingError: A loss is not finite, or z does not move the hand in this network.
     """
     if model.motion is None:
-        raise TrainingError(f"latent_form is '{model.config.latent_form}', which has no motion to pretrain; choose 'motion'")
+        raise TrainingError(f"a network in frame '{model.config.frame}' has no motion to pretrain; choose frame 'palm'")
     processes, device = begin(config.schedule)
     motion, encoder = model.motion.to(device), model.hand_encoder.to(device).eval()
     generator = torch.Generator(device)

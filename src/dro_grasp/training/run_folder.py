@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from dro_grasp.errors import OutputError, TrainingError
-from dro_grasp.files import replacing
+from dro_grasp.files import FOREIGN, UNTYPED, is_unread, reason_of, replacing, set_aside
 
 CHECKPOINT = "checkpoint.pt"
 """File with everything that a run needs to resume."""
@@ -45,23 +45,28 @@ class RunFolder:
     def read_checkpoint(self, plan: dict[str, Any]) -> dict[str, Any] | None:
         """The checkpoint, which must have the same plan; None where there is none.
 
-        A damaged one is set aside, and the run begins anew: there is nothing else to go on from.
+        A damaged one is set aside with its log, and the run begins anew: there is nothing else to go on from. One that
+        cannot be read now may be sound, and is left alone.
 
         Raises:
-            TrainingError: The checkpoint is of a run with another plan.
+            TrainingError: The checkpoint cannot be read, or is of a run with another plan.
+            OutputError: A damaged one cannot be set aside.
         """
         path = self.path / CHECKPOINT
         if not path.is_file():
             return None
         try:
-            state = torch.load(path, weights_only=True, map_location="cpu")
-            found, _ = dict(state["plan"]), [state[key] for key in ENTRIES]
-            state["step"], state["seconds"] = int(state["step"]), float(state["seconds"])
-        except Exception as error:  # PyTorch's reader raises what its parts do
-            aside = path.replace(path.with_name(f"{path.name}.damaged"))
-            print(f"{path} is damaged ({type(error).__name__}) and set aside as {aside.name}; the training begins anew",
-                  file=sys.stderr)
+            state = _state(path)
+        except FOREIGN as error:
+            if is_unread(error):
+                raise TrainingError(f"{path} cannot be read ({reason_of(error)}); nothing was changed. Start again once it can "
+                                    "be, or use another folder") from error
+            with self._writing(path):
+                aside = set_aside(path, self.path / LOG)
+            print(f"{path} is damaged ({type(error).__name__}) and set aside as {aside.name}, its log beside it; the training "
+                  "begins anew", file=sys.stderr)
             return None
+        found = state["plan"]
         for name, asked in plan.items():
             if found.get(name, asked) != asked:  # earlier versions stored less
                 raise TrainingError(f"{path} belongs to a run with {name} {found[name]}, {asked} was asked for; use the "
@@ -104,6 +109,24 @@ class RunFolder:
             left = "the run resumes from its last checkpoint" if there else "there is no checkpoint yet, so the run begins anew"
             raise OutputError(f"cannot write {path}: {error.strerror or error}; free some space, or make it writable, and "
                               f"start again: {left}") from error
+
+
+def _state(path: Path) -> dict[str, Any]:
+    """The entries of a checkpoint. Its bytes are read first, as PyTorch's reader hides a failing disk in a RuntimeError.
+
+    Raises:
+        ValueError: It lacks some, or holds something else.
+    """
+    content = io.BytesIO(path.read_bytes())
+    try:
+        state = torch.load(content, weights_only=True, map_location="cpu")
+    except UNTYPED as error:  # PyTorch takes a damaged pickle's entries for what they should be
+        raise ValueError(str(error)) from error
+    kinds = {"step": int, "seconds": (int, float), "plan": dict}
+    if not isinstance(state, dict) or not set(ENTRIES) <= state.keys() or not all(
+            isinstance(state[name], kind) for name, kind in kinds.items()):
+        raise ValueError("it is no checkpoint")
+    return state
 
 
 def last_logged(folder: Path) -> dict[str, float]:

@@ -14,10 +14,11 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import CONTACT_LINKS, REASON
 from dro_grasp.grasps.controller import completed
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.viewer.appearance import PREDICTED_COLOUR
 from dro_grasp.viewer.pictures import outcome
-from dro_grasp.viewer.stage import HOST, ServedPage, serve
+from dro_grasp.viewer.scene_view import HOST, ServedPage, escaped, serve
 
 Posture = Literal["open", "pregrasp", "grasp", "squeeze"]
 """Stages of closing the hand that the viewer shows."""
@@ -55,10 +56,10 @@ class GraspViewer(ServedPage):
         self.posture: Posture = "grasp"
         self._joints = postures_of(hand, obj, grasps)
         super().__init__(port, host)
-        self.stage.set_pair(hand, obj, self._joints["grasp"][0], grasps.T_object_wrist[0].float())
+        self.view.set_pair(hand, obj, self._joints["grasp"][0], grasps.T_object_wrist[0].float())
         self._predicted = None
         if predicted_points is not None:
-            self._predicted = self.stage.cloud("predicted", predicted_points[0].numpy(), PREDICTED_COLOUR)
+            self._predicted = self.view.cloud("predicted", predicted_points[0].numpy(), PREDICTED_COLOUR)
         self._add_controls()
         self.show(0, "grasp")
 
@@ -67,15 +68,15 @@ class GraspViewer(ServedPage):
         self.index = index
         self.posture = posture or self.posture
         with self.server.atomic():
-            self.stage.show(self._joints[self.posture][index], self.grasps.T_object_wrist[index].float())
+            self.view.show(self._joints[self.posture][index], self.grasps.T_object_wrist[index].float())
             if self._predicted is not None and self.predicted_points is not None:
                 self._predicted.points = self.predicted_points[index].numpy().astype(np.float32)
-            self.stage.colour_grid(outcome(self.grasps, index))
+            self.view.colour_grid(outcome(self.grasps, index))
             self._text.content = describe(self.grasps, index)
 
     def _add_controls(self) -> None:
         gui = self.server.gui
-        gui.add_markdown(f"**{self.hand.name}** on **{self.obj.name}**")
+        gui.add_markdown(f"**{escaped(self.hand.name)}** on **{escaped(self.obj.name)}**")
         last = max(1, len(self.grasps) - 1)
         slider = gui.add_slider("Grasp", 0, last, 1, 0, disabled=len(self.grasps) == 1, hint="Best score first.")
         postures = gui.add_button_group("Posture", POSTURES)
@@ -87,11 +88,12 @@ class GraspViewer(ServedPage):
         predicted = gui.add_checkbox("Predicted points", False, disabled=missing, hint=hint)
         slider.on_update(lambda _: self.show(int(slider.value)))
         postures.on_click(lambda _: self.show(self.index, cast(Posture, postures.value)))
-        shapes.on_update(lambda _: self.stage.show_shapes(shapes.value))
-        solved.on_update(lambda _: setattr(self.stage.solved, "visible", solved.value))
+        shapes.on_update(lambda _: self.view.show_shapes(shapes.value))
+        solved.on_update(lambda _: setattr(self.view.solved, "visible", solved.value))
         predicted.on_update(lambda _: setattr(self._predicted, "visible", predicted.value))
 
 
+@checked
 def view_grasps(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, predicted_points: Float[Tensor, "n n_points 3"] | None = None,
     port: int = 8080, host: str = HOST,
@@ -106,7 +108,7 @@ def describe(grasps: GraspBatch, index: int) -> str:
     if bool(grasps.evaluated[index]):
         why = (grasps.extra.get(REASON) or [""] * len(grasps))[index]
         outcome = "success" if grasps.success[index] else "failed"
-        lines.append(f"**{outcome}** under {grasps.protocol[index]}{f': {why}' if why else ''}")
+        lines.append(f"**{outcome}** under {escaped(grasps.protocol[index])}{f': {escaped(why)}' if why else ''}")
     else:
         lines.append("not evaluated")
     values = {"confidence": (grasps.confidence, 100.0, " %"), "energy": (grasps.energy, 1.0, ""),
@@ -116,7 +118,7 @@ def describe(grasps: GraspBatch, index: int) -> str:
         if bool(column[index].isfinite()):
             lines.append(f"{name} {float(column[index]) * factor:.2f}{unit}")
     if links := (grasps.extra.get(CONTACT_LINKS) or [None] * len(grasps))[index]:
-        lines.append(f"touched by {', '.join(links)}")
+        lines.append(f"touched by {escaped(', '.join(links))}")
     if bool(grasps.fingers_in_contact[index].isfinite()):
         lines.append(f"fingers in contact {int(grasps.fingers_in_contact[index])}")
     return "  \n".join(lines)

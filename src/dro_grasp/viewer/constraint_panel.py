@@ -14,7 +14,7 @@ from dro_grasp.geometry.balls import Ball
 from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.constraints import Constraints
-from dro_grasp.viewer.stage import Place, rgb
+from dro_grasp.viewer.scene_view import Client, rgb
 
 ANY: str = "any"
 """The choice of every palm direction."""
@@ -33,14 +33,14 @@ TABLE = (0.82, 0.80, 0.76)
 class ConstraintPanel:
     """A folder of controls; empty fields ask for nothing."""
 
-    def __init__(self, place: Place, changed: Callable[[], None]) -> None:
+    def __init__(self, client: Client, changed: Callable[[], None]) -> None:
         """Add the controls.
 
         Args:
-            place: The page.
+            client: The page.
             changed: Called when a control has changed.
         """
-        self.place, gui = place, place.gui
+        self.client, gui = client, client.gui
         with gui.add_folder("Constraints", expand_by_default=False):
             self.direction = gui.add_dropdown(
                 "Palm direction", (ANY, *HALF_AXES), initial_value=ANY, hint="-z grasps from above.")
@@ -77,7 +77,7 @@ class ConstraintPanel:
 
     def draw(self, constraints: Constraints, obj: ObjectModel) -> None:
         """Show table, places and scene beside the object."""
-        scene = self.place.scene
+        scene = self.client.scene
         scene.remove_by_name("/constraints")
         if constraints.table is not None:
             x, y, _ = obj.cloud.mean(0).tolist()

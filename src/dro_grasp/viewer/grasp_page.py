@@ -27,7 +27,7 @@ from dro_grasp.simulation.trial import record
 from dro_grasp.viewer.app import POSTURES, Posture, describe, postures_of
 from dro_grasp.viewer.constraint_panel import ANY
 from dro_grasp.viewer.pictures import after_closing, contact_points, outcome, shows_held
-from dro_grasp.viewer.stage import Place, Stage
+from dro_grasp.viewer.scene_view import Client, SceneView, escaped
 
 FRAME_TIME = 0.04
 """Time between two pictures of a trial [s] (ours)."""
@@ -75,18 +75,18 @@ class Closed(Exception):
 class GraspPage:
     """A page with a folder of controls for the grasps that it shows."""
 
-    def __init__(self, place: Place) -> None:
+    def __init__(self, client: Client) -> None:
         """Put scene and controls on a page."""
-        self.place, self.stage = place, Stage(place)
+        self.client, self.view = client, SceneView(client)
         self.closed = threading.Event()
         """Whether nobody sees the page any more."""
         self.made: ShownGrasps | None = None
         self.shown: list[int] = []
         self.film: Film | None = None
         self._busy = threading.Lock()
-        with place.atomic():  # the browser gets no control before all are connected
+        with client.atomic():  # the browser gets no control before all are connected
             self._add_choices()
-            self.status = place.gui.add_markdown("")
+            self.status = client.gui.add_markdown("")
             self._add_display()
 
     def _add_choices(self) -> None:
@@ -97,7 +97,7 @@ class GraspPage:
         return text
 
     def _add_display(self) -> None:
-        gui = self.place.gui
+        gui = self.client.gui
         with gui.add_folder("Display"):
             self.success = gui.add_dropdown("Show", ("all", "succeeded", "failed"), initial_value="all")
             self.palm = gui.add_dropdown("Palm along", (ANY, *HALF_AXES), initial_value=ANY)
@@ -144,7 +144,7 @@ class GraspPage:
 
     def _complain(self, error: DroGraspError) -> None:
         """Show an error."""
-        self._say(f"**Error:** {self._plain(str(error))}")
+        self._say(f"**Error:** {escaped(self._plain(str(error)))}")
 
     def _say(self, text: str) -> None:
         """Show a line.
@@ -162,7 +162,7 @@ class GraspPage:
         first = self.made.refined
         if len(first):
             joints, T = first.joints[0].float(), first.T_object_wrist[0].float()
-            self.stage.set_pair(self.made.hand, self.made.obj, joints, T, self.made.on_table)
+            self.view.set_pair(self.made.hand, self.made.obj, joints, T, self.made.on_table)
         self._filter()
 
     def _filter(self) -> None:
@@ -206,13 +206,13 @@ class GraspPage:
             joints = postures_of(hand, obj, grasp)[cast(Posture, posture)][0]
         T = grasp.T_object_wrist[0].float()
         self._forget_film()
-        with self.place.atomic():
-            self.stage.show(joints, T)
-            self.stage.solved.visible = self.points.value
-            self.stage.contacts.visible = self.contacts.value
+        with self.client.atomic():
+            self.view.show(joints, T)
+            self.view.solved.visible = self.points.value
+            self.view.contacts.visible = self.contacts.value
             if self.contacts.value:
-                self.stage.contacts.points = contact_points(hand, obj, joints, T).astype("float32")
-            self.stage.colour_grid(outcome(grasps, index))
+                self.view.contacts.points = contact_points(hand, obj, joints, T).astype("float32")
+            self.view.colour_grid(outcome(grasps, index))
             self.text.content = f"{describe(grasps, index)}  \nposture: {posture}"
 
     def _play(self) -> None:
@@ -221,7 +221,7 @@ class GraspPage:
         if self.made is None or index is None:
             return
         grasps, protocol = self._batch(), self.made.protocol
-        self._say(f"Playing the trial under *{protocol}*.")
+        self._say(f"Playing the trial under *{escaped(protocol)}*.")
         film = Film(grasps.T_object_wrist[index].float(), *record(self.made.hand, self.made.obj, grasps, index, protocol))
         last = len(film.poses) - 1
         self.film, self.moment.max, self.moment.disabled = film, last, False
@@ -240,8 +240,8 @@ class GraspPage:
         """Show a moment of the trial that was played."""
         if (film := self.film) is None:
             return
-        self.stage.contacts.visible = False
-        self.stage.show(film.joints[moment], film.T_object_wrist, film.T_object_wrist @ film.poses[moment])
+        self.view.contacts.visible = False
+        self.view.show(film.joints[moment], film.T_object_wrist, film.T_object_wrist @ film.poses[moment])
 
     def _forget_film(self) -> None:
         """No trial was played of what is shown now."""
@@ -252,7 +252,7 @@ class GraspPage:
         name, content = self.exported(self.format.value)
         if event.client is not None:
             event.client.send_file_download(name, content, save_immediately=True)
-        self._say(f"{name}: {len(self.shown)} grasps.")
+        self._say(f"{escaped(name)}: {len(self.shown)} grasps.")
 
     def exported(self, kind: str) -> tuple[str, bytes]:
         """Name and content of a file with the shown grasps, in one of EXPORTS.
@@ -275,7 +275,7 @@ def chosen(hand: Hand, grasps: GraspBatch, success: str, palm: str) -> Bool[Tens
     """Grasps with an outcome (`all`, `succeeded`, `failed`) whose palm points along a half-axis (or `any`)."""
     keep = torch.ones(len(grasps), dtype=torch.bool)
     if success != "all":
-        keep &= grasps.success if success == "succeeded" else grasps.evaluated & ~grasps.success
+        keep &= grasps.evaluated & (grasps.trial_success == (success == "succeeded"))
     if palm != ANY:
         keep &= half_axis(hand.palm_directions(grasps.T_object_wrist)) == HALF_AXES.index(palm)
     return keep

@@ -28,7 +28,7 @@ from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.rendering.meshes import OBJECT_COLOUR, Colour
 from dro_grasp.viewer.appearance import SOLVED_COLOUR, SUCCESS_COLOUR
-from dro_grasp.viewer.stage import HOST, POINT_SIZE, ServedPage, rgb
+from dro_grasp.viewer.scene_view import HOST, POINT_SIZE, ServedPage, escaped, rgb
 
 RATE = 25.0
 """Pictures a second (ours)."""
@@ -110,7 +110,7 @@ class LiftPage(ServedPage):
     def _put(self, robot: Robot) -> None:
         """Show a robot at home beside its table, in the place of another one."""
         scene, self.robot = self.server.scene, robot
-        self.name.content = f"**{robot.name}**"
+        self.name.content = f"**{escaped(robot.name)}**"
         for name in ("/robot", "/table"):
             scene.remove_by_name(name)
         self._links = [
@@ -150,7 +150,7 @@ class LiftPage(ServedPage):
         try:
             work()
         except DroGraspError as error:
-            self.text.content = f"**Error:** {error}"
+            self.text.content = f"**Error:** {escaped(error)}"
         finally:
             self._busy.release()
 
@@ -174,11 +174,12 @@ class LiftPage(ServedPage):
         film, self.film = Film.of_attempt(recorder), None
         if robot is not self.robot:
             self._put(robot)
+        of_object = ((stored.solid_sha256, obj.solid_sha256) if stored.solid_sha256 else (stored.object_sha256, obj.sha256))
         others = [name for name, then, now in (
-            ("robot", stored.robot_sha256, robot.sha256), ("object", stored.object_sha256, obj.sha256),
+            ("robot", stored.robot_sha256, robot.sha256), ("object", *of_object),
             ("weights", stored.weights_sha256, describe_weights(weights)["sha256"])) if then not in {"", now}]
         changed = f"**Not as stored**: with other content than then: {', '.join(others)}. " if others else ""
-        self.show(film, changed + ("held" if made.success else f"**{made.stage}**: {made.reason}"))
+        self.show(film, changed + ("held" if made.success else f"**{escaped(made.stage)}**: {escaped(made.reason)}"))
 
     def show(self, film: Film, outcome: str = "") -> None:
         """Put a film on the page, and show its first picture."""
@@ -200,7 +201,7 @@ class LiftPage(ServedPage):
                         f"/seen/{name}", points.astype(np.float32), rgb(colour), point_size=POINT_SIZE, point_shape="circle",
                         precision="float32"))
             self.grasps.options = (NONE, EVERY, *dict.fromkeys(film.plan.scene.fate))
-            said += film.plan.lines()
+            said += map(escaped, film.plan.lines())
         self._said = "  \n".join(filter(None, said))
         self.moment.max, self.moment.disabled, self.play.disabled = len(film.arm) - 1, False, False
         self._aim()
@@ -252,7 +253,7 @@ class LiftPage(ServedPage):
         every = max(1, len(self.film.arm) // 6)
         meshes = [mesh for q, hand in zip(self.film.arm[::every], self.film.hand[::every], strict=True)
                   for mesh in robot_meshes(self.robot, q, hand)]
-        self.stage.aim(Camera.around(np.concatenate([m.vertices for m in meshes]), VIEW, aspect=4 / 3))
+        self.view.aim(Camera.around(np.concatenate([m.vertices for m in meshes]), VIEW, aspect=4 / 3))
 
 
 def move(handle: viser.SceneNodeHandle, T: Float[np.ndarray, "4 4"]) -> None:

@@ -23,6 +23,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import require_pair
 from dro_grasp.grasps.summary import percent
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import Checked, checked
 from dro_grasp.objects.ball_solid import solid_of
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.rendering.meshes import dots
@@ -58,7 +59,7 @@ PicturedPosture = Literal["held", "grasp"]
 
 
 @dataclass(frozen=True)
-class PictureStyle:
+class PictureStyle(Checked):
     """How a grasp is drawn."""
 
     size: tuple[int, int] = TILE
@@ -72,6 +73,7 @@ class PictureStyle:
     the joints and poses that it is given."""
 
 
+@checked
 def draw_grasps(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, path: Path | str, count: int = MAX_PICTURES, columns: int = COLUMNS,
     style: PictureStyle | None = None,

@@ -9,12 +9,13 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 
 import viser
 
 from dro_grasp.errors import DroGraspError
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.sources import made_for_another
+from dro_grasp.grasps.sources import made_for_another, object_of
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import hand_names
 from dro_grasp.objects.catalogue import object_names
@@ -31,18 +32,18 @@ from dro_grasp.viewer.appearance import waiting_pose
 from dro_grasp.viewer.constraint_panel import ConstraintPanel
 from dro_grasp.viewer.grasp_page import Closed, GraspPage, ShownGrasps
 from dro_grasp.viewer.pictures import protocol_name
-from dro_grasp.viewer.shelf import Shelf
-from dro_grasp.viewer.stage import HOST, Place, ServedPage
+from dro_grasp.viewer.scene_view import HOST, Client, ServedPage, escaped
+from dro_grasp.web.library import Kind, Library
 
-LARGEST_CALL = 64
+MAX_GRASPS = 64
 """Most grasps of one click (ours)."""
-MOST_CANDIDATES = 8
+MAX_CANDIDATES = 8
 """Most candidates for each of them (ours)."""
-PATIENCE = 0.5
+TURN_POLL = 0.5
 """Time after which a page that waits for another looks whether it is still open [s] (ours)."""
-UPLOAD_PATIENCE = 10.0
+UPLOAD_TIMEOUT = 10.0
 """Time that an upload waits to be picked while the page does other work, such as loading its first pair [s] (ours)."""
-GRACE = 5.0
+CLOSE_TIMEOUT = 5.0
 """Time that a closed page has to end what it does before its uploads are deleted [s] (ours)."""
 
 
@@ -55,30 +56,31 @@ class Studio(GraspPage):
     """
 
     def __init__(
-        self, place: Place, predictor: GraspPredictor, hand: str = "allegro", obj: str = "rubber_duck",
+        self, client: Client, predictor: GraspPredictor, hand: str = "allegro", obj: str = "rubber_duck",
         turn: threading.Lock | None = None, preview: bool = True,
     ) -> None:
         """Start with a hand and an object chosen.
 
         Args:
-            place: Where the page is.
+            client: Where the page is.
             predictor: May be that of other pages too.
             hand: Name or path; the object likewise.
             turn: Held while grasps are made, for pages that share a machine.
             preview: Show hand and object at once; not needed where `open` follows.
         """
-        self.predictor, self.shelf, self._first = predictor, Shelf(), (hand, obj)
+        self.predictor, self.library, self._first = predictor, Library(), (hand, obj)
         self._turn = turn or threading.Lock()
+        self._batches: dict[str, GraspBatch] = {}  # grasps of a file, by the name of their object
         self._given: dict[str, Hand] = {}  # the hand that came with a file's grasps, by the name of their object
-        super().__init__(place)
+        super().__init__(client)
         if preview:
             self._guarded(self._preview)
 
     def close(self) -> None:
         """End what the page does, and delete its uploads."""
         self.closed.set()
-        self._busy.acquire(timeout=GRACE)  # never released: nothing is done on this page any more
-        self.shelf.close()
+        self._busy.acquire(timeout=CLOSE_TIMEOUT)  # never released: nothing is done on this page any more
+        self.library.close()
 
     def open(self, hand: Hand, grasps: GraspBatch, obj: ObjectModel | None = None, first: str | None = None) -> None:
         """Show the grasps of a file. Its hand and objects can be picked, and more grasps generated, like any other.
@@ -93,20 +95,29 @@ class Studio(GraspPage):
             GraspFileError: The hand has other joints than the grasps.
         """
         grasps.require_hand(hand)
-        self.shelf.put(hand, grasps, obj)
-        self._given |= dict.fromkeys([name for name, _ in grasps.by_object()] if obj is None else [obj.name], hand)
-        self.hand.options, self.object.options = self.shelf.hand_names(), self.shelf.object_names()
-        self.hand.value = hand.name
-        self.object.value = obj.name if obj is not None else first or grasps.object[0]
+        for name, own in grasps.by_object() if obj is None else [(obj.name, grasps)]:
+            self._batches[name], self._given[name] = own, hand
+            self.library.add("object", name, partial(object_of, own, None, 1.0))
+        self._choose(hand, obj)
+        if obj is None:
+            self.object.value = first or grasps.object[0]
         self._guarded(self._pick_object)
 
     def offer(self, hand: Hand | None, obj: ObjectModel | None) -> None:
         """Pick a hand, an object or both, which may be the user's own; None leaves what is picked."""
-        self.shelf.put(hand, obj=obj)
-        self.hand.options, self.object.options = self.shelf.hand_names(), self.shelf.object_names()
-        self.hand.value = self.hand.value if hand is None else hand.name
-        self.object.value = self.object.value if obj is None else obj.name
+        self._choose(hand, obj)
         self._guarded(self._preview)
+
+    def _choose(self, hand: Hand | None, obj: ObjectModel | None) -> None:
+        """Add a hand, an object or both to what can be picked, and pick them."""
+        choices: tuple[tuple[Kind, Hand | ObjectModel | None, viser.GuiDropdownHandle[str]], ...] = (
+            ("hand", hand, self.hand), ("object", obj, self.object))
+        for kind, model, choice in choices:
+            if model is not None:
+                self.library.add(kind, model.name, model)
+            choice.options = self.library.names(kind)
+            if model is not None:
+                choice.value = model.name
 
     def generate(
         self, hand: str, obj: str, num: int = GraspRequest.num, constraints: Constraints | None = None,
@@ -125,7 +136,7 @@ class Studio(GraspPage):
             DroGraspError: An argument cannot be used.
         """
         wanted = constraints or Constraints()
-        problem = GraspProblem(self.shelf.hand(hand), self.shelf.obj(obj), self.predictor.device, wanted)
+        problem = GraspProblem(self.library.hand(hand), self.library.obj(obj), self.predictor.device, wanted)
         request = GraspRequest(num, candidates=candidates, temperature=temperature, source=source)
         found = self.predictor.run(problem, request, self._counting("proposing"))
         raw, refined = found.proposed, found.grasps
@@ -138,33 +149,34 @@ class Studio(GraspPage):
 
     def _preview(self) -> None:
         """Show the chosen hand above the chosen object, before there are grasps."""
-        hand, obj = self.shelf.hand(self.hand.value), self.shelf.obj(self.object.value)
+        hand, obj = self.library.hand(self.hand.value), self.library.obj(self.object.value)
         self.made, self.shown, self.text.content = None, [], ""
         self.slider.disabled = self.play.disabled = self.download.disabled = True
         self._forget_film()
-        self.stage.set_pair(hand, obj, hand.canonical_joints(), waiting_pose(hand, obj))
-        self._say(f"{hand.name} above {obj.name}. Press *Generate*, or pick or upload others.")
+        self.view.set_pair(hand, obj, hand.canonical_joints(), waiting_pose(hand, obj))
+        self._say(f"{escaped(hand.name)} above {escaped(obj.name)}. Press *Generate*, or pick or upload others.")
 
     def _pick_object(self) -> None:
         """Show the grasps of the chosen object if a file has some of the chosen hand, and the pair alone otherwise."""
-        grasps = self.shelf.batches.get(self.object.value)
-        hand = self.shelf.hand(self.hand.value)
+        grasps = self._batches.get(self.object.value)
+        hand = self.library.hand(self.hand.value)
         if grasps is None or (grasps.hand_sha256 != hand.sha256 and self._given.get(self.object.value) is not hand):
             self._preview()
             return
         other = [] if grasps.hand_sha256 in {"", hand.sha256} else [f"{made_for_another(grasps.hand, hand.name)}."]
-        obj, label = self.shelf.obj(self.object.value), next(filter(None, grasps.protocol), "")
+        obj, label = self.library.obj(self.object.value), next(filter(None, grasps.protocol), "")
         self.made = ShownGrasps(hand, obj, grasps, grasps, protocol_name(label))
         self._present()
-        held = f", **{int(grasps.success.sum())}** held under *{label}*" if label else ", not evaluated"
+        held = f", **{int(grasps.success.sum())}** held under *{escaped(label)}*" if label else ", not evaluated"
         short = "" if grasps.out_of == len(grasps) else f" ({grasps.out_of} were asked for)"
-        self._say("  \n".join([f"{len(grasps)} grasps of {obj.name}{short}{held}", *other, *diagnose(grasps)]))
+        remarks = map(escaped, [*other, *diagnose(grasps)])
+        self._say("  \n".join([f"{len(grasps)} grasps of {escaped(obj.name)}{short}{held}", *remarks]))
 
     def _plain(self, text: str) -> str:
-        return self.shelf.plain(text)
+        return self.library.plain(text)
 
     def _add_choices(self) -> None:
-        (hand, obj), gui = self._first, self.place.gui
+        (hand, obj), gui = self._first, self.client.gui
         with gui.add_folder("Hand and object"):
             self.hand = gui.add_dropdown("Hand", tuple(dict.fromkeys([*hand_names(), hand])), initial_value=hand)
             hand_file = gui.add_upload_button("Upload a hand (URDF, MJCF, ZIP)", mime_type=".urdf,.xml,.zip")
@@ -172,19 +184,19 @@ class Studio(GraspPage):
             kinds = ".stl,.obj,.ply,.glb,.off,.npy,.pcd"
             object_file = gui.add_upload_button("Upload an object (STL, OBJ, PLY)", mime_type=kinds)
         with gui.add_folder("Generate"):
-            self.num = gui.add_slider("Grasps", 1, LARGEST_CALL, 1, GraspRequest.num)
+            self.num = gui.add_slider("Grasps", 1, MAX_GRASPS, 1, GraspRequest.num)
             self.source = gui.add_dropdown(
                 "Source", (AUTO, *source_names()), initial_value=AUTO,
                 hint="auto: the optimiser helps where the network is unsure.")
             self.candidates = gui.add_slider(
-                "Candidates", 1, MOST_CANDIDATES, 1, GraspRequest.candidates,
+                "Candidates", 1, MAX_CANDIDATES, 1, GraspRequest.candidates,
                 hint="Candidates proposed for each grasp; the best by score are kept.")
             self.usual = gui.add_checkbox("Usual diversity", True, hint="1 for a mesh, less for a bare point cloud.")
             self.temperature = gui.add_slider(
                 "Diversity", 0.0, 1.0, 0.05, 1.0, disabled=True, hint="0: the likeliest grasp of each placement.")
             self.protocol = gui.add_dropdown("Trial", tuple(PROTOCOLS), initial_value=DEFAULT_PROTOCOL)
             self.button = gui.add_button("Generate", color="green")
-        self.panel = panel = ConstraintPanel(self.place, lambda: self._guarded(self._draw_constraints))
+        self.panel = panel = ConstraintPanel(self.client, lambda: self._guarded(self._draw_constraints))
         hand_file.on_upload(lambda _: self._take(hand_file.value, "hand", self.hand, self._preview))
         object_file.on_upload(lambda _: self._take(object_file.value, "object", self.object, self._preview))
         panel.upload.on_upload(lambda _: self._take(panel.upload.value, "scene", panel.avoid, self._draw_constraints))
@@ -195,35 +207,37 @@ class Studio(GraspPage):
         self.usual.on_update(lambda _: setattr(self.temperature, "disabled", self.usual.value))
 
     def _take(
-        self, upload: viser.UploadedFile, kind: str, choice: viser.GuiDropdownHandle[str], show: Callable[[], None]
+        self, upload: viser.UploadedFile, kind: Kind, choice: viser.GuiDropdownHandle[str], show: Callable[[], None]
     ) -> None:
         """Store an upload, pick it and show it; where other work takes long, it can be picked later."""
         with suppress(Closed):
             if self.closed.is_set():
                 return
             try:
-                label = self.shelf.take(upload.name, upload.content, kind)
+                label = self.library.take(upload.name, upload.content, kind)
             except DroGraspError as error:
                 self._complain(error)
                 return
+            if kind == "object":
+                self._batches.pop(label, None)
             choice.options = tuple(dict.fromkeys([*choice.options, label]))
-            later = f"Busy. {label} is stored; pick it afterwards."
-            self._guarded(lambda: self._pick_upload(label, choice, show), UPLOAD_PATIENCE, later)
+            later = f"Busy. {escaped(label)} is stored; pick it afterwards."
+            self._guarded(lambda: self._pick_upload(label, choice, show), UPLOAD_TIMEOUT, later)
 
     def _pick_upload(self, label: str, choice: viser.GuiDropdownHandle[str], show: Callable[[], None]) -> None:
         """Pick an upload and show it."""
         choice.value = label
         show()
-        self._say(f"{label} is picked. {self.status.content}")
+        self._say(f"{escaped(label)} is picked. {self.status.content}")
 
     def _table_under(self) -> None:
         """Put the table under the chosen object."""
-        self.panel.put_under(self.shelf.obj(self.object.value))
+        self.panel.put_under(self.library.obj(self.object.value))
         self._draw_constraints()
 
     def _draw_constraints(self) -> None:
         """Show what the controls ask for."""
-        self.panel.draw(self.panel.constraints(self.shelf.scene), self.shelf.obj(self.object.value))
+        self.panel.draw(self.panel.constraints(self.library.scene), self.library.obj(self.object.value))
         self._say("Grasps of the next click respect these constraints.")
 
     def _counting(self, what: str) -> Callable[[int, int], None]:
@@ -231,7 +245,7 @@ class Studio(GraspPage):
         return lambda done, total: self._say(f"{what}: {done} of {total}")
 
     def _generate(self) -> None:
-        while not self._turn.acquire(timeout=PATIENCE):
+        while not self._turn.acquire(timeout=TURN_POLL):
             self._say("Grasps of another page are made; these are next.")
         try:
             self._generate_now()
@@ -243,12 +257,13 @@ class Studio(GraspPage):
         begin = time.perf_counter()
         temperature = None if self.usual.value else float(self.temperature.value)
         made = self.generate(
-            self.hand.value, self.object.value, int(self.num.value), self.panel.constraints(self.shelf.scene), temperature,
+            self.hand.value, self.object.value, int(self.num.value), self.panel.constraints(self.library.scene), temperature,
             self.protocol.value, int(self.candidates.value), self.source.value)
         held = "" if made.obj.is_cloud else (
-            f", **{int(made.refined.success.sum())}** held under *{self.protocol.value}*")
-        short = [] if made.shortage is None else [made.shortage]
-        lines = [f"{len(made.refined)} grasps{held}; {time.perf_counter() - begin:.1f} s", *short, *diagnose(made.refined)]
+            f", **{int(made.refined.success.sum())}** held under *{escaped(self.protocol.value)}*")
+        remarks = [] if made.shortage is None else [made.shortage]
+        remarks += diagnose(made.refined)
+        lines = [f"{len(made.refined)} grasps{held}; {time.perf_counter() - begin:.1f} s", *map(escaped, remarks)]
         self._say("  \n".join(lines))
 
 
@@ -256,10 +271,10 @@ class StudioServer(ServedPage):
     """A server that gives every browser a page of its own; `stop()` ends it.
 
     Examples:
-        >>> server = StudioServer(lambda place, turn: Studio(place, predictor, turn=turn))
+        >>> server = StudioServer(lambda client, turn: Studio(client, predictor, turn=turn))
     """
 
-    def __init__(self, make: Callable[[Place, threading.Lock], Studio], port: int = 8080, host: str = HOST) -> None:
+    def __init__(self, make: Callable[[Client, threading.Lock], Studio], port: int = 8080, host: str = HOST) -> None:
         """Start serving.
 
         Args:

@@ -22,7 +22,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from dro_grasp.errors import BundleError
-from dro_grasp.files import given_path, reading, replacing
+from dro_grasp.files import UNTYPED, given_path, reading, replacing
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.geometry.se3 import compose
 from dro_grasp.grasps.batch import GraspBatch
@@ -177,7 +177,8 @@ def load_bundle(path: Path | str) -> Bundle:
     path = given_path(path)
     if not path.is_file():
         raise BundleError(f"no bundle at {path}; make one with `dro-grasp dataset bundle`")
-    with reading(path, BundleError, "a bundle that is not cut short; make it again with `dro-grasp dataset bundle`"):
+    with reading(path, BundleError, "a bundle that is not cut short; make it again with `dro-grasp dataset bundle`",
+                 *UNTYPED):
         with safe_open(path, "pt") as file:
             header = json.loads((file.metadata() or {}).get(HEADER, "null"))
             tensors = {key: file.get_tensor(key) for key in file.keys()}
@@ -277,7 +278,10 @@ def _grasp_tensors(key: str, T: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n
 
 
 def _unpack_grasps(key: str, tensors: Tensors) -> HandGrasps:
-    quaternion = roma.quat_wxyz_to_xyzw(tensors[f"{key}.quaternion_wxyz"])
+    quaternion = tensors[f"{key}.quaternion_wxyz"]
+    if quaternion.shape[-1:] != (4,) or not quaternion.is_floating_point():
+        raise ValueError(f"'{key}.quaternion_wxyz' is {quaternion.dtype} of shape {tuple(quaternion.shape)}")
+    quaternion = roma.quat_wxyz_to_xyzw(quaternion)
     if not len(quaternion):
         return HandGrasps(torch.zeros(0, 4, 4), tensors[f"{key}.joints"], tensors[f"{key}.object"].long())
     rotation = roma.unitquat_to_rotmat(torch.nn.functional.normalize(quaternion, dim=-1))

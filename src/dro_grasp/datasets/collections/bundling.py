@@ -16,12 +16,14 @@ from dro_grasp.errors import BundleError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import hand_of, object_of, pair_keys, require_same
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import checked
 from dro_grasp.objects.shape import ObjectModel
 
 CLOUD_POINTS = 4096
 """Points of an object in a bundle (ours), of the 16,384 that it has in memory: a sample has 128 to 512 of them."""
 
 
+@checked
 def make_bundle(
     inputs: Sequence[Path], output: Path, split: str = "train", hands: Sequence[str] = (), per_pair: int | None = None,
     without_grasps: Sequence[Hand] = (),

@@ -49,11 +49,11 @@ class Agreement:
 
     def extended(self, grasps: GraspBatch, trial: TrialResult) -> Agreement:
         """With the new trials of more grasps."""
-        failed = Counter(f.value for f, held in zip(trial.failure, grasps.success.tolist(), strict=True) if f and held)
-        success = int(trial.success.sum())
+        failed = Counter(f.value for f, held in zip(trial.failure, grasps.trial_success.tolist(), strict=True) if f and held)
+        success, agreed = int(trial.success.sum()), int((trial.success == grasps.trial_success).sum())
         of_hand = self.hands.get(grasps.hand, (0, 0))
         return replace(
-            self, evaluated=self.evaluated + len(grasps), agreed=self.agreed + int((trial.success == grasps.success).sum()),
+            self, evaluated=self.evaluated + len(grasps), agreed=self.agreed + agreed,
             succeeded=self.succeeded + success, reasons=self.reasons + failed,
             hands=self.hands | {grasps.hand: (of_hand[0] + len(grasps), of_hand[1] + success)},
         )
@@ -110,7 +110,7 @@ def keep_passing(
         grasps = pair.grasps.with_trial(simulate(hand, obj, pair.grasps, rules))
         if close_fingers:
             grasps = closed_where_it_holds(hand, obj, grasps, rules)
-        kept.append((pair, grasps[grasps.success.nonzero()[:, 0]]))
+        kept.append((pair, grasps[grasps.success]))
     return kept
 
 

@@ -14,6 +14,7 @@ from dro_grasp.errors import GraspFileError
 from dro_grasp.files import given_path
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.table import read_footer
+from dro_grasp.kinds import checked
 
 YIELDS = "yields"
 """Entry of a file's notes with the yield of each of its objects."""
@@ -39,6 +40,7 @@ def yield_notes(yields: Mapping[str, Yield]) -> dict[str, Any]:
     return {YIELDS: {name: made.to_dict() for name, made in yields.items()}, "version": __version__}
 
 
+@checked
 def read_collection(path: Path | str, only_successful: bool = True) -> Iterator[PairGrasps]:
     """The grasps of each pair, one pair after the other.
 
@@ -62,7 +64,7 @@ def read_collection(path: Path | str, only_successful: bool = True) -> Iterator[
     empty = True
     for pair in pairs:
         empty = False
-        yield replace(pair, grasps=pair.grasps[pair.grasps.success.nonzero()[:, 0]]) if only_successful else pair
+        yield replace(pair, grasps=pair.grasps[pair.grasps.trial_success]) if only_successful else pair
     if empty:
         raise GraspFileError(f"{path} holds no grasp; leave it out, or generate again without --only-successful")
 

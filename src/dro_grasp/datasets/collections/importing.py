@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from dro_grasp.errors import GraspFileError, ObjectError, OptionError
-from dro_grasp.files import given_path, reading
+from dro_grasp.files import UNTYPED, given_path, reading
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import with_sources
 from dro_grasp.hands.library import load_hand
@@ -84,7 +84,7 @@ def read_foreign(path: Path, kind: Format) -> list[ForeignGrasp]:
         raise GraspFileError(f"{path} is a folder; name the {kind} files in it")
     if not path.is_file():
         raise GraspFileError(f"no file {path}; give the path of a {kind} file")
-    with reading(path, GraspFileError, f"a {kind} file: {EXPECTED[kind]}; download it again if it is damaged"):
+    with reading(path, GraspFileError, f"a {kind} file: {EXPECTED[kind]}; download it again if it is damaged", *UNTYPED):
         try:
             return list(readers[kind](path))
         except _MoreThanData as error:

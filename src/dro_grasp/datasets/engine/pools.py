@@ -63,7 +63,7 @@ def attempt(work: Work, job: Job, task: Task) -> FinishedShard | Failed:
     """Make a shard; an error becomes a value, as it must not stop the other shards."""
     try:
         return work(job, task)
-    except Exception as error:
+    except Exception as error:  # a fault of ours too: `failure_of` names it
         return failure_of(error)
 
 
@@ -116,7 +116,7 @@ class LocalPool:
             result, pool = Failed(f"its worker process died (exit code {error.exitcode})", died=True), _replaced(pool)
         except BrokenProcessPool:
             result, pool = Failed("its worker process died before it began", died=True), _replaced(pool)
-        except Exception as error:  # a result that cannot be handed over
+        except Exception as error:  # a result that cannot be handed over: pickling runs code of any kind
             result = failure_of(error)
         self.idle.append(pool)
         return task, result

@@ -16,13 +16,14 @@ from typing import TypeVar
 
 from dro_grasp.datasets.engine.pools import Failed, LocalPool, Outcome, Pool
 from dro_grasp.datasets.engine.settings import require_settings
-from dro_grasp.datasets.engine.shards import Shard, Yield, find_shards, read_yield, remove_leftovers, set_aside, sole_run
+from dro_grasp.datasets.engine.shards import Shard, Yield, find_shards, read_yield, remove_leftovers, sole_run
 from dro_grasp.datasets.engine.worker import EngineConfig, Job, Task
 from dro_grasp.devices import require_device
 from dro_grasp.errors import GraspFileError, OptionError
-from dro_grasp.files import given_path, make_folder
+from dro_grasp.files import given_path, is_unread, make_folder, set_aside
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand, locate_hand
+from dro_grasp.kinds import checked
 from dro_grasp.objects.catalogue import ASSET_PREFIX, load_object, locate_object, object_names
 
 REPORT_EVERY = 10.0
@@ -94,6 +95,7 @@ class DatasetReport:
     """Pairs that were given up, and why."""
 
 
+@checked
 def synthesize_dataset(
     hands: Sequence[str], objects: Sequence[str], grasps_per_pair: int, output_dir: Path | str,
     workers: int | Callable[[Job], Pool] = 2, seed: int = 0, config: EngineConfig | None = None,
@@ -198,13 +200,19 @@ def _load(folder: Path, shard: Shard) -> GraspBatch:
 def _readable(
     folder: Path, shards: Iterable[Shard], read: Callable[[Path, Shard], Content], say: Callable[[str], None]
 ) -> list[tuple[Shard, Content]]:
-    """The shards that can be read, with what was read; the others are named and set aside."""
+    """The shards that can be read, with what was read; damaged ones are named and set aside.
+
+    Raises:
+        GraspFileError: Disk or memory fails.
+    """
     found = []
     for shard in shards:
         try:
             found.append((shard, read(folder, shard)))
         except GraspFileError as error:
-            say(f"{error}; it is set aside as {set_aside(folder, shard).name} and made again")
+            if is_unread(error):  # a disk that fails once must not cost a sound shard
+                raise
+            say(f"{error}; it is set aside as {set_aside(shard.path(folder)).name} and made again")
     return found
 
 

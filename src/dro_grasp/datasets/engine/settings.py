@@ -50,9 +50,12 @@ def _noted(path: Path) -> dict[str, Any] | None:
     """What the note says; None where there is none."""
     with reading(path, GraspFileError, "the settings of the grasps in its folder; remove it to go on with any"):
         try:
-            return dict(json.loads(path.read_text()))
+            found = json.loads(path.read_text())
         except FileNotFoundError:
             return None
+        if not isinstance(found, dict):
+            raise ValueError(f"it holds a {type(found).__name__}")
+        return found
 
 
 def _asked(job: Job) -> dict[str, Any]:

@@ -29,8 +29,6 @@ LOCK = ".lock"
 """File in a data set's folder that a run locks while it fills the folder; one for each part of a run that is divided."""
 HOLDER = ".process"
 """File with the number of the process that holds the lock; other systems than Linux let nobody read a locked file."""
-DAMAGED = ".damaged"
-"""Ending of a shard that could not be read and was set aside (ours)."""
 MOST = 1e18
 """More than any count or time of a yield (ours)."""
 STALE = 3600.0
@@ -224,12 +222,6 @@ def _take(lock: FileLock, folder: Path) -> None:
                           "folder and join both with `dro-grasp dataset merge`") from error
     except OSError:
         pass  # a file system without locks
-
-
-def set_aside(folder: Path, shard: Shard) -> Path:
-    """Rename a shard's file, so that it counts no longer and nothing in it is lost; returns its new path."""
-    path = shard.path(folder)
-    return path.replace(path.with_name(path.name + DAMAGED))
 
 
 def remove_leftovers(folder: Path) -> int:

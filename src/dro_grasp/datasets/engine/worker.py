@@ -20,6 +20,7 @@ from dro_grasp.grasps.duplicates import distinct
 from dro_grasp.grasps.sources import with_sources
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
+from dro_grasp.kinds import Checked
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
@@ -31,7 +32,7 @@ LOOSE = "held by too few links"
 
 
 @dataclass(frozen=True)
-class EngineConfig:
+class EngineConfig(Checked):
     """Settings of a data set's production."""
 
     protocol: str = "strict"
@@ -78,6 +79,7 @@ class EngineConfig:
         Raises:
             OptionError: As said.
         """
+        super().__post_init__()
         if not 1 <= self.shard[0] <= self.shard[1]:
             raise OptionError(f"shard is {self.shard[0]}/{self.shard[1]}; give a part from 1 on, and of how many, such as 3/16")
 

@@ -15,6 +15,7 @@ from dro_grasp.hands.procedural.acceptance import why_unfit
 from dro_grasp.hands.procedural.plan import HandPlan
 from dro_grasp.hands.procedural.sampling import sample_plan
 from dro_grasp.hands.procedural.writing import write_urdf
+from dro_grasp.kinds import checked
 
 MOST_DRAWS = 200
 """Draws after which a seed is given up (ours; the first one or two are usually kept)."""
@@ -51,6 +52,7 @@ def hand_name(seed: int) -> str:
     return f"hand_{seed:05d}"
 
 
+@checked
 def make_hand(seed: int) -> MadeHand:
     """Make the procedural hand of a seed: the same seed gives the same hand, another one another hand.
 

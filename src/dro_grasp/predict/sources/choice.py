@@ -18,6 +18,7 @@ from dro_grasp.errors import OptionError
 from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import Checked
 
 CROWDING_POINTS = 64
 """Hand points, spread evenly, between which the distance of fingers is measured (ours)."""
@@ -27,7 +28,7 @@ LEAST_PART = 1e-6
 
 
 @dataclass(frozen=True)
-class ChoicePenalties:
+class ChoicePenalties(Checked):
     """What speaks against a hand; set by trials on training objects (ours)."""
 
     finger_penetration: float = 1200.0
@@ -53,7 +54,7 @@ class ChoicePenalties:
 
 
 @dataclass(frozen=True)
-class ChoiceConfig:
+class ChoiceConfig(Checked):
     """How many placements and z are drawn for each candidate, and the penalties by which one is chosen."""
 
     placements: int = 2
@@ -69,6 +70,7 @@ class ChoiceConfig:
         Raises:
             OptionError: `placements` or `draws` is not positive.
         """
+        super().__post_init__()
         for name in ("placements", "draws"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} is {getattr(self, name)}; draw at least one for each candidate")

@@ -12,6 +12,7 @@ from torch import Tensor
 from dro_grasp.geometry.se3 import apply, apply_to_cloud, compose, random_rotations
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.choice import ChoiceConfig, choice_scores
@@ -84,6 +85,7 @@ def mean_grasps(
     return GraspBatch.create(hand, obj, T, joints, seed=seed, provenance="control: mean grasp")
 
 
+@checked
 def palm_facing_starts(hand: Hand, obj: ObjectModel, num: int, seed: int) -> GraspBatch:
     """Half-closed hands that face the object, with the palm at its surface; never optimised.
 

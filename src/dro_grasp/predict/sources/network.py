@@ -23,6 +23,7 @@ from dro_grasp.geometry.se3 import apply_to_cloud, compose, rotate
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.proportions import proportions
+from dro_grasp.kinds import Checked
 from dro_grasp.models.network import DistanceNetwork, Moves
 from dro_grasp.optimization.palm_directions import CLEAR, Spread, lack_of_room, wrist_rotations
 from dro_grasp.optimization.starts import CHOICES
@@ -36,7 +37,7 @@ HIGHEST_TEMPERATURE = 2.0
 
 
 @dataclass(frozen=True)
-class ProposalConfig:
+class ProposalConfig(Checked):
     """How candidates are sampled and decoded."""
 
     rotations_per_grasp: int = 16
@@ -61,6 +62,7 @@ class ProposalConfig:
 
     def __post_init__(self) -> None:
         """Refuse a temperature out of range."""
+        super().__post_init__()
         check_temperature(self.temperature)
 
 
@@ -162,8 +164,8 @@ def _placements(
     count = wanted * (config.rotations_per_grasp if direction is None else config.rolls_per_grasp)
     rotations = wrist_rotations(hand, max(count, config.prior_choices * offered), direction, spread, generator, up)
     opened = hand.points(hand.canonical_joints())
-    shape = proportions(hand, axes) if network.config.placement_hand == "proportions" else None
-    rotation, position = network.sample_placements(opened @ axes, cloud, rotations @ axes, offered, generator, shape)
+    rotation, position = network.sample_placements(
+        cloud, rotations @ axes, offered, generator, proportions(hand, axes))
     offset = cloud.mean(0) + rotate(rotation, position - hand.grasp_centre_wrist @ axes)
     placed = compose(rotation @ axes.mT, offset)
     if surroundings is not None:

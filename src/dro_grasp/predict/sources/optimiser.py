@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from dro_grasp.energy.contact_candidates import ContactConfig
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.kinds import Checked
 from dro_grasp.optimization.starts import StartConfig
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize_with
 from dro_grasp.predict.admission import facing
@@ -18,7 +19,7 @@ DESCENT_STEPS = 1200
 
 
 @dataclass(frozen=True)
-class OptimiserConfig:
+class OptimiserConfig(Checked):
     """How the optimiser proposes (ours)."""
 
     starts_per_candidate: int = 4

@@ -1,0 +1,62 @@
+"""The counts of docs/data-card.md, from the files themselves, as Markdown.
+
+Run it as `python -m lab.benchmarks.data_card [data/grasps] [--pictures docs/pictures]`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections import Counter
+from pathlib import Path
+
+from dro_grasp.compare.coverage import measure_coverage
+from dro_grasp.compare.rows import finger_contact
+from dro_grasp.datasets.collections.collection import read_collection
+from dro_grasp.datasets.engine.shards import Yield
+from dro_grasp.viewer.dataset_pages import charts, grasps_drawn
+from lab.benchmarks.report import ROOT
+
+PICTURED = "assets-shadowhand.parquet"
+"""The hand of the pictures."""
+COLUMNS = ("hand", "grasps", "train", "few_shot", "validate", "objects", "fewest", "without", "valid of evaluated [%]",
+           "per CPU-hour", "diversity", "wrist", "joints", "all six half-axes [%]", "fingers [%]", "all fingers [%]", "kB")
+"""Headings of the table."""
+
+
+def row(path: Path) -> list[str]:
+    """One file's counts."""
+    (hand,) = measure_coverage(read_collection(path))
+    made: Yield = hand.yields
+    counts = [p.grasps for p in hand.pairs]
+    splits = Counter(hand.grasps.split)
+    touching = finger_contact(hand.grasps.fingers_in_contact, len(hand.hand.fingers))
+    cells = [hand.grasps.hand, len(hand.grasps), splits["train"], splits["few_shot"], splits["validate"], len(counts),
+             min(counts), sum(c == 0 for c in counts), f"{100 * made.valid / max(1, made.evaluated):.0f}",
+             f"{made.per_cpu_hour:,.0f}", *(f"{v:.3f}" for v in hand.diversity.values()),
+             f"{100 * sum(min(p.half_axes) > 0 for p in hand.pairs) / len(hand.pairs):.0f}",
+             *("-" if math.isnan(touching[0]) else f"{100 * share:.0f}" for share in touching), path.stat().st_size // 1000]
+    return [f"{c:,}" if isinstance(c, int) else c for c in cells]
+
+
+def main() -> None:
+    """Print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, nargs="?", default=ROOT / "data" / "grasps", help="merged files")
+    parser.add_argument("--pictures", type=Path, help="folder for pictures of one hand")
+    options = parser.parse_args()
+    folder = options.folder
+    if options.pictures is not None:
+        (hand,) = measure_coverage(read_collection(folder / PICTURED))
+        (options.pictures / "data-charts.png").write_bytes(charts(hand))
+        (options.pictures / "data-grasps.png").write_bytes(grasps_drawn(hand))
+    print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
+    files = sorted(folder.glob("*.parquet"))
+    for path in files:
+        print(f"| {' | '.join(row(path))} |")
+    print(f"\n{sum(len(p.grasps) for p in read_collection(folder)):,} grasps, "
+          f"{sum(path.stat().st_size for path in files) / 1e6:.1f} MB")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,118 @@
+"""Lifts with an arm: from a camera's cloud, from the true mesh, in clutter, and controls that ignore score or shape.
+
+    python -m lab.benchmarks.lifts --output FOLDER [--robots NAME ...] [--rows cloud mesh ...] [--attempts N] [--json]
+
+One row for each robot and kind of attempt, by default on the paper's validate objects; attempts that FOLDER holds are not
+repeated, and their plans are stored in it: `python -m lab.benchmarks.plan_check FOLDER` checks them again. Needs the extra
+`[arm]`; the default objects need the development assets, and the mean grasp a bundle of training grasps (--bundle).
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from dro_grasp.compare.methods import mean_grasps_of
+from dro_grasp.compare.metrics import wilson_interval
+from dro_grasp.datasets.bundle.training_file import load_bundle
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.objects.catalogue import load_object, resolve_objects
+from dro_grasp.planning.attempts import Attempt, TabletopConfig, attempt
+from dro_grasp.planning.planner import NO_PATH, PlanConfig
+from dro_grasp.planning.robot import load_robot
+from dro_grasp.planning.table_scene import PickedObject
+from dro_grasp.planning.tabletop import TabletopRun, endings, failures, processor_seconds, run_tabletop
+from dro_grasp.planning.workcell import upright
+from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.choice import ChoiceConfig
+from dro_grasp.predict.sources.controls import MeanGrasp, mean_grasps
+from dro_grasp.predict.stages import complete
+from lab.benchmarks.report import emit
+
+ROWS = {
+    "cloud": TabletopConfig(),
+    "mesh": TabletopConfig(see="mesh"),
+    "score alone": TabletopConfig(plan=PlanConfig(rehearsals=0)),
+    "random": TabletopConfig(plan=PlanConfig(order="random")),
+    "clutter": TabletopConfig(clutter=3, segment="mask"),
+    "mean grasp": TabletopConfig(plan=PlanConfig(order="random")),
+}
+"""Kinds of attempts: what is seen, what stands around it, and which reachable grasp is taken."""
+MEAN_GRASPS = 64
+"""Rotations of the mean grasp, of which any is taken that the arm can carry out (ours)."""
+COLUMNS = ("robot", "row", "held", "rate [%]", "interval [%]", "planned", "of reachable", "ended in", "median [s]",
+           "95 % within [s]", "grasps [%]")
+"""Headings; `of reachable` are the attempts with a grasp that the arm reaches, times are of one core, from depth image to timed
+plan, and `grasps` is the share of planning in which grasps are made: network, refinement and ranking."""
+
+
+def row(robot: str, kind: str, done: list[Attempt]) -> list[object]:
+    """What attempts of one kind came to, in the order of COLUMNS."""
+    held = sum(a.success for a in done)
+    low, high = wilson_interval(held, len(done))
+    seconds = processor_seconds(done)
+    ended = ", ".join(f"{stage} {count}" for stage, count in endings(done).items())
+    times = [None, None] if seconds is None else [round(seconds["median"], 1), round(seconds["within_95"], 1)]
+    planned = sum(a.processor_seconds > 0 for a in done)
+    reachable = planned + sum(a.stage == "plan" and NO_PATH in a.reason for a in done)
+    shares = [a.grasp_seconds / a.plan_seconds for a in done if a.plan_seconds > 0]
+    return [robot, kind, f"{held} of {len(done)}", round(100 * held / len(done)), f"{100 * low:.0f}-{100 * high:.0f}", planned,
+            reachable, ended, *times, round(100 * float(np.median(shares))) if shares else None]
+
+
+def mean_grasp_attempts(run: TabletopRun, mean: MeanGrasp) -> Iterator[Attempt]:
+    """The same attempts with the mean training grasp at random rotations; nothing looks at the object's shape."""
+    robot, predictor = load_robot(run.robot), GraspPredictor()
+
+    def propose(seen: PickedObject, T_world_object: np.ndarray, seed: int) -> GraspBatch:
+        obj, T = upright(seen.obj, T_world_object)
+        problem = GraspProblem(robot.hand, obj)
+        grasps = complete(problem, mean_grasps(problem, mean, MEAN_GRASPS, seed, ChoiceConfig.first()))
+        T = torch.from_numpy(T).float()
+        return grasps.replace(T_object_wrist=T @ grasps.T_object_wrist, score=torch.zeros(len(grasps)))
+
+    for name in run.objects:
+        obj = load_object(name)
+        for number in range(run.attempts):
+            yield replace(attempt(robot, obj, number, run.seed, predictor, run.config, proposer=propose), robot_file=run.robot)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--output", type=Path, required=True, help="folder of the attempts")
+    parser.add_argument("--robots", nargs="+", default=["xarm7_leaphand", "ur5e_allegro"])
+    parser.add_argument("--rows", nargs="+", choices=ROWS, default=["cloud", "mesh", "random"])
+    parser.add_argument("--objects", nargs="+", default=["assets:validate"])
+    parser.add_argument("--attempts", type=int, default=10)
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--bundle", type=Path, help="training grasps, for the mean grasp")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    arguments = parser.parse_args()
+    if "mean grasp" in arguments.rows and arguments.bundle is None:
+        parser.error("the mean grasp needs training grasps: --bundle PATH")
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    objects, rows, lost = tuple(resolve_objects(arguments.objects)), [], []
+    for robot in arguments.robots:
+        for kind in arguments.rows:
+            run = TabletopRun(robot, objects, arguments.attempts, config=ROWS[kind])
+            if kind == "mean grasp":
+                mean = mean_grasps_of(load_bundle(arguments.bundle))[load_robot(robot).hand.name]
+                done = list(mean_grasp_attempts(run, mean))
+            else:
+                output = arguments.output / f"{Path(robot).stem}.parquet"
+                done = run_tabletop(run, output, arguments.workers, plans=arguments.output / kind)
+            rows.append(row(robot, kind, done))
+            lost += [f"{robot}, {kind}: {text}" for text in failures(done)]
+    emit(f"Lifts, {arguments.attempts} attempts on each of {len(objects)} objects", rows, COLUMNS,
+         {"rows": [dict(zip(COLUMNS, r, strict=True)) for r in rows], "failures": lost}, arguments.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Damaged files against every reader, and commands that are stopped in the middle."""

@@ -1,0 +1,6 @@
+"""Methods of others, re-implemented, as the benchmark takes any class: `--method lab.methods.gendexgrasp:GenDexGrasp`."""
+
+from pathlib import Path
+
+WEIGHTS = Path(__file__).parents[1] / "weights"
+"""Folder of their weights."""

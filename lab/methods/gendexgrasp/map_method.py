@@ -1,0 +1,60 @@
+"""GenDexGrasp as a method: maps from the network, sharpened, and a hand fitted to each; any hand, nothing annotated."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.models.checkpoints import load_into
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.source import Progress, Source
+from lab.methods import WEIGHTS
+from lab.methods.gendexgrasp.contact_maps import FITTING_GAMMA, TRAINING_GAMMA, sharpened
+from lab.methods.gendexgrasp.map_fitting import FittingConfig, MapTarget, fit
+from lab.methods.gendexgrasp.map_network import LATENT, ContactMapNetwork
+
+POINTS = 256
+"""Object points of a map, as many as in training (GenDexGrasp: 2,048)."""
+
+
+class ContactMapMethod(Source):
+    """GenDexGrasp: one map a grasp; of its particles the one of lowest energy. Nothing is refined, ranked or settled."""
+
+    def __init__(self, weights: Path, name: str = "gendexgrasp", config: FittingConfig | None = None) -> None:
+        """Load the weights.
+
+        Raises:
+            WeightsError: They are missing or of another network.
+        """
+        self.name, self.config = name, config or FittingConfig()
+        self.network = load_into(ContactMapNetwork(), weights)
+
+    def propose(self, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None) -> GraspBatch:
+        """Draw maps of the object, and fit the hand."""
+        generator = torch.Generator().manual_seed(seed)
+        cloud, outward = torch.from_numpy(problem.obj.cloud), torch.from_numpy(problem.obj.cloud_normals)
+        rows = torch.randint(len(cloud), (POINTS,), generator=generator)
+        points, normals = cloud[rows].float(), outward[rows].float()
+        centred = (points - cloud.float().mean(0)).expand(num, -1, -1)
+        with torch.no_grad():
+            goals = sharpened(self.network.decode(centred, torch.randn(num, LATENT, generator=generator)))
+        hand = problem.hand.with_points(min(self.config.hand_points, problem.hand.n_points))
+        T, q, energy = fit(hand, MapTarget(points, normals, goals, problem.obj.distance_field), self.config, generator)
+        return GraspBatch.create(
+            problem.hand, problem.obj, T, q, energy=energy, seed=seed, provenance=f"GenDexGrasp {self.name}")
+
+
+class GenDexGrasp(ContactMapMethod):
+    """The method with a gamma of 2, as GenDexGrasp's optimiser has it."""
+
+    def __init__(self, weights: Path = WEIGHTS / "gendexgrasp.safetensors") -> None:
+        super().__init__(weights, "gendexgrasp", FittingConfig(gamma=FITTING_GAMMA))
+
+
+class GenDexGraspGamma1(ContactMapMethod):
+    """The method with a gamma of 1, as in its training."""
+
+    def __init__(self, weights: Path = WEIGHTS / "gendexgrasp.safetensors") -> None:
+        super().__init__(weights, "gendexgrasp-gamma1", FittingConfig(gamma=TRAINING_GAMMA))

@@ -1,0 +1,1 @@
+"""Experiments that are over and still run; `lab/notebook` says what they gave."""

@@ -1,0 +1,216 @@
+"""Train the network that completes objects seen in part, on views of training objects with known surfaces.
+
+    python -m lab.studies.train_completion --folder FOLDER [--part K N] [--steps N] [--collect-only]
+
+Each object is viewed in its own and in stretched shapes, as half of a cloud and by a depth camera, from many sides. The
+network learns its true signed distance near its surface, near the surfaces that symmetries guess, and around both. The
+folder keeps the views of each object, so a stopped script resumes, and other processes can take other objects. The script
+reports errors on objects left out of a first fit; the network written to the package is fitted to all. Needs the
+development assets.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+from dro_grasp.errors import ObjectError
+from dro_grasp.models.checkpoints import save_weights
+from dro_grasp.models.completion_network import SHIPPED, SurfaceNetwork
+from dro_grasp.objects.catalogue import load_object, resolve_objects
+from dro_grasp.objects.loading import mesh_object
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.objects.surface_distances import signed_distances
+from dro_grasp.perception.completion import GUESSES, THINNEST, surface_features, to_view_axes
+from dro_grasp.perception.partial_views import DepthCamera, visible_side
+
+Kind = Literal["half", "depth"]
+KINDS: tuple[Kind, ...] = ("half", "depth")
+"""Kinds of view."""
+SHAPES = 5
+"""Shapes of each object; the first is its own, the others are stretched."""
+SIDES = 4
+"""Views of each shape of each kind."""
+PLACES = 1536
+"""Points with a true distance in a view."""
+STRETCH = (0.7, 1.35)
+"""Range of the factors of a stretched object's extents."""
+BLUR = 0.006
+"""Standard deviation of points about surfaces [m]."""
+AROUND = 0.02
+"""Margin of the other points beyond both surfaces [m]."""
+AWAY = 0.006
+"""Points at least this far from all seen points are unseen [m]."""
+DISTANCE = (0.35, 0.7)
+"""Range of the cameras' distances [m]."""
+NOISE = (0.0, 0.0015)
+"""Range of the cameras' noise [m]."""
+FEWEST = 40
+"""Fewest seen points of a view that is used."""
+STANDING = 0.5
+"""Share of depth images with a known up direction."""
+FARTHEST = 0.03
+"""Distances are clamped to plus and minus this [m]."""
+VIEWS = 32
+"""Views in a batch."""
+SOME = 384
+"""Points of each of them."""
+RATE = 1e-3
+"""Peak learning rate."""
+DECAY = 1e-4
+"""Weight decay."""
+AVERAGE = 0.998
+"""Decay of the moving average of the weights."""
+EVERY = 6
+"""One in this many objects is left out of the first fit."""
+
+
+class Views(NamedTuple):
+    """Points in v views."""
+
+    guessed: Float[Tensor, "v n guesses"]
+    """Signed distances to the guessed surfaces [m]."""
+    features: Float[Tensor, "v n features"]
+    """Other features of the points."""
+    truth: Float[Tensor, "v n"]
+    """True signed distances [m]."""
+    kind: Int[Tensor, " v"]
+    """Index into KINDS."""
+    unseen: Bool[Tensor, "v n"]
+    """Whether a point is away from all seen points."""
+
+
+def stretched(obj: ObjectModel, rng: np.random.Generator) -> ObjectModel:
+    """The object with other extents."""
+    assert obj.vertices is not None
+    assert obj.faces is not None
+    mesh = trimesh.Trimesh(obj.vertices * rng.uniform(*STRETCH, 3), obj.faces, process=False)
+    return mesh_object(obj.name, mesh, origin=obj.name)
+
+
+def view_of(
+    obj: ObjectModel, kind: Kind, rng: np.random.Generator
+) -> tuple[Float[Tensor, "n guesses"], Float[Tensor, "n features"], Float[Tensor, " n"], Bool[Tensor, " n"]] | None:
+    """One view: guessed distances, features, true distances, and which points are unseen; None if too little is seen."""
+    camera = DepthCamera(distance=rng.uniform(*DISTANCE), noise=rng.uniform(*NOISE))
+    points, normals, place = visible_side(obj, kind, int(rng.integers(1 << 30)), camera)
+    if len(points) < FEWEST:
+        return None
+    side, axes, middle = to_view_axes(points, normals, place)
+    if side.width < THINNEST:
+        return None
+    up = axes[2] if place is not None and rng.uniform() < STANDING else None
+    guesses = side.guesses(up, GUESSES)
+    true = (obj.cloud - middle) @ axes
+    guessed = np.concatenate([g.points for g in guesses])
+    both, n = np.concatenate([true, guesses[0].points]), PLACES // 3
+    near = [rng.choice(surface, n) + BLUR * rng.normal(size=(n, 3)) for surface in (true, guessed)]
+    places = np.concatenate([*near, rng.uniform(both.min(0) - AROUND, both.max(0) + AROUND, (n, 3))])
+    told = surface_features(side, guesses, places)
+    assert obj.vertices is not None
+    assert obj.faces is not None
+    truth = signed_distances(obj.vertices, obj.faces, places @ axes.T + middle)
+    unseen = side.tree.query(places)[0] > AWAY
+    return told.guessed, told.features, torch.from_numpy(truth).float(), torch.from_numpy(unseen)
+
+
+def collect(label: str, seed: int) -> Views:
+    """Views of one object and its stretched shapes."""
+    rng, own, found, kinds = np.random.default_rng(seed), load_object(label), [], []
+    for shape in range(SHAPES):
+        try:
+            obj = own if shape == 0 else stretched(own, rng)
+        except ObjectError as error:
+            print(f"{label}: {error}")
+            continue
+        for k, kind in enumerate(KINDS):
+            views = [view for view in (view_of(obj, kind, rng) for _ in range(SIDES)) if view is not None]
+            found += views
+            kinds += [k] * len(views)
+    guessed, features, truth, unseen = (torch.stack(column) for column in zip(*found, strict=True))
+    return Views(guessed, features, truth, torch.tensor(kinds), unseen)
+
+
+def joined(parts: list[Views]) -> Views:
+    """All views in one."""
+    return Views(*(torch.cat(column) for column in zip(*parts, strict=True)))
+
+
+def error(predicted: Float[Tensor, "*n"], truth: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Errors of clamped distances [m]."""
+    return (predicted.clamp(-FARTHEST, FARTHEST) - truth.clamp(-FARTHEST, FARTHEST)).abs()
+
+
+def fit(views: Views, steps: int, seed: int) -> SurfaceNetwork:
+    """The averaged weights after the given number of steps."""
+    torch.manual_seed(seed)  # of the initial weights
+    generator = torch.Generator().manual_seed(seed)
+    network = SurfaceNetwork(GUESSES, views.features.shape[-1])
+    average = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(AVERAGE))
+    optimiser = torch.optim.AdamW(network.parameters(), RATE, weight_decay=DECAY)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=steps, pct_start=0.05)
+    for _ in range(steps):
+        view = torch.randint(len(views.truth), (VIEWS, 1), generator=generator)
+        place = torch.randint(views.truth.shape[1], (VIEWS, SOME), generator=generator)
+        loss = error(network(views.guessed[view, place], views.features[view, place]), views.truth[view, place]).mean()
+        optimiser.zero_grad()
+        (1e3 * loss).backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimiser.step()
+        schedule.step()
+        average.update_parameters(network)
+    network.load_state_dict(average.module.state_dict())
+    return network.eval()
+
+
+@torch.no_grad()
+def report(network: SurfaceNetwork, views: Views) -> None:
+    """Errors at unseen points, beside those of the best symmetry."""
+    for k, kind in enumerate(KINDS):
+        some = Views(*(column[views.kind == k] for column in views))
+        predicted = torch.cat([network(g, f) for g, f in zip(some.guessed.split(16), some.features.split(16), strict=True)])
+        for name, values in (("best symmetry", some.guessed[..., 0]), ("network", predicted)):
+            near = some.unseen & (some.truth.abs() < 0.01)
+            inside = ((values < 0) == (some.truth < 0))[some.unseen].float().mean()
+            print(f"{kind}, unseen, {name}: error {1e3 * error(values, some.truth)[near].mean():.2f} mm near the "
+                  f"surface, {100 * inside:.1f} % on the right side of it")
+
+
+def main() -> None:
+    """Collect, fit without some objects and report, fit with all and save."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--folder", type=Path, required=True, help="folder for the views")
+    parser.add_argument("--part", type=int, nargs=2, default=(0, 1), metavar=("K", "N"), help="collect the k-th of n parts")
+    parser.add_argument("--steps", type=int, default=2500, help="steps of each of the two fits")
+    parser.add_argument("--seed", type=int, default=0, help="seed of everything")
+    parser.add_argument("--collect-only", action="store_true", help="do not fit")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    options.folder.mkdir(parents=True, exist_ok=True)
+    labels = resolve_objects(["assets:train", "builtin:train"])
+    for k, label in list(enumerate(labels))[options.part[0]::options.part[1]]:
+        path = options.folder / f"{label.replace('/', '-')}-{options.seed}.pt"
+        if not path.exists():
+            torch.save(tuple(collect(label, options.seed * len(labels) + k)), path)
+            print(label, flush=True)
+    if options.collect_only:
+        return
+    parts = [Views(*torch.load(path, weights_only=True)) for path in sorted(options.folder.glob("*.pt"))]
+    left_out = [part for k, part in enumerate(parts) if k % EVERY == 0]
+    report(fit(joined([p for k, p in enumerate(parts) if k % EVERY]), options.steps, options.seed), joined(left_out))
+    SHIPPED.parent.mkdir(exist_ok=True)
+    about = {"stage": "completion", "script": Path(__file__).name, "steps": options.steps, "seed": options.seed,
+             "data": {"objects": len(parts), "views": sum(len(part.kind) for part in parts)}}
+    save_weights(fit(joined(parts), options.steps, options.seed), SHIPPED, about)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,1 +1,0 @@
-"""GenDexGrasp (Li et al. 2023) from scratch: a network invents contact maps of an object, and a descent fits a hand to them."""

@@ -1,1 +1,0 @@
-"""ManiFM-style grasps: a network names contact points for fingertips, and the hand reaches for them. See `contact_method`."""

@@ -1,0 +1,264 @@
+"""From a grasp that can be reached to a timed motion: a path, then the stages of a lift, within limits and checked again.
+
+Paths are of OMPL (RRT-Connect), and end at the first of several goals that can be reached; timing is of TOPP-RA.
+"""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from dro_grasp.planning.motion import STAGES, Trajectory
+from dro_grasp.planning.reachability import Feasible, Postures, carried
+from dro_grasp.planning.workcell import Workcell
+
+if TYPE_CHECKING:
+    from toppra.interpolator import AbstractGeometricPath
+
+RESOLUTION = 0.03
+"""Largest change of a joint between two configurations that are checked on an edge [rad or m] (ours)."""
+SIMPLIFY_SECONDS = 3.0
+"""Longest time spent on shortening a path [s] (ours): it ends by itself long before, but on a busy machine."""
+SPACING = 0.08
+"""Largest change of a joint between the waypoints of a path that is returned [rad or m] (ours)."""
+RANGE = 0.6
+"""Longest edge of the planner's trees [rad] (ours)."""
+STEP = 0.01
+"""Longest time between samples of a trajectory [s] (ours); each of its parts has samples at equal distances."""
+USED = 0.95
+"""Share of each limit that is used: they hold at points of a grid, and a motion that exceeds one between is slowed (ours)."""
+SAME = 1e-6
+"""Waypoints nearer to each other are one [rad or m] (ours)."""
+GRID = 150
+"""Least number of points of the path at which the limits hold (ours)."""
+TRAVEL_CLEARANCE = 0.001
+"""Distance that the timed motion keeps while it travels, off the straight edges that were planned [m] (ours)."""
+
+Check = Callable[[Float[np.ndarray, " n"]], bool]
+"""Whether a configuration is free."""
+
+
+@dataclass(frozen=True)
+class Path:
+    """A path in joint space that ends at a goal."""
+
+    waypoints: Float[np.ndarray, "k n"]
+    """Densely spaced [rad or m]."""
+    goal: int
+    """Index of the goal that it ends at."""
+
+
+def find_path(
+    start: Float[np.ndarray, " n"], goals: Float[np.ndarray, "g n"], free: Check, lower: Float[np.ndarray, " n"],
+    upper: Float[np.ndarray, " n"], seconds: float, seed: int,
+) -> Path | None:
+    """A path from the start to one of the goals, None if none is found in time.
+
+    Args:
+        start: Free configuration [rad or m].
+        goals: Free configurations; the planner takes the one that it connects first, and tries them in this order.
+        free: Whether a configuration is free.
+        lower: Limits of the joints [rad or m].
+        upper: Likewise.
+        seconds: Longest time spent on planning [s].
+        seed: Of OMPL's generators, which are its own.
+    """
+    from ompl import base as ob, geometric as og, util as ou
+
+    def state(q: Float[np.ndarray, " n"]) -> Any:
+        made: Any = space.allocState()
+        for i, value in enumerate(q.tolist()):
+            made[i] = value
+        return made
+
+    def values(state: Any) -> Float[np.ndarray, " n"]:
+        return np.array([state[i] for i in range(len(start))])
+
+    ou.setLogLevel(ou.LOG_NONE)
+    ou.RNG.setSeed(seed + 1)  # OMPL takes zero for no seed
+    space = ob.RealVectorStateSpace(len(start))
+    bounds = ob.RealVectorBounds(len(start))
+    for i, (low, high) in enumerate(zip(lower.tolist(), upper.tolist(), strict=True)):
+        bounds.setLow(i, low)
+        bounds.setHigh(i, high)
+    space.setBounds(bounds)
+    setup = og.SimpleSetup(space)
+    setup.setStateValidityChecker(lambda state: free(values(state)))
+    information = setup.getSpaceInformation()
+    information.setStateValidityCheckingResolution(RESOLUTION / space.getMaximumExtent())
+    setup.setStartState(state(start))
+    goal_set = ob.GoalStates(information)
+    for goal in goals:
+        goal_set.addState(state(goal))
+    setup.setGoal(goal_set)
+    planner = og.RRTConnect(information)
+    planner.setRange(RANGE)
+    setup.setPlanner(planner)
+    setup.solve(seconds)
+    if not setup.haveExactSolutionPath():  # `solve` is content with approximate paths
+        return None
+    setup.simplifySolution(SIMPLIFY_SECONDS)
+    corners = np.array([values(s) for s in setup.getSolutionPath().getStates()])
+    corners[0] = start
+    goal = int(np.linalg.norm(goals - corners[-1], axis=1).argmin())
+    return Path(densified(corners, SPACING), goal)
+
+
+def densified(corners: Float[np.ndarray, "k n"], spacing: float) -> Float[np.ndarray, "m n"]:
+    """The same polyline with waypoints at most `spacing` apart, in the largest change of a joint."""
+    pieces = []
+    for a, b in pairwise(corners):
+        count = max(1, int(np.ceil(np.abs(b - a).max() / spacing)))
+        pieces.append(a + np.linspace(0, 1, count, endpoint=False)[:, None] * (b - a))
+    return np.concatenate([*pieces, corners[-1:]])
+
+
+@dataclass(frozen=True)
+class TimedStages:
+    """A whole motion."""
+
+    stage: Int[np.ndarray, " m"]
+    """Index into STAGES of each sample."""
+    arm: Trajectory
+    hand: Trajectory
+
+
+def timed_stages(
+    cell: Workcell, waypoints: Float[np.ndarray, "k n_arm"], goal: Feasible, hand: Postures, closing_seconds: float,
+    grip_seconds: float,
+) -> TimedStages | None:
+    """From home along the waypoints to the standoff, to the grasp, and up; None if the timed motion touches something.
+
+    Args:
+        cell: The robot and what it must not touch.
+        waypoints: From home to the standoff [rad or m].
+        goal: Approach and lift.
+        hand: Postures of the hand.
+        closing_seconds: Least time in which the hand closes [s].
+        grip_seconds: How long it presses then [s].
+    """
+    robot = cell.robot
+    limits = robot.velocity, robot.acceleration
+    n = len(hand.grasp)
+    fingers = np.full(n, robot.hand_velocity), np.full(n, robot.hand_acceleration)
+    reach = smooth(waypoints, *limits)
+    if not _clear(cell, reach.position, hand.opened):
+        reach = cornered(waypoints, *limits)
+    standoff, grasp = goal.approach[0], goal.approach[-1]
+    shape = smooth(np.stack([hand.opened, hand.pregrasp]), *fingers, STEP)  # each stage takes time, also if nothing moves
+    # A spline through these would swing beyond them, and out of the joints' range.
+    close = joined([cornered(hand.closing, *fingers, closing_seconds), standing(hand.squeeze, grip_seconds)])
+    approach, lift = smooth(goal.approach, *limits, STEP), smooth(goal.lift, *limits, STEP)
+    start = robot.T_world_wrist(grasp)
+    free = _clear(cell, reach.position, hand.opened) and all(
+        cell.free(standoff, posture, 0.0) for posture in shape.position) and all(
+        cell.free(q, hand.pregrasp, 0.0, touch=True) for q in approach.position) and all(
+        cell.free(grasp, posture, 0.0, touch=True) for posture in close.position) and all(
+        cell.free(q, hand.squeeze, 0.0, carried(robot.T_world_wrist(q), start), touch=True) for q in lift.position)
+    if not free:
+        return None
+    arms = [reach, _still(standoff, shape), approach, _still(grasp, close), lift]
+    hands = [_still(hand.opened, reach), shape, _still(hand.pregrasp, approach), close, _still(hand.squeeze, lift)]
+    lengths = [len(part.time) - (i > 0) for i, part in enumerate(arms)]
+    return TimedStages(np.repeat(np.arange(len(STAGES)), lengths), joined(arms), joined(hands))
+
+
+def _clear(cell: Workcell, positions: Float[np.ndarray, "k n_arm"], hand: Float[np.ndarray, " n_dof"]) -> bool:
+    return all(cell.free(q, hand, TRAVEL_CLEARANCE) for q in positions)
+
+
+def _still(q: Float[np.ndarray, " n"], other: Trajectory) -> Trajectory:
+    """No motion at the times of another trajectory."""
+    return replace(standing(q, 0.0), time=other.time, **{
+        name: np.tile(row, (len(other.time), 1))
+        for name, row in (("position", q), ("velocity", np.zeros_like(q)), ("acceleration", np.zeros_like(q)))})
+
+
+def smooth(
+    waypoints: Float[np.ndarray, "k n"], velocity: Float[np.ndarray, " n"], acceleration: Float[np.ndarray, " n"],
+    least_seconds: float = 0.0,
+) -> Trajectory:
+    """The quickest motion along a cubic spline through the waypoints.
+
+    Args:
+        waypoints: Neighbours are close together [rad or m].
+        velocity: Limits [rad/s or m/s].
+        acceleration: Limits [rad/s^2 or m/s^2].
+        least_seconds: A quicker motion is slowed down to this duration [s].
+    """
+    kept = [0, *(i for i in range(1, len(waypoints)) if np.abs(waypoints[i] - waypoints[i - 1]).max() > SAME)]
+    points = waypoints[kept]
+    if len(points) == 1:
+        return standing(points[0], least_seconds)
+    along = np.concatenate([[0.0], np.linalg.norm(np.diff(points, axis=0), axis=1).cumsum()])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import toppra
+        from toppra import algorithm, constraint
+
+        logging.getLogger("toppra").setLevel(logging.CRITICAL)
+        limits = [constraint.JointVelocityConstraint(USED * np.stack([-velocity, velocity], 1)),
+                  constraint.JointAccelerationConstraint(USED * np.stack([-acceleration, acceleration], 1))]
+        path = toppra.SplineInterpolator(along, points, bc_type="natural")
+        grid = np.linspace(0, along[-1], max(GRID, 3 * len(points)))
+        timed = algorithm.TOPPRA(limits, path, gridpoints=grid, parametrizer="ParametrizeConstAccel").compute_trajectory(0, 0)
+    if timed is None:
+        raise RuntimeError("a path through its own waypoints has no timing within positive limits")
+    fine = np.linspace(0, timed.duration, 4 * GRID)
+    excess = [1.0, least_seconds / timed.duration, float(np.abs(timed(fine, 1) / velocity).max()),
+              float(np.abs(timed(fine, 2) / acceleration).max()) ** 0.5]
+    return _sampled(timed, max(excess))
+
+
+def cornered(
+    waypoints: Float[np.ndarray, "k n"], velocity: Float[np.ndarray, " n"], acceleration: Float[np.ndarray, " n"],
+    least_seconds: float = 0.0,
+) -> Trajectory:
+    """The same along straight lines, with a stop at each corner: slow, and never off the path or beyond its ends.
+
+    Args:
+        waypoints: Ends and corners, and any points between them [rad or m].
+        velocity: Limits [rad/s or m/s].
+        acceleration: Limits [rad/s^2 or m/s^2].
+        least_seconds: A quicker motion is slowed down to this duration [s]; each line gets its share by length.
+    """
+    steps = np.diff(waypoints, axis=0)
+    unit = steps / np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-12)
+    turns = [i for i in range(1, len(steps)) if float(unit[i] @ unit[i - 1]) < 1 - 1e-9]
+    corners = waypoints[[0, *turns, -1]]
+    lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    share = (lengths + 1e-12) / (lengths + 1e-12).sum()  # without any way to go, the time passes all the same
+    legs = zip(pairwise(corners), share, strict=True)
+    return joined([smooth(np.stack(leg), velocity, acceleration, least_seconds * part) for leg, part in legs])
+
+
+def standing(q: Float[np.ndarray, " n"], seconds: float) -> Trajectory:
+    """No motion for a while."""
+    time = np.linspace(0, seconds, max(2, int(np.ceil(seconds / STEP - 1e-9)) + 1)) if seconds > 0 else np.zeros(1)
+    still = np.zeros((len(time), len(q)))
+    return Trajectory(time, np.tile(q, (len(time), 1)), still, still.copy())
+
+
+def joined(parts: list[Trajectory]) -> Trajectory:
+    """One trajectory after the other."""
+    starts = np.concatenate([[0.0], np.cumsum([p.seconds for p in parts])])
+    rows = [slice(None if i == 0 else 1, None) for i in range(len(parts))]  # each begins where the last one ended
+    time = np.concatenate([p.time[r] + t for p, r, t in zip(parts, rows, starts[:-1], strict=True)])
+    fields = [np.concatenate([getattr(p, name)[r] for p, r in zip(parts, rows, strict=True)])
+              for name in ("position", "velocity", "acceleration")]
+    return Trajectory(time, *fields)
+
+
+def _sampled(timed: AbstractGeometricPath, slower: float) -> Trajectory:
+    duration = float(timed.duration) * slower
+    time = np.linspace(0, duration, max(2, int(np.ceil(duration / STEP)) + 1))
+    position, velocity, acceleration = (timed(time / slower, order) / slower**order for order in range(3))
+    velocity[[0, -1]] = 0.0
+    return Trajectory(time, position, velocity, acceleration)

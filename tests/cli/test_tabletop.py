@@ -1,0 +1,101 @@
+"""`tabletop`: what it hands to attempts, prints and stores, with attempts that end at once; these are tested on their own."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+import dro_grasp as dro
+from dro_grasp import extras
+from dro_grasp.cli.main import main
+from dro_grasp.planning import tabletop
+from dro_grasp.planning.attempts import Attempt, TabletopConfig
+
+
+@pytest.fixture
+def done(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Attempt]:
+    """The attempts that were made: of a can they hold, of anything else the first one falls."""
+    done: list[Attempt] = []
+
+    def attempt(robot: Any, obj: Any, number: int, seed: int, weights: Any, config: TabletopConfig, _: object) -> Attempt:
+        assert weights == "mine"
+        held = obj.name == "can" or number > 0
+        done.append(Attempt(robot.name, obj.name, number, seed, config.label(), held, "done" if held else "lift",
+                            "" if held else "it fell", processor_seconds=1.0 + number))
+        return done[-1]
+
+    monkeypatch.setattr(tabletop, "attempt", attempt)
+    monkeypatch.setattr(tabletop, "load_robot", lambda name: SimpleNamespace(name=name, sha256=name))
+    monkeypatch.setattr(tabletop, "describe_weights", lambda weights: {"sha256": weights})
+    monkeypatch.setattr(tabletop, "GraspPredictor", lambda weights: weights)
+    monkeypatch.chdir(tmp_path)
+    return done
+
+
+def lifted(*options: str) -> int:
+    common = ["--robot", "some_robot", "--objects", "can", "cube", "--attempts", "2", "--weights", "mine"]
+    return main(["tabletop", *common, *options])
+
+
+def test_every_option_reaches_the_attempts_and_the_counts_are_printed(
+    done: list[Attempt], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert lifted("--see", "mesh", "--order", "random", "--direction", "0", "0", "-1", "--cone", "0.6", "--opening", "0.012",
+                  "--num", "9", "--rehearsals", "4", "--clutter", "2", "--segment", "mask", "--noise", "0.003", "--seed", "5",
+                  "--json") == 0
+    constraints = dro.Constraints((0, 0, -1), cone=0.6, opening=0.012)
+    config = TabletopConfig("mesh", 0.003, clutter=2, segment="mask", plan=dro.PlanConfig(
+        9, order="random", rehearsals=4, constraints=constraints))
+    assert [TabletopConfig.from_label(a.settings) for a in done] == [config] * 4
+    assert {(a.robot, a.seed) for a in done} == {("some_robot", 5)}
+    assert [(a.object, a.number) for a in done] == [("can", 0), ("can", 1), ("cube", 0), ("cube", 1)]
+    told = json.loads(capsys.readouterr().out)
+    assert (told["attempts"], told["success"], told["success_rate"]) == (4, 3, 0.75)
+    assert told["interval"] == pytest.approx([0.3006, 0.9544], abs=1e-4), "Wilson's, from a table"
+    assert (told["ended"], told["failures"]) == ({"done": 3, "lift": 1}, ["cube, attempt 0, lift: it fell"])
+    assert told["processor_seconds"] == pytest.approx({"median": 1.5, "within_95": 2.0, "n": 4})
+
+
+def test_people_see_objects_rates_and_every_attempt_aside(done: list[Attempt], capsys: pytest.CaptureFixture[str]) -> None:
+    assert lifted("--output", "results.parquet") == 0
+    assert {a.settings for a in done} == {TabletopConfig().label()}
+    said = capsys.readouterr()
+    assert said.err.splitlines() == ["can, attempt 0: held", "can, attempt 1: held", "cube, attempt 0: lift: it fell",
+                                     "cube, attempt 1: held"]
+    assert "1 of 2" in next(line for line in said.out.splitlines() if "cube" in line)
+    assert "3 of 4 attempts succeeded (75%, 95 % interval 30% to 95%)" in said.out
+    assert said.out.endswith("attempts: results.parquet\n")
+    assert lifted("--output", "results.parquet") == 0
+    assert len(done) == 4, "they are not repeated"
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(("options", "said"), [
+    (["--seed", "-1"], "seed is -1; give an integer from 0 to 2^31 - 1"),
+    (["--noise", "-0.001"], "noise is -0.001; give a standard deviation in metres from 0 on"),
+    (["--noise", "nan"], "noise is nan"),
+    (["--clutter", "-1"], "clutter is -1"),
+    (["--plans", "mine"], "mine is a file; give a folder"),
+    (["--output", "nowhere/results.parquet"], "create it first"),
+    (["--direction", "0", "0", "-1", "--directions", "paper"], "leave out one of them"),
+])
+def test_what_cannot_be_attempted_is_refused_in_words(
+    options: list[str], said: str, done: list[Attempt], capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("mine").write_text("mine")
+    assert lifted(*options) == 2
+    assert said in capsys.readouterr().err
+    assert not done
+
+
+def test_without_the_extra_it_says_what_to_install(
+    done: list[Attempt], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(extras, "find_spec", lambda name: None)
+    assert lifted() == 2
+    assert "pip install '.[arm]' in the folder of the clone" in capsys.readouterr().err
+    assert not done

@@ -1,0 +1,47 @@
+"""A stand-in for what answers in the computing process of a grasp server: it starts at once and fails in its own ways."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+from dro_grasp.errors import OptionError
+
+
+class QuickAnswerer:
+    """Does what each call says."""
+
+    def __init__(self, config: Any) -> None:
+        """Load nothing.
+
+        Raises:
+            OptionError: The configuration is `broken`.
+        """
+        if config == "broken":
+            raise OptionError("the weights are broken; mend them")
+        if config == "deadly":
+            os._exit(7)
+
+    def hand_names(self) -> list[str]:
+        return ["claw"]
+
+    def object_names(self) -> list[str]:
+        return ["can"]
+
+    def answer(self, call: Any, progress: Callable[[int, int], None]) -> Any:
+        """`echo`, `die`, `sleep` until it is cancelled, or `hang` whatever is said."""
+        if call.hand == "die":
+            os._exit(7)
+        if call.hand == "wrong":
+            raise OptionError("num is 0")
+        if call.hand == "faulty":
+            raise ZeroDivisionError
+        if call.hand == "hang":
+            time.sleep(60)
+        while call.hand == "sleep":
+            progress(0, 1)
+            time.sleep(0.01)
+        return SimpleNamespace(model_dump_json=lambda: call.id)
