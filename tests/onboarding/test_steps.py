@@ -164,13 +164,18 @@ def test_the_folder_of_another_hand_is_refused(home: Path, capsys: pytest.Captur
 
 @pytest.mark.parametrize(("more", "word"), [
     (["--seed", "7"], "with seed"),
-    (["--source", "network"], "with method auto, network was asked for")])
+    (["--source", "auto"], "with source network, auto was asked for")])
 def test_a_folder_that_was_begun_otherwise_is_refused(
     home: Path, more: list[str], word: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its finished steps would be given for those that were asked for."""
-    assert main([*command(home), *more]) == 2
-    assert word in capsys.readouterr().err
+    """Its finished steps would be given for those that were asked for. Earlier versions called the source a method."""
+    state = home / "out" / steps.STATE
+    stored = state.read_text()
+    for text in (stored, stored.replace('"source": "network"', '"method": "network"')):
+        state.write_text(text)
+        assert main([*command(home), *more]) == 2
+        assert word in capsys.readouterr().err
+    state.write_text(stored)
 
 
 def test_a_folder_that_was_begun_with_other_weights_is_refused(

@@ -31,7 +31,7 @@ from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.optimization.synthesis import SynthesisConfig
 from dro_grasp.predict.config import AUTO
 from dro_grasp.predict.predictor import GraspPredictor
-from dro_grasp.predict.sources.registry import source_or_name
+from dro_grasp.predict.sources.registry import FORMER_NAMES, source_or_name
 from dro_grasp.simulation.protocols import PROTOCOLS, protocol
 from dro_grasp.training.config import ScheduleConfig, TrainConfig
 from dro_grasp.training.loop import train
@@ -223,8 +223,11 @@ class _Onboarding:
         """What a run before has stored; a damaged file is set aside, and its steps are made again."""
         try:
             known = json.loads(state.read_text())
+            asked = dict(known.get("asked", {}))
+            if "method" in asked:  # of earlier versions
+                asked["source"] = FORMER_NAMES.get(asked["method"], asked["method"])
             return {"hand": str(known["hand"]), "sha256": str(known["sha256"]), "steps": dict(known["steps"]),
-                    "asked": dict(known.get("asked", {}))}
+                    "asked": asked}
         except (ValueError, LookupError, TypeError) as error:
             aside = set_aside(state)
             self.say(f"{state} is damaged ({type(error).__name__}) and set aside as {aside.name}; its steps are made again")
@@ -233,7 +236,7 @@ class _Onboarding:
     def _asked(self) -> dict[str, Any]:
         """What decides on the results, beside the hand and the time."""
         return {"weights": self.config.weights or DEFAULT, "objects": self.objects, "held_out": self.held_out,
-                "num": self.config.num, "source": self.config.source, "learning_rate": self.config.learning_rate,
+                "num": self.config.num, "source": FORMER_NAMES.get(self.config.source, self.config.source), "learning_rate": self.config.learning_rate,
                 "seed": self.config.seed}
 
     def run(self) -> None:
