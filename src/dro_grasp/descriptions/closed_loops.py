@@ -18,8 +18,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from dro_grasp.descriptions.compiling import compile_hand
-from dro_grasp.descriptions.notes import Note
+from dro_grasp.descriptions.compiling import Note, compile_hand
 
 CLOSED = 1e-3
 """Largest gap of a loop that counts as closed [m or rad] (ours)."""
@@ -83,10 +82,8 @@ def is_linear(equality: mujoco.MjsEquality) -> bool:
 class Group:
     """Joints that ties connect."""
 
-    joints: tuple[int, ...]
-    """Their numbers, shallow ones first."""
-    ties: tuple[int, ...]
-    """Numbers of the ties."""
+    joints: tuple[int, ...]  # their numbers, shallow ones first
+    ties: tuple[int, ...]  # numbers of the ties
 
 
 class Linkage:
@@ -208,10 +205,8 @@ class Rule:
     leader: int
     slope: float
     offset: float
-    error: float
-    """Largest distance from the rule while the leader goes through its range [rad or m]."""
-    also: tuple[int, ...]
-    """Other leaders that move the joint."""
+    error: float  # largest distance from the rule while the leader goes through its range [rad or m]
+    also: tuple[int, ...]  # other leaders that move the joint
 
     @classmethod
     def of(cls, joint: int, sweeps: Mapping[int, Float[np.ndarray, "k n"]], reference: Float[np.ndarray, " n"]) -> Rule:

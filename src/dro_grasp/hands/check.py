@@ -9,22 +9,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
+from dro_grasp.descriptions.compiling import Note
 from dro_grasp.descriptions.loader import Description
-from dro_grasp.descriptions.notes import Note
 from dro_grasp.descriptions.part import named
 from dro_grasp.files import check_output, replacing
-from dro_grasp.geometry import se3
 from dro_grasp.geometry.point_clouds import enclosed_volume
 from dro_grasp.hands.anatomy import Finger
-from dro_grasp.hands.build import build_hand
-from dro_grasp.hands.fixed_jaw import fixed_jaw_of
+from dro_grasp.hands.build import LONGEST_REACH, build_hand, reach
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand_description
-from dro_grasp.hands.opening_notes import opening_notes
-from dro_grasp.hands.whole_robots import LONGEST_REACH, reach
+from dro_grasp.hands.opening import FingerMotion, opening_notes
+from dro_grasp.hands.palm import fixed_jaw_of
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.rendering.meshes import Mesh, arrow
 from dro_grasp.rendering.rasterizer import render
@@ -33,16 +29,9 @@ TILE = (560, 520)
 """Width and height of one view [pixels]."""
 TEXT = 30
 """Height of a line of text [pixels]."""
-CONTACT = (0.93, 0.66, 0.30)
-"""Colour of contact links."""
-OTHER = (0.62, 0.66, 0.72)
-"""Colour of links that cannot touch anything."""
-DIRECTION = (0.85, 0.15, 0.15)
-"""Colour of the palm direction."""
-TRACK = (0.15, 0.39, 0.92)
-"""Colour of the fingertips' tracks."""
-LEFT_OUT = (0.62, 0.30, 0.75)
-"""Colour of the tracks that the open posture leaves out."""
+COLOURS = {"contact": (0.93, 0.66, 0.30), "other": (0.62, 0.66, 0.72), "direction": (0.85, 0.15, 0.15),
+           "track": (0.15, 0.39, 0.92), "left out": (0.62, 0.30, 0.75)}
+"""Of contact links, links that cannot touch anything, the palm direction, the fingertips' tracks and what they leave out."""
 SIDEWAYS = 0.15
 """Cosine below which a thumb is on neither side of the other fingers (ours); hands with a side have 0.34 to 0.96."""
 END = {1: "upper", -1: "lower"}
@@ -255,23 +244,16 @@ def _meshes(hand: Hand, openness: float) -> list[Mesh]:
     poses = hand.tree.forward(hand.canonical_joints(openness)).numpy()
     meshes = [
         Mesh(g.vertices @ poses[g.link, :3, :3].T + poses[g.link, :3, 3], g.faces,
-             CONTACT if g.link in hand.contact_links else OTHER)
+             COLOURS["contact" if g.link in hand.contact_links else "other"])
         for g in (hand.description.geometry if hand.description else ())
         if g.visual and bool(hand.tree.descends[g.link, hand.palm])
     ]
     start = hand.palm_centre_wrist.numpy()
-    meshes.append(arrow(start, start + 0.1 * hand.palm_direction_wrist.numpy(), DIRECTION, radius=0.003))
+    meshes.append(arrow(start, start + 0.1 * hand.palm_direction_wrist.numpy(), COLOURS["direction"], radius=0.003))
     used = torch.stack([hand.canonical_joints(float(x)) for x in torch.linspace(1, 0.25, 8)])
     farthest = torch.where(hand.open_ends == hand.open_limits, used[0], hand.open_limits)
     beyond = torch.stack([torch.lerp(used[0], farthest, float(x)) for x in torch.linspace(0, 1, 12)])
-    for colour, joints in ((TRACK, used), (LEFT_OUT, beyond))[: 1 + (not torch.equal(farthest, used[0]))]:
-        for track in _tracks(hand, joints):
-            meshes.extend(arrow(a, b, colour, radius=0.0012) for a, b in pairwise(track))
+    for colour, joints in (("track", used), ("left out", beyond))[: 1 + (not torch.equal(farthest, used[0]))]:
+        for track in FingerMotion.of(hand).tips(joints).transpose(0, 1).numpy():
+            meshes.extend(arrow(a, b, COLOURS[colour], radius=0.0012) for a, b in pairwise(track))
     return meshes
-
-
-def _tracks(hand: Hand, joints: Float[Tensor, "steps n_dof"]) -> Float[np.ndarray, "n_tips steps 3"]:
-    """Positions of the fingertips on a way of the joints [m]."""
-    poses = hand.tree.forward(joints)[:, list(hand.tips)]
-    middles = torch.stack([hand.link_points[hand.link_index == t].mean(0) for t in hand.tips])
-    return se3.apply(poses, middles).transpose(0, 1).numpy()

@@ -273,10 +273,8 @@ class Hand:
             first[members[rank[members].argsort()[:per_link]]] = True
         priority = torch.where(first, rank - self.n_points, rank)
         keep = priority.argsort()[:count].sort().values
-        return dataclasses.replace(
-            self, link_points=self.link_points[keep], link_normals=self.link_normals[keep],
-            link_index=self.link_index[keep],
-        )
+        return dataclasses.replace(self, link_points=self.link_points[keep], link_normals=self.link_normals[keep],
+                                   link_index=self.link_index[keep])
 
     @cached_tensor
     def spread_rank(self) -> Int[Tensor, " n_hand"]:

@@ -6,6 +6,7 @@ let it fold back closes on nothing on the way from there.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -13,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dro_grasp.descriptions.compiling import Note
 from dro_grasp.geometry import se3
 from dro_grasp.hands.anatomy import Finger
 from dro_grasp.hands.hand import Hand
@@ -32,7 +34,6 @@ ranges, 16 hands that open as they should have 0.82 at most, and most of them 0.
 LEAST_REACH = 0.35
 """Share of its widest reach below which a finger that opens farther folds back (ours). At the limits of their ranges, 16 hands
 that open as they should keep 0.44 to 1; a finger that points straight back behind its knuckle keeps 0 or less."""
-
 ALIKE = 0.9
 """Cosine between the ways in which two joints move a fingertip from which on they bend the finger alike (ours)."""
 ACROSS = 0.3
@@ -50,10 +51,8 @@ STILL = 5e-3
 class Line:
     """A straight line: the palm's axis."""
 
-    point: Float[Tensor, "3"]
-    """A point on it [m]."""
-    direction: Float[Tensor, "3"]
-    """Unit vector along it."""
+    point: Float[Tensor, "3"]  # a point on it [m]
+    direction: Float[Tensor, "3"]  # unit vector along it
 
     def span(self, tips: Float[Tensor, "*batch 3"], knuckles: Float[Tensor, "*batch 3"]) -> Float[Tensor, " *batch"]:
         """Distances of fingertips to the line [m]; negative for those on the other side of it than their knuckles."""
@@ -74,11 +73,8 @@ class FingerMotion:
     """Fingertips as functions of joints, in the root link's frame."""
 
     tree: KinematicTree
-    """Links and joints."""
     fingers: tuple[Finger, ...]
-    """The fingers."""
-    tip_points: Float[Tensor, "n_tips 3"]
-    """A point on each fingertip, in its link's frame [m]."""
+    tip_points: Float[Tensor, "n_tips 3"]  # a point on each fingertip, in its link's frame [m]
 
     @staticmethod
     def of(hand: Hand) -> FingerMotion:
@@ -103,20 +99,14 @@ class FingerMotion:
     def sideways(
         self, q: Float[Tensor, " n_dof"], bends: Bool[Tensor, " n_dof"], palm_direction: Float[Tensor, "3"]
     ) -> Bool[Tensor, " n_dof"]:
-        """Joints that move a fingertip across the way in which all other joints of its finger bend it, and not to the palm.
-
-        Args:
-            q: Joints [rad or m].
-            bends: The joints that are looked at; two others at least must bend a finger alike.
-            palm_direction: Unit vector.
-        """
+        """Joints that move a fingertip across the way in which all other joints of its finger bend it, and not to the palm."""
         found, velocity = torch.zeros_like(bends), self.velocities(q)
         for row, finger in enumerate(self.fingers):
             joints = (self.tree.moves[finger.tip] & bends & (velocity[row].norm(dim=0) > STILL)).nonzero()[:, 0]
             ways = torch.nn.functional.normalize(velocity[row][:, joints], dim=0).T
             for i, joint in enumerate(joints.tolist()):
                 others = ways[torch.arange(len(ways)) != i]
-                if len(others) < 2:
+                if len(others) < 2:  # two at least must bend a finger alike
                     continue
                 bending = main_axis(others)
                 alike = bool((others @ bending).abs().min() > ALIKE)
@@ -148,13 +138,7 @@ class FingerMotion:
         self, measure: Callable[[Float[Tensor, "n n_tips 3"], Float[Tensor, "n n_tips 3"]], Float[Tensor, "n n_tips"]],
         start: Float[Tensor, " n_dof"], bends: Bool[Tensor, " n_dof"],
     ) -> Float[Tensor, " n_dof"]:
-        """The posture whose fingertips span the most, found joint by joint [rad or m].
-
-        Args:
-            measure: The span of fingertips with these knuckles [m].
-            start: Where the search begins; joints that do not bend stay there, and of equal spans the nearest wins.
-            bends: The joints that are searched.
-        """
+        """The posture whose fingertips span the most, found joint by joint; of equal spans the one nearest to the start."""
         q, tree = start, self.tree
         for _ in range(SWEEPS):
             before = q
@@ -173,10 +157,7 @@ class FingerMotion:
     def folded(
         self, path: Float[Tensor, "steps n_dof"], bends: Bool[Tensor, " n_dof"], axis: Line
     ) -> Bool[Tensor, " n_tips"]:
-        """Fingers that fold back on a path from closed to open.
-
-        Beyond their widest span they point behind the palm, or lose most of their reach.
-        """
+        """Fingers that, on a path to open and beyond their widest span, point behind the palm or lose most of their reach."""
         at = axis.span(self.tips(path), self.knuckles(path, bends)).argmax(0)
         beyond = torch.arange(len(path))[:, None] >= at
         behind = self.behind(path, bends, axis.direction) > BEHIND
@@ -199,11 +180,9 @@ class FingerMotion:
 
 
 def open_side_by_side(hand: Hand, openness: float) -> Float[Tensor, " n_dof"]:
-    """`Hand.canonical_joints`, but all joints that move a finger sideways are neutral, so that no fingers cross [rad or m].
-
-    Joints that turn a finger about its length, or sit beyond its knuckle, count as bending: they spread it only where it bends.
-    At their open ends neighbours cross.
-    """
+    """`Hand.canonical_joints`, but all joints that move a finger sideways are neutral, so that no fingers cross [rad or m]."""
+    # Joints that turn a finger about its length, or sit beyond its knuckle, count as bending: they spread it only where it
+    # bends. At their open ends neighbours cross.
     q, motion, palm = hand.canonical_joints(openness), FingerMotion.of(hand), hand.palm_direction_wrist
     spreads = [motion.sideways(hand.canonical_joints(share), hand.movable, palm) for share in SPREADING]
     return torch.where(torch.stack(spreads).any(0) & hand.movable, hand.neutral, q)
@@ -212,3 +191,29 @@ def open_side_by_side(hand: Hand, openness: float) -> Float[Tensor, " n_dof"]:
 def main_axis(vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
     """Unit vector along which most of the vectors lie, forth or back."""
     return torch.linalg.svd(vectors, full_matrices=False)[2][0]
+
+
+def opening_notes(hand: Hand) -> list[Note]:
+    """What the open posture leaves out, finger by finger, and the fingers that point behind the palm in it."""
+    bends = hand.movable & ~hand.abduction
+    behind = FingerMotion.of(hand).behind(hand.canonical_joints(1.0), bends, hand.palm_direction_wrist).tolist()
+    notes = []
+    for finger, angle in zip(hand.fingers, behind, strict=True):
+        tip, left_out = hand.tree.link_names[finger.tip], _left_out(hand, finger)
+        if left_out:
+            notes.append(Note("info", tip, f"can open farther than the open posture, which leaves out {', '.join(left_out)}"))
+        if angle > BEHIND:
+            text = f"points {math.degrees(angle):.0f} degrees behind the palm in the open posture. Is the palm direction right?"
+            notes.append(Note("warning", tip, text + " If so, state another open posture"))
+    return notes
+
+
+def _left_out(hand: Hand, finger: Finger) -> list[str]:
+    """For each joint of a finger that can open farther than it does: how much of its range is not used."""
+    tree, told = hand.tree, []
+    for joint in (tree.moves[finger.tip] & hand.movable).nonzero()[:, 0].tolist():
+        limit = float(hand.open_limits[joint])
+        share = abs(limit - float(hand.open_ends[joint])) / float(tree.upper[joint] - tree.lower[joint])
+        if share > 0:
+            told.append(f"{share:.0%} of {tree.joint_names[joint]} ({float(hand.open_ends[joint]):.2f} to {limit:.2f})")
+    return told

@@ -25,38 +25,25 @@ KNUCKLE = 1.25
 class Style:
     """What the fingers of one hand have in common."""
 
-    radius: float
-    """Half the thickness of a first phalanx [m]."""
-    length: float
-    """Length of the longest finger [m]."""
-    phalanges: int
-    """Phalanges of a finger, 2 or 3."""
-    shape: FingerShape
-    """Shape of the phalanges."""
-    width: float
-    """Width of a box-shaped phalanx as a share of its thickness."""
-    coupling: Coupling
-    """Joints that follow the one before."""
-    ratios: tuple[float, float]
-    """Angle of the second and of the third joint per angle of the one before, where they follow."""
-    spread: float
-    """Limit of the spreading joint to either side [rad]; 0 if there is none."""
-    lower: float
-    """Lower limit of the first bending joint [rad]."""
-    uppers: tuple[float, float, float]
-    """Upper limits of the bending joints [rad]."""
+    radius: float  # half the thickness of a first phalanx [m]
+    length: float  # length of the longest finger [m]
+    phalanges: int  # phalanges of a finger, 2 or 3
+    shape: FingerShape  # shape of the phalanges
+    width: float  # width of a box-shaped phalanx as a share of its thickness
+    coupling: Coupling  # joints that follow the one before
+    ratios: tuple[float, float]  # angle of the second and of the third joint per angle of the one before, where they follow
+    spread: float  # limit of the spreading joint to either side [rad]; 0 if there is none
+    lower: float  # lower limit of the first bending joint [rad]
+    uppers: tuple[float, float, float]  # upper limits of the bending joints [rad]
 
 
 @dataclass(frozen=True)
 class Mount:
     """Where a finger stands on the palm."""
 
-    position: Float[np.ndarray, "3"]
-    """Its first axis, in the palm's frame [m]."""
-    along: Float[np.ndarray, "3"]
-    """Direction of the straight finger."""
-    closing: Float[np.ndarray, "3"]
-    """Direction in which it closes; need not be perpendicular."""
+    position: Float[np.ndarray, "3"]  # its first axis, in the palm's frame [m]
+    along: Float[np.ndarray, "3"]  # direction of the straight finger
+    closing: Float[np.ndarray, "3"]  # direction in which it closes; need not be perpendicular
 
     @property
     def frame(self) -> Float[np.ndarray, "3 3"]:
@@ -81,14 +68,10 @@ def vector(v: Float[np.ndarray, "3"]) -> Vector:
 class Turn:
     """A joint before a finger's bending joints: it spreads a finger or turns a thumb."""
 
-    axis: Float[np.ndarray, "3"]
-    """Unit vector in the palm's frame."""
-    lower: float
-    """Lower limit [rad]."""
-    upper: float
-    """Upper limit [rad]."""
-    open: float = 0.0
-    """Angle in the open hand [rad]."""
+    axis: Float[np.ndarray, "3"]  # unit vector in the palm's frame
+    lower: float  # [rad]
+    upper: float  # [rad]
+    open: float = 0.0  # angle in the open hand [rad]
 
 
 def finger_plan(name: str, mount: Mount, style: Style, length: float, turn: Turn | None = None) -> FingerPlan:
@@ -144,14 +127,10 @@ def phalanx(style: Style, radius: float, length: float, tip: bool) -> tuple[Soli
 class Block:
     """A palm that faces along its first axis: x is its depth, y its width, z its height, up to its upper end."""
 
-    shape: PalmShape
-    """Seen from above."""
-    depth: float
-    """Along the palm direction [m]."""
-    width: float
-    """[m]."""
-    height: float
-    """[m]."""
+    shape: PalmShape  # seen from above
+    depth: float  # along the palm direction [m]
+    width: float  # [m]
+    height: float  # [m]
 
     def solids(self) -> tuple[Solid, ...]:
         """Its shape; the middle of the upper edge is at the origin."""
