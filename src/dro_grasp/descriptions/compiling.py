@@ -21,8 +21,6 @@ LEAST_MASS = 1e-4
 """Mass of moving links that state none, or a negative one [kg] (ours)."""
 LEAST_INERTIA = 1e-8
 """Inertia of moving links that state none [kg m^2] (ours)."""
-MOST_REPAIRS = 64
-"""Number of repairs after which compiling fails (ours)."""
 MOST_JOINTS = 100
 """Most joints that move (ours); a humanoid with two hands has some 80."""
 LONGEST = 10.0
@@ -34,8 +32,6 @@ LEAST_TURN = 0.1
 """Range of a hand's widest turning joint below which its limits look like radians that were read as degrees [rad] (ours)."""
 TURNS = 1e4
 """Largest reference angle [rad], and largest ratio or offset of a coupling (ours)."""
-STIFFEST = 1e9
-"""Largest stiffness of a joint [Nm/rad or N/m] (ours)."""
 HEAVIEST = 1e4
 """Largest mass [kg] and inertia [kg m^2] (ours)."""
 NUMBERS = (
@@ -45,7 +41,7 @@ NUMBERS = (
     ("link", "body_ipos", "centre of mass", LONGEST), ("link", "body_mass", "mass", HEAVIEST),
     ("link", "body_inertia", "inertia", HEAVIEST), ("joint", "jnt_axis", "axis", 2.0),
     ("joint", "jnt_range", "limits", MOST_TURN), ("joint", "qpos0", "reference", TURNS),
-    ("joint", "qpos_spring", "spring's reference", TURNS), ("joint", "jnt_stiffness", "stiffness", STIFFEST),
+    ("joint", "qpos_spring", "spring's reference", TURNS), ("joint", "jnt_stiffness", "stiffness", 1e9),
     ("coupling", "eq_data", "coefficients", TURNS),
 )
 """Numbers of a compiled model: the kind of their owner, the array, what it means, and the largest value. Lengths come before
@@ -86,7 +82,7 @@ def compile_hand(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> mujoco.M
 
 
 def _compile(spec: mujoco.MjSpec, notes: list[Note]) -> mujoco.MjModel:
-    for _ in range(MOST_REPAIRS):
+    for _ in range(64):  # repairs, after which it fails
         try:
             return spec.copy().compile()
         except ValueError as error:

@@ -124,11 +124,10 @@ class Description:
 
 
 def _read_urdf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.MjSpec, tuple[Path, ...]]:
-    prepared = prepare_urdf(root, path)
-    notes.extend(prepared.notes)
-    assets = {name: as_obj(file) for name, file in prepared.converted.items()}
+    xml, files, converted = prepare_urdf(root, path, notes)
+    assets = {name: as_obj(file) for name, file in converted.items()}
     with mujoco_speaks_to(notes, path):
-        return mujoco.MjSpec.from_string(prepared.xml, assets=assets), prepared.mesh_files
+        return mujoco.MjSpec.from_string(xml, assets=assets), tuple(files)
 
 
 def _read_mjcf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.MjSpec, tuple[Path, ...]]:

@@ -15,8 +15,6 @@ NO_LIMITS = "states no limits"
 """Beginning of the note of a joint whose limits had to be assumed."""
 CONTINUOUS_LIMIT = math.pi
 """Limits of hinges that state none, both ways from zero [rad] (ours)."""
-AS_FREE = "within its joints' limits; it is left out, and they move freely"
-"""End of the notes of ties that cannot hold."""
 SLIDE_LIMIT = 0.05
 """Limits of slides that state none, both ways from zero [m] (ours)."""
 
@@ -24,12 +22,7 @@ SLIDE_LIMIT = 0.05
 def keep_hand_only(spec: mujoco.MjSpec, path: Path, *, fixed_base: bool = False) -> tuple[Note, ...]:
     """Reduce a file, in place, to its largest articulated body tree, with its root at identity.
 
-    Actuators, sensors, cameras, lights and everything else that is not the hand are deleted.
-
-    Args:
-        spec: The file.
-        path: Where it is, for messages.
-        fixed_base: Whether the root stands still; else the joints that move all of the hand are deleted, too.
+    Everything else that is not the hand is deleted, and unless the base is fixed the joints that move all of the hand, too.
 
     Raises:
         HandError: Nothing moves, or a joint is neither a hinge nor a slide.
@@ -142,12 +135,15 @@ def _keep_joint_equalities(spec: mujoco.MjSpec, notes: list[Note]) -> None:
                 notes.append(Note("warning", equality.name1, f"follows '{equality.name2}' by a polynomial; only its linear "
                                   "part is kept"))
             continue
-        if equality.active and equality.type == mujoco.mjtEq.mjEQ_TENDON:
-            notes.append(Note("warning", equality.name1, f"is a tendon whose length cannot stay {AS_FREE}"))
-        elif equality.active and equality.type in {mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD}:
-            if equality.objtype != mujoco.mjtObj.mjOBJ_BODY or {equality.name1, equality.name2} <= bodies:
-                tied = f"is tied to '{equality.name2}' in a loop that cannot close"
-                notes.append(Note("warning", equality.name1, f"{tied} {AS_FREE}"))
+        lost = ""
+        if equality.type == mujoco.mjtEq.mjEQ_TENDON:
+            lost = "is a tendon whose length cannot stay"
+        elif equality.type in {mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD} and (
+                equality.objtype != mujoco.mjtObj.mjOBJ_BODY or {equality.name1, equality.name2} <= bodies):
+            lost = f"is tied to '{equality.name2}' in a loop that cannot close"
+        if lost and equality.active:
+            text = f"{lost} within its joints' limits; it is left out, and they move freely"
+            notes.append(Note("warning", equality.name1, text))
         spec.delete(equality)
 
 
@@ -172,7 +168,6 @@ def _check_joints(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
 
 
 def _let_visuals_collide(spec: mujoco.MjSpec, notes: list[Note]) -> None:
-    """Let a hand without any collision shape collide with its visual shapes."""
     if any(g.contype or g.conaffinity for g in spec.geoms):
         return
     for geom in spec.geoms:

@@ -146,10 +146,7 @@ class Coupling:
 def resolve_couplings(
     couplings: tuple[Coupling, ...], names: Sequence[str], path: Path
 ) -> tuple[list[int], Float[np.ndarray, "n_joints n_dof"], Float[np.ndarray, " n_joints"]]:
-    """Every joint as an affine function of the independent ones.
-
-    Returns:
-        Indices of the independent joints, coupling and offset: joints = coupling @ independent joints + offset.
+    """Indices of the independent joints, coupling and offset: joints = coupling @ independent joints + offset.
 
     Raises:
         HandError: Followers follow each other in a cycle, or absurdly fast, or all joints are held.

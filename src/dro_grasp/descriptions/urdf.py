@@ -8,7 +8,6 @@ import math
 import os
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -20,39 +19,28 @@ from dro_grasp.geometry.mesh_files import open_mesh
 
 MOVING = {"revolute", "continuous", "prismatic"}
 """URDF joint types with one degree of freedom."""
-RENAMED_WORLD = "world_link"
-"""Name of a link that its file calls `world`, which is MuJoCo's name for the ground."""
-READABLE_MESHES = {".stl", ".obj", ".msh"}
-"""Mesh formats that MuJoCo reads; trimesh converts the others."""
 
 
-@dataclass(frozen=True)
-class PreparedUrdf:
-    """A URDF ready for MuJoCo."""
-
-    xml: str  # the description as MuJoCo reads it
-    notes: tuple[Note, ...]  # findings and repairs
-    mesh_files: tuple[Path, ...]  # every mesh file in use
-    converted: dict[str, Path]
-    """Meshes in formats that MuJoCo cannot read (GLB, DAE, ...), by the file names that stand in for them."""
-
-
-def prepare_urdf(root: ET.Element, path: Path) -> PreparedUrdf:
+def prepare_urdf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[str, list[Path], dict[str, Path]]:
     """Check the link tree, resolve meshes and set MuJoCo's options.
+
+    Returns:
+        XML for MuJoCo, the mesh files in use, and those that MuJoCo cannot read (GLB, DAE, ...) by the names that stand in.
 
     Raises:
         HandError: A name is used twice, a number is not one, no joint moves, links form a cycle or several trees, or no mesh
             is found.
     """
-    notes: list[Note] = []
     _check_names(root, path)
     _settle_joints(root, path, notes)
     _drop_empty_shapes(root, path, notes)
     base = _check_links(root, path)
     if base == "world":
-        _rename_link(root, "world", RENAMED_WORLD)
-        notes.append(Note("info", "world", f"is MuJoCo's name for the ground; this link is called '{RENAMED_WORLD}' here "
-                          "and in exported files"))
+        for place, attribute in (("link", "name"), ("joint/parent", "link"), ("joint/child", "link")):
+            for element in root.findall(f"{place}[@{attribute}='world']"):
+                element.set(attribute, "world_link")
+        notes.append(Note("info", "world", "is MuJoCo's name for the ground; this link is called 'world_link' here and in "
+                          "exported files"))
     _check_mimic(root, notes)
     files, converted = resolve_meshes(root, path, notes)
     extension = root.find("mujoco")
@@ -63,7 +51,7 @@ def prepare_urdf(root: ET.Element, path: Path) -> PreparedUrdf:
         compiler.attrib.pop(stale, None)
     compiler.attrib.update(discardvisual="false", fusestatic="false", balanceinertia="true", boundmass=str(LEAST_MASS),
                            boundinertia=str(LEAST_INERTIA), strippath="false")
-    return PreparedUrdf(ET.tostring(root, encoding="unicode"), tuple(notes), tuple(files), converted)
+    return ET.tostring(root, encoding="unicode"), files, converted
 
 
 def _check_names(root: ET.Element, path: Path) -> None:
@@ -85,19 +73,13 @@ def _settle_joints(root: ET.Element, path: Path, notes: list[Note]) -> None:
             raise HandError(f"{path}: joint '{name}' has the type '{kind}'; expected one of "
                             f"{', '.join(sorted(MOVING))}, fixed, floating")
         elif kind != "fixed":
-            _check_axis(joint, path)
+            for element in joint.findall("axis"):
+                axis = _numbers(element, "xyz", path, _called(joint))
+                if len(axis) != 3 or math.hypot(*axis) < 1e-6:
+                    raise HandError(f"{path}: joint '{name}' has the axis '{element.get('xyz')}'; expected a direction of "
+                                    "three numbers, not all zero")
             if kind != "continuous":
                 _check_limits(joint, path, notes)
-
-
-def _check_axis(joint: ET.Element, path: Path) -> None:
-    element = joint.find("axis")
-    if element is None:
-        return
-    axis = _numbers(element, "xyz", path, _called(joint))
-    if len(axis) != 3 or math.hypot(*axis) < 1e-6:
-        raise HandError(f"{path}: joint '{joint.get('name')}' has the axis '{element.get('xyz')}'; expected a direction "
-                        "of three numbers, not all zero")
 
 
 def _check_limits(joint: ET.Element, path: Path, notes: list[Note]) -> None:
@@ -123,12 +105,11 @@ def _drop_empty_shapes(root: ET.Element, path: Path, notes: list[Note]) -> None:
     """Remove boxes, spheres and cylinders without extent, which MuJoCo refuses."""
     for link in root.findall("link"):
         for element in [*link.findall("visual"), *link.findall("collision")]:
-            shape = element.find("geometry/*")
-            sizes = [] if shape is None else [
-                x for name in ("size", "radius", "length") if name in shape.attrib
-                for x in _numbers(shape, name, path, _called(link))
-            ]
-            if shape is not None and min(sizes, default=1.0) <= 0:
+            for shape in element.findall("geometry/*")[:1]:
+                stated = [name for name in ("size", "radius", "length") if name in shape.attrib]
+                sizes = [x for name in stated for x in _numbers(shape, name, path, _called(link))]
+                if min(sizes, default=1.0) > 0:
+                    continue
                 link.remove(element)
                 notes.append(Note("warning", link.get("name", ""), f"{element.tag} {shape.tag} of size "
                                   f"{' '.join(f'{x:g}' for x in sizes)} has no volume and is left out"))
@@ -191,18 +172,7 @@ def _link_of(joint: ET.Element, end: str, links: Iterable[str], path: Path) -> s
     return name
 
 
-def _rename_link(root: ET.Element, old: str, new: str) -> None:
-    for link in root.findall("link"):
-        if link.get("name") == old:
-            link.set("name", new)
-    for joint in root.findall("joint"):
-        for element in [*joint.findall("parent"), *joint.findall("child")]:
-            if element.get("link") == old:
-                element.set("link", new)
-
-
 def _check_mimic(root: ET.Element, notes: list[Note]) -> None:
-    """Drop mimic tags that name joints which do not move."""
     kinds = {joint.get("name"): joint.get("type") for joint in root.findall("joint")}
     for joint in root.findall("joint"):
         for mimic in joint.findall("mimic"):
@@ -251,7 +221,8 @@ def _resolve_mesh(element: ET.Element, folder: Path, files: dict[str, Path]) -> 
     file = find_mesh(name, folder)
     if file is None:
         return False
-    stand_in = str(file) if file.suffix.lower() in READABLE_MESHES else hashlib.sha256(name.encode()).hexdigest()[:16] + ".obj"
+    readable = file.suffix.lower() in {".stl", ".obj", ".msh"}  # by MuJoCo; trimesh converts the others
+    stand_in = str(file) if readable else hashlib.sha256(name.encode()).hexdigest()[:16] + ".obj"
     mesh.set("filename", stand_in)
     files[stand_in] = file
     return True

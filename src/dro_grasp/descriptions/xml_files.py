@@ -12,8 +12,6 @@ import defusedxml.ElementTree
 from dro_grasp.errors import HandError
 from dro_grasp.files import command
 
-XACRO = "{http://www.ros.org/wiki/xacro}"
-"""Namespace of xacro's tags, as ElementTree spells it."""
 DEEPEST = 100
 """Most elements within each other, and most links one below the other (ours); the deepest hand known to us has 30."""
 MOST_ELEMENTS = 50_000
@@ -55,7 +53,7 @@ def parse_xml(path: Path) -> ET.Element:
         raise HandError(f"{path} cannot be read ({error}); expected a URDF (<robot>) or MJCF (<mujoco>) file") from error
     assert root is not None  # an empty file is no XML
     _check_elements(root, path)
-    if any(isinstance(element.tag, str) and element.tag.startswith(XACRO) for element in root.iter()):
+    if any(str(element.tag).startswith("{http://www.ros.org/wiki/xacro}") for element in root.iter()):
         expanded = path.with_name("expanded.urdf")
         raise HandError(f"{path} is a xacro template; expand it first: {command('xacro', path, '-o', expanded)}")
     return root

@@ -16,6 +16,9 @@ from dro_grasp.errors import HandError
 from dro_grasp.geometry import se3
 from dro_grasp.kinematics.tree import FIXED, KinematicTree
 
+Joints = Float[Tensor, " n_dof"]  # a value of each independent joint
+JointMask = Bool[Tensor, " n_dof"]
+Point = Float[Tensor, "3"]
 PALM = -1
 """Finger number of links that belong to no finger: the palm, links fixed to it or above it, and links that fingers share."""
 FEWEST_WITH_THUMB = 4
@@ -142,7 +145,7 @@ def find_fingers(
 
 
 def measure_opposition(
-    tree: KinematicTree, q: Float[Tensor, " n_dof"], rate: Float[Tensor, " n_dof"], tips: Sequence[int],
+    tree: KinematicTree, q: Joints, rate: Joints, tips: Sequence[int],
     tip_offsets: Float[Tensor, "n_tips 3"],
 ) -> Float[Tensor, " n_tips"]:
     """How much each fingertip moves against the others at joints `q`, while all joints close at `rate`.
@@ -164,9 +167,9 @@ def find_thumb(opposition: Float[Tensor, " n_tips"]) -> int | None:
 
 
 def closing_gains(
-    tree: KinematicTree, q: Float[Tensor, " n_dof"], tips: Sequence[int], tip_points: Float[Tensor, "n_tips 3"],
-    targets: Sequence[Float[Tensor, "3"]],
-) -> Float[Tensor, " n_dof"]:
+    tree: KinematicTree, q: Joints, tips: Sequence[int], tip_points: Float[Tensor, "n_tips 3"],
+    targets: Sequence[Point],
+) -> Joints:
     """How much nearer to the targets the upper limit of each joint brings its fingertips than the lower limit [m].
 
     All other joints are at `q`. Distances to several targets, which are points in the root link's frame [m], are added. The
@@ -182,7 +185,7 @@ def closing_gains(
     return mean[0] - mean[1]
 
 
-def axes_along(tree: KinematicTree, q: Float[Tensor, " n_dof"], direction: Float[Tensor, "3"]) -> Bool[Tensor, " n_dof"]:
+def axes_along(tree: KinematicTree, q: Joints, direction: Point) -> JointMask:
     """The joints whose axes lie along a direction of the root link's frame and which bend no finger."""
     # A joint with a parallel one below it, or with none below it, is part of a finger's flexion.
     angular = tree.motion_axes(tree.forward(q))[1]

@@ -1,7 +1,4 @@
-"""From a description to a Hand, step by step.
-
-Source: paper section III-B and appendix, dataset preprocessing.
-"""
+"""From a description to a Hand, step by step. Source: paper section III-B and appendix, dataset preprocessing."""
 
 from __future__ import annotations
 
@@ -77,7 +74,6 @@ class HandBuilder:
     """The steps from a description to a hand; each is derived once, when a later one needs it."""
 
     def __init__(self, description: Description, seed: int = 0) -> None:
-        """Begin with a description, and a seed of the point sampling."""
         self.description, self.tree, self.seed = description, description.tree, seed
 
     def build(self, name: str) -> Hand:
@@ -179,13 +175,11 @@ class HandBuilder:
 
     @cached_property
     def closing(self) -> Closing:
-        """From where and to where the joints close, and the palm.
-
-        Half closed, a hand whose limits let its fingers roll up encloses little; it is examined earlier then.
-        """
+        """From where and to where the joints close, and the palm."""
         finder = ClosingFinder(self.tree, self.rest, self.movable, self.stated, self.fingers, self.coarse, self.on_palm,
                                sideways=torch.zeros_like(self.movable))
         found = finder.find()
+        # Half closed, a hand whose limits let its fingers roll up encloses little; it is examined earlier then.
         if found.palm.score <= WELL_ENCLOSED and finder.motion.bend(self.tree.lower, self.tree.upper) >= ROLLING_UP:
             with contextlib.suppress(HandError):  # nothing is enclosed so early
                 early = dataclasses.replace(finder, closings=EARLY_CLOSINGS).find()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -21,14 +22,13 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand_description
 from dro_grasp.hands.opening import FingerMotion, opening_notes
 from dro_grasp.hands.palm import fixed_jaw_of
+from dro_grasp.kinematics.tree import KinematicTree
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.rendering.meshes import Mesh, arrow
 from dro_grasp.rendering.rasterizer import render
 
 TILE = (560, 520)
 """Width and height of one view [pixels]."""
-TEXT = 30
-"""Height of a line of text [pixels]."""
 COLOURS = {"contact": (0.93, 0.66, 0.30), "other": (0.62, 0.66, 0.72), "direction": (0.85, 0.15, 0.15),
            "track": (0.15, 0.39, 0.92), "left out": (0.62, 0.30, 0.75)}
 """Of contact links, links that cannot touch anything, the palm direction, the fingertips' tracks and what they leave out."""
@@ -51,7 +51,7 @@ class HandReport:
     """Findings, repairs and faults."""
 
     def __repr__(self) -> str:
-        count = {level: sum(note.level == level for note in self.notes) for level in dict.fromkeys(n.level for n in self.notes)}
+        count = Counter(note.level for note in self.notes)
         found = ", ".join(f"{n} {level}{'s' * (n > 1)}" for level, n in count.items()) or "nothing wrong was found"
         return f"HandReport({self.hand!r}, {found}; lines() tells all)"
 
@@ -81,8 +81,7 @@ def check_hand(name: str | Path) -> HandReport:
     """
     description, label = load_hand_description(name)
     hand = build_hand(description, name=label)
-    found = (*_part_notes(hand, description), *_finger_notes(hand), *opening_notes(hand), *_shape_notes(hand, description),
-             *_point_notes(hand))
+    found = (*_part_notes(hand, description), *_finger_notes(hand), *opening_notes(hand), *_shape_notes(hand, description))
     return HandReport(hand, _facts(hand, description), (*description.notes, *found))
 
 
@@ -100,7 +99,7 @@ def _facts(hand: Hand, description: Description) -> dict[str, Any]:
         "palm_link": names[hand.palm],
         "palm_direction": [round(float(x), 3) for x in hand.palm_direction_wrist],
         "fingertips": [names[t] for t in hand.tips],
-        "fingers": {names[finger.tip]: _finger_facts(hand, finger) for finger in hand.fingers},
+        "fingers": {names[finger.tip]: _finger_facts(tree, finger) for finger in hand.fingers},
         "thumb": None if hand.thumb is None else names[hand.tips[hand.thumb]],
         "thumb_opposition": {names[t]: round(float(x), 2) for t, x in zip(hand.tips, hand.thumb_opposition, strict=True)},
         "side": hand_side(hand),
@@ -117,9 +116,8 @@ def _facts(hand: Hand, description: Description) -> dict[str, Any]:
     }
 
 
-def _finger_facts(hand: Hand, finger: Finger) -> dict[str, list[str]]:
+def _finger_facts(tree: KinematicTree, finger: Finger) -> dict[str, list[str]]:
     """The links of a finger and the joints that move them, followers included."""
-    tree = hand.tree
     joints = [tree.moving_names[tree.link_joint[link]] for link in finger.links if tree.link_joint[link] >= 0]
     return {"links": [tree.link_names[link] for link in finger.links], "joints": joints}
 
@@ -133,16 +131,12 @@ def _rigid_groups(hand: Hand) -> list[list[str]]:
 
 
 def hand_side(hand: Hand) -> str:
-    """`left`, `right`, or `none` for a hand without a thumb or with fingers all around the palm.
-
-    With the fingers up and the palm towards the viewer, the thumb of a right hand is on the viewer's right.
-    """
+    """`left`, `right`, or `none` for a hand without a thumb or with fingers all around the palm."""
     if hand.thumb is None:
         return "none"
-    points, index = hand.points(hand.canonical_joints(1.0)), hand.link_index
-    tips = torch.stack([points[index == t].mean(0) for t in hand.tips])
-    palm = hand.palm_centre_wrist
+    tips, palm = FingerMotion.of(hand).tips(hand.canonical_joints(1.0)), hand.palm_centre_wrist
     others = torch.cat([tips[: hand.thumb], tips[hand.thumb + 1 :]]).mean(0)
+    # With the fingers up and the palm towards the viewer, the thumb of a right hand is on the viewer's right.
     aside = torch.linalg.cross(others - palm, hand.palm_direction_wrist)
     handed = float(torch.nn.functional.cosine_similarity(aside, tips[hand.thumb] - palm, dim=0))
     return "none" if abs(handed) < SIDEWAYS else "right" if handed > 0 else "left"
@@ -168,7 +162,7 @@ def _finger_notes(hand: Hand) -> list[Note]:
 
 
 def _shape_notes(hand: Hand, description: Description) -> list[Note]:
-    """Links that cannot touch anything, or whose shapes enclose nothing."""
+    """Links that cannot touch anything, whose shapes enclose nothing, or that have too few points."""
     notes = []
     for link, name in enumerate(hand.tree.link_names):
         if not bool(hand.tree.descends[link, hand.palm]):
@@ -179,16 +173,11 @@ def _shape_notes(hand: Hand, description: Description) -> list[Note]:
         volume = sum(abs(enclosed_volume(g.vertices[g.faces])) for g in shapes)
         if shapes and volume < THIN_VOLUME:
             notes.append(Note("warning", name, "has shapes without volume"))
-    return notes
-
-
-def _point_notes(hand: Hand) -> list[Note]:
     few = [hand.tree.link_names[i] for i in hand.link_index.unique().tolist() if not bool(hand.registrable[i])]
-    return [Note("info", name, "has too few points for a pose of its own; its neighbours place it") for name in few]
+    return [*notes, *(Note("info", name, "has too few points for a pose of its own; its neighbours place it") for name in few)]
 
 
 def _words(value: Any) -> list[str]:
-    """A fact in words, on one line or more."""
     if isinstance(value, dict) and any(isinstance(v, dict) for v in value.values()):
         return [f"{tip} (links {', '.join(v['links'])}; joints {', '.join(v['joints'])})" for tip, v in value.items()]
     if isinstance(value, dict):
@@ -211,17 +200,17 @@ def picture(hand: Hand, path: Path | str) -> None:
     from PIL import Image, ImageDraw, ImageFont
 
     path = check_output(path)
-    width, height = TILE
-    sheet = Image.new("RGB", (2 * width, height + 2 * TEXT), (255, 255, 255))
+    (width, height), line = TILE, 30  # pixels
+    sheet = Image.new("RGB", (2 * width, height + 2 * line), (255, 255, 255))
     pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(15)
     camera = _camera(hand)
     for column, (title, openness) in enumerate((("open", 1.0), ("closed", 0.25))):
-        sheet.paste(Image.fromarray(render(_meshes(hand, openness), camera, width, height)), (column * width, TEXT))
+        sheet.paste(Image.fromarray(render(_meshes(hand, openness), camera, width, height)), (column * width, line))
         pen.text((column * width + 12, 6), f"{hand.name}, {title}", fill=(20, 20, 20), font=font)
     legend = "orange: contact links   grey: others   red: palm direction   blue: fingertips from open to closed"
     if not torch.equal(hand.open_ends, hand.open_limits):
         legend += "   purple: left out"
-    pen.text((12, height + TEXT + 6), legend, fill=(90, 90, 90), font=font)
+    pen.text((12, height + line + 6), legend, fill=(90, 90, 90), font=font)
     with replacing(path, "picture") as temporary:
         sheet.save(temporary, format="PNG")
 

@@ -13,6 +13,7 @@ from dro_grasp.descriptions.tree_reading import LinkGeometry
 from dro_grasp.hands.anatomy import rigid_groups
 from dro_grasp.kinematics.tree import KinematicTree
 
+Point = Float[np.ndarray, "3"]
 POSTURES = 16
 """Random postures in which a pin must be where both links have it (ours)."""
 LOOSE = 0.03
@@ -33,15 +34,15 @@ class _End:
     tip: int
     link: int  # its topmost link, in whose frame the rest is
     vertices: Float[np.ndarray, "n 3"]  # corners of its shapes [m]
-    anchor: Float[np.ndarray, "3"]  # a point on the axis of its joint [m]
-    axis: Float[np.ndarray, "3"]
+    anchor: Point  # a point on the axis of its joint [m]
+    axis: Point
 
-    def has(self, pin: Float[np.ndarray, "3"]) -> bool:
+    def has(self, pin: Point) -> bool:
         """Whether a point is at this link."""
         low, high = self.vertices.min(0) - OUTSIDE, self.vertices.max(0) + OUTSIDE
         return bool(((pin >= low) & (pin <= high)).all())
 
-    def lever(self, pin: Float[np.ndarray, "3"]) -> float:
+    def lever(self, pin: Point) -> float:
         """Distance of a point from the axis of this link's own joint [m]."""
         return float(np.linalg.norm(np.cross(pin - self.anchor, self.axis)))
 

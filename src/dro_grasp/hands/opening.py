@@ -7,7 +7,6 @@ let it fold back closes on nothing on the way from there.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -16,7 +15,7 @@ from torch import Tensor
 
 from dro_grasp.descriptions.compiling import Note
 from dro_grasp.geometry import se3
-from dro_grasp.hands.anatomy import Finger
+from dro_grasp.hands.anatomy import Finger, JointMask, Joints, Point
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinematics.tree import REVOLUTE, KinematicTree
 
@@ -51,21 +50,17 @@ STILL = 5e-3
 class Line:
     """A straight line: the palm's axis."""
 
-    point: Float[Tensor, "3"]  # a point on it [m]
-    direction: Float[Tensor, "3"]  # unit vector along it
+    point: Point  # a point on it [m]
+    direction: Point  # unit vector along it; zero for the point alone
 
     def span(self, tips: Float[Tensor, "*batch 3"], knuckles: Float[Tensor, "*batch 3"]) -> Float[Tensor, " *batch"]:
         """Distances of fingertips to the line [m]; negative for those on the other side of it than their knuckles."""
-        return span(self._across(tips), self._across(knuckles))
+        tips, knuckles = self._across(tips), self._across(knuckles)
+        return torch.where((tips * knuckles).sum(-1) >= 0, 1.0, -1.0) * tips.norm(dim=-1)
 
     def _across(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         offset = points - self.point
         return offset - (offset @ self.direction)[..., None] * self.direction
-
-
-def span(tips: Float[Tensor, "*batch 3"], knuckles: Float[Tensor, "*batch 3"]) -> Float[Tensor, " *batch"]:
-    """Distances of fingertips to the origin [m]; negative for those on the other side of it than their knuckles."""
-    return torch.where((tips * knuckles).sum(-1) >= 0, 1.0, -1.0) * tips.norm(dim=-1)
 
 
 @dataclass(frozen=True)
@@ -91,14 +86,12 @@ class FingerMotion:
         """Positions of the fingertips [m]."""
         return se3.apply(self.tree.forward(q)[..., self.links, :, :], self.tip_points)
 
-    def velocities(self, q: Float[Tensor, " n_dof"]) -> Float[Tensor, "n_tips 3 n_dof"]:
+    def velocities(self, q: Joints) -> Float[Tensor, "n_tips 3 n_dof"]:
         """Motion of each fingertip per motion of each joint [m/rad or m/m]."""
         poses = self.tree.forward(q)
         return self.tree.point_jacobian(poses, self.tips(q), torch.tensor(self.links))
 
-    def sideways(
-        self, q: Float[Tensor, " n_dof"], bends: Bool[Tensor, " n_dof"], palm_direction: Float[Tensor, "3"]
-    ) -> Bool[Tensor, " n_dof"]:
+    def sideways(self, q: Joints, bends: JointMask, palm_direction: Point) -> JointMask:
         """Joints that move a fingertip across the way in which all other joints of its finger bend it, and not to the palm."""
         found, velocity = torch.zeros_like(bends), self.velocities(q)
         for row, finger in enumerate(self.fingers):
@@ -113,31 +106,28 @@ class FingerMotion:
                 found[joint] |= alike and bool(torch.stack([bending, palm_direction]).mv(ways[i]).abs().max() < ACROSS)
         return found
 
-    def bend(self, opened: Float[Tensor, " n_dof"], closed: Float[Tensor, " n_dof"]) -> float:
+    def bend(self, opened: Joints, closed: Joints) -> float:
         """Angle by which the joints of a finger turn in all from one posture to another, largest of all fingers [rad]."""
         turns = self.tree.link_coupling.abs() @ (closed - opened).abs() * (torch.tensor(self.tree.kind) == REVOLUTE)
         return max(float(turns[list(finger.chain)].sum()) for finger in self.fingers)
 
-    def reaches(self, q: Float[Tensor, "*batch n_dof"], bends: Bool[Tensor, " n_dof"]) -> Float[Tensor, "*batch n_tips 3"]:
+    def reaches(self, q: Float[Tensor, "*batch n_dof"], bends: JointMask) -> Float[Tensor, "*batch n_tips 3"]:
         """From the knuckle of each finger to its tip [m]."""
         return self.tips(q) - self.knuckles(q, bends)
 
-    def knuckles(self, q: Float[Tensor, "*batch n_dof"], bends: Bool[Tensor, " n_dof"]) -> Float[Tensor, "*batch n_tips 3"]:
+    def knuckles(self, q: Float[Tensor, "*batch n_dof"], bends: JointMask) -> Float[Tensor, "*batch n_tips 3"]:
         """Positions of the knuckles [m]."""
         links = [self._knuckle(finger, bends) for finger in self.fingers]
         return se3.apply(self.tree.forward(q)[..., links, :, :], self.tree.anchor[links])
 
-    def _knuckle(self, finger: Finger, bends: Bool[Tensor, " n_dof"]) -> int:
+    def _knuckle(self, finger: Finger, bends: JointMask) -> int:
         """The first link that bends far; a metacarpal, which bends a little, is no knuckle."""
         chain = list(finger.chain)
         ranges = (self.tree.upper - self.tree.lower) / self.tree.joint_unit * bends
         far = ((self.tree.link_coupling[chain] != 0) * ranges).amax(-1)
         return chain[int((far >= KNUCKLE * far.max()).nonzero()[0, 0])]
 
-    def widest(
-        self, measure: Callable[[Float[Tensor, "n n_tips 3"], Float[Tensor, "n n_tips 3"]], Float[Tensor, "n n_tips"]],
-        start: Float[Tensor, " n_dof"], bends: Bool[Tensor, " n_dof"],
-    ) -> Float[Tensor, " n_dof"]:
+    def widest(self, axis: Line, start: Joints, bends: JointMask) -> Joints:
         """The posture whose fingertips span the most, found joint by joint; of equal spans the one nearest to the start."""
         q, tree = start, self.tree
         for _ in range(SWEEPS):
@@ -148,15 +138,13 @@ class FingerMotion:
                 values = values[(values - start[joint]).abs().argsort(stable=True)]
                 tried = q.repeat(len(values), 1)
                 tried[:, joint] = values
-                total = measure(self.tips(tried), self.knuckles(tried, bends)).sum(-1)
+                total = axis.span(self.tips(tried), self.knuckles(tried, bends)).sum(-1)
                 q = tried[int((total > total.max() - SAME_SPAN).nonzero()[0, 0])]
             if torch.equal(q, before):
                 break
         return q
 
-    def folded(
-        self, path: Float[Tensor, "steps n_dof"], bends: Bool[Tensor, " n_dof"], axis: Line
-    ) -> Bool[Tensor, " n_tips"]:
+    def folded(self, path: Float[Tensor, "steps n_dof"], bends: JointMask, axis: Line) -> Bool[Tensor, " n_tips"]:
         """Fingers that, on a path to open and beyond their widest span, point behind the palm or lose most of their reach."""
         at = axis.span(self.tips(path), self.knuckles(path, bends)).argmax(0)
         beyond = torch.arange(len(path))[:, None] >= at
@@ -164,14 +152,14 @@ class FingerMotion:
         return (beyond & ((self.kept(path, bends, at) < LEAST_REACH) | behind)).any(0)
 
     def behind(
-        self, q: Float[Tensor, "*batch n_dof"], bends: Bool[Tensor, " n_dof"], palm_direction: Float[Tensor, "3"]
+        self, q: Float[Tensor, "*batch n_dof"], bends: JointMask, palm_direction: Point
     ) -> Float[Tensor, "*batch n_tips"]:
         """Angle by which each finger points behind the plane of the palm [rad]; negative in front of it."""
         reach = self.reaches(q, bends)
         return torch.asin((-(reach @ palm_direction) / reach.norm(dim=-1).clamp_min(1e-6)).clamp(-1, 1))
 
     def kept(
-        self, path: Float[Tensor, "steps n_dof"], bends: Bool[Tensor, " n_dof"], at: Int[Tensor, " n_tips"] | int = 0
+        self, path: Float[Tensor, "steps n_dof"], bends: JointMask, at: Int[Tensor, " n_tips"] | int = 0
     ) -> Float[Tensor, "steps n_tips"]:
         """Share of each finger's reach at one step of a path that it keeps at every step, measured along that reach."""
         reach = self.reaches(path, bends)
@@ -179,7 +167,7 @@ class FingerMotion:
         return (reach * then).sum(-1) / then.square().sum(-1).clamp_min(1e-12)
 
 
-def open_side_by_side(hand: Hand, openness: float) -> Float[Tensor, " n_dof"]:
+def open_side_by_side(hand: Hand, openness: float) -> Joints:
     """`Hand.canonical_joints`, but all joints that move a finger sideways are neutral, so that no fingers cross [rad or m]."""
     # Joints that turn a finger about its length, or sit beyond its knuckle, count as bending: they spread it only where it
     # bends. At their open ends neighbours cross.
@@ -188,7 +176,7 @@ def open_side_by_side(hand: Hand, openness: float) -> Float[Tensor, " n_dof"]:
     return torch.where(torch.stack(spreads).any(0) & hand.movable, hand.neutral, q)
 
 
-def main_axis(vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
+def main_axis(vectors: Float[Tensor, "n 3"]) -> Point:
     """Unit vector along which most of the vectors lie, forth or back."""
     return torch.linalg.svd(vectors, full_matrices=False)[2][0]
 
@@ -210,10 +198,7 @@ def opening_notes(hand: Hand) -> list[Note]:
 
 def _left_out(hand: Hand, finger: Finger) -> list[str]:
     """For each joint of a finger that can open farther than it does: how much of its range is not used."""
-    tree, told = hand.tree, []
-    for joint in (tree.moves[finger.tip] & hand.movable).nonzero()[:, 0].tolist():
-        limit = float(hand.open_limits[joint])
-        share = abs(limit - float(hand.open_ends[joint])) / float(tree.upper[joint] - tree.lower[joint])
-        if share > 0:
-            told.append(f"{share:.0%} of {tree.joint_names[joint]} ({float(hand.open_ends[joint]):.2f} to {limit:.2f})")
-    return told
+    tree, ends, limits = hand.tree, hand.open_ends.tolist(), hand.open_limits.tolist()
+    shares = ((hand.open_limits.double() - hand.open_ends).abs() / (tree.upper.double() - tree.lower)).tolist()
+    joints = (tree.moves[finger.tip] & hand.movable).nonzero()[:, 0].tolist()
+    return [f"{shares[j]:.0%} of {tree.joint_names[j]} ({ends[j]:.2f} to {limits[j]:.2f})" for j in joints if shares[j] > 0]

@@ -20,10 +20,11 @@ from dro_grasp.errors import HandError
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.hand import Hand
 
+Point = Float[np.ndarray, "3"]
+Points = Float[np.ndarray, "n 3"]
+Mask = Bool[np.ndarray, " n"]
 GRID_SPACING = 0.008
 """Spacing of candidate ball centres [m] (ours)."""
-PLANES = 32
-"""Planes of the hull that the centres are compared with at once; most centres fall to the first (ours)."""
 CLOSINGS = (0.35, 0.5, 0.65)
 """Shares of the way from open to closed at which the hand is examined (ours)."""
 EARLY_CLOSINGS = (0.1, 0.2, *CLOSINGS)
@@ -56,15 +57,13 @@ LARGEST_WIDTH = 2.5
 class Palm:
     """The palm in some frame."""
 
-    centre: Float[np.ndarray, "3"]  # middle of the inner face [m]
-    direction: Float[np.ndarray, "3"]  # unit vector towards the object
-    grasp_centre: Float[np.ndarray, "3"]  # centre of the enclosed ball [m]
+    centre: Point  # middle of the inner face [m]
+    direction: Point  # unit vector towards the object
+    grasp_centre: Point  # centre of the enclosed ball [m]
     score: float  # how well palm and fingers surround the ball [m]; higher is better
 
 
-def find_palm(
-    palm_points: Float[np.ndarray, "n 3"], palm_normals: Float[np.ndarray, "n 3"], fingers: list[Float[np.ndarray, "_ 3"]]
-) -> Palm:
+def find_palm(palm_points: Points, palm_normals: Points, fingers: list[Float[np.ndarray, "_ 3"]]) -> Palm:
     """The palm in front of which palm and fingers, given by surface points [m] and outward normals, enclose a ball best.
 
     Raises:
@@ -79,7 +78,7 @@ def find_palm(
     axes = [np.arange(a, b, GRID_SPACING) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     planes = np.unique(hull.equations.round(6), axis=0)
-    for some in np.array_split(planes, math.ceil(len(planes) / PLANES)):
+    for some in np.array_split(planes, math.ceil(len(planes) / 32)):  # most centres fall to the first planes
         grid = grid[(grid @ some[:, :3].T < -some[:, 3]).all(1)]
     tree = KDTree(palm_points)
     to_palm, nearest = map(np.asarray, tree.query(grid))
@@ -97,9 +96,7 @@ def find_palm(
     return Palm(*_face_towards(palm_points, palm_normals, centre), centre, float(score.max()))
 
 
-def _face_towards(
-    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "3"]
-) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+def _face_towards(points: Points, normals: Points, target: Point) -> tuple[Point, Point]:
     """Middle [m] and mean normal of the part of the palm's surface that is nearest to a point in front of it."""
     offset = target - points
     distance = np.linalg.norm(offset, axis=1)
@@ -114,15 +111,12 @@ def _face_towards(
 class FixedJaw:
     """The part of a palm that a finger closes on."""
 
-    mask: Bool[np.ndarray, " n"]  # the points of the hand that are on it
-    direction: Float[np.ndarray, "3"]  # unit vector from the palm to its end, along the nearly closed finger
+    mask: Mask  # the points of the hand that are on it
+    direction: Point  # unit vector from the palm to its end, along the nearly closed finger
     length: float  # how far it extends from there [m]
 
 
-def find_fixed_jaw(
-    before: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "n 3"], on_palm: Bool[np.ndarray, " n"],
-    on_finger: Bool[np.ndarray, " n"],
-) -> FixedJaw | None:
+def find_fixed_jaw(before: Points, points: Points, on_palm: Mask, on_finger: Mask) -> FixedJaw | None:
     """The jaw that a nearly closed finger approaches; None if the palm has no such part, as a flat palm or a block alone.
 
     Along the finger, the jaw begins where the part of the palm ends that the closing finger has passed.
@@ -159,13 +153,13 @@ def fixed_jaw_of(hand: Hand) -> FixedJaw | None:
     return find_fixed_jaw(before, after, *((hand.finger_of_link[hand.link_index] == part).numpy() for part in (PALM, 0)))
 
 
-def _faster(points: Float[np.ndarray, "m 3"], speed: Float[np.ndarray, " m"]) -> Float[np.ndarray, "3"] | None:
+def _faster(points: Float[np.ndarray, "m 3"], speed: Float[np.ndarray, " m"]) -> Point | None:
     """The direction in which points move faster, from the hinge outwards; None if all move alike."""
     offset = points - points.mean(0)
     gradient = np.linalg.lstsq(offset, speed - speed.mean())[0]
     return gradient if np.ptp(offset @ gradient) > SLIDING * speed.mean() else None
 
 
-def _unit(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+def _unit(vector: Point) -> Point:
     """The vector's direction; zero if it has none."""
     return vector / max(float(np.linalg.norm(vector)), 1e-12)

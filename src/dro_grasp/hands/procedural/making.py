@@ -104,17 +104,16 @@ def make_hand(seed: int) -> MadeHand:
 
 
 def why_unfit(plan: HandPlan, report: HandReport) -> str:
-    """Why a hand is drawn again; empty if it is kept.
-
-    Args:
-        plan: What was meant.
-        report: What `hand check` derived from its URDF.
-    """
+    """Why a hand, whose URDF `hand check` reads so, is drawn again; empty if it is kept."""
     hand = report.hand
     warnings = [note.text for note in report.notes if note.level == "warning"]
     if warnings:
         return f"the check warns: {warnings[0]}"
-    return _misread(plan, hand) or _overlap(plan, hand) or _idle(hand)
+    if misread := _misread(plan, hand):
+        return misread
+    assert hand.description is not None
+    depths = self_penetration(hand.description, posture(plan, hand))
+    return "its links overlap in the open hand" if max(depths.values(), default=0.0) > TOUCHING else _idle(hand)
 
 
 def _misread(plan: HandPlan, hand: Hand) -> str:
@@ -137,12 +136,6 @@ def posture(plan: HandPlan, hand: Hand) -> Float[Tensor, " n_dof"]:
     """The planned open posture [rad]."""
     angles = plan.open_posture()
     return torch.tensor([angles[name] for name in hand.tree.joint_names])
-
-
-def _overlap(plan: HandPlan, hand: Hand) -> str:
-    assert hand.description is not None
-    depths = self_penetration(hand.description, posture(plan, hand))
-    return "its links overlap in the open hand" if max(depths.values(), default=0.0) > TOUCHING else ""
 
 
 def _idle(hand: Hand) -> str:

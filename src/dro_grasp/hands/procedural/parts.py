@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from dro_grasp.hands.procedural.plan import Coupling, FingerPlan, FingerShape, PalmShape, Segment, Solid, Vector, rpy_of
 
+Point = Float[np.ndarray, "3"]
 SHARES = {1: (1.0,), 2: (0.56, 0.44), 3: (0.45, 0.30, 0.25)}
 """Shares of a finger's length, from the palm outwards, by its number of phalanges (ours; human fingers are close)."""
 TAPER = 0.93
@@ -41,9 +42,9 @@ class Style:
 class Mount:
     """Where a finger stands on the palm."""
 
-    position: Float[np.ndarray, "3"]  # its first axis, in the palm's frame [m]
-    along: Float[np.ndarray, "3"]  # direction of the straight finger
-    closing: Float[np.ndarray, "3"]  # direction in which it closes; need not be perpendicular
+    position: Point  # its first axis, in the palm's frame [m]
+    along: Point  # direction of the straight finger
+    closing: Point  # direction in which it closes; need not be perpendicular
 
     @property
     def frame(self) -> Float[np.ndarray, "3 3"]:
@@ -53,12 +54,12 @@ class Mount:
         return np.stack([x, np.cross(z, x), z], -1)
 
 
-def unit(v: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+def unit(v: Point) -> Point:
     """The direction of a vector."""
     return v / np.linalg.norm(v)
 
 
-def vector(v: Float[np.ndarray, "3"]) -> Vector:
+def vector(v: Point) -> Vector:
     """An array as the tuple that plans hold."""
     x, y, z = v.tolist()
     return x, y, z
@@ -68,7 +69,7 @@ def vector(v: Float[np.ndarray, "3"]) -> Vector:
 class Turn:
     """A joint before a finger's bending joints: it spreads a finger or turns a thumb."""
 
-    axis: Float[np.ndarray, "3"]  # unit vector in the palm's frame
+    axis: Point  # unit vector in the palm's frame
     lower: float  # [rad]
     upper: float  # [rad]
     open: float = 0.0  # angle in the open hand [rad]
@@ -104,14 +105,7 @@ def _knuckle(style: Style) -> tuple[Solid, ...]:
 
 
 def phalanx(style: Style, radius: float, length: float, tip: bool) -> tuple[Solid, ...]:
-    """A link from the joint at its origin to the next joint, or to the round end of a fingertip.
-
-    Args:
-        style: Shape and width.
-        radius: Half its thickness [m].
-        length: From the joint to the next joint, or to the end [m].
-        tip: Whether it is the last one.
-    """
+    """A link of half this thickness [m] and this length [m] from its joint to the next one, or to the round end of a tip."""
     straight = length - radius if tip else length
     middle, end = (0.0, 0.0, straight / 2), (0.0, 0.0, straight)
     if style.shape == "capsule":
@@ -160,13 +154,7 @@ class Block:
 
 
 def plate(shape: PalmShape, half: tuple[float, float], depth: float) -> tuple[Solid, ...]:
-    """A palm that faces along z, with its upper face at z = 0.
-
-    Args:
-        shape: Seen from above.
-        half: Half its extents along x and y [m].
-        depth: Along z [m].
-    """
+    """A palm of half these extents along x and y [m] that faces along z, with its upper face at z = 0."""
     x, y = half
     middle = (0.0, 0.0, -depth / 2)
     block = Solid((2 * x, 2 * y, depth), middle)

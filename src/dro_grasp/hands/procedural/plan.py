@@ -113,7 +113,7 @@ class HandPlan:
     folds_back: bool = False  # whether the limits let the fingers fold back behind the palm
 
     def open_posture(self) -> dict[str, float]:
-        """Angles of the independent joints in the open hand, by joint name [rad]."""
+        """Angles of the independent joints in the open hand, by name [rad]."""
         return {joint_name(finger, number): segment.open for finger in self.fingers
                 for number, segment in enumerate(finger.segments) if segment.follows is None}
 
