@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from dro_grasp.descriptions import bounds
+from dro_grasp.descriptions.compiling import NUMBERS
 from dro_grasp.descriptions.loader import load_description
 from dro_grasp.errors import HandError
 from dro_grasp.hands.anatomy import LONGEST_FINGER, MOST_FINGERS
@@ -118,7 +118,7 @@ def test_what_hands_have_is_within_the_bounds(tmp_path: Path) -> None:
     assert load_description(tmp_path / "b.xml").sha256 != before
 
 
-@pytest.mark.parametrize("name", [row[1] for row in bounds.NUMBERS])
+@pytest.mark.parametrize("name", [row[1] for row in NUMBERS])
 def test_every_checked_array_is_one_of_mujocos(tmp_path: Path, name: str) -> None:
     model = load_description(written(tmp_path, mjcf(), "claw.xml")).model
     assert re.fullmatch(r"\w+", name)

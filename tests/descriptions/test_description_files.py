@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from dro_grasp.descriptions.couplings import Coupling, resolve_couplings
-from dro_grasp.descriptions.urdf_meshes import as_obj, find_mesh, resolve_meshes
+from dro_grasp.descriptions.tree_reading import Coupling, resolve_couplings
+from dro_grasp.descriptions.urdf import as_obj, find_mesh, resolve_meshes
 from dro_grasp.descriptions.xml_files import included_files, parse_xml
 from dro_grasp.errors import HandError
 
@@ -21,7 +21,7 @@ HERE = Path("hand.urdf")
 def test_chains_of_followers_multiply_and_shift():
     # d follows c, c follows a; b is free.
     rules = (Coupling(2, 0, 0.5, 0.1), Coupling(3, 2, -2.0, 0.3))
-    free, coupling, offset = resolve_couplings(rules, 4, NAMES, HERE)
+    free, coupling, offset = resolve_couplings(rules, NAMES, HERE)
     assert free == [0, 1]
     for a, b in np.random.default_rng(0).uniform(-1, 1, (5, 2)):
         c = 0.5 * a + 0.1
@@ -30,7 +30,7 @@ def test_chains_of_followers_multiply_and_shift():
 
 def test_a_held_joint_and_what_follows_it_are_constant():
     rules = (Coupling(1, -1, 1.0, 0.4), Coupling(2, 1, 3.0, 0.1))
-    free, coupling, offset = resolve_couplings(rules, 3, NAMES, HERE)
+    free, coupling, offset = resolve_couplings(rules, NAMES[:3], HERE)
     assert free == [0]
     np.testing.assert_allclose(coupling[1:], 0)
     np.testing.assert_allclose(offset, [0, 0.4, 1.3])
@@ -39,7 +39,7 @@ def test_a_held_joint_and_what_follows_it_are_constant():
 @pytest.mark.parametrize("rules", [(Coupling(0, 0, 1, 0),), (Coupling(0, 1, 1, 0), Coupling(1, 2, 1, 0), Coupling(2, 0, 1, 0))])
 def test_followers_in_a_circle_are_refused(rules):
     with pytest.raises(HandError, match=r"in a cycle .a -> "):
-        resolve_couplings(rules, 3, NAMES, HERE)
+        resolve_couplings(rules, NAMES[:3], HERE)
 
 
 @pytest.mark.parametrize(("text", "word"), [

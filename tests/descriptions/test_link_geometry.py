@@ -10,8 +10,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from dro_grasp.descriptions.link_geometry import read_geometry
-from dro_grasp.descriptions.tree_reading import quaternion_matrix
+from dro_grasp.descriptions.tree_reading import quaternion_matrix, read_geometry
 
 TURN = Rotation.from_euler("xyz", [20, -35, 70], degrees=True)
 PLACE = np.array([0.01, -0.02, 0.03])

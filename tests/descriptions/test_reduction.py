@@ -7,8 +7,7 @@ from pathlib import Path
 import mujoco
 import pytest
 
-from dro_grasp.descriptions.compiling import LEAST_MASS, compile_hand
-from dro_grasp.descriptions.notes import Note
+from dro_grasp.descriptions.compiling import LEAST_MASS, Note, compile_hand
 from dro_grasp.descriptions.reduction import CONTINUOUS_LIMIT, keep_hand_only
 from dro_grasp.errors import HandError
 

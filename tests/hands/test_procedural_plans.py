@@ -13,15 +13,12 @@ import pytest
 import torch
 
 import dro_grasp as dro
-from dro_grasp.descriptions.loader import load_description
-from dro_grasp.descriptions.self_contact import self_penetration
+from dro_grasp.descriptions.loader import load_description, self_penetration
 from dro_grasp.errors import OptionError
 from dro_grasp.hands.check import check_hand
-from dro_grasp.hands.procedural.acceptance import posture, why_unfit
-from dro_grasp.hands.procedural.making import make_hand
-from dro_grasp.hands.procedural.plan import FingerPlan, HandPlan
+from dro_grasp.hands.procedural.making import make_hand, posture, why_unfit
+from dro_grasp.hands.procedural.plan import FingerPlan, HandPlan, write_urdf
 from dro_grasp.hands.procedural.sampling import sample_plan
-from dro_grasp.hands.procedural.writing import write_urdf
 from tests.helpers.claw_urdf import joint, link, written
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from trimesh.convex import convex_hull
 
-from dro_grasp.descriptions.self_contact import self_penetration
+from dro_grasp.descriptions.loader import self_penetration
 from dro_grasp.errors import HandError, ObjectError
 from dro_grasp.geometry.balls import Balls
 from dro_grasp.hands.hand import Hand

@@ -18,9 +18,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from dro_grasp.descriptions.compiling import compile_hand
-from dro_grasp.descriptions.notes import Note
+from dro_grasp.descriptions.compiling import Note, compile_hand
 
+Joints = Float[np.ndarray, " n"]  # a value of each joint
 CLOSED = 1e-3
 """Largest gap of a loop that counts as closed [m or rad] (ours)."""
 STEPS = 32
@@ -56,11 +56,6 @@ def couple_closed_loops(spec: mujoco.MjSpec, driven: Collection[str], path: Path
     Args:
         spec: The hand alone, whose joints have limits.
         driven: Names of the joints that actuators move: they lead.
-        path: The hand's file, for messages.
-        notes: Where it is said which joint follows which.
-
-    Raises:
-        HandError: MuJoCo refuses the hand, or a number of it is absurd.
     """
     if not any(e.active and not is_linear(e) for e in spec.equalities):
         return
@@ -83,10 +78,8 @@ def is_linear(equality: mujoco.MjsEquality) -> bool:
 class Group:
     """Joints that ties connect."""
 
-    joints: tuple[int, ...]
-    """Their numbers, shallow ones first."""
-    ties: tuple[int, ...]
-    """Numbers of the ties."""
+    joints: tuple[int, ...]  # their numbers, shallow ones first
+    ties: tuple[int, ...]  # numbers of the ties
 
 
 class Linkage:
@@ -108,9 +101,7 @@ class Linkage:
         springs = self.model.jnt_stiffness.reshape(self.model.njnt, -1)[:, 0].clip(0)
         self.springs = SPRING * np.sqrt(springs / max(springs.max(initial=0.0), 1e-12))
 
-    def gaps(
-        self, q: Float[np.ndarray, " n"], ties: Sequence[int]
-    ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
+    def gaps(self, q: Joints, ties: Sequence[int]) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
         """Gaps of some ties [m or rad], and their derivatives by the joints."""
         self.data.qpos[:] = q
         for step in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_tendon, mujoco.mj_makeConstraint):
@@ -151,7 +142,7 @@ class Linkage:
                 found.append(joint)
         return found
 
-    def close(self, group: Group, q: Float[np.ndarray, " n"], held: Mapping[int, float]) -> Float[np.ndarray, " n"]:
+    def close(self, group: Group, q: Joints, held: Mapping[int, float]) -> Joints:
         """The joint values near some at which the loops of a group close and its springs rest, with some joints held."""
         free = [j for j in group.joints if j not in held and self.upper[j] - self.lower[j] > 1e-9]
         q = q.copy()
@@ -160,7 +151,7 @@ class Linkage:
             return q
         before, rest = q[free].clip(self.lower[free], self.upper[free]), self.model.qpos_spring[free]
 
-        def full(x: Float[np.ndarray, " k"]) -> Float[np.ndarray, " n"]:
+        def full(x: Float[np.ndarray, " k"]) -> Joints:
             q[free] = x
             return q
 
@@ -197,7 +188,7 @@ class Linkage:
             depth, body = depth + 1, int(self.model.body_parentid[body])
         return depth
 
-    def _off_centre(self) -> Float[np.ndarray, " n"]:
+    def _off_centre(self) -> Joints:
         return self.start + OFF_CENTRE * ((self.lower + self.upper) / 2 - self.start)
 
 
@@ -208,13 +199,11 @@ class Rule:
     leader: int
     slope: float
     offset: float
-    error: float
-    """Largest distance from the rule while the leader goes through its range [rad or m]."""
-    also: tuple[int, ...]
-    """Other leaders that move the joint."""
+    error: float  # largest distance from the rule while the leader goes through its range [rad or m]
+    also: tuple[int, ...]  # other leaders that move the joint
 
     @classmethod
-    def of(cls, joint: int, sweeps: Mapping[int, Float[np.ndarray, "k n"]], reference: Float[np.ndarray, " n"]) -> Rule:
+    def of(cls, joint: int, sweeps: Mapping[int, Float[np.ndarray, "k n"]], reference: Joints) -> Rule:
         """The best rule for the leader that moves a joint most, by least squares."""
         moved = {leader: float(np.ptp(sweep[:, joint])) for leader, sweep in sweeps.items()}
         leader = max(moved, key=lambda k: moved[k])

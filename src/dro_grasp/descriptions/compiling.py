@@ -1,25 +1,51 @@
-"""Compile a hand: repair usable descriptions that MuJoCo refuses, and print nothing on the terminal."""
+"""Compile a hand: repair what MuJoCo refuses, refuse numbers that no hand has, and print nothing on the terminal."""
 
 from __future__ import annotations
 
+import math
 import re
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import mujoco
+import numpy as np
+from jaxtyping import Float
 
-from dro_grasp.descriptions.bounds import check_numbers, limit_notes
-from dro_grasp.descriptions.notes import Note
 from dro_grasp.errors import HandError
 
 LEAST_MASS = 1e-4
 """Mass of moving links that state none, or a negative one [kg] (ours)."""
 LEAST_INERTIA = 1e-8
 """Inertia of moving links that state none [kg m^2] (ours)."""
-MOST_REPAIRS = 64
-"""Number of repairs after which compiling fails (ours)."""
+MOST_JOINTS = 100
+"""Most joints that move (ours); a humanoid with two hands has some 80."""
+LONGEST = 10.0
+"""Largest coordinate, size or travel of a slide [m] (ours)."""
+MOST_TURN = 25.0
+"""Largest limit of a joint that turns [rad] (ours): four turns; no finger, wrist or arm makes more than two either way. In
+degrees, the limits of a finger are beyond it."""
+LEAST_TURN = 0.1
+"""Range of a hand's widest turning joint below which its limits look like radians that were read as degrees [rad] (ours)."""
+TURNS = 1e4
+"""Largest reference angle [rad], and largest ratio or offset of a coupling (ours)."""
+HEAVIEST = 1e4
+"""Largest mass [kg] and inertia [kg m^2] (ours)."""
+NUMBERS = (
+    ("link", "body_pos", "origin", LONGEST), ("link", "body_quat", "rotation", 2.0),
+    ("shape", "geom_pos", "origin", LONGEST), ("shape", "geom_quat", "rotation", 2.0), ("shape", "geom_size", "size", LONGEST),
+    ("vertex", "mesh_vert", "vertex", LONGEST), ("joint", "jnt_pos", "anchor", LONGEST),
+    ("link", "body_ipos", "centre of mass", LONGEST), ("link", "body_mass", "mass", HEAVIEST),
+    ("link", "body_inertia", "inertia", HEAVIEST), ("joint", "jnt_axis", "axis", 2.0),
+    ("joint", "jnt_range", "limits", MOST_TURN), ("joint", "qpos0", "reference", TURNS),
+    ("joint", "qpos_spring", "spring's reference", TURNS), ("joint", "jnt_stiffness", "stiffness", 1e9),
+    ("coupling", "eq_data", "coefficients", TURNS),
+)
+"""Numbers of a compiled model: the kind of their owner, the array, what it means, and the largest value. Lengths come before
+masses, which MuJoCo derives from them where a file states none."""
 
 
 @contextmanager
@@ -32,14 +58,10 @@ def mujoco_speaks_to(notes: list[Note], path: Path) -> Iterator[None]:
             warnings.simplefilter("ignore")
             yield
     except ValueError as error:
-        raise HandError(f"{path} cannot be read: {one_line(error)}") from error
+        lines = [line.strip() for line in str(error).strip().splitlines()]
+        raise HandError(f"{path} cannot be read: {'; '.join(filter(None, lines))}") from error
     finally:
         mujoco.set_mju_user_warning(before)
-
-
-def one_line(error: Exception) -> str:
-    """A message of MuJoCo on one line."""
-    return "; ".join(line.strip() for line in str(error).strip().splitlines() if line.strip())
 
 
 def compile_hand(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> mujoco.MjModel:
@@ -48,24 +70,19 @@ def compile_hand(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> mujoco.M
     Raises:
         HandError: MuJoCo refuses the description for a reason that cannot be repaired, or a number is absurd.
     """
+    for body in list(spec.bodies)[1:]:
+        if body.mass < 0:  # MuJoCo may raise it to its least without a word
+            notes.append(Note("warning", body.name, f"states a mass of {body.mass:g} kg; taken as {LEAST_MASS:g} kg"))
+            body.mass = LEAST_MASS
     with mujoco_speaks_to(notes, path):
-        _settle_masses(spec, notes)
         model = _compile(spec, notes)
-    check_numbers(model, path)
-    notes.extend(limit_notes(model))
+    _check_numbers(model, path)
+    notes.extend(_limit_notes(model))
     return model
 
 
-def _settle_masses(spec: mujoco.MjSpec, notes: list[Note]) -> None:
-    """Take the least mass where a link states a negative one, which MuJoCo may raise to its least without a word."""
-    for body in list(spec.bodies)[1:]:
-        if body.mass < 0:
-            notes.append(Note("warning", body.name, f"states a mass of {body.mass:g} kg; taken as {LEAST_MASS:g} kg"))
-            body.mass = LEAST_MASS
-
-
 def _compile(spec: mujoco.MjSpec, notes: list[Note]) -> mujoco.MjModel:
-    for _ in range(MOST_REPAIRS):
+    for _ in range(64):  # repairs, after which it fails
         try:
             return spec.copy().compile()
         except ValueError as error:
@@ -108,3 +125,81 @@ def _repair(spec: mujoco.MjSpec, message: str, notes: list[Note]) -> bool:
         notes.append(Note("warning", "inertia", "some links have impossible inertias, which are balanced"))
         return True
     return False
+
+
+def _check_numbers(model: mujoco.MjModel, path: Path) -> None:
+    """Refuse numbers of a compiled hand that are not finite, or beyond all that a hand has; name their owner."""
+    for j in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE):
+        if np.abs(model.jnt_range[j]).max() > LONGEST:
+            raise HandError(f"{path}: the limits of joint '{model.joint(j).name}' are {_told(model.jnt_range[j])} m; expected "
+                            f"at most {LONGEST:g} m; this looks like millimetres: scale the file by 0.001")
+    for kind, array, what, largest in NUMBERS:
+        values = np.asarray(getattr(model, array), float)
+        values = values[:, None] if values.ndim == 1 else values[:, :4]
+        bad = np.flatnonzero(~(np.abs(values) <= largest).all(1))
+        if len(bad):
+            raise HandError(f"{path}: the {what} of {_owner(model, kind, int(bad[0]))} is {_told(values[bad[0]])}; expected "
+                            f"finite numbers of at most {largest:g}, in metres, radians and kilograms"
+                            f"{_hint(what, values[bad[0]], largest)}")
+
+
+def guess_unit(spec: mujoco.MjSpec) -> list[Note]:
+    """Take the angles of an MJCF file that states no unit as radians, in place, if no joint would turn as degrees."""
+    turns = [joint.range[1] - joint.range[0] for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_HINGE]
+    if not (spec.compiler.degree and 0 < max(turns, default=0.0) < math.degrees(LEAST_TURN)):
+        return []
+    spec.compiler.degree = False
+    return [Note("warning", "limits", f"no joint would turn by more than {max(turns):.2g} degrees, MJCF's unit where none is "
+                 'stated; taken as radians: state <compiler angle="radian"/>')]
+
+
+def _limit_notes(model: mujoco.MjModel) -> list[Note]:
+    """A question if no joint of a hand turns by more than a few degrees."""
+    turns = np.ptp(model.jnt_range[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE], axis=1)
+    if not 0 < turns.max(initial=0.0) < LEAST_TURN:
+        return []
+    return [Note("warning", "limits", f"no joint turns by more than {turns.max():.2g} rad; if the limits are radians, say so: "
+                 'without <compiler angle="radian"/> MJCF has degrees')]
+
+
+def _hint(what: str, values: Float[np.ndarray, " n"], largest: float) -> str:
+    """What numbers beyond all bounds may be, if they are finite."""
+    if not np.isfinite(values).all():
+        return ""
+    if what in {"mass", "inertia"}:
+        return "; if the file does not state it, its shapes are in another unit than metres: scale the file"
+    if what == "limits":
+        return "; this looks like degrees: write radians, or leave the limits out where a joint has none"
+    return "; this looks like millimetres: scale the file by 0.001" if largest == LONGEST else ""
+
+
+def _owner(model: mujoco.MjModel, kind: str, index: int) -> str:
+    """The element that an entry of an array belongs to, in words."""
+    if kind == "shape":
+        return f"a shape of link '{model.body(int(model.geom_bodyid[index])).name}'"
+    if kind == "coupling":
+        of_joint, first = model.eq_type[index] == mujoco.mjtEq.mjEQ_JOINT, int(model.eq_obj1id[index])
+        return f"the coupling of joint '{model.joint(first).name}'" if of_joint else f"the tie number {index}"
+    if kind == "vertex":
+        return f"mesh '{model.mesh(int(np.searchsorted(model.mesh_vertadr, index, 'right')) - 1).name}'"
+    return f"{kind} '{(model.body if kind == 'link' else model.joint)(index).name}'"
+
+
+def _told(values: Float[np.ndarray, " n"]) -> str:
+    return " ".join(f"{x:g}" for x in values)
+
+
+@dataclass(frozen=True)
+class Note:
+    """One thing that loading derived, repaired or found wrong."""
+
+    level: Literal["info", "warning", "error"]
+    subject: str  # the link, joint or file concerned
+    text: str
+
+
+def collide(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Find the contacts at the joint values of `data.qpos`, without any step of time, forces or velocities."""
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_collision(model, data)

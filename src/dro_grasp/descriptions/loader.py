@@ -16,22 +16,20 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from jaxtyping import Float
+from torch import Tensor
 
-from dro_grasp.descriptions.bounds import guess_unit
-from dro_grasp.descriptions.compiling import compile_hand, mujoco_speaks_to
-from dro_grasp.descriptions.couplings import Coupling
-from dro_grasp.descriptions.link_geometry import LinkGeometry, read_geometry
-from dro_grasp.descriptions.notes import Note
-from dro_grasp.descriptions.open_posture import open_key, open_state
+from dro_grasp.descriptions.compiling import Note, collide, compile_hand, guess_unit, mujoco_speaks_to
 from dro_grasp.descriptions.part import arm_in_mjcf, arm_in_urdf, named, part_of_mjcf, part_of_urdf
 from dro_grasp.descriptions.reduction import keep_hand_only
-from dro_grasp.descriptions.tree_reading import contradicted_limits, read_couplings, read_tree
-from dro_grasp.descriptions.urdf import prepare_urdf
-from dro_grasp.descriptions.urdf_meshes import as_obj
+from dro_grasp.descriptions.tree_reading import Coupling, LinkGeometry, read_couplings, read_geometry, read_tree
+from dro_grasp.descriptions.urdf import as_obj, prepare_urdf
 from dro_grasp.descriptions.xml_files import included_files, parse_xml
 from dro_grasp.errors import HandError
 from dro_grasp.files import given_path
 from dro_grasp.kinematics.tree import KinematicTree
+
+OPEN = "open"
+"""Name of the state or keyframe (ours; MoveIt's own examples use it)."""
 
 
 def load_description(path: Path | str, link: str | None = None, *, arm: bool = False) -> Description:
@@ -68,8 +66,7 @@ def load_description(path: Path | str, link: str | None = None, *, arm: bool = F
         raise HandError(f"{path} starts with <{root.tag}>; expected a URDF (<robot>) or MJCF (<mujoco>) file")
     notes.extend(keep_hand_only(spec, path, fixed_base=arm))
     model = compile_hand(spec, path, notes)
-    tree = read_tree(model, read_couplings(model), path)
-    notes.extend(contradicted_limits(model, tree))
+    tree = read_tree(model, path, notes)
     return Description(path.resolve(), link, spec, model, tree, _digest(path, files, link), tuple(notes), stated)
 
 
@@ -77,19 +74,13 @@ def load_description(path: Path | str, link: str | None = None, *, arm: bool = F
 class Description:
     """The content of a hand's file. Each body of the compiled model is a link; the first one is the root, at identity."""
 
-    path: Path
-    """The file."""
-    link: str | None
-    """The link at which the hand that was read begins, or at which the arm ends; None for the whole file."""
+    path: Path  # the file
+    link: str | None  # the link at which the hand that was read begins, or at which the arm ends; None for the whole file
     _spec: mujoco.MjSpec
-    model: mujoco.MjModel
-    """The hand alone, compiled."""
-    tree: KinematicTree
-    """The kinematic tree, with couplings resolved."""
-    sha256: str
-    """Hash of the file, of the files it uses, and of the part's name."""
-    notes: tuple[Note, ...]
-    """Findings and repairs."""
+    model: mujoco.MjModel  # the hand alone, compiled
+    tree: KinematicTree  # the kinematic tree, with couplings resolved
+    sha256: str  # hash of the file, of the files it uses, and of the part's name
+    notes: tuple[Note, ...]  # findings and repairs
     open_posture: Mapping[str, float]
     """The open posture that the file, or the SRDF beside it, states, by joint [rad or m]; empty if it states none."""
 
@@ -133,11 +124,10 @@ class Description:
 
 
 def _read_urdf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.MjSpec, tuple[Path, ...]]:
-    prepared = prepare_urdf(root, path)
-    notes.extend(prepared.notes)
-    assets = {name: as_obj(file) for name, file in prepared.converted.items()}
+    xml, files, converted = prepare_urdf(root, path, notes)
+    assets = {name: as_obj(file) for name, file in converted.items()}
     with mujoco_speaks_to(notes, path):
-        return mujoco.MjSpec.from_string(prepared.xml, assets=assets), prepared.mesh_files
+        return mujoco.MjSpec.from_string(xml, assets=assets), tuple(files)
 
 
 def _read_mjcf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.MjSpec, tuple[Path, ...]]:
@@ -163,3 +153,48 @@ def _digest(path: Path, files: tuple[Path, ...], link: str | None) -> str:
     for file in (path, *sorted(set(files), key=os.fspath)):
         digest.update(file.read_bytes())
     return digest.hexdigest()
+
+
+def open_state(srdf: Path) -> dict[str, float]:
+    """Joint values of every `<group_state name="open">` of an SRDF file [rad or m]; empty if it has none.
+
+    Raises:
+        HandError: The file is not valid XML, or a value is not a number.
+    """
+    stated = {}
+    for state in parse_xml(srdf).iter("group_state"):
+        for joint in state.iter("joint") if state.get("name") == OPEN else ():
+            try:
+                stated[joint.get("name", "")] = float(joint.get("value", ""))
+            except ValueError as error:
+                raise HandError(f"{srdf}: the state '{OPEN}' has value=\"{joint.get('value')}\" for joint "
+                                f"'{joint.get('name')}'; expected one number") from error
+    return stated
+
+
+def open_key(spec: mujoco.MjSpec) -> dict[str, float]:
+    """Joint values of the keyframe `open` of an MJCF [rad or m]; empty if it has none."""
+    if not any(key.name == OPEN for key in spec.keys):
+        return {}
+    model = spec.copy().compile()
+    values = model.key_qpos[model.key(OPEN).id]
+    single = {int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)}
+    joints = [j for j in range(model.njnt) if int(model.jnt_type[j]) in single]
+    return {model.joint(j).name: float(values[model.jnt_qposadr[j]]) for j in joints}
+
+
+def self_penetration(description: Description, q: Float[Tensor, " n_dof"]) -> dict[tuple[str, str], float]:
+    """Depth [m] by the names of each two links that penetrate each other at these joints; neighbours in the tree may."""
+    model, tree = description.model, description.tree
+    data = mujoco.MjData(model)
+    angles = (tree.coupling @ q.double().to(tree.coupling) + tree.offset).tolist()
+    for name, angle in zip(tree.moving_names, angles, strict=True):
+        data.qpos[model.joint(name).qposadr[0]] = angle
+    collide(model, data)
+    depths: dict[tuple[str, str], float] = {}
+    for contact in data.contact:
+        first, second = sorted(int(model.geom_bodyid[g]) for g in contact.geom)
+        if contact.dist < 0 and first not in (second, int(model.body_parentid[second])):
+            pair = model.body(first).name, model.body(second).name
+            depths[pair] = max(depths.get(pair, 0.0), -float(contact.dist))
+    return depths

@@ -1,10 +1,13 @@
-"""Take a part of a file that holds a whole robot: the hand, by the link at which it begins, or the arm that carries it."""
+"""Take a part of a file that holds a whole robot: the hand, by the link at which it begins, or the arm that carries it.
+
+All raise HandError if there is no such link.
+"""
 
 from __future__ import annotations
 
 import difflib
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import mujoco
@@ -31,11 +34,7 @@ def split_part(name: str) -> tuple[str, str | None]:
 
 
 def part_of_urdf(root: ET.Element, link: str, path: Path) -> None:
-    """Keep, in place, a link of a URDF and what hangs on it.
-
-    Raises:
-        HandError: There is no such link.
-    """
+    """Keep, in place, a link of a URDF and what hangs on it."""
     ends = _ends(root)
     kept = _below(ends, link)
     _require(link, [element.get("name", "") for element in root.findall("link")], path)
@@ -48,11 +47,7 @@ def part_of_urdf(root: ET.Element, link: str, path: Path) -> None:
 
 
 def arm_in_urdf(root: ET.Element, link: str, path: Path) -> None:
-    """Keep, in place, all of a URDF but a hand; of the link at which it begins, a frame. Only joints that move this frame move.
-
-    Raises:
-        HandError: There is no such link.
-    """
+    """Keep, in place, all of a URDF but a hand; of the link at which it begins, a frame. Only joints that move it move."""
     _require(link, [element.get("name", "") for element in root.findall("link")], path)
     ends = _ends(root)
     hand, carriers = _below(ends, link), {link}
@@ -63,20 +58,17 @@ def arm_in_urdf(root: ET.Element, link: str, path: Path) -> None:
             root.remove(joint)
         elif below not in carriers:
             joint.set("type", "fixed")
-            _remove_all(joint, {"mimic"})
+            for mimic in joint.findall("mimic"):
+                joint.remove(mimic)
     for element in root.findall("link"):
         if element.get("name") == link:
-            _remove_all(element, {"visual", "collision", "inertial"})
+            element[:] = [child for child in element if child.tag not in {"visual", "collision", "inertial"}]
         elif element.get("name") in hand:
             root.remove(element)
 
 
 def arm_in_mjcf(spec: mujoco.MjSpec, link: str, path: Path) -> None:
-    """The same of an MJCF, in place; its keyframes are lost.
-
-    Raises:
-        HandError: There is no such body.
-    """
+    """The same of an MJCF, in place; its keyframes are lost."""
     _require(link, [body.name for body in list(spec.bodies)[1:]], path)
     hand = spec.body(link)
     for item in [*hand.bodies, *hand.geoms, *spec.keys]:
@@ -91,11 +83,7 @@ def arm_in_mjcf(spec: mujoco.MjSpec, link: str, path: Path) -> None:
 
 
 def part_of_mjcf(spec: mujoco.MjSpec, link: str, path: Path) -> mujoco.MjSpec:
-    """A body of an MJCF and what hangs on it, with the couplings, tendons, actuators and keyframes of its joints.
-
-    Raises:
-        HandError: There is no such body, or MuJoCo cannot take it out.
-    """
+    """A body of an MJCF and what hangs on it, with the couplings, tendons, actuators and keyframes of its joints."""
     _require(link, [body.name for body in list(spec.bodies)[1:]], path)
     part = mujoco.MjSpec()
     part.compiler.degree = spec.compiler.degree
@@ -110,7 +98,8 @@ def part_of_mjcf(spec: mujoco.MjSpec, link: str, path: Path) -> mujoco.MjSpec:
 
 def _ends(root: ET.Element) -> dict[ET.Element, tuple[str, str]]:
     """Parent and child link of every joint of a URDF."""
-    return {joint: (_end(joint, "parent"), _end(joint, "child")) for joint in root.findall("joint")}
+    link_of = lambda end: "" if end is None else end.get("link", "")  # noqa: E731
+    return {joint: (link_of(joint.find("parent")), link_of(joint.find("child"))) for joint in root.findall("joint")}
 
 
 def _below(ends: Mapping[ET.Element, tuple[str, str]], link: str) -> set[str]:
@@ -119,16 +108,6 @@ def _below(ends: Mapping[ET.Element, tuple[str, str]], link: str) -> set[str]:
     while grown := {below for above, below in ends.values() if above in found} - found:
         found |= grown
     return found
-
-
-def _remove_all(element: ET.Element, tags: Collection[str]) -> None:
-    for child in [child for child in element if child.tag in tags]:
-        element.remove(child)
-
-
-def _end(joint: ET.Element, which: str) -> str:
-    element = joint.find(which)
-    return "" if element is None else element.get("link", "")
 
 
 def _require(link: str, links: Sequence[str], path: Path) -> None:

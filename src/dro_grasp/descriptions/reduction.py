@@ -7,19 +7,14 @@ from pathlib import Path
 
 import mujoco
 
-from dro_grasp.descriptions.bounds import MOST_JOINTS
 from dro_grasp.descriptions.closed_loops import couple_closed_loops, driven_joints, is_linear
-from dro_grasp.descriptions.notes import Note
+from dro_grasp.descriptions.compiling import MOST_JOINTS, Note
 from dro_grasp.errors import HandError
 
 NO_LIMITS = "states no limits"
 """Beginning of the note of a joint whose limits had to be assumed."""
 CONTINUOUS_LIMIT = math.pi
 """Limits of hinges that state none, both ways from zero [rad] (ours)."""
-LOOPS = frozenset({mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD})
-"""Kinds of ties between two bodies."""
-AS_FREE = "within its joints' limits; it is left out, and they move freely"
-"""End of the notes of ties that cannot hold."""
 SLIDE_LIMIT = 0.05
 """Limits of slides that state none, both ways from zero [m] (ours)."""
 
@@ -27,12 +22,7 @@ SLIDE_LIMIT = 0.05
 def keep_hand_only(spec: mujoco.MjSpec, path: Path, *, fixed_base: bool = False) -> tuple[Note, ...]:
     """Reduce a file, in place, to its largest articulated body tree, with its root at identity.
 
-    Actuators, sensors, cameras, lights and everything else that is not the hand are deleted.
-
-    Args:
-        spec: The file.
-        path: Where it is, for messages.
-        fixed_base: Whether the root stands still; else the joints that move all of the hand are deleted, too.
+    Everything else that is not the hand is deleted, and unless the base is fixed the joints that move all of the hand, too.
 
     Raises:
         HandError: Nothing moves, or a joint is neither a hinge nor a slide.
@@ -85,14 +75,10 @@ def _largest_tree(spec: mujoco.MjSpec, path: Path) -> mujoco.MjsBody:
     roots = list(spec.worldbody.bodies)
     if not roots:
         raise HandError(f"{path} has no body; expected a hand with moving joints")
-    counts = [sum(j.type != mujoco.mjtJoint.mjJNT_FREE for j in _all_joints(r)) for r in roots]
+    counts = [sum(j.type != mujoco.mjtJoint.mjJNT_FREE for j in r.find_all("joint")) for r in roots]
     if max(counts) == 0:
         raise HandError(f"{path} has no moving joint; a hand needs at least one revolute or prismatic joint")
     return roots[counts.index(max(counts))]
-
-
-def _all_joints(body: mujoco.MjsBody) -> list[mujoco.MjsJoint]:
-    return [*body.joints, *(j for child in body.bodies for j in _all_joints(child))]
 
 
 def _name_everything(spec: mujoco.MjSpec) -> list[Note]:
@@ -140,7 +126,7 @@ def _couple_tendons(spec: mujoco.MjSpec, notes: list[Note]) -> None:
 
 def _keep_joint_equalities(spec: mujoco.MjSpec, notes: list[Note]) -> None:
     """Keep only couplings that the kinematic tree can state, so simulation and kinematics agree."""
-    joints = {joint.name for joint in spec.joints}
+    joints, bodies = {joint.name for joint in spec.joints}, {body.name for body in list(spec.bodies)[1:]}
     for equality in list(spec.equalities):
         inside = equality.name1 in joints and (not equality.name2 or equality.name2 in joints)
         if equality.type == mujoco.mjtEq.mjEQ_JOINT and equality.active and inside:
@@ -149,18 +135,16 @@ def _keep_joint_equalities(spec: mujoco.MjSpec, notes: list[Note]) -> None:
                 notes.append(Note("warning", equality.name1, f"follows '{equality.name2}' by a polynomial; only its linear "
                                   "part is kept"))
             continue
-        if equality.active and equality.type == mujoco.mjtEq.mjEQ_TENDON:
-            notes.append(Note("warning", equality.name1, f"is a tendon whose length cannot stay {AS_FREE}"))
-        elif equality.active and equality.type in LOOPS and _within(spec, equality):
-            tied = f"is tied to '{equality.name2}' in a loop that cannot close"
-            notes.append(Note("warning", equality.name1, f"{tied} {AS_FREE}"))
+        lost = ""
+        if equality.type == mujoco.mjtEq.mjEQ_TENDON:
+            lost = "is a tendon whose length cannot stay"
+        elif equality.type in {mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD} and (
+                equality.objtype != mujoco.mjtObj.mjOBJ_BODY or {equality.name1, equality.name2} <= bodies):
+            lost = f"is tied to '{equality.name2}' in a loop that cannot close"
+        if lost and equality.active:
+            text = f"{lost} within its joints' limits; it is left out, and they move freely"
+            notes.append(Note("warning", equality.name1, text))
         spec.delete(equality)
-
-
-def _within(spec: mujoco.MjSpec, equality: mujoco.MjsEquality) -> bool:
-    """Whether both ends of a tie are bodies of the hand."""
-    bodies = {body.name for body in list(spec.bodies)[1:]}
-    return equality.objtype != mujoco.mjtObj.mjOBJ_BODY or {equality.name1, equality.name2} <= bodies
 
 
 def _check_joints(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
@@ -184,7 +168,6 @@ def _check_joints(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
 
 
 def _let_visuals_collide(spec: mujoco.MjSpec, notes: list[Note]) -> None:
-    """Let a hand without any collision shape collide with its visual shapes."""
     if any(g.contype or g.conaffinity for g in spec.geoms):
         return
     for geom in spec.geoms:

@@ -1,59 +1,47 @@
-"""Prepare a URDF in memory for MuJoCo: check links and joints, find meshes, name the root link. No file is changed.
-
-The result is an XML string that MuJoCo reads, with notes on every finding.
-"""
+"""Prepare a URDF in memory for MuJoCo: check links and joints, find meshes, name the root link. No file is changed."""
 
 from __future__ import annotations
 
+import copy
+import hashlib
 import math
+import os
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import unquote
 
-from dro_grasp.descriptions.bounds import DEEPEST
-from dro_grasp.descriptions.compiling import LEAST_INERTIA, LEAST_MASS
-from dro_grasp.descriptions.notes import Note
-from dro_grasp.descriptions.urdf_meshes import resolve_meshes
+from dro_grasp.descriptions.compiling import LEAST_INERTIA, LEAST_MASS, Note
+from dro_grasp.descriptions.xml_files import DEEPEST
 from dro_grasp.errors import HandError
+from dro_grasp.files import reading
+from dro_grasp.geometry.mesh_files import open_mesh
 
 MOVING = {"revolute", "continuous", "prismatic"}
 """URDF joint types with one degree of freedom."""
-RENAMED_WORLD = "world_link"
-"""Name of a link that its file calls `world`, which is MuJoCo's name for the ground."""
 
 
-@dataclass(frozen=True)
-class PreparedUrdf:
-    """A URDF ready for MuJoCo."""
-
-    xml: str
-    """The description as MuJoCo reads it."""
-    notes: tuple[Note, ...]
-    """Findings and repairs."""
-    mesh_files: tuple[Path, ...]
-    """Every mesh file in use."""
-    converted: dict[str, Path]
-    """Meshes in formats that MuJoCo cannot read (GLB, DAE, ...), by the file names that stand in for them."""
-
-
-def prepare_urdf(root: ET.Element, path: Path) -> PreparedUrdf:
+def prepare_urdf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[str, list[Path], dict[str, Path]]:
     """Check the link tree, resolve meshes and set MuJoCo's options.
+
+    Returns:
+        XML for MuJoCo, the mesh files in use, and those that MuJoCo cannot read (GLB, DAE, ...) by the names that stand in.
 
     Raises:
         HandError: A name is used twice, a number is not one, no joint moves, links form a cycle or several trees, or no mesh
             is found.
     """
-    notes: list[Note] = []
     _check_names(root, path)
     _settle_joints(root, path, notes)
     _drop_empty_shapes(root, path, notes)
     base = _check_links(root, path)
     if base == "world":
-        _rename_link(root, "world", RENAMED_WORLD)
-        notes.append(Note("info", "world", f"is MuJoCo's name for the ground; this link is called '{RENAMED_WORLD}' here "
-                          "and in exported files"))
-    _check_mimic(root, path, notes)
+        for place, attribute in (("link", "name"), ("joint/parent", "link"), ("joint/child", "link")):
+            for element in root.findall(f"{place}[@{attribute}='world']"):
+                element.set(attribute, "world_link")
+        notes.append(Note("info", "world", "is MuJoCo's name for the ground; this link is called 'world_link' here and in "
+                          "exported files"))
+    _check_mimic(root, notes)
     files, converted = resolve_meshes(root, path, notes)
     extension = root.find("mujoco")
     extension = ET.SubElement(root, "mujoco") if extension is None else extension
@@ -63,7 +51,7 @@ def prepare_urdf(root: ET.Element, path: Path) -> PreparedUrdf:
         compiler.attrib.pop(stale, None)
     compiler.attrib.update(discardvisual="false", fusestatic="false", balanceinertia="true", boundmass=str(LEAST_MASS),
                            boundinertia=str(LEAST_INERTIA), strippath="false")
-    return PreparedUrdf(ET.tostring(root, encoding="unicode"), tuple(notes), tuple(files), converted)
+    return ET.tostring(root, encoding="unicode"), files, converted
 
 
 def _check_names(root: ET.Element, path: Path) -> None:
@@ -85,19 +73,13 @@ def _settle_joints(root: ET.Element, path: Path, notes: list[Note]) -> None:
             raise HandError(f"{path}: joint '{name}' has the type '{kind}'; expected one of "
                             f"{', '.join(sorted(MOVING))}, fixed, floating")
         elif kind != "fixed":
-            _check_axis(joint, path)
+            for element in joint.findall("axis"):
+                axis = _numbers(element, "xyz", path, _called(joint))
+                if len(axis) != 3 or math.hypot(*axis) < 1e-6:
+                    raise HandError(f"{path}: joint '{name}' has the axis '{element.get('xyz')}'; expected a direction of "
+                                    "three numbers, not all zero")
             if kind != "continuous":
                 _check_limits(joint, path, notes)
-
-
-def _check_axis(joint: ET.Element, path: Path) -> None:
-    element = joint.find("axis")
-    if element is None:
-        return
-    axis = _numbers(element, "xyz", path, _called(joint))
-    if len(axis) != 3 or math.hypot(*axis) < 1e-6:
-        raise HandError(f"{path}: joint '{joint.get('name')}' has the axis '{element.get('xyz')}'; expected a direction "
-                        "of three numbers, not all zero")
 
 
 def _check_limits(joint: ET.Element, path: Path, notes: list[Note]) -> None:
@@ -123,12 +105,11 @@ def _drop_empty_shapes(root: ET.Element, path: Path, notes: list[Note]) -> None:
     """Remove boxes, spheres and cylinders without extent, which MuJoCo refuses."""
     for link in root.findall("link"):
         for element in [*link.findall("visual"), *link.findall("collision")]:
-            shape = element.find("geometry/*")
-            sizes = [] if shape is None else [
-                x for name in ("size", "radius", "length") if name in shape.attrib
-                for x in _numbers(shape, name, path, _called(link))
-            ]
-            if shape is not None and sizes and min(sizes) <= 0:
+            for shape in element.findall("geometry/*")[:1]:
+                stated = [name for name in ("size", "radius", "length") if name in shape.attrib]
+                sizes = [x for name in stated for x in _numbers(shape, name, path, _called(link))]
+                if min(sizes, default=1.0) > 0:
+                    continue
                 link.remove(element)
                 notes.append(Note("warning", link.get("name", ""), f"{element.tag} {shape.tag} of size "
                                   f"{' '.join(f'{x:g}' for x in sizes)} has no volume and is left out"))
@@ -191,30 +172,94 @@ def _link_of(joint: ET.Element, end: str, links: Iterable[str], path: Path) -> s
     return name
 
 
-def _rename_link(root: ET.Element, old: str, new: str) -> None:
-    """Rename a link: MuJoCo reserves the name `world`."""
-    for link in root.findall("link"):
-        if link.get("name") == old:
-            link.set("name", new)
+def _check_mimic(root: ET.Element, notes: list[Note]) -> None:
+    kinds = {joint.get("name"): joint.get("type") for joint in root.findall("joint")}
     for joint in root.findall("joint"):
-        for end in ("parent", "child"):
-            element = joint.find(end)
-            if element is not None and element.get("link") == old:
-                element.set("link", new)
+        for mimic in joint.findall("mimic"):
+            kind = kinds.get(target := mimic.get("joint", ""), "missing")
+            if kind not in MOVING:
+                notes.append(Note("warning", joint.get("name", ""), f"mimics joint '{target}', which is {kind}; the joint is "
+                                  "taken as free"))
+                joint.remove(mimic)
 
 
-def _check_mimic(root: ET.Element, path: Path, notes: list[Note]) -> None:
-    """Drop mimic tags of joints that do not move; refuse cycles of followers."""
-    joints = {j.get("name", ""): j for j in root.findall("joint")}
-    leader = {name: j.find("mimic").get("joint", "") for name, j in joints.items() if j.find("mimic") is not None}  # type: ignore[union-attr]
-    for name, target in leader.items():
-        chain = [name]
-        while chain[-1] in leader:
-            chain.append(leader[chain[-1]])
-            if chain[-1] in chain[:-1]:
-                raise HandError(f"{path}: mimic joints follow each other in a cycle ({' -> '.join(chain)}); one of "
-                                "them must be free")
-        kind = joints[target].get("type") if target in joints else "missing"
-        if kind not in MOVING:
-            notes.append(Note("warning", name, f"mimics joint '{target}', which is {kind}; the joint is taken as free"))
-            joints[name].remove(joints[name].find("mimic"))  # type: ignore[arg-type]
+def resolve_meshes(root: ET.Element, path: Path, notes: list[Note]) -> tuple[list[Path], dict[str, Path]]:
+    """Point every mesh to its file, in place; drop shapes whose mesh cannot be found, if any shape is left.
+
+    Returns:
+        The mesh files in use, and those in formats that MuJoCo cannot read by the names that stand in for them.
+
+    Raises:
+        HandError: No mesh can be found, and there is no other shape.
+    """
+    files: dict[str, Path] = {}
+    missing: list[str] = []
+    for link in root.iter("link"):
+        lost = [element for element in [*link.findall("visual"), *link.findall("collision")]
+                if not _resolve_mesh(element, path.parent, files)]
+        for element in lost:
+            name = element.find("geometry/mesh").get("filename", "")  # type: ignore[union-attr]
+            missing.append(name)
+            link.remove(element)
+            notes.append(Note("warning", link.get("name", ""), f"{element.tag} mesh '{name}' was not found and is left out"))
+        if any(element.tag == "collision" for element in lost) and link.find("collision") is None:
+            _collide_with_visuals(link, notes)
+    if missing and not files and root.find("link/*/geometry") is None:
+        looked = ", ".join(str(p) for p in _candidates(missing[0], path.parent)[:4])
+        raise HandError(f"{path}: none of its {len(missing)} meshes can be found (first: '{missing[0]}'; looked for "
+                        f"{looked}); put the meshes beside the URDF or correct the file names")
+    converted = {name: file for name, file in files.items() if name != str(file)}
+    return list(files.values()), converted
+
+
+def _resolve_mesh(element: ET.Element, folder: Path, files: dict[str, Path]) -> bool:
+    """Point a shape's mesh to its file, or to a name that stands in for it; False if there is no such file."""
+    mesh = element.find("geometry/mesh")
+    if mesh is None:
+        return True
+    name = mesh.get("filename", "")
+    file = find_mesh(name, folder)
+    if file is None:
+        return False
+    readable = file.suffix.lower() in {".stl", ".obj", ".msh"}  # by MuJoCo; trimesh converts the others
+    stand_in = str(file) if readable else hashlib.sha256(name.encode()).hexdigest()[:16] + ".obj"
+    mesh.set("filename", stand_in)
+    files[stand_in] = file
+    return True
+
+
+def as_obj(file: Path) -> bytes:
+    """A mesh in any format trimesh reads, as OBJ text."""
+    import trimesh
+
+    # trimesh alone is called here, and its many readers raise whatever they stumble over.
+    with reading(f"mesh {file}", HandError, "STL, OBJ, GLB, DAE or PLY, whole", Exception):
+        loaded = open_mesh(file)
+        mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
+        return trimesh.exchange.obj.export_obj(mesh, include_normals=False, include_texture=False).encode()
+
+
+def _collide_with_visuals(link: ET.Element, notes: list[Note]) -> None:
+    """Let a link whose collision meshes are all missing collide with its visual shapes."""
+    visuals = link.findall("visual")
+    for visual in visuals:
+        shape = copy.deepcopy(visual)
+        shape.tag = "collision"
+        link.append(shape)
+    if visuals:
+        notes.append(Note("warning", link.get("name", ""), "collides with its visual shapes instead"))
+
+
+def _candidates(name: str, folder: Path) -> list[Path]:
+    """Paths at which a mesh may lie, the most likely first; in URIs, %20 may stand for a space."""
+    rest = name.replace("\\", "/").split("://", 1)[-1]
+    roots, spellings = ((folder, *list(folder.parents)[:4]), (rest, unquote(rest))) if "://" in name else ((folder,), (rest,))
+    tails = dict.fromkeys(tail for spelling in spellings for tail in (spelling, spelling.split("/", 1)[-1]))
+    return [root / tail for root in roots for tail in tails]
+
+
+def find_mesh(name: str, folder: Path) -> Path | None:
+    """The file of a mesh name (relative, absolute, `package://` or `file://`); None if there is none."""
+    if not name:
+        return None
+    return next((file.resolve() for file in _candidates(name, folder) if os.path.isfile(file)), None)

@@ -1,4 +1,4 @@
-"""Read description files as XML, and refuse entities, which can read other files or exhaust memory."""
+"""Read description files as XML. What no hand has is refused: MuJoCo would run out of time, memory or stack on it."""
 
 from __future__ import annotations
 
@@ -9,16 +9,27 @@ from pathlib import Path
 import defusedxml
 import defusedxml.ElementTree
 
-from dro_grasp.descriptions.bounds import MOST_BYTES, check_elements
 from dro_grasp.errors import HandError
 from dro_grasp.files import command
 
-XACRO = "{http://www.ros.org/wiki/xacro}"
-"""Namespace of xacro's tags, as ElementTree spells it."""
+DEEPEST = 100
+"""Most elements within each other, and most links one below the other (ours); the deepest hand known to us has 30."""
+MOST_ELEMENTS = 50_000
+"""Most elements of one file (ours)."""
+MOST_LINKS = 1_000
+"""Most links, after repetitions (ours); a tactile hand with a frame for every taxel has some 500."""
+MOST_BYTES = 20_000_000
+"""Largest description [bytes] (ours)."""
+MOST_PIXELS = 10_000
+"""Most pixels of a generated texture along each side (ours)."""
+MOST_DIVISIONS = 200.0
+"""Most divisions of a generated mesh in each direction (ours); 10,000 would take a minute and 7 GB."""
+UNUSED = {"composite", "flexcomp", "flex", "hfield", "skin", "plugin"}
+"""Elements of MJCF that no rigid hand has, and that can grow without limit (ours)."""
 
 
 def parse_xml(path: Path) -> ET.Element:
-    """Parse a description; entities are refused.
+    """Parse a description.
 
     Raises:
         HandError: The file is missing, is not XML, declares entities, or is larger or deeper than any hand's.
@@ -40,10 +51,9 @@ def parse_xml(path: Path) -> ET.Element:
         raise HandError(f"{path} is not valid XML ({error}); expected a URDF (<robot>) or MJCF (<mujoco>) file") from error
     except (OSError, ValueError, LookupError) as error:
         raise HandError(f"{path} cannot be read ({error}); expected a URDF (<robot>) or MJCF (<mujoco>) file") from error
-    if root is None:
-        raise HandError(f"{path} is an empty XML file; expected a URDF (<robot>) or MJCF (<mujoco>) file")
-    check_elements(root, path)
-    if any(isinstance(element.tag, str) and element.tag.startswith(XACRO) for element in root.iter()):
+    assert root is not None  # an empty file is no XML
+    _check_elements(root, path)
+    if any(str(element.tag).startswith("{http://www.ros.org/wiki/xacro}") for element in root.iter()):
         expanded = path.with_name("expanded.urdf")
         raise HandError(f"{path} is a xacro template; expand it first: {command('xacro', path, '-o', expanded)}")
     return root
@@ -72,3 +82,32 @@ def included_files(root: ET.Element, path: Path) -> tuple[Path, ...]:
                 found[file.resolve()] = None
                 waiting.append((parse_xml(file), file, (*above, file.resolve())))
     return tuple(found)
+
+
+def _check_elements(root: ET.Element, path: Path) -> None:
+    """Refuse a file of too many elements or links, too deep ones, or elements that can grow without limit."""
+    waiting, elements, links = [(root, 1, 1.0)], 0, 0.0
+    while waiting:
+        element, depth, times = waiting.pop()
+        elements += 1
+        links += times * (element.tag in {"body", "link"})
+        if depth > DEEPEST or elements > MOST_ELEMENTS or links > MOST_LINKS:
+            raise HandError(f"{path} has more than {DEEPEST} elements within each other, {MOST_LINKS} links, or "
+                            f"{MOST_ELEMENTS} elements; expected a robot hand, leave out what is not part of it")
+        if element.tag in UNUSED and root.tag == "mujoco":  # in a URDF these belong to simulators, and nobody here reads them
+            raise HandError(f"{path} has <{element.tag}>, which is no part of a rigid hand; remove it")
+        if element.tag == "texture" and max(_largest(element, "width"), _largest(element, "height")) > MOST_PIXELS:
+            raise HandError(f"{path} has a <texture> wider or higher than {MOST_PIXELS} pixels; remove it")
+        if element.tag == "mesh" and "builtin" in element.attrib and not _largest(element, "params") <= MOST_DIVISIONS:
+            raise HandError(f"{path} has a built-in <mesh> of params=\"{element.get('params', '')[:40]}\"; expected numbers "
+                            f"of at most {MOST_DIVISIONS:g}; divide it less, or give a file")
+        times *= max(1.0, _largest(element, "count")) if element.tag == "replicate" else 1
+        waiting.extend((child, depth + 1, times) for child in element)
+
+
+def _largest(element: ET.Element, attribute: str) -> float:
+    """The largest number in an attribute; 0 where there is none, which is left to MuJoCo."""
+    try:
+        return max(map(float, element.get(attribute, "").split()), default=0.0)
+    except ValueError:
+        return 0.0

@@ -1,7 +1,6 @@
 """A hand's anatomy, read off its tree: fingertips, palm link, rigid groups, fingers, thumb, opening signs.
 
-This is the only definition of fingers and thumb in the package: `HandBuilder` calls these functions, `Hand` holds their
-results, and all other code reads the hand.
+Nothing else in the package defines fingers and thumb: `HandBuilder` calls these functions, and other code reads the `Hand`.
 """
 
 from __future__ import annotations
@@ -17,6 +16,9 @@ from dro_grasp.errors import HandError
 from dro_grasp.geometry import se3
 from dro_grasp.kinematics.tree import FIXED, KinematicTree
 
+Joints = Float[Tensor, " n_dof"]  # a value of each independent joint
+JointMask = Bool[Tensor, " n_dof"]
+Point = Float[Tensor, "3"]
 PALM = -1
 """Finger number of links that belong to no finger: the palm, links fixed to it or above it, and links that fingers share."""
 FEWEST_WITH_THUMB = 4
@@ -88,14 +90,12 @@ def find_tips(tree: KinematicTree, shaped: Collection[int]) -> tuple[int, ...]:
 
 
 def find_palm_link(tree: KinematicTree, tips: Sequence[int], shaped: Collection[int]) -> int:
-    """The last common ancestor of the fingertips; with one finger, the link that carries it.
-
-    If neither it nor any link fixed below it has a shape, the nearest link above that it is fixed to and that has one.
-    """
+    """The last common ancestor of the fingertips; with one finger, the link that carries it."""
     palm = max(tree.descends[list(tips)].all(0).nonzero()[:, 0].tolist())
     while len(tips) == 1 and palm > 0 and any(tree.kind[i] != FIXED for i in path_to(tree, palm)):
         palm = tree.parent[palm]
     candidate = palm
+    # If neither it nor any link fixed below it has a shape, the nearest link above that it is fixed to and that has one.
     while not set(shaped) & set(fixed_below(tree, candidate)):
         if candidate == 0 or tree.kind[candidate] != FIXED:
             return palm
@@ -118,7 +118,7 @@ def find_fingers(
     of its parent. A link fixed to the palm belongs to no finger, even if it carries one, because it does not move.
 
     Args:
-        rods: For last links that are no tips the tip of the finger that they are pinned to.
+        rods: As `find_rods` gives them.
 
     Raises:
         HandError: A finger has more joints than any has.
@@ -145,16 +145,10 @@ def find_fingers(
 
 
 def measure_opposition(
-    tree: KinematicTree, q: Float[Tensor, " n_dof"], rate: Float[Tensor, " n_dof"], tips: Sequence[int],
+    tree: KinematicTree, q: Joints, rate: Joints, tips: Sequence[int],
     tip_offsets: Float[Tensor, "n_tips 3"],
 ) -> Float[Tensor, " n_tips"]:
-    """How much each fingertip, while the hand closes, moves against the others.
-
-    Args:
-        q: Joints at which this is measured [rad or m].
-        rate: Their velocities while the whole hand closes.
-        tips: Fingertip links.
-        tip_offsets: Points beyond them whose velocity is taken, in their links' frames [m].
+    """How much each fingertip moves against the others at joints `q`, while all joints close at `rate`.
 
     Returns:
         Minus the mean cosine to the other tips' directions: -1 if all move alike, 1 if the others all move the opposite way.
@@ -173,19 +167,13 @@ def find_thumb(opposition: Float[Tensor, " n_tips"]) -> int | None:
 
 
 def closing_gains(
-    tree: KinematicTree, q: Float[Tensor, " n_dof"], tips: Sequence[int], tip_points: Float[Tensor, "n_tips 3"],
-    targets: Sequence[Float[Tensor, "3"]],
-) -> Float[Tensor, " n_dof"]:
+    tree: KinematicTree, q: Joints, tips: Sequence[int], tip_points: Float[Tensor, "n_tips 3"],
+    targets: Sequence[Point],
+) -> Joints:
     """How much nearer to the targets the upper limit of each joint brings its fingertips than the lower limit [m].
 
-    Args:
-        q: Values of all other joints [rad or m].
-        tips: Fingertip links.
-        tip_points: A point on each, in its link's frame [m].
-        targets: Points in the root link's frame [m]; the distances to them are added.
-
-    Returns:
-        The mean over the tips that a joint moves; 0 for a joint that moves none.
+    All other joints are at `q`. Distances to several targets, which are points in the root link's frame [m], are added. The
+    mean over the tips that a joint moves is taken; 0 for a joint that moves none.
     """
     links, each = list(tips), torch.arange(tree.n_dof)
     ends = q.repeat(2, tree.n_dof, 1)  # (end, joint that is moved there, joints)
@@ -197,11 +185,9 @@ def closing_gains(
     return mean[0] - mean[1]
 
 
-def axes_along(tree: KinematicTree, q: Float[Tensor, " n_dof"], direction: Float[Tensor, "3"]) -> Bool[Tensor, " n_dof"]:
-    """The joints whose axes lie along a direction of the root link's frame and which bend no finger.
-
-    A joint with a parallel one below it, or with none below it, is part of a finger's flexion.
-    """
+def axes_along(tree: KinematicTree, q: Joints, direction: Point) -> JointMask:
+    """The joints whose axes lie along a direction of the root link's frame and which bend no finger."""
+    # A joint with a parallel one below it, or with none below it, is part of a finger's flexion.
     angular = tree.motion_axes(tree.forward(q))[1]
     moving = torch.tensor(tree.kind) != FIXED
     below = tree.descends & moving[:, None] & ~torch.eye(tree.n_links, dtype=torch.bool)

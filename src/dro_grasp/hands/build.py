@@ -1,12 +1,10 @@
-"""From a description to a Hand, step by step.
-
-Source: paper section III-B and appendix, dataset preprocessing.
-"""
+"""From a description to a Hand, step by step. Source: paper section III-B and appendix, dataset preprocessing."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
@@ -25,8 +23,7 @@ from dro_grasp.hands.linkages import find_rods
 from dro_grasp.hands.opening import ROLLING_UP
 from dro_grasp.hands.palm import EARLY_CLOSINGS, MUCH_BETTER, WELL_ENCLOSED
 from dro_grasp.hands.surface import LinkSurface, sample_links
-from dro_grasp.hands.whole_robots import require_one_hand
-from dro_grasp.kinematics.tree import FIXED
+from dro_grasp.kinematics.tree import FIXED, KinematicTree
 
 TIP_OFFSET = 0.03
 """Distance of the extra target beyond a fingertip [m]. Source: appendix, URDF file preprocessing."""
@@ -34,6 +31,14 @@ LARGEST_HAND = 1.5
 """Largest extent, from the palm on, that a hand in metres has [m] (ours)."""
 SMALLEST_HAND = 0.02
 """Smallest extent, from the palm on, that a hand in metres has [m] (ours)."""
+LONGEST_REACH = 0.45
+"""Longest way from a hand's palm along its links to a fingertip [m] (ours). Of the built-in hands, the development assets and
+thirty published ones, the longest is 0.23; arms begin at 0.5."""
+LONGEST_JAW = 0.2
+"""The same where there is a single fingertip [m] (ours): 0.03 to 0.05 for the jaws of SO-100, SO-101, Z1 and
+Talos; the smallest arm that was seen, Koch's, has 0.34."""
+MOST_NAMED = 6
+"""Most hands that an error names (ours)."""
 
 
 def build_hand(description: Description, *, name: str | None = None, seed: int = 0, n_points: int = 512) -> Hand:
@@ -48,7 +53,10 @@ def build_hand(description: Description, *, name: str | None = None, seed: int =
         HandError: The description has no finger, no link with a surface, or a size that no hand has.
         OptionError: So many points cannot be kept.
     """
-    hand = HandBuilder(description, seed).build(name or description.name)
+    try:
+        hand = HandBuilder(description, seed).build(name or description.name)
+    except HandError as error:
+        raise HandError(f"{description.path}: {error}") from error
     fewest = POINTS_PER_LINK * len(hand.tips)
     if not fewest <= n_points <= hand.n_points:
         raise OptionError(f"n_points is {n_points}; give an integer from {fewest} to {hand.n_points}, the points that hand "
@@ -66,7 +74,6 @@ class HandBuilder:
     """The steps from a description to a hand; each is derived once, when a later one needs it."""
 
     def __init__(self, description: Description, seed: int = 0) -> None:
-        """Begin with a description, and a seed of the point sampling."""
         self.description, self.tree, self.seed = description, description.tree, seed
 
     def build(self, name: str) -> Hand:
@@ -91,7 +98,7 @@ class HandBuilder:
         """Links with a visual or collision shape."""
         shaped = sorted({g.link for g in self.description.geometry})
         if not shaped:
-            raise self._error("no link has a visual or collision shape, so the hand can touch nothing; give its links shapes")
+            raise HandError("no link has a visual or collision shape, so the hand can touch nothing; give its links shapes")
         return shaped
 
     @cached_property
@@ -101,7 +108,7 @@ class HandBuilder:
             return find_tips(self.tree, self.shaped)
         except HandError as error:
             lost = [note.text for note in self.description.notes if note.level == "warning"]
-            raise self._error("; ".join([str(error), *lost[:3]])) from error
+            raise HandError("; ".join([str(error), *lost[:3]])) from error
 
     @cached_property
     def rods(self) -> dict[int, int]:
@@ -118,20 +125,13 @@ class HandBuilder:
         """The palm link."""
         palm = find_palm_link(self.tree, self.tips, self.shaped)
         if self.description.link is None:
-            try:
-                require_one_hand(self.tree, self.tips, palm, self.description.path.name)
-            except HandError as error:
-                raise self._error(str(error)) from error
+            require_one_hand(self.tree, self.tips, palm, self.description.path.name)
         return palm
 
     @cached_property
     def fingers(self) -> tuple[Finger, ...]:
         """One for each fingertip."""
-        palm = self.palm
-        try:
-            return find_fingers(self.tree, self.tips, palm, self.rods)
-        except HandError as error:
-            raise self._error(str(error)) from error
+        return find_fingers(self.tree, self.tips, self.palm, self.rods)
 
     @cached_property
     def links(self) -> list[int]:
@@ -155,11 +155,11 @@ class HandBuilder:
         size = float(np.ptp(surface.posed(self.tree, self.rest)[0], axis=0).max())
         if size > LARGEST_HAND:
             whole = named(self.description.path.name, "LINK")
-            raise self._error(f"the hand is {size:.3g} m large, which looks like millimetres; expected metres: scale its "
-                              f"origins, shapes and meshes by 0.001; or, if this is a whole robot, give its hand: {whole}")
+            raise HandError(f"the hand is {size:.3g} m large, which looks like millimetres; expected metres: scale its "
+                            f"origins, shapes and meshes by 0.001; or, if this is a whole robot, give its hand: {whole}")
         if size < SMALLEST_HAND:
-            raise self._error(f"the hand is {size:.3g} m large, which looks like another unit than metres; expected "
-                              f"{SMALLEST_HAND} to {LARGEST_HAND} m: scale its origins, shapes and meshes")
+            raise HandError(f"the hand is {size:.3g} m large, which looks like another unit than metres; expected "
+                            f"{SMALLEST_HAND} to {LARGEST_HAND} m: scale its origins, shapes and meshes")
         return surface
 
     @cached_property
@@ -175,22 +175,16 @@ class HandBuilder:
 
     @cached_property
     def closing(self) -> Closing:
-        """From where and to where the joints close, and the palm.
-
-        Half closed, a hand whose limits let its fingers roll up encloses little; it is examined earlier then.
-        """
+        """From where and to where the joints close, and the palm."""
         finder = ClosingFinder(self.tree, self.rest, self.movable, self.stated, self.fingers, self.coarse, self.on_palm,
                                sideways=torch.zeros_like(self.movable))
-        try:
-            found = finder.find()
-            if found.palm.score > WELL_ENCLOSED or finder.motion.bend(self.tree.lower, self.tree.upper) < ROLLING_UP:
-                return found
+        found = finder.find()
+        # Half closed, a hand whose limits let its fingers roll up encloses little; it is examined earlier then.
+        if found.palm.score <= WELL_ENCLOSED and finder.motion.bend(self.tree.lower, self.tree.upper) >= ROLLING_UP:
             with contextlib.suppress(HandError):  # nothing is enclosed so early
                 early = dataclasses.replace(finder, closings=EARLY_CLOSINGS).find()
                 return early if early.palm.score > found.palm.score + MUCH_BETTER else found
-            return found
-        except HandError as error:
-            raise self._error(str(error)) from error
+        return found
 
     @cached_property
     def stated(self) -> Float[Tensor, " n_dof"]:
@@ -210,5 +204,41 @@ class HandBuilder:
             offsets.append(middle + TIP_OFFSET * along / along.norm().clamp(min=1e-6))
         return torch.stack(offsets)
 
-    def _error(self, text: str) -> HandError:
-        return HandError(f"{self.description.path}: {text}")
+
+def reach(tree: KinematicTree, above: int, below: int) -> float:
+    """The way along the links from one down to another [m]."""
+    links = sorted(set(path_to(tree, below)) - set(path_to(tree, above)))
+    return float(tree.origin[links, :3, 3].norm(dim=-1).sum())
+
+
+def find_hands(tree: KinematicTree, tips: Sequence[int]) -> list[int]:
+    """The palms of a whole robot: the links all of whose fingertips, two at least, are near, and above which that ends."""
+    found: list[int] = []
+    for link in range(tree.n_links):
+        own = [tip for tip in tips if tip != link and bool(tree.descends[tip, link])]
+        together = len(own) > 1 and max(tree.descends[own].all(0).nonzero()[:, 0].tolist()) == link
+        if together and not tree.descends[link, found].any() and all(reach(tree, link, tip) < LONGEST_REACH for tip in own):
+            found.append(link)
+    return found
+
+
+def require_one_hand(tree: KinematicTree, tips: Sequence[int], palm: int, file: str) -> None:
+    """Refuse a whole robot, of which nobody could say what its hand is.
+
+    Raises:
+        HandError: It has several hands, or one beside other moving ends, or arms alone; the message says how to ask for one.
+    """
+    hands = find_hands(tree, tips)
+    if hands and not bool(tree.descends[list(tips), hands[0]].all()):
+        more = ", ..." if len(hands) > MOST_NAMED else ""
+        given = ", ".join(named(file, tree.link_names[hand]) for hand in hands[:MOST_NAMED])
+        raise HandError(f"this is a whole robot; give the hand that you want: {given}{more}")
+    longest = LONGEST_REACH if len(tips) > 1 else LONGEST_JAW
+    far = [tip for tip in tips if reach(tree, palm, tip) > longest]
+    if far and not hands:
+        carriers = [tree.parent[max(link for link in path_to(tree, tip) if tree.kind[link] != FIXED)] for tip in far]
+        given = " or ".join(named(file, tree.link_names[carrier]) for carrier in dict.fromkeys(carriers[:MOST_NAMED]))
+        what = "this is an arm" if len(tips) == 1 else "these are arms or legs"
+        raise HandError(f"its fingertip '{tree.link_names[far[0]]}' is {reach(tree, palm, far[0]):.2g} m of links away from "
+                        f"'{tree.link_names[palm]}', so {what}; if a hand is part of it, name the link at which it begins, "
+                        f"for example {given}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -9,40 +10,28 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
+from dro_grasp.descriptions.compiling import Note
 from dro_grasp.descriptions.loader import Description
-from dro_grasp.descriptions.notes import Note
 from dro_grasp.descriptions.part import named
 from dro_grasp.files import check_output, replacing
-from dro_grasp.geometry import se3
 from dro_grasp.geometry.point_clouds import enclosed_volume
 from dro_grasp.hands.anatomy import Finger
-from dro_grasp.hands.build import build_hand
-from dro_grasp.hands.fixed_jaw import fixed_jaw_of
+from dro_grasp.hands.build import LONGEST_REACH, build_hand, reach
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand_description
-from dro_grasp.hands.opening_notes import opening_notes
-from dro_grasp.hands.whole_robots import LONGEST_REACH, reach
+from dro_grasp.hands.opening import FingerMotion, opening_notes
+from dro_grasp.hands.palm import fixed_jaw_of
+from dro_grasp.kinematics.tree import KinematicTree
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.rendering.meshes import Mesh, arrow
 from dro_grasp.rendering.rasterizer import render
 
 TILE = (560, 520)
 """Width and height of one view [pixels]."""
-TEXT = 30
-"""Height of a line of text [pixels]."""
-CONTACT = (0.93, 0.66, 0.30)
-"""Colour of contact links."""
-OTHER = (0.62, 0.66, 0.72)
-"""Colour of links that cannot touch anything."""
-DIRECTION = (0.85, 0.15, 0.15)
-"""Colour of the palm direction."""
-TRACK = (0.15, 0.39, 0.92)
-"""Colour of the fingertips' tracks."""
-LEFT_OUT = (0.62, 0.30, 0.75)
-"""Colour of the tracks that the open posture leaves out."""
+COLOURS = {"contact": (0.93, 0.66, 0.30), "other": (0.62, 0.66, 0.72), "direction": (0.85, 0.15, 0.15),
+           "track": (0.15, 0.39, 0.92), "left out": (0.62, 0.30, 0.75)}
+"""Of contact links, links that cannot touch anything, the palm direction, the fingertips' tracks and what they leave out."""
 SIDEWAYS = 0.15
 """Cosine below which a thumb is on neither side of the other fingers (ours); hands with a side have 0.34 to 0.96."""
 END = {1: "upper", -1: "lower"}
@@ -62,7 +51,7 @@ class HandReport:
     """Findings, repairs and faults."""
 
     def __repr__(self) -> str:
-        count = {level: sum(note.level == level for note in self.notes) for level in dict.fromkeys(n.level for n in self.notes)}
+        count = Counter(note.level for note in self.notes)
         found = ", ".join(f"{n} {level}{'s' * (n > 1)}" for level, n in count.items()) or "nothing wrong was found"
         return f"HandReport({self.hand!r}, {found}; lines() tells all)"
 
@@ -92,8 +81,7 @@ def check_hand(name: str | Path) -> HandReport:
     """
     description, label = load_hand_description(name)
     hand = build_hand(description, name=label)
-    found = (*_part_notes(hand, description), *_finger_notes(hand), *opening_notes(hand), *_shape_notes(hand, description),
-             *_point_notes(hand))
+    found = (*_part_notes(hand, description), *_finger_notes(hand), *opening_notes(hand), *_shape_notes(hand, description))
     return HandReport(hand, _facts(hand, description), (*description.notes, *found))
 
 
@@ -111,7 +99,7 @@ def _facts(hand: Hand, description: Description) -> dict[str, Any]:
         "palm_link": names[hand.palm],
         "palm_direction": [round(float(x), 3) for x in hand.palm_direction_wrist],
         "fingertips": [names[t] for t in hand.tips],
-        "fingers": {names[finger.tip]: _finger_facts(hand, finger) for finger in hand.fingers},
+        "fingers": {names[finger.tip]: _finger_facts(tree, finger) for finger in hand.fingers},
         "thumb": None if hand.thumb is None else names[hand.tips[hand.thumb]],
         "thumb_opposition": {names[t]: round(float(x), 2) for t, x in zip(hand.tips, hand.thumb_opposition, strict=True)},
         "side": hand_side(hand),
@@ -128,9 +116,8 @@ def _facts(hand: Hand, description: Description) -> dict[str, Any]:
     }
 
 
-def _finger_facts(hand: Hand, finger: Finger) -> dict[str, list[str]]:
+def _finger_facts(tree: KinematicTree, finger: Finger) -> dict[str, list[str]]:
     """The links of a finger and the joints that move them, followers included."""
-    tree = hand.tree
     joints = [tree.moving_names[tree.link_joint[link]] for link in finger.links if tree.link_joint[link] >= 0]
     return {"links": [tree.link_names[link] for link in finger.links], "joints": joints}
 
@@ -144,16 +131,12 @@ def _rigid_groups(hand: Hand) -> list[list[str]]:
 
 
 def hand_side(hand: Hand) -> str:
-    """`left`, `right`, or `none` for a hand without a thumb or with fingers all around the palm.
-
-    With the fingers up and the palm towards the viewer, the thumb of a right hand is on the viewer's right.
-    """
+    """`left`, `right`, or `none` for a hand without a thumb or with fingers all around the palm."""
     if hand.thumb is None:
         return "none"
-    points, index = hand.points(hand.canonical_joints(1.0)), hand.link_index
-    tips = torch.stack([points[index == t].mean(0) for t in hand.tips])
-    palm = hand.palm_centre_wrist
+    tips, palm = FingerMotion.of(hand).tips(hand.canonical_joints(1.0)), hand.palm_centre_wrist
     others = torch.cat([tips[: hand.thumb], tips[hand.thumb + 1 :]]).mean(0)
+    # With the fingers up and the palm towards the viewer, the thumb of a right hand is on the viewer's right.
     aside = torch.linalg.cross(others - palm, hand.palm_direction_wrist)
     handed = float(torch.nn.functional.cosine_similarity(aside, tips[hand.thumb] - palm, dim=0))
     return "none" if abs(handed) < SIDEWAYS else "right" if handed > 0 else "left"
@@ -179,7 +162,7 @@ def _finger_notes(hand: Hand) -> list[Note]:
 
 
 def _shape_notes(hand: Hand, description: Description) -> list[Note]:
-    """Links that cannot touch anything, or whose shapes enclose nothing."""
+    """Links that cannot touch anything, whose shapes enclose nothing, or that have too few points."""
     notes = []
     for link, name in enumerate(hand.tree.link_names):
         if not bool(hand.tree.descends[link, hand.palm]):
@@ -190,16 +173,11 @@ def _shape_notes(hand: Hand, description: Description) -> list[Note]:
         volume = sum(abs(enclosed_volume(g.vertices[g.faces])) for g in shapes)
         if shapes and volume < THIN_VOLUME:
             notes.append(Note("warning", name, "has shapes without volume"))
-    return notes
-
-
-def _point_notes(hand: Hand) -> list[Note]:
     few = [hand.tree.link_names[i] for i in hand.link_index.unique().tolist() if not bool(hand.registrable[i])]
-    return [Note("info", name, "has too few points for a pose of its own; its neighbours place it") for name in few]
+    return [*notes, *(Note("info", name, "has too few points for a pose of its own; its neighbours place it") for name in few)]
 
 
 def _words(value: Any) -> list[str]:
-    """A fact in words, on one line or more."""
     if isinstance(value, dict) and any(isinstance(v, dict) for v in value.values()):
         return [f"{tip} (links {', '.join(v['links'])}; joints {', '.join(v['joints'])})" for tip, v in value.items()]
     if isinstance(value, dict):
@@ -222,17 +200,17 @@ def picture(hand: Hand, path: Path | str) -> None:
     from PIL import Image, ImageDraw, ImageFont
 
     path = check_output(path)
-    width, height = TILE
-    sheet = Image.new("RGB", (2 * width, height + 2 * TEXT), (255, 255, 255))
+    (width, height), line = TILE, 30  # pixels
+    sheet = Image.new("RGB", (2 * width, height + 2 * line), (255, 255, 255))
     pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(15)
     camera = _camera(hand)
     for column, (title, openness) in enumerate((("open", 1.0), ("closed", 0.25))):
-        sheet.paste(Image.fromarray(render(_meshes(hand, openness), camera, width, height)), (column * width, TEXT))
+        sheet.paste(Image.fromarray(render(_meshes(hand, openness), camera, width, height)), (column * width, line))
         pen.text((column * width + 12, 6), f"{hand.name}, {title}", fill=(20, 20, 20), font=font)
     legend = "orange: contact links   grey: others   red: palm direction   blue: fingertips from open to closed"
     if not torch.equal(hand.open_ends, hand.open_limits):
         legend += "   purple: left out"
-    pen.text((12, height + TEXT + 6), legend, fill=(90, 90, 90), font=font)
+    pen.text((12, height + line + 6), legend, fill=(90, 90, 90), font=font)
     with replacing(path, "picture") as temporary:
         sheet.save(temporary, format="PNG")
 
@@ -255,23 +233,16 @@ def _meshes(hand: Hand, openness: float) -> list[Mesh]:
     poses = hand.tree.forward(hand.canonical_joints(openness)).numpy()
     meshes = [
         Mesh(g.vertices @ poses[g.link, :3, :3].T + poses[g.link, :3, 3], g.faces,
-             CONTACT if g.link in hand.contact_links else OTHER)
+             COLOURS["contact" if g.link in hand.contact_links else "other"])
         for g in (hand.description.geometry if hand.description else ())
         if g.visual and bool(hand.tree.descends[g.link, hand.palm])
     ]
     start = hand.palm_centre_wrist.numpy()
-    meshes.append(arrow(start, start + 0.1 * hand.palm_direction_wrist.numpy(), DIRECTION, radius=0.003))
+    meshes.append(arrow(start, start + 0.1 * hand.palm_direction_wrist.numpy(), COLOURS["direction"], radius=0.003))
     used = torch.stack([hand.canonical_joints(float(x)) for x in torch.linspace(1, 0.25, 8)])
     farthest = torch.where(hand.open_ends == hand.open_limits, used[0], hand.open_limits)
     beyond = torch.stack([torch.lerp(used[0], farthest, float(x)) for x in torch.linspace(0, 1, 12)])
-    for colour, joints in ((TRACK, used), (LEFT_OUT, beyond))[: 1 + (not torch.equal(farthest, used[0]))]:
-        for track in _tracks(hand, joints):
-            meshes.extend(arrow(a, b, colour, radius=0.0012) for a, b in pairwise(track))
+    for colour, joints in (("track", used), ("left out", beyond))[: 1 + (not torch.equal(farthest, used[0]))]:
+        for track in FingerMotion.of(hand).tips(joints).transpose(0, 1).numpy():
+            meshes.extend(arrow(a, b, COLOURS[colour], radius=0.0012) for a, b in pairwise(track))
     return meshes
-
-
-def _tracks(hand: Hand, joints: Float[Tensor, "steps n_dof"]) -> Float[np.ndarray, "n_tips steps 3"]:
-    """Positions of the fingertips on a way of the joints [m]."""
-    poses = hand.tree.forward(joints)[:, list(hand.tips)]
-    middles = torch.stack([hand.link_points[hand.link_index == t].mean(0) for t in hand.tips])
-    return se3.apply(poses, middles).transpose(0, 1).numpy()

@@ -17,11 +17,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dro_grasp.errors import HandError
-from dro_grasp.hands.anatomy import Finger, axes_along, closing_gains
-from dro_grasp.hands.fixed_jaw import JUST_BEFORE, NEARLY_CLOSED, FixedJaw, find_fixed_jaw
-from dro_grasp.hands.opening import FingerMotion, Line, main_axis, span
-from dro_grasp.hands.palm import CLOSINGS, NOTHING_ENCLOSED, Palm, find_palm
-from dro_grasp.hands.postures import Postures
+from dro_grasp.hands.anatomy import Finger, JointMask, Joints, Point, axes_along, closing_gains
+from dro_grasp.hands.opening import FingerMotion, Line, main_axis
+from dro_grasp.hands.palm import CLOSINGS, NEARLY_CLOSED, NOTHING_ENCLOSED, FixedJaw, Palm, find_fixed_jaw, find_palm
 from dro_grasp.hands.surface import LinkSurface
 from dro_grasp.kinematics.tree import KinematicTree
 
@@ -35,36 +33,34 @@ ALL_ROLLED_UP = 0.5
 fingers bend as far back as forth, keeps 0.36 at most; of 15 other hands some finger keeps 0.65 or more."""
 PATH = 65
 """Postures on the way from closed to open at which a hand is examined (ours)."""
+AT_LIMIT = 0.1
+"""Distance to a limit, as a share of the range, within which a joint is at this limit (ours)."""
 
 
 @dataclass(frozen=True)
 class Closing:
     """The closing of a hand: ends of each joint, and the palm."""
 
-    opening_signs: Float[Tensor, " n_dof"]
-    """As in `Hand`."""
-    open_ends: Float[Tensor, " n_dof"]
-    """As in `Hand` [rad or m]."""
-    abduction: Bool[Tensor, " n_dof"]
-    """As in `Hand`."""
-    palm: Palm
-    """In the root link's frame."""
+    opening_signs: Joints  # as in `Hand`
+    open_ends: Joints  # as in `Hand` [rad or m]
+    abduction: JointMask  # as in `Hand`
+    palm: Palm  # in the root link's frame
 
 
 @dataclass(frozen=True)
-class ClosingFinder(Postures):
+class ClosingFinder:
     """What the closing of a hand is derived from."""
 
+    tree: KinematicTree
+    rest: Joints  # as in `Hand`
+    movable: JointMask  # as in `Hand`
+    stated: Joints
+    """The open posture that the hand's file states [rad or m]; NaN for joints of which it says nothing."""
     fingers: tuple[Finger, ...]
-    """The fingers."""
-    coarse: LinkSurface
-    """Some samples of every link from the palm on."""
-    on_palm: Bool[np.ndarray, " n"]
-    """The samples on the palm."""
-    sideways: Bool[Tensor, " n_dof"]
-    """Joints that are taken to spread the fingers, whatever their axes."""
-    closings: tuple[float, ...] = CLOSINGS
-    """Shares of the way from open to closed at which the hand is examined."""
+    coarse: LinkSurface  # some samples of every link from the palm on
+    on_palm: Bool[np.ndarray, " n"]  # the samples on the palm
+    sideways: JointMask  # joints that are taken to spread the fingers, whatever their axes
+    closings: tuple[float, ...] = CLOSINGS  # shares of the way from open to closed at which the hand is examined
 
     def find(self) -> Closing:
         """The closing between the limits, or from the widest posture of fingers that fold back beyond it."""
@@ -84,23 +80,21 @@ class ClosingFinder(Postures):
         return self.motion.kept(beyond, self.movable).amin(0)
 
     @cached_property
-    def spread(self) -> Float[Tensor, " n_dof"]:
+    def spread(self) -> Joints:
         """The posture whose fingertips are farthest from the palm's middle [rad or m]."""
-        return self.motion.widest(self._from_middle, self.start, self.movable & self.stated.isnan() & ~self.sideways)
+        middle = Line(self.palm_middle, torch.zeros(3))
+        return self.motion.widest(middle, self.start, self.movable & self.stated.isnan() & ~self.sideways)
 
     @cached_property
-    def start(self) -> Float[Tensor, " n_dof"]:
+    def start(self) -> Joints:
         """Joints at rest, or as the file states them [rad or m]."""
         return torch.where(self.stated.isnan(), self.rest, self.stated)
 
     def between_limits(self) -> Closing:
-        """Opening signs, abduction joints and palm, refined together.
-
-        A joint opens towards the limit at which its fingertips are farther from the grasp centre and from the palm, while
-        all other joints are at rest or half closed. The distance to the grasp centre tells closing from spreading; curled
-        fingers pass it, but come nearer to the palm all the way. A joint whose axis points out of the palm, at rest and with
-        bent fingers alike, only spreads the fingers.
-        """
+        """Opening signs, abduction joints and palm, refined together."""
+        # A joint opens towards the limit at which its fingertips are farther from the grasp centre and from the palm, while
+        # all other joints are at rest or half closed. The distance to the grasp centre tells closing from spreading; curled
+        # fingers pass it, but come nearer to the palm all the way.
         tree, n_dof = self.tree, self.tree.n_dof
         centre = _tensor(self.coarse.posed(tree, (tree.lower + tree.upper) / 2)[0].mean(0))
         signs, abduction = -torch.ones(n_dof), torch.zeros(n_dof, dtype=torch.bool)
@@ -116,12 +110,9 @@ class ClosingFinder(Postures):
         return Closing(signs, self.opened(signs), abduction & self.movable, palm)
 
     def from_widest(self) -> Closing:
-        """The closing of fingers that start from their widest span.
-
-        Where fingers fold as far to one side of the palm as to the other, limits do not tell the sides apart. So the hand is
-        spread as far from the palm's middle as it goes and closed to both sides; on the better one palm and fingers enclose
-        a ball best.
-        """
+        """The closing of fingers that start from their widest span."""
+        # Where fingers fold as far to one side of the palm as to the other, limits do not tell the sides apart. So the hand is
+        # spread as far from the palm's middle as it goes and closed to both sides.
         tree = self.tree
         signs, palm = self.better_side(self.spread)
         abduction = self.out_of_palm(self.spread, signs, palm) & self.movable
@@ -140,26 +131,20 @@ class ClosingFinder(Postures):
         signs = self.signs_from(widest, found.opening_signs, abduction, _tensor(found.palm.grasp_centre))
         return self.narrowed(self.movable & ~abduction, widest, signs)
 
-    def widest_about(self, palm: Palm, abduction: Bool[Tensor, " n_dof"]) -> Float[Tensor, " n_dof"]:
+    def widest_about(self, palm: Palm, abduction: JointMask) -> Joints:
         """The posture whose fingertips are farthest from the palm's axis [rad or m]."""
         axis = Line(_tensor(palm.centre), _tensor(palm.direction))
-        return self.motion.widest(axis.span, self.start, self.movable & ~abduction & self.stated.isnan())
+        return self.motion.widest(axis, self.start, self.movable & ~abduction & self.stated.isnan())
 
-    def narrowed(
-        self, cut: Bool[Tensor, " n_dof"], widest: Float[Tensor, " n_dof"], signs: Float[Tensor, " n_dof"]
-    ) -> Closing:
+    def narrowed(self, cut: JointMask, widest: Joints, signs: Joints) -> Closing:
         """The closing of a hand some of whose joints do not open beyond the widest posture."""
         lower = torch.where(cut & (signs < 0), widest, self.tree.lower)
         upper = torch.where(cut & (signs > 0), widest, self.tree.upper)
         tree = dataclasses.replace(self.tree, lower=lower, upper=upper)
         return dataclasses.replace(self, tree=tree, stated=torch.where(cut, widest, self.stated)).between_limits()
 
-    def better_side(self, spread: Float[Tensor, " n_dof"]) -> tuple[Float[Tensor, " n_dof"], Palm]:
-        """Opening signs of a hand that closes from here to the better side, and the palm there.
-
-        Raises:
-            HandError: Palm and fingers enclose nothing on either side.
-        """
+    def better_side(self, spread: Joints) -> tuple[Joints, Palm]:
+        """Opening signs of a hand that closes from here to the side where it encloses a ball best, and the palm there."""
         velocity, still = self.motion.velocities(spread), torch.zeros_like(self.movable)
         normal, sides = main_axis(velocity.mT.reshape(-1, 3)), []
         for side in (normal, -normal):
@@ -170,13 +155,8 @@ class ClosingFinder(Postures):
             raise HandError(NOTHING_ENCLOSED)
         return max(sides, key=lambda pair: pair[1].score)
 
-    def signs_at_limits(
-        self, signs: Float[Tensor, " n_dof"], abduction: Bool[Tensor, " n_dof"], spreads: Bool[Tensor, " n_dof"],
-        centre: Float[Tensor, "3"],
-    ) -> Float[Tensor, " n_dof"]:
+    def signs_at_limits(self, signs: Joints, abduction: JointMask, spreads: JointMask, centre: Point) -> Joints:
         """Opening signs by what each joint does from limit to limit, with the others at rest or, by these signs, half closed.
-
-        A single finger closes on the jaw that is part of the palm, if there is one on either side.
 
         Args:
             signs: Opening signs so far.
@@ -185,19 +165,18 @@ class ClosingFinder(Postures):
             centre: The grasp centre [m].
         """
         bases = (self.rest, self.posture(self.opened(signs), signs, abduction, 0.5))
-        gains = torch.stack([self.gains(self.tree, q, centre) for q in bases]).sum(0)
+        tips, targets = (self.motion.links, self.motion.tip_points), (centre, self.palm_middle)
+        gains = torch.stack([closing_gains(self.tree, q, *tips, targets) for q in bases]).sum(0)
         signs = torch.where((gains >= 0) | spreads, -1.0, 1.0)
+        # A single finger closes on the jaw that is part of the palm, if there is one on either side.
         jaw, other = (self.fixed_jaw(self.opened(way), way, abduction) for way in (signs, -signs))
-        return self.as_stated(signs if other is None or (jaw and jaw.length >= other.length) else -signs)
+        signs = signs if other is None or (jaw and jaw.length >= other.length) else -signs
+        # A joint whose stated open posture is a limit opens towards it.
+        return torch.where(self.stated.isnan(), signs, self.away_from_limits(self.stated, signs))
 
-    def signs_from(
-        self, widest: Float[Tensor, " n_dof"], signs: Float[Tensor, " n_dof"], abduction: Bool[Tensor, " n_dof"],
-        centre: Float[Tensor, "3"],
-    ) -> Float[Tensor, " n_dof"]:
-        """Opening signs of joints that start from the widest posture: those that close each fingertip on the grasp centre.
-
-        The joints of a finger are decided together, because a thumb closes on the other fingers only as a whole.
-        """
+    def signs_from(self, widest: Joints, signs: Joints, abduction: JointMask, centre: Point) -> Joints:
+        """Opening signs of joints that start from the widest posture: those that close each fingertip on the grasp centre."""
+        # The joints of a finger are decided together, because a thumb closes on the other fingers only as a whole.
         for finger in self.fingers:
             joints = (self.tree.moves[finger.tip] & self.movable & ~abduction).nonzero()[:, 0]
             if not len(joints):  # it only spreads
@@ -225,33 +204,18 @@ class ClosingFinder(Postures):
         return FingerMotion(self.tree, self.fingers, middles)
 
     @cached_property
-    def palm_middle(self) -> Float[Tensor, "3"]:
+    def palm_middle(self) -> Point:
         """Mean of the palm's samples [m]."""
         return _tensor(self.coarse.posed(self.tree, self.rest)[0][self.on_palm].mean(0))
 
-    def _from_middle(self, tips: Float[Tensor, "*batch 3"], knuckles: Float[Tensor, "*batch 3"]) -> Float[Tensor, " *batch"]:
-        return span(tips - self.palm_middle, knuckles - self.palm_middle)
-
-    def gains(self, tree: KinematicTree, q: Float[Tensor, " n_dof"], centre: Float[Tensor, "3"]) -> Float[Tensor, " n_dof"]:
-        """How much each joint, from end to end, brings its fingertips nearer to the grasp centre and to the palm [m]."""
-        return closing_gains(tree, q, self.motion.links, self.motion.tip_points, (centre, self.palm_middle))
-
-    def out_of_palm(
-        self, opened: Float[Tensor, " n_dof"], signs: Float[Tensor, " n_dof"], palm: Palm
-    ) -> Bool[Tensor, " n_dof"]:
-        """Joints whose axes point out of the palm, at rest and with bent fingers alike, and those that move sideways."""
+    def out_of_palm(self, opened: Joints, signs: Joints, palm: Palm) -> JointMask:
+        """Joints that only spread fingers: their axes point out of the palm, at rest and with bent fingers alike."""
         bent = self.posture(opened, signs, torch.zeros_like(self.movable), 0.5)
         direction = _tensor(palm.direction)
         return (axes_along(self.tree, self.rest, direction) & axes_along(self.tree, bent, direction)) | self.sideways
 
-    def examine(
-        self, opened: Float[Tensor, " n_dof"], signs: Float[Tensor, " n_dof"], abduction: Bool[Tensor, " n_dof"]
-    ) -> Palm:
-        """The palm at the closing where palm and fingers enclose a ball best.
-
-        Raises:
-            HandError: They enclose nothing.
-        """
+    def examine(self, opened: Joints, signs: Joints, abduction: JointMask) -> Palm:
+        """The palm at the closing where palm and fingers enclose a ball best."""
         jaw, on_palm, on_fingers = self.fixed_jaw(opened, signs, abduction), self.on_palm, self.on_fingers
         if jaw is not None:
             on_palm, on_fingers = on_palm & ~jaw.mask, [*on_fingers, jaw.mask]
@@ -267,16 +231,33 @@ class ClosingFinder(Postures):
         """The samples on each finger."""
         return [np.isin(self.coarse.link.numpy(), finger.chain) for finger in self.fingers]
 
-    def fixed_jaw(
-        self, opened: Float[Tensor, " n_dof"], signs: Float[Tensor, " n_dof"], abduction: Bool[Tensor, " n_dof"]
-    ) -> FixedJaw | None:
+    def fixed_jaw(self, opened: Joints, signs: Joints, abduction: JointMask) -> FixedJaw | None:
         """The part of the palm that a single finger closes on; None for several fingers."""
         if len(self.fingers) > 1:
             return None
-        postures = (self.posture(opened, signs, abduction, share) for share in (JUST_BEFORE, NEARLY_CLOSED))
+        postures = (self.posture(opened, signs, abduction, share) for share in NEARLY_CLOSED)
         before, after = (self.coarse.posed(self.tree, q)[0] for q in postures)
         return find_fixed_jaw(before, after, self.on_palm, self.on_fingers[0])
 
+    def opened(self, signs: Joints) -> Joints:
+        """The stated open posture; for other joints the limits towards which they open."""
+        limits = torch.where(signs > 0, self.tree.upper, self.tree.lower)
+        return torch.where(self.stated.isnan(), limits, self.stated)
 
-def _tensor(values: Float[np.ndarray, "3"]) -> Float[Tensor, "3"]:
+    def away_from_limits(self, opened: Joints, signs: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_dof"]:
+        """The signs, but joints that are open at one of their limits close towards the other one."""
+        room = AT_LIMIT * (self.tree.upper - self.tree.lower)
+        at_lower, at_upper = opened - self.tree.lower < room, self.tree.upper - opened < room
+        return torch.where(at_lower, -1.0, torch.where(at_upper, 1.0, signs))
+
+    def posture(
+        self, opened: Joints, signs: Float[Tensor, "*batch n_dof"], abduction: JointMask,
+        share: float,
+    ) -> Float[Tensor, "*batch n_dof"]:
+        """Joints this share of the way from open to closed; those that are held or only spread fingers at rest."""
+        closed = torch.where(signs > 0, self.tree.lower, self.tree.upper)
+        return torch.where(self.movable & ~abduction, opened + share * (closed - opened), self.rest)
+
+
+def _tensor(values: Float[np.ndarray, "3"]) -> Point:
     return torch.tensor(values, dtype=torch.float32)

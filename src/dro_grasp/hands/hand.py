@@ -154,25 +154,22 @@ class Hand:
 
     def canonical_joints(self, openness: float = 0.75) -> Float[Tensor, " n_dof"]:
         """Open-hand joints [rad or m]: this share of the way from the closed to the open end; held joints at rest."""
-        return self._spread_evenly(self._between(self.rest.new_full((self.tree.n_dof,), openness)))
+        return self._opened(self.rest.new_full((self.tree.n_dof,), openness))
 
     def random_open_joints(self, n: int, generator: torch.Generator) -> Float[Tensor, "n n_dof"]:
         """Open hands like those the network is trained on: openness uniform in 0.65 to 0.85, one draw per hand."""
         share = 0.65 + 0.2 * torch.rand(n, 1, generator=generator, device=generator.device).to(self.rest)
-        return self._spread_evenly(self._between(share.expand(n, self.tree.n_dof)))
+        return self._opened(share.expand(n, self.tree.n_dof))
 
     def random_joints(self, n: int, generator: torch.Generator) -> Float[Tensor, "n n_dof"]:
         """Joints uniform between their open and closed ends [rad or m]; held joints at rest."""
         share = torch.rand(n, self.tree.n_dof, generator=generator, device=generator.device).to(self.rest)
         return torch.where(self.movable, self.lower + share * (self.upper - self.lower), self.rest)
 
-    def _spread_evenly(self, q: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_dof"]:
-        """Put joints that only spread the fingers where they are neutral."""
+    def _opened(self, share: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_dof"]:
+        """Joints this share of the way from closed to open; held joints at rest, those that only spread fingers neutral."""
+        q = torch.where(self.movable, self.open_ends * share + self.closed_ends * (1 - share), self.rest)
         return torch.where(self.abduction & self.movable, self.neutral, q)
-
-    def _between(self, share: Float[Tensor, "*batch n_dof"]) -> Float[Tensor, "*batch n_dof"]:
-        """Joints this share of the way from closed to open; held joints at rest."""
-        return torch.where(self.movable, self.open_ends * share + self.closed_ends * (1 - share), self.rest)
 
     def points(
         self, q: Float[Tensor, "*batch n_dof"], T_world_wrist: Float[Tensor, "*batch 4 4"] | None = None
@@ -273,10 +270,8 @@ class Hand:
             first[members[rank[members].argsort()[:per_link]]] = True
         priority = torch.where(first, rank - self.n_points, rank)
         keep = priority.argsort()[:count].sort().values
-        return dataclasses.replace(
-            self, link_points=self.link_points[keep], link_normals=self.link_normals[keep],
-            link_index=self.link_index[keep],
-        )
+        return dataclasses.replace(self, link_points=self.link_points[keep], link_normals=self.link_normals[keep],
+                                   link_index=self.link_index[keep])
 
     @cached_tensor
     def spread_rank(self) -> Int[Tensor, " n_hand"]:

@@ -65,23 +65,16 @@ def load_hand_description(name: str | Path) -> tuple[Description, str]:
 
 def hand_names() -> dict[str, str]:
     """Names that `load_hand` takes, each with its source: `builtin` or `assets`."""
-    names = {file.stem: "builtin" for file in sorted(BUILTIN_FOLDER.glob("*.urdf"))}
-    folder = _asset_folder()
-    for name, file in ASSET_FILES.items():
-        if folder is not None and (folder / file).is_file():
-            names[ASSET_PREFIX + name] = "assets"
-    return names
+    builtin = {file.stem: "builtin" for file in sorted(BUILTIN_FOLDER.glob("*.urdf"))}
+    return builtin | {ASSET_PREFIX + name: "assets" for name in ASSET_FILES if _asset_file(name)}
 
 
 class HandFile(NamedTuple):
     """Where a hand is described."""
 
-    path: Path
-    """The file."""
-    name: str
-    """The hand's name in results."""
-    link: str | None
-    """The link at which the hand begins; None where the file is the hand's."""
+    path: Path  # the file
+    name: str  # the hand's name in results
+    link: str | None  # the link at which the hand begins; None where the file is the hand's
 
 
 def locate_hand(name: str | Path) -> HandFile:
@@ -117,10 +110,8 @@ def _asset_folder() -> Path | None:
 
 def _asset_file(name: str) -> Path | None:
     folder = _asset_folder()
-    if folder is None or name not in ASSET_FILES:
-        return None
-    file = folder / ASSET_FILES[name]
-    return file if file.is_file() else None
+    file = folder / ASSET_FILES[name] if folder and name in ASSET_FILES else None
+    return file if file and file.is_file() else None
 
 
 def _robot_description(name: str) -> Path | None:

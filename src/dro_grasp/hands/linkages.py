@@ -9,10 +9,11 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from dro_grasp.descriptions.link_geometry import LinkGeometry
+from dro_grasp.descriptions.tree_reading import LinkGeometry
 from dro_grasp.hands.anatomy import rigid_groups
 from dro_grasp.kinematics.tree import KinematicTree
 
+Point = Float[np.ndarray, "3"]
 POSTURES = 16
 """Random postures in which a pin must be where both links have it (ours)."""
 LOOSE = 0.03
@@ -31,20 +32,17 @@ class _End:
     """A last link of the hand, with all that is fixed to it."""
 
     tip: int
-    link: int
-    """Its topmost link, in whose frame the rest is."""
-    vertices: Float[np.ndarray, "n 3"]
-    """Corners of its shapes [m]."""
-    anchor: Float[np.ndarray, "3"]
-    """A point on the axis of its joint [m]."""
-    axis: Float[np.ndarray, "3"]
+    link: int  # its topmost link, in whose frame the rest is
+    vertices: Float[np.ndarray, "n 3"]  # corners of its shapes [m]
+    anchor: Point  # a point on the axis of its joint [m]
+    axis: Point
 
-    def has(self, pin: Float[np.ndarray, "3"]) -> bool:
+    def has(self, pin: Point) -> bool:
         """Whether a point is at this link."""
         low, high = self.vertices.min(0) - OUTSIDE, self.vertices.max(0) + OUTSIDE
         return bool(((pin >= low) & (pin <= high)).all())
 
-    def lever(self, pin: Float[np.ndarray, "3"]) -> float:
+    def lever(self, pin: Point) -> float:
         """Distance of a point from the axis of this link's own joint [m]."""
         return float(np.linalg.norm(np.cross(pin - self.anchor, self.axis)))
 
@@ -55,12 +53,8 @@ def find_rods(tree: KinematicTree, tips: Sequence[int], geometry: Sequence[LinkG
     Two last links that turn about one point in all postures are pinned together. The rod is the one that reaches less far
     from the link where their chains part.
 
-    Args:
-        tips: A link at the end of each chain, as `find_tips` gives them.
-        geometry: The shapes of all links.
-
     Returns:
-        For each rod the tip of the finger that it is pinned to.
+        For each rod, which is the end of a chain as `find_tips` gives it, the tip of the finger that it is pinned to.
     """
     if tree.n_dof == len(tree.moving_names):
         return {}  # a linkage has joints that follow

@@ -6,15 +6,16 @@ let it fold back closes on nothing on the way from there.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dro_grasp.descriptions.compiling import Note
 from dro_grasp.geometry import se3
-from dro_grasp.hands.anatomy import Finger
+from dro_grasp.hands.anatomy import Finger, JointMask, Joints, Point
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinematics.tree import REVOLUTE, KinematicTree
 
@@ -32,7 +33,6 @@ ranges, 16 hands that open as they should have 0.82 at most, and most of them 0.
 LEAST_REACH = 0.35
 """Share of its widest reach below which a finger that opens farther folds back (ours). At the limits of their ranges, 16 hands
 that open as they should keep 0.44 to 1; a finger that points straight back behind its knuckle keeps 0 or less."""
-
 ALIKE = 0.9
 """Cosine between the ways in which two joints move a fingertip from which on they bend the finger alike (ours)."""
 ACROSS = 0.3
@@ -50,23 +50,17 @@ STILL = 5e-3
 class Line:
     """A straight line: the palm's axis."""
 
-    point: Float[Tensor, "3"]
-    """A point on it [m]."""
-    direction: Float[Tensor, "3"]
-    """Unit vector along it."""
+    point: Point  # a point on it [m]
+    direction: Point  # unit vector along it; zero for the point alone
 
     def span(self, tips: Float[Tensor, "*batch 3"], knuckles: Float[Tensor, "*batch 3"]) -> Float[Tensor, " *batch"]:
         """Distances of fingertips to the line [m]; negative for those on the other side of it than their knuckles."""
-        return span(self._across(tips), self._across(knuckles))
+        tips, knuckles = self._across(tips), self._across(knuckles)
+        return torch.where((tips * knuckles).sum(-1) >= 0, 1.0, -1.0) * tips.norm(dim=-1)
 
     def _across(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         offset = points - self.point
         return offset - (offset @ self.direction)[..., None] * self.direction
-
-
-def span(tips: Float[Tensor, "*batch 3"], knuckles: Float[Tensor, "*batch 3"]) -> Float[Tensor, " *batch"]:
-    """Distances of fingertips to the origin [m]; negative for those on the other side of it than their knuckles."""
-    return torch.where((tips * knuckles).sum(-1) >= 0, 1.0, -1.0) * tips.norm(dim=-1)
 
 
 @dataclass(frozen=True)
@@ -74,11 +68,8 @@ class FingerMotion:
     """Fingertips as functions of joints, in the root link's frame."""
 
     tree: KinematicTree
-    """Links and joints."""
     fingers: tuple[Finger, ...]
-    """The fingers."""
-    tip_points: Float[Tensor, "n_tips 3"]
-    """A point on each fingertip, in its link's frame [m]."""
+    tip_points: Float[Tensor, "n_tips 3"]  # a point on each fingertip, in its link's frame [m]
 
     @staticmethod
     def of(hand: Hand) -> FingerMotion:
@@ -95,66 +86,49 @@ class FingerMotion:
         """Positions of the fingertips [m]."""
         return se3.apply(self.tree.forward(q)[..., self.links, :, :], self.tip_points)
 
-    def velocities(self, q: Float[Tensor, " n_dof"]) -> Float[Tensor, "n_tips 3 n_dof"]:
+    def velocities(self, q: Joints) -> Float[Tensor, "n_tips 3 n_dof"]:
         """Motion of each fingertip per motion of each joint [m/rad or m/m]."""
         poses = self.tree.forward(q)
         return self.tree.point_jacobian(poses, self.tips(q), torch.tensor(self.links))
 
-    def sideways(
-        self, q: Float[Tensor, " n_dof"], bends: Bool[Tensor, " n_dof"], palm_direction: Float[Tensor, "3"]
-    ) -> Bool[Tensor, " n_dof"]:
-        """Joints that move a fingertip across the way in which all other joints of its finger bend it, and not to the palm.
-
-        Args:
-            q: Joints [rad or m].
-            bends: The joints that are looked at; two others at least must bend a finger alike.
-            palm_direction: Unit vector.
-        """
+    def sideways(self, q: Joints, bends: JointMask, palm_direction: Point) -> JointMask:
+        """Joints that move a fingertip across the way in which all other joints of its finger bend it, and not to the palm."""
         found, velocity = torch.zeros_like(bends), self.velocities(q)
         for row, finger in enumerate(self.fingers):
             joints = (self.tree.moves[finger.tip] & bends & (velocity[row].norm(dim=0) > STILL)).nonzero()[:, 0]
             ways = torch.nn.functional.normalize(velocity[row][:, joints], dim=0).T
             for i, joint in enumerate(joints.tolist()):
                 others = ways[torch.arange(len(ways)) != i]
-                if len(others) < 2:
+                if len(others) < 2:  # two at least must bend a finger alike
                     continue
                 bending = main_axis(others)
                 alike = bool((others @ bending).abs().min() > ALIKE)
                 found[joint] |= alike and bool(torch.stack([bending, palm_direction]).mv(ways[i]).abs().max() < ACROSS)
         return found
 
-    def bend(self, opened: Float[Tensor, " n_dof"], closed: Float[Tensor, " n_dof"]) -> float:
+    def bend(self, opened: Joints, closed: Joints) -> float:
         """Angle by which the joints of a finger turn in all from one posture to another, largest of all fingers [rad]."""
         turns = self.tree.link_coupling.abs() @ (closed - opened).abs() * (torch.tensor(self.tree.kind) == REVOLUTE)
         return max(float(turns[list(finger.chain)].sum()) for finger in self.fingers)
 
-    def reaches(self, q: Float[Tensor, "*batch n_dof"], bends: Bool[Tensor, " n_dof"]) -> Float[Tensor, "*batch n_tips 3"]:
+    def reaches(self, q: Float[Tensor, "*batch n_dof"], bends: JointMask) -> Float[Tensor, "*batch n_tips 3"]:
         """From the knuckle of each finger to its tip [m]."""
         return self.tips(q) - self.knuckles(q, bends)
 
-    def knuckles(self, q: Float[Tensor, "*batch n_dof"], bends: Bool[Tensor, " n_dof"]) -> Float[Tensor, "*batch n_tips 3"]:
+    def knuckles(self, q: Float[Tensor, "*batch n_dof"], bends: JointMask) -> Float[Tensor, "*batch n_tips 3"]:
         """Positions of the knuckles [m]."""
         links = [self._knuckle(finger, bends) for finger in self.fingers]
         return se3.apply(self.tree.forward(q)[..., links, :, :], self.tree.anchor[links])
 
-    def _knuckle(self, finger: Finger, bends: Bool[Tensor, " n_dof"]) -> int:
+    def _knuckle(self, finger: Finger, bends: JointMask) -> int:
         """The first link that bends far; a metacarpal, which bends a little, is no knuckle."""
         chain = list(finger.chain)
         ranges = (self.tree.upper - self.tree.lower) / self.tree.joint_unit * bends
         far = ((self.tree.link_coupling[chain] != 0) * ranges).amax(-1)
         return chain[int((far >= KNUCKLE * far.max()).nonzero()[0, 0])]
 
-    def widest(
-        self, measure: Callable[[Float[Tensor, "n n_tips 3"], Float[Tensor, "n n_tips 3"]], Float[Tensor, "n n_tips"]],
-        start: Float[Tensor, " n_dof"], bends: Bool[Tensor, " n_dof"],
-    ) -> Float[Tensor, " n_dof"]:
-        """The posture whose fingertips span the most, found joint by joint [rad or m].
-
-        Args:
-            measure: The span of fingertips with these knuckles [m].
-            start: Where the search begins; joints that do not bend stay there, and of equal spans the nearest wins.
-            bends: The joints that are searched.
-        """
+    def widest(self, axis: Line, start: Joints, bends: JointMask) -> Joints:
+        """The posture whose fingertips span the most, found joint by joint; of equal spans the one nearest to the start."""
         q, tree = start, self.tree
         for _ in range(SWEEPS):
             before = q
@@ -164,33 +138,28 @@ class FingerMotion:
                 values = values[(values - start[joint]).abs().argsort(stable=True)]
                 tried = q.repeat(len(values), 1)
                 tried[:, joint] = values
-                total = measure(self.tips(tried), self.knuckles(tried, bends)).sum(-1)
+                total = axis.span(self.tips(tried), self.knuckles(tried, bends)).sum(-1)
                 q = tried[int((total > total.max() - SAME_SPAN).nonzero()[0, 0])]
             if torch.equal(q, before):
                 break
         return q
 
-    def folded(
-        self, path: Float[Tensor, "steps n_dof"], bends: Bool[Tensor, " n_dof"], axis: Line
-    ) -> Bool[Tensor, " n_tips"]:
-        """Fingers that fold back on a path from closed to open.
-
-        Beyond their widest span they point behind the palm, or lose most of their reach.
-        """
+    def folded(self, path: Float[Tensor, "steps n_dof"], bends: JointMask, axis: Line) -> Bool[Tensor, " n_tips"]:
+        """Fingers that, on a path to open and beyond their widest span, point behind the palm or lose most of their reach."""
         at = axis.span(self.tips(path), self.knuckles(path, bends)).argmax(0)
         beyond = torch.arange(len(path))[:, None] >= at
         behind = self.behind(path, bends, axis.direction) > BEHIND
         return (beyond & ((self.kept(path, bends, at) < LEAST_REACH) | behind)).any(0)
 
     def behind(
-        self, q: Float[Tensor, "*batch n_dof"], bends: Bool[Tensor, " n_dof"], palm_direction: Float[Tensor, "3"]
+        self, q: Float[Tensor, "*batch n_dof"], bends: JointMask, palm_direction: Point
     ) -> Float[Tensor, "*batch n_tips"]:
         """Angle by which each finger points behind the plane of the palm [rad]; negative in front of it."""
         reach = self.reaches(q, bends)
         return torch.asin((-(reach @ palm_direction) / reach.norm(dim=-1).clamp_min(1e-6)).clamp(-1, 1))
 
     def kept(
-        self, path: Float[Tensor, "steps n_dof"], bends: Bool[Tensor, " n_dof"], at: Int[Tensor, " n_tips"] | int = 0
+        self, path: Float[Tensor, "steps n_dof"], bends: JointMask, at: Int[Tensor, " n_tips"] | int = 0
     ) -> Float[Tensor, "steps n_tips"]:
         """Share of each finger's reach at one step of a path that it keeps at every step, measured along that reach."""
         reach = self.reaches(path, bends)
@@ -198,17 +167,38 @@ class FingerMotion:
         return (reach * then).sum(-1) / then.square().sum(-1).clamp_min(1e-12)
 
 
-def open_side_by_side(hand: Hand, openness: float) -> Float[Tensor, " n_dof"]:
-    """`Hand.canonical_joints`, but all joints that move a finger sideways are neutral, so that no fingers cross [rad or m].
-
-    Joints that turn a finger about its length, or sit beyond its knuckle, count as bending: they spread it only where it bends.
-    At their open ends neighbours cross.
-    """
+def open_side_by_side(hand: Hand, openness: float) -> Joints:
+    """`Hand.canonical_joints`, but all joints that move a finger sideways are neutral, so that no fingers cross [rad or m]."""
+    # Joints that turn a finger about its length, or sit beyond its knuckle, count as bending: they spread it only where it
+    # bends. At their open ends neighbours cross.
     q, motion, palm = hand.canonical_joints(openness), FingerMotion.of(hand), hand.palm_direction_wrist
     spreads = [motion.sideways(hand.canonical_joints(share), hand.movable, palm) for share in SPREADING]
     return torch.where(torch.stack(spreads).any(0) & hand.movable, hand.neutral, q)
 
 
-def main_axis(vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "3"]:
+def main_axis(vectors: Float[Tensor, "n 3"]) -> Point:
     """Unit vector along which most of the vectors lie, forth or back."""
     return torch.linalg.svd(vectors, full_matrices=False)[2][0]
+
+
+def opening_notes(hand: Hand) -> list[Note]:
+    """What the open posture leaves out, finger by finger, and the fingers that point behind the palm in it."""
+    bends = hand.movable & ~hand.abduction
+    behind = FingerMotion.of(hand).behind(hand.canonical_joints(1.0), bends, hand.palm_direction_wrist).tolist()
+    notes = []
+    for finger, angle in zip(hand.fingers, behind, strict=True):
+        tip, left_out = hand.tree.link_names[finger.tip], _left_out(hand, finger)
+        if left_out:
+            notes.append(Note("info", tip, f"can open farther than the open posture, which leaves out {', '.join(left_out)}"))
+        if angle > BEHIND:
+            text = f"points {math.degrees(angle):.0f} degrees behind the palm in the open posture. Is the palm direction right?"
+            notes.append(Note("warning", tip, text + " If so, state another open posture"))
+    return notes
+
+
+def _left_out(hand: Hand, finger: Finger) -> list[str]:
+    """For each joint of a finger that can open farther than it does: how much of its range is not used."""
+    tree, ends, limits = hand.tree, hand.open_ends.tolist(), hand.open_limits.tolist()
+    shares = ((hand.open_limits.double() - hand.open_ends).abs() / (tree.upper.double() - tree.lower)).tolist()
+    joints = (tree.moves[finger.tip] & hand.movable).nonzero()[:, 0].tolist()
+    return [f"{shares[j]:.0%} of {tree.joint_names[j]} ({ends[j]:.2f} to {limits[j]:.2f})" for j in joints if shares[j] > 0]

@@ -23,19 +23,15 @@ JOINTS = 20.0
 
 
 def proportions(hand: Hand, axes: Float[Tensor, "3 3"]) -> Float[Tensor, " f"]:
-    """Lengths in UNIT about the grasp centre, and counts.
+    """Lengths in UNIT about the grasp centre, along axes that are columns in the wrist frame, and counts.
 
     For each openness the mean, spread, minimum and maximum of the fingertips, mean and spread of the fingers' surface, and the
     thumb's tip, or zeros without one; then the mean and spread of the open hand's palm, and the numbers of fingers, thumbs and
     joints.
-
-    Args:
-        hand: Any hand.
-        axes: Those of the numbers, as columns in the wrist frame.
     """
     owner = hand.finger_of_link[hand.link_index]
     found: list[Float[Tensor, " k"]] = []
-    poses = [[_about(hand, axes, x) for x in _posed(hand, openness)] for openness in OPENNESS]
+    poses = [[(x - hand.grasp_centre_wrist) @ axes / UNIT for x in _posed(hand, openness)] for openness in OPENNESS]
     for tips, points in poses:
         thumb = torch.zeros_like(tips[0]) if hand.thumb is None else tips[hand.thumb]
         found += [*_moments(tips), tips.amin(0), tips.amax(0), *_moments(points[owner >= 0]), thumb]
@@ -50,10 +46,6 @@ def _posed(hand: Hand, openness: float) -> tuple[Float[Tensor, "n_tips 3"], Floa
     q = hand.canonical_joints(openness)
     T = hand.tree.forward(q)[list(hand.tips)]
     return (T[:, :3, :3] @ hand.tip_offsets[..., None])[..., 0] + T[:, :3, 3], hand.points(q)
-
-
-def _about(hand: Hand, axes: Float[Tensor, "3 3"], points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    return (points - hand.grasp_centre_wrist) @ axes / UNIT
 
 
 def _moments(points: Float[Tensor, "n 3"]) -> Float[Tensor, "2 3"]:

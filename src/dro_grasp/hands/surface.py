@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dro_grasp.descriptions.link_geometry import LinkGeometry
 from dro_grasp.descriptions.loader import Description
+from dro_grasp.descriptions.tree_reading import LinkGeometry
 from dro_grasp.errors import HandError
 from dro_grasp.geometry import se3
 from dro_grasp.geometry.point_clouds import sample_surface
@@ -26,12 +26,9 @@ NUDGE = 5e-4
 class LinkSurface:
     """Samples on the links from the palm on."""
 
-    points: Float[Tensor, "n 3"]
-    """In their links' frames [m]."""
-    normals: Float[Tensor, "n 3"]
-    """Outward unit normals, in their links' frames."""
-    link: Int[Tensor, " n"]
-    """The link of each point."""
+    points: Float[Tensor, "n 3"]  # in their links' frames [m]
+    normals: Float[Tensor, "n 3"]  # outward unit normals, in their links' frames
+    link: Int[Tensor, " n"]  # the link of each point
 
     def thinned(self, step: int) -> LinkSurface:
         """Every `step`-th sample."""
@@ -63,8 +60,8 @@ def sample_links(description: Description, links: list[int], seed: int) -> LinkS
         try:
             p, n = _sample_shapes(shapes, generator)
         except ValueError as error:
-            raise HandError(f"{description.path}: the shapes of link '{description.tree.link_names[link]}' have no area; give "
-                            "it a shape that is not flat in two directions") from error
+            raise HandError(f"the shapes of link '{description.tree.link_names[link]}' have no area; give it a shape that is "
+                            "not flat in two directions") from error
         points.append(p)
         normals.append(n)
         index.append(torch.full((len(p),), link))

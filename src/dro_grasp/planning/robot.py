@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from dro_grasp.descriptions.bounds import MOST_TURN
+from dro_grasp.descriptions.compiling import MOST_TURN
 from dro_grasp.descriptions.loader import Description, load_description
 from dro_grasp.descriptions.part import named
 from dro_grasp.descriptions.reduction import NO_LIMITS

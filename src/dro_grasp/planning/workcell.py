@@ -13,7 +13,7 @@ import torch
 import trimesh
 from jaxtyping import Bool, Float, Int
 
-from dro_grasp.descriptions.collision import collide
+from dro_grasp.descriptions.compiling import collide
 from dro_grasp.errors import PlanError, RobotError
 from dro_grasp.geometry.table_plane import moved_plane
 from dro_grasp.objects.cache import content_hash

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dro_grasp.descriptions.collision import collide
+from dro_grasp.descriptions.compiling import collide
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand

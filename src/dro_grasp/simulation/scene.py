@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dro_grasp.descriptions.collision import collide
+from dro_grasp.descriptions.compiling import collide
 from dro_grasp.errors import HandError, ObjectError
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.hands.hand import Hand

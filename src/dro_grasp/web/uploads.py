@@ -6,7 +6,7 @@ import io
 import zipfile
 from pathlib import Path, PurePosixPath
 
-from dro_grasp.descriptions.urdf_meshes import find_mesh
+from dro_grasp.descriptions.urdf import find_mesh
 from dro_grasp.descriptions.xml_files import parse_xml
 from dro_grasp.errors import OptionError
 from dro_grasp.files import reading

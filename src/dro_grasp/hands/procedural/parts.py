@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from dro_grasp.hands.procedural.plan import Coupling, FingerPlan, FingerShape, PalmShape, Segment, Solid, Vector, rpy_of
 
+Point = Float[np.ndarray, "3"]
 SHARES = {1: (1.0,), 2: (0.56, 0.44), 3: (0.45, 0.30, 0.25)}
 """Shares of a finger's length, from the palm outwards, by its number of phalanges (ours; human fingers are close)."""
 TAPER = 0.93
@@ -25,38 +26,25 @@ KNUCKLE = 1.25
 class Style:
     """What the fingers of one hand have in common."""
 
-    radius: float
-    """Half the thickness of a first phalanx [m]."""
-    length: float
-    """Length of the longest finger [m]."""
-    phalanges: int
-    """Phalanges of a finger, 2 or 3."""
-    shape: FingerShape
-    """Shape of the phalanges."""
-    width: float
-    """Width of a box-shaped phalanx as a share of its thickness."""
-    coupling: Coupling
-    """Joints that follow the one before."""
-    ratios: tuple[float, float]
-    """Angle of the second and of the third joint per angle of the one before, where they follow."""
-    spread: float
-    """Limit of the spreading joint to either side [rad]; 0 if there is none."""
-    lower: float
-    """Lower limit of the first bending joint [rad]."""
-    uppers: tuple[float, float, float]
-    """Upper limits of the bending joints [rad]."""
+    radius: float  # half the thickness of a first phalanx [m]
+    length: float  # length of the longest finger [m]
+    phalanges: int  # phalanges of a finger, 2 or 3
+    shape: FingerShape  # shape of the phalanges
+    width: float  # width of a box-shaped phalanx as a share of its thickness
+    coupling: Coupling  # joints that follow the one before
+    ratios: tuple[float, float]  # angle of the second and of the third joint per angle of the one before, where they follow
+    spread: float  # limit of the spreading joint to either side [rad]; 0 if there is none
+    lower: float  # lower limit of the first bending joint [rad]
+    uppers: tuple[float, float, float]  # upper limits of the bending joints [rad]
 
 
 @dataclass(frozen=True)
 class Mount:
     """Where a finger stands on the palm."""
 
-    position: Float[np.ndarray, "3"]
-    """Its first axis, in the palm's frame [m]."""
-    along: Float[np.ndarray, "3"]
-    """Direction of the straight finger."""
-    closing: Float[np.ndarray, "3"]
-    """Direction in which it closes; need not be perpendicular."""
+    position: Point  # its first axis, in the palm's frame [m]
+    along: Point  # direction of the straight finger
+    closing: Point  # direction in which it closes; need not be perpendicular
 
     @property
     def frame(self) -> Float[np.ndarray, "3 3"]:
@@ -66,12 +54,12 @@ class Mount:
         return np.stack([x, np.cross(z, x), z], -1)
 
 
-def unit(v: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+def unit(v: Point) -> Point:
     """The direction of a vector."""
     return v / np.linalg.norm(v)
 
 
-def vector(v: Float[np.ndarray, "3"]) -> Vector:
+def vector(v: Point) -> Vector:
     """An array as the tuple that plans hold."""
     x, y, z = v.tolist()
     return x, y, z
@@ -81,14 +69,10 @@ def vector(v: Float[np.ndarray, "3"]) -> Vector:
 class Turn:
     """A joint before a finger's bending joints: it spreads a finger or turns a thumb."""
 
-    axis: Float[np.ndarray, "3"]
-    """Unit vector in the palm's frame."""
-    lower: float
-    """Lower limit [rad]."""
-    upper: float
-    """Upper limit [rad]."""
-    open: float = 0.0
-    """Angle in the open hand [rad]."""
+    axis: Point  # unit vector in the palm's frame
+    lower: float  # [rad]
+    upper: float  # [rad]
+    open: float = 0.0  # angle in the open hand [rad]
 
 
 def finger_plan(name: str, mount: Mount, style: Style, length: float, turn: Turn | None = None) -> FingerPlan:
@@ -121,14 +105,7 @@ def _knuckle(style: Style) -> tuple[Solid, ...]:
 
 
 def phalanx(style: Style, radius: float, length: float, tip: bool) -> tuple[Solid, ...]:
-    """A link from the joint at its origin to the next joint, or to the round end of a fingertip.
-
-    Args:
-        style: Shape and width.
-        radius: Half its thickness [m].
-        length: From the joint to the next joint, or to the end [m].
-        tip: Whether it is the last one.
-    """
+    """A link of half this thickness [m] and this length [m] from its joint to the next one, or to the round end of a tip."""
     straight = length - radius if tip else length
     middle, end = (0.0, 0.0, straight / 2), (0.0, 0.0, straight)
     if style.shape == "capsule":
@@ -144,14 +121,10 @@ def phalanx(style: Style, radius: float, length: float, tip: bool) -> tuple[Soli
 class Block:
     """A palm that faces along its first axis: x is its depth, y its width, z its height, up to its upper end."""
 
-    shape: PalmShape
-    """Seen from above."""
-    depth: float
-    """Along the palm direction [m]."""
-    width: float
-    """[m]."""
-    height: float
-    """[m]."""
+    shape: PalmShape  # seen from above
+    depth: float  # along the palm direction [m]
+    width: float  # [m]
+    height: float  # [m]
 
     def solids(self) -> tuple[Solid, ...]:
         """Its shape; the middle of the upper edge is at the origin."""
@@ -181,13 +154,7 @@ class Block:
 
 
 def plate(shape: PalmShape, half: tuple[float, float], depth: float) -> tuple[Solid, ...]:
-    """A palm that faces along z, with its upper face at z = 0.
-
-    Args:
-        shape: Seen from above.
-        half: Half its extents along x and y [m].
-        depth: Along z [m].
-    """
+    """A palm of half these extents along x and y [m] that faces along z, with its upper face at z = 0."""
     x, y = half
     middle = (0.0, 0.0, -depth / 2)
     block = Solid((2 * x, 2 * y, depth), middle)

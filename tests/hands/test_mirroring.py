@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from dro_grasp.descriptions.mirroring import mirror, scale
+from dro_grasp.hands.variants import mirror, scale
 
 MIRROR = np.diag([1.0, -1.0, 1.0])
 LIMIT = '<limit lower="-0.02" upper="0.9" velocity="2" effort="3"/>'
