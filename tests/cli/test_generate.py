@@ -232,7 +232,7 @@ def test_a_picture_of_successes_shows_no_failures(
     generate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     none_holds(monkeypatch)
-    monkeypatch.setattr("dro_grasp.viewer.app.view_grasps", lambda *_: pytest.fail("failures are shown"))
+    monkeypatch.setattr("dro_grasp.viewer.grasp_page.view_grasps", lambda *_: pytest.fail("failures are shown"))
     path, base = tmp_path / "grasps.png", ["generate", "--hand", "gripper3", "--object", "sphere", "--num", "2"]
     assert main([*base, "--method", "network", "--only-successful", "--picture", str(path), "--view"]) == 0
     said = capsys.readouterr()

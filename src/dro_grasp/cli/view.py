@@ -151,7 +151,7 @@ class Picture:
         from dro_grasp.files import check_output
         from dro_grasp.grasps.reading import load_grasps
         from dro_grasp.grasps.sources import hand_of
-        from dro_grasp.viewer.pictures import PictureStyle, draw_sheet
+        from dro_grasp.pictures.sheets import PictureStyle, draw_sheet
 
         self._check_options()
         check_output(self.output, ".png")

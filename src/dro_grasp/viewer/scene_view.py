@@ -1,4 +1,4 @@
-"""The 3D scene in the browser, one hand and one object in their poses; and pages with their own server that show it."""
+"""What the pages in the browser share: the scene of a hand and an object, work that is done once at a time, and the server."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ import math
 import re
 import socket
 import sys
+import threading
+import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -16,13 +19,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.errors import OptionError
+from dro_grasp.errors import DroGraspError, OptionError
 from dro_grasp.extras import require_extra
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.pictures import appearance
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.rendering.meshes import OBJECT_COLOUR, Colour
-from dro_grasp.viewer import appearance
 from dro_grasp.web.origins import own_names, refusal
 
 try:
@@ -55,7 +58,6 @@ RAISED = 0.27
 """Share of its height by which hand and object then stand above the middle (ours)."""
 GRID_DEPTH = 0.12
 """Distance from the object's lowest point down to the grid [m]."""
-
 
 Point = tuple[float, float, float]
 """A place [m]."""
@@ -101,6 +103,7 @@ class SceneView:
         for k, (link, vertices, faces) in enumerate(appearance.link_shapes(hand)):
             scene.add_mesh_simple(f"{name}/hand/{link}/{k}", vertices, faces, color=rgb(colours[link]), side="double")
         self.solved = self.cloud("solved", np.zeros((1, 3)), appearance.SOLVED_COLOUR)
+        self.predicted = self.cloud("predicted", np.zeros((1, 3)), appearance.PREDICTED_COLOUR)
         self.contacts = self.cloud("contacts", np.zeros((1, 3)), appearance.CONTACT_COLOUR, CONTACT_SIZE)
         position = (*obj.cloud.mean(0)[:2].tolist(), float(obj.cloud.min(0)[2]) - GRID_DEPTH)
         self._grid = scene.add_grid(f"{name}/grid", width=0.4, height=0.4, cell_size=0.05, section_size=0.1, position=position)
@@ -144,8 +147,7 @@ class SceneView:
         moved = np.eye(4) if T_object is None else T_object.double().numpy()
         with self.client.atomic():
             for frame, pose in zip([self._object, *self.links], [moved, *poses], strict=True):
-                frame.position = pose[:3, 3]
-                frame.wxyz = viser.transforms.SO3.from_matrix(pose[:3, :3]).wxyz
+                move(frame, pose)
             self.solved.points = points.astype(np.float32)
 
     def colour_grid(self, success: bool | None) -> None:
@@ -159,6 +161,11 @@ class SceneView:
                 frame.visible = visible
 
 
+def move(handle: viser.SceneNodeHandle, T: Float[np.ndarray, "4 4"]) -> None:
+    """Put something in the scene at a pose [m]."""
+    handle.position, handle.wxyz = T[:3, 3], viser.transforms.SO3.from_matrix(T[:3, :3]).wxyz
+
+
 def viewpoint(camera: Camera, aspect: float = ASPECT) -> tuple[Point, Point]:
     """Where a camera stands, and where it looks, so that a window of this width over height shows all of a picture [m]."""
     start, target = np.asarray(camera.position), np.asarray(camera.target)
@@ -167,12 +174,7 @@ def viewpoint(camera: Camera, aspect: float = ASPECT) -> tuple[Point, Point]:
         height = 2 * float(np.linalg.norm(position - target)) * math.tan(camera.field_of_view / 2)
         down = -RAISED * height * camera.axes()[1]
         position, target = position + down, target + down
-    return _point(position), _point(target)
-
-
-def _point(place: Float[np.ndarray, "3"]) -> Point:
-    x, y, z = place.tolist()
-    return x, y, z
+    return tuple(position.tolist()), tuple(target.tolist())
 
 
 def rgb(colour: Colour) -> tuple[int, int, int]:
@@ -211,8 +213,89 @@ def escaped(text: object) -> str:
     return re.sub(r"[&<>{}\[\]*`\\!#|~$\n]", lambda sign: f"&#{ord(sign.group())};", str(text))
 
 
+class Closed(Exception):
+    """The page was closed while it worked."""
+
+
+class Page(ABC):
+    """A page with a stage and a film of it, which does one thing at a time and shows errors."""
+
+    play: viser.GuiButtonHandle
+    """Plays the film."""
+    moment: viser.GuiSliderHandle[int]
+    """The picture of the film that is shown."""
+    status: viser.GuiMarkdownHandle
+    """What the page does, and errors."""
+
+    def __init__(self, client: Client) -> None:
+        """Start with an empty stage; the class adds the controls."""
+        self.client, self.view, self.film = client, SceneView(client), None
+        self.closed = threading.Event()
+        """Whether nobody sees the page any more."""
+        self._busy = threading.Lock()
+
+    @abstractmethod
+    def show_moment(self, moment: int) -> None:
+        """Show one picture of the film, if there is one."""
+
+    @abstractmethod
+    def _play(self) -> None:
+        """Play the film."""
+
+    def _add_player(self, label: str) -> None:
+        """Add the controls of the film, disabled at first."""
+        gui = self.client.gui
+        self.play = gui.add_button(label, disabled=True)
+        self.moment = gui.add_slider("Moment", 0, 1, 1, 0, disabled=True, hint="Of what was played.")
+        self.play.on_click(lambda _: self._guarded(self._play))
+        self.moment.on_update(lambda event: None if event.client is None else self.show_moment(int(self.moment.value)))
+
+    def _roll(self, film: Any, moments: int, interval: float) -> bool:
+        """Show a film picture by picture, each for an interval [s]; False if another took its place."""
+        for moment in range(moments):
+            begin = time.monotonic()
+            if self.film is not film:
+                return False
+            self.show_moment(moment)
+            self.moment.value = moment
+            time.sleep(max(0.0, interval - (time.monotonic() - begin)))
+        return True
+
+    def _guarded(self, work: Callable[[], None], patience: float = 0.0, otherwise: str = "Busy; wait a moment.") -> None:
+        """Do one thing at a time, and show errors on the page.
+
+        Args:
+            work: What to do.
+            patience: Time to wait for the end of other work [s].
+            otherwise: What is said if it does not end.
+        """
+        with contextlib.suppress(Closed):
+            if not self._busy.acquire(timeout=patience):
+                self._say(otherwise)
+                return
+            try:
+                work()
+            except DroGraspError as error:
+                self._complain(error)
+            finally:
+                self._busy.release()
+
+    def _complain(self, error: DroGraspError) -> None:
+        self._say(f"**Error:** {escaped(error)}")
+
+    def _say(self, text: str) -> None:
+        """Show a line.
+
+        Raises:
+            Closed: Nobody sees it any more; whatever goes on ends here.
+        """
+        if self.closed.is_set():
+            raise Closed
+        self.status.content = text
+
+
 class ServedPage:
-    """A page with a stage that is being served; `stop()` ends it."""
+    """Pages that are being served; `stop()` ends them."""
 
     def __init__(self, port: int, host: str) -> None:
         """Start serving.
@@ -240,7 +323,6 @@ class ServedPage:
         # A panel at the side leaves the hand in sight; narrow windows get it at the bottom.
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         self.server.gui.main_panel.dock_right()
-        self.view = SceneView(self.server)
 
     @property
     def url(self) -> str:

@@ -21,17 +21,17 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import hand_names
 from dro_grasp.objects.catalogue import object_names
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.pictures.appearance import waiting_pose
+from dro_grasp.pictures.sheets import protocol_name
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import evaluate
 from dro_grasp.predictor import GraspPredictor, GraspRequest, Method
 from dro_grasp.simulation.diagnosis import diagnose
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
-from dro_grasp.viewer.appearance import waiting_pose
 from dro_grasp.viewer.constraint_panel import ConstraintPanel
-from dro_grasp.viewer.grasp_page import Closed, GraspPage, ShownGrasps
-from dro_grasp.viewer.pictures import protocol_name
-from dro_grasp.viewer.scene_view import HOST, Client, ServedPage, escaped
+from dro_grasp.viewer.grasp_page import GraspPage, ShownGrasps
+from dro_grasp.viewer.scene_view import HOST, Client, Closed, ServedPage, escaped
 from dro_grasp.web.library import Kind, Library
 
 MAX_GRASPS = 64
@@ -141,7 +141,8 @@ class Studio(GraspPage):
         raw, refined = found.proposed, found.grasps
         if not problem.obj.is_cloud:
             raw, refined = (evaluate(problem, grasps, protocol, self._counting("evaluating")) for grasps in (raw, refined))
-        self.made = ShownGrasps(problem.hand, problem.obj, raw, refined, protocol, found.shortage, wanted.table is not None)
+        self.made = ShownGrasps(
+            problem.hand, problem.obj, raw, refined, protocol, found.shortage, wanted.table is not None, found.points)
         self._present()
         self.panel.draw(wanted, problem.obj)
         return self.made
@@ -171,8 +172,9 @@ class Studio(GraspPage):
         remarks = map(escaped, [*other, *diagnose(grasps)])
         self._say("  \n".join([f"{len(grasps)} grasps of {escaped(obj.name)}{short}{held}", *remarks]))
 
-    def _plain(self, text: str) -> str:
-        return self.library.plain(text)
+    def _complain(self, error: DroGraspError) -> None:
+        """Show an error without the folders of uploads."""
+        self._say(f"**Error:** {escaped(self.library.plain(str(error)))}")
 
     def _add_choices(self) -> None:
         (hand, obj), gui = self._first, self.client.gui

@@ -14,9 +14,9 @@ import torch
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.pictures.appearance import success_colour
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.viewer.app import GraspViewer, describe
-from dro_grasp.viewer.appearance import success_colour
 from dro_grasp.viewer.scene_view import HOST, ServedPage, viewpoint
 from tests.helpers.browser import free_port, page_of
 from tests.helpers.loaded_hands import loaded_hand
