@@ -25,8 +25,7 @@ from dro_grasp.hands.library import BUILTIN_FOLDER
 from dro_grasp.objects.builtin import BUILTIN
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.viewer import grasp_page as module
-from dro_grasp.viewer.grasp_page import GraspViewer, postures_of
-from dro_grasp.viewer.grasp_page import EXPORTS, chosen
+from dro_grasp.viewer.grasp_page import EXPORTS, GraspViewer, chosen, postures_of
 from dro_grasp.viewer.scene_view import HOST, ServedPage
 from dro_grasp.viewer.studio import Studio, StudioServer
 from tests.helpers.browser import free_port, page_of
@@ -345,7 +344,7 @@ def test_what_a_file_states_is_shown_as_text_and_never_as_html(studio: Studio, m
         page.close()
     viewer = GraspViewer(hand, replace(obj, name=attack), grasps, port=free_port())
     viewer.stop()
-    texts = [*shown, *titles, viewer._text.content]
+    texts = [*shown, *titles, viewer.status.content, viewer.text.content]
     assert sum("onerror" in text for text in texts) == 7
     for text in filter(None, texts):
         assert not set("<{[`") & set(text), text

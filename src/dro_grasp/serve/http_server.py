@@ -16,6 +16,7 @@ import uvicorn
 from fastapi import FastAPI, HTTPException, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import PlainTextResponse, Response
+from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException as AnyHTTPException
 
 from dro_grasp._version import __version__
@@ -69,17 +70,15 @@ class Gate:
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         """Pass a request on, or refuse it."""
-        if scope["type"] != "http":
-            await self.app(scope, receive, send)
-            return
-        headers = {name.decode("latin-1").title(): value.decode("latin-1") for name, value in scope["headers"]}
-        reply = self._refusal(headers, scope["path"])
-        if reply is not None:
-            await Response(reply.body, reply.status, media_type="application/json")(scope, receive, send)
-            return
-        await self.app(scope, self._limited(receive), send)
+        if scope["type"] == "http":
+            reply = self._refusal(Headers(scope=scope), scope["path"])
+            if reply is not None:
+                await sent(reply)(scope, receive, send)
+                return
+            receive = self._limited(receive)
+        await self.app(scope, receive, send)
 
-    def _refusal(self, headers: dict[str, str], path: str) -> Reply | None:
+    def _refusal(self, headers: Headers, path: str) -> Reply | None:
         if why := refusal(headers, self.own):
             return refused(HTTPStatus.FORBIDDEN, f"the request is refused: {why}")
         borne = headers.get("Authorization", "").removeprefix("Bearer ").encode()
@@ -96,15 +95,16 @@ class Gate:
         return f"the request has more than {self.access.megabytes:g} MB; simplify the mesh or thin out the cloud"
 
     def _limited(self, receive: Any) -> Any:
-        """The request's parts, until there are too many or they come too slowly."""
+        """The request's parts, until there are too many or they come too slowly, which neither FastAPI nor uvicorn limits."""
         size, whole, deadline = 0, False, asyncio.get_running_loop().time() + BODY_TIMEOUT
 
         async def part() -> Any:
             nonlocal size, whole
-            if whole:
+            if whole:  # from here on, only the end of the connection is awaited
                 return await receive()
             try:
-                message = await asyncio.wait_for(receive(), deadline - asyncio.get_running_loop().time())
+                async with asyncio.timeout_at(deadline):
+                    message = await receive()
             except TimeoutError:
                 raise HTTPException(HTTPStatus.REQUEST_TIMEOUT, f"the request did not arrive in {BODY_TIMEOUT:g} s") from None
             size += len(message.get("body", b""))
@@ -114,6 +114,11 @@ class Gate:
             return message
 
         return part
+
+
+def sent(reply: Reply) -> Response:
+    """A reply as it is sent."""
+    return Response(reply.body, reply.status, media_type="application/json")
 
 
 def application(queue: RequestQueue, access: Access) -> FastAPI:
@@ -134,8 +139,7 @@ def application(queue: RequestQueue, access: Access) -> FastAPI:
     @app.post("/grasps", response_model=GraspAnswer, responses=told)
     async def grasps(call: GraspCall, request: Request) -> Any:  # pyright: ignore[reportInvalidTypeForm]
         """Grasps of an object by a hand, the best first. Closing the connection cancels the request."""
-        reply = await _answered(queue, call, request)
-        return Response(reply.body, reply.status, media_type="application/json")
+        return sent(await _answered(queue, call, request))
 
     @app.delete("/grasps/{id}", responses={404: {"model": Refusal}})
     async def cancel(id: str) -> dict[str, str]:
@@ -192,14 +196,13 @@ async def _left(request: Request) -> None:
 
 async def _invalid(_: Any, error: Any) -> Response:
     first = error.errors()[0]
-    place = ".".join(str(part) for part in first["loc"] if part != "body")
-    why = f"{place or 'the request'}: {first['msg']}; the page /docs shows what a request holds"
-    reply = refused(HTTPStatus.UNPROCESSABLE_ENTITY, why)
-    return Response(reply.body, reply.status, media_type="application/json")
+    place = ".".join(str(part) for part in first["loc"] if part != "body") or "the request"
+    why = f"{place}: {first['msg']}; the page /docs shows what a request holds"
+    return sent(refused(HTTPStatus.UNPROCESSABLE_ENTITY, why))
 
 
 async def _failed(_: Any, error: Any) -> Response:
-    return Response(refused(HTTPStatus(error.status_code), error.detail).body, error.status_code, media_type="application/json")
+    return sent(refused(HTTPStatus(error.status_code), error.detail))
 
 
 def metrics_text(queue: RequestQueue) -> str:

@@ -42,12 +42,8 @@ MAX_CONNECTIONS = 64
 """Most open connections to one page (ours)."""
 HOST = "127.0.0.1"
 """Default address: only this machine can connect."""
-PORTS = range(1, 65536)
-"""Valid TCP ports."""
 POINT_SIZE = 0.0022
 """Size of a drawn point [m]."""
-CONTACT_SIZE = 0.005
-"""Size of a drawn contact [m]."""
 CAMERA_DISTANCE = 1.15
 """Initial camera distance, as a multiple of that of a picture."""
 ASPECT = 4 / 3
@@ -96,15 +92,14 @@ class SceneView:
         self.hand = hand
         self._object = scene.add_frame(f"{name}/object", show_axes=False)
         for i, mesh in enumerate(appearance.object_meshes(obj)):
-            colour = rgb(OBJECT_COLOUR)
-            scene.add_mesh_simple(f"{name}/object/{i}", mesh.vertices, mesh.faces, color=colour, side="double")
+            scene.add_mesh_simple(f"{name}/object/{i}", mesh.vertices, mesh.faces, color=rgb(OBJECT_COLOUR), side="double")
         colours = appearance.link_colours(hand)
         self.links = [scene.add_frame(f"{name}/hand/{i}", show_axes=False) for i in range(hand.tree.n_links)]
         for k, (link, vertices, faces) in enumerate(appearance.link_shapes(hand)):
             scene.add_mesh_simple(f"{name}/hand/{link}/{k}", vertices, faces, color=rgb(colours[link]), side="double")
         self.solved = self.cloud("solved", np.zeros((1, 3)), appearance.SOLVED_COLOUR)
         self.predicted = self.cloud("predicted", np.zeros((1, 3)), appearance.PREDICTED_COLOUR)
-        self.contacts = self.cloud("contacts", np.zeros((1, 3)), appearance.CONTACT_COLOUR, CONTACT_SIZE)
+        self.contacts = self.cloud("contacts", np.zeros((1, 3)), appearance.CONTACT_COLOUR, size=0.005)
         position = (*obj.cloud.mean(0)[:2].tolist(), float(obj.cloud.min(0)[2]) - GRID_DEPTH)
         self._grid = scene.add_grid(f"{name}/grid", width=0.4, height=0.4, cell_size=0.05, section_size=0.1, position=position)
         self.aim(appearance.best_camera(hand, joints, T, obj, from_above=on_table))
@@ -262,13 +257,7 @@ class Page(ABC):
         return True
 
     def _guarded(self, work: Callable[[], None], patience: float = 0.0, otherwise: str = "Busy; wait a moment.") -> None:
-        """Do one thing at a time, and show errors on the page.
-
-        Args:
-            work: What to do.
-            patience: Time to wait for the end of other work [s].
-            otherwise: What is said if it does not end.
-        """
+        """Do one thing at a time, and show errors on the page; `otherwise` is said if other work outlasts the patience [s]."""
         with contextlib.suppress(Closed):
             if not self._busy.acquire(timeout=patience):
                 self._say(otherwise)
@@ -298,17 +287,13 @@ class ServedPage:
     """Pages that are being served; `stop()` ends them."""
 
     def __init__(self, port: int, host: str) -> None:
-        """Start serving.
-
-        Args:
-            port: Port to serve on; if it is taken, the next free one.
-            host: Address to serve at; 0.0.0.0 serves the whole network.
+        """Start serving at an address of this machine, 0.0.0.0 being the whole network; a port that is taken is counted up.
 
         Raises:
             OptionError: The port is invalid, or the host is no address of this machine.
         """
-        if port not in PORTS:
-            raise OptionError(f"port is {port}; give a number from {PORTS[0]} to {PORTS[-1]}, for example --port 8080")
+        if not 0 < port < 2**16:
+            raise OptionError(f"port is {port}; give a number from 1 to 65535, for example --port 8080")
         if not host:
             raise OptionError(f"host is empty; give --host {HOST} for this machine only, or 0.0.0.0 for the whole network")
         try:
