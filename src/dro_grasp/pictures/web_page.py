@@ -59,4 +59,3 @@ def _cell(value: object) -> str:
 def image(png: bytes, description: str) -> str:
     """A picture embedded in the page."""
     return f'<p><img alt="{html.escape(description)}" src="data:image/png;base64,{base64.b64encode(png).decode()}"></p>'
-

@@ -31,10 +31,6 @@ SHUTDOWN_TIMEOUT = 10.0
 """Time that requests under way get to end when the server is stopped [s] (ours)."""
 MAX_CONNECTIONS = 128
 """Most open connections (ours)."""
-OPEN_PAGES = ("/health",)
-"""Pages that need no token."""
-THIS_MACHINE = ("127.0.0.1", "localhost", "::1")
-"""Addresses at which only this machine can connect."""
 
 
 @dataclass(frozen=True)
@@ -49,12 +45,7 @@ class Access:
     """Largest body of a request [MB]."""
 
     def __post_init__(self) -> None:
-        """Refuse to serve others without a token.
-
-        Raises:
-            OptionError: As said, or a limit is out of range.
-        """
-        if self.host not in THIS_MACHINE and not self.token:
+        if self.host not in {"127.0.0.1", "localhost", "::1"} and not self.token:
             raise OptionError(f"host is '{self.host}', where others can connect; give a token that they must bear (--token, or "
                               "the environment variable DRO_GRASP_TOKEN), or serve this machine only (--host 127.0.0.1)")
         if not 0 < self.megabytes <= 1000:
@@ -65,7 +56,6 @@ class Gate:
     """Refuses what comes from foreign pages, bears no token, or is too large or too slow, before anything reads it."""
 
     def __init__(self, app: Callable[..., Awaitable[None]], access: Access, own: frozenset[str]) -> None:
-        """Stand before an application on a machine with these names."""
         self.app, self.access, self.own = app, access, own
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
@@ -82,7 +72,7 @@ class Gate:
         if why := refusal(headers, self.own):
             return refused(HTTPStatus.FORBIDDEN, f"the request is refused: {why}")
         borne = headers.get("Authorization", "").removeprefix("Bearer ").encode()
-        if self.access.token and path not in OPEN_PAGES and not secrets.compare_digest(borne, self.access.token.encode()):
+        if self.access.token and path != "/health" and not secrets.compare_digest(borne, self.access.token.encode()):
             return refused(HTTPStatus.UNAUTHORIZED, "the request bears no token, or another one than the server's; send the "
                                                     "header 'Authorization: Bearer TOKEN'")
         length = headers.get("Content-Length", "0")
@@ -134,7 +124,7 @@ def application(queue: RequestQueue, access: Access) -> FastAPI:
     app.add_middleware(Gate, access=access, own=own_names(access.host))
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(AnyHTTPException, _failed)
-    told: dict[int | str, dict[str, Any]] = {status: {"model": Refusal} for status in (401, 403, 409, 413, 422, 500, 503, 504)}
+    told: dict[int | str, Any] = {status: {"model": Refusal} for status in (401, 403, 408, 409, 413, 422, 500, 503, 504)}
 
     @app.post("/grasps", response_model=GraspAnswer, responses=told)
     async def grasps(call: GraspCall, request: Request) -> Any:  # pyright: ignore[reportInvalidTypeForm]

@@ -135,12 +135,7 @@ GraspCall: Any = create_model(
 
 
 def settings_in(call: Any, settings: type[Settings], **loaded: Any) -> Settings:
-    """The dataclass whose fields a GraspCall holds.
-
-    Args:
-        call: What is asked.
-        settings: Its class.
-        loaded: Fields whose values were made of what the call holds.
+    """The dataclass of a class whose fields a GraspCall holds, and those that were loaded from what it holds.
 
     Raises:
         OptionError: A value is out of range.

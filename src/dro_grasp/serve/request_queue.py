@@ -24,8 +24,6 @@ from dro_grasp.errors import DroGraspError, OptionError, ServerError
 
 GRACE = 3.0
 """Time for a cancelled request to end by itself; then its process is ended, and starts anew in some seconds [s] (ours)."""
-PAGE = 4096
-"""Bytes of a page of memory, as /proc counts."""
 
 
 class Reply(NamedTuple):
@@ -62,7 +60,7 @@ class Cancelled(Exception):
 
 
 class Computer:
-    """What the process keeps from one request to the next."""
+    """What the process keeps from one request to the next, and does there."""
 
     answerer: Any
     """Answers the requests."""
@@ -76,11 +74,7 @@ class Computer:
 
     @classmethod
     def load(cls, answerer: Callable[[Any], Any], config: Any) -> Ready:
-        """Load what the answerer needs.
-
-        Raises:
-            DroGraspError: Something of it cannot be used.
-        """
+        """Load what the answerer needs; raises what that raises."""
         cls.answerer = answerer(config)
         return Ready(cls.answerer.hand_names(), cls.answerer.object_names(), os.getpid())
 
@@ -98,8 +92,7 @@ class Computer:
         except Cancelled:
             return CANCELLED
         except Exception as error:
-            return refused(
-                HTTPStatus.INTERNAL_SERVER_ERROR, f"{type(error).__name__}: {error}; this is a fault of dro-grasp")
+            return refused(HTTPStatus.INTERNAL_SERVER_ERROR, f"{type(error).__name__}: {error}; this is a fault of dro-grasp")
 
 
 @dataclass(eq=False)
@@ -151,8 +144,7 @@ class RequestQueue:
             answerer: Makes what answers, in the process; an `Answerer` by default.
 
         Raises:
-            OptionError: A limit is out of range.
-            DroGraspError: Something cannot be loaded.
+            DroGraspError: A limit is out of range, or something cannot be loaded.
         """
         if longest < 1 or not 0 < time_limit < float("inf"):
             raise OptionError(f"the queue is {longest} long and the time limit {time_limit} s; give at least 1, and a positive "
@@ -166,8 +158,8 @@ class RequestQueue:
         self._numbers = itertools.count(1)
         self._lock = threading.Lock()
         self._turns = ThreadPoolExecutor(1, "requests")
-        context = multiprocessing.get_context("spawn")
-        self._cancelled = context.Value("Q", 0, lock=False)
+        self._context = multiprocessing.get_context("spawn")
+        self._cancelled = self._context.Value("Q", 0, lock=False)
         self._start()
 
     @property
@@ -183,8 +175,8 @@ class RequestQueue:
     @property
     def memory(self) -> int:
         """Memory that the process holds [bytes]; 0 where the system does not tell."""
-        with suppress(OSError, IndexError, ValueError):
-            return PAGE * int(Path(f"/proc/{self.ready.process}/statm").read_text().split()[1])
+        with suppress(OSError, AttributeError):
+            return os.sysconf("SC_PAGE_SIZE") * int(Path(f"/proc/{self.ready.process}/statm").read_text().split()[1])
         return 0
 
     def submit(self, call: Any) -> Request:
@@ -279,14 +271,9 @@ class RequestQueue:
                                                              f"{error}); it starts anew"), False
 
     def _start(self) -> None:
-        """Start the process, and wait until it has loaded.
-
-        Raises:
-            DroGraspError: Something cannot be loaded.
-        """
+        """Start the process, and wait until it has loaded; raises what loading raises."""
         self.metrics.starts += 1
-        self._pool = ProcessPool(
-            1, initializer=Computer.prepare, initargs=(self._cancelled,), context=multiprocessing.get_context("spawn"))
+        self._pool = ProcessPool(1, initializer=Computer.prepare, initargs=(self._cancelled,), context=self._context)
         try:
             self.ready: Ready = self._pool.schedule(Computer.load, (self.answerer, self.config)).result()
         except (ProcessExpired, BrokenProcessPool) as error:

@@ -31,8 +31,6 @@ FRAME_TIME = 0.04
 """Time between two pictures of a trial [s] (ours)."""
 Posture = Literal["held", "open", "pregrasp", "grasp", "squeeze"]
 """Stages of closing the hand; the first is that after closing in a trial."""
-HELD = "held"
-"""The posture after closing."""
 GRASP_FILE = "grasp file (Parquet)"
 """Choice of the grasp file itself among the formats that can be downloaded."""
 EXPORTS = (GRASP_FILE, *(form.title for form in FORMATS.values() if not form.file_per_grasp))
@@ -74,7 +72,6 @@ class GraspPage(Page):
     """A page with a folder of controls for the grasps that it shows."""
 
     def __init__(self, client: Client) -> None:
-        """Put scene and controls on a page."""
         super().__init__(client)
         self.made: ShownGrasps | None = None
         self.shown: list[int] = []
@@ -85,7 +82,7 @@ class GraspPage(Page):
             self._add_display()
 
     def _add_choices(self) -> None:
-        """Controls above those of the grasps: none."""
+        """Add controls above those of the grasps."""
 
     def _add_display(self) -> None:
         gui = self.client.gui
@@ -94,7 +91,7 @@ class GraspPage(Page):
             self.palm = gui.add_dropdown("Palm along", (ANY, *HALF_AXES), initial_value=ANY)
             self.slider = gui.add_slider("Grasp", 0, 1, 1, 0, disabled=True, hint="Best score first.")
             self.stage_of = gui.add_button_group("Stage", ("network", "refined"))
-            self.posture = gui.add_dropdown("Posture", get_args(Posture), initial_value=HELD, hint="held: after closing.")
+            self.posture = gui.add_dropdown("Posture", get_args(Posture), initial_value="held", hint="held: after closing.")
             self.shapes = gui.add_checkbox("Hand shapes", True)
             self.points = gui.add_checkbox("Hand points", False, hint="The hand's surface points.")
             self.predicted = gui.add_checkbox("Predicted points", False, hint="As the network saw the hand; files lack them.")
@@ -116,8 +113,7 @@ class GraspPage(Page):
     def _present(self) -> None:
         """Put the pair of the grasps on the stage, and show the first grasp."""
         assert self.made is not None
-        first = self.made.refined
-        if len(first):
+        if len(first := self.made.refined):
             joints, T = first.joints[0].float(), first.T_object_wrist[0].float()
             self.view.set_pair(self.made.hand, self.made.obj, joints, T, self.made.on_table)
         self._filter()
@@ -142,8 +138,7 @@ class GraspPage(Page):
 
     def _picked(self) -> int | None:
         """Row of the picked grasp; None if none passes the filters."""
-        shown = self.shown
-        return shown[min(int(self.slider.value), len(shown) - 1)] if shown else None
+        return self.shown[min(int(self.slider.value), len(self.shown) - 1)] if self.shown else None
 
     def _batch(self) -> GraspBatch:
         assert self.made is not None
@@ -156,7 +151,7 @@ class GraspPage(Page):
             return
         hand, obj, grasps = self.made.hand, self.made.obj, self._batch()
         grasp, posture = grasps[index], self.posture.value
-        if posture == HELD:
+        if posture == "held":
             grasp = after_closing(hand, obj, grasp) if shows_held(hand, None) else grasp
             joints = grasp.joints[0].float()
         else:

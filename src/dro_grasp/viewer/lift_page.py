@@ -95,7 +95,6 @@ class LiftPage(ServedPage, Page):
             robot: The robot that is shown first.
             attempts: Stored attempts, which can be picked and are run once more to be played, each with its own robot.
             weights: Name or file, where those that they were made with are not meant.
-            port: As `ServedPage` takes it; the host likewise.
         """
         self.robot, self.attempts, self.weights = robot, list(attempts), weights
         ServedPage.__init__(self, port, host)
@@ -238,14 +237,9 @@ class LiftPage(ServedPage, Page):
 def lift_page(
     file: Path, chosen: int = 0, robot: str | None = None, weights: str | None = None, port: int = 8080, host: str = HOST
 ) -> LiftPage:
-    """A page for a plan file, or for a file of attempts, of which one is shown first.
+    """A page for what `dro-grasp plan` or `dro-grasp tabletop` wrote; of attempts, the chosen one is shown first.
 
-    Args:
-        file: What `dro-grasp plan` or `dro-grasp tabletop` wrote.
-        chosen: Number of the attempt.
-        robot: Name or file, where the file's own are not meant.
-        weights: Likewise.
-        port: As `ServedPage` takes it; the host likewise.
+    Robot and weights are given, by name or file, where the file's own are not meant.
 
     Raises:
         DroGraspError: The file or the robot cannot be used.

@@ -65,7 +65,6 @@ class SceneView:
     """One hand and one object on a page; `set_pair` replaces them."""
 
     def __init__(self, client: Client) -> None:
-        """Start with an empty scene."""
         self.client = client
         self.hand: Hand | None = None
         client.scene.set_up_direction("+z")
@@ -77,19 +76,16 @@ class SceneView:
     def set_pair(
         self, hand: Hand, obj: ObjectModel, joints: Float[Tensor, " n_dof"], T: Float[Tensor, "4 4"], on_table: bool = False
     ) -> None:
-        """Replace hand and object, and move the camera to the best viewpoint.
+        """Replace hand and object, and move the camera to the best viewpoint, on a table from above.
 
         Args:
             joints: Initial joints [rad or m].
             T: Initial wrist pose in the object's frame [m].
-            on_table: Look from above.
         """
-        scene, name = self.client.scene, f"/pair{self._root}"
-        if self.hand is not None:
-            scene.remove_by_name(name)
-            self._root += 1
-            name = f"/pair{self._root}"
-        self.hand = hand
+        scene, self.hand = self.client.scene, hand
+        scene.remove_by_name(f"/pair{self._root}")
+        self._root += 1  # what is removed late takes nothing of its successor with it
+        name = f"/pair{self._root}"
         self._object = scene.add_frame(f"{name}/object", show_axes=False)
         for i, mesh in enumerate(appearance.object_meshes(obj)):
             scene.add_mesh_simple(f"{name}/object/{i}", mesh.vertices, mesh.faces, color=rgb(OBJECT_COLOUR), side="double")
@@ -97,9 +93,9 @@ class SceneView:
         self.links = [scene.add_frame(f"{name}/hand/{i}", show_axes=False) for i in range(hand.tree.n_links)]
         for k, (link, vertices, faces) in enumerate(appearance.link_shapes(hand)):
             scene.add_mesh_simple(f"{name}/hand/{link}/{k}", vertices, faces, color=rgb(colours[link]), side="double")
-        self.solved = self.cloud("solved", np.zeros((1, 3)), appearance.SOLVED_COLOUR)
-        self.predicted = self.cloud("predicted", np.zeros((1, 3)), appearance.PREDICTED_COLOUR)
-        self.contacts = self.cloud("contacts", np.zeros((1, 3)), appearance.CONTACT_COLOUR, size=0.005)
+        self.solved = self._cloud("solved", appearance.SOLVED_COLOUR)
+        self.predicted = self._cloud("predicted", appearance.PREDICTED_COLOUR)
+        self.contacts = self._cloud("contacts", appearance.CONTACT_COLOUR, size=0.005)
         position = (*obj.cloud.mean(0)[:2].tolist(), float(obj.cloud.min(0)[2]) - GRID_DEPTH)
         self._grid = scene.add_grid(f"{name}/grid", width=0.4, height=0.4, cell_size=0.05, section_size=0.1, position=position)
         self.aim(appearance.best_camera(hand, joints, T, obj, from_above=on_table))
@@ -122,14 +118,11 @@ class SceneView:
             client.camera.position, client.camera.look_at = viewpoint(camera, client.camera.aspect)
             client.camera.fov = camera.field_of_view
 
-    def cloud(
-        self, name: str, points: Float[np.ndarray, "n 3"], colour: Colour, size: float = POINT_SIZE
-    ) -> viser.PointCloudHandle:
-        """Add points of a size [m], hidden at first."""
+    def _cloud(self, name: str, colour: Colour, size: float = POINT_SIZE) -> viser.PointCloudHandle:
+        """Add points of a size [m], hidden until there are some to show."""
         return self.client.scene.add_point_cloud(
-            f"/pair{self._root}/{name}", points.astype(np.float32), colors=rgb(colour), point_size=size,
-            point_shape="circle", precision="float32", visible=False,
-        )
+            f"/pair{self._root}/{name}", np.zeros((1, 3), np.float32), colors=rgb(colour), point_size=size,
+            point_shape="circle", precision="float32", visible=False)
 
     def show(
         self, joints: Float[Tensor, " n_dof"], T: Float[Tensor, "4 4"], T_object: Float[Tensor, "4 4"] | None = None
@@ -215,15 +208,10 @@ class Closed(Exception):
 class Page(ABC):
     """A page with a stage and a film of it, which does one thing at a time and shows errors."""
 
-    play: viser.GuiButtonHandle
-    """Plays the film."""
-    moment: viser.GuiSliderHandle[int]
-    """The picture of the film that is shown."""
     status: viser.GuiMarkdownHandle
-    """What the page does, and errors."""
+    """What the page does, and errors; whoever inherits adds it."""
 
     def __init__(self, client: Client) -> None:
-        """Start with an empty stage; the class adds the controls."""
         self.client, self.view, self.film = client, SceneView(client), None
         self.closed = threading.Event()
         """Whether nobody sees the page any more."""
