@@ -16,27 +16,21 @@ from typing import Any
 
 import numpy as np
 import torch
+import viser
+import viser.transforms
+import websockets.asyncio.server
 from jaxtyping import Float
 from torch import Tensor
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
 
 from dro_grasp.errors import DroGraspError, OptionError
-from dro_grasp.extras import require_extra
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pictures import appearance
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.rendering.meshes import OBJECT_COLOUR, Colour
 from dro_grasp.web.origins import own_names, refusal
-
-try:
-    import viser
-    import viser.transforms
-    import websockets.asyncio.server
-    from websockets.asyncio.server import ServerConnection
-    from websockets.http11 import Request, Response
-except ModuleNotFoundError:
-    require_extra("apps")
-    raise
 
 MAX_CONNECTIONS = 64
 """Most open connections to one page (ours)."""
