@@ -167,8 +167,7 @@ def draw_grasp(
         behind = render(fingers, camera, *style.size, oversampling=oversampling)
         whole = (style.opacity * whole + (1 - style.opacity) * behind + 0.5).astype(np.uint8)
     if len(contacts):
-        dotted = [dots(contacts, CONTACT_COLOUR, CONTACT_RADIUS)]
-        marks = render(dotted, camera, *style.size, oversampling=oversampling)
+        marks = render([dots(contacts, CONTACT_COLOUR, CONTACT_RADIUS)], camera, *style.size, oversampling=oversampling)
         whole = np.where((marks < 250).any(-1, keepdims=True), marks, whole)
     return whole
 
@@ -187,7 +186,7 @@ def draw_hands(hands: Sequence[Hand], captions: Sequence[str], path: Path | str,
     Raises:
         OutputError: There is no hand, or the file cannot be written.
     """
-    tiles = [(draw_hand(hand), text, None) for hand, text in zip(hands, captions, strict=True)]
+    tiles: list[Tile] = [(draw_hand(hand), text, None) for hand, text in zip(hands, captions, strict=True)]
     _save(tiles, title, path, columns=6, outcomes=False)
 
 

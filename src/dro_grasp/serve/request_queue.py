@@ -27,12 +27,10 @@ GRACE = 3.0
 
 
 class Reply(NamedTuple):
-    """What a request comes to."""
+    """What a request comes to: a status of HTTP and a JSON object."""
 
     status: int
-    """Of HTTP."""
     body: bytes
-    """A JSON object."""
 
 
 def refused(status: HTTPStatus, why: str) -> Reply:
@@ -45,14 +43,11 @@ CANCELLED = refused(HTTPStatus.CONFLICT, "the request was cancelled")
 
 
 class Ready(NamedTuple):
-    """What the process says once it has loaded what it computes with."""
+    """What the process says once it has loaded what it computes with: names that can be asked for, and its own number."""
 
     hands: list[str]
-    """Names that can be asked for."""
     objects: list[str]
-    """Likewise."""
     process: int
-    """Its number."""
 
 
 class Cancelled(Exception):
@@ -112,7 +107,7 @@ class Request:
     """When it came [s]."""
 
     def abandon(self) -> None:
-        """End its computation together with the process."""
+        """End its computation together with the process, as pebble does with a task that is cancelled while it runs."""
         if self.task is not None:
             self.task.cancel()
 
@@ -224,7 +219,7 @@ class RequestQueue:
             names, running = list(self._known), self._running
         for name in names:
             self.cancel(name)
-        if running is not None:
+        if running is not None:  # only now, so that none that waits takes its place
             running.abandon()
         self._turns.shutdown()
         self._end()

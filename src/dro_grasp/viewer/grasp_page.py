@@ -58,14 +58,11 @@ class ShownGrasps:
 
 
 class Film(NamedTuple):
-    """A trial that was played."""
+    """A trial that was played: the grasp's wrist, the object's poses in the wrist's frame [m], and the hand's joints."""
 
     T_object_wrist: Float[Tensor, "4 4"]
-    """Wrist pose of its grasp [m]."""
     poses: Float[Tensor, "frames 4 4"]
-    """Of the object, in the wrist's frame [m]."""
     joints: Float[Tensor, "frames n_dof"]
-    """Of the hand [rad or m]."""
 
 
 class GraspPage(Page):
