@@ -263,16 +263,19 @@ class StudioServer(ServedPage):
     def stop(self) -> None:
         """Stop serving; all pages end."""
         super().stop()
-        while self.studios:
-            self.studios.popitem()[1].close()
+        for number in list(self.studios):
+            self._close(number)
 
     def enter(self, client: viser.ClientHandle) -> None:
         """A browser has come: it gets its page."""
         self.studios[client.client_id] = self._make(client, self._turn)
         if client.client_id not in self.server.get_clients():  # it left meanwhile
-            self.leave(client)
+            self._close(client.client_id)
 
     def leave(self, client: viser.ClientHandle) -> None:
         """A browser has gone: its page ends."""
-        if (studio := self.studios.pop(client.client_id, None)) is not None:
+        self._close(client.client_id)
+
+    def _close(self, number: int) -> None:
+        if (studio := self.studios.pop(number, None)) is not None:
             studio.close()
