@@ -15,8 +15,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 import dro_grasp as dro
 from dro_grasp.objects.catalogue import resolve_objects
-from dro_grasp.viewer.appearance import success_colour
-from dro_grasp.viewer.pictures import after_closing, draw_grasp, outcome
+from dro_grasp.pictures.appearance import success_colour
+from dro_grasp.pictures.sheets import after_closing, draw_grasp, outcome
 
 HANDS = ("allegro", "barrett", "gripper3", "leaphand", "shadowhand",
          *(f"assets/{name}" for name in ("inspire", "ability", "dclaw", "orca", "ezgripper")))

@@ -14,7 +14,7 @@ from dro_grasp.compare.coverage import measure_coverage
 from dro_grasp.compare.rows import finger_contact
 from dro_grasp.datasets.collections.collection import read_collection
 from dro_grasp.datasets.engine.shards import Yield
-from dro_grasp.viewer.dataset_pages import charts, grasps_drawn
+from dro_grasp.pictures.dataset_report import charts, grasps_drawn
 from lab.benchmarks.report import ROOT
 
 PICTURED = "assets-shadowhand.parquet"

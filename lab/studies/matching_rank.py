@@ -23,12 +23,12 @@ from dro_grasp.compare.correspondence import matching_rank, mean_rank
 from dro_grasp.hands.hand import Hand
 from dro_grasp.models.checkpoints import load_weights
 from dro_grasp.models.encoder import StaticGraphEncoder
+from dro_grasp.pictures.sheets import contact_sheet
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.rendering.meshes import dots
 from dro_grasp.rendering.rasterizer import render
 from dro_grasp.training.config import AugmentationConfig
 from dro_grasp.training.samples import SampleSource
-from dro_grasp.viewer.pictures import contact_sheet
 from lab.benchmarks.distance_error import validation_bundle
 from lab.benchmarks.report import emit
 from lab.benchmarks.synthesis import HANDS

@@ -32,6 +32,11 @@ from .optimization.refinement import RefineConfig as RefineConfig
 from .optimization.synthesis import SynthesisConfig as SynthesisConfig, synthesize as synthesize
 from .perception.partial_views import DepthCamera as DepthCamera, visible_points as visible_points
 from .perception.scan import depth_points as depth_points, scanned_object as scanned_object
+from .pictures.sheets import PictureStyle as PictureStyle, draw_grasps as draw_grasps
+from .pipeline.choice import ChoiceConfig as ChoiceConfig, ChoicePenalties as ChoicePenalties
+from .pipeline.constraints import Constraints as Constraints
+from .pipeline.problem import GraspProblem as GraspProblem
+from .pipeline.stages import complete as complete, evaluate as evaluate, rank as rank, refine as refine
 from .planning.attempts import Attempt as Attempt, TabletopConfig as TabletopConfig
 from .planning.motion import (
     MotionPlan as MotionPlan,
@@ -77,5 +82,4 @@ from .training.config import (
 )
 from .training.loop import train as train
 from .training.pretraining import pretrain as pretrain, pretrain_motion as pretrain_motion
-from .viewer.app import view_grasps as view_grasps
-from .viewer.pictures import PictureStyle as PictureStyle, draw_grasps as draw_grasps
+from .viewer.grasp_page import view_grasps as view_grasps

@@ -17,8 +17,8 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.reading import load_grasps
 from dro_grasp.grasps.sources import object_of, with_own_files
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.pictures.sheets import CAPTION, HEADER, TILE
 from dro_grasp.predict.sources.controls import palm_facing_starts
-from dro_grasp.viewer.pictures import CAPTION, HEADER, TILE
 from dro_grasp.viewer.studio import StudioServer
 from tests.helpers.browser import free_port
 from tests.helpers.loaded_hands import loaded_hand
@@ -119,7 +119,7 @@ def test_objects_of_one_name_in_one_file_are_told_apart_by_every_command(
     assert main(["export", str(file), "--format", "csv", "--output", str(tmp_path / "out")]) == 0
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["textured (2).csv", "textured.csv"]
     drawn: list[list[tuple[str, int]]] = []
-    monkeypatch.setattr("dro_grasp.viewer.pictures.draw_sheet", lambda hand, pairs, *_: drawn.append(
+    monkeypatch.setattr("dro_grasp.pictures.sheets.draw_sheet", lambda hand, pairs, *_: drawn.append(
         [(obj.sha256, len(own)) for obj, own in pairs]))
     for more in ([], ["--object", "textured (2)"]):
         assert main(["picture", str(file), "--output", str(sheet), *more]) == 0

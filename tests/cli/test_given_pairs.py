@@ -119,7 +119,7 @@ def test_an_object_without_success_does_not_get_the_grasps_of_another(
 ) -> None:
     both.replace(success=torch.tensor([False, True, False]), protocol=("strict/1",) * 3).save("both.parquet")
     drawn: list[list[tuple[str, int]]] = []
-    monkeypatch.setattr("dro_grasp.viewer.pictures.draw_sheet", lambda hand, pairs, *_: drawn.append(
+    monkeypatch.setattr("dro_grasp.pictures.sheets.draw_sheet", lambda hand, pairs, *_: drawn.append(
         [(obj.name, len(own)) for obj, own in pairs]))
     command = ["picture", "both.parquet", "--only-successful", "--output", "sheet.png"]
     assert main([*command, "--object", "mug"]) == 2

@@ -132,7 +132,7 @@ def test_the_page_names_everything_and_holds_its_pictures(pairs, tmp_path, capsy
 
 
 def test_the_page_can_be_made_of_a_hand_without_any_grasp(pairs, tmp_path):
-    from dro_grasp.viewer.dataset_pages import write_report
+    from dro_grasp.pictures.dataset_report import write_report
 
     write_report(measure_coverage(pairs[1:]), Path(tmp_path / "none.html"))
     assert "lost" in (tmp_path / "none.html").read_text()

@@ -13,8 +13,8 @@ import torch
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.reading import load_grasps
+from dro_grasp.pictures.sheets import heading
 from dro_grasp.simulation.outcome import TrialResult
-from dro_grasp.viewer.pictures import heading
 from tests.helpers.claw import ball
 from tests.helpers.toy_batches import CUBE, evaluated, make
 from tests.helpers.toy_hand import toy_hand

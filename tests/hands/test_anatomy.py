@@ -12,7 +12,7 @@ import torch
 from dro_grasp.energy.contact_candidates import contact_candidates
 from dro_grasp.hands.anatomy import PALM, find_fingers
 from dro_grasp.hands.hand import Hand
-from dro_grasp.viewer.appearance import link_colours
+from dro_grasp.pictures.appearance import link_colours
 from tests.helpers.bracket_hand import bracket_hand
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.toy_hand import toy_hand

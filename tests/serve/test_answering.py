@@ -68,10 +68,11 @@ def test_a_scene_is_avoided_in_the_frame_of_the_grasps(answerer: Answerer) -> No
         np.testing.assert_allclose(scene.points, expected.points)
         assert answerer.scene(call.avoid, call.camera) is scene
     assert answerer.scene(None, None) is None
-    asked = ask(answerer, "can", num=1, avoid={"points": wall.tolist()}, hold=[[0, 0, 0, 0.3]])
+    asked = ask(answerer, "can", num=1, candidates=16, avoid={"points": wall.tolist()}, hold=[[0, 0, 0, 0.3]])
     avoiding = dro.Constraints(avoid=dro.load_scene(wall), hold=((0.0, 0.0, 0.0, 0.3),))
     hand, can = dro.load_hand("gripper3"), dro.load_object("can")
-    check(asked, answerer.predictor.predict(hand, can, 1, constraints=avoiding, **QUICK))
+    options = QUICK | {"candidates": 16}
+    check(asked, answerer.predictor.predict(hand, can, 1, constraints=avoiding, **options))
 
 
 def test_what_was_sent_or_named_once_stays_loaded(answerer: Answerer) -> None:

@@ -9,7 +9,6 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
@@ -95,8 +94,8 @@ def test_sigterm_lets_a_request_end_and_closes_the_server(client: dro.GraspClien
 def test_a_small_load_loses_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
-    serving = import_module("serving")
+    from lab.benchmarks import serving
+
     monkeypatch.setattr(serving, "LONE", 2)
     arguments = ["--clients", "2", "--requests", "12", "--weights", str(untrained_weights(tmp_path)), "--json"]
     assert serving.main(arguments) == 0

@@ -25,8 +25,7 @@ from dro_grasp.hands.library import BUILTIN_FOLDER
 from dro_grasp.objects.builtin import BUILTIN
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.viewer import grasp_page as module
-from dro_grasp.viewer.app import GraspViewer, postures_of
-from dro_grasp.viewer.grasp_page import EXPORTS, chosen
+from dro_grasp.viewer.grasp_page import EXPORTS, GraspViewer, chosen, postures_of
 from dro_grasp.viewer.scene_view import HOST, ServedPage
 from dro_grasp.viewer.studio import Studio, StudioServer
 from tests.helpers.browser import free_port, page_of
@@ -112,7 +111,7 @@ def test_contacts_are_marked_where_the_hand_touches_and_only_when_asked(studio: 
 def test_a_trial_plays_and_ends_where_it_began(
     studio: Studio, made: module.ShownGrasps, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module.time, "sleep", lambda _: None)
+    monkeypatch.setattr(time, "sleep", lambda _: None)
     seen = []
     honest = studio.view.show
 
@@ -123,7 +122,7 @@ def test_a_trial_plays_and_ends_where_it_began(
     monkeypatch.setattr(studio.view, "show", show)
     studio._guarded(studio._play)
     assert (studio.moment.max, studio.moment.disabled) == (len(seen) - 1, False)
-    studio._show_moment(7)
+    studio.show_moment(7)
     assert torch.equal(seen.pop(), seen[7]), "any moment can be seen again"
     moved = [T for T in seen if T is not None]
     assert len(moved) > 50
@@ -146,13 +145,13 @@ def test_a_filter_that_no_grasp_passes_ends_a_trial_that_plays(
         if len(waits) == 2:
             studio._filter()
 
-    monkeypatch.setattr(module.time, "sleep", wait)
+    monkeypatch.setattr(time, "sleep", wait)
     try:
         studio._guarded(studio._play)
         assert (len(waits), studio.moment.disabled, studio.moment.value) == (2, True, 0)
         assert studio.text.content == "No grasp passes these filters."
         assert "something else was picked" in studio.status.content
-        studio._show_moment(1)
+        studio.show_moment(1)
         studio._guarded(studio._play)
         assert len(waits) == 2, "nothing is left to play"
     finally:
@@ -345,7 +344,7 @@ def test_what_a_file_states_is_shown_as_text_and_never_as_html(studio: Studio, m
         page.close()
     viewer = GraspViewer(hand, replace(obj, name=attack), grasps, port=free_port())
     viewer.stop()
-    texts = [*shown, *titles, viewer._text.content]
+    texts = [*shown, *titles, viewer.status.content, viewer.text.content]
     assert sum("onerror" in text for text in texts) == 7
     for text in filter(None, texts):
         assert not set("<{[`") & set(text), text

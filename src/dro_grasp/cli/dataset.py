@@ -69,7 +69,7 @@ class Report(DataSets):
         """Measure, print, write the page."""
         from dro_grasp.compare.coverage import measure_coverage
         from dro_grasp.files import check_output
-        from dro_grasp.viewer.dataset_pages import write_report
+        from dro_grasp.pictures.dataset_report import write_report
 
         output = None if self.output is None else check_output(self.output, ".html")
         hands = measure_coverage(self.pairs(only_successful=True))

@@ -128,7 +128,7 @@ class Generate:
         if self.json:
             print_json({"results": [d.report for d in done], "failed": failed} if several else done[0].report)
         if self.view:
-            from dro_grasp.viewer.app import view_grasps
+            from dro_grasp.viewer.grasp_page import view_grasps
 
             for d in (d for d in done if len(d.grasps)):
                 view_grasps(hand, d.obj, d.grasps, d.predicted_points)
@@ -182,7 +182,7 @@ class Generate:
         if output is not None:
             with_sources(kept, self.hand, name, self.scale, job.camera).save(output)
         if picture is not None and len(kept):
-            from dro_grasp.viewer.pictures import draw_grasps
+            from dro_grasp.pictures.sheets import draw_grasps
 
             report["picture"] = str(picture)
             draw_grasps(job.hand, obj, kept, picture)

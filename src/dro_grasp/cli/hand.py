@@ -118,7 +118,7 @@ def _add_to_listing(path: Path, made: list[MadeHand]) -> None:
 
 def _draw(files: list[Path], made: list[MadeHand], path: Path) -> None:
     from dro_grasp.hands.library import load_hand
-    from dro_grasp.viewer.hand_sheet import draw_hands
+    from dro_grasp.pictures.sheets import draw_hands
 
     captions = [f"{hand.seed}   {hand.plan.joints - hand.plan.followers} joints" + (
         f" + {hand.plan.followers}" if hand.plan.followers else "") for hand in made]

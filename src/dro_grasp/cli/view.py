@@ -24,8 +24,6 @@ MAX_SIDE = 4096
 """Largest width and height of one picture [pixels]."""
 MAX_PIXELS = 50_000_000
 """Most pixels of all pictures on a sheet together."""
-MAX_LISTED = 8
-"""Most objects that an error names."""
 
 
 @dataclass(frozen=True)
@@ -62,55 +60,54 @@ class View:
         from dro_grasp.extras import require_extra
 
         require_extra("apps")
-        from dro_grasp.predict.predictor import GraspPredictor
         from dro_grasp.viewer.scene_view import serve
-        from dro_grasp.viewer.studio import Studio, StudioServer
 
-        if self.file is None:
-            serve(StudioServer(self._picked(), self.port, self.host))
-            return 0
-        if is_motion(self.file):
+        if self.file is not None and is_motion(self.file):
             require_extra("arm")
             from dro_grasp.viewer.lift_page import lift_page
 
             serve(lift_page(self.file, self.attempt, self.robot, self.weights, self.port, self.host))
             return 0
+        from dro_grasp.viewer.studio import StudioServer
+
+        serve(StudioServer(self._picked() if self.file is None else self._opened(self.file), self.port, self.host))
+        return 0
+
+    def _opened(self, file: Path) -> Callable[[Client, Lock], Studio]:
+        """What makes a page that shows the grasps of a file."""
         from dro_grasp.grasps.reading import load_grasps
         from dro_grasp.grasps.sources import hand_of
 
-        grasps = load_grasps(self.file)
+        grasps = load_grasps(file)
         hand = hand_of(grasps, self.hand)
         grasps.require_hand(hand)
         obj, chosen = of_object(grasps, self.object, self.scale)
         given = self.object is not None and self.object not in dict(grasps.by_object())
-        predictor = GraspPredictor(self.weights, self.device)
-
-        def opened(client: Client, turn: Lock) -> Studio:
-            studio = Studio(client, predictor, turn=turn, preview=False)
-            studio.open(hand, chosen if given else grasps, obj if given else None, self.object)
-            return studio
-
-        serve(StudioServer(opened, self.port, self.host))
-        return 0
+        return self._pages(lambda studio: studio.open(
+            hand, chosen if given else grasps, obj if given else None, self.object))
 
     def _picked(self) -> Callable[[Client, Lock], Studio]:
-        """A page without a file: the hand and the object that are named are picked."""
+        """What makes a page without a file, on which the hand and the object that are named are picked."""
         from dro_grasp.hands.library import load_hand
         from dro_grasp.objects.catalogue import load_object
-        from dro_grasp.predict.predictor import GraspPredictor
-        from dro_grasp.viewer.studio import Studio
 
         hand = None if self.hand is None else load_hand(self.hand)
         obj = None if self.object is None else load_object(self.object, scale=self.scale)
+        return self._pages(None if hand is None and obj is None else lambda studio: studio.offer(hand, obj))
+
+    def _pages(self, fill: Callable[[Studio], None] | None) -> Callable[[Client, Lock], Studio]:
+        """What makes the page of a browser, which is filled with what was given, and with a first pair otherwise."""
+        from dro_grasp.viewer.studio import Studio
+
         predictor = GraspPredictor(self.weights, self.device)
 
-        def opened(client: Client, turn: Lock) -> Studio:
-            studio = Studio(client, predictor, turn=turn, preview=hand is None and obj is None)
-            if hand is not None or obj is not None:
-                studio.offer(hand, obj)
+        def made(client: Client, turn: Lock) -> Studio:
+            studio = Studio(client, predictor, turn=turn, preview=fill is None)
+            if fill is not None:
+                fill(studio)
             return studio
 
-        return opened
+        return made
 
 
 @dataclass(frozen=True)
@@ -151,7 +148,7 @@ class Picture:
         from dro_grasp.files import check_output
         from dro_grasp.grasps.reading import load_grasps
         from dro_grasp.grasps.sources import hand_of
-        from dro_grasp.viewer.pictures import PictureStyle, draw_sheet
+        from dro_grasp.pictures.sheets import PictureStyle, draw_sheet
 
         self._check_options()
         check_output(self.output, ".png")
@@ -186,7 +183,6 @@ class Picture:
         return pairs
 
     def _check_options(self) -> None:
-        """Refuse invalid options by name."""
         from dro_grasp.errors import OptionError
 
         for option, value in (("--count", self.count), ("--columns", self.columns)):
@@ -225,7 +221,7 @@ def of_object(grasps: GraspBatch, name: str | None, scale: float) -> tuple[Objec
 
     parts = dict(grasps.by_object())
     if name is not None and name not in parts and len(parts) > 1:
-        listed = ", ".join(list(parts)[:MAX_LISTED]) + (", ..." if len(parts) > MAX_LISTED else "")
+        listed = ", ".join(list(parts)[:8]) + (", ..." if len(parts) > 8 else "")
         raise OptionError(f"--object is '{name}', but the grasps are of {len(parts)} objects ({listed}); give one of these "
                           "names: another object fits only a file of one object")
     own = name if name in parts else grasps.object[0]

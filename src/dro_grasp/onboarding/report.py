@@ -11,12 +11,12 @@ from dro_grasp.files import command
 from dro_grasp.hands.library import load_hand, locate_hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.onboarding.steps import DATA, PICTURE, REPORT, STRICT, Onboarded
+from dro_grasp.pictures.sheets import draw_grasps
+from dro_grasp.pictures.web_page import image, table, write_page
 from dro_grasp.predict.config import AUTO, GraspRequest
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.stages import evaluate
-from dro_grasp.viewer.pictures import draw_grasps
-from dro_grasp.web.page import image, table, write_page
 
 GRASPS = 8
 """Grasps drawn on each object."""

@@ -36,7 +36,7 @@ from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.source import Progress
 from dro_grasp.predict.stages import evaluate
 from dro_grasp.serve.messages import GraspAnswer, SentCamera, SentGrasp, SentObject, settings_in
-from dro_grasp.web.library import Library
+from dro_grasp.web.library import Kind, Library
 from dro_grasp.web.uploads import store_upload
 
 MAX_PROBLEMS = 8
@@ -66,25 +66,34 @@ class Answerer:
         """Load the weights and the hands.
 
         Raises:
-            OptionError: Two files of hands or of objects have one name.
-            DroGraspError: Something cannot be used.
+            DroGraspError: Something cannot be used, or two files of hands or of objects have one name.
         """
         self.library = Library()
-        objects = [(Path(source).stem, source) for source in resolve_objects(list(config.objects))]
-        for name, source in by_name("objects", objects).items():
-            self.library.add("object", name, source)
-        hands = {source: load_hand(source) for source in config.hands}
-        for name, source in by_name("hands", [(hand.name, source) for source, hand in hands.items()]).items():
-            self.library.add("hand", name, hands[source])
+        self._offer("object", [(Path(source).stem, source, source) for source in resolve_objects(list(config.objects))])
+        self._offer("hand", [((hand := load_hand(source)).name, source, hand) for source in dict.fromkeys(config.hands)])
         self.predictor = GraspPredictor(config.weights, config.device)
         self.problems: LRUCache[Hashable, GraspProblem] = LRUCache(MAX_PROBLEMS)
 
-    def answer(self, call: Any, progress: Progress | None = None) -> GraspAnswer:
-        """The answer to a GraspCall.
+    def _offer(self, kind: Kind, named: Sequence[tuple[str, str, Any]]) -> None:
+        """Let what lies in files be asked for by name.
 
         Args:
-            call: What is asked.
-            progress: Called now and then; what it raises ends the work.
+            kind: What all are.
+            named: Name, name or file that was given, and what the library takes, of each.
+
+        Raises:
+            OptionError: Two have one name.
+        """
+        first: dict[str, str] = {}
+        for name, source, content in named:
+            other = first.setdefault(name, source)
+            if given_path(other).resolve() != given_path(source).resolve():
+                raise OptionError(f"{kind}s '{other}' and '{source}' would both be asked for by the name '{name}'; rename one "
+                                  "of the files, or leave one out")
+            self.library.add(kind, name, content)
+
+    def answer(self, call: Any, progress: Progress | None = None) -> GraspAnswer:
+        """The answer to a GraspCall; `progress` is called now and then, and what it raises ends the work.
 
         Raises:
             DroGraspError: The request cannot be met.
@@ -98,7 +107,9 @@ class Answerer:
         hand, (key, obj) = self.hand(call.hand), self.object(call.object, call.camera)
         if call.protocol is not None and obj.is_cloud:
             raise OptionError(f"protocol is '{call.protocol}', and a bare cloud gets no trial; send a mesh, or leave it out")
-        problem = self._problem(hand, key, obj, constraints)
+        pair = hand.name, key, constraints
+        if (problem := self.problems.get(pair)) is None:
+            problem = self.problems[pair] = GraspProblem(hand, obj, self.predictor.device, constraints)
         loaded = time.perf_counter() - begin
         made = self.predictor.run(problem, request, progress)
         middle = time.perf_counter()
@@ -147,11 +158,7 @@ class Answerer:
         return key, self.library.loaded("object", key, lambda: self._load(sent, camera))
 
     def scene(self, sent: SentObject | None, camera: SentCamera | None) -> Scene | None:
-        """What the hand is to avoid, in the frame of the grasps: what was sent, or an object that the server was started with.
-
-        Raises:
-            ObjectError: It cannot be used.
-        """
+        """What the hand is to avoid, in the frame of the grasps: what was sent, or an object of the server's own."""
         if sent is None:
             return None
         if sent.name is not None and sent.name not in self.library.own["object"]:
@@ -164,13 +171,6 @@ class Answerer:
 
         return self.library.loaded("scene", content_key(sent, camera), load)
 
-    def _problem(self, hand: Hand, key: Hashable, obj: ObjectModel, constraints: Constraints) -> GraspProblem:
-        """The pair of a hand and the object of a key, with what was derived from it before."""
-        pair = hand.name, key, constraints
-        if (problem := self.problems.get(pair)) is None:
-            problem = self.problems[pair] = GraspProblem(hand, obj, self.predictor.device, constraints)
-        return problem
-
     def _load(self, sent: SentObject, camera: SentCamera | None) -> ObjectModel:
         with unpacked(sent, self.library.own["object"]) as source:
             if camera is None:
@@ -179,21 +179,6 @@ class Answerer:
             T, named = sent_pose(camera), isinstance(source, Path)
             points = read_points(source) if named else source
             return scanned_object(source.stem if named else "cloud", points * sent.scale, T.numpy(), keep_table=sent.keep_table)
-
-
-def by_name(kind: str, named: Sequence[tuple[str, str]]) -> dict[str, str]:
-    """The names or files of hands or objects by the names under which they can be asked for.
-
-    Raises:
-        OptionError: Two have one name.
-    """
-    found: dict[str, str] = {}
-    for name, source in named:
-        first = found.setdefault(name, source)
-        if given_path(first).resolve() != given_path(source).resolve():
-            raise OptionError(f"{kind} '{first}' and '{source}' would both be asked for by the name '{name}'; rename one of "
-                              "the files, or leave one out")
-    return found
 
 
 def content_key(sent: SentObject, camera: SentCamera | None) -> bytes:

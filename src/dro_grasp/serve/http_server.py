@@ -16,6 +16,7 @@ import uvicorn
 from fastapi import FastAPI, HTTPException, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import PlainTextResponse, Response
+from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException as AnyHTTPException
 
 from dro_grasp._version import __version__
@@ -30,10 +31,6 @@ SHUTDOWN_TIMEOUT = 10.0
 """Time that requests under way get to end when the server is stopped [s] (ours)."""
 MAX_CONNECTIONS = 128
 """Most open connections (ours)."""
-OPEN_PAGES = ("/health",)
-"""Pages that need no token."""
-THIS_MACHINE = ("127.0.0.1", "localhost", "::1")
-"""Addresses at which only this machine can connect."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +45,7 @@ class Access:
     """Largest body of a request [MB]."""
 
     def __post_init__(self) -> None:
-        """Refuse to serve others without a token.
-
-        Raises:
-            OptionError: As said, or a limit is out of range.
-        """
-        if self.host not in THIS_MACHINE and not self.token:
+        if self.host not in {"127.0.0.1", "localhost", "::1"} and not self.token:
             raise OptionError(f"host is '{self.host}', where others can connect; give a token that they must bear (--token, or "
                               "the environment variable DRO_GRASP_TOKEN), or serve this machine only (--host 127.0.0.1)")
         if not 0 < self.megabytes <= 1000:
@@ -64,26 +56,23 @@ class Gate:
     """Refuses what comes from foreign pages, bears no token, or is too large or too slow, before anything reads it."""
 
     def __init__(self, app: Callable[..., Awaitable[None]], access: Access, own: frozenset[str]) -> None:
-        """Stand before an application on a machine with these names."""
         self.app, self.access, self.own = app, access, own
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         """Pass a request on, or refuse it."""
-        if scope["type"] != "http":
-            await self.app(scope, receive, send)
-            return
-        headers = {name.decode("latin-1").title(): value.decode("latin-1") for name, value in scope["headers"]}
-        reply = self._refusal(headers, scope["path"])
-        if reply is not None:
-            await Response(reply.body, reply.status, media_type="application/json")(scope, receive, send)
-            return
-        await self.app(scope, self._limited(receive), send)
+        if scope["type"] == "http":
+            reply = self._refusal(Headers(scope=scope), scope["path"])
+            if reply is not None:
+                await sent(reply)(scope, receive, send)
+                return
+            receive = self._limited(receive)
+        await self.app(scope, receive, send)
 
-    def _refusal(self, headers: dict[str, str], path: str) -> Reply | None:
+    def _refusal(self, headers: Headers, path: str) -> Reply | None:
         if why := refusal(headers, self.own):
             return refused(HTTPStatus.FORBIDDEN, f"the request is refused: {why}")
         borne = headers.get("Authorization", "").removeprefix("Bearer ").encode()
-        if self.access.token and path not in OPEN_PAGES and not secrets.compare_digest(borne, self.access.token.encode()):
+        if self.access.token and path != "/health" and not secrets.compare_digest(borne, self.access.token.encode()):
             return refused(HTTPStatus.UNAUTHORIZED, "the request bears no token, or another one than the server's; send the "
                                                     "header 'Authorization: Bearer TOKEN'")
         length = headers.get("Content-Length", "0")
@@ -96,15 +85,16 @@ class Gate:
         return f"the request has more than {self.access.megabytes:g} MB; simplify the mesh or thin out the cloud"
 
     def _limited(self, receive: Any) -> Any:
-        """The request's parts, until there are too many or they come too slowly."""
+        """The request's parts, until there are too many or they come too slowly, which neither FastAPI nor uvicorn limits."""
         size, whole, deadline = 0, False, asyncio.get_running_loop().time() + BODY_TIMEOUT
 
         async def part() -> Any:
             nonlocal size, whole
-            if whole:
+            if whole:  # from here on, only the end of the connection is awaited
                 return await receive()
             try:
-                message = await asyncio.wait_for(receive(), deadline - asyncio.get_running_loop().time())
+                async with asyncio.timeout_at(deadline):
+                    message = await receive()
             except TimeoutError:
                 raise HTTPException(HTTPStatus.REQUEST_TIMEOUT, f"the request did not arrive in {BODY_TIMEOUT:g} s") from None
             size += len(message.get("body", b""))
@@ -114,6 +104,11 @@ class Gate:
             return message
 
         return part
+
+
+def sent(reply: Reply) -> Response:
+    """A reply as it is sent."""
+    return Response(reply.body, reply.status, media_type="application/json")
 
 
 def application(queue: RequestQueue, access: Access) -> FastAPI:
@@ -129,13 +124,12 @@ def application(queue: RequestQueue, access: Access) -> FastAPI:
     app.add_middleware(Gate, access=access, own=own_names(access.host))
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(AnyHTTPException, _failed)
-    told: dict[int | str, dict[str, Any]] = {status: {"model": Refusal} for status in (401, 403, 409, 413, 422, 500, 503, 504)}
+    told: dict[int | str, Any] = {status: {"model": Refusal} for status in (401, 403, 408, 409, 413, 422, 500, 503, 504)}
 
     @app.post("/grasps", response_model=GraspAnswer, responses=told)
     async def grasps(call: GraspCall, request: Request) -> Any:  # pyright: ignore[reportInvalidTypeForm]
         """Grasps of an object by a hand, the best first. Closing the connection cancels the request."""
-        reply = await _answered(queue, call, request)
-        return Response(reply.body, reply.status, media_type="application/json")
+        return sent(await _answered(queue, call, request))
 
     @app.delete("/grasps/{id}", responses={404: {"model": Refusal}})
     async def cancel(id: str) -> dict[str, str]:
@@ -192,14 +186,13 @@ async def _left(request: Request) -> None:
 
 async def _invalid(_: Any, error: Any) -> Response:
     first = error.errors()[0]
-    place = ".".join(str(part) for part in first["loc"] if part != "body")
-    why = f"{place or 'the request'}: {first['msg']}; the page /docs shows what a request holds"
-    reply = refused(HTTPStatus.UNPROCESSABLE_ENTITY, why)
-    return Response(reply.body, reply.status, media_type="application/json")
+    place = ".".join(str(part) for part in first["loc"] if part != "body") or "the request"
+    why = f"{place}: {first['msg']}; the page /docs shows what a request holds"
+    return sent(refused(HTTPStatus.UNPROCESSABLE_ENTITY, why))
 
 
 async def _failed(_: Any, error: Any) -> Response:
-    return Response(refused(HTTPStatus(error.status_code), error.detail).body, error.status_code, media_type="application/json")
+    return sent(refused(HTTPStatus(error.status_code), error.detail))
 
 
 def metrics_text(queue: RequestQueue) -> str:

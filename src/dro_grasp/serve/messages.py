@@ -11,16 +11,7 @@ from dataclasses import MISSING, fields
 from itertools import pairwise
 from typing import Any, Literal, TypeVar, get_type_hints
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    PydanticSchemaGenerationError,
-    TypeAdapter,
-    create_model,
-    field_validator,
-    model_validator,
-)
+from pydantic import BaseModel, ConfigDict, Field, create_model, field_validator, model_validator
 
 from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.constraints import Constraints
@@ -107,18 +98,10 @@ WIRE_TYPES: dict[str, Any] = {"avoid": SentObject | None, "source": Literal["aut
 
 
 def fields_of(settings: type[Any]) -> dict[str, Any]:
-    """Type, default and description of a dataclass's fields, as pydantic takes them; what has no form in JSON is left out."""
+    """Type, default and description of a dataclass's fields, as pydantic takes them."""
     types, told = get_type_hints(settings) | WIRE_TYPES, field_docs(settings)
     return {f.name: (types[f.name], Field(... if f.default is MISSING else f.default, description=told.get(f.name)))
-            for f in fields(settings) if _has_json(types[f.name])}
-
-
-def _has_json(kind: Any) -> bool:
-    try:
-        TypeAdapter(kind)
-    except PydanticSchemaGenerationError:
-        return False
-    return True
+            for f in fields(settings)}
 
 
 def field_docs(settings: type[Any]) -> dict[str, str]:
@@ -135,18 +118,12 @@ GraspCall: Any = create_model(
 
 
 def settings_in(call: Any, settings: type[Settings], **loaded: Any) -> Settings:
-    """The dataclass whose fields a GraspCall holds.
-
-    Args:
-        call: What is asked.
-        settings: Its class.
-        loaded: Fields whose values were made of what the call holds.
+    """The dataclass of a class whose fields a GraspCall holds, and those that were loaded from what it holds.
 
     Raises:
         OptionError: A value is out of range.
     """
-    names = [f.name for f in fields(settings) if f.name in type(call).model_fields]  # type: ignore[arg-type]
-    return settings(**{name: getattr(call, name) for name in names} | loaded)
+    return settings(**{f.name: getattr(call, f.name) for f in fields(settings)} | loaded)  # type: ignore[arg-type]
 
 
 class SentGrasp(Message):

@@ -24,17 +24,13 @@ from dro_grasp.errors import DroGraspError, OptionError, ServerError
 
 GRACE = 3.0
 """Time for a cancelled request to end by itself; then its process is ended, and starts anew in some seconds [s] (ours)."""
-PAGE = 4096
-"""Bytes of a page of memory, as /proc counts."""
 
 
 class Reply(NamedTuple):
-    """What a request comes to."""
+    """What a request comes to: a status of HTTP and a JSON object."""
 
     status: int
-    """Of HTTP."""
     body: bytes
-    """A JSON object."""
 
 
 def refused(status: HTTPStatus, why: str) -> Reply:
@@ -47,14 +43,11 @@ CANCELLED = refused(HTTPStatus.CONFLICT, "the request was cancelled")
 
 
 class Ready(NamedTuple):
-    """What the process says once it has loaded what it computes with."""
+    """What the process says once it has loaded what it computes with: names that can be asked for, and its own number."""
 
     hands: list[str]
-    """Names that can be asked for."""
     objects: list[str]
-    """Likewise."""
     process: int
-    """Its number."""
 
 
 class Cancelled(Exception):
@@ -62,7 +55,7 @@ class Cancelled(Exception):
 
 
 class Computer:
-    """What the process keeps from one request to the next."""
+    """What the process keeps from one request to the next, and does there."""
 
     answerer: Any
     """Answers the requests."""
@@ -76,11 +69,7 @@ class Computer:
 
     @classmethod
     def load(cls, answerer: Callable[[Any], Any], config: Any) -> Ready:
-        """Load what the answerer needs.
-
-        Raises:
-            DroGraspError: Something of it cannot be used.
-        """
+        """Load what the answerer needs; raises what that raises."""
         cls.answerer = answerer(config)
         return Ready(cls.answerer.hand_names(), cls.answerer.object_names(), os.getpid())
 
@@ -98,8 +87,7 @@ class Computer:
         except Cancelled:
             return CANCELLED
         except Exception as error:
-            return refused(
-                HTTPStatus.INTERNAL_SERVER_ERROR, f"{type(error).__name__}: {error}; this is a fault of dro-grasp")
+            return refused(HTTPStatus.INTERNAL_SERVER_ERROR, f"{type(error).__name__}: {error}; this is a fault of dro-grasp")
 
 
 @dataclass(eq=False)
@@ -119,7 +107,7 @@ class Request:
     """When it came [s]."""
 
     def abandon(self) -> None:
-        """End its computation together with the process."""
+        """End its computation together with the process, as pebble does with a task that is cancelled while it runs."""
         if self.task is not None:
             self.task.cancel()
 
@@ -151,8 +139,7 @@ class RequestQueue:
             answerer: Makes what answers, in the process; an `Answerer` by default.
 
         Raises:
-            OptionError: A limit is out of range.
-            DroGraspError: Something cannot be loaded.
+            DroGraspError: A limit is out of range, or something cannot be loaded.
         """
         if longest < 1 or not 0 < time_limit < float("inf"):
             raise OptionError(f"the queue is {longest} long and the time limit {time_limit} s; give at least 1, and a positive "
@@ -166,8 +153,8 @@ class RequestQueue:
         self._numbers = itertools.count(1)
         self._lock = threading.Lock()
         self._turns = ThreadPoolExecutor(1, "requests")
-        context = multiprocessing.get_context("spawn")
-        self._cancelled = context.Value("Q", 0, lock=False)
+        self._context = multiprocessing.get_context("spawn")
+        self._cancelled = self._context.Value("Q", 0, lock=False)
         self._start()
 
     @property
@@ -183,8 +170,8 @@ class RequestQueue:
     @property
     def memory(self) -> int:
         """Memory that the process holds [bytes]; 0 where the system does not tell."""
-        with suppress(OSError, IndexError, ValueError):
-            return PAGE * int(Path(f"/proc/{self.ready.process}/statm").read_text().split()[1])
+        with suppress(OSError, AttributeError):
+            return os.sysconf("SC_PAGE_SIZE") * int(Path(f"/proc/{self.ready.process}/statm").read_text().split()[1])
         return 0
 
     def submit(self, call: Any) -> Request:
@@ -232,7 +219,7 @@ class RequestQueue:
             names, running = list(self._known), self._running
         for name in names:
             self.cancel(name)
-        if running is not None:
+        if running is not None:  # only now, so that none that waits takes its place
             running.abandon()
         self._turns.shutdown()
         self._end()
@@ -279,14 +266,9 @@ class RequestQueue:
                                                              f"{error}); it starts anew"), False
 
     def _start(self) -> None:
-        """Start the process, and wait until it has loaded.
-
-        Raises:
-            DroGraspError: Something cannot be loaded.
-        """
+        """Start the process, and wait until it has loaded; raises what loading raises."""
         self.metrics.starts += 1
-        self._pool = ProcessPool(
-            1, initializer=Computer.prepare, initargs=(self._cancelled,), context=multiprocessing.get_context("spawn"))
+        self._pool = ProcessPool(1, initializer=Computer.prepare, initargs=(self._cancelled,), context=self._context)
         try:
             self.ready: Ready = self._pool.schedule(Computer.load, (self.answerer, self.config)).result()
         except (ProcessExpired, BrokenProcessPool) as error:

@@ -20,6 +20,8 @@ ANY: str = "any"
 """The choice of every palm direction."""
 NOTHING: str = "nothing"
 """The choice of no scene."""
+OBJECT_FILES = ".stl,.obj,.ply,.glb,.off,.npy,.pcd"
+"""Files of objects and scenes that a browser offers to upload."""
 TABLE_SIZE = 0.5
 """Edge of the table that is drawn [m] (ours)."""
 AVOIDED = (0.75, 0.35, 0.3)
@@ -34,12 +36,7 @@ class ConstraintPanel:
     """A folder of controls; empty fields ask for nothing."""
 
     def __init__(self, client: Client, changed: Callable[[], None]) -> None:
-        """Add the controls.
-
-        Args:
-            client: The page.
-            changed: Called when a control has changed.
-        """
+        """Add the controls to a page; `changed` is called when one has changed."""
         self.client, gui = client, client.gui
         with gui.add_folder("Constraints", expand_by_default=False):
             self.direction = gui.add_dropdown(
@@ -51,16 +48,12 @@ class ConstraintPanel:
             self.spare = gui.add_text("Spare", "", hint="x y z radius [m], more after a semicolon: places to stay out of.")
             self.opening = gui.add_text("Opening [mm]", "", hint="Least distance from closing fingers to the object, before.")
             self.avoid = gui.add_dropdown("Avoid", tuple([NOTHING]), initial_value=NOTHING, hint="A scene without the object.")
-            kinds = ".stl,.obj,.ply,.glb,.off,.npy,.pcd"
-            self.upload = gui.add_upload_button("Upload a scene to avoid", mime_type=kinds)
+            self.upload = gui.add_upload_button("Upload a scene to avoid", mime_type=OBJECT_FILES)
         for control in (self.table, self.hold, self.spare, self.avoid):
             control.on_update(lambda event: None if event.client is None else changed())
 
     def constraints(self, scene: Callable[[str], Scene]) -> Constraints:
-        """What the controls ask for.
-
-        Args:
-            scene: The scene of a name.
+        """What the controls ask for; `scene` is the scene of a name.
 
         Raises:
             OptionError: A field holds something else than numbers, or they are out of range.
@@ -70,10 +63,6 @@ class ConstraintPanel:
             None if self.direction.value == ANY else half_axis_direction(self.direction.value), table,
             None if cone is None else math.radians(cone), None if self.avoid.value == NOTHING else scene(self.avoid.value),
             _balls(self.hold), _balls(self.spare), None if opening is None else opening / 1000)
-
-    def put_under(self, obj: ObjectModel) -> None:
-        """Put the table under an object."""
-        self.table.value = f"{float(obj.cloud[:, 2].min()):.4f}"
 
     def draw(self, constraints: Constraints, obj: ObjectModel) -> None:
         """Show table, places and scene beside the object."""
@@ -94,11 +83,7 @@ class ConstraintPanel:
 
 
 def _number(field: viser.GuiTextHandle) -> float | None:
-    """The number of a field; None for an empty one.
-
-    Raises:
-        OptionError: It holds something else.
-    """
+    """The number of a field; None for an empty one."""
     numbers = _numbers(field, field.value)
     if len(numbers) > 1:
         raise OptionError(f"{field.label} is '{field.value}'; give one number, or nothing")
@@ -106,11 +91,6 @@ def _number(field: viser.GuiTextHandle) -> float | None:
 
 
 def _balls(field: viser.GuiTextHandle) -> tuple[Ball, ...]:
-    """The balls of a field.
-
-    Raises:
-        OptionError: One has no four numbers.
-    """
     rows = [_numbers(field, part) for part in field.value.split(";") if part.strip()]
     if any(len(row) != 4 for row in rows):
         raise OptionError(f"{field.label} is '{field.value}'; give x y z radius in metres, for example 0 0 0.1 0.03; more "

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import threading
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 import viser
-import viser.transforms
 from jaxtyping import Float
 
-from dro_grasp.errors import DroGraspError, OptionError
+from dro_grasp.errors import OptionError
 from dro_grasp.models.checkpoints import describe_weights
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.pictures.appearance import SOLVED_COLOUR, SUCCESS_COLOUR
 from dro_grasp.planning.animation import OTHER_COLOUR, VIEW, Recorder
 from dro_grasp.planning.attempts import Attempt, TabletopConfig, attempt
 from dro_grasp.planning.motion import CHOSEN, READY, STAGES, WAITING, MotionPlan
@@ -27,8 +25,7 @@ from dro_grasp.planning.robot_check import robot_meshes, robot_shapes, shape_pos
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.rendering.meshes import OBJECT_COLOUR, Colour
-from dro_grasp.viewer.appearance import SOLVED_COLOUR, SUCCESS_COLOUR
-from dro_grasp.viewer.scene_view import HOST, POINT_SIZE, ServedPage, escaped, rgb
+from dro_grasp.viewer.scene_view import HOST, POINT_SIZE, Page, ServedPage, escaped, move, rgb
 
 RATE = 25.0
 """Pictures a second (ours)."""
@@ -81,7 +78,7 @@ class Film:
         return Film(arm, hand, poses, recorder.plan, recorder.objects)
 
 
-class LiftPage(ServedPage):
+class LiftPage(ServedPage, Page):
     """A running page; `stop()` ends it.
 
     Examples:
@@ -98,12 +95,11 @@ class LiftPage(ServedPage):
             robot: The robot that is shown first.
             attempts: Stored attempts, which can be picked and are run once more to be played, each with its own robot.
             weights: Name or file, where those that they were made with are not meant.
-            port: As `ServedPage` takes it; the host likewise.
         """
         self.robot, self.attempts, self.weights = robot, list(attempts), weights
+        ServedPage.__init__(self, port, host)
+        Page.__init__(self, self.server)
         self.film: Film | None = None
-        self._busy = threading.Lock()
-        super().__init__(port, host)
         self._add_controls()
         self._put(robot)
 
@@ -131,28 +127,14 @@ class LiftPage(ServedPage):
             labels = [f"{i}: {a.object}, {'held' if a.success else a.stage}" for i, a in enumerate(self.attempts)]
             self.picked = gui.add_dropdown("Attempt", labels, initial_value=labels[0])
             self.picked.on_update(lambda _: self._guarded(lambda: self.repeat(labels.index(self.picked.value))))
-        self.play = gui.add_button("Play", disabled=True)
-        self.moment = gui.add_slider("Moment", 0, 1, 1, 0, disabled=True)
+        self._add_player("Play")
         self.cloud = gui.add_checkbox("Camera's cloud", True, hint="What was planned for, its unseen side estimated.")
         self.shapes = gui.add_checkbox("Objects", True, hint="As they were simulated.", disabled=not self.attempts)
         self.grasps: viser.GuiDropdownHandle[str] = gui.add_dropdown(
             "Grasps", [str(NONE), str(EVERY)], initial_value=NONE, hint="Lines from wrist to fingertips.")
-        self.text = gui.add_markdown("")
-        self.play.on_click(lambda _: self._guarded(self._play))
-        self.moment.on_update(lambda event: None if event.client is None else self.show_moment(int(self.moment.value)))
+        self.text = self.status = gui.add_markdown("")
         for choice in (self.cloud, self.shapes, self.grasps):
             choice.on_update(lambda _: self._show_layers())
-
-    def _guarded(self, work: Callable[[], None]) -> None:
-        """Do one thing at a time, and show errors on the page."""
-        if not self._busy.acquire(blocking=False):
-            return
-        try:
-            work()
-        except DroGraspError as error:
-            self.text.content = f"**Error:** {escaped(error)}"
-        finally:
-            self._busy.release()
 
     def repeat(self, index: int) -> None:
         """Run a stored attempt once more with its own robot and weights, and show it, and what of these has changed since.
@@ -222,11 +204,7 @@ class LiftPage(ServedPage):
 
     def _play(self) -> None:
         assert self.film is not None
-        for moment in range(len(self.film.arm)):
-            begin = time.monotonic()
-            self.show_moment(moment)
-            self.moment.value = moment
-            time.sleep(max(0.0, 1 / RATE - (time.monotonic() - begin)))
+        self._roll(self.film, len(self.film.arm), 1 / RATE)
 
     def _show_layers(self) -> None:
         """Show and hide what the controls say."""
@@ -256,22 +234,12 @@ class LiftPage(ServedPage):
         self.view.aim(Camera.around(np.concatenate([m.vertices for m in meshes]), VIEW, aspect=4 / 3))
 
 
-def move(handle: viser.SceneNodeHandle, T: Float[np.ndarray, "4 4"]) -> None:
-    """Put something in the scene at a pose [m]."""
-    handle.position, handle.wxyz = T[:3, 3], viser.transforms.SO3.from_matrix(T[:3, :3]).wxyz
-
-
 def lift_page(
     file: Path, chosen: int = 0, robot: str | None = None, weights: str | None = None, port: int = 8080, host: str = HOST
 ) -> LiftPage:
-    """A page for a plan file, or for a file of attempts, of which one is shown first.
+    """A page for what `dro-grasp plan` or `dro-grasp tabletop` wrote; of attempts, the chosen one is shown first.
 
-    Args:
-        file: What `dro-grasp plan` or `dro-grasp tabletop` wrote.
-        chosen: Number of the attempt.
-        robot: Name or file, where the file's own are not meant.
-        weights: Likewise.
-        port: As `ServedPage` takes it; the host likewise.
+    Robot and weights are given, by name or file, where the file's own are not meant.
 
     Raises:
         DroGraspError: The file or the robot cannot be used.

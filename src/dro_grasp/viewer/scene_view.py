@@ -1,4 +1,4 @@
-"""The 3D scene in the browser, one hand and one object in their poses; and pages with their own server that show it."""
+"""What the pages in the browser share: the scene of a hand and an object, work that is done once at a time, and the server."""
 
 from __future__ import annotations
 
@@ -8,43 +8,36 @@ import math
 import re
 import socket
 import sys
+import threading
+import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import torch
+import viser
+import viser.transforms
+import websockets.asyncio.server
 from jaxtyping import Float
 from torch import Tensor
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
 
-from dro_grasp.errors import OptionError
-from dro_grasp.extras import require_extra
+from dro_grasp.errors import DroGraspError, OptionError
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.pictures import appearance
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.rendering.meshes import OBJECT_COLOUR, Colour
-from dro_grasp.viewer import appearance
 from dro_grasp.web.origins import own_names, refusal
-
-try:
-    import viser
-    import viser.transforms
-    import websockets.asyncio.server
-    from websockets.asyncio.server import ServerConnection
-    from websockets.http11 import Request, Response
-except ModuleNotFoundError:
-    require_extra("apps")
-    raise
 
 MAX_CONNECTIONS = 64
 """Most open connections to one page (ours)."""
 HOST = "127.0.0.1"
 """Default address: only this machine can connect."""
-PORTS = range(1, 65536)
-"""Valid TCP ports."""
 POINT_SIZE = 0.0022
 """Size of a drawn point [m]."""
-CONTACT_SIZE = 0.005
-"""Size of a drawn contact [m]."""
 CAMERA_DISTANCE = 1.15
 """Initial camera distance, as a multiple of that of a picture."""
 ASPECT = 4 / 3
@@ -56,7 +49,6 @@ RAISED = 0.27
 GRID_DEPTH = 0.12
 """Distance from the object's lowest point down to the grid [m]."""
 
-
 Point = tuple[float, float, float]
 """A place [m]."""
 Client = viser.ViserServer | viser.ClientHandle
@@ -67,7 +59,6 @@ class SceneView:
     """One hand and one object on a page; `set_pair` replaces them."""
 
     def __init__(self, client: Client) -> None:
-        """Start with an empty scene."""
         self.client = client
         self.hand: Hand | None = None
         client.scene.set_up_direction("+z")
@@ -79,29 +70,26 @@ class SceneView:
     def set_pair(
         self, hand: Hand, obj: ObjectModel, joints: Float[Tensor, " n_dof"], T: Float[Tensor, "4 4"], on_table: bool = False
     ) -> None:
-        """Replace hand and object, and move the camera to the best viewpoint.
+        """Replace hand and object, and move the camera to the best viewpoint, on a table from above.
 
         Args:
             joints: Initial joints [rad or m].
             T: Initial wrist pose in the object's frame [m].
-            on_table: Look from above.
         """
-        scene, name = self.client.scene, f"/pair{self._root}"
-        if self.hand is not None:
-            scene.remove_by_name(name)
-            self._root += 1
-            name = f"/pair{self._root}"
-        self.hand = hand
+        scene, self.hand = self.client.scene, hand
+        scene.remove_by_name(f"/pair{self._root}")
+        self._root += 1  # what is removed late takes nothing of its successor with it
+        name = f"/pair{self._root}"
         self._object = scene.add_frame(f"{name}/object", show_axes=False)
         for i, mesh in enumerate(appearance.object_meshes(obj)):
-            colour = rgb(OBJECT_COLOUR)
-            scene.add_mesh_simple(f"{name}/object/{i}", mesh.vertices, mesh.faces, color=colour, side="double")
+            scene.add_mesh_simple(f"{name}/object/{i}", mesh.vertices, mesh.faces, color=rgb(OBJECT_COLOUR), side="double")
         colours = appearance.link_colours(hand)
         self.links = [scene.add_frame(f"{name}/hand/{i}", show_axes=False) for i in range(hand.tree.n_links)]
         for k, (link, vertices, faces) in enumerate(appearance.link_shapes(hand)):
             scene.add_mesh_simple(f"{name}/hand/{link}/{k}", vertices, faces, color=rgb(colours[link]), side="double")
-        self.solved = self.cloud("solved", np.zeros((1, 3)), appearance.SOLVED_COLOUR)
-        self.contacts = self.cloud("contacts", np.zeros((1, 3)), appearance.CONTACT_COLOUR, CONTACT_SIZE)
+        self.solved = self._cloud("solved", appearance.SOLVED_COLOUR)
+        self.predicted = self._cloud("predicted", appearance.PREDICTED_COLOUR)
+        self.contacts = self._cloud("contacts", appearance.CONTACT_COLOUR, size=0.005)
         position = (*obj.cloud.mean(0)[:2].tolist(), float(obj.cloud.min(0)[2]) - GRID_DEPTH)
         self._grid = scene.add_grid(f"{name}/grid", width=0.4, height=0.4, cell_size=0.05, section_size=0.1, position=position)
         self.aim(appearance.best_camera(hand, joints, T, obj, from_above=on_table))
@@ -124,14 +112,11 @@ class SceneView:
             client.camera.position, client.camera.look_at = viewpoint(camera, client.camera.aspect)
             client.camera.fov = camera.field_of_view
 
-    def cloud(
-        self, name: str, points: Float[np.ndarray, "n 3"], colour: Colour, size: float = POINT_SIZE
-    ) -> viser.PointCloudHandle:
-        """Add points of a size [m], hidden at first."""
+    def _cloud(self, name: str, colour: Colour, size: float = POINT_SIZE) -> viser.PointCloudHandle:
+        """Add points of a size [m], hidden until there are some to show."""
         return self.client.scene.add_point_cloud(
-            f"/pair{self._root}/{name}", points.astype(np.float32), colors=rgb(colour), point_size=size,
-            point_shape="circle", precision="float32", visible=False,
-        )
+            f"/pair{self._root}/{name}", np.zeros((1, 3), np.float32), colors=rgb(colour), point_size=size,
+            point_shape="circle", precision="float32", visible=False)
 
     def show(
         self, joints: Float[Tensor, " n_dof"], T: Float[Tensor, "4 4"], T_object: Float[Tensor, "4 4"] | None = None
@@ -144,8 +129,7 @@ class SceneView:
         moved = np.eye(4) if T_object is None else T_object.double().numpy()
         with self.client.atomic():
             for frame, pose in zip([self._object, *self.links], [moved, *poses], strict=True):
-                frame.position = pose[:3, 3]
-                frame.wxyz = viser.transforms.SO3.from_matrix(pose[:3, :3]).wxyz
+                move(frame, pose)
             self.solved.points = points.astype(np.float32)
 
     def colour_grid(self, success: bool | None) -> None:
@@ -159,6 +143,11 @@ class SceneView:
                 frame.visible = visible
 
 
+def move(handle: viser.SceneNodeHandle, T: Float[np.ndarray, "4 4"]) -> None:
+    """Put something in the scene at a pose [m]."""
+    handle.position, handle.wxyz = T[:3, 3], viser.transforms.SO3.from_matrix(T[:3, :3]).wxyz
+
+
 def viewpoint(camera: Camera, aspect: float = ASPECT) -> tuple[Point, Point]:
     """Where a camera stands, and where it looks, so that a window of this width over height shows all of a picture [m]."""
     start, target = np.asarray(camera.position), np.asarray(camera.target)
@@ -167,12 +156,7 @@ def viewpoint(camera: Camera, aspect: float = ASPECT) -> tuple[Point, Point]:
         height = 2 * float(np.linalg.norm(position - target)) * math.tan(camera.field_of_view / 2)
         down = -RAISED * height * camera.axes()[1]
         position, target = position + down, target + down
-    return _point(position), _point(target)
-
-
-def _point(place: Float[np.ndarray, "3"]) -> Point:
-    x, y, z = place.tolist()
-    return x, y, z
+    return tuple(position.tolist()), tuple(target.tolist())
 
 
 def rgb(colour: Colour) -> tuple[int, int, int]:
@@ -211,21 +195,87 @@ def escaped(text: object) -> str:
     return re.sub(r"[&<>{}\[\]*`\\!#|~$\n]", lambda sign: f"&#{ord(sign.group())};", str(text))
 
 
+class Closed(Exception):
+    """The page was closed while it worked."""
+
+
+class Page(ABC):
+    """A page with a stage and a film of it, which does one thing at a time and shows errors."""
+
+    status: viser.GuiMarkdownHandle
+    """What the page does, and errors; whoever inherits adds it."""
+
+    def __init__(self, client: Client) -> None:
+        self.client, self.view, self.film = client, SceneView(client), None
+        self.closed = threading.Event()
+        """Whether nobody sees the page any more."""
+        self._busy = threading.Lock()
+
+    @abstractmethod
+    def show_moment(self, moment: int) -> None:
+        """Show one picture of the film, if there is one."""
+
+    @abstractmethod
+    def _play(self) -> None:
+        """Play the film."""
+
+    def _add_player(self, label: str) -> None:
+        """Add the controls of the film, disabled at first."""
+        gui = self.client.gui
+        self.play = gui.add_button(label, disabled=True)
+        self.moment = gui.add_slider("Moment", 0, 1, 1, 0, disabled=True, hint="Of what was played.")
+        self.play.on_click(lambda _: self._guarded(self._play))
+        self.moment.on_update(lambda event: None if event.client is None else self.show_moment(int(self.moment.value)))
+
+    def _roll(self, film: Any, moments: int, interval: float) -> bool:
+        """Show a film picture by picture, each for an interval [s]; False if another took its place."""
+        for moment in range(moments):
+            begin = time.monotonic()
+            if self.film is not film:
+                return False
+            self.show_moment(moment)
+            self.moment.value = moment
+            time.sleep(max(0.0, interval - (time.monotonic() - begin)))
+        return True
+
+    def _guarded(self, work: Callable[[], None], patience: float = 0.0, otherwise: str = "Busy; wait a moment.") -> None:
+        """Do one thing at a time, and show errors on the page; `otherwise` is said if other work outlasts the patience [s]."""
+        with contextlib.suppress(Closed):
+            if not self._busy.acquire(timeout=patience):
+                self._say(otherwise)
+                return
+            try:
+                work()
+            except DroGraspError as error:
+                self._complain(error)
+            finally:
+                self._busy.release()
+
+    def _complain(self, error: DroGraspError) -> None:
+        self._say(f"**Error:** {escaped(error)}")
+
+    def _say(self, text: str) -> None:
+        """Show a line.
+
+        Raises:
+            Closed: Nobody sees it any more; whatever goes on ends here.
+        """
+        if self.closed.is_set():
+            raise Closed
+        self.status.content = text
+
+
 class ServedPage:
-    """A page with a stage that is being served; `stop()` ends it."""
+    """Pages that are being served; `stop()` ends them."""
 
     def __init__(self, port: int, host: str) -> None:
-        """Start serving.
-
-        Args:
-            port: Port to serve on; if it is taken, the next free one.
-            host: Address to serve at; 0.0.0.0 serves the whole network.
+        """Start serving at an address of this machine, 0.0.0.0 being the whole network; a port that is taken is counted up.
 
         Raises:
             OptionError: The port is invalid, or the host is no address of this machine.
         """
-        if port not in PORTS:
-            raise OptionError(f"port is {port}; give a number from {PORTS[0]} to {PORTS[-1]}, for example --port 8080")
+        if not 0 < port < 2**16:
+            raise OptionError(f"port is {port}; give a number from 1 to 65535, for example --port 8080")
         if not host:
             raise OptionError(f"host is empty; give --host {HOST} for this machine only, or 0.0.0.0 for the whole network")
         try:
@@ -240,7 +290,6 @@ class ServedPage:
         # A panel at the side leaves the hand in sight; narrow windows get it at the bottom.
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         self.server.gui.main_panel.dock_right()
-        self.view = SceneView(self.server)
 
     @property
     def url(self) -> str:

@@ -20,19 +20,18 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import hand_names
 from dro_grasp.objects.catalogue import object_names
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.pictures.appearance import waiting_pose
+from dro_grasp.pictures.sheets import protocol_name
 from dro_grasp.predict.config import AUTO, GraspRequest
-from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.registry import source_names
 from dro_grasp.predict.stages import evaluate
 from dro_grasp.simulation.diagnosis import diagnose
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
-from dro_grasp.viewer.appearance import waiting_pose
-from dro_grasp.viewer.constraint_panel import ConstraintPanel
-from dro_grasp.viewer.grasp_page import Closed, GraspPage, ShownGrasps
-from dro_grasp.viewer.pictures import protocol_name
-from dro_grasp.viewer.scene_view import HOST, Client, ServedPage, escaped
+from dro_grasp.viewer.constraint_panel import OBJECT_FILES, ConstraintPanel
+from dro_grasp.viewer.grasp_page import GraspPage, ShownGrasps
+from dro_grasp.viewer.scene_view import HOST, Client, Closed, ServedPage, escaped
 from dro_grasp.web.library import Kind, Library
 
 MAX_GRASPS = 64
@@ -51,21 +50,17 @@ class Studio(GraspPage):
     """The page of one browser, or of all; `close()` ends it.
 
     Examples:
-        >>> studio = Studio(ServedPage(8080, HOST).server, GraspPredictor())
-        >>> studio.generate("allegro", "mug", num=8)
+        >>> studio = Studio(ServedPage(8080, HOST).server, GraspPredictor(), "allegro", "mug")
     """
 
     def __init__(
         self, client: Client, predictor: GraspPredictor, hand: str = "allegro", obj: str = "rubber_duck",
         turn: threading.Lock | None = None, preview: bool = True,
     ) -> None:
-        """Start with a hand and an object chosen.
+        """Start with a hand and an object chosen, by name or path.
 
         Args:
-            client: Where the page is.
-            predictor: May be that of other pages too.
-            hand: Name or path; the object likewise.
-            turn: Held while grasps are made, for pages that share a machine.
+            turn: Held while grasps are made, for pages that share a machine; the predictor may be shared too.
             preview: Show hand and object at once; not needed where `open` follows.
         """
         self.predictor, self.library, self._first = predictor, Library(), (hand, obj)
@@ -119,34 +114,6 @@ class Studio(GraspPage):
             if model is not None:
                 choice.value = model.name
 
-    def generate(
-        self, hand: str, obj: str, num: int = GraspRequest.num, constraints: Constraints | None = None,
-        temperature: float | None = None, protocol: str = DEFAULT_PROTOCOL, candidates: int = GraspRequest.candidates,
-        source: str = AUTO,
-    ) -> ShownGrasps:
-        """Predict, refine, rank and evaluate, then show the best; bare clouds get no trial.
-
-        Args:
-            constraints: What the grasps have to respect.
-            temperature: Of z; the weights' own by default.
-            candidates: Proposed for each grasp.
-            source: What proposes, as in `GraspRequest`.
-
-        Raises:
-            DroGraspError: An argument cannot be used.
-        """
-        wanted = constraints or Constraints()
-        problem = GraspProblem(self.library.hand(hand), self.library.obj(obj), self.predictor.device, wanted)
-        request = GraspRequest(num, candidates=candidates, temperature=temperature, source=source)
-        found = self.predictor.run(problem, request, self._counting("proposing"))
-        raw, refined = found.proposed, found.grasps
-        if not problem.obj.is_cloud:
-            raw, refined = (evaluate(problem, grasps, protocol, self._counting("evaluating")) for grasps in (raw, refined))
-        self.made = ShownGrasps(problem.hand, problem.obj, raw, refined, protocol, found.shortage, wanted.table is not None)
-        self._present()
-        self.panel.draw(wanted, problem.obj)
-        return self.made
-
     def _preview(self) -> None:
         """Show the chosen hand above the chosen object, before there are grasps."""
         hand, obj = self.library.hand(self.hand.value), self.library.obj(self.object.value)
@@ -172,8 +139,9 @@ class Studio(GraspPage):
         remarks = map(escaped, [*other, *diagnose(grasps)])
         self._say("  \n".join([f"{len(grasps)} grasps of {escaped(obj.name)}{short}{held}", *remarks]))
 
-    def _plain(self, text: str) -> str:
-        return self.library.plain(text)
+    def _complain(self, error: DroGraspError) -> None:
+        """Show an error without the folders of uploads."""
+        self._say(f"**Error:** {escaped(self.library.plain(str(error)))}")
 
     def _add_choices(self) -> None:
         (hand, obj), gui = self._first, self.client.gui
@@ -181,8 +149,7 @@ class Studio(GraspPage):
             self.hand = gui.add_dropdown("Hand", tuple(dict.fromkeys([*hand_names(), hand])), initial_value=hand)
             hand_file = gui.add_upload_button("Upload a hand (URDF, MJCF, ZIP)", mime_type=".urdf,.xml,.zip")
             self.object = gui.add_dropdown("Object", tuple(dict.fromkeys([*object_names(), obj])), initial_value=obj)
-            kinds = ".stl,.obj,.ply,.glb,.off,.npy,.pcd"
-            object_file = gui.add_upload_button("Upload an object (STL, OBJ, PLY)", mime_type=kinds)
+            object_file = gui.add_upload_button("Upload an object (STL, OBJ, PLY)", mime_type=OBJECT_FILES)
         with gui.add_folder("Generate"):
             self.num = gui.add_slider("Grasps", 1, MAX_GRASPS, 1, GraspRequest.num)
             self.source = gui.add_dropdown(
@@ -225,14 +192,13 @@ class Studio(GraspPage):
             self._guarded(lambda: self._pick_upload(label, choice, show), UPLOAD_TIMEOUT, later)
 
     def _pick_upload(self, label: str, choice: viser.GuiDropdownHandle[str], show: Callable[[], None]) -> None:
-        """Pick an upload and show it."""
         choice.value = label
         show()
         self._say(f"{escaped(label)} is picked. {self.status.content}")
 
     def _table_under(self) -> None:
         """Put the table under the chosen object."""
-        self.panel.put_under(self.library.obj(self.object.value))
+        self.panel.table.value = f"{float(self.library.obj(self.object.value).cloud[:, 2].min()):.4f}"
         self._draw_constraints()
 
     def _draw_constraints(self) -> None:
@@ -240,31 +206,43 @@ class Studio(GraspPage):
         self.panel.draw(self.panel.constraints(self.library.scene), self.library.obj(self.object.value))
         self._say("Grasps of the next click respect these constraints.")
 
-    def _counting(self, what: str) -> Callable[[int, int], None]:
-        """What tells the progress of some work on the page."""
-        return lambda done, total: self._say(f"{what}: {done} of {total}")
-
     def _generate(self) -> None:
+        """Make grasps as the controls say, when it is this page's turn."""
         while not self._turn.acquire(timeout=TURN_POLL):
             self._say("Grasps of another page are made; these are next.")
         try:
-            self._generate_now()
+            self._say("Generating ...")
+            begin = time.perf_counter()
+            made = self._generated()
         finally:
             self._turn.release()
-
-    def _generate_now(self) -> None:
-        self._say("Generating ...")
-        begin = time.perf_counter()
-        temperature = None if self.usual.value else float(self.temperature.value)
-        made = self.generate(
-            self.hand.value, self.object.value, int(self.num.value), self.panel.constraints(self.library.scene), temperature,
-            self.protocol.value, int(self.candidates.value), self.source.value)
         held = "" if made.obj.is_cloud else (
-            f", **{int(made.refined.success.sum())}** held under *{escaped(self.protocol.value)}*")
+            f", **{int(made.refined.success.sum())}** held under *{escaped(made.protocol)}*")
         remarks = [] if made.shortage is None else [made.shortage]
         remarks += diagnose(made.refined)
         lines = [f"{len(made.refined)} grasps{held}; {time.perf_counter() - begin:.1f} s", *map(escaped, remarks)]
         self._say("  \n".join(lines))
+
+    def _generated(self) -> ShownGrasps:
+        """Predict, refine, rank and evaluate, then show the best; bare clouds get no trial."""
+        def counting(what: str) -> Callable[[int, int], None]:
+            return lambda done, total: self._say(f"{what}: {done} of {total}")
+
+        wanted, protocol = self.panel.constraints(self.library.scene), self.protocol.value
+        hand, obj = self.library.hand(self.hand.value), self.library.obj(self.object.value)
+        problem = GraspProblem(hand, obj, self.predictor.device, wanted)
+        request = GraspRequest(
+            int(self.num.value), candidates=int(self.candidates.value), source=self.source.value,
+            temperature=None if self.usual.value else float(self.temperature.value))
+        found = self.predictor.run(problem, request, counting("proposing"))
+        raw, refined = found.proposed, found.grasps
+        if not obj.is_cloud:
+            raw, refined = (evaluate(problem, grasps, protocol, counting("evaluating")) for grasps in (raw, refined))
+        on_table = wanted.table is not None
+        self.made = ShownGrasps(hand, obj, raw, refined, protocol, found.shortage, on_table, found.points)
+        self._present()
+        self.panel.draw(wanted, obj)
+        return self.made
 
 
 class StudioServer(ServedPage):
@@ -275,12 +253,7 @@ class StudioServer(ServedPage):
     """
 
     def __init__(self, make: Callable[[Client, threading.Lock], Studio], port: int = 8080, host: str = HOST) -> None:
-        """Start serving.
-
-        Args:
-            make: Makes the page of a browser; its second argument is the same for all.
-            port: As `ServedPage` takes it; the host likewise.
-        """
+        """Start serving; `make` makes the page of a browser, with a lock that is the same for all."""
         super().__init__(port, host)
         self._make, self._turn = make, threading.Lock()
         self.studios: dict[int, Studio] = {}
@@ -305,6 +278,5 @@ class StudioServer(ServedPage):
         self._close(client.client_id)
 
     def _close(self, number: int) -> None:
-        studio = self.studios.pop(number, None)
-        if studio is not None:
+        if (studio := self.studios.pop(number, None)) is not None:
             studio.close()

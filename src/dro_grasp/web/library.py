@@ -29,7 +29,6 @@ class Library:
     """Hands, objects and scenes by name; each is loaded when it is first asked for, and those used last stay loaded."""
 
     def __init__(self) -> None:
-        """Start with the built-in hands and objects."""
         self.own: dict[Kind, dict[str, Any]] = {kind: {} for kind in MAX_LOADED}
         """What was added: by its name, what it is loaded from, or itself."""
         self._loaded = {kind: LRUCache[Hashable, Any](most) for kind, most in MAX_LOADED.items()}
@@ -50,25 +49,14 @@ class Library:
         return tuple(dict.fromkeys([*self.own[kind], *builtin]))
 
     def add(self, kind: Kind, name: str, source: Any) -> None:
-        """Name something, in the place of another of this name.
-
-        Args:
-            kind: What it is used as.
-            name: Its name.
-            source: Itself; what loads it, without arguments; or its file or other name.
-        """
+        """Name something, in the place of another of this name, by itself, what loads it, or its file or other name."""
         self.own[kind][name] = source
         self._loaded[kind].pop(name, None)
 
     def take(self, name: str, content: bytes, kind: Kind) -> str:
-        """Store an upload, and return the name under which it can be asked for.
+        """Store an upload that is to be used as a kind, and return the name under which it can be asked for.
 
         An upload replaces the one before of its name and kind; names that another kind has taken get a number.
-
-        Args:
-            name: Of the file.
-            content: Of the file.
-            kind: What it is to be used as.
 
         Raises:
             OptionError: The upload is refused.
@@ -83,34 +71,22 @@ class Library:
         return label
 
     def hand(self, name: str) -> Hand:
-        """The hand of a name.
-
-        Raises:
-            HandError: It cannot be used.
-        """
+        """The hand of a name; raises what loading it raises, as the next two do."""
         return self._of_name("hand", name, load_hand)
 
     def obj(self, name: str) -> ObjectModel:
-        """The object of a name.
-
-        Raises:
-            ObjectError: It cannot be used.
-        """
+        """The object of a name."""
         return self._of_name("object", name, load_object)
 
     def scene(self, name: str) -> Scene:
-        """The scene of a name.
-
-        Raises:
-            ObjectError: It cannot be used.
-        """
+        """The scene of a name."""
         return self._of_name("scene", name, load_scene)
 
     def _of_name(self, kind: Kind, name: str, load: Callable[[Any], Any]) -> Any:
         source = self.own[kind].get(name, name)
-        if not isinstance(source, str | Path) and not callable(source):
-            return source
-        return self.loaded(kind, name, source if callable(source) else lambda: load(source))
+        if isinstance(source, str | Path):
+            return self.loaded(kind, name, lambda: load(source))
+        return self.loaded(kind, name, source) if callable(source) else source
 
     def loaded(self, kind: Kind, key: Hashable, load: Callable[[], Any]) -> Any:
         """What is kept under a key, which is loaded where nothing is."""

@@ -12,23 +12,15 @@ from urllib.parse import urlsplit
 
 
 def own_names(served_at: str) -> frozenset[str]:
-    """Names of this machine, in small letters.
+    """Names of this machine, and that which it is served at, in small letters.
 
     A name server may be asked, which takes seconds where none answers: call it once, before requests come.
-
-    Args:
-        served_at: The address that is served at, as the user gave it.
     """
     return frozenset(name.lower() for name in ("localhost", served_at, socket.gethostname(), socket.getfqdn()))
 
 
 def refusal(headers: Mapping[str, str], own: Collection[str]) -> str:
-    """Why a request is refused; empty if it is not.
-
-    Args:
-        headers: Of the request, by name.
-        own: Names of this machine; see `own_names`.
-    """
+    """Why a request with these headers is refused on a machine with these names; empty if it is not."""
     host, origin = headers.get("Host", ""), headers.get("Origin")
     try:
         name = urlsplit(f"//{host}").hostname or ""

@@ -41,10 +41,9 @@ def store_upload(name: str, content: bytes, folder: Path) -> Path:
         raise OptionError(f"{plain} has {len(content) / 1e6:.0f} MB, the limit is {MAX_BYTES / 1e6:.0f} MB; use the command "
                           "line for larger files")
     if not plain.lower().endswith(".zip"):
-        path = folder / plain
-        path.write_bytes(content)
+        (folder / plain).write_bytes(content)
         _confine(folder)
-        return path
+        return folder / plain
     _unpack(plain, content, folder)
     _confine(folder)
     found = sorted((p for p in folder.rglob("*") if p.suffix.lower() in DESCRIPTIONS), key=lambda p: (len(p.parts), p))
@@ -70,26 +69,21 @@ def _confine(folder: Path) -> None:
 
 def _unpack(name: str, content: bytes, folder: Path) -> None:
     with reading(name, OptionError, "a ZIP file, whole; pack it again"), zipfile.ZipFile(io.BytesIO(content)) as archive:
-        _unpack_entries(name, archive, folder)
-
-
-def _unpack_entries(name: str, archive: zipfile.ZipFile, folder: Path) -> None:
-    entries = archive.infolist()
-    size = sum(entry.file_size for entry in entries)
-    if size > MAX_UNPACKED or len(entries) > MAX_FILES:
-        raise OptionError(f"{name} unpacks to {len(entries)} files of {size / 1e6:.0f} MB, the limits are {MAX_FILES} "
-                          f"files and {MAX_UNPACKED / 1e6:.0f} MB")
-    left = MAX_UNPACKED
-    for entry in entries:
-        target = folder / entry.filename
-        if entry.filename.startswith("/") or ".." in PurePosixPath(entry.filename.replace("\\", "/")).parts:
-            raise OptionError(f"{name} holds '{entry.filename}', which lies outside the archive; pack it again")
-        if entry.is_dir():
-            continue
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with archive.open(entry) as source:  # the sizes listed in a ZIP file may be false
-            data = source.read(left + 1)
-        left -= len(data)
-        if left < 0:
-            raise OptionError(f"{name} unpacks to more data than it declares; pack it again")
-        target.write_bytes(data)
+        entries, left = archive.infolist(), MAX_UNPACKED
+        size = sum(entry.file_size for entry in entries)
+        if size > MAX_UNPACKED or len(entries) > MAX_FILES:
+            raise OptionError(f"{name} unpacks to {len(entries)} files of {size / 1e6:.0f} MB, the limits are {MAX_FILES} "
+                              f"files and {MAX_UNPACKED / 1e6:.0f} MB")
+        for entry in entries:
+            target = folder / entry.filename
+            if entry.filename.startswith("/") or ".." in PurePosixPath(entry.filename.replace("\\", "/")).parts:
+                raise OptionError(f"{name} holds '{entry.filename}', which lies outside the archive; pack it again")
+            if entry.is_dir():
+                continue
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with archive.open(entry) as source:  # the sizes listed in a ZIP file may be false
+                data = source.read(left + 1)
+            left -= len(data)
+            if left < 0:
+                raise OptionError(f"{name} unpacks to more data than it declares; pack it again")
+            target.write_bytes(data)

@@ -18,8 +18,8 @@ from dro_grasp.files import check_output
 from dro_grasp.frames import HALF_AXES
 from dro_grasp.grasps.columns import ENERGY_TERM
 from dro_grasp.grasps.sources import object_of
-from dro_grasp.viewer.pictures import caption, contact_sheet, draw_grasp
-from dro_grasp.web.page import ShadedCount, image, table, write_page
+from dro_grasp.pictures.sheets import caption, contact_sheet, draw_grasp
+from dro_grasp.pictures.web_page import ShadedCount, image, table, write_page
 
 MAX_PICTURES = 8
 """Grasps drawn for each hand, each on another object."""

@@ -1,4 +1,4 @@
-"""Pictures of grasps, drawn without a browser, OpenGL or system packages."""
+"""Pictures of grasps and of hands, alone or on one sheet, drawn without a browser, OpenGL or system packages."""
 
 from __future__ import annotations
 
@@ -26,18 +26,15 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked, checked
 from dro_grasp.objects.ball_solid import solid_of
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.pictures.appearance import CONTACT_COLOUR, best_camera, hand_meshes, object_meshes, success_colour
+from dro_grasp.rendering.camera import Camera
 from dro_grasp.rendering.meshes import dots
 from dro_grasp.rendering.rasterizer import render
 from dro_grasp.simulation.closed_poses import held
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
-from dro_grasp.viewer.appearance import CONTACT_COLOUR, best_camera, hand_meshes, object_meshes, success_colour
 
 TILE = (320, 280)
 """Width and height of the picture of one grasp [pixels]."""
-MAX_PICTURES = 16
-"""Default limit of grasps on one sheet."""
-COLUMNS = 4
-"""Default number of pictures side by side."""
 PIXELS_AT_ONCE = 2048 * 2048
 """Pixels that are drawn side by side (ours): bounds the memory."""
 CONTACT_DISTANCE = 0.002
@@ -52,10 +49,10 @@ INK = (40, 44, 52)
 """Colour of text (red, green, blue, to 255)."""
 FAINT = (120, 126, 136)
 """Colour of captions of grasps that were not evaluated (red, green, blue, to 255)."""
-
-
-PicturedPosture = Literal["held", "grasp"]
-"""What a sheet shows of a grasp."""
+HAND_TILE = (300, 280)
+"""Width and height of the picture of one hand [pixels]."""
+OPENNESS = 0.7
+"""Share of the way from closed to open at which hands are drawn (ours)."""
 
 
 @dataclass(frozen=True)
@@ -68,14 +65,18 @@ class PictureStyle(Checked):
     """Opacity of the object; below 1 the hand shows through it."""
     contacts: bool = False
     """Mark contacts in red, even where something hides them."""
-    posture: PicturedPosture = "held"
+    posture: Literal["held", "grasp"] = "held"
     """Hand and object after the hand has closed in a trial, or the grasp itself, which closing starts from; `draw_grasp` draws
     the joints and poses that it is given."""
 
 
+Tile = tuple[UInt8[np.ndarray, "height width 3"], str, bool | None]
+"""A picture, its caption, and the trial outcome that gives its colour."""
+
+
 @checked
 def draw_grasps(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, path: Path | str, count: int = MAX_PICTURES, columns: int = COLUMNS,
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, path: Path | str, count: int = 16, columns: int = 4,
     style: PictureStyle | None = None,
 ) -> None:
     """Write a PNG with pictures of the first `count` grasps, `columns` side by side, captioned with score and trial outcome.
@@ -88,11 +89,11 @@ def draw_grasps(
     """
     require_pair(hand, obj)
     closed = ", drawn after closing" if shows_held(hand, style) else ""
-    _save(*_tiles(hand, obj, grasps[:count], style), heading(hand, obj, grasps) + closed, path, columns)
+    _save(_tiles(hand, obj, grasps[:count], style), heading(hand, obj, grasps) + closed, path, columns)
 
 
 def draw_sheet(
-    hand: Hand, pairs: Sequence[tuple[ObjectModel, GraspBatch]], path: Path | str, columns: int = COLUMNS,
+    hand: Hand, pairs: Sequence[tuple[ObjectModel, GraspBatch]], path: Path | str, columns: int = 4,
     style: PictureStyle | None = None,
 ) -> None:
     """Write a PNG with pictures of all given grasps, of one object or several, as `draw_grasps` draws them.
@@ -103,35 +104,27 @@ def draw_sheet(
     if len(pairs) == 1:
         (obj, grasps), = pairs
         return draw_grasps(hand, obj, grasps, path, len(grasps), columns, style)
-    tiles, captions = [], []
-    for obj, grasps in pairs:
-        drawn, told = _tiles(hand, obj, grasps, style)
-        tiles += drawn
-        captions += [(f"{obj.name}   {text}", passed) for text, passed in told]
+    tiles = [(tile, f"{obj.name}   {text}", passed) for obj, grasps in pairs
+             for tile, text, passed in _tiles(hand, obj, grasps, style)]
     together = GraspBatch.concatenate([grasps for _, grasps in pairs])
-    _save(tiles, captions, f"{hand.name} on {len(pairs)} objects: {_told(together)}", path, columns)
+    _save(tiles, f"{hand.name} on {len(pairs)} objects: {_told(together)}", path, columns)
 
 
-def _tiles(
-    hand: Hand, obj: ObjectModel, grasps: GraspBatch, style: PictureStyle | None
-) -> tuple[list[UInt8[np.ndarray, "height width 3"]], list[tuple[str, bool | None]]]:
-    """Pictures of grasps of one object, and their captions."""
+def _tiles(hand: Hand, obj: ObjectModel, grasps: GraspBatch, style: PictureStyle | None) -> list[Tile]:
+    """Captioned pictures of grasps of one object."""
     drawn = after_closing(hand, obj, grasps) if shows_held(hand, style) else grasps
     width, height = (style or PictureStyle()).size
     with ThreadPoolExecutor(max(1, min(cores(), PIXELS_AT_ONCE // (width * height)))) as threads:
-        tiles = list(threads.map(lambda i: draw_grasp(hand, obj, drawn, i, style), range(len(grasps))))
-    return tiles, [caption(grasps, i) for i in range(len(grasps))]
+        tiles = threads.map(lambda i: draw_grasp(hand, obj, drawn, i, style), range(len(grasps)))
+        return [(tile, *caption(grasps, i)) for i, tile in enumerate(tiles)]
 
 
-def _save(
-    tiles: list[UInt8[np.ndarray, "height width 3"]], captions: Sequence[tuple[str, bool | None]], title: str, path: Path | str,
-    columns: int,
-) -> None:
+def _save(tiles: list[Tile], title: str, path: Path | str, columns: int, outcomes: bool = True) -> None:
     if not tiles:
-        raise OutputError(f"no grasp to draw into {path}; ask for at least one")
-    sheet = contact_sheet(tiles, captions, title, columns)
+        raise OutputError(f"no {'grasp' if outcomes else 'hand'} to draw into {path}; ask for at least one")
+    pictures, captions = [tile[0] for tile in tiles], [tile[1:] for tile in tiles]
     with replacing(path, "picture") as temporary:
-        sheet.save(temporary, format="PNG")
+        contact_sheet(pictures, captions, title, columns, outcomes).save(temporary, format="PNG")
 
 
 def shows_held(hand: Hand, style: PictureStyle | None) -> bool:
@@ -174,8 +167,7 @@ def draw_grasp(
         behind = render(fingers, camera, *style.size, oversampling=oversampling)
         whole = (style.opacity * whole + (1 - style.opacity) * behind + 0.5).astype(np.uint8)
     if len(contacts):
-        dotted = [dots(contacts, CONTACT_COLOUR, CONTACT_RADIUS)]
-        marks = render(dotted, camera, *style.size, oversampling=oversampling)
+        marks = render([dots(contacts, CONTACT_COLOUR, CONTACT_RADIUS)], camera, *style.size, oversampling=oversampling)
         whole = np.where((marks < 250).any(-1, keepdims=True), marks, whole)
     return whole
 
@@ -186,6 +178,35 @@ def contact_points(
     """Points of the posed hand in contact with the object [m]."""
     points = hand.points(joints, T_object_wrist)
     return points[obj.distance_field.distances(points)[0].abs() < CONTACT_DISTANCE].double().numpy()
+
+
+def draw_hands(hands: Sequence[Hand], captions: Sequence[str], path: Path | str, title: str) -> None:
+    """Write a PNG with a captioned picture of each hand, six side by side, seen from in front of its palm.
+
+    Raises:
+        OutputError: There is no hand, or the file cannot be written.
+    """
+    tiles: list[Tile] = [(draw_hand(hand), text, None) for hand, text in zip(hands, captions, strict=True)]
+    _save(tiles, title, path, columns=6, outcomes=False)
+
+
+def draw_hand(hand: Hand) -> UInt8[np.ndarray, "height width 3"]:
+    """The picture of one hand, almost open."""
+    with torch.no_grad():
+        meshes = hand_meshes(hand, hand.canonical_joints(OPENNESS), above_palm=False)
+    points = np.concatenate([mesh.vertices for mesh in meshes])
+    return render(meshes, Camera.around(points, *_view(hand), aspect=HAND_TILE[0] / HAND_TILE[1]), *HAND_TILE)
+
+
+def _view(hand: Hand) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Direction to the camera and direction that points up: along the fingers, or out of a palm from which they stand up."""
+    front = hand.palm_direction_wrist.double().numpy()
+    x, y, _ = hand.palm_axes_wrist.double().numpy().T
+    origins = hand.tree.forward(hand.canonical_joints(1.0))[:, :3, 3].double().numpy()
+    fingers = np.mean([origins[finger.tip] - origins[finger.chain[0]] for finger in hand.fingers], 0)
+    away = fingers @ front > 0.7 * np.linalg.norm(fingers)
+    towards, up = (y + 0.45 * front + 0.5 * x, front) if away else (front + 0.7 * y + 0.25 * x, x)
+    return tuple(towards.tolist()), tuple(up.tolist())
 
 
 def heading(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> str:
@@ -219,7 +240,7 @@ def caption(grasps: GraspBatch, index: int) -> tuple[str, bool | None]:
 
 def contact_sheet(
     tiles: list[UInt8[np.ndarray, "height width 3"]], captions: Sequence[tuple[str, bool | None]], title: str,
-    columns: int = COLUMNS, outcomes: bool = True,
+    columns: int = 4, outcomes: bool = True,
 ) -> Image.Image:
     """A grid of captioned pictures under a title; the captions tell the outcomes in colour, unless there are none."""
     height, width = tiles[0].shape[:2]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from dro_grasp._version import __version__
@@ -33,11 +34,12 @@ def write_page(path: Path, title: str, body: str) -> None:
                              f"{body}<p class=note>dro-grasp {__version__}</p>")
 
 
+@dataclass(frozen=True)
 class ShadedCount:
     """A count whose cell is shaded by its share of the largest count."""
 
-    def __init__(self, count: int, largest: int) -> None:
-        self.count, self.share = count, count / max(1, largest)
+    count: int
+    largest: int
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
@@ -48,7 +50,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 
 def _cell(value: object) -> str:
     if isinstance(value, ShadedCount):
-        colour = f"rgba(42,120,142,{0.65 * value.share:.2f})" if value.count else "#f3d9cc"
+        colour = f"rgba(42,120,142,{0.65 * value.count / value.largest:.2f})" if value.count else "#f3d9cc"
         return f'<td class=cell style="background:{colour}">{value.count}</td>'
     if isinstance(value, str) and " " in value:
         return f"<td class=words>{html.escape(value)}</td>"
@@ -59,4 +61,3 @@ def _cell(value: object) -> str:
 def image(png: bytes, description: str) -> str:
     """A picture embedded in the page."""
     return f'<p><img alt="{html.escape(description)}" src="data:image/png;base64,{base64.b64encode(png).decode()}"></p>'
-

@@ -21,10 +21,8 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.partial_views import partial_view
-from dro_grasp.rendering.camera import Camera
-from dro_grasp.rendering.rasterizer import render
-from dro_grasp.viewer import pictures
-from dro_grasp.viewer.appearance import (
+from dro_grasp.pictures import sheets as pictures
+from dro_grasp.pictures.appearance import (
     OBJECT_COLOUR,
     best_camera,
     hand_meshes,
@@ -32,7 +30,7 @@ from dro_grasp.viewer.appearance import (
     object_meshes,
     success_colour,
 )
-from dro_grasp.viewer.pictures import (
+from dro_grasp.pictures.sheets import (
     CAPTION,
     CONTACT_DISTANCE,
     HEADER,
@@ -44,6 +42,8 @@ from dro_grasp.viewer.pictures import (
     draw_grasps,
     heading,
 )
+from dro_grasp.rendering.camera import Camera
+from dro_grasp.rendering.rasterizer import render
 from tests.helpers.loaded_hands import loaded_hand
 
 

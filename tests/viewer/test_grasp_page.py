@@ -14,9 +14,9 @@ import torch
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.pictures.appearance import success_colour
 from dro_grasp.rendering.camera import Camera
-from dro_grasp.viewer.app import GraspViewer, describe
-from dro_grasp.viewer.appearance import success_colour
+from dro_grasp.viewer.grasp_page import GraspViewer, describe, postures_of
 from dro_grasp.viewer.scene_view import HOST, ServedPage, viewpoint
 from tests.helpers.browser import free_port, page_of
 from tests.helpers.loaded_hands import loaded_hand
@@ -50,10 +50,10 @@ def viewer(grasps: GraspBatch):
 def test_links_stand_where_kinematics_puts_them(viewer: GraspViewer, grasps: GraspBatch) -> None:
     from dro_grasp.geometry.rotations import roma
 
-    for posture in ("open", "pregrasp", "grasp", "squeeze"):
+    hand = loaded_hand("gripper3")
+    for posture, joints in postures_of(hand, load_object("sphere"), grasps).items():
         viewer.show(1, posture)
-        q = viewer._joints[posture][1]
-        poses = grasps.T_object_wrist[1] @ viewer.hand.tree.forward(q)
+        poses = grasps.T_object_wrist[1] @ hand.tree.forward(joints[1])
         for frame, pose in zip(viewer.view.links, poses, strict=True):
             assert np.allclose(frame.position, pose[:3, 3], atol=1e-6)
             shown = roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(torch.tensor(np.asarray(frame.wxyz)).float()))
@@ -61,23 +61,33 @@ def test_links_stand_where_kinematics_puts_them(viewer: GraspViewer, grasps: Gra
 
 
 def test_points_and_colours_follow_the_grasp(viewer: GraspViewer, grasps: GraspBatch) -> None:
+    hand = loaded_hand("gripper3")
     for index in (0, 1):
         viewer.show(index, "grasp")
-        solved = viewer.hand.points(grasps.joints[index], grasps.T_object_wrist[index])
+        solved = hand.points(grasps.joints[index], grasps.T_object_wrist[index])
         assert np.allclose(viewer.view.solved.points, solved, atol=1e-5)
-        assert np.allclose(viewer._predicted.points, solved + 0.001, atol=1e-5)
+        assert np.allclose(viewer.view.predicted.points, solved + 0.001, atol=1e-5)
         wanted = tuple(round(255 * c) for c in success_colour(bool(grasps.success[index])))
         assert tuple(viewer.view._grid.cell_color) == wanted
-        assert f"Grasp {index}" in viewer._text.content
+        assert f"Grasp {index}" in viewer.text.content
 
 
-def test_postures_open_and_close(viewer: GraspViewer, grasps: GraspBatch) -> None:
-    joints, obj = viewer._joints, viewer.obj
+def test_postures_open_and_close(grasps: GraspBatch) -> None:
+    hand, obj = loaded_hand("gripper3"), load_object("sphere")
+    joints = postures_of(hand, obj, grasps)
     spread = {
-        name: (viewer.hand.points(q, grasps.T_object_wrist) - torch.from_numpy(obj.centre_of_mass).float())
+        name: (hand.points(q, grasps.T_object_wrist) - torch.from_numpy(obj.centre_of_mass).float())
         .norm(dim=-1).mean() for name, q in joints.items()
     }
     assert spread["pregrasp"] > spread["grasp"] > spread["squeeze"]
+
+
+def test_layers_are_shown_as_the_controls_say(viewer: GraspViewer) -> None:
+    viewer.show(0, "grasp")
+    assert (viewer.view.links[0].visible, viewer.view.solved.visible, viewer.view.predicted.visible) == (True, False, False)
+    viewer.shapes.value, viewer.points.value, viewer.predicted.value = False, True, True
+    assert (viewer.view.links[0].visible, viewer.view.solved.visible, viewer.view.predicted.visible) == (False, True, True)
+    viewer.shapes.value, viewer.points.value, viewer.predicted.value = True, False, False
 
 
 def test_only_this_machine_is_served(viewer: GraspViewer) -> None:

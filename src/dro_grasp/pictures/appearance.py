@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import colorsys
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -18,8 +17,6 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.rendering.meshes import OBJECT_COLOUR, Colour, Mesh, dots
 
-PALM_COLOUR: Colour = (0.58, 0.62, 0.69)
-"""Grey of links that belong to no finger."""
 PREDICTED_COLOUR: Colour = (0.85, 0.20, 0.55)
 """Pink of hand points predicted by the network."""
 SOLVED_COLOUR: Colour = (0.15, 0.45, 0.85)
@@ -28,17 +25,12 @@ CONTACT_COLOUR: Colour = (0.86, 0.10, 0.16)
 """Red of contact marks."""
 SUCCESS_COLOUR: Colour = (0.16, 0.60, 0.30)
 """Green of grasps that passed their trial."""
-FAILURE_COLOUR: Colour = (0.80, 0.22, 0.20)
-"""Red of grasps that failed their trial."""
-UNEVALUATED_COLOUR: Colour = (0.50, 0.50, 0.50)
-"""Grey of grasps that were not evaluated."""
-
 WAITING_HEIGHT = 0.05
 """Height of the grasp centre of a waiting hand above the object [m]."""
 CELLS = 28
 """Cells along each side of the coarse picture that rates a viewpoint."""
-VIEWPOINTS = 48
-"""Half the number of viewpoints spread over the sphere."""
+VIEWPOINTS = 96
+"""Viewpoints spread over the sphere."""
 LOWEST_VIEW = -0.5
 """Smallest height of a camera on the unit sphere, so that none points straight up."""
 LOWEST_OVER_TABLE = 0.3
@@ -50,12 +42,12 @@ HIGHEST_VIEW = 0.85
 def link_colours(hand: Hand) -> list[Colour]:
     """One cool colour for each finger, grey for the palm."""
     hues = [0.62 - 0.17 * i / max(1, len(hand.fingers) - 1) for i in range(len(hand.fingers))]
-    return [PALM_COLOUR if f == PALM else colorsys.hls_to_rgb(hues[f], 0.56, 0.48) for f in hand.finger_of_link.tolist()]
+    return [(0.58, 0.62, 0.69) if f == PALM else colorsys.hls_to_rgb(hues[f], 0.56, 0.48) for f in hand.finger_of_link.tolist()]
 
 
 def success_colour(success: bool | None) -> Colour:
     """Green for success, red for failure, grey if not evaluated."""
-    return UNEVALUATED_COLOUR if success is None else SUCCESS_COLOUR if success else FAILURE_COLOUR
+    return (0.50, 0.50, 0.50) if success is None else SUCCESS_COLOUR if success else (0.80, 0.22, 0.20)
 
 
 def link_shapes(hand: Hand) -> list[tuple[int, Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]]:
@@ -117,15 +109,9 @@ def best_camera(
     points = np.concatenate([of_hand, of_object])
     owner = np.concatenate([finger.astype(int), np.full(len(of_object), 2)])
     lowest = LOWEST_OVER_TABLE if from_above else LOWEST_VIEW
-    rated = [(_clarity(points, owner, direction), direction) for direction in _directions() if direction[2] > lowest]
+    directions = [tuple(row) for row in even_directions(VIEWPOINTS).tolist() if lowest < row[2] < HIGHEST_VIEW]
+    rated = [(_clarity(points, owner, direction), direction) for direction in directions]
     return Camera.around(points, max(rated)[1], field_of_view=0.5, aspect=aspect)
-
-
-@lru_cache(maxsize=1)
-def _directions() -> tuple[tuple[float, float, float], ...]:
-    """Evenly spread viewpoints, without those from straight below or above."""
-    rows = even_directions(2 * VIEWPOINTS)
-    return tuple((x, y, z) for x, y, z in rows.tolist() if LOWEST_VIEW < z < HIGHEST_VIEW)
 
 
 def _clarity(points: Float[np.ndarray, "n 3"], owner: Int[np.ndarray, " n"], direction: tuple[float, float, float]) -> float:
