@@ -21,7 +21,7 @@ from dro_grasp.cli.main import main
 from dro_grasp.errors import OptionError, PlanError, RobotError
 from dro_grasp.planning.motion import STAGES, MotionPlan
 from dro_grasp.planning.planner import PACKAGES, PlanConfig, Task, plan
-from dro_grasp.planning.robot_file import BUILTIN_ROBOTS
+from dro_grasp.planning.robot import BUILTIN_ROBOTS
 from dro_grasp.planning.workcell import Workcell, arm_addresses, robot_spec
 from dro_grasp.simulation.hand_part import joint_addresses
 from dro_grasp.simulation.protocols import PROTOCOLS

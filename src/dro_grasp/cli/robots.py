@@ -53,7 +53,7 @@ class Robots:
 
     def run(self) -> int:
         """Print the names."""
-        from dro_grasp.planning.robot_file import robot_names
+        from dro_grasp.planning.robot import robot_names
 
         names = robot_names()
         print_result(self.json, {"robots": names}, "robots", ["name"], [[n] for n in names], "also: the path of a robot.yaml")

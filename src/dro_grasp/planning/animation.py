@@ -17,9 +17,8 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.planning.attempts import Attempt, Watcher, attempt
 from dro_grasp.planning.motion import MotionPlan
 from dro_grasp.planning.physics import LiftScene
-from dro_grasp.planning.robot import Robot, load_robot
+from dro_grasp.planning.robot import Robot, Table, load_robot
 from dro_grasp.planning.robot_check import robot_meshes, table_meshes
-from dro_grasp.planning.robot_file import Table
 from dro_grasp.planning.table_scene import PickedObject
 from dro_grasp.planning.tabletop import TabletopRun
 from dro_grasp.predictor import GraspPredictor

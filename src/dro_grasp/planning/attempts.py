@@ -28,8 +28,7 @@ from dro_grasp.planning.motion import STAGES, MotionPlan
 from dro_grasp.planning.physics import SHAPE_GROUP, TICK, Deviation, LiftScene, object_name
 from dro_grasp.planning.planner import PlanConfig, plan
 from dro_grasp.planning.reachability import ReachConfig
-from dro_grasp.planning.robot import Robot
-from dro_grasp.planning.robot_file import CameraMount, Table
+from dro_grasp.planning.robot import CameraMount, Robot, Table
 from dro_grasp.planning.table_scene import PickedObject, pick_object
 from dro_grasp.planning.workcell import ARM, Workcell, moved
 from dro_grasp.predictor import GraspPredictor

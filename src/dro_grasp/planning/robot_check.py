@@ -14,8 +14,7 @@ from PIL import Image
 
 from dro_grasp.descriptions.loader import Description
 from dro_grasp.files import check_output, replacing
-from dro_grasp.planning.robot import Robot, load_robot
-from dro_grasp.planning.robot_file import Table
+from dro_grasp.planning.robot import Robot, Table, load_robot
 from dro_grasp.planning.workcell import CLEARANCE, TABLE, WORLD, Workcell
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.rendering.meshes import Colour, Mesh, arrow

@@ -18,8 +18,7 @@ from dro_grasp.objects.in_memory import numbers
 from dro_grasp.objects.loading import MIN_CLOUD, cloud_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.scan import given_points, given_pose, scanned_object
-from dro_grasp.planning.robot import Robot
-from dro_grasp.planning.robot_file import Table
+from dro_grasp.planning.robot import Robot, Table
 from dro_grasp.planning.workcell import VOXEL
 
 THICKNESS = 0.006

@@ -19,8 +19,7 @@ from dro_grasp.geometry.table_plane import moved_plane
 from dro_grasp.objects.cache import content_hash
 from dro_grasp.objects.scenery import Scene, one_per_cell
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.planning.robot import Robot
-from dro_grasp.planning.robot_file import Table
+from dro_grasp.planning.robot import Robot, Table
 from dro_grasp.simulation.hand_part import HULL_VERTICES, PREFIX, attach, hand_spec, joint_addresses, let_touch
 from dro_grasp.simulation.protocols import PROTOCOLS, Protocol
 
