@@ -42,16 +42,8 @@ POSE_KEYS = {"position", "quaternion_wxyz"}
 """What it states of a pose."""
 CAMERA_KEYS = {*POSE_KEYS, "target", "T_world_camera", "width", "height", "focal", "centre"}
 """What it may state of the camera."""
-LONGEST_ARM = 5.0
-"""A farther link must be in another unit [m] (ours)."""
 TURN = np.pi
 """Planned motions stay this near home, so that configurations a whole turn apart count once [rad] (ours)."""
-HASHED_DIGITS = 9
-"""Decimals of poses and limits that count for a robot's hash (ours)."""
-FULL = 6
-"""Joints of an arm that brings its wrist to any pose in reach."""
-DEFAULT_EFFORT = 50.0
-"""Largest torque of an arm's joint that states none [Nm]; only simulated servos use it (ours)."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +135,7 @@ class Robot:
     @property
     def has_few_joints(self) -> bool:
         """Whether the arm brings its wrist to some poses only."""
-        return len(self.home) < FULL
+        return len(self.home) < 6
 
     @property
     def T_wrist_aim(self) -> Float[np.ndarray, "4 4"]:
@@ -183,15 +175,7 @@ def _farthest(
     tree: KinematicTree, lower: Float[np.ndarray, " n_dof"], upper: Float[np.ndarray, " n_dof"], link: int,
     points: Float[np.ndarray, "n 3"],
 ) -> float:
-    """No point that is fixed to a link gets farther from the root link's origin than this [m], by the triangle inequality.
-
-    Args:
-        tree: The links.
-        lower: Least value of each independent joint [rad or m].
-        upper: Greatest value of each independent joint [rad or m].
-        link: Index of the link.
-        points: In the link's frame [m].
-    """
+    """No point in a link's frame [m] gets farther from the root link's origin than this [m], by the triangle inequality."""
     tree = tree.double
     coupling, offset = tree.link_coupling, tree.link_offset
     ends = torch.stack([coupling * torch.from_numpy(end).double() for end in (lower, upper)])
@@ -216,7 +200,7 @@ def _farthest_surface(
 
 def _rounded(values: Float[np.ndarray, "..."]) -> list[Any]:
     """For hashes: what machines compute differs in the last digits."""
-    return (values.round(HASHED_DIGITS) + 0.0).tolist()
+    return (values.round(9) + 0.0).tolist()
 
 
 def locate_robot(name: str | Path) -> Path:
@@ -265,7 +249,7 @@ def load_robot(name: str | Path) -> Robot:
     return Robot(
         file.name, arm, load_hand(file.hand), fit.mount, file.T_link_wrist, file.T_world_base,
         fit.home(lower, upper), lower, upper, fit.limit("velocity"), fit.limit("acceleration"),
-        fit.limit("effort", DEFAULT_EFFORT), *file.hand_limits, file.camera, file.table)
+        fit.limit("effort", 50.0), *file.hand_limits, file.camera, file.table)
 
 
 class _RobotFile:
@@ -400,7 +384,7 @@ class _Fit:
             raise self.error(f"joints {', '.join(idle)} of the arm do not move link '{link}'; remove what they move (a "
                              "gripper?) from the arm's file, or mount the hand farther out")
         reach = float(tree.forward(torch.zeros(tree.n_dof))[:, :3, 3].norm(dim=-1).max())
-        if reach > LONGEST_ARM:
+        if reach > 5.0:
             raise self.error(f"a link of the arm is {reach:.3g} m from its base, which looks like millimetres; expected metres")
 
     def positions(self) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
@@ -423,7 +407,7 @@ class _Fit:
         return lower, upper
 
     def limit(self, kind: str, default: float | None = None) -> Float[np.ndarray, " n"]:
-        """One limit of each joint: the file's, or else the arm's."""
+        """One limit of each joint: the file's, or else the arm's; only simulated servos use a default effort [Nm] (ours)."""
         given, stated = self.file.limits.get(kind), _stated_limits(self.arm.path, kind)
         if given is not None and not isinstance(given, dict):
             given = dict.fromkeys(self.joints, given)
