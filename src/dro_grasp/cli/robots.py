@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from dro_grasp.cli.inputs import ConstraintOptions, Flag, PalmOptions, optional
-from dro_grasp.cli.output import print_json, print_result, print_table, say, say_aside
+from dro_grasp.cli.output import print_json, print_report, print_result, print_table, say, say_aside
 
 if TYPE_CHECKING:
     import numpy as np
@@ -310,11 +310,7 @@ class CheckRobot:
         report = check_robot(self.robot)
         if self.picture is not None:
             draw_robot(report.robot, self.picture)
-        if self.json:
-            print_json({**report.to_dict(), "picture": None if self.picture is None else str(self.picture)})
-        else:
-            for line in [*report.lines(), *([f"picture: {self.picture}"] if self.picture else [])]:
-                say(line)
+        print_report(report, self.picture, self.json)
         return 0 if report.usable else 2
 
 

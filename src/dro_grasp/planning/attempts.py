@@ -34,22 +34,10 @@ from dro_grasp.planning.workcell import ARM, Workcell, moved
 from dro_grasp.predictor import GraspPredictor
 from dro_grasp.simulation.hand_part import PREFIX
 
-VERSION = 3
-"""Goes up with every change that can change an outcome."""
-LABEL = f"tabletop/{VERSION} "
-"""Beginning of the settings of stored attempts."""
-PUSHED = 0.03
-"""Farthest that the object may move before the hand closes [m] (ours)."""
-SLIPPED = 0.05
-"""Farthest that it may move in the hand after the lift [m] (ours)."""
-STAYED = 0.02
-"""An object that the lift raised less than this stayed where it was [m] (ours)."""
+LABEL = "tabletop/3 "
+"""Beginning of the settings of stored attempts; the number goes up with every change that can change an outcome."""
 APART = 0.03
 """Distance between the outlines of objects as they are put down [m] (ours)."""
-MOST_CLUTTER = 8
-"""Most other objects that there is room for (ours)."""
-AROUND = 0.10
-"""Other objects stand at most this far beyond the region of the one that is asked for [m] (ours)."""
 STRIDE = 2
 """Every so many pixels, in both directions, one ray is cast (ours)."""
 
@@ -95,8 +83,8 @@ class TabletopConfig(Checked):
         x, y, far_x, far_y = self.region
         if not (-math.inf < x < far_x < math.inf and -math.inf < y < far_y < math.inf):
             raise OptionError(f"region is {self.region}; give two corners, the lower one first: X0 Y0 X1 Y1 in metres")
-        if not 0 <= self.clutter <= MOST_CLUTTER:
-            raise OptionError(f"clutter is {self.clutter}; give a number of other objects from 0 to {MOST_CLUTTER}")
+        if not 0 <= self.clutter <= 8:  # there is no room for more
+            raise OptionError(f"clutter is {self.clutter}; give a number of other objects from 0 to 8")
 
     def label(self) -> str:
         """Version and every setting, as stored with results: results of other settings are not mixed."""
@@ -246,11 +234,11 @@ def carry_out(scene: LiftScene, made: MotionPlan, config: TabletopConfig, watch:
         for i in range(rows.start + 1, rows.stop):
             scene.command(made.arm.position[i], made.arm.velocity[i], made.hand.position[i])
             scene.advance(float(made.arm.time[i] - made.arm.time[i - 1]), call)
-        if stage == "approach" and (moved := _apart(scene.pose(0), start)) > PUSHED:
+        if stage == "approach" and (moved := _apart(scene.pose(0), start)) > 0.03:  # [m] (ours)
             return stage, f"the hand pushed the object by {100 * moved:.1f} cm before it closed"
     lifted = float(scene.pose(0)[2, 3] - start[2, 3])
     if lifted < config.plan.reach.within(scene.robot).lift / 2:
-        return "lift", "the object stayed on the table" if lifted < STAYED else "the object fell during the lift"
+        return "lift", "the object stayed on the table" if lifted < 0.02 else "the object fell during the lift"
     grip = scene.in_hand(0)
     arm, hand = made.arm.position[-1], made.hand.position[-1]
     for stage, seconds in (("hold", config.hold_seconds), ("shake", config.shake_seconds)):
@@ -263,7 +251,7 @@ def carry_out(scene: LiftScene, made: MotionPlan, config: TabletopConfig, watch:
             scene.command(target, velocity, hand)
             scene.advance(TICK, call)
         slip = _apart(scene.in_hand(0), grip)
-        if slip > SLIPPED or not scene.touched(0):
+        if slip > 0.05 or not scene.touched(0):  # [m] (ours)
             return stage, f"the object slipped by {100 * slip:.0f} cm out of the hand"
     return "done", ""
 
@@ -274,8 +262,8 @@ def other_objects(name: str, count: int, draw: np.random.Generator) -> list[Obje
 
 
 def scatter(scene: LiftScene, region: Region, draw: np.random.Generator) -> bool:
-    """Put all objects down, the first one in the region and the others around it; False if one of them never comes to rest."""
-    wide = (region[0] - AROUND / 2, region[1] - AROUND, region[2] + AROUND, region[3] + AROUND)
+    """Put all objects down, the first one in the region and others up to 10 cm around it; False if one never comes to rest."""
+    wide = (region[0] - 0.05, region[1] - 0.10, region[2] + 0.10, region[3] + 0.10)
     return all(rest(scene, index, wide if index else region, draw) for index in range(len(scene.objects)))
 
 

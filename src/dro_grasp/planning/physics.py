@@ -40,8 +40,6 @@ MEMORY = 2**28
 """Memory for contacts [bytes]; what is not needed is never touched. Ours: by itself MuJoCo has room for some 300 contacts."""
 SHAPE_GROUP = 4
 """Group of the geoms that only cameras see: the objects' true meshes."""
-PART_GROUP = 3
-"""Group of the convex parts, with which objects collide."""
 BALL_BIT = 2
 """Bit of contacts of an estimated object's balls with the hand (ours)."""
 HULL_BIT = 4
@@ -187,7 +185,7 @@ def _add_thing(scene: mujoco.MjSpec, obj: ObjectModel, index: int) -> Float[np.n
     assert obj.faces is not None
     body = add_object(scene, obj, LIFT_PROTOCOL, object_name(index))
     for geom in body.geoms:
-        geom.group = PART_GROUP
+        geom.group = 3  # cameras do not see the parts
     shape = scene.add_mesh(
         name=f"shape{index}", uservert=(obj.vertices - obj.centre_of_mass).ravel(), userface=obj.faces.astype(np.int32).ravel())
     shape.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL

@@ -275,7 +275,14 @@ def add(task: Task, tries: Tries, grasps: GraspBatch) -> None:
     first = sum(len(part) for part in tries.parts)
     tries.parts.append(grasps)
     with tries.watch("reach"):
-        for row, reason in [*_forbidden(task, grasps), *task.reach.hopeless(grasps).items()]:
+        if task.constraints != Constraints():
+            T = np.linalg.inv(task.T)
+            problem = GraspProblem(task.robot.hand, task.obj, constraints=task.constraints.moved(T))
+            there = grasps.replace(T_object_wrist=torch.from_numpy(T).float() @ grasps.T_object_wrist)
+            for reason, wrong in faults(problem, there).items():
+                for row in wrong.nonzero()[:, 0].tolist():
+                    tries.dropped.setdefault(first + row, reason)
+        for row, reason in task.reach.hopeless(grasps).items():
             tries.dropped.setdefault(first + row, reason)
     tries.waiting += [i for i in range(first, first + len(grasps)) if i not in tries.dropped]
     tries.waiting += [goal.index for goal in tries.ready]
@@ -285,16 +292,6 @@ def add(task: Task, tries: Tries, grasps: GraspBatch) -> None:
     else:
         score = tries.grasps.score.tolist()
         tries.waiting.sort(key=lambda i: -score[i])
-
-
-def _forbidden(task: Task, grasps: GraspBatch) -> list[tuple[int, str]]:
-    """Rows that do not respect the constraints, and why; table and obstacles are the arm's affair."""
-    if task.constraints == Constraints():
-        return []
-    T = np.linalg.inv(task.T)
-    problem = GraspProblem(task.robot.hand, task.obj, constraints=task.constraints.moved(T))
-    there = grasps.replace(T_object_wrist=torch.from_numpy(T).float() @ grasps.T_object_wrist)
-    return [(row, reason) for reason, wrong in faults(problem, there).items() for row in wrong.nonzero()[:, 0].tolist()]
 
 
 def reachable(task: Task, tries: Tries) -> Iterator[Feasible]:

@@ -24,10 +24,6 @@ from dro_grasp.planning.candidates import lowest_points
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.workcell import VOXEL, Workcell, arm_addresses
 
-POSITION_TOLERANCE = 5e-4
-"""Largest error of the wrist's position [m] (ours)."""
-ROTATION_TOLERANCE = 2e-3
-"""Largest error of its rotation [rad] (ours)."""
 TURNED = 0.12
 """Farthest that a wrist is turned about the grasp centre from what was asked [rad] (ours)."""
 STEEPEST = 0.2
@@ -195,7 +191,7 @@ class Reachability:
 
 
 class WristSolver:
-    """Solves for one robot; it knows no obstacles.
+    """Solves for one robot, to half a millimetre; it knows no obstacles.
 
     An arm with few joints brings the grasp centre to its place, and turns the wrist as nearly as it can.
     """
@@ -205,7 +201,8 @@ class WristSolver:
         import mink
 
         few = cell.robot.has_few_joints
-        self._T_wrist_aim, self._turned = cell.robot.T_wrist_aim, TURNED if few else ROTATION_TOLERANCE
+        self._T_wrist_aim = cell.robot.T_wrist_aim
+        self._turned = TURNED if few else 2e-3  # largest error of the wrist's rotation [rad] (ours)
         self.model, self.addresses = cell.arm, arm_addresses(cell.arm, cell.robot)
         self.lower, self.upper = cell.robot.working_range
         self._configuration = mink.Configuration(self.model)
@@ -254,7 +251,7 @@ class WristSolver:
 
     def _arrived(self) -> bool:
         error = self._task.compute_error(self._configuration)
-        return bool(np.linalg.norm(error[:3]) < POSITION_TOLERANCE and np.linalg.norm(error[3:]) < self._turned)
+        return bool(np.linalg.norm(error[:3]) < 5e-4 and np.linalg.norm(error[3:]) < self._turned)
 
 
 def reachable_directions(robot: Robot, place: Float[np.ndarray, "3"], seed: int = 0) -> Float[Tensor, "k 3"]:

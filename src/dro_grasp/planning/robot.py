@@ -34,14 +34,8 @@ from dro_grasp.rendering.camera import Camera
 
 BUILTIN_ROBOTS = Path(__file__).parent / "builtin"
 """Folder of the built-in robots."""
-LIMITS = {"velocity", "acceleration", "effort", "position"}
-"""What may be stated of the arm's joints."""
-KEYS = {"name", "arm", "hand", "mount", "base", "home", "limits", "hand_limits", "camera", "table"}
-"""What a robot file may state."""
 POSE_KEYS = {"position", "quaternion_wxyz"}
-"""What it states of a pose."""
-CAMERA_KEYS = {*POSE_KEYS, "target", "T_world_camera", "width", "height", "focal", "centre"}
-"""What it may state of the camera."""
+"""What a robot file states of a pose."""
 TURN = np.pi
 """Planned motions stay this near home, so that configurations a whole turn apart count once [rad] (ours)."""
 
@@ -261,7 +255,8 @@ class _RobotFile:
             values = yaml.safe_load(path.read_text())
         except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
             raise RobotError(f"{path} cannot be read as YAML: {' '.join(str(error).split())}") from error
-        values = self.mapping(values, "the file", KEYS, {"arm", "hand", "home"})
+        known = {"name", "arm", "hand", "mount", "base", "home", "limits", "hand_limits", "camera", "table"}
+        values = self.mapping(values, "the file", known, {"arm", "hand", "home"})
         self.name, self.arm = str(values.get("name", path.stem)), path.parent / given_path(str(values["arm"]))
         hand = str(values["hand"])
         file, link = split_part(str(path.parent / hand))
@@ -271,7 +266,7 @@ class _RobotFile:
         self.T_world_base = self.pose(self.mapping(values.get("base", {}), "base", POSE_KEYS), "base")
         home = self.mapping(values["home"], "home")
         self.home = {str(k): self.number(v, f"home of joint {k}") for k, v in home.items()}
-        self.limits = self.mapping(values.get("limits", {}), "limits", LIMITS)
+        self.limits = self.mapping(values.get("limits", {}), "limits", {"velocity", "acceleration", "effort", "position"})
         hand_limits = self.mapping(values.get("hand_limits", {}), "hand_limits", {"velocity", "acceleration"})
         self.hand_limits = [self.positive(hand_limits.get(key, default), f"hand_limits: {key}")
                             for key, default in (("velocity", 2.0), ("acceleration", 10.0))]
@@ -319,7 +314,8 @@ class _RobotFile:
     def _camera(self, values: Any) -> CameraMount | None:
         if values is None:
             return None
-        values = self.mapping(values, "camera", CAMERA_KEYS, {"focal"})
+        known = {*POSE_KEYS, "target", "T_world_camera", "width", "height", "focal", "centre"}
+        values = self.mapping(values, "camera", known, {"focal"})
         if "T_world_camera" in values:
             try:
                 T = torch.tensor(values["T_world_camera"], dtype=torch.float64)

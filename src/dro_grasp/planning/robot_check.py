@@ -140,14 +140,11 @@ def robot_meshes(robot: Robot, arm: Float[np.ndarray, " n_arm"], hand: Float[np.
 
 def robot_shapes(robot: Robot) -> list[Mesh]:
     """The visual shapes of arm and hand, each in its link's frame."""
-    found = []
-    for description in _parts(robot):
-        for shape in description.geometry:
-            if shape.visual:
-                arm_colour = MOUNT_COLOUR if shape.link == 0 else ARM_COLOUR
-                colour = arm_colour if description is robot.arm else HAND_COLOUR
-                found.append(Mesh(shape.vertices, shape.faces, colour))
-    return found
+    def colour(description: Description, link: int) -> Colour:
+        return HAND_COLOUR if description is not robot.arm else ARM_COLOUR if link else MOUNT_COLOUR
+
+    return [Mesh(shape.vertices, shape.faces, colour(description, shape.link))
+            for description in _parts(robot) for shape in description.geometry if shape.visual]
 
 
 def shape_poses(

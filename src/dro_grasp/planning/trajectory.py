@@ -18,16 +18,12 @@ from dro_grasp.planning.motion import STAGES, Trajectory
 from dro_grasp.planning.reachability import Feasible, Postures, carried
 from dro_grasp.planning.workcell import Workcell
 
-RESOLUTION = 0.03
-"""Largest change of a joint between two configurations that are checked on an edge [rad or m] (ours)."""
 SPACING = 0.08
 """Largest change of a joint between the waypoints of a path that is returned [rad or m] (ours)."""
 STEP = 0.01
 """Longest time between samples of a trajectory [s] (ours); each of its parts has samples at equal distances."""
 USED = 0.95
 """Share of each limit that is used: they hold at points of a grid, and a motion that exceeds one between is slowed (ours)."""
-GRID = 150
-"""Least number of points of the path at which the limits hold (ours)."""
 
 Check = Callable[[Float[np.ndarray, " n"]], bool]
 """Whether a configuration is free."""
@@ -64,7 +60,8 @@ def find_path(
     setup = og.SimpleSetup(space)
     setup.setStateValidityChecker(lambda state: free(values(state)))
     information = setup.getSpaceInformation()
-    information.setStateValidityCheckingResolution(RESOLUTION / space.getMaximumExtent())
+    # Configurations that are checked on an edge differ by at most 0.03 rad or m in all joints together (ours).
+    information.setStateValidityCheckingResolution(0.03 / space.getMaximumExtent())
     setup.setStartState(state(start))
     goal_set = ob.GoalStates(information)
     for goal in goals:
@@ -161,11 +158,11 @@ def smooth(
         limits = [constraint.JointVelocityConstraint(USED * np.stack([-velocity, velocity], 1)),
                   constraint.JointAccelerationConstraint(USED * np.stack([-acceleration, acceleration], 1))]
         path = toppra.SplineInterpolator(along, points, bc_type="natural")
-        grid = np.linspace(0, along[-1], max(GRID, 3 * len(points)))
+        grid = np.linspace(0, along[-1], max(150, 3 * len(points)))  # where the limits hold (ours)
         timed = algorithm.TOPPRA(limits, path, gridpoints=grid, parametrizer="ParametrizeConstAccel").compute_trajectory(0, 0)
     if timed is None:
         raise RuntimeError("a path through its own waypoints has no timing within positive limits")
-    fine = np.linspace(0, timed.duration, 4 * GRID)
+    fine = np.linspace(0, timed.duration, 600)
     excess = [1.0, least_seconds / timed.duration, float(np.abs(timed(fine, 1) / velocity).max()),
               float(np.abs(timed(fine, 2) / acceleration).max()) ** 0.5]
     slower = max(excess)

@@ -34,8 +34,6 @@ TARGET = "target"
 """Name of the object that is grasped."""
 OBSTACLE = "obstacle"
 """What obstacles are called in contacts."""
-TABLE_THICKNESS = 0.05
-"""[m] (ours)"""
 VOXEL = 0.01
 """Edge of the cells that a cloud of obstacles fills [m] (ours)."""
 CLEARANCE = 0.005
@@ -338,10 +336,10 @@ def robot_spec(robot: Robot, protocol: Protocol, table: Table | None) -> mujoco.
     attach(scene, arm, placed_frame(scene.worldbody, robot.T_world_base), ARM)
     attach(scene, hand_spec(robot.hand, protocol), placed_frame(scene.body(ARM + robot.mount_link), robot.T_link_wrist))
     if table is not None:
-        half = [table.size[0] / 2, table.size[1] / 2, TABLE_THICKNESS / 2]
+        half = [table.size[0] / 2, table.size[1] / 2, 0.025]  # [m]: a board of 5 cm (ours)
         scene.worldbody.add_geom(
             name=TABLE, type=mujoco.mjtGeom.mjGEOM_BOX, size=half, rgba=[0.82, 0.80, 0.76, 1],
-            pos=[*table.centre, table.height - TABLE_THICKNESS / 2], friction=[protocol.friction, 0.005, 1e-4])
+            pos=[*table.centre, table.height - half[2]], friction=[protocol.friction, 0.005, 1e-4])
     return scene
 
 
