@@ -131,15 +131,11 @@ class LiftScene:
         linear, angular = self.data.qvel[start:start + 3], self.data.qvel[start + 3:start + 6]
         return float(np.linalg.norm(linear) + 0.05 * np.linalg.norm(angular))
 
-    def wrist(self) -> Float[np.ndarray, "4 4"]:
-        """Where the hand's root link really is [m]."""
-        body, T = self.data.body(PREFIX + self.robot.hand.wrist_link), np.eye(4)
-        T[:3, :3], T[:3, 3] = body.xmat.reshape(3, 3), body.xpos
-        return T
-
     def in_hand(self, index: int) -> Float[np.ndarray, "4 4"]:
         """Where an object really is in the frame of the hand's root link [m]."""
-        return np.linalg.inv(self.wrist()) @ self.pose(index)
+        body, T = self.data.body(PREFIX + self.robot.hand.wrist_link), np.eye(4)
+        T[:3, :3], T[:3, 3] = body.xmat.reshape(3, 3), body.xpos
+        return np.linalg.inv(T) @ self.pose(index)
 
     def joints(self) -> tuple[Float[np.ndarray, " n_arm"], Float[np.ndarray, " n_dof"]]:
         """Where arm and hand really are, in independent joints [rad or m]."""
@@ -156,9 +152,9 @@ class LiftScene:
         self.data.ctrl[self._arm_servos] = arm + DAMPING_TIME * velocity
         self.data.ctrl[self._hand_servos] = hand[self._driven]
 
-    def advance(self, seconds: float, watch: Callable[[], None] | None = None, every: float = 0.02) -> None:
-        """Let time pass; `watch` is called at intervals of `every` seconds."""
-        steps, stride = round(seconds / self.model.opt.timestep), max(1, round(every / self.model.opt.timestep))
+    def advance(self, seconds: float, watch: Callable[[], None] | None = None) -> None:
+        """Let time pass; `watch` is called once a tick."""
+        steps, stride = round(seconds / self.model.opt.timestep), max(1, round(TICK / self.model.opt.timestep))
         with quiet():
             for done in range(0, steps, stride):
                 mujoco.mj_step(self.model, self.data, min(stride, steps - done))
@@ -293,7 +289,7 @@ class Rehearsal:
             self.scene.command(q, rate * velocity, _at(hand, along)[0])
             few = self.scene.data.ncon <= self.few_contacts
             self.scene.model.opt.noslip_iterations = LIFT_PROTOCOL.noslip if few else 0
-            self.scene.advance(TICK, every=TICK)
+            self.scene.advance(TICK)
 
 
 def _at(rows: Float[np.ndarray, "k n"], along: float) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:

@@ -275,7 +275,7 @@ def add(task: Task, tries: Tries, grasps: GraspBatch) -> None:
     first = sum(len(part) for part in tries.parts)
     tries.parts.append(grasps)
     with tries.watch("reach"):
-        if task.constraints != Constraints():
+        if task.constraints != Constraints():  # table and obstacles are the arm's affair
             T = np.linalg.inv(task.T)
             problem = GraspProblem(task.robot.hand, task.obj, constraints=task.constraints.moved(T))
             there = grasps.replace(T_object_wrist=torch.from_numpy(T).float() @ grasps.T_object_wrist)

@@ -153,7 +153,8 @@ class Reachability:
         T = grasps.T_object_wrist[index].double().numpy()
         ahead = robot.hand.palm_directions(grasps.T_object_wrist[index:index + 1])[0].double().numpy()
         back, up = self._line(T, -self.config.standoff * ahead), self._line(T, np.array([0, 0, self.config.lift]))
-        postures, reasons, (lower, upper) = Postures.of(robot, grasps, index), [Fault.OUT_OF_REACH], robot.working_range
+        postures, (lower, upper) = Postures.of(robot, grasps, index), robot.working_range
+        reasons: list[str] = [Fault.OUT_OF_REACH]
         for seed in [robot.home, *self.random.uniform(lower, upper, (self.config.seeds - 1, len(lower)))]:
             q = self.solver.solve(T, [seed])
             if q is None:

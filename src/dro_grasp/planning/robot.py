@@ -243,7 +243,7 @@ def load_robot(name: str | Path) -> Robot:
     return Robot(
         file.name, arm, load_hand(file.hand), fit.mount, file.T_link_wrist, file.T_world_base,
         fit.home(lower, upper), lower, upper, fit.limit("velocity"), fit.limit("acceleration"),
-        fit.limit("effort", 50.0), *file.hand_limits, file.camera, file.table)
+        fit.limit("effort", 50.0), file.hand_velocity, file.hand_acceleration, file.camera, file.table)
 
 
 class _RobotFile:
@@ -268,8 +268,8 @@ class _RobotFile:
         self.home = {str(k): self.number(v, f"home of joint {k}") for k, v in home.items()}
         self.limits = self.mapping(values.get("limits", {}), "limits", {"velocity", "acceleration", "effort", "position"})
         hand_limits = self.mapping(values.get("hand_limits", {}), "hand_limits", {"velocity", "acceleration"})
-        self.hand_limits = [self.positive(hand_limits.get(key, default), f"hand_limits: {key}")
-                            for key, default in (("velocity", 2.0), ("acceleration", 10.0))]
+        self.hand_velocity = self.positive(hand_limits.get("velocity", 2.0), "hand_limits: velocity")
+        self.hand_acceleration = self.positive(hand_limits.get("acceleration", 10.0), "hand_limits: acceleration")
         self.camera, self.table = self._camera(values.get("camera")), self._table(values.get("table"))
 
     def error(self, text: str) -> RobotError:

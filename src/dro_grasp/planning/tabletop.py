@@ -6,7 +6,7 @@ import multiprocessing
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import MISSING, asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -190,12 +190,9 @@ def read_attempts(path: Path) -> list[Attempt]:
         GraspFileError: It is another file.
     """
     known = {f.name for f in fields(Attempt)}
-    needed = {f.name for f in fields(Attempt) if f.default is MISSING and f.default_factory is MISSING}
-    with reading(path, GraspFileError, "a file of attempts; name another one, or move this one away", pa.ArrowException):
-        rows = pq.read_table(path).to_pylist()
-        if lacking := needed - {*(rows[0] if rows else needed)}:
-            raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
-    return [Attempt(**{k: v for k, v in row.items() if k in known}) for row in rows]
+    expected = "a file of attempts; name another one, or move this one away"
+    with reading(path, GraspFileError, expected, pa.ArrowException, TypeError):  # which names the columns that are missing
+        return [Attempt(**{k: v for k, v in row.items() if k in known}) for row in pq.read_table(path).to_pylist()]
 
 
 def endings(attempts: Sequence[Attempt]) -> dict[str, int]:
