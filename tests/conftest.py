@@ -81,7 +81,7 @@ def small_robot(tmp_path_factory: pytest.TempPathFactory) -> str:
     """The file of the built-in xArm 7 with a hand that loads quickly, and without a camera."""
     import yaml
 
-    from dro_grasp.planning.robot_file import BUILTIN_ROBOTS
+    from dro_grasp.planning.robot import BUILTIN_ROBOTS
 
     values = yaml.safe_load((BUILTIN_ROBOTS / "xarm7_leaphand.yaml").read_text())
     values |= {"arm": str(BUILTIN_ROBOTS / "xarm7.urdf"), "hand": "gripper3"}

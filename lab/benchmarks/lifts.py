@@ -23,7 +23,8 @@ from dro_grasp.datasets.bundle.training_file import load_bundle
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.planning.attempts import Attempt, TabletopConfig, attempt
-from dro_grasp.planning.planner import NO_PATH, PlanConfig
+from dro_grasp.planning.planner import PlanConfig
+from dro_grasp.planning.reachability import Fault
 from dro_grasp.planning.robot import load_robot
 from dro_grasp.planning.table_scene import PickedObject
 from dro_grasp.planning.tabletop import TabletopRun, endings, failures, processor_seconds, run_tabletop
@@ -60,7 +61,7 @@ def row(robot: str, kind: str, done: list[Attempt]) -> list[object]:
     ended = ", ".join(f"{stage} {count}" for stage, count in endings(done).items())
     times = [None, None] if seconds is None else [round(seconds["median"], 1), round(seconds["within_95"], 1)]
     planned = sum(a.processor_seconds > 0 for a in done)
-    reachable = planned + sum(a.stage == "plan" and NO_PATH in a.reason for a in done)
+    reachable = planned + sum(a.stage == "plan" and Fault.NO_PATH in a.reason for a in done)
     shares = [a.grasp_seconds / a.plan_seconds for a in done if a.plan_seconds > 0]
     return [robot, kind, f"{held} of {len(done)}", round(100 * held / len(done)), f"{100 * low:.0f}-{100 * high:.0f}", planned,
             reachable, ended, *times, round(100 * float(np.median(shares))) if shares else None]

@@ -33,10 +33,6 @@ from .optimization.synthesis import SynthesisConfig as SynthesisConfig, synthesi
 from .perception.partial_views import DepthCamera as DepthCamera, visible_points as visible_points
 from .perception.scan import depth_points as depth_points, scanned_object as scanned_object
 from .pictures.sheets import PictureStyle as PictureStyle, draw_grasps as draw_grasps
-from .pipeline.choice import ChoiceConfig as ChoiceConfig, ChoicePenalties as ChoicePenalties
-from .pipeline.constraints import Constraints as Constraints
-from .pipeline.problem import GraspProblem as GraspProblem
-from .pipeline.stages import complete as complete, evaluate as evaluate, rank as rank, refine as refine
 from .planning.attempts import Attempt as Attempt, TabletopConfig as TabletopConfig
 from .planning.motion import (
     MotionPlan as MotionPlan,

@@ -14,8 +14,8 @@ import dro_grasp as dro
 from dro_grasp.objects.ball_solid import solid_of
 from dro_grasp.planning.candidates import grasps_in_world
 from dro_grasp.planning.physics import DEVIATIONS, MEMORY, Deviation, LiftScene, Rehearsal
-from dro_grasp.planning.planner import LOSES, PlanConfig, plan
-from dro_grasp.planning.reachability import Feasible, Postures
+from dro_grasp.planning.planner import PlanConfig, plan
+from dro_grasp.planning.reachability import Fault, Feasible, Postures
 from dro_grasp.planning.workcell import Workcell
 from tests.helpers.claw import claw_xml
 from tests.helpers.clouds import cloud_of
@@ -114,7 +114,7 @@ def test_where_none_holds_the_best_score_is_taken_all_the_same(
     made = plan(robot, ball, config=PlanConfig(deviations=(heavy,)), grasps=grasps)
     assert made.notes.chosen == plan(robot, ball, config=PlanConfig(rehearsals=0), grasps=grasps).notes.chosen
     sometimes = PlanConfig(deviations=(Deviation(), heavy, Deviation()))
-    assert LOSES not in plan(robot, ball, config=sometimes, grasps=grasps).notes.dropped
+    assert Fault.LOSES not in plan(robot, ball, config=sometimes, grasps=grasps).notes.dropped
 
 
 def test_servos_follow_a_trajectory_within_a_degree(robot: dro.Robot) -> None:

@@ -19,9 +19,10 @@ from scipy.spatial.distance import pdist
 import dro_grasp as dro
 from dro_grasp.cli.main import main
 from dro_grasp.errors import OptionError, PlanError, RobotError
+from dro_grasp.extras import EXTRAS
 from dro_grasp.planning.motion import STAGES, MotionPlan
-from dro_grasp.planning.planner import PACKAGES, PlanConfig, Task, plan
-from dro_grasp.planning.robot_file import BUILTIN_ROBOTS
+from dro_grasp.planning.planner import PlanConfig, Task, plan
+from dro_grasp.planning.robot import BUILTIN_ROBOTS
 from dro_grasp.planning.workcell import Workcell, arm_addresses, robot_spec
 from dro_grasp.simulation.hand_part import joint_addresses
 from dro_grasp.simulation.protocols import PROTOCOLS
@@ -224,11 +225,11 @@ def test_without_the_extra_planning_says_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "ompl", None)
     assert main(["plan", "--robot", "xarm7_leaphand", "--object", "can"]) == 2
-    assert "ompl; run pip install '.[arm]' in the folder of the clone" in capsys.readouterr().err
+    assert "ompl; run pip install 'dro-grasp[arm]', or pip install '.[arm]' in the folder of" in capsys.readouterr().err
 
 
 def test_every_other_command_works_without_the_extra(small_robot: str) -> None:
-    blocked = "".join(f"sys.modules[{name!r}] = None; " for name in PACKAGES)
+    blocked = "".join(f"sys.modules[{name!r}] = None; " for name in EXTRAS["arm"])
     code = (f"import sys; {blocked}import dro_grasp as dro; from dro_grasp.cli.main import main; "
             f"dro.PlanConfig, dro.MotionPlan.load; sys.exit(main(['robot', 'check', {small_robot!r}]))")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

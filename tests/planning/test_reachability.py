@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 import dro_grasp as dro
 from dro_grasp.planning.reachability import (
-    HITS_OBSTACLE,
     STEEPEST,
     TURNED,
+    Fault,
     Reachability,
     ReachConfig,
     WristSolver,
@@ -117,4 +117,4 @@ def test_hands_that_would_meet_an_obstacle_are_dropped(robot: dro.Robot) -> None
     obstacle = dro.load_object(middle + 0.03 * ball / np.linalg.norm(ball, axis=1, keepdims=True), keep_table=True)
     for thing in (obstacle, dro.load_object("cube")):
         reach = Reachability(Workcell(replace(robot, table=None), [thing], obj, T), ReachConfig(), 0)
-        assert reach.hopeless(grasps) == ({0: HITS_OBSTACLE} if thing is obstacle else {})
+        assert reach.hopeless(grasps) == ({0: Fault.HITS_OBSTACLE} if thing is obstacle else {})

@@ -15,8 +15,7 @@ import yaml
 import dro_grasp as dro
 from dro_grasp.cli.main import main
 from dro_grasp.errors import RobotError
-from dro_grasp.planning.robot import Robot, load_robot
-from dro_grasp.planning.robot_file import BUILTIN_ROBOTS, robot_names
+from dro_grasp.planning.robot import BUILTIN_ROBOTS, Robot, load_robot, robot_names
 from dro_grasp.planning.workcell import Workcell
 from tests.helpers.whole_robot import arm_with_claw, two_arms
 

@@ -22,13 +22,14 @@ def test_a_path_goes_round_a_wall_to_the_goal_that_can_be_reached() -> None:
     start, goals = np.array([-0.8, -0.8]), np.array([[0.7, -0.7], [0.8, 0.2]])
     found = find_path(start, goals, free, low, high, 2.0, 0)
     assert found is not None
-    assert found.goal == 1  # the other one is walled in
-    assert np.allclose(found.waypoints[[0, -1]], [start, goals[1]])
-    assert all(free(q) for q in found.waypoints)
-    assert found.waypoints[:, 1].max() > 0.6
+    waypoints, goal = found
+    assert goal == 1  # the other one is walled in
+    assert np.allclose(waypoints[[0, -1]], [start, goals[1]])
+    assert all(free(q) for q in waypoints)
+    assert waypoints[:, 1].max() > 0.6
     again = find_path(start, goals, free, low, high, 2.0, 0)
     assert again is not None
-    assert np.array_equal(again.waypoints, found.waypoints)
+    assert np.array_equal(again[0], waypoints)
     assert find_path(start, goals[:1], free, low, high, 0.3, 0) is None
 
 
@@ -77,8 +78,9 @@ def test_a_stage_in_which_nothing_moves_is_a_stage(robot: dro.Robot, planned: Mo
     cell, hand = Workcell(replace(robot, table=None)), Postures(opened, bent, opened, opened)
     made = timed_stages(cell, np.stack([robot.home, approach[0]]), Feasible(0, approach, lift), hand, 1.0, 0.5)
     assert made is not None
-    whole = replace(planned, stage=made.stage, arm=made.arm, hand=made.hand)
+    stages, arm, fingers = made
+    whole = replace(planned, stage=stages, arm=arm, hand=fingers)
     assert f"{still} 0.0 s" in whole.lines()[2]
     assert (np.diff(whole.arm.time) > 0).all()
-    assert sorted(set(made.stage.tolist())) == list(range(len(STAGES)))
+    assert sorted(set(stages.tolist())) == list(range(len(STAGES)))
     assert all(np.ptp(whole.arm.position[whole.part(s)], axis=0).max() > 0 for s in ("reach", "approach", "lift") if s != still)

@@ -121,6 +121,7 @@ class Evaluate:
         """Print the rates of each object and of all; of what is `lost`, grasps were asked for, and none was found."""
         from dro_grasp.compare.metrics import mean_share, success_rate
         from dro_grasp.grasps.batch import GraspBatch
+        from dro_grasp.simulation.contact_quality import NAMES
         from dro_grasp.simulation.diagnosis import count_failures, diagnose, next_steps
 
         rows = []
@@ -133,9 +134,8 @@ class Evaluate:
         (rate, low, high), beside = success_rate(success, asked), shares(done, hand, asked)
         report = {
             "file": str(self.file), "hand": hand.name, "protocol": rules.label, "asked": asked, "num": len(done),
-            "success": success,
-            "success_rate": rate, "interval_95": [low, high],
-            **beside, "contact_quality": qualities(done),
+            "success": success, "success_rate": rate, "interval_95": [low, high],
+            **beside, "contact_quality": {name: float(done.extra[name].mean()) for name in NAMES if name in done.extra},
             "objects": {row[0]: dict(zip(("asked", "num", "success"), row[1:4], strict=True)) for row in rows},
             "bare_clouds": bare,
             "reasons": count_failures(done), "next": next_steps(done), "seconds": round(seconds, 3),
@@ -181,10 +181,3 @@ def shares(grasps: GraspBatch, hand: Hand, asked: int) -> dict[str, float]:
     held = [mean_share(grasps.robustness, asked)[0]] if bool(grasps.robustness.isfinite().all()) else []
     names = list(SHARES)[-2 - len(held):]
     return dict(zip(names, [*held, *finger_contact(grasps.fingers_in_contact, len(hand.fingers))], strict=True))
-
-
-def qualities(grasps: GraspBatch) -> dict[str, float]:
-    """Means of the analytic metrics of grasps that have them."""
-    from dro_grasp.simulation.contact_quality import NAMES
-
-    return {name: float(grasps.extra[name].mean()) for name in NAMES if name in grasps.extra}

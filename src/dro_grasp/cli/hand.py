@@ -12,7 +12,7 @@ import tyro
 
 from dro_grasp.cli.inputs import Flag, optional
 from dro_grasp.cli.listing import Hands
-from dro_grasp.cli.output import print_json, print_table, progress_bar, say
+from dro_grasp.cli.output import print_json, print_report, print_table, progress_bar, say
 
 if TYPE_CHECKING:
     from dro_grasp.hands.procedural.making import MadeHand
@@ -47,16 +47,23 @@ class Make:
 
     def run(self) -> int:
         """Make, write, list and draw."""
+        from dro_grasp.errors import OptionError, OutputError
         from dro_grasp.files import check_output, make_folder, replacing
         from dro_grasp.hands.procedural.making import hand_name, make_hand
 
-        self._check_numbers()
+        if self.num < 1:
+            raise OptionError(f"--num is {self.num}; give at least 1")
+        if self.seed < 0:
+            raise OptionError(f"--seed is {self.seed}; give 0 or more")
         if self.picture is not None:
             check_output(self.picture, ".png")
         folder = make_folder(self.output)
         seeds = range(self.seed, self.seed + self.num)
         files = [folder / f"{hand_name(seed)}.urdf" for seed in seeds]
-        self._check_files(files)
+        there = [file for file in files if file.exists()]
+        if there and not self.overwrite:
+            raise OutputError(f"{len(there)} of {len(files)} files exist (first: {there[0]}); give --overwrite to replace "
+                              "them, or another --seed or folder")
         made = []
         with progress_bar("making hands", self.json) as progress:
             for seed, file in zip(seeds, files, strict=True):
@@ -70,22 +77,6 @@ class Make:
             _draw(files, made, self.picture)
         self._report(made)
         return 0
-
-    def _check_numbers(self) -> None:
-        from dro_grasp.errors import OptionError
-
-        if self.num < 1:
-            raise OptionError(f"--num is {self.num}; give at least 1")
-        if self.seed < 0:
-            raise OptionError(f"--seed is {self.seed}; give 0 or more")
-
-    def _check_files(self, files: list[Path]) -> None:
-        from dro_grasp.errors import OutputError
-
-        there = [file for file in files if file.exists()]
-        if there and not self.overwrite:
-            raise OutputError(f"{len(there)} of {len(files)} files exist (first: {there[0]}); give --overwrite to replace "
-                              "them, or another --seed or folder")
 
     def _report(self, made: list[MadeHand]) -> None:
         rows = [hand.facts() for hand in made]
@@ -191,13 +182,7 @@ class Check:
         report = check_hand(self.hand)
         if self.picture is not None:
             picture(report.hand, self.picture)
-        if self.json:
-            print_json({**report.to_dict(), "picture": None if self.picture is None else str(self.picture)})
-            return 0
-        for line in report.lines():
-            say(line)
-        if self.picture is not None:
-            say(f"picture: {self.picture}")
+        print_report(report, self.picture, self.json)
         return 0
 
 

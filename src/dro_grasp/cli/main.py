@@ -19,11 +19,9 @@ from dro_grasp.cli.generate import Generate
 from dro_grasp.cli.hand import HandCommand
 from dro_grasp.cli.listing import Hands, Objects
 from dro_grasp.cli.onboard import Onboard
-from dro_grasp.cli.plan import Plan
-from dro_grasp.cli.robots import RobotCommand
+from dro_grasp.cli.robots import Plan, RobotCommand, Tabletop
 from dro_grasp.cli.serve import Serve
 from dro_grasp.cli.synthesize import Synthesize
-from dro_grasp.cli.tabletop import Tabletop
 from dro_grasp.cli.train import Pretrain, Train
 from dro_grasp.cli.view import Picture, View
 from dro_grasp.cli.weights import Weights

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import compress
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -55,6 +56,15 @@ def print_result(
     print_table(title, columns, rows)
     for note in filter(None, notes):
         say(note)
+
+
+def print_report(report: Any, picture: Path | None, as_json: bool) -> None:
+    """Print a check's report, as one JSON object or in its lines, and where its picture is."""
+    if as_json:
+        print_json({**report.to_dict(), "picture": None if picture is None else str(picture)})
+        return
+    for line in [*report.lines(), *([] if picture is None else [f"picture: {picture}"])]:
+        say(line)
 
 
 def records(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[dict[str, Any]]:

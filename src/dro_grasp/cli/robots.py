@@ -1,15 +1,289 @@
-"""`dro-grasp robot`: the check of a robot description, and the names of the built-in robots."""
+"""`dro-grasp plan`, `tabletop` and `robot`: motions of arms that carry a hand, their trial in simulation, and checks."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from dro_grasp.cli.inputs import Flag, optional
-from dro_grasp.cli.output import print_json, print_result, say
+from dro_grasp.cli.inputs import ConstraintOptions, Flag, PalmOptions, optional
+from dro_grasp.cli.output import print_json, print_report, print_result, print_table, say, say_aside
+
+if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Float
+
+    from dro_grasp.planning.attempts import Attempt
+    from dro_grasp.planning.robot import Robot
+    from dro_grasp.planning.table_scene import PickedObject
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Plan how a robot grasps an object and lifts it: what a robot's computer runs. Needs the extra `[arm]`.
+
+    Example: dro-grasp plan --robot xarm7_leaphand --object mug --at 0.5 0.1 --output plan.npz --trajectory plan.yaml
+    """
+
+    robot: str
+    """A robot file, or the name of a built-in robot (see `dro-grasp robot list`)."""
+    object: str
+    """A cloud (PLY, NPY, PCD), a mesh, or an object's name (see `dro-grasp objects`), in the robot's world frame. A cloud may
+    show the table and other things too."""
+    camera: Annotated[str | None, optional("JSON|robot", "the object is in the world frame")] = None
+    """The object is a cloud in this camera's frame; it is cleaned and completed. A file with {"frame": "world",
+    "T_frame_camera": 4x4}, or `robot` for the camera of the robot file."""
+    pose: Annotated[Path | None, optional("JSON", "the object's frame is the world frame")] = None
+    """File with {"frame": "world", "T_frame_object": 4x4}: where the object stands."""
+    at: Annotated[tuple[float, float] | None, optional("X Y", "as --pose says")] = None
+    """Stand the object, upright in its own frame, on the table at this place [m]."""
+    near: Annotated[tuple[float, float] | None, optional("X Y", "there is only one")] = None
+    """The object is a cloud of a table with several things: take the one nearest to this place in the world [m], and keep clear
+    of the others."""
+    obstacles: tuple[str, ...] = ()
+    """Clouds and meshes of things, in the world frame, that nothing may touch."""
+    avoid: Annotated[Path | None, optional("MESH|CLOUD", "nothing")] = None
+    """Mesh or cloud of what stands around, of any size, in the world frame and without object and robot: hand and arm stay
+    clear of it."""
+    constraints: ConstraintOptions = field(default_factory=ConstraintOptions)
+    """In the world frame."""
+    num: int = 24
+    """Grasps to choose from, in each of up to three batches."""
+    top: int = 5
+    """Reachable grasps of best score that are given to the planner at once."""
+    rehearsals: int = 8
+    """Grasps of each batch whose lift is simulated, where a table is known, on the object as it is known; 0 for none."""
+    directions: Literal["paper", "all"] = "all"
+    """Palm directions: `paper`, from above to the right side, or `all` that a table leaves room for."""
+    planner_seconds: float = 3.0
+    """Longest time for one path [s]."""
+    seed: int = 0
+    """Of grasps, inverse kinematics and planner."""
+    weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
+    """Name of shipped weights (see `dro-grasp weights list`) or the path of a weights file."""
+    output: Annotated[Path | None, optional("NPZ", "not saved")] = None
+    """Plan file: arm and hand over time, by stage, and what was dropped."""
+    trajectory: Annotated[Path | None, optional("YAML", "not written")] = None
+    """The motion as trajectory_msgs/JointTrajectory, one for the arm and one for the hand."""
+    csv: Annotated[Path | None, optional("CSV", "not written")] = None
+    """The motion as a table."""
+    json: Flag = False
+    """Print one JSON object instead of text."""
+
+    def run(self) -> int:
+        """Check everything that can be checked before the work, then plan and write."""
+        from dro_grasp.errors import OptionError
+        from dro_grasp.extras import require_extra
+        from dro_grasp.files import check_output, replacing
+        from dro_grasp.objects.catalogue import load_object
+        from dro_grasp.objects.scenery import load_scene
+        from dro_grasp.planning.motion import trajectory_csv, trajectory_yaml
+        from dro_grasp.planning.planner import PlanConfig, plan
+        from dro_grasp.planning.robot import load_robot
+        from dro_grasp.predictor import GraspPredictor
+
+        require_extra("arm")
+        if not 0 <= self.seed < 2**31:
+            raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^31 - 1")
+        avoid = None if self.avoid is None else load_scene(self.avoid)
+        constraints = self.constraints.constraints(avoid=avoid)
+        config = PlanConfig(
+            self.num, self.top, self.directions, constraints, rehearsals=self.rehearsals, planner_seconds=self.planner_seconds)
+        for option, place in (("--at", self.at), ("--near", self.near)):
+            if place is not None and not all(map(math.isfinite, place)):
+                raise OptionError(f"{option} is {place[0]:g} {place[1]:g}; give x and y in metres, such as {option} 0.5 0.1")
+        for path, ending in ((self.output, ".npz"), (self.trajectory, ".yaml"), (self.csv, ".csv")):
+            if path is not None:
+                check_output(path, ending)
+        robot = load_robot(self.robot)
+        obstacles = [load_object(name) for name in self.obstacles]
+        picked, T_world_object = self._place(robot)
+        robot, obj, obstacles = picked.robot, picked.obj, [*obstacles, *picked.obstacles]
+        if robot.table is None:
+            say_aside(f"robot '{robot.name}' states no table: nothing keeps the hand above what the object stands on; state "
+                      "`table` in the robot file")
+        for note in obj.notes:
+            say_aside(f"{obj.name}: {note}")
+        made = plan(robot, obj, T_world_object, obstacles, GraspPredictor(self.weights), config, self.seed)
+        if self.output is not None:
+            made.save(self.output)
+        for path, text in ((self.trajectory, trajectory_yaml), (self.csv, trajectory_csv)):
+            if path is not None:
+                with replacing(path, "trajectory") as temporary:
+                    temporary.write_text(text(made), encoding="utf-8")
+        written = {k: str(p) for k, p in (("plan", self.output), ("trajectory", self.trajectory), ("csv", self.csv)) if p}
+        if self.json:
+            print_json({**asdict(made.notes), "motion_seconds": made.seconds, **written})
+            return 0
+        for line in [*made.lines(), *(f"{what}: {path}" for what, path in written.items())]:
+            say(line)
+        return 0
+
+    def _place(self, robot: Robot) -> tuple[PickedObject, Float[np.ndarray, "4 4"]]:
+        """The object with what stands around it, and where its frame is in the world."""
+        import numpy as np
+
+        from dro_grasp.errors import OptionError
+        from dro_grasp.files import given_path
+        from dro_grasp.frames import read_motion
+        from dro_grasp.objects.catalogue import load_object
+        from dro_grasp.objects.loading import read_geometry, read_points
+        from dro_grasp.perception.scan import load_scan
+        from dro_grasp.planning.robot import Table
+        from dro_grasp.planning.table_scene import PickedObject, pick_object, sees_table
+
+        if sum(given is not None for given in (self.camera, self.pose, self.at)) > 1:
+            raise OptionError("--camera, --pose and --at each say where the object is; give one of them")
+        if self.near is not None and (self.pose is not None or self.at is not None):
+            raise OptionError("--near picks an object of a cloud in the world's or a camera's frame; leave out --pose and --at")
+        T, path, camera = np.eye(4), given_path(self.object), self._camera(robot)
+        if camera is not None or self.near is not None:
+            points = read_points(path)
+            world = points if camera is None else points @ camera[:3, :3].T + camera[:3, 3]
+            if self.near is not None or (robot.table is not None and sees_table(world, robot.table)):
+                return pick_object(path.stem, points, robot, camera, self.near), T
+            assert camera is not None
+            return PickedObject(load_scan(path, camera), [], robot), T
+        if self.pose is None and self.at is None and robot.table is not None and path.is_file():
+            found, unit = read_geometry(path)  # a table is larger than any object that is loaded
+            if isinstance(found, np.ndarray) and found.ndim == 2 and sees_table(found[:, :3] * unit, robot.table):
+                return pick_object(path.stem, found[:, :3] * unit, robot), T
+        obj = load_object(self.object)
+        if self.pose is not None:
+            T = read_motion(self.pose, "T_frame_object").T.double().numpy()
+        elif self.at is not None:
+            if robot.table is None:
+                say_aside(f"robot '{robot.name}' states no table: z = 0 is taken for one; state `table` in the robot file")
+                robot = replace(robot, table=Table(0.0, self.at))
+            assert robot.table is not None
+            T[:3, 3] = *self.at, robot.table.height - float(obj.cloud[:, 2].min())
+        elif obj.is_cloud and robot.table is not None and obj.table is not None:
+            return pick_object(path.stem, read_points(path), robot), T  # a table, perhaps with several things on it
+        return PickedObject(obj, [], robot), T
+
+    def _camera(self, robot: Robot) -> Float[np.ndarray, "4 4"] | None:
+        """The camera's pose in the world; None if the object is in the world's frame."""
+        from dro_grasp.errors import OptionError
+        from dro_grasp.frames import read_motion
+
+        if self.camera is None:
+            return None
+        if self.camera != "robot":
+            return read_motion(Path(self.camera), "T_frame_camera").T.double().numpy()
+        if robot.camera is None:
+            raise OptionError(f"robot '{robot.name}' has no camera; state it in the robot file, or give --camera JSON")
+        return robot.camera.T_world_camera
+
+
+@dataclass(frozen=True)
+class Tabletop:
+    """Let a robot see, plan, grasp, lift, hold and shake objects on its table, in MuJoCo. Needs the extra `[arm]`.
+
+    Example: dro-grasp tabletop --robot xarm7_leaphand --objects mug can --attempts 2 --output results.parquet
+    """
+
+    robot: str
+    """A robot file, or the name of a built-in robot (see `dro-grasp robot list`)."""
+    objects: tuple[str, ...]
+    """Names or files of meshes, `all`, or `assets:validate`."""
+    attempts: int = 10
+    """With each object, each at another place and in another pose."""
+    see: Literal["cloud", "mesh"] = "cloud"
+    """What is planned for: the robot's camera's cloud alone, or, as a control, the true mesh at its true place."""
+    order: Literal["score", "random"] = "score"
+    """Which reachable grasps are taken: the best by score, or, as a control, any."""
+    directions: Literal["paper", "all"] = "all"
+    """Palm directions: `paper`, from above to the right side, or `all`."""
+    constraints: PalmOptions = field(default_factory=PalmOptions)
+    """In the world frame."""
+    num: int = 24
+    """Grasps to choose from, in each of up to three batches."""
+    rehearsals: int = 8
+    """Grasps of each batch whose lift is simulated on the object as it is known, before one is chosen; 0 for none."""
+    region: Annotated[tuple[float, float, float, float] | None, optional("X0 Y0 X1 Y1", "0.38 -0.18 0.58 0.18")] = None
+    """Where objects are put, from corner to corner about the arm's base [m]; a small arm needs them nearer."""
+    clutter: int = 0
+    """Other objects, drawn from the built-in ones, that stand around the one that is asked for: 2 to 4 make a crowd."""
+    segment: Literal["cluster", "mask"] = "cluster"
+    """How the object's points are told from those of others: by distance, or by its true mask."""
+    noise: float = 0.0015
+    """Standard deviation of the camera's depth [m]."""
+    seed: int = 0
+    """Of all draws."""
+    weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
+    """Name of shipped weights (see `dro-grasp weights list`) or the path of a weights file."""
+    workers: int = 1
+    """Processes; each takes one object after the other."""
+    output: Annotated[Path | None, optional("PARQUET", "not saved")] = None
+    """A row for each attempt, with stage, reason, times and seed. Attempts that it holds with the same robot, objects, weights,
+    settings and seed are not repeated."""
+    plans: Annotated[Path | None, optional("FOLDER", "not saved")] = None
+    """Folder for the plan of each attempt, ROBOT-OBJECT-NUMBER.npz."""
+    video: Annotated[Path | None, optional("GIF|WEBP", "none")] = None
+    """Animation of the first attempt, which is run once more for it."""
+    json: Flag = False
+    """Print one JSON object instead of text."""
+
+    def run(self) -> int:
+        """Run what is missing, store and print."""
+        from dro_grasp.extras import require_extra
+
+        require_extra("arm")
+        from dro_grasp.files import check_output
+        from dro_grasp.objects.catalogue import resolve_objects
+        from dro_grasp.planning.animation import FORMATS, draw_attempt
+        from dro_grasp.planning.attempts import TabletopConfig
+        from dro_grasp.planning.planner import PlanConfig
+        from dro_grasp.planning.tabletop import TabletopRun, run_tabletop
+
+        if self.video is not None:
+            check_output(self.video, *FORMATS)
+        config = TabletopConfig(
+            self.see, self.noise, self.region or TabletopConfig.region, clutter=self.clutter, segment=self.segment,
+            plan=PlanConfig(
+                self.num, directions=self.directions, order=self.order, rehearsals=self.rehearsals,
+                constraints=self.constraints.constraints()))
+        run = TabletopRun(
+            self.robot, tuple(resolve_objects(list(self.objects))), self.attempts, self.seed, self.weights, config)
+        done = run_tabletop(run, self.output, self.workers, None if self.json else _say, self.plans)
+        self._report(done)
+        if self.video is not None:
+            draw_attempt(run, self.video)
+            say_aside(f"video: {self.video}")
+        return 0
+
+    def _report(self, done: list[Attempt]) -> None:
+        from dro_grasp.evaluation.metrics import wilson_interval
+        from dro_grasp.planning.tabletop import endings, failures, processor_seconds
+
+        held = sum(a.success for a in done)
+        low, high = wilson_interval(held, len(done))
+        seconds = processor_seconds(done)
+        if self.json:
+            print_json({
+                "robot": done[0].robot, "attempts": len(done), "success": held, "success_rate": held / len(done),
+                "interval": [low, high], "ended": endings(done), "processor_seconds": seconds, "failures": failures(done)})
+            return
+        rows = []
+        for name in dict.fromkeys(a.object for a in done):
+            own = [a for a in done if a.object == name]
+            ended = ", ".join(f"{stage} {count}" for stage, count in endings(own).items())
+            rows.append([name, f"{sum(a.success for a in own)} of {len(own)}", ended])
+        print_table(f"{done[0].robot}: lifts", ["object", "held", "ended in"], rows)
+        say(f"{held} of {len(done)} attempts succeeded ({held / len(done):.0%}, 95 % interval {low:.0%} to {high:.0%})")
+        if seconds:
+            say(f"depth image to timed plan, time of one core: median {seconds['median']:.1f} s, 95 % within "
+                f"{seconds['within_95']:.1f} s (n = {seconds['n']})")
+        if self.output is not None:
+            say(f"attempts: {self.output}")
+
+
+def _say(attempt: Attempt) -> None:
+    outcome = "held" if attempt.success else f"{attempt.stage}: {attempt.reason}"
+    say_aside(f"{attempt.object}, attempt {attempt.number}: {outcome}")
 
 
 @dataclass(frozen=True)
@@ -36,11 +310,7 @@ class CheckRobot:
         report = check_robot(self.robot)
         if self.picture is not None:
             draw_robot(report.robot, self.picture)
-        if self.json:
-            print_json({**report.to_dict(), "picture": None if self.picture is None else str(self.picture)})
-        else:
-            for line in [*report.lines(), *([f"picture: {self.picture}"] if self.picture else [])]:
-                say(line)
+        print_report(report, self.picture, self.json)
         return 0 if report.usable else 2
 
 
@@ -53,7 +323,7 @@ class Robots:
 
     def run(self) -> int:
         """Print the names."""
-        from dro_grasp.planning.robot_file import robot_names
+        from dro_grasp.planning.robot import robot_names
 
         names = robot_names()
         print_result(self.json, {"robots": names}, "robots", ["name"], [[n] for n in names], "also: the path of a robot.yaml")

@@ -17,9 +17,8 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.planning.attempts import Attempt, Watcher, attempt
 from dro_grasp.planning.motion import MotionPlan
 from dro_grasp.planning.physics import LiftScene
-from dro_grasp.planning.robot import Robot, load_robot
+from dro_grasp.planning.robot import Robot, Table, load_robot
 from dro_grasp.planning.robot_check import robot_meshes, table_meshes
-from dro_grasp.planning.robot_file import Table
 from dro_grasp.planning.table_scene import PickedObject
 from dro_grasp.planning.tabletop import TabletopRun
 from dro_grasp.predict.predictor import GraspPredictor
@@ -37,8 +36,6 @@ VIEW = (0.9, -1.25, 0.75)
 """Direction from the robot towards the camera, in the world."""
 OTHER_COLOUR: Colour = (0.62, 0.68, 0.55)
 """Green of other objects on the table."""
-LAST_SECONDS = 1.0
-"""How long the last frame stays [s] (ours)."""
 
 
 @dataclass
@@ -68,33 +65,24 @@ class Recorder(Watcher):
             self.next_time = scene.data.time + 1 / self.rate - scene.model.opt.timestep / 2
 
 
-def check_animation(path: Path) -> None:
-    """Refuse a path that no animation can be written to.
-
-    Raises:
-        OutputError: The ending is unknown, or the path cannot be written.
-    """
-    check_output(path, *FORMATS)
-
-
 def draw_animation(robot: Robot, recorder: Recorder, path: Path) -> None:
     """Write the animation of a recorded attempt.
 
     Raises:
-        OutputError: Nothing was recorded, or the path cannot be written.
+        OutputError: Nothing was recorded, the ending is unknown, or the path cannot be written.
     """
-    check_animation(path)
+    check_output(path, *FORMATS)
     if not recorder.frames:
         raise OutputError(f"no motion to draw into {path}: the attempt ended before the robot moved")
     camera = _camera(robot, recorder)
     pictures = [Image.fromarray(_frame(robot, recorder.objects, camera, *frame)) for frame in recorder.frames]
-    seconds = [1000 // RATE] * (len(pictures) - 1) + [round(1000 * LAST_SECONDS)]
+    lengths = [1000 // RATE] * (len(pictures) - 1) + [1000]
     kind = FORMATS[path.suffix.lower()]
     options = {"quality": 70, "method": 4} if kind == "WEBP" else {"optimize": True}
     if kind == "GIF":
         pictures = [p.quantize(64) for p in pictures]
     with replacing(path, "animation") as temporary:
-        pictures[0].save(temporary, format=kind, save_all=True, append_images=pictures[1:], duration=seconds, loop=0, **options)
+        pictures[0].save(temporary, format=kind, save_all=True, append_images=pictures[1:], duration=lengths, loop=0, **options)
 
 
 def draw_attempt(run: TabletopRun, path: Path) -> Attempt:
@@ -103,7 +91,6 @@ def draw_attempt(run: TabletopRun, path: Path) -> Attempt:
     Raises:
         OutputError: The path cannot be written, or the robot did not move.
     """
-    check_animation(path)
     robot, obj, recorder = load_robot(run.robot), load_object(run.objects[0]), Recorder()
     result = attempt(robot, obj, 0, run.seed, GraspPredictor(run.weights), run.config, recorder)
     draw_animation(robot, recorder, path)

@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -27,48 +27,19 @@ from dro_grasp.planning.motion import STAGES, MotionPlan
 from dro_grasp.planning.physics import SHAPE_GROUP, TICK, Deviation, LiftScene, object_name
 from dro_grasp.planning.planner import PlanConfig, plan
 from dro_grasp.planning.reachability import ReachConfig
-from dro_grasp.planning.robot import Robot
-from dro_grasp.planning.robot_file import CameraMount, Table
+from dro_grasp.planning.robot import CameraMount, Robot, Table
 from dro_grasp.planning.table_scene import PickedObject, pick_object
 from dro_grasp.planning.workcell import ARM, Workcell, moved
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.simulation.hand_part import PREFIX
 
-VERSION = 3
-"""Goes up with every change that can change an outcome."""
-LABEL = f"tabletop/{VERSION} "
-"""Beginning of the settings of stored attempts."""
-PUSHED = 0.03
-"""Farthest that the object may move before the hand closes [m] (ours)."""
-SLIPPED = 0.05
-"""Farthest that it may move in the hand after the lift [m] (ours)."""
-STAYED = 0.02
-"""An object that the lift raised less than this stayed where it was [m] (ours)."""
-SHAKE_FREQUENCY = 1.5
-"""[1/s] (ours)"""
-SHAKE_ANGLE = 0.04
-"""Amplitude of the arm's first joint [rad] (ours): 2 cm at half a metre, 1.8 m/s^2."""
-DROP = 0.005
-"""Height above the table from which an object comes to rest [m] (ours)."""
-REST_SECONDS = 4.0
-"""Longest time in which it comes to rest [s] (ours)."""
-REST_SPEED = 0.002
-"""Speed below which it rests [m/s] (ours)."""
-DRAWS = 20
-"""How often it is put down anew if it rolls off the region (ours)."""
-PLACES = 100
-"""Places that are tried until one is free (ours)."""
+LABEL = "tabletop/3 "
+"""Beginning of the settings of stored attempts; the number goes up with every change that can change an outcome."""
 APART = 0.03
 """Distance between the outlines of objects as they are put down [m] (ours)."""
-MOST_CLUTTER = 8
-"""Most other objects that there is room for (ours)."""
-AROUND = 0.10
-"""Other objects stand at most this far beyond the region of the one that is asked for [m] (ours)."""
 STRIDE = 2
 """Every so many pixels, in both directions, one ray is cast (ours)."""
-FARTHEST = 3.0
-"""Longest ray [m] (ours)."""
 
 Region = tuple[float, float, float, float]
 """Least x and y, greatest x and y, from the arm's base [m]."""
@@ -112,17 +83,12 @@ class TabletopConfig(Checked):
         x, y, far_x, far_y = self.region
         if not (-math.inf < x < far_x < math.inf and -math.inf < y < far_y < math.inf):
             raise OptionError(f"region is {self.region}; give two corners, the lower one first: X0 Y0 X1 Y1 in metres")
-        if not 0 <= self.clutter <= MOST_CLUTTER:
-            raise OptionError(f"clutter is {self.clutter}; give a number of other objects from 0 to {MOST_CLUTTER}")
+        if not 0 <= self.clutter <= 8:  # there is no room for more
+            raise OptionError(f"clutter is {self.clutter}; give a number of other objects from 0 to 8")
 
     def label(self) -> str:
         """Version and every setting, as stored with results: results of other settings are not mixed."""
-        values = asdict(self)
-        if self.plan.constraints == Constraints():
-            del values["plan"]["constraints"]  # results from before there were any are of the same settings
-        if self.plan.deviations == PlanConfig.deviations:
-            del values["plan"]["deviations"]  # likewise
-        return LABEL + json.dumps(values, sort_keys=True)
+        return LABEL + json.dumps(asdict(self), sort_keys=True)
 
     @staticmethod
     def from_label(label: str) -> TabletopConfig:
@@ -131,22 +97,18 @@ class TabletopConfig(Checked):
         Raises:
             OptionError: They are of another version.
         """
+        def with_tuples(values: dict[str, Any]) -> dict[str, Any]:
+            return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+
         try:
-            values = json.loads(label.removeprefix(LABEL))
-            reach = ReachConfig(**values["plan"].pop("reach"))
-            wanted = values["plan"].pop("constraints", {})
-            direction = wanted.get("direction")
-            constraints = Constraints(
-                None if direction is None else tuple(direction), cone=wanted.get("cone"), opening=wanted.get("opening"))
-            if "deviations" in values["plan"]:
-                values["plan"]["deviations"] = tuple(
-                    Deviation(tuple(d.pop("shift")), **d) for d in values["plan"]["deviations"])
-            config = TabletopConfig(**values | {"plan": PlanConfig(**values["plan"], reach=reach, constraints=constraints),
-                                                "region": tuple(values["region"])})
+            values = json.loads(label.removeprefix(LABEL), object_hook=with_tuples)
+            plan = values.pop("plan")
+            plan["reach"], plan["constraints"] = ReachConfig(**plan["reach"]), Constraints(**plan["constraints"])
+            plan["deviations"] = tuple(Deviation(**deviation) for deviation in plan["deviations"])
+            return TabletopConfig(**values, plan=PlanConfig(**plan))
         except (ValueError, TypeError, KeyError) as error:
             raise OptionError(f"the attempt was made by another version of dro-grasp ({label.split(' ')[0]}), and cannot be "
                               "repeated; run `dro-grasp tabletop` again") from error
-        return config
 
 
 @dataclass(frozen=True)
@@ -194,15 +156,11 @@ class Attempt:
     weights: str = ""
     """The same of the weights."""
     robot_sha256: str = ""
-    """Hash of the robot, of its arm and hand; empty, as the following, in files from before there was one."""
+    """Hash of the robot, of its arm and hand; empty, as the following, where attempts are made one by one."""
     object_sha256: str = ""
     weights_sha256: str = ""
     solid_sha256: str = ""
     """Hash of what was simulated of the object; one mesh may have other convex parts."""
-
-
-Proposer = Callable[[PickedObject, Float[np.ndarray, "4 4"], int], GraspBatch]
-"""Complete grasps with scores, in the world, of what was seen, of the pose of its frame, and of a seed."""
 
 
 class Watcher:
@@ -217,7 +175,7 @@ class Watcher:
 
 def attempt(
     robot: Robot, obj: ObjectModel, number: int, seed: int, predictor: GraspPredictor, config: TabletopConfig | None = None,
-    watch: Watcher | None = None, proposer: Proposer | None = None,
+    watch: Watcher | None = None, proposer: Callable[[PickedObject, Float[np.ndarray, "4 4"], int], GraspBatch] | None = None,
 ) -> Attempt:
     """Run one attempt from beginning to end.
 
@@ -229,7 +187,8 @@ def attempt(
         predictor: Proposes grasps.
         config: How it runs.
         watch: Is told what happens.
-        proposer: Makes the grasps instead of the predictor.
+        proposer: Makes complete grasps with scores, in the world, of what was seen, the pose of its frame and a seed, instead
+            of the predictor.
 
     Raises:
         OptionError: The robot lacks a table or a camera, or the object is a bare cloud.
@@ -275,24 +234,24 @@ def carry_out(scene: LiftScene, made: MotionPlan, config: TabletopConfig, watch:
         for i in range(rows.start + 1, rows.stop):
             scene.command(made.arm.position[i], made.arm.velocity[i], made.hand.position[i])
             scene.advance(float(made.arm.time[i] - made.arm.time[i - 1]), call)
-        if stage == "approach" and (moved := _apart(scene.pose(0), start)) > PUSHED:
+        if stage == "approach" and (moved := _apart(scene.pose(0), start)) > 0.03:  # [m] (ours)
             return stage, f"the hand pushed the object by {100 * moved:.1f} cm before it closed"
     lifted = float(scene.pose(0)[2, 3] - start[2, 3])
     if lifted < config.plan.reach.within(scene.robot).lift / 2:
-        return "lift", "the object stayed on the table" if lifted < STAYED else "the object fell during the lift"
+        return "lift", "the object stayed on the table" if lifted < 0.02 else "the object fell during the lift"
     grip = scene.in_hand(0)
     arm, hand = made.arm.position[-1], made.hand.position[-1]
     for stage, seconds in (("hold", config.hold_seconds), ("shake", config.shake_seconds)):
         for k in range(round(seconds / TICK)):
             target, velocity = arm.copy(), np.zeros_like(arm)
-            if stage == "shake":
-                phase = 2 * np.pi * SHAKE_FREQUENCY
-                target[0] += SHAKE_ANGLE * np.sin(phase * TICK * k)
-                velocity[0] = SHAKE_ANGLE * phase * np.cos(phase * TICK * k)
+            if stage == "shake":  # the arm's first joint, at 1.5 Hz: 2 cm at half a metre, 1.8 m/s^2 (ours)
+                phase, angle = 2 * np.pi * 1.5, 0.04
+                target[0] += angle * np.sin(phase * TICK * k)
+                velocity[0] = angle * phase * np.cos(phase * TICK * k)
             scene.command(target, velocity, hand)
             scene.advance(TICK, call)
         slip = _apart(scene.in_hand(0), grip)
-        if slip > SLIPPED or not scene.touched(0):
+        if slip > 0.05 or not scene.touched(0):  # [m] (ours)
             return stage, f"the object slipped by {100 * slip:.0f} cm out of the hand"
     return "done", ""
 
@@ -303,8 +262,8 @@ def other_objects(name: str, count: int, draw: np.random.Generator) -> list[Obje
 
 
 def scatter(scene: LiftScene, region: Region, draw: np.random.Generator) -> bool:
-    """Put all objects down, the first one in the region and the others around it; False if one of them never comes to rest."""
-    wide = (region[0] - AROUND / 2, region[1] - AROUND, region[2] + AROUND, region[3] + AROUND)
+    """Put all objects down, the first one in the region and others up to 10 cm around it; False if one never comes to rest."""
+    wide = (region[0] - 0.05, region[1] - 0.10, region[2] + 0.10, region[3] + 0.10)
     return all(rest(scene, index, wide if index else region, draw) for index in range(len(scene.objects)))
 
 
@@ -313,19 +272,20 @@ def rest(scene: LiftScene, index: int, region: Region, draw: np.random.Generator
     low, high = np.array(region[:2]), np.array(region[2:])
     table, obj = scene.robot.table or Table(), scene.objects[index]
     assert obj.vertices is not None
-    for _ in range(DRAWS):
+    for _ in range(20):  # it is put down anew if it rolls off the region
         generator = torch.Generator().manual_seed(int(draw.integers(2**31)))
         T = np.eye(4)
         T[:3, :3] = random_rotations(1, generator)[0].double().numpy()
         T[:2, 3] = _free_place(scene, index, T, region, draw)
-        T[2, 3] = table.height + DROP - float((obj.vertices @ T[2, :3]).min())
+        T[2, 3] = table.height + 0.005 - float((obj.vertices @ T[2, :3]).min())
         scene.place(index, T)
-        for _ in range(round(REST_SECONDS / 0.5)):
+        resting = False
+        for _ in range(8):  # half seconds in which it comes to rest
             scene.advance(0.5)
-            if scene.speed(index) < REST_SPEED:
+            if resting := scene.speed(index) < 0.002:
                 break
         place = scene.pose(index)[:2, 3] - scene.robot.T_world_base[:2, 3]
-        if scene.speed(index) < REST_SPEED and (place > low - 0.05).all() and (place < high + 0.05).all():
+        if resting and (place > low - 0.05).all() and (place < high + 0.05).all():
             return True
     return False
 
@@ -338,7 +298,7 @@ def _free_place(
     poses = [scene.pose(i) for i in range(index)]
     others = [obj.cloud @ T[:2, :3].T + T[:2, 3] for obj, T in zip(scene.objects, poses, strict=False)]
     tree, place = KDTree(np.concatenate(others)) if others else None, base
-    for _ in range(PLACES):
+    for _ in range(100):
         place = base + draw.uniform(region[:2], region[2:])
         if tree is None or tree.query(outline + place)[0].min() > APART:
             break
@@ -355,13 +315,8 @@ def depth_image(
 ) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Depth along the camera's z axis [m], and which pixels show the scene's first object.
 
-    Depth is zero where nothing is near, and where the robot's model covers the view.
-
-    Args:
-        scene: Its objects are seen as their true meshes.
-        camera: Pose and intrinsics.
-        noise: Standard deviation of depth [m].
-        seed: Of the noise.
+    Depth is zero where nothing is near, and where the robot's model covers the view. Objects are seen as their true meshes.
+    `noise` is the standard deviation of depth [m].
     """
     row, column = np.meshgrid(np.arange(0, camera.height, STRIDE), np.arange(0, camera.width, STRIDE), indexing="ij")
     pixels = np.stack([column, row, np.ones_like(row)], -1).reshape(-1, 3).astype(float)
@@ -373,7 +328,7 @@ def depth_image(
     geom, distance = np.full(len(rays), -1, np.int32), np.full(len(rays), -1.0)
     eye = camera.T_world_camera[:3, 3].copy()
     mujoco.mj_multiRay(
-        scene.model, scene.data, eye, world.ravel().copy(), groups, True, -1, geom, distance, None, len(rays), FARTHEST)
+        scene.model, scene.data, eye, world.ravel().copy(), groups, True, -1, geom, distance, None, len(rays), 3.0)
     owner = [scene.model.body(int(b)).name for b in scene.model.geom_bodyid]
     robot = np.array([name.startswith((ARM, PREFIX)) for name in owner])
     seen = (geom >= 0) & (distance > 0) & ~robot[np.maximum(geom, 0)]

@@ -27,8 +27,6 @@ READY = "could be carried out too"
 """Fate of grasps that were given to the planner beside it."""
 WAITING = "not tried"
 """Fate of grasps that were not looked at, since better ones sufficed."""
-EXPECTED = "a plan file (.npz), as `dro-grasp plan` writes it"
-"""What a file that is read as a plan must be."""
 COLUMNS = ("time", "stage", "arm", "arm_velocity", "arm_acceleration", "hand", "hand_velocity", "hand_acceleration")
 """Arrays of a plan file."""
 SCENE = ("points", "others", "T_world_wrist", "joints", "score")
@@ -180,7 +178,8 @@ class MotionPlan:
             PlanError: No such file, or a truncated or foreign one, or one of another version.
         """
         path = given_path(path)
-        with reading(path, PlanError, EXPECTED, *UNTYPED), path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+        expected = reading(path, PlanError, "a plan file (.npz), as `dro-grasp plan` writes it", *UNTYPED)
+        with expected, path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             header: dict[str, Any] = json.loads(str(file["header"]))
             if header.pop("format_version", None) != FORMAT or tuple(header.pop("stages", ())) != STAGES:
                 raise PlanError(f"{path} is a plan file of another version; plan again")
@@ -201,13 +200,10 @@ def grasps_and_dropped(grasps: int, dropped: dict[str, int]) -> str:
 def trajectory_yaml(plan: MotionPlan) -> str:
     """One trajectory_msgs/JointTrajectory each for arm and hand, with the same times. Source: ROS 2 common_interfaces."""
     notes, times = plan.notes, {name: round(float(plan.arm.time[plan.part(name)][-1]), DIGITS) for name in STAGES}
-    lines = [
-        f"# Robot '{notes.robot}' lifts object '{notes.object}'. Joints in rad or m, time in s.",
-        f"# The wrist pose of the grasp is in frame '{notes.frame}'. Stages end at (s): {times}",
-    ]
-    messages = {"arm": _message(notes.frame, notes.arm_joints, plan.arm), "hand": _message(
-        notes.frame, notes.hand_joints, plan.hand)}
-    return "\n".join([*lines, yaml_text(messages)])
+    messages = {"arm": _message(notes.frame, notes.arm_joints, plan.arm),
+                "hand": _message(notes.frame, notes.hand_joints, plan.hand)}
+    return (f"# Robot '{notes.robot}' lifts object '{notes.object}'. Joints in rad or m, time in s.\n"
+            f"# The wrist pose of the grasp is in frame '{notes.frame}'. Stages end at (s): {times}\n{yaml_text(messages)}")
 
 
 def trajectory_csv(plan: MotionPlan) -> str:

@@ -34,53 +34,18 @@ LIFT_PROTOCOL = replace(PROTOCOLS["dro"], name="tabletop", timestep=0.002, force
 Without the solver against slip, held objects creep out of soft contacts; DexGraspBench has two of its iterations."""
 TICK = 0.02
 """Time between targets of the servos [s] (ours)."""
-STIFFNESS_PER_EFFORT = 40.0
-"""Gain of an arm's servo for each Nm that it can exert [1/rad]: full torque at an error of 1.4 degrees (ours)."""
 DAMPING_TIME = 0.03
 """Damping of an arm's servo over its stiffness [s] (ours); the wanted velocity is fed forward, so nothing lags behind."""
-ARMATURE = 0.1
-"""Inertia of the motors of an arm's joints [kg m^2]. Source: the usual value of models of such arms."""
-ROLLING = 0.002
-"""Rolling friction of the table, as of a cloth: balls come to rest [m] (ours)."""
-ASIDE = 10.0
-"""Where objects wait until they are placed, a metre apart [m]."""
 MEMORY = 2**28
 """Memory for contacts [bytes]; what is not needed is never touched. Ours: by itself MuJoCo has room for some 300 contacts."""
 SHAPE_GROUP = 4
 """Group of the geoms that only cameras see: the objects' true meshes."""
-PART_GROUP = 3
-"""Group of the convex parts, with which objects collide."""
-FOOT = 0.004
-"""What an estimated object has this near to its lowest point stands on the table [m] (ours)."""
 BALL_BIT = 2
 """Bit of contacts of an estimated object's balls with the hand (ours)."""
 HULL_BIT = 4
 """Bit of contacts of its convex hull with the table (ours)."""
-TIME_STEP = 0.004
-"""Time step of the simulation [s] (ours)."""
-APPROACH = 0.03
-"""Length of the part of the approach that is rehearsed, its end [m] (ours)."""
-HEIGHT = 0.08
-"""Length of the part of the lift that is rehearsed, its start [m] (ours)."""
-APPROACH_SECONDS = 0.3
-"""Duration of this part of the approach [s] (ours)."""
-CLOSING_SECONDS = 1.0
-"""Duration of closing [s]. Source: as in trials."""
-GRIP_SECONDS = 0.3
-"""How long the hand presses then [s] (ours)."""
-LIFT_SECONDS = 0.7
-"""Duration of this part of the lift [s] (ours)."""
-HOLD_SECONDS = 0.3
-"""How long the object is held up then [s] (ours)."""
-RISEN = 0.5
-"""Share of this height that a held object rises at least (ours)."""
-SLIPPED = 0.02
-"""Farthest that it may move in the hand while it is held up [m] (ours)."""
 FEWEST_LINKS = 2
 """Links that touch the object at least, once the hand has closed (ours)."""
-FEW_CONTACTS = 100
-"""Contacts up to which the solver against slip runs (ours): its time grows with their square, and a hand that holds an object
-has some 20."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +88,8 @@ class LiftScene:
         self._centres = [_add_thing(scene, obj, i) for i, obj in enumerate(objects)]
         if robot.table is not None:
             board = scene.geom(TABLE)
-            board.condim, board.friction = 6, [LIFT_PROTOCOL.friction, 0.005, ROLLING]
+            # It rolls as on a cloth, so that balls come to rest (ours).
+            board.condim, board.friction = 6, [LIFT_PROTOCOL.friction, 0.005, 0.002]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             self.model = cell.compiled(scene)
@@ -140,7 +106,7 @@ class LiftScene:
         self._joints.set(self.data, arm, hand)
         self.command(arm, np.zeros_like(arm), hand)
         for i in range(len(self.objects)):
-            self.place(i, np.array([[1, 0, 0, ASIDE + i], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]))
+            self.place(i, np.array([[1, 0, 0, 10.0 + i], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]))
 
     def place(self, index: int, T_world_object: Float[np.ndarray, "4 4"]) -> None:
         """Put an object somewhere, at rest."""
@@ -165,15 +131,11 @@ class LiftScene:
         linear, angular = self.data.qvel[start:start + 3], self.data.qvel[start + 3:start + 6]
         return float(np.linalg.norm(linear) + 0.05 * np.linalg.norm(angular))
 
-    def wrist(self) -> Float[np.ndarray, "4 4"]:
-        """Where the hand's root link really is [m]."""
-        body, T = self.data.body(PREFIX + self.robot.hand.wrist_link), np.eye(4)
-        T[:3, :3], T[:3, 3] = body.xmat.reshape(3, 3), body.xpos
-        return T
-
     def in_hand(self, index: int) -> Float[np.ndarray, "4 4"]:
         """Where an object really is in the frame of the hand's root link [m]."""
-        return np.linalg.inv(self.wrist()) @ self.pose(index)
+        body, T = self.data.body(PREFIX + self.robot.hand.wrist_link), np.eye(4)
+        T[:3, :3], T[:3, 3] = body.xmat.reshape(3, 3), body.xpos
+        return np.linalg.inv(T) @ self.pose(index)
 
     def joints(self) -> tuple[Float[np.ndarray, " n_arm"], Float[np.ndarray, " n_dof"]]:
         """Where arm and hand really are, in independent joints [rad or m]."""
@@ -190,9 +152,9 @@ class LiftScene:
         self.data.ctrl[self._arm_servos] = arm + DAMPING_TIME * velocity
         self.data.ctrl[self._hand_servos] = hand[self._driven]
 
-    def advance(self, seconds: float, watch: Callable[[], None] | None = None, every: float = 0.02) -> None:
-        """Let time pass; `watch` is called at intervals of `every` seconds."""
-        steps, stride = round(seconds / self.model.opt.timestep), max(1, round(every / self.model.opt.timestep))
+    def advance(self, seconds: float, watch: Callable[[], None] | None = None) -> None:
+        """Let time pass; `watch` is called once a tick."""
+        steps, stride = round(seconds / self.model.opt.timestep), max(1, round(TICK / self.model.opt.timestep))
         with quiet():
             for done in range(0, steps, stride):
                 mujoco.mj_step(self.model, self.data, min(stride, steps - done))
@@ -202,12 +164,9 @@ class LiftScene:
     def touched(self, index: int) -> int:
         """How many links of the hand touch an object."""
         body = self.model.body(object_name(index)).id
-        links = set()
-        for a, b in self.model.geom_bodyid[self.data.contact.geom].reshape(-1, 2).tolist():
-            if body in (a, b):
-                other = self.model.body(a if b == body else b).name
-                links |= {other} if other.startswith(PREFIX) else set()
-        return len(links)
+        pairs = self.model.geom_bodyid[self.data.contact.geom].reshape(-1, 2)
+        touching = {int(other) for other in pairs[(pairs == body).any(1)].ravel()}
+        return sum(self.model.body(other).name.startswith(PREFIX) for other in touching)
 
 
 def _add_thing(scene: mujoco.MjSpec, obj: ObjectModel, index: int) -> Float[np.ndarray, "3"]:
@@ -222,7 +181,7 @@ def _add_thing(scene: mujoco.MjSpec, obj: ObjectModel, index: int) -> Float[np.n
     assert obj.faces is not None
     body = add_object(scene, obj, LIFT_PROTOCOL, object_name(index))
     for geom in body.geoms:
-        geom.group = PART_GROUP
+        geom.group = 3  # cameras do not see the parts
     shape = scene.add_mesh(
         name=f"shape{index}", uservert=(obj.vertices - obj.centre_of_mass).ravel(), userface=obj.faces.astype(np.int32).ravel())
     shape.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
@@ -238,7 +197,7 @@ def _add_estimate(scene: mujoco.MjSpec, obj: ObjectModel, index: int) -> Float[n
     for ball in body.geoms:
         ball.contype = ball.conaffinity = BALL_BIT
     cloud, height = obj.cloud.astype(float), float(board.pos[2] + board.size[2])
-    foot = cloud[cloud[:, 2] < cloud[:, 2].min() + FOOT] * (1, 1, 0) + (0, 0, height)
+    foot = cloud[cloud[:, 2] < cloud[:, 2].min() + 0.004] * (1, 1, 0) + (0, 0, height)  # what is within 4 mm of it (ours)
     corners = np.concatenate([cloud, foot]) - solid.centre_of_mass
     mesh = scene.add_mesh(name=f"hull{index}", uservert=corners[ConvexHull(corners).vertices].ravel())
     mesh.maxhullvert = HULL_VERTICES
@@ -254,11 +213,12 @@ def _add_estimate(scene: mujoco.MjSpec, obj: ObjectModel, index: int) -> Float[n
 def _add_arm_servos(scene: mujoco.MjSpec, robot: Robot) -> None:
     for name, effort in zip(robot.arm_joints, robot.effort.tolist(), strict=True):
         joint = scene.joint(ARM + name)
-        joint.armature, joint.frictionloss = ARMATURE, 0.0
+        # The inertia of motors [kg m^2] is the usual one of models of such arms.
+        joint.armature, joint.frictionloss = 0.1, 0.0
         joint.damping[:], joint.stiffness[:] = 0.0, 0.0
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
         servo = scene.add_actuator(name=ARM + name, target=ARM + name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        stiffness = STIFFNESS_PER_EFFORT * effort
+        stiffness = 40.0 * effort  # [1/rad]: full torque at an error of 1.4 degrees (ours)
         servo.set_to_position(kp=stiffness, kv=DAMPING_TIME * stiffness)
         servo.forcelimited, servo.forcerange = True, [-effort, effort]
 
@@ -266,15 +226,10 @@ def _add_arm_servos(scene: mujoco.MjSpec, robot: Robot) -> None:
 class Rehearsal:
     """Lifts one object again and again."""
 
-    def __init__(
-        self, cell: Workcell, deviations: Sequence[Deviation] = DEVIATIONS, few_contacts: int = FEW_CONTACTS
-    ) -> None:
-        """Build the scene; the robot has a table, and obstacles are left out.
+    def __init__(self, cell: Workcell, deviations: Sequence[Deviation] = DEVIATIONS, few_contacts: int = 100) -> None:
+        """Build the scene of robot, table and object, which are all there; obstacles are left out.
 
-        Args:
-            cell: The robot, its table and the object.
-            deviations: How the rehearsals of one grasp deviate.
-            few_contacts: Contacts up to which the solver against slip runs.
+        Up to `few_contacts` the solver against slip runs: its time grows with their square, and hands that hold have some 20.
         """
         self.deviations, self.few_contacts = deviations, few_contacts
         obj, self.T_world_object = cell.target, cell.T_world_target
@@ -282,7 +237,7 @@ class Rehearsal:
         if obj.is_cloud and not np.array_equal(self.T_world_object, np.eye(4)):  # what stands on a table has its foot there
             obj, self.T_world_object = moved(obj, self.T_world_object), np.eye(4)
         self.scene = LiftScene(cell, [obj])
-        self.scene.model.opt.timestep = TIME_STEP
+        self.scene.model.opt.timestep = 0.004  # [s] (ours)
         self._gravity = self.scene.model.opt.gravity.copy()
         self._friction = self.scene.model.geom_friction.copy()
 
@@ -293,27 +248,27 @@ class Rehearsal:
         return (1 + sum(self.holds(goal, hand, deviation) for deviation in self.deviations[1:])) / len(self.deviations)
 
     def holds(self, goal: Feasible, hand: Postures, deviation: Deviation) -> bool:
-        """Approach, close, lift and hold once."""
+        """Approach over 3 cm, close, lift by 8 cm and hold, once. The hand closes as in trials; other numbers are ours."""
         scene, start = self.scene, self.T_world_object.copy()
         start[:2, 3] += deviation.shift
         scene.model.opt.gravity[:] = deviation.weight * self._gravity
         scene.model.geom_friction[:] = deviation.friction * self._friction
-        approach = self._within(goal.approach[::-1], APPROACH)[::-1]
+        approach = self._within(goal.approach[::-1], 0.03)[::-1]
         scene.begin(approach[0], hand.pregrasp)
         scene.place(0, start)
-        self._follow(approach, hand.pregrasp[None], APPROACH_SECONDS)
-        self._follow(approach[-1:], hand.closing, CLOSING_SECONDS)
-        self._follow(approach[-1:], hand.squeeze[None], GRIP_SECONDS)
+        self._follow(approach, hand.pregrasp[None], 0.3)
+        self._follow(approach[-1:], hand.closing, 1.0)
+        self._follow(approach[-1:], hand.squeeze[None], 0.3)
         if scene.touched(0) < FEWEST_LINKS:
             return False
-        rows = self._within(goal.lift, HEIGHT)
-        self._follow(rows, hand.squeeze[None], LIFT_SECONDS)
+        rows = self._within(goal.lift, 0.08)
+        self._follow(rows, hand.squeeze[None], 0.7)
         risen, grip = scene.pose(0)[2, 3] - start[2, 3], scene.in_hand(0)
-        if risen < RISEN * self._lengths(rows)[-1]:
+        if risen < self._lengths(rows)[-1] / 2:
             return False
-        self._follow(rows[-1:], hand.squeeze[None], HOLD_SECONDS)
+        self._follow(rows[-1:], hand.squeeze[None], 0.3)
         slip = np.linalg.norm((scene.in_hand(0) - grip)[:3, 3])
-        return bool(slip < SLIPPED) and scene.touched(0) >= FEWEST_LINKS
+        return bool(slip < 0.02) and scene.touched(0) >= FEWEST_LINKS
 
     def _within(self, rows: Float[np.ndarray, "k n_arm"], length: float) -> Float[np.ndarray, "m n_arm"]:
         """The first configurations of a straight line, and one step of it at least."""
@@ -334,7 +289,7 @@ class Rehearsal:
             self.scene.command(q, rate * velocity, _at(hand, along)[0])
             few = self.scene.data.ncon <= self.few_contacts
             self.scene.model.opt.noslip_iterations = LIFT_PROTOCOL.noslip if few else 0
-            self.scene.advance(TICK, every=TICK)
+            self.scene.advance(TICK)
 
 
 def _at(rows: Float[np.ndarray, "k n"], along: float) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:

@@ -27,9 +27,9 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.planning.candidates import Directions, grasps_in_world
 from dro_grasp.planning.motion import CHOSEN, READY, WAITING, MotionPlan, PlanNotes, PlanScene, grasps_and_dropped
 from dro_grasp.planning.physics import DEVIATIONS, Deviation, Rehearsal
-from dro_grasp.planning.reachability import Feasible, Postures, Reachability, ReachConfig, reachable_directions
+from dro_grasp.planning.reachability import Fault, Feasible, Postures, Reachability, ReachConfig, reachable_directions
 from dro_grasp.planning.robot import Robot
-from dro_grasp.planning.trajectory import Path, TimedStages, find_path, timed_stages
+from dro_grasp.planning.trajectory import find_path, timed_stages
 from dro_grasp.planning.workcell import OBSTACLE, Workcell, moved, scene_solid, upright
 from dro_grasp.predict.admission import BESIDE, NARROW, SPARED, TURNED, faults
 from dro_grasp.predict.config import AUTO, GraspRequest
@@ -38,13 +38,6 @@ from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.source import Source
 from dro_grasp.predict.stopwatch import Stopwatch
-
-BATCH_SEED = 7919
-"""Between the seeds of batches of grasps (ours)."""
-NO_PATH = "without a path"
-"""The planner connects none of the goals, or a timed motion would touch something."""
-LOSES = "losing the object when rehearsed"
-"""The simulated hand does not lift the object as it is known."""
 
 
 @dataclass(frozen=True)
@@ -266,13 +259,17 @@ def candidates(
     make = given or _predicted(task, predictor or GraspPredictor())
     for batch in range(task.config.batches):
         with tries.watch("grasps"):
-            made = make(task.seed + batch * BATCH_SEED)
+            made = make(task.seed + 7919 * batch)  # far from the seeds of other plans
         yield made, batch + 1 == task.config.batches
 
 
 def _predicted(task: Task, predictor: GraspPredictor) -> Callable[[int], GraspBatch]:
     """What makes grasps from a seed."""
-    directions, clouds = _directions(task), [thing.cloud for thing in task.cell.obstacles]
+    directions: Directions | Float[Tensor, "k 3"] = task.config.directions
+    if directions == "all" and task.constraints.direction is None and task.robot.has_few_joints:
+        middle = task.T[:3, :3] @ task.obj.cloud.mean(0) + task.T[:3, 3]
+        directions = reachable_directions(task.robot, middle, task.seed)
+    clouds = [thing.cloud for thing in task.cell.obstacles]
     wanted = replace(
         task.constraints, table=task.height, avoid=load_scene(np.concatenate(clouds), OBSTACLE) if clouds else None)
     return lambda seed: grasps_in_world(
@@ -280,19 +277,19 @@ def _predicted(task: Task, predictor: GraspPredictor) -> Callable[[int], GraspBa
         GraspRequest(task.config.num, seed, task.config.candidates, source=task.config.source), wanted, directions)
 
 
-def _directions(task: Task) -> Directions | Float[Tensor, "k 3"]:
-    """Palm directions to ask for: those that an arm with few joints can reach, or as configured."""
-    if task.config.directions != "all" or task.constraints.direction is not None or not task.robot.has_few_joints:
-        return task.config.directions
-    return reachable_directions(task.robot, task.T[:3, :3] @ task.obj.cloud.mean(0) + task.T[:3, 3], task.seed)
-
-
 def add(task: Task, tries: Tries, grasps: GraspBatch) -> None:
     """Let further grasps wait in order, but those that do not respect the constraints or are hopeless."""
     first = sum(len(part) for part in tries.parts)
     tries.parts.append(grasps)
     with tries.watch("reach"):
-        for row, reason in [*_forbidden(task, grasps), *task.reach.hopeless(grasps).items()]:
+        if task.constraints != Constraints():  # table and obstacles are the arm's affair
+            T = np.linalg.inv(task.T)
+            problem = GraspProblem(task.robot.hand, task.obj, constraints=task.constraints.moved(T))
+            there = grasps.replace(T_object_wrist=torch.from_numpy(T).float() @ grasps.T_object_wrist)
+            for reason, wrong in faults(problem, there).items():
+                for row in wrong.nonzero()[:, 0].tolist():
+                    tries.dropped.setdefault(first + row, reason)
+        for row, reason in task.reach.hopeless(grasps).items():
             tries.dropped.setdefault(first + row, reason)
     tries.waiting += [i for i in range(first, first + len(grasps)) if i not in tries.dropped]
     tries.waiting += [goal.index for goal in tries.ready]
@@ -302,16 +299,6 @@ def add(task: Task, tries: Tries, grasps: GraspBatch) -> None:
     else:
         score = tries.grasps.score.tolist()
         tries.waiting.sort(key=lambda i: -score[i])
-
-
-def _forbidden(task: Task, grasps: GraspBatch) -> list[tuple[int, str]]:
-    """Rows that do not respect the constraints, and why; table and obstacles are the arm's affair."""
-    if task.constraints == Constraints():
-        return []
-    T = np.linalg.inv(task.T)
-    problem = GraspProblem(task.robot.hand, task.obj, constraints=task.constraints.moved(T))
-    there = grasps.replace(T_object_wrist=torch.from_numpy(T).float() @ grasps.T_object_wrist)
-    return [(row, reason) for reason, wrong in faults(problem, there).items() for row in wrong.nonzero()[:, 0].tolist()]
 
 
 def reachable(task: Task, tries: Tries) -> Iterator[Feasible]:
@@ -339,7 +326,7 @@ def rehearsed(task: Task, tries: Tries, found: Iterator[Feasible]) -> list[Feasi
         share = tries.share.get(goal.index)
         if share == 0:
             tries.lost.append(goal)
-            tries.dropped[goal.index] = LOSES
+            tries.dropped[goal.index] = Fault.LOSES
             continue
         goals.append(goal)
         if share == 1:
@@ -366,42 +353,33 @@ def trusted(task: Task, tries: Tries, best: int) -> bool:
 
 def motion(task: Task, tries: Tries, goals: list[Feasible], seed: int) -> MotionPlan | None:
     """The motion to the best goal, or else to the first that a path leads to; None, with the reason noted, if there is none."""
-    left, grasps = list(goals), tries.grasps
+    left, config, robot, opened = list(goals), task.config, task.robot, task.robot.open_hand
     for best in [True, *[False] * len(goals)]:
+        asked, seconds = (left[:1], config.best_seconds) if best else (left, config.planner_seconds)
+        standoffs = np.array([goal.approach[0] for goal in asked])
         with tries.watch("path"):
-            path = path_to(task, left[:1] if best else left, best, seed) if left else None
-        if path is None and not best:
-            break
+            path = find_path(robot.home, standoffs, lambda q: task.cell.free(q, opened), *robot.working_range, seconds,
+                             seed) if asked else None
         if path is not None:
-            goal = left.pop(path.goal)
+            waypoints, reached = path
+            goal = left.pop(reached)
+            postures = Postures.of(robot, tries.grasps, goal.index)
             with tries.watch("timing"):
-                made = timed(task, path, goal, grasps)
+                made = timed_stages(task.cell, waypoints, goal, postures, config.closing_seconds, config.grip_seconds)
             if made is not None:
-                return _described(task, tries, made, goal.index, goals, left)
-            tries.dropped[goal.index] = NO_PATH
-    tries.dropped |= dict.fromkeys((goal.index for goal in left), NO_PATH)
+                notes, scene = _described(task, tries, goal.index, goals, left)
+                return MotionPlan(notes, scene, *made)
+            tries.dropped[goal.index] = Fault.NO_PATH
+        elif not best:
+            break
+    tries.dropped |= dict.fromkeys((goal.index for goal in left), Fault.NO_PATH)
     return None
 
 
-def path_to(task: Task, goals: list[Feasible], best: bool, seed: int) -> Path | None:
-    """A path from home, with the hand open, to the standoff of one of the goals."""
-    opened, seconds = task.robot.open_hand, task.config.best_seconds if best else task.config.planner_seconds
-    standoffs = np.stack([goal.approach[0] for goal in goals])
-    return find_path(
-        task.robot.home, standoffs, lambda q: task.cell.free(q, opened), *task.robot.working_range, seconds, seed)
-
-
-def timed(task: Task, path: Path, goal: Feasible, grasps: GraspBatch) -> TimedStages | None:
-    """All stages of the lift over time; None if something would be touched."""
-    postures = Postures.of(task.robot, grasps, goal.index)
-    return timed_stages(
-        task.cell, path.waypoints, goal, postures, task.config.closing_seconds, task.config.grip_seconds)
-
-
 def _described(
-    task: Task, tries: Tries, made: TimedStages, chosen: int, goals: list[Feasible], left: list[Feasible]
-) -> MotionPlan:
-    """The motion with what it was planned for."""
+    task: Task, tries: Tries, chosen: int, goals: list[Feasible], left: list[Feasible]
+) -> tuple[PlanNotes, PlanScene]:
+    """What a motion to the chosen goal was planned for, and how it came about."""
     robot, obj, T, grasps, ready = task.robot, task.obj, task.T, tries.grasps, {goal.index for goal in left}
     clouds = [np.zeros((0, 3), np.float32), *(thing.cloud for thing in task.cell.obstacles)]
     wrists = grasps.T_object_wrist.double().numpy()
@@ -412,4 +390,4 @@ def _described(
     scene = PlanScene(
         obj.cloud @ T[:3, :3].T + T[:3, 3], np.concatenate(clouds), wrists, grasps.joints.double().numpy(),
         grasps.score.double().numpy(), tuple(fate))
-    return MotionPlan(notes, scene, made.stage, made.arm, made.hand)
+    return notes, scene

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from enum import StrEnum
 
 import numpy as np
 import torch
@@ -23,48 +24,24 @@ from dro_grasp.planning.candidates import lowest_points
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.workcell import VOXEL, Workcell, arm_addresses
 
-BELOW_TABLE = "below the table"
-"""A finger, or the palm, would be in the table."""
-HITS_OBJECT = "through the object on the way to it"
-"""The opened fingers would push the object away."""
-HITS_OBSTACLE = "in an obstacle or through one on the way"
-"""The hand would meet an obstacle."""
-OUT_OF_REACH = "out of reach"
-"""Inverse kinematics finds no configuration."""
-COLLIDES = "with the robot in collision"
-"""The configurations found collide with table, obstacles or the robot itself."""
-NO_LINE = "without a straight approach"
-"""Between standoff and grasp."""
-NO_LIFT = "without a straight lift"
-"""The arm cannot raise the object so far, or hits something with it."""
-POSITION_TOLERANCE = 5e-4
-"""Largest error of the wrist's position [m] (ours)."""
-ROTATION_TOLERANCE = 2e-3
-"""Largest error of its rotation [rad] (ours)."""
-ROTATION_COST = 0.3
-"""Weight of a radian against that of a metre (ours)."""
-LITTLE_COST = 0.01
-"""The same for arms that cannot reach every rotation, so that they are exact in position (ours)."""
-ITERATIONS = 25
-"""Most steps towards a pose (ours)."""
-LARGEST_STEP = 0.25
-"""Largest change of a joint between neighbouring poses of a straight line [rad or m]: beyond, the arm flips over (ours)."""
 TURNED = 0.12
 """Farthest that a wrist is turned about the grasp centre from what was asked [rad] (ours)."""
-DRAWS = 50_000
-"""Random configurations among which palm directions are looked for (ours)."""
-NEAREST = 64
-"""Configurations whose grasp centre is nearest to the place (ours)."""
-DIRECTIONS = 8
-"""Palm directions that grasps are asked for from (ours)."""
 STEEPEST = 0.2
 """Sine of the angle above the horizontal up to which a palm may face upwards (ours): the table is below."""
-SMALL_ARM = 0.7
-"""Length of arm and hand below which an arm is small [m] (ours)."""
-SMALL_STANDOFF = 0.05
-"""Longest approach of a small arm [m] (ours)."""
-SMALL_LIFT = 0.08
-"""Highest lift of a small arm [m] (ours)."""
+
+
+class Fault(StrEnum):
+    """Why a grasp cannot be carried out."""
+
+    BELOW_TABLE = "below the table"
+    HITS_OBJECT = "through the object on the way to it"  # the opened fingers would push it away
+    HITS_OBSTACLE = "in an obstacle or through one on the way"
+    OUT_OF_REACH = "out of reach"
+    COLLIDES = "with the robot in collision"
+    NO_LINE = "without a straight approach"
+    NO_LIFT = "without a straight lift"
+    LOSES = "losing the object when rehearsed"
+    NO_PATH = "without a path"  # to any of the goals, or the timed motion would touch something
 
 
 @dataclass(frozen=True)
@@ -89,10 +66,10 @@ class ReachConfig(Checked):
     """Starts of inverse kinematics: home, and random ones."""
 
     def within(self, robot: Robot) -> ReachConfig:
-        """The same, but approach and lift of a small arm are shorter."""
-        if robot.longest_reach >= SMALL_ARM:
+        """The same, but an arm that with its hand is shorter than 0.7 m approaches over 5 cm and lifts by 8 cm at most."""
+        if robot.longest_reach >= 0.7:
             return self
-        return replace(self, standoff=min(self.standoff, SMALL_STANDOFF), lift=min(self.lift, SMALL_LIFT))
+        return replace(self, standoff=min(self.standoff, 0.05), lift=min(self.lift, 0.08))
 
 
 @dataclass(frozen=True)
@@ -150,10 +127,10 @@ class Reachability:
         points = hand.points(grasps.pregrasp_joints[:, None].expand(-1, len(way), -1), line).flatten(1, 2)
         T_object_world = torch.from_numpy(np.linalg.inv(cell.T_world_target)).to(T)
         depth = -cell.target.distance_field.distances(apply_to_cloud(T_object_world.expand(len(T), 4, 4), points))[0].amin(-1)
-        tests = [(HITS_OBSTACLE, self._obstacle_distance(points) < self.config.obstacle_margin),
-                 (HITS_OBJECT, depth > self.config.deepest)]
+        tests = [(Fault.HITS_OBSTACLE, self._obstacle_distance(points) < self.config.obstacle_margin),
+                 (Fault.HITS_OBJECT, depth > self.config.deepest)]
         if (table := cell.robot.table) is not None:
-            tests.insert(0, (BELOW_TABLE, lowest_points(hand, grasps) <= table.height + self.config.table_margin))
+            tests.insert(0, (Fault.BELOW_TABLE, lowest_points(hand, grasps) <= table.height + self.config.table_margin))
         found: dict[int, str] = {}
         for reason, failed in tests:
             for row in failed.nonzero()[:, 0].tolist():
@@ -176,7 +153,8 @@ class Reachability:
         T = grasps.T_object_wrist[index].double().numpy()
         ahead = robot.hand.palm_directions(grasps.T_object_wrist[index:index + 1])[0].double().numpy()
         back, up = self._line(T, -self.config.standoff * ahead), self._line(T, np.array([0, 0, self.config.lift]))
-        postures, reasons, (lower, upper) = Postures.of(robot, grasps, index), [OUT_OF_REACH], robot.working_range
+        postures, (lower, upper) = Postures.of(robot, grasps, index), robot.working_range
+        reasons: list[str] = [Fault.OUT_OF_REACH]
         for seed in [robot.home, *self.random.uniform(lower, upper, (self.config.seeds - 1, len(lower)))]:
             q = self.solver.solve(T, [seed])
             if q is None:
@@ -185,25 +163,25 @@ class Reachability:
             if not isinstance(outcome, str):
                 return Feasible(index, *outcome)
             reasons.append(outcome)
-        return max(reasons, key=(OUT_OF_REACH, COLLIDES, NO_LINE, NO_LIFT).index)
+        return max(reasons, key=(Fault.OUT_OF_REACH, Fault.COLLIDES, Fault.NO_LINE, Fault.NO_LIFT).index)
 
     def _through(
         self, q: Float[np.ndarray, " n_arm"], back: Float[np.ndarray, "k 4 4"], up: Float[np.ndarray, "m 4 4"], hand: Postures
     ) -> tuple[Float[np.ndarray, "k n_arm"], Float[np.ndarray, "m n_arm"]] | str:
         """Approach and lift through one configuration of the grasp, or why there are none."""
         free, clearance = self.cell.free, self.config.clearance
-        if not all(free(q, posture, clearance, touch=True) for posture in (hand.pregrasp, hand.grasp, hand.squeeze)):
-            return COLLIDES
+        if not all(free(q, posture, clearance, touch=True) for posture in hand.closing):
+            return Fault.COLLIDES
         retreat = self.solver.follow(back, q)
         if retreat is None or not all(free(x, hand.pregrasp, clearance, touch=True) for x in retreat):
-            return NO_LINE
+            return Fault.NO_LINE
         shapes = np.linspace(0, 1, 5)[:, None] * (hand.pregrasp - hand.opened) + hand.opened
         if not free(retreat[-1], hand.opened) or not all(free(retreat[-1], shape, clearance) for shape in shapes):
-            return NO_LINE
+            return Fault.NO_LINE
         raised = self.solver.follow(up, q)
         if raised is None or not all(
                 free(x, hand.squeeze, clearance, carried(up[i], up[0]), touch=True) for i, x in enumerate(raised)):
-            return NO_LIFT
+            return Fault.NO_LIFT
         return retreat[::-1].copy(), raised
 
     def _line(self, T: Float[np.ndarray, "4 4"], motion: Float[np.ndarray, "3"]) -> Float[np.ndarray, "k 4 4"]:
@@ -214,7 +192,7 @@ class Reachability:
 
 
 class WristSolver:
-    """Solves for one robot; it knows no obstacles.
+    """Solves for one robot, to half a millimetre; it knows no obstacles.
 
     An arm with few joints brings the grasp centre to its place, and turns the wrist as nearly as it can.
     """
@@ -224,25 +202,21 @@ class WristSolver:
         import mink
 
         few = cell.robot.has_few_joints
-        self._T_wrist_aim, self._turned = cell.robot.T_wrist_aim, TURNED if few else ROTATION_TOLERANCE
+        self._T_wrist_aim = cell.robot.T_wrist_aim
+        self._turned = TURNED if few else 2e-3  # largest error of the wrist's rotation [rad] (ours)
         self.model, self.addresses = cell.arm, arm_addresses(cell.arm, cell.robot)
         self.lower, self.upper = cell.robot.working_range
         self._configuration = mink.Configuration(self.model)
-        self._task = mink.FrameTask(
-            "wrist", "site", position_cost=1.0, orientation_cost=LITTLE_COST if few else ROTATION_COST, lm_damping=1e-4)
+        # Weight of a radian against that of a metre (ours); arms that cannot reach every rotation are exact in position.
+        cost = 0.01 if few else 0.3
+        self._task = mink.FrameTask("wrist", "site", position_cost=1.0, orientation_cost=cost, lm_damping=1e-4)
         self._limit = mink.ConfigurationLimit(self.model)
 
     def solve(
         self, T_world_wrist: Float[np.ndarray, "4 4"], seeds: Iterable[Float[np.ndarray, " n_arm"]],
-        iterations: int = ITERATIONS,
+        iterations: int = 25,
     ) -> Float[np.ndarray, " n_arm"] | None:
-        """The configuration that the first successful seed leads to; None if none does.
-
-        Args:
-            T_world_wrist: Wanted pose [m].
-            seeds: Where to start [rad or m].
-            iterations: Most steps from each.
-        """
+        """The configuration with a wrist pose [m] that the first successful seed [rad or m] leads to; None if none does."""
         import mink
 
         self._task.set_target(mink.SE3.from_matrix(T_world_wrist @ self._T_wrist_aim))
@@ -270,7 +244,7 @@ class WristSolver:
         found = []
         for T in poses:
             q = self.solve(T, [start], 10)
-            if q is None or float(np.abs(q - start).max()) > LARGEST_STEP:
+            if q is None or float(np.abs(q - start).max()) > 0.25:  # beyond, the arm flips over (ours)
                 return None
             found.append(q)
             start = q
@@ -278,24 +252,18 @@ class WristSolver:
 
     def _arrived(self) -> bool:
         error = self._task.compute_error(self._configuration)
-        return bool(np.linalg.norm(error[:3]) < POSITION_TOLERANCE and np.linalg.norm(error[3:]) < self._turned)
+        return bool(np.linalg.norm(error[:3]) < 5e-4 and np.linalg.norm(error[3:]) < self._turned)
 
 
 def reachable_directions(robot: Robot, place: Float[np.ndarray, "3"], seed: int = 0) -> Float[Tensor, "k 3"]:
-    """Palm directions with which the arm brings its grasp centre to a place, spread evenly.
-
-    Args:
-        robot: The robot.
-        place: In the world [m].
-        seed: The same seed gives the same directions.
-    """
-    arm = np.random.default_rng(seed).uniform(*robot.working_range, (DRAWS, len(robot.home)))
+    """Eight palm directions with which the arm brings its grasp centre nearly to a place [m], spread evenly."""
+    arm = np.random.default_rng(seed).uniform(*robot.working_range, (50_000, len(robot.home)))
     T = torch.from_numpy(robot.T_world_wrist(arm)).float()
     away = (robot.hand.grasp_centres(T) - torch.from_numpy(place).float()).norm(dim=-1)
     directions = robot.hand.palm_directions(T)
     away = torch.where(directions[:, 2] < STEEPEST, away, torch.inf)
-    near = directions[away.topk(NEAREST, largest=False).indices]
-    return near[farthest_points(near, DIRECTIONS)]
+    near = directions[away.topk(64, largest=False).indices]
+    return near[farthest_points(near, 8)]
 
 
 def carried(T_world_wrist: Float[np.ndarray, "4 4"], T_at_grasp: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:

@@ -1,10 +1,11 @@
-"""A robot: an arm that carries a hand, compared with its file and ready for planning."""
+"""A robot: an arm that carries a hand, read from `robot.yaml`, compared with its arm, and ready for planning."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import re
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,30 +14,56 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
+import yaml
 from jaxtyping import Float
 
 from dro_grasp.descriptions.compiling import MOST_TURN
 from dro_grasp.descriptions.loader import Description, load_description
-from dro_grasp.descriptions.part import named
+from dro_grasp.descriptions.part import named, split_part
 from dro_grasp.descriptions.reduction import NO_LIMITS
 from dro_grasp.descriptions.xml_files import parse_xml
 from dro_grasp.errors import HandError, RobotError
+from dro_grasp.files import given_path
+from dro_grasp.frames import motion_fault
+from dro_grasp.geometry.rotations import roma
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand, locate_hand
 from dro_grasp.kinematics.tree import PRISMATIC, REVOLUTE, KinematicTree
-from dro_grasp.planning.robot_file import CameraMount, RobotFile, Table, is_number, locate_robot, read_robot_file
 from dro_grasp.records import flat
+from dro_grasp.rendering.camera import Camera
 
-LONGEST_ARM = 5.0
-"""A farther link must be in another unit [m] (ours)."""
+BUILTIN_ROBOTS = Path(__file__).parent / "builtin"
+"""Folder of the built-in robots."""
+POSE_KEYS = {"position", "quaternion_wxyz"}
+"""What a robot file states of a pose."""
 TURN = np.pi
 """Planned motions stay this near home, so that configurations a whole turn apart count once [rad] (ours)."""
-HASHED_DIGITS = 9
-"""Decimals of poses and limits that count for a robot's hash (ours)."""
-FULL = 6
-"""Joints of an arm that brings its wrist to any pose in reach."""
-DEFAULT_EFFORT = 50.0
-"""Largest torque of an arm's joint that states none [Nm]; only simulated servos use it (ours)."""
+
+
+@dataclass(frozen=True)
+class CameraMount:
+    """A depth camera that stands still. Its z axis points forward, x right and y down."""
+
+    T_world_camera: Float[np.ndarray, "4 4"]
+    """Pose [m]."""
+    intrinsics: Float[np.ndarray, "3 3"]
+    """Focal lengths and principal point [pixels]."""
+    width: int = 640
+    """[pixels]"""
+    height: int = 480
+    """[pixels]"""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A level rectangle that everything stands on."""
+
+    height: float = 0.0
+    """z of its upper side in the world [m]."""
+    centre: tuple[float, float] = (0.45, 0.0)
+    """Its middle in the world [m]."""
+    size: tuple[float, float] = (1.2, 1.4)
+    """Extent along x and y [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +129,7 @@ class Robot:
     @property
     def has_few_joints(self) -> bool:
         """Whether the arm brings its wrist to some poses only."""
-        return len(self.home) < FULL
+        return len(self.home) < 6
 
     @property
     def T_wrist_aim(self) -> Float[np.ndarray, "4 4"]:
@@ -142,15 +169,7 @@ def _farthest(
     tree: KinematicTree, lower: Float[np.ndarray, " n_dof"], upper: Float[np.ndarray, " n_dof"], link: int,
     points: Float[np.ndarray, "n 3"],
 ) -> float:
-    """No point that is fixed to a link gets farther from the root link's origin than this [m], by the triangle inequality.
-
-    Args:
-        tree: The links.
-        lower: Least value of each independent joint [rad or m].
-        upper: Greatest value of each independent joint [rad or m].
-        link: Index of the link.
-        points: In the link's frame [m].
-    """
+    """No point in a link's frame [m] gets farther from the root link's origin than this [m], by the triangle inequality."""
     tree = tree.double
     coupling, offset = tree.link_coupling, tree.link_offset
     ends = torch.stack([coupling * torch.from_numpy(end).double() for end in (lower, upper)])
@@ -175,7 +194,27 @@ def _farthest_surface(
 
 def _rounded(values: Float[np.ndarray, "..."]) -> list[Any]:
     """For hashes: what machines compute differs in the last digits."""
-    return (values.round(HASHED_DIGITS) + 0.0).tolist()
+    return (values.round(9) + 0.0).tolist()
+
+
+def locate_robot(name: str | Path) -> Path:
+    """The file of a built-in robot, or the path that is given.
+
+    Raises:
+        RobotError: There is neither.
+    """
+    path, builtin = given_path(name), BUILTIN_ROBOTS / f"{name}.yaml"
+    if "/" not in str(name) and builtin.is_file():
+        return builtin
+    if not path.is_file():
+        raise RobotError(f"no robot is called '{name}' and no file is there; give a robot.yaml, or one of "
+                         f"{', '.join(robot_names())}")
+    return path
+
+
+def robot_names() -> list[str]:
+    """Names of the built-in robots."""
+    return sorted(file.stem for file in BUILTIN_ROBOTS.glob("*.yaml"))
 
 
 def load_robot(name: str | Path) -> Robot:
@@ -185,10 +224,10 @@ def load_robot(name: str | Path) -> Robot:
         RobotError: The file, its arm, or how the two fit; the message names the entry and a remedy.
         HandError: The hand cannot be used.
     """
-    file = read_robot_file(locate_robot(name))
+    file = _RobotFile(locate_robot(name))
     hand = locate_hand(file.hand)
     within = hand.link if hand.path.resolve() == file.arm.resolve() else None
-    mount = file.mount_link or within
+    mount = file.mount.get("link", within)
     if mount is None:
         raise RobotError(f"{file.path} lacks the entry 'mount'; state where the hand sits, or, if the arm's file has the hand, "
                          f"give it as a part of that: hand: {named(file.arm.name, 'LINK')}")
@@ -197,25 +236,136 @@ def load_robot(name: str | Path) -> Robot:
     except HandError as error:
         path = str(file.arm)
         reason = path.join(re.sub(r"\bhand\b", "robot", part) for part in str(error).split(path))
-        raise RobotError(f"{file.path}: the arm cannot be used: {reason}") from error
-    fit = _Fit(file, arm, mount)
+        raise file.error(f"the arm cannot be used: {reason}") from error
+    fit = _Fit(file, arm, str(mount))
     fit.check_tree()
     lower, upper = fit.positions()
     return Robot(
-        file.name, arm, load_hand(file.hand), mount, file.T_link_wrist, file.T_world_base,
+        file.name, arm, load_hand(file.hand), fit.mount, file.T_link_wrist, file.T_world_base,
         fit.home(lower, upper), lower, upper, fit.limit("velocity"), fit.limit("acceleration"),
-        fit.limit("effort", DEFAULT_EFFORT), file.hand_velocity, file.hand_acceleration, file.camera, file.table)
+        fit.limit("effort", 50.0), file.hand_velocity, file.hand_acceleration, file.camera, file.table)
+
+
+class _RobotFile:
+    """What a robot file says, with the file and the entry named in errors; nothing is compared with arm and hand yet."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            values = yaml.safe_load(path.read_text())
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            raise RobotError(f"{path} cannot be read as YAML: {' '.join(str(error).split())}") from error
+        known = {"name", "arm", "hand", "mount", "base", "home", "limits", "hand_limits", "camera", "table"}
+        values = self.mapping(values, "the file", known, {"arm", "hand", "home"})
+        self.name, self.arm = str(values.get("name", path.stem)), path.parent / given_path(str(values["arm"]))
+        hand = str(values["hand"])
+        file, link = split_part(str(path.parent / hand))
+        self.hand = named(file, link) if Path(file).is_file() else hand
+        self.mount = self.mapping(values["mount"], "mount", {"link", *POSE_KEYS}, {"link"}) if "mount" in values else {}
+        self.T_link_wrist = self.pose(self.mount, "mount")
+        self.T_world_base = self.pose(self.mapping(values.get("base", {}), "base", POSE_KEYS), "base")
+        home = self.mapping(values["home"], "home")
+        self.home = {str(k): self.number(v, f"home of joint {k}") for k, v in home.items()}
+        self.limits = self.mapping(values.get("limits", {}), "limits", {"velocity", "acceleration", "effort", "position"})
+        hand_limits = self.mapping(values.get("hand_limits", {}), "hand_limits", {"velocity", "acceleration"})
+        self.hand_velocity = self.positive(hand_limits.get("velocity", 2.0), "hand_limits: velocity")
+        self.hand_acceleration = self.positive(hand_limits.get("acceleration", 10.0), "hand_limits: acceleration")
+        self.camera, self.table = self._camera(values.get("camera")), self._table(values.get("table"))
+
+    def error(self, text: str) -> RobotError:
+        return RobotError(f"{self.path}: {text}")
+
+    def mapping(self, value: Any, what: str, known: set[str] | None = None, needed: set[str] | None = None) -> dict[Any, Any]:
+        if not isinstance(value, dict):
+            raise self.error(f"{what} is {value!r}; expected entries 'name: value'")
+        if known is not None and (extra := [k for k in value if k not in known]):
+            raise self.error(f"{what} has an entry '{extra[0]}'; known are {', '.join(sorted(known))}")
+        if missing := sorted((needed or set()) - set(value)):
+            raise self.error(f"{what} lacks the entry '{missing[0]}'")
+        return value
+
+    def number(self, value: Any, what: str) -> float:
+        if not _is_number(value):
+            raise self.error(f"{what} is {value!r}; expected a number")
+        return float(value)
+
+    def positive(self, value: Any, what: str) -> float:
+        if (number := self.number(value, what)) <= 0:
+            raise self.error(f"{what} is {number:g}; expected a number above 0")
+        return number
+
+    def numbers(self, value: Any, what: str, count: int) -> list[float]:
+        if not isinstance(value, list | tuple) or len(value) != count:
+            raise self.error(f"{what} is {value!r}; expected {count} numbers in brackets")
+        return [self.number(v, what) for v in value]
+
+    def pose(self, values: dict[str, Any], what: str) -> Float[np.ndarray, "4 4"]:
+        T = np.eye(4)
+        T[:3, 3] = self.numbers(values.get("position", [0, 0, 0]), f"{what}: position", 3)
+        wxyz = np.array(self.numbers(values.get("quaternion_wxyz", [1, 0, 0, 0]), f"{what}: quaternion_wxyz", 4))
+        if abs(float(np.linalg.norm(wxyz)) - 1) > 1e-3:
+            raise self.error(f"{what}: quaternion_wxyz has length {np.linalg.norm(wxyz):g}; expected 1")
+        unit = torch.from_numpy(wxyz / np.linalg.norm(wxyz))
+        T[:3, :3] = roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(unit)).numpy()
+        if (fault := motion_fault(torch.from_numpy(T))) is not None:
+            raise self.error(f"{what}: {fault}")
+        return T
+
+    def _camera(self, values: Any) -> CameraMount | None:
+        if values is None:
+            return None
+        known = {*POSE_KEYS, "target", "T_world_camera", "width", "height", "focal", "centre"}
+        values = self.mapping(values, "camera", known, {"focal"})
+        if "T_world_camera" in values:
+            try:
+                T = torch.tensor(values["T_world_camera"], dtype=torch.float64)
+            except (TypeError, ValueError) as error:
+                raise self.error(f"camera: T_world_camera is no matrix of numbers ({error}); expected 4 rows of 4") from error
+            if (fault := motion_fault(T)) is not None:
+                raise self.error(f"camera: T_world_camera is no rigid motion: {fault}")
+            pose = T.numpy()
+        elif "target" in values:
+            pose = self._looking(values)
+        else:
+            pose = self.pose(values, "camera")
+        width, height = (int(self.positive(values.get(k, d), f"camera: {k}")) for k, d in (("width", 640), ("height", 480)))
+        focal = self.positive(values["focal"], "camera: focal")
+        x, y = self.numbers(values.get("centre", [(width - 1) / 2, (height - 1) / 2]), "camera: centre", 2)
+        return CameraMount(pose, np.array([[focal, 0.0, x], [0.0, focal, y], [0.0, 0.0, 1.0]]), width, height)
+
+    def _looking(self, values: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
+        """The pose of a camera at `position` that looks at `target`, with the world's z up in its picture."""
+        position, target = (self.numbers(values.get(k), f"camera: {k}", 3) for k in ("position", "target"))
+        if np.allclose(position, target):
+            raise self.error("camera: position and target are the same point; expected a direction between them")
+        axes = Camera((position[0], position[1], position[2]), (target[0], target[1], target[2])).axes()
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = np.stack([axes[0], -axes[1], -axes[2]], 1), position
+        return T
+
+    def _table(self, values: Any) -> Table | None:
+        if values is None:
+            return None
+        values = self.mapping(values, "table", {"height", "centre", "size"})
+        default = Table()
+        x, y = self.numbers(values.get("centre", list(default.centre)), "table: centre", 2)
+        length, width = self.numbers(values.get("size", list(default.size)), "table: size", 2)
+        if min(length, width) <= 0:
+            raise self.error(f"table: size is {[length, width]}; expected metres above 0")
+        return Table(self.number(values.get("height", 0.0), "table: height"), (x, y), (length, width))
+
+
+def _is_number(value: Any) -> bool:
+    """Whether an entry of a robot file is a finite number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
 class _Fit:
     """Compares a robot file with its arm."""
 
-    def __init__(self, file: RobotFile, arm: Description, mount: str) -> None:
-        self.file, self.arm, self.tree, self.mount = file, arm, arm.tree, mount
+    def __init__(self, file: _RobotFile, arm: Description, mount: str) -> None:
+        self.file, self.arm, self.tree, self.mount, self.error = file, arm, arm.tree, mount, file.error
         self.joints = list(self.tree.joint_names)
-
-    def error(self, text: str) -> RobotError:
-        return RobotError(f"{self.file.path}: {text}")
 
     def check_tree(self) -> None:
         """The mount link exists, and every joint of the arm moves it."""
@@ -230,7 +380,7 @@ class _Fit:
             raise self.error(f"joints {', '.join(idle)} of the arm do not move link '{link}'; remove what they move (a "
                              "gripper?) from the arm's file, or mount the hand farther out")
         reach = float(tree.forward(torch.zeros(tree.n_dof))[:, :3, 3].norm(dim=-1).max())
-        if reach > LONGEST_ARM:
+        if reach > 5.0:
             raise self.error(f"a link of the arm is {reach:.3g} m from its base, which looks like millimetres; expected metres")
 
     def positions(self) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
@@ -241,7 +391,7 @@ class _Fit:
         for i, name in enumerate(self.joints):
             if name in stated:
                 ends = stated[name]
-                if not isinstance(ends, list) or len(ends) != 2 or not all(map(is_number, ends)) or not ends[0] < ends[1]:
+                if not isinstance(ends, list) or len(ends) != 2 or not all(map(_is_number, ends)) or not ends[0] < ends[1]:
                     raise self.error(f"limits: position of joint '{name}' is {ends!r}; expected [lower, upper], numbers in rad "
                                      "or m")
                 lower[i], upper[i] = ends
@@ -253,7 +403,7 @@ class _Fit:
         return lower, upper
 
     def limit(self, kind: str, default: float | None = None) -> Float[np.ndarray, " n"]:
-        """One limit of each joint: the file's, or else the arm's."""
+        """One limit of each joint: the file's, or else the arm's; only simulated servos use a default effort [Nm] (ours)."""
         given, stated = self.file.limits.get(kind), _stated_limits(self.arm.path, kind)
         if given is not None and not isinstance(given, dict):
             given = dict.fromkeys(self.joints, given)
@@ -263,7 +413,7 @@ class _Fit:
             if value is None:
                 raise self.error(f"joint '{name}' of the arm has no {kind} limit; state it in {self.file.path.name}, for "
                                  f"example limits: {{{kind}: 1.5}}, in rad/s or rad/s^2")
-            if not is_number(value) or value <= 0:
+            if not _is_number(value) or value <= 0:
                 raise self.error(f"limits: {kind} of joint '{name}' is {value!r}; expected a number above 0")
         return np.array([float(values.get(name, default)) for name in self.joints])
 

@@ -14,8 +14,7 @@ from PIL import Image
 
 from dro_grasp.descriptions.loader import Description
 from dro_grasp.files import check_output, replacing
-from dro_grasp.planning.robot import Robot, load_robot
-from dro_grasp.planning.robot_file import Table
+from dro_grasp.planning.robot import Robot, Table, load_robot
 from dro_grasp.planning.workcell import CLEARANCE, TABLE, WORLD, Workcell
 from dro_grasp.rendering.camera import Camera
 from dro_grasp.rendering.meshes import Colour, Mesh, arrow
@@ -34,10 +33,6 @@ HAND_COLOUR: Colour = (0.25, 0.47, 0.75)
 """Blue of the hand."""
 TABLE_COLOUR: Colour = (0.90, 0.87, 0.82)
 """Sand of the table."""
-CAMERA_COLOUR: Colour = (0.85, 0.2, 0.2)
-"""Red of the camera's direction."""
-REACH_SAMPLES = 2000
-"""Random configurations among which reach is measured (ours)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +103,7 @@ def check_robot(name: str | Path) -> RobotReport:
     robot = load_robot(name)
     cell, opened = Workcell(robot), robot.open_hand
     contacts = [f"{c.first} and {c.second} ({c.depth})" for c in cell.contacts(robot.home, opened, CLEARANCE)]
-    draws = np.random.default_rng(0).uniform(robot.lower, robot.upper, (REACH_SAMPLES, len(robot.home)))
+    draws = np.random.default_rng(0).uniform(robot.lower, robot.upper, (2000, len(robot.home)))
     free, blocking = np.array([cell.free(q, opened) for q in draws]), None
     if not free.any():
         met = Counter(pair for q in draws for pair in {(c.first, c.second) for c in cell.contacts(q, opened, CLEARANCE)})
@@ -130,7 +125,7 @@ def draw_robot(robot: Robot, path: Path) -> None:
     meshes = [*robot_meshes(robot, robot.home, robot.open_hand), *table_meshes(robot.table)]
     if robot.camera is not None:
         T = robot.camera.T_world_camera
-        meshes.append(arrow(T[:3, 3], T[:3, 3] + 0.15 * T[:3, 2], CAMERA_COLOUR, radius=0.008))
+        meshes.append(arrow(T[:3, 3], T[:3, 3] + 0.15 * T[:3, 2], (0.85, 0.2, 0.2), radius=0.008))
     points = np.concatenate([m.vertices for m in meshes])
     picture = render(meshes, Camera.around(points, VIEW, aspect=SIZE[0] / SIZE[1]), *SIZE)
     with replacing(check_output(path), "picture") as temporary:
@@ -145,14 +140,11 @@ def robot_meshes(robot: Robot, arm: Float[np.ndarray, " n_arm"], hand: Float[np.
 
 def robot_shapes(robot: Robot) -> list[Mesh]:
     """The visual shapes of arm and hand, each in its link's frame."""
-    found = []
-    for description in _parts(robot):
-        for shape in description.geometry:
-            if shape.visual:
-                arm_colour = MOUNT_COLOUR if shape.link == 0 else ARM_COLOUR
-                colour = arm_colour if description is robot.arm else HAND_COLOUR
-                found.append(Mesh(shape.vertices, shape.faces, colour))
-    return found
+    def colour(description: Description, link: int) -> Colour:
+        return HAND_COLOUR if description is not robot.arm else ARM_COLOUR if link else MOUNT_COLOUR
+
+    return [Mesh(shape.vertices, shape.faces, colour(description, shape.link))
+            for description in _parts(robot) for shape in description.geometry if shape.visual]
 
 
 def shape_poses(
@@ -171,13 +163,13 @@ def _parts(robot: Robot) -> list[Description]:
     return [robot.arm, *([robot.hand.description] if robot.hand.description is not None else [])]
 
 
-def table_meshes(table: Table | None, thickness: float = 0.02) -> list[Mesh]:
-    """The table as a board."""
+def table_meshes(table: Table | None) -> list[Mesh]:
+    """The table as a board of 2 cm."""
     if table is None:
         return []
     import trimesh
 
-    board = trimesh.creation.box(extents=[*table.size, thickness])
-    board.apply_translation([*table.centre, table.height - thickness / 2])
+    board = trimesh.creation.box(extents=[*table.size, 0.02])
+    board.apply_translation([*table.centre, table.height - 0.01])
     return [Mesh(np.asarray(board.vertices), np.asarray(board.faces), TABLE_COLOUR)]
 

@@ -18,30 +18,15 @@ from dro_grasp.objects.in_memory import numbers
 from dro_grasp.objects.loading import MIN_CLOUD, cloud_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.scan import given_points, given_pose, scanned_object
-from dro_grasp.planning.robot import Robot
-from dro_grasp.planning.robot_file import Table
+from dro_grasp.planning.robot import Robot, Table
 from dro_grasp.planning.workcell import VOXEL
 
 THICKNESS = 0.006
 """Points at most this far from the plane are the table's [m]: four standard deviations of the noise (ours)."""
-STEEPEST = 0.2
-"""Largest angle between the table's normal and the world's z axis [rad] (ours)."""
-HIGHEST = 0.4
-"""Points farther above the table are no object's [m] (ours)."""
 NEIGHBOUR = 0.012
 """Points nearer to each other than this are of one object [m] (ours): a camera a metre away has points each 3 mm."""
 FEWEST = 60
 """Fewest points of an object (ours)."""
-FRAGMENT = 0.05
-"""Groups of fewer points than an object has, this near to the one that is wanted, are taken for parts of it [m] (ours)."""
-ABOUT = 0.03
-"""Largest difference between the table's height in the robot file and in a cloud [m] (ours)."""
-SHARE = 0.2
-"""Least share of a cloud's points on a table that is in it (ours)."""
-LARGEST_OBJECT = 0.4
-"""Something longer that lies at the table's height is the table [m] (ours)."""
-SPECK = 5
-"""Groups of fewer points are noise, no obstacles (ours)."""
 
 
 @dataclass(frozen=True)
@@ -123,8 +108,9 @@ def pick_object(
 
 def sees_table(world: Float[np.ndarray, "n 3"], table: Table) -> bool:
     """Whether points are those of a table, with or without something on it, and not of one object alone."""
-    on = world[np.abs(world[:, 2] - table.height) < ABOUT]
-    return len(on) >= SHARE * len(world) and float(np.ptp(on[:, :2], axis=0).max(initial=0)) > LARGEST_OBJECT
+    # A fifth of them lies within 3 cm of the table's height in the robot file, and is longer than any object (ours).
+    on = world[np.abs(world[:, 2] - table.height) < 0.03]
+    return len(on) >= 0.2 * len(world) and float(np.ptp(on[:, :2], axis=0).max(initial=0)) > 0.4
 
 
 def _solid(sight: Sight) -> list[ObjectModel]:
@@ -156,7 +142,7 @@ def sort_out(
     inside = (np.abs(world[:, :2] - table.centre) < np.array(table.size) / 2).all(1)
     plane = fit_plane(world[inside])
     height = world @ plane[:3] - plane[3]
-    kept = inside & (height > THICKNESS) & (height < HIGHEST)
+    kept = inside & (height > THICKNESS) & (height < 0.4)  # [m]: what is higher is no object's (ours)
     middle = (plane[3] - plane[:2] @ np.array(table.centre)) / plane[2]
     points, world, group = points[kept], world[kept], clusters(world[kept])
     sizes = np.bincount(group) if len(group) else np.zeros(1, int)
@@ -173,18 +159,19 @@ def sort_out(
     else:
         nearest = 0 if near is None else int(np.linalg.norm(places - near, axis=1).argmin())
         wanted = group == large[nearest]
-    fragment = (sizes[group] < FEWEST) & (KDTree(world[wanted]).query(world)[0] < FRAGMENT)
-    others = ~wanted & ~fragment & (sizes[group] >= SPECK)
+    # Small groups within 5 cm of the wanted one are taken for parts of it, and groups of less than 5 points for noise (ours).
+    fragment = (sizes[group] < FEWEST) & (KDTree(world[wanted]).query(world)[0] < 0.05)
+    others = ~wanted & ~fragment & (sizes[group] >= 5)
     return Sight(points[wanted], world[others], float(middle), places)
 
 
 def fit_plane(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4"]:
-    """Upward unit normal of the level plane that most points lie on, and its height along the normal [m].
+    """Upward unit normal of the plane, tilted by at most 0.2 rad, that most points lie on, and its height along it [m].
 
     Raises:
         ObjectError: There is none.
     """
-    plane = largest_plane(points, THICKNESS / 2, STEEPEST, fits=3)
+    plane = largest_plane(points, THICKNESS / 2, 0.2, fits=3)
     if plane is None or (np.abs(points @ plane[:3] - plane[3]) < THICKNESS / 2).sum() < FEWEST:
         raise ObjectError("the camera sees no level table; correct its pose in the robot file, or the table's place")
     return plane

@@ -6,7 +6,7 @@ import multiprocessing
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import MISSING, asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +26,6 @@ from dro_grasp.planning.motion import MotionPlan
 from dro_grasp.planning.robot import load_robot
 from dro_grasp.planning.table_scene import PickedObject
 from dro_grasp.predict.predictor import GraspPredictor
-
-Progress = Callable[[Attempt], None]
-"""Called after each attempt."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +71,7 @@ class PlanKeeper(Watcher):
 
 @checked
 def run_tabletop(
-    run: TabletopRun, output: Path | None = None, workers: int = 1, progress: Progress | None = None,
+    run: TabletopRun, output: Path | None = None, workers: int = 1, progress: Callable[[Attempt], None] | None = None,
     plans: Path | None = None, make: Callable[..., Attempt] | None = None,
 ) -> list[Attempt]:
     """Run all attempts that `output` does not hold yet; each is stored when it ends.
@@ -84,13 +81,12 @@ def run_tabletop(
         output: Parquet file; attempts with the same robot, objects, weights, settings and seed in it are not repeated, others
             stay. Files of the same names count as the same only if their contents are.
         workers: Processes, which share out the objects; with several, attempts are stored object by object.
-        progress: See `Progress`.
+        progress: Called after each attempt.
         plans: Folder for the plan of each attempt, ROBOT-OBJECT-NUMBER.npz.
         make: Makes one, instead of `attempt`, with the same arguments.
 
     Raises:
-        OptionError: The extra is missing, something cannot be attempted, two objects have one name, or `output` holds such
-            attempts from before contents were noted.
+        OptionError: The extra is missing, something cannot be attempted, or two objects have one name.
         RobotError: The robot cannot be used.
         ObjectError: An object cannot be used.
         WeightsError: The weights cannot be used.
@@ -119,18 +115,14 @@ def _done(
     """The attempts of a run that are stored, by object and number; and the name of each object that is given, once each.
 
     Raises:
-        OptionError: Nobody can tell of some, or they are of another object of the name.
+        OptionError: Some are of another object of the name.
     """
     robot, weights, objects = load_robot(run.robot), describe_weights(run.weights)["sha256"], _objects(run.objects)
     alike = [a for a in stored if (a.robot, a.settings, a.seed) == (robot.name, run.config.label(), run.seed)]
-    unknown = [a for a in alike if not a.weights_sha256 and a.object in objects and a.number < run.attempts]
-    if unknown:
-        raise OptionError(f"{output} holds {len(unknown)} of these attempts from a version that did not note the contents of "
-                          "robot, object and weights, so that they may be of others; keep it, and give another --output")
     done = [a for a in alike if (a.robot_sha256, a.weights_sha256) == (robot.sha256, weights)]
     for a in done:
         source, sha256, solid = objects.get(a.object, ("", a.object_sha256, a.solid_sha256))
-        if a.object_sha256 != sha256 or a.solid_sha256 not in {"", solid}:
+        if (a.object_sha256, a.solid_sha256) != (sha256, solid):
             raise OptionError(f"'{source}' is not the object '{a.object}' of the attempts in {output}, made with "
                               f"'{a.object_file}' as it was then; rename the file, or attempt it apart, with its own --output "
                               "and --plans")
@@ -198,12 +190,9 @@ def read_attempts(path: Path) -> list[Attempt]:
         GraspFileError: It is another file.
     """
     known = {f.name for f in fields(Attempt)}
-    needed = {f.name for f in fields(Attempt) if f.default is MISSING and f.default_factory is MISSING}
-    with reading(path, GraspFileError, "a file of attempts; name another one, or move this one away", pa.ArrowException):
-        rows = pq.read_table(path).to_pylist()
-        if lacking := needed - {*(rows[0] if rows else needed)}:
-            raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
-    return [Attempt(**{k: v for k, v in row.items() if k in known}) for row in rows]
+    expected = "a file of attempts; name another one, or move this one away"
+    with reading(path, GraspFileError, expected, pa.ArrowException, TypeError):  # which names the columns that are missing
+        return [Attempt(**{k: v for k, v in row.items() if k in known}) for row in pq.read_table(path).to_pylist()]
 
 
 def endings(attempts: Sequence[Attempt]) -> dict[str, int]:

@@ -8,9 +8,8 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -19,56 +18,25 @@ from dro_grasp.planning.motion import STAGES, Trajectory
 from dro_grasp.planning.reachability import Feasible, Postures, carried
 from dro_grasp.planning.workcell import Workcell
 
-if TYPE_CHECKING:
-    from toppra.interpolator import AbstractGeometricPath
-
-RESOLUTION = 0.03
-"""Largest change of a joint between two configurations that are checked on an edge [rad or m] (ours)."""
-SIMPLIFY_SECONDS = 3.0
-"""Longest time spent on shortening a path [s] (ours): it ends by itself long before, but on a busy machine."""
 SPACING = 0.08
 """Largest change of a joint between the waypoints of a path that is returned [rad or m] (ours)."""
-RANGE = 0.6
-"""Longest edge of the planner's trees [rad] (ours)."""
 STEP = 0.01
 """Longest time between samples of a trajectory [s] (ours); each of its parts has samples at equal distances."""
 USED = 0.95
 """Share of each limit that is used: they hold at points of a grid, and a motion that exceeds one between is slowed (ours)."""
-SAME = 1e-6
-"""Waypoints nearer to each other are one [rad or m] (ours)."""
-GRID = 150
-"""Least number of points of the path at which the limits hold (ours)."""
-TRAVEL_CLEARANCE = 0.001
-"""Distance that the timed motion keeps while it travels, off the straight edges that were planned [m] (ours)."""
 
 Check = Callable[[Float[np.ndarray, " n"]], bool]
 """Whether a configuration is free."""
 
 
-@dataclass(frozen=True)
-class Path:
-    """A path in joint space that ends at a goal."""
-
-    waypoints: Float[np.ndarray, "k n"]
-    """Densely spaced [rad or m]."""
-    goal: int
-    """Index of the goal that it ends at."""
-
-
 def find_path(
     start: Float[np.ndarray, " n"], goals: Float[np.ndarray, "g n"], free: Check, lower: Float[np.ndarray, " n"],
     upper: Float[np.ndarray, " n"], seconds: float, seed: int,
-) -> Path | None:
-    """A path from the start to one of the goals, None if none is found in time.
+) -> tuple[Float[np.ndarray, "k n"], int] | None:
+    """Dense waypoints [rad or m] from the start to one of the goals, and its index; None if no path is found in `seconds`.
 
-    Args:
-        start: Free configuration [rad or m].
-        goals: Free configurations; the planner takes the one that it connects first, and tries them in this order.
-        free: Whether a configuration is free.
-        lower: Limits of the joints [rad or m].
-        upper: Likewise.
-        seconds: Longest time spent on planning [s].
-        seed: Of OMPL's generators, which are its own.
+    Start and goals are free; the planner tries the goals in their order, and takes the one that it connects first. OMPL's
+    generators, which the seed is of, are its own.
     """
     from ompl import base as ob, geometric as og, util as ou
 
@@ -85,30 +53,30 @@ def find_path(
     ou.RNG.setSeed(seed + 1)  # OMPL takes zero for no seed
     space = ob.RealVectorStateSpace(len(start))
     bounds = ob.RealVectorBounds(len(start))
-    for i, (low, high) in enumerate(zip(lower.tolist(), upper.tolist(), strict=True)):
-        bounds.setLow(i, low)
-        bounds.setHigh(i, high)
+    for i in range(len(start)):
+        bounds.setLow(i, float(lower[i]))
+        bounds.setHigh(i, float(upper[i]))
     space.setBounds(bounds)
     setup = og.SimpleSetup(space)
     setup.setStateValidityChecker(lambda state: free(values(state)))
     information = setup.getSpaceInformation()
-    information.setStateValidityCheckingResolution(RESOLUTION / space.getMaximumExtent())
+    # Configurations that are checked on an edge differ by at most 0.03 rad or m in all joints together (ours).
+    information.setStateValidityCheckingResolution(0.03 / space.getMaximumExtent())
     setup.setStartState(state(start))
     goal_set = ob.GoalStates(information)
     for goal in goals:
         goal_set.addState(state(goal))
     setup.setGoal(goal_set)
     planner = og.RRTConnect(information)
-    planner.setRange(RANGE)
+    planner.setRange(0.6)  # longest edge of the trees [rad] (ours)
     setup.setPlanner(planner)
     setup.solve(seconds)
     if not setup.haveExactSolutionPath():  # `solve` is content with approximate paths
         return None
-    setup.simplifySolution(SIMPLIFY_SECONDS)
+    setup.simplifySolution(3.0)  # seconds (ours): it ends by itself long before, but on a busy machine
     corners = np.array([values(s) for s in setup.getSolutionPath().getStates()])
     corners[0] = start
-    goal = int(np.linalg.norm(goals - corners[-1], axis=1).argmin())
-    return Path(densified(corners, SPACING), goal)
+    return densified(corners, SPACING), int(np.linalg.norm(goals - corners[-1], axis=1).argmin())
 
 
 def densified(corners: Float[np.ndarray, "k n"], spacing: float) -> Float[np.ndarray, "m n"]:
@@ -120,36 +88,27 @@ def densified(corners: Float[np.ndarray, "k n"], spacing: float) -> Float[np.nda
     return np.concatenate([*pieces, corners[-1:]])
 
 
-@dataclass(frozen=True)
-class TimedStages:
-    """A whole motion."""
-
-    stage: Int[np.ndarray, " m"]
-    """Index into STAGES of each sample."""
-    arm: Trajectory
-    hand: Trajectory
-
-
 def timed_stages(
     cell: Workcell, waypoints: Float[np.ndarray, "k n_arm"], goal: Feasible, hand: Postures, closing_seconds: float,
     grip_seconds: float,
-) -> TimedStages | None:
+) -> tuple[Int[np.ndarray, " m"], Trajectory, Trajectory] | None:
     """From home along the waypoints to the standoff, to the grasp, and up; None if the timed motion touches something.
 
-    Args:
-        cell: The robot and what it must not touch.
-        waypoints: From home to the standoff [rad or m].
-        goal: Approach and lift.
-        hand: Postures of the hand.
-        closing_seconds: Least time in which the hand closes [s].
-        grip_seconds: How long it presses then [s].
+    The hand closes in `closing_seconds` at least, and then presses for `grip_seconds`.
+
+    Returns:
+        Index into STAGES of each sample, the arm's motion and the hand's.
     """
-    robot = cell.robot
+    robot, n = cell.robot, len(hand.grasp)
     limits = robot.velocity, robot.acceleration
-    n = len(hand.grasp)
     fingers = np.full(n, robot.hand_velocity), np.full(n, robot.hand_acceleration)
+
+    def clear(reach: Trajectory) -> bool:
+        """A smooth motion leaves the straight edges that were planned; it keeps a distance of 1 mm (ours)."""
+        return all(cell.free(q, hand.opened, 0.001) for q in reach.position)
+
     reach = smooth(waypoints, *limits)
-    if not _clear(cell, reach.position, hand.opened):
+    if not clear(reach):
         reach = cornered(waypoints, *limits)
     standoff, grasp = goal.approach[0], goal.approach[-1]
     shape = smooth(np.stack([hand.opened, hand.pregrasp]), *fingers, STEP)  # each stage takes time, also if nothing moves
@@ -157,7 +116,7 @@ def timed_stages(
     close = joined([cornered(hand.closing, *fingers, closing_seconds), standing(hand.squeeze, grip_seconds)])
     approach, lift = smooth(goal.approach, *limits, STEP), smooth(goal.lift, *limits, STEP)
     start = robot.T_world_wrist(grasp)
-    free = _clear(cell, reach.position, hand.opened) and all(
+    free = clear(reach) and all(
         cell.free(standoff, posture, 0.0) for posture in shape.position) and all(
         cell.free(q, hand.pregrasp, 0.0, touch=True) for q in approach.position) and all(
         cell.free(grasp, posture, 0.0, touch=True) for posture in close.position) and all(
@@ -167,33 +126,25 @@ def timed_stages(
     arms = [reach, _still(standoff, shape), approach, _still(grasp, close), lift]
     hands = [_still(hand.opened, reach), shape, _still(hand.pregrasp, approach), close, _still(hand.squeeze, lift)]
     lengths = [len(part.time) - (i > 0) for i, part in enumerate(arms)]
-    return TimedStages(np.repeat(np.arange(len(STAGES)), lengths), joined(arms), joined(hands))
-
-
-def _clear(cell: Workcell, positions: Float[np.ndarray, "k n_arm"], hand: Float[np.ndarray, " n_dof"]) -> bool:
-    return all(cell.free(q, hand, TRAVEL_CLEARANCE) for q in positions)
+    return np.repeat(np.arange(len(STAGES)), lengths), joined(arms), joined(hands)
 
 
 def _still(q: Float[np.ndarray, " n"], other: Trajectory) -> Trajectory:
     """No motion at the times of another trajectory."""
-    return replace(standing(q, 0.0), time=other.time, **{
-        name: np.tile(row, (len(other.time), 1))
-        for name, row in (("position", q), ("velocity", np.zeros_like(q)), ("acceleration", np.zeros_like(q)))})
+    still = np.zeros((len(other.time), len(q)))
+    return Trajectory(other.time, np.tile(q, (len(still), 1)), still, still)
 
 
 def smooth(
     waypoints: Float[np.ndarray, "k n"], velocity: Float[np.ndarray, " n"], acceleration: Float[np.ndarray, " n"],
     least_seconds: float = 0.0,
 ) -> Trajectory:
-    """The quickest motion along a cubic spline through the waypoints.
+    """The quickest motion along a cubic spline through waypoints that are close together [rad or m], within limits.
 
-    Args:
-        waypoints: Neighbours are close together [rad or m].
-        velocity: Limits [rad/s or m/s].
-        acceleration: Limits [rad/s^2 or m/s^2].
-        least_seconds: A quicker motion is slowed down to this duration [s].
+    One that is quicker than `least_seconds` is slowed down.
     """
-    kept = [0, *(i for i in range(1, len(waypoints)) if np.abs(waypoints[i] - waypoints[i - 1]).max() > SAME)]
+    # Waypoints nearer to each other are one.
+    kept = [0, *(i for i in range(1, len(waypoints)) if np.abs(waypoints[i] - waypoints[i - 1]).max() > 1e-6)]
     points = waypoints[kept]
     if len(points) == 1:
         return standing(points[0], least_seconds)
@@ -207,14 +158,19 @@ def smooth(
         limits = [constraint.JointVelocityConstraint(USED * np.stack([-velocity, velocity], 1)),
                   constraint.JointAccelerationConstraint(USED * np.stack([-acceleration, acceleration], 1))]
         path = toppra.SplineInterpolator(along, points, bc_type="natural")
-        grid = np.linspace(0, along[-1], max(GRID, 3 * len(points)))
+        grid = np.linspace(0, along[-1], max(150, 3 * len(points)))  # where the limits hold (ours)
         timed = algorithm.TOPPRA(limits, path, gridpoints=grid, parametrizer="ParametrizeConstAccel").compute_trajectory(0, 0)
     if timed is None:
         raise RuntimeError("a path through its own waypoints has no timing within positive limits")
-    fine = np.linspace(0, timed.duration, 4 * GRID)
+    fine = np.linspace(0, timed.duration, 600)
     excess = [1.0, least_seconds / timed.duration, float(np.abs(timed(fine, 1) / velocity).max()),
               float(np.abs(timed(fine, 2) / acceleration).max()) ** 0.5]
-    return _sampled(timed, max(excess))
+    slower = max(excess)
+    duration = float(timed.duration) * slower
+    time = np.linspace(0, duration, max(2, int(np.ceil(duration / STEP)) + 1))
+    position, velocities, accelerations = (timed(time / slower, order) / slower**order for order in range(3))
+    velocities[[0, -1]] = 0.0
+    return Trajectory(time, position, velocities, accelerations)
 
 
 def cornered(
@@ -223,11 +179,7 @@ def cornered(
 ) -> Trajectory:
     """The same along straight lines, with a stop at each corner: slow, and never off the path or beyond its ends.
 
-    Args:
-        waypoints: Ends and corners, and any points between them [rad or m].
-        velocity: Limits [rad/s or m/s].
-        acceleration: Limits [rad/s^2 or m/s^2].
-        least_seconds: A quicker motion is slowed down to this duration [s]; each line gets its share by length.
+    Waypoints are ends and corners, and any points between them; each line gets its share of `least_seconds` by length.
     """
     steps = np.diff(waypoints, axis=0)
     unit = steps / np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-12)
@@ -243,7 +195,7 @@ def standing(q: Float[np.ndarray, " n"], seconds: float) -> Trajectory:
     """No motion for a while."""
     time = np.linspace(0, seconds, max(2, int(np.ceil(seconds / STEP - 1e-9)) + 1)) if seconds > 0 else np.zeros(1)
     still = np.zeros((len(time), len(q)))
-    return Trajectory(time, np.tile(q, (len(time), 1)), still, still.copy())
+    return Trajectory(time, np.tile(q, (len(time), 1)), still, still)
 
 
 def joined(parts: list[Trajectory]) -> Trajectory:
@@ -255,10 +207,3 @@ def joined(parts: list[Trajectory]) -> Trajectory:
               for name in ("position", "velocity", "acceleration")]
     return Trajectory(time, *fields)
 
-
-def _sampled(timed: AbstractGeometricPath, slower: float) -> Trajectory:
-    duration = float(timed.duration) * slower
-    time = np.linspace(0, duration, max(2, int(np.ceil(duration / STEP)) + 1))
-    position, velocity, acceleration = (timed(time / slower, order) / slower**order for order in range(3))
-    velocity[[0, -1]] = 0.0
-    return Trajectory(time, position, velocity, acceleration)

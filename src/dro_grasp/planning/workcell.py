@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from enum import IntEnum
 from functools import cached_property, lru_cache
 
 import mujoco
@@ -19,8 +20,7 @@ from dro_grasp.geometry.table_plane import moved_plane
 from dro_grasp.objects.cache import content_hash
 from dro_grasp.objects.scenery import Scene, one_per_cell
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.planning.robot import Robot
-from dro_grasp.planning.robot_file import Table
+from dro_grasp.planning.robot import Robot, Table
 from dro_grasp.simulation.hand_part import HULL_VERTICES, PREFIX, attach, hand_spec, joint_addresses, let_touch
 from dro_grasp.simulation.protocols import PROTOCOLS, Protocol
 
@@ -34,24 +34,8 @@ TARGET = "target"
 """Name of the object that is grasped."""
 OBSTACLE = "obstacle"
 """What obstacles are called in contacts."""
-TABLE_THICKNESS = 0.05
-"""[m] (ours)"""
 VOXEL = 0.01
 """Edge of the cells that a cloud of obstacles fills [m] (ours)."""
-POINTS_PER_CELL = 16
-"""Points drawn on a mesh for each square of edge VOXEL (ours): one cell in ten million stays empty."""
-MOST_POINTS = 5_000_000
-"""Most points drawn on a mesh (ours)."""
-ARM_PART = 0
-"""Geoms of the arm."""
-HAND_PART = 1
-"""Geoms of the hand."""
-SURROUNDINGS = 2
-"""Table and obstacles."""
-OBJECT = 3
-"""The object that is grasped."""
-BITS = {ARM_PART: (1, 15), HAND_PART: (2, 13), SURROUNDINGS: (4, 11), OBJECT: (8, 7)}
-"""MuJoCo's contype and conaffinity by part: only the arm collides with itself. Fingers that meet are the grasp's affair."""
 CLEARANCE = 0.005
 """Distance that the robot keeps from everything else while it travels [m] (ours)."""
 SINK = 0.002
@@ -60,12 +44,16 @@ SAMPLES = 100
 """Random configurations in which links that always collide are looked for (ours)."""
 ALWAYS = 0.95
 """Share of these in which they collide (ours)."""
-LEVEL = 1e-6
-"""Largest change of the height or tilt of a link that no joint raises or tilts (ours)."""
-KEPT = 4
-"""Robots whose models are kept (ours)."""
-UPRIGHT = 1e-6
-"""Largest deviation of an upright object's z axis from the world's (ours)."""
+
+
+class Part(IntEnum):
+    """What a geom is of: the arm, the hand, table and obstacles, or the object that is grasped."""
+
+    ARM, HAND, SURROUNDINGS, OBJECT = range(4)
+
+
+BITS = {Part.ARM: (1, 15), Part.HAND: (2, 13), Part.SURROUNDINGS: (4, 11), Part.OBJECT: (8, 7)}
+"""MuJoCo's contype and conaffinity by part: only the arm collides with itself. Fingers that meet are the grasp's affair."""
 
 
 @dataclass(frozen=True)
@@ -95,13 +83,9 @@ class Workcell:
         self, robot: Robot, obstacles: Sequence[ObjectModel] = (), target: ObjectModel | None = None,
         T_world_target: Float[np.ndarray, "4 4"] | None = None,
     ) -> None:
-        """Note what is there.
+        """Note what is there, and where the object stands [m]; its frame is the world's by default, as that of obstacles.
 
-        Args:
-            robot: Arm, hand and table; contacts that they always have are excluded.
-            obstacles: Things in the world's frame; clouds count as small boxes.
-            target: The object; a bare cloud counts as its convex hull.
-            T_world_target: Where it stands [m]; its frame is the world's by default.
+        A cloud counts as small boxes if it is an obstacle, and as its convex hull if it is the object.
         """
         self.robot, self.obstacles, self.target = robot, tuple(obstacles), target
         self.T_world_target = np.eye(4) if T_world_target is None else T_world_target
@@ -156,18 +140,16 @@ class Workcell:
                 raise PlanError(f"object '{self.target.name}' collides with {link} while the robot is at home; give its place "
                                 "in the robot's world frame, or another home")
             if other == OBSTACLE:
-                raise PlanError(f"obstacle {self._touching_at_home()} collides with {link} while the robot is at home, "
+                pairs, distance = self._detect(self.robot.home, self.robot.open_hand, None)
+                bad = pairs[self._bad(pairs, distance, CLEARANCE, False, False)].ravel().tolist()
+                geoms = [self.model.geom(geom).name for geom in bad if self._name(geom) == OBSTACLE]
+                numbers = sorted({int(name.split("solid")[1].split(".")[0]) for name in geoms})
+                names = ", ".join(f"'{self.obstacles[number].name}'" for number in numbers)
+                raise PlanError(f"obstacle {names} collides with {link} while the robot is at home, "
                                 f"{contact.depth}; cut the robot out of that cloud or mesh, correct its place in the robot's "
                                 "world frame, or give another home")
             raise RobotError(f"robot '{self.robot.name}' collides at home: {link} and {other}, {contact.depth}; correct "
                              "`table` in the robot file, the camera's pose if the table was found in a cloud, or `home`")
-
-    def _touching_at_home(self) -> str:
-        """Names of the obstacles that collide with the robot at home."""
-        pairs, distance = self._detect(self.robot.home, self.robot.open_hand, None)
-        bad = pairs[self._bad(pairs, distance, CLEARANCE, False, False)].ravel().tolist()
-        names = [self.model.geom(geom).name for geom in bad if self._name(geom) == OBSTACLE]
-        return ", ".join(f"'{self.obstacles[i].name}'" for i in sorted({int(n.split("solid")[1].split(".")[0]) for n in names}))
 
     def contacts(
         self, arm: Float[np.ndarray, " n_arm"], hand: Float[np.ndarray, " n_dof"], clearance: float = 0.0,
@@ -213,10 +195,10 @@ class Workcell:
         self, pairs: Int[np.ndarray, "k 2"], distance: Float[np.ndarray, " k"], clearance: float, moved: bool, touch: bool
     ) -> Bool[np.ndarray, " k"]:
         low, high = np.sort(self._part[pairs], axis=1).reshape(-1, 2).T
-        bad = distance < np.where(high <= HAND_PART, 0.0, clearance)
+        bad = distance < np.where(high <= Part.HAND, 0.0, clearance)
         if touch:
-            bad &= (high != OBJECT) | (low != HAND_PART)
-        beside = (high == OBJECT) & (low == SURROUNDINGS)
+            bad &= (high != Part.OBJECT) | (low != Part.HAND)
+        beside = (high == Part.OBJECT) & (low == Part.SURROUNDINGS)
         return np.where(beside, moved & (distance < self._resting - SINK), bad)
 
     @cached_property
@@ -232,7 +214,7 @@ class Workcell:
     def _resting(self) -> float:
         """Signed distance of the object, where it stands, to the nearest of table and obstacles, at most zero [m]."""
         pairs, distance = self._detect(self.robot.home, self.robot.open_hand, None)
-        beside = (np.sort(self._part[pairs], axis=1).reshape(-1, 2) == (SURROUNDINGS, OBJECT)).all(1)
+        beside = (np.sort(self._part[pairs], axis=1).reshape(-1, 2) == (Part.SURROUNDINGS, Part.OBJECT)).all(1)
         return min(0.0, float(distance[beside].min(initial=0.0)))
 
 
@@ -262,7 +244,7 @@ class _Key:
         return _Key(replace(robot, table=None, camera=None).sha256, robot)
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=4)
 def _arm_model(key: _Key) -> mujoco.MjModel:
     robot, scene = key.robot, mujoco.MjSpec()
     attach(scene, robot.arm.spec(), placed_frame(scene.worldbody, robot.T_world_base), ARM)
@@ -275,7 +257,7 @@ def _arm_model(key: _Key) -> mujoco.MjModel:
     return model
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=4)
 def _constant_contacts(key: _Key) -> tuple[tuple[str, str], ...]:
     """Links that collide at home with the open hand or nearly everywhere, and fixed neighbours."""
     robot, scene = key.robot, robot_spec(key.robot, PROTOCOLS["dro"], None)
@@ -308,7 +290,7 @@ def _fixed_to_table(robot: Robot) -> list[str]:
     if (table := robot.table) is None:
         return []
     poses = robot.T_world_base @ robot.arm.tree.double.forward(torch.from_numpy(np.stack(_draws(robot)))).numpy()
-    level = (np.ptp(poses[:, :, 2], axis=0).max(-1) < LEVEL) & robot.arm.tree.moves.any(-1).numpy()
+    level = (np.ptp(poses[:, :, 2], axis=0).max(-1) < 1e-6) & robot.arm.tree.moves.any(-1).numpy()
     found = set()
     for shape in robot.arm.geometry:
         if shape.collides and level[shape.link]:
@@ -321,10 +303,10 @@ def _fixed_to_table(robot: Robot) -> list[str]:
     return sorted(found)
 
 
-def _part(body: str) -> int:
+def _part(body: str) -> Part:
     if body.startswith(ARM):
-        return ARM_PART
-    return HAND_PART if body.startswith(PREFIX) else OBJECT if body == TARGET else SURROUNDINGS
+        return Part.ARM
+    return Part.HAND if body.startswith(PREFIX) else Part.OBJECT if body == TARGET else Part.SURROUNDINGS
 
 
 def _set_bits(scene: mujoco.MjSpec, fingers: bool = False) -> None:
@@ -336,7 +318,7 @@ def _set_bits(scene: mujoco.MjSpec, fingers: bool = False) -> None:
         geom.contype, geom.conaffinity = BITS[part]
         if fingers:
             geom.conaffinity |= geom.contype
-        geom.margin = CLEARANCE if part in {ARM_PART, HAND_PART} else 0.0
+        geom.margin = CLEARANCE if part <= Part.HAND else 0.0
 
 
 def robot_spec(robot: Robot, protocol: Protocol, table: Table | None) -> mujoco.MjSpec:
@@ -354,10 +336,10 @@ def robot_spec(robot: Robot, protocol: Protocol, table: Table | None) -> mujoco.
     attach(scene, arm, placed_frame(scene.worldbody, robot.T_world_base), ARM)
     attach(scene, hand_spec(robot.hand, protocol), placed_frame(scene.body(ARM + robot.mount_link), robot.T_link_wrist))
     if table is not None:
-        half = [table.size[0] / 2, table.size[1] / 2, TABLE_THICKNESS / 2]
+        half = [table.size[0] / 2, table.size[1] / 2, 0.025]  # [m]: a board of 5 cm (ours)
         scene.worldbody.add_geom(
             name=TABLE, type=mujoco.mjtGeom.mjGEOM_BOX, size=half, rgba=[0.82, 0.80, 0.76, 1],
-            pos=[*table.centre, table.height - TABLE_THICKNESS / 2], friction=[protocol.friction, 0.005, 1e-4])
+            pos=[*table.centre, table.height - half[2]], friction=[protocol.friction, 0.005, 1e-4])
     return scene
 
 
@@ -416,17 +398,12 @@ def _free_pose(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "7"]:
 
 
 def scene_solid(scene: Scene, centre: Float[np.ndarray, "3"], reach: float) -> list[ObjectModel]:
-    """What of a scene is within reach of a robot, as one thing; nothing if none of it is.
-
-    Args:
-        scene: In the world's frame.
-        centre: The robot's base [m].
-        reach: How far anything of the robot, and what it carries, gets from there [m].
-    """
+    """What of a scene in the world is within `reach` [m] of the robot's base, as one thing; nothing if none of it is."""
     points = scene.points
     if scene.faces is not None:
         mesh = trimesh.Trimesh(scene.points, scene.faces, process=False)
-        count = min(MOST_POINTS, int(POINTS_PER_CELL * mesh.area / VOXEL**2) + POINTS_PER_CELL)
+        # With 16 points on each square of edge VOXEL one cell in ten million stays empty.
+        count = min(5_000_000, int(16 * mesh.area / VOXEL**2) + 16)
         points = np.concatenate([points[scene.faces].reshape(-1, 3), trimesh.sample.sample_surface(mesh, count, seed=0)[0]])
     points = points[np.linalg.norm(points - centre, axis=1) < reach]
     if not len(points):
@@ -435,11 +412,9 @@ def scene_solid(scene: Scene, centre: Float[np.ndarray, "3"], reach: float) -> l
     return [ObjectModel(scene.name, cloud, np.zeros_like(cloud), cloud.mean(0, dtype=np.float64), content_hash(cloud))]
 
 
-def upright(
-    obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"]
-) -> tuple[ObjectModel, Float[np.ndarray, "4 4"]]:
+def upright(obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"]) -> tuple[ObjectModel, Float[np.ndarray, "4 4"]]:
     """The same object in the same place, with a frame whose z axis points up."""
-    if np.abs(T_world_object[2, :3] - (0, 0, 1)).max() < UPRIGHT:
+    if np.abs(T_world_object[2, :3] - (0, 0, 1)).max() < 1e-6:
         return obj, T_world_object
     turn, stand = np.eye(4), np.eye(4)
     turn[:3, :3], stand[:3, 3] = T_world_object[:3, :3], T_world_object[:3, 3]
