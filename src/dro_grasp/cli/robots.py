@@ -83,7 +83,7 @@ class Plan:
         from dro_grasp.planning.motion import trajectory_csv, trajectory_yaml
         from dro_grasp.planning.planner import PlanConfig, plan
         from dro_grasp.planning.robot import load_robot
-        from dro_grasp.predictor import GraspPredictor
+        from dro_grasp.predict.predictor import GraspPredictor
 
         require_extra("arm")
         if not 0 <= self.seed < 2**31:
@@ -256,7 +256,7 @@ class Tabletop:
         return 0
 
     def _report(self, done: list[Attempt]) -> None:
-        from dro_grasp.evaluation.metrics import wilson_interval
+        from dro_grasp.compare.metrics import wilson_interval
         from dro_grasp.planning.tabletop import endings, failures, processor_seconds
 
         held = sum(a.success for a in done)
