@@ -100,12 +100,8 @@ class NetworkConfig:
     def preset(name: str) -> NetworkConfig:
         """A named configuration.
 
-        Args:
-            name: `paper` (14 M parameters), `paper-slim`, the same form as narrow as the default weights, or `multi`, that of
-                the default weights (1.5 M), which is also called `slim`.
-
-        Raises:
-            OptionError: No configuration has the name.
+        That is `paper` (14 M parameters), `paper-slim`, the same form as narrow as the default weights, or `multi`, that of
+        the default weights (1.5 M), which is also called `slim`.
         """
         if name not in PRESETS:
             raise OptionError(f"no network is called '{name}'; choose {', '.join(PRESETS)}")

@@ -115,13 +115,7 @@ def feature_names() -> list[str]:
 
 
 def grasp_features(energy: GraspEnergy, grasps: GraspBatch, terms: Float[Tensor, "n terms"]) -> GraspFeatures:
-    """Features of grasps.
-
-    Args:
-        energy: Energy of the hand on the object.
-        grasps: Grasps of the two.
-        terms: Weighted terms of the energy.
-    """
+    """Features of grasps of one hand on one object, whose energy has these weighted terms."""
     state = grasp_state(energy, grasps, terms)
 
     def table(features: dict[str, Feature], *shape: int) -> Float[Tensor, "*shape features"]:

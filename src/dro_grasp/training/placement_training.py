@@ -8,15 +8,13 @@ import torch
 
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.errors import TrainingError
-from dro_grasp.models.network import DistanceNetwork, untrained_network
+from dro_grasp.models.network import DistanceNetwork, take_initial, untrained_network
 from dro_grasp.models.placement import PlacementPrior
 from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.training import losses
 from dro_grasp.training.config import PlacementConfig
-from dro_grasp.training.given_weights import take_initial
-from dro_grasp.training.reports import Report, console_report
-from dro_grasp.training.run_plan import run_plan
-from dro_grasp.training.runs import Losses, TrainingRun, begin
+from dro_grasp.training.run_folder import run_plan
+from dro_grasp.training.runs import Losses, Report, TrainingRun, begin, console_report
 from dro_grasp.training.samples import HandSamples, SampleSource
 
 
@@ -24,20 +22,10 @@ def train_placement(
     bundle: Bundle, network: NetworkConfig, config: PlacementConfig, folder: Path, initial: DistanceNetwork,
     report: Report | None = None, name: str = "trained",
 ) -> DistanceNetwork:
-    """Train the placement prior of given weights, and nothing else.
-
-    Args:
-        folder: Run folder; a checkpoint in it is resumed.
-        initial: Weights to begin with; `network` must be their configuration.
-        report: Called every few steps; the console by default.
-
-    Returns:
-        The weights with the moving average of the prior's, on the CPU, in evaluation mode.
+    """Train the placement prior of given weights, and nothing else; arguments, result and errors as those of `train`.
 
     Raises:
-        OptionError: The schedule cannot be carried out here.
-        TrainingError: A loss is not finite, or the network has no placement prior.
-        WeightsError: `initial` does not fit the network.
+        TrainingError: The network has no placement prior.
     """
     processes, device = begin(config.schedule)
     model = untrained_network(network, config.schedule.seed, name)
@@ -57,7 +45,6 @@ def train_placement(
         return placement_losses(prior, groups, config.augmentation.proportions, generator)
 
     run.train(step, report or console_report("placement"))
-    prior.load_state_dict(run.average.module.state_dict())
     return model.cpu().eval()
 
 
@@ -70,22 +57,14 @@ def measure_hands(model: DistanceNetwork, source: SampleSource) -> None:
 def placement_losses(
     prior: PlacementPrior, groups: list[HandSamples], noise: float, generator: torch.Generator
 ) -> Losses:
-    """The prior's loss as `total`, and what it has learned.
+    """The prior's loss as `total`, and what it has learned, with `noise` on proportions, in their spreads.
 
     `log_density` is that of true positions [nat], `preferred` the share of pairs of a true and a random rotation in which the
     true one has the higher score.
-
-    Args:
-        prior: In training.
-        groups: Samples.
-        noise: Standard deviation of the noise on proportions, in their spreads.
-        generator: Source of the noise.
     """
     rows = torch.cat([group.proportions.expand(len(group.placed), -1) for group in groups])
     hand = rows + noise * prior.standardised.spread * torch.randn(rows.shape, generator=generator, device=rows.device)
-    obj, other, position = (
-        torch.cat([getattr(g, n) for g in groups]) for n in ("obj_hand", "obj_random", "position")
-    )
+    obj, other, position = (torch.cat([getattr(g, n) for g in groups]) for n in ("obj_hand", "obj_random", "position"))
     density, score = prior.log_density(obj, hand, position)
     other_score = prior(other, hand)[3]
     preferred = (score[:, None] > other_score).float().mean()

@@ -17,12 +17,10 @@ from dro_grasp.errors import OptionError
 
 @dataclass(frozen=True)
 class Processes:
-    """This process among those that train together; a process alone by default."""
+    """This process, by its number, among those that train together; a process alone by default."""
 
     rank: int = 0
-    """Number of this process."""
     count: int = 1
-    """Number of processes."""
 
     @property
     def first(self) -> bool:

@@ -51,11 +51,7 @@ class SampleSource:
     def __init__(
         self, bundle: Bundle, network: NetworkConfig, augmentation: AugmentationConfig, device: torch.device | str = "cpu"
     ) -> None:
-        """Put hands, grasps and objects on the device of the samples, and of the generators that draw them.
-
-        Raises:
-            BundleError: The bundle holds no grasps.
-        """
+        """Put hands, grasps and objects on the device of the samples, and of the generators that draw them."""
         self.network, self.augmentation = network, augmentation
         if bundle.n_grasps == 0:
             raise BundleError("the bundle holds no grasps; synthesise some first")
@@ -73,12 +69,9 @@ class SampleSource:
         self.centres = self.points.mean(1)
 
     def draw_hands(self, count: int, generator: torch.Generator, by_count: float = 0.0) -> list[str]:
-        """Names of the hands of one step.
+        """Names of the hands of one step; none comes twice where there are enough.
 
-        Args:
-            count: How many; none comes twice where there are enough.
-            generator: Source of randomness.
-            by_count: A hand is drawn in proportion to the number of its grasps to this power; at 0 as often as any other.
+        A hand is drawn in proportion to the number of its grasps to the power `by_count`, at 0 as often as any other.
         """
         device = generator.device
         if by_count == 0:
@@ -153,13 +146,7 @@ class SampleSource:
     def tilted(
         self, T: Float[Tensor, "b 4 4"], centre: Float[Tensor, "b 3"], generator: torch.Generator
     ) -> Float[Tensor, "b 3 3"]:
-        """Wrist rotations of open hands near those of grasps, for a network that does not know the placement.
-
-        Args:
-            T: Wrist poses of grasps.
-            centre: Centres of their objects, in the same frame [m].
-            generator: Source of randomness.
-        """
+        """Wrist rotations of open hands near grasps with wrists T of objects about `centre` [m], if no placement is known."""
         toward = torch.nn.functional.normalize(centre - T[:, :3, 3], dim=-1)
         return random_turns(len(T), self.augmentation.tilt, generator, toward) @ T[:, :3, :3]
 

@@ -100,11 +100,8 @@ class Bundle:
     @cached_property
     def fingerprint(self) -> str:
         """Twelve digits that tell bundles with other hands, objects or grasps apart."""
-        digest = sha256()
-        for name, hand in self.hands.items():
-            digest.update(f"{name} {hand.sha256}".encode())
-        for name in self.objects:
-            digest.update(name.encode())
+        named = [*(f"{name} {hand.sha256}" for name, hand in self.hands.items()), *self.objects]
+        digest = sha256("".join(named).encode())
         clouds = [tensor for cloud in self.objects.values() for tensor in (cloud.points, cloud.normals)]
         grasps = [tensor for g in self.grasps.values() for tensor in (g.T_object_wrist, g.joints, g.object_index)]
         for tensor in (*clouds, *grasps):
@@ -113,10 +110,8 @@ class Bundle:
 
     def summary(self) -> dict[str, Any]:
         """Counts of hands, objects and grasps."""
-        return {
-            "hands": {name: len(g.joints) for name, g in self.grasps.items()},
-            "objects": len(self.objects), "grasps": self.n_grasps,
-        }
+        return {"hands": {name: len(g.joints) for name, g in self.grasps.items()}, "objects": len(self.objects),
+                "grasps": self.n_grasps}
 
 
 def write_bundle(
@@ -126,12 +121,9 @@ def write_bundle(
     """Write a training bundle of grasps of some splits, by these hands on objects with these clouds.
 
     Args:
-        path: File to write.
-        hands: Hands of the grasps.
-        objects: Clouds by name.
         grasps: At least one grasp of each of these hands.
         splits: Splits that the grasps may be of.
-        without_grasps: Hands without grasps, for pretraining.
+        without_grasps: Further hands, for pretraining.
 
     Raises:
         BundleError: A grasp is of another split, its hand or object is missing, two hands share a name, or the file grows
@@ -153,12 +145,12 @@ def write_bundle(
     header: dict[str, Any] = {"format_version": FORMAT_VERSION, "objects": names, "hands": []}
     for i, (name, cloud) in enumerate(objects.items()):
         tensors |= _pack_cloud(f"object.{i}", cloud, name)
-    for i, hand in enumerate(hands):
+    for i, hand in enumerate((*hands, *without_grasps)):
         header["hands"].append(_pack_hand(f"hand.{i}", hand, tensors))
-        tensors |= _pack_grasps(f"grasps.{i}", hand, [b for b in grasps if b.hand_sha256 == hand.sha256], names, splits)
-    for i, hand in enumerate(without_grasps, len(hands)):
-        header["hands"].append(_pack_hand(f"hand.{i}", hand, tensors))
-        tensors |= _grasp_tensors(f"grasps.{i}", torch.zeros(0, 4, 4), torch.zeros(0, hand.tree.n_dof), [])
+        if i < len(hands):
+            tensors |= _pack_grasps(f"grasps.{i}", hand, [b for b in grasps if b.hand_sha256 == hand.sha256], names, splits)
+        else:
+            tensors |= _grasp_tensors(f"grasps.{i}", torch.zeros(0, 4, 4), torch.zeros(0, hand.tree.n_dof), [])
     size = sum(t.numel() * t.element_size() for t in tensors.values())
     if size > MAX_BYTES:
         raise BundleError(f"the bundle would have {size / 1e6:.1f} MB, at most {MAX_BYTES / 1e6:.0f} MB are allowed; take "
@@ -193,11 +185,7 @@ def load_bundle(path: Path | str) -> Bundle:
 
 
 def _checked(bundle: Bundle) -> Bundle:
-    """Refuse hands, clouds and grasps that do not fit each other.
-
-    Raises:
-        ValueError: As said; its text names the part.
-    """
+    """Refuse, by a ValueError, hands, clouds and grasps that do not fit each other."""
     for name, cloud in bundle.objects.items():
         if cloud.points.shape != cloud.normals.shape or cloud.points.shape[1:] != (3,) or not len(cloud.points):
             raise ValueError(f"the cloud of object '{name}' has points {tuple(cloud.points.shape)}")
@@ -269,7 +257,6 @@ def _pack_grasps(key: str, hand: Hand, batches: list[GraspBatch], names: list[st
 
 
 def _grasp_tensors(key: str, T: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"], objects: list[int]) -> Tensors:
-    """Grasps of one hand, or none."""
     quaternion = roma.rotmat_to_unitquat(T[:, :3, :3]) if len(T) else T.new_zeros(0, 4)
     return {
         f"{key}.position": T[:, :3, 3].contiguous(), f"{key}.quaternion_wxyz": roma.quat_xyzw_to_wxyz(quaternion).contiguous(),

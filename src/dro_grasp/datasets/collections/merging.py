@@ -70,13 +70,8 @@ class Merged:
         return table_bytes(columns, self.header | {"notes": yield_notes(self.yields)})
 
     def save(self, path: Path) -> None:
-        """Write the grasp file.
-
-        Raises:
-            OutputError: The path cannot be written.
-        """
-        path = check_output(path)
-        with replacing(path) as temporary:
+        """Write the grasp file."""
+        with replacing(check_output(path)) as temporary:
             temporary.write_bytes(self.to_bytes())
 
 
@@ -112,11 +107,7 @@ def merge(
 
 
 def require_choice(per_pair: int | None) -> None:
-    """Refuse a number of grasps of a pair with which none would be left.
-
-    Raises:
-        OptionError: It is less than 1.
-    """
+    """Refuse a number of grasps of a pair with which none would be left."""
     if per_pair is not None and per_pair < 1:
         raise OptionError(f"per_pair is {per_pair}; give at least 1, or leave it out to keep all grasps (--per-pair)")
 
@@ -176,8 +167,7 @@ def _merge_hand(name: str, pairs: dict[str, list[Waiting]], per_pair: int | None
 
 
 def _joined(tables: Sequence[pa.Table]) -> pa.Table:
-    """One table after the other; columns that some lack are unknown for their grasps."""
-    return pa.concat_tables(tables, promote_options="permissive")
+    return pa.concat_tables(tables, promote_options="permissive")  # columns that some lack are unknown for their grasps
 
 
 def spread(hand: Hand, grasps: GraspBatch, count: int) -> Int[Tensor, " k"]:
@@ -185,9 +175,6 @@ def spread(hand: Hand, grasps: GraspBatch, count: int) -> Int[Tensor, " k"]:
 
     Farthest-first: the choice starts with the first grasp and adds the one whose palm direction is farthest from all
     chosen ones.
-
-    Raises:
-        OptionError: `count` is less than 1.
     """
     require_choice(count)
     if len(grasps) <= count:

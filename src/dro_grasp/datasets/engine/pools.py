@@ -127,7 +127,6 @@ def _one_process() -> ProcessPool:
 
 
 def _end(pool: ProcessPool) -> None:
-    """Stop a pool's process, whatever it does."""
     pool.stop()
     pool.join()
 

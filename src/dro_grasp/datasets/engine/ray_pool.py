@@ -30,11 +30,9 @@ class RayPool:
     """Tasks of a Ray cluster, one CPU each."""
 
     def __init__(self, job: Job, workers: int, limit: float, address: str | None = None, work: Work = make_shard) -> None:
-        """Join a cluster, or start one on this machine.
+        """Join a cluster, or start one of so many workers here; a shard that takes longer than the limit [s] is stopped.
 
         Args:
-            workers: Processes of a cluster that has to be started; a running cluster is used whole.
-            limit: A shard that takes longer is stopped [s].
             address: Address `host:port` of the cluster's head, or `auto` for the one that runs here; None takes
                 RAY_ADDRESS, and without it starts a cluster on this machine.
 
