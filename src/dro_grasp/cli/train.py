@@ -80,7 +80,8 @@ class Stage:
         from dro_grasp.errors import OptionError
         from dro_grasp.models.presets import FORMER, LAST_WITH_OTHERS, NetworkConfig
 
-        network = initial.config if initial is not None and self.preset is None else NetworkConfig.preset(self.preset or "multi")
+        given = None if initial is None or self.preset is not None else initial.config
+        network = given or NetworkConfig.preset(self.preset or "multi")
         kept = {"method": "dro", "latent": network.latent, "divergence_warmup": 0, "free_bits": 0, "drawn": 0}
         for option, asked in self.former.items():
             fixed = str((kept | FORMER[network.frame])[option.removeprefix("--").replace("-", "_")])

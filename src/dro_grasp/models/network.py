@@ -85,15 +85,12 @@ class Moves:
     """Open hands as draws of z move them, before any distance is predicted."""
 
     hand_features: Float[Tensor, "b n width"]
-    """Of the open hand's points."""
     object_features: Float[Tensor, "b m width"]
-    """Of the object's points."""
     obj: Float[Tensor, "b m 3"]
-    """The object, in the network's frame [m]."""
+    """In the network's frame [m]."""
     z: Float[Tensor, "b k latent"]
-    """Draws of z, k for each hand."""
     points: Float[Tensor, "b k n 3"]
-    """The hand that each of them moves, in the network's frame [m]; where z moves nothing, the open hand."""
+    """The hand that each z moves, in the network's frame [m]; where z moves nothing, the open hand."""
 
     def pick(self, rows: Int[Tensor, " c"], draws: Int[Tensor, " c"]) -> Moves:
         """One draw each of some of the hands."""
@@ -108,9 +105,8 @@ class NetworkOutput:
     distances: Float[Tensor, "b n columns"]
     """D(R,O) [m]."""
     mean: Float[Tensor, "b latent"]
-    """Mean of the posterior of z."""
+    """Of the posterior of z, as its log-variance."""
     log_variance: Float[Tensor, "b latent"]
-    """Its log-variance."""
     flow_error: Float[Tensor, " b"]
     """Squared velocity error of the flow to z; zero in the paper's form."""
     moved: Float[Tensor, "b n 3"]
@@ -236,7 +232,8 @@ class DistanceNetwork(nn.Module):
         hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"],
     ) -> Float[Tensor, "b n m"]:
         base = torch.cdist(hand, obj, compute_mode=EXACT) if self.config.placed else None
-        return self.head(latent.with_latent(psi_hand, z), latent.with_latent(psi_object, z), base)
+        with_z = (torch.cat([psi, z[:, None].expand(-1, psi.shape[1], -1)], -1) for psi in (psi_hand, psi_object))
+        return self.head(*with_z, base)
 
     def to_frame(
         self, points: Float[Tensor, "b n 3"], centre: Float[Tensor, "b 3"], rotation: Float[Tensor, "b 3 3"]

@@ -41,9 +41,8 @@ class GraspState:
     gap: Float[Tensor, "n l"]
     """Signed distance to the object [m]."""
     object_normal: Float[Tensor, "n l 3"]
-    """Outward normal of the object there."""
+    """Outward, as that of the link."""
     link_normal: Float[Tensor, "n l 3"]
-    """Outward normal of the link."""
     position: Float[Tensor, "n l 3"]
     """Position relative to the object's centre [m]."""
     arriving: Float[Tensor, "n l 3"]
@@ -109,9 +108,8 @@ class GraspFeatures(NamedTuple):
     whole: Float[Tensor, "n grasp_features"]
 
 
-def feature_names() -> list[str]:
-    """Names of all features, links first."""
-    return [*LINK_FEATURES, *GRASP_FEATURES]
+FEATURE_NAMES = [*LINK_FEATURES, *GRASP_FEATURES]
+"""Names of all features."""
 
 
 def grasp_features(energy: GraspEnergy, grasps: GraspBatch, terms: Float[Tensor, "n terms"]) -> GraspFeatures:

@@ -60,7 +60,6 @@ class ScheduleConfig(Checked):
     """Optimiser and bookkeeping of both loops."""
 
     steps: int = 10_000
-    """Optimiser steps."""
     minutes: float | None = None
     """Time limit [min]; the learning rate follows steps or time, whichever is further on."""
     learning_rate: float = 1e-3
@@ -97,9 +96,7 @@ class TrainConfig(Checked):
     losses: LossConfig = LossConfig()
     augmentation: AugmentationConfig = AugmentationConfig()
     hands_per_step: int = 4
-    """Different hands in one step."""
     samples_per_hand: int = 4
-    """Grasps of each of these hands."""
     by_count: float = 0.0
     """Hands are drawn in proportion to the number of their grasps to this power; at 0 each as often as any other."""
     columns: int = 48
@@ -123,7 +120,6 @@ class PlacementConfig(Checked):
     hands_per_step: int = 8
     samples_per_hand: int = 12
     by_count: float = 0.5
-    """As in main training."""
 
 
 @dataclass(frozen=True)

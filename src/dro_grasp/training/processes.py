@@ -61,9 +61,6 @@ def join(device: str) -> tuple[Processes, str]:
 
     Processes stay joined until they end, so a second stage of training finds them joined. Device `cuda` stands for the GPU
     with this process's number on its machine.
-
-    Raises:
-        OptionError: torchrun started more processes on this machine than it has GPUs.
     """
     if process_count() == 1:
         return Processes(), device

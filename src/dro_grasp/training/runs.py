@@ -29,14 +29,11 @@ SECONDS_BETWEEN_LINES = 10.0
 
 @dataclass(frozen=True)
 class RunProgress:
-    """How far a run is."""
+    """How far a run is: steps done, those of the schedule, and the share of it that is done, from 0 to 1."""
 
     step: int
-    """Steps done."""
     steps: int
-    """Steps of the schedule."""
     share: float
-    """Share of the schedule that is done: 0 at the start, 1 at the end."""
 
 
 Report = Callable[[RunProgress, dict[str, float]], None]
@@ -254,12 +251,7 @@ def learning_rate_share(step: int, progress: float, schedule: ScheduleConfig) ->
 
 
 def check_schedule(schedule: ScheduleConfig) -> None:
-    """Refuse a schedule that cannot be carried out here.
-
-    Raises:
-        OptionError: A number is not positive and finite, this machine lacks the device, TensorBoard is asked for and not
-            installed, or the processes would get different numbers of shards.
-    """
+    """Refuse a schedule that cannot be carried out here."""
     require_device(schedule.device)
     for name in ("steps", "minutes", "learning_rate", "log_every", "recalibration", "shards"):
         value = getattr(schedule, name)

@@ -54,12 +54,10 @@ def split_of(hand: str, object_split: str) -> str:
 
 @dataclass(frozen=True)
 class ObjectCloud:
-    """Surface points of an object."""
+    """Surface points of an object [m], with outward unit normals."""
 
     points: Float[Tensor, "k 3"]
-    """[m]"""
     normals: Float[Tensor, "k 3"]
-    """Outward unit normals."""
 
 
 @dataclass(frozen=True)
@@ -67,11 +65,10 @@ class HandGrasps:
     """All grasps of one hand."""
 
     T_object_wrist: Float[Tensor, "n 4 4"]
-    """Wrist poses."""
     joints: Float[Tensor, "n n_dof"]
     """Independent joints [rad or m]."""
     object_index: Int[Tensor, " n"]
-    """Index into the bundle's object names."""
+    """Index into the bundle's objects."""
 
     def to(self, device: torch.device | str) -> HandGrasps:
         """The same grasps on another device."""
@@ -86,11 +83,6 @@ class Bundle:
     objects: dict[str, ObjectCloud]
     grasps: dict[str, HandGrasps]
     """By hand name. A hand may have none: pretraining needs its kinematics alone."""
-
-    @property
-    def object_names(self) -> tuple[str, ...]:
-        """Names in the order of object_index."""
-        return tuple(self.objects)
 
     @property
     def n_grasps(self) -> int:
@@ -230,8 +222,7 @@ def _unpack_cloud(key: str, tensors: Tensors) -> ObjectCloud:
 
 
 def _pack_hand(key: str, hand: Hand, tensors: Tensors) -> dict[str, Any]:
-    """Tensors go into the file, plain values into its header."""
-    plain = {}
+    plain = {}  # values for the file's header; tensors go into the file
     for field, value in hand.to_tensors().items():
         if isinstance(value, Tensor):
             tensors[f"{key}.{field}"] = value.contiguous().clone()
@@ -268,8 +259,8 @@ def _unpack_grasps(key: str, tensors: Tensors) -> HandGrasps:
     quaternion = tensors[f"{key}.quaternion_wxyz"]
     if quaternion.shape[-1:] != (4,) or not quaternion.is_floating_point():
         raise ValueError(f"'{key}.quaternion_wxyz' is {quaternion.dtype} of shape {tuple(quaternion.shape)}")
-    quaternion = roma.quat_wxyz_to_xyzw(quaternion)
-    if not len(quaternion):
-        return HandGrasps(torch.zeros(0, 4, 4), tensors[f"{key}.joints"], tensors[f"{key}.object"].long())
-    rotation = roma.unitquat_to_rotmat(torch.nn.functional.normalize(quaternion, dim=-1))
-    return HandGrasps(compose(rotation, tensors[f"{key}.position"]), tensors[f"{key}.joints"], tensors[f"{key}.object"].long())
+    T = torch.zeros(0, 4, 4)
+    if len(quaternion):
+        quaternion = torch.nn.functional.normalize(roma.quat_wxyz_to_xyzw(quaternion), dim=-1)
+        T = compose(roma.unitquat_to_rotmat(quaternion), tensors[f"{key}.position"])
+    return HandGrasps(T, tensors[f"{key}.joints"], tensors[f"{key}.object"].long())

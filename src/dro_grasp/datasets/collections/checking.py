@@ -28,13 +28,11 @@ class Agreement:
     """Stored verdicts against those of new trials, for some grasps."""
 
     protocol: str
-    """Protocol of the new trials."""
+    """Of the new trials."""
     evaluated: int = 0
-    """Number of new trials."""
     agreed: int = 0
-    """Trials with the stored verdict."""
+    """Of the trials, those with the stored verdict."""
     succeeded: int = 0
-    """Grasps that pass the new trial."""
     reasons: Counter[str] = field(default_factory=Counter)
     """Why stored successes fail now, counted."""
     hands: dict[str, tuple[int, int]] = field(default_factory=dict)

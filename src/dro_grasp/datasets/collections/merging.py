@@ -51,7 +51,6 @@ class Merged:
     table: pa.Table
     """The grasps as columns of their file, which take a fifth of the memory."""
     header: dict[str, Any]
-    """Of the file."""
     yields: dict[str, Yield]
     """By object."""
     duplicates: int
