@@ -10,9 +10,10 @@ import pytest
 import torch
 
 from dro_grasp.cli.main import main
-from dro_grasp.datasets.collections import checking
+from dro_grasp.datasets.collections import checking, collection
 from dro_grasp.datasets.collections.checking import check, keep_passing
 from dro_grasp.datasets.collections.collection import PairGrasps, read_collection
+from dro_grasp.datasets.engine import worker
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
@@ -192,7 +193,7 @@ def test_two_hands_of_one_name_are_refused_before_any_trial(stored, tmp_path, ca
         raise AssertionError("a trial")
 
     monkeypatch.setattr(checking, "simulate", none)
-    monkeypatch.setattr(checking, "hand_of", none)
+    monkeypatch.setattr(collection, "hand_of", none)
     GraspBatch.load(stored).replace(hand_sha256="0123456789abcdef").save(tmp_path / "other.parquet")
     output = tmp_path / "kept"
     more = ["--output", str(output)] if command == "filter" else []

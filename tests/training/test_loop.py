@@ -16,8 +16,7 @@ from dro_grasp.evaluation.correspondence import matching_rank
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.training import loop
 from dro_grasp.training.config import AugmentationConfig, LossConfig, MotionConfig, PretrainConfig, TrainConfig
-from dro_grasp.training.loop import train
-from dro_grasp.training.placement_training import measure_hands
+from dro_grasp.training.loop import measure_hands, train
 from dro_grasp.training.pretraining import contrastive_step, pretrain_motion
 from dro_grasp.training.runs import recalibrate
 from dro_grasp.training.samples import SampleSource

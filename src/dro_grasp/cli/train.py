@@ -210,8 +210,7 @@ class Train(Stage):
         from dro_grasp.files import check_output
         from dro_grasp.models.checkpoints import history_of, load_weights, locate_weights, save_weights
         from dro_grasp.training.config import LOSSES, AugmentationConfig, PlacementConfig, TrainConfig
-        from dro_grasp.training.loop import train
-        from dro_grasp.training.placement_training import train_placement
+        from dro_grasp.training.loop import train, train_placement
         from dro_grasp.training.processes import is_first
 
         check_output(self.output, ".safetensors")

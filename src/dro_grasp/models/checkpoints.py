@@ -180,10 +180,11 @@ def verify_weights(name: str | Path | None = None) -> str:
 
 
 def _read(path: Path) -> tuple[dict[str, Any], Tensors]:
-    if _starts_like_a_pickle(path):
-        raise WeightsError(f"{path} is a pickled PyTorch file, which can run code and is refused; expected safetensors "
-                           "written by `dro-grasp train`")
     with reading(path, WeightsError, "a weights file that is not cut short; copy or train it again"):
+        with path.open("rb") as file:
+            if file.read(2) in PICKLES:
+                raise WeightsError(f"{path} is a pickled PyTorch file, which can run code and is refused; expected "
+                                   "safetensors written by `dro-grasp train`")
         with safe_open(path, "pt") as file:
             text = (file.metadata() or {}).get(KEY)
             tensors = {key: file.get_tensor(key) for key in file.keys()}
@@ -199,11 +200,3 @@ def _read(path: Path) -> tuple[dict[str, Any], Tensors]:
         raise WeightsError(f"{path}: its configuration and 'about' must be objects, and 'history' a list of objects; train "
                            "again")
     return entry, tensors
-
-
-def _starts_like_a_pickle(path: Path) -> bool:
-    try:
-        with path.open("rb") as file:
-            return file.read(2) in PICKLES
-    except OSError:
-        return False
