@@ -91,7 +91,6 @@ class Synthesize:
         return code
 
     def _check_numbers(self) -> None:
-        """Refuse invalid numbers by the names of their options."""
         from dro_grasp.errors import OptionError
 
         for option, value in (("--grasps", self.grasps), ("--workers", self.workers)):
@@ -113,6 +112,6 @@ class Synthesize:
         return int(found[1]), int(found[2])
 
     def _ray_pool(self, job: Job) -> Pool:
-        from dro_grasp.datasets.engine.ray_pool import RayPool
+        from dro_grasp.datasets.engine.pools import RayPool
 
         return RayPool(job, self.workers, job.config.shard_seconds, self.ray_address)

@@ -61,7 +61,6 @@ class PlacementPrior(nn.Module):
     """
 
     def __init__(self, width: int, components: int) -> None:
-        """Untrained, with hidden layers of a `width` and a mixture of `components`."""
         super().__init__()
         self.components = components
         self.standardised = Standardised()

@@ -34,7 +34,6 @@ class HoldingScore(nn.Module):
     deviation: Float[Tensor, " features"]
 
     def __init__(self, trials: int, width: int) -> None:
-        """Random weights, for so many kinds of trial."""
         super().__init__()
         self.layers = nn.Sequential(nn.Linear(FEATURES, width), nn.SiLU(), nn.Linear(width, trials))
         self.register_buffer("mean", torch.zeros(FEATURES))

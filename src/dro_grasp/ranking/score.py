@@ -35,7 +35,6 @@ class ScoreNetwork(nn.Module):
     """
 
     def __init__(self, trials: int, width: int = 64) -> None:
-        """Random weights, for so many kinds of trial."""
         super().__init__()
         of_link, of_grasp = (sum(f.width for f in table.values()) for table in (LINK_FEATURES, GRASP_FEATURES))
         self.link = nn.Sequential(nn.Linear(of_link, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU())

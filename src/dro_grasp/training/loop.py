@@ -109,7 +109,6 @@ def step_losses(
 
 
 def _clouds(groups: list[HandSamples]) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b m 3"], Float[Tensor, "b n 3"]]:
-    """The network's inputs: open hands, objects, grasps [m]."""
     placed, obj, grasp = (torch.cat([getattr(g, n) for g in groups]) for n in ("placed", "obj", "grasp"))
     return placed, obj, grasp
 

@@ -49,7 +49,6 @@ class SampleSource:
     def __init__(
         self, bundle: Bundle, network: NetworkConfig, augmentation: AugmentationConfig, device: torch.device | str = "cpu"
     ) -> None:
-        """Put hands, grasps and objects on the device of the samples, and of the generators that draw them."""
         self.network, self.augmentation = network, augmentation
         if bundle.n_grasps == 0:
             raise BundleError("the bundle holds no grasps; synthesise some first")
@@ -159,7 +158,6 @@ class SampleSource:
     def _objects(
         self, index: Int[Tensor, " b"], generator: torch.Generator
     ) -> tuple[Float[Tensor, "b m 3"], Float[Tensor, "b m 3"]]:
-        """Random object points with noise [m], and their normals."""
         m, device = self.network.n_object, generator.device
         twice = torch.randint(self.points.shape[1], (len(index), 2 * m), generator=generator, device=device)
         direction = torch.randn(len(index), 3, generator=generator, device=device)

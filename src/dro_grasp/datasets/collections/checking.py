@@ -98,7 +98,6 @@ def keep_passing(
 
 
 def _loaded(parts: Sequence[GraspBatch], progress: Progress | None) -> Iterator[tuple[Hand, ObjectModel]]:
-    """Hand and object of the grasps of one pair after the other."""
     total, done, sources = sum(map(len, parts)), 0, Sources()
     # All are found before the first trial: none is lost to a file that has changed, or to a bare cloud.
     pairs = [sources.of(grasps) for grasps in parts]

@@ -110,7 +110,6 @@ def _entry(entries: dict[str, Any], name: str) -> Any:
 
 
 def _load_tensors(path: Path) -> Any:
-    """Read a torch file of tensors and containers only."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

@@ -141,7 +141,6 @@ def _by_pair(paths: Sequence[Path | str], folder: Path) -> dict[str, dict[str, l
 
 
 def _merge_hand(name: str, pairs: dict[str, list[Waiting]], per_pair: int | None, file_bytes: int) -> Iterator[Merged]:
-    """The hand's grasps, a file's worth at a time."""
     hand, row_bytes, number = None, 0.0, 1
     kept: list[pa.Table] = []
     header: dict[str, Any] = {}

@@ -277,7 +277,6 @@ class Production:
             self.say(f"{pair[0]} on {pair[1]}: {state.error}")
 
     def _summary(self, seconds: float) -> str:
-        """One line about the state of the run."""
         states = self.states.values()
         going = [s for s in states if not s.why_given_up(self.goal, self.config)]
         return (f"{sum(s.grasps for s in states)} grasps; {sum(s.grasps >= self.goal for s in states)} of {len(states)} pairs "
