@@ -89,5 +89,5 @@ def test_without_ray_the_engine_says_what_to_install(monkeypatch):
     from dro_grasp.datasets.engine.worker import EngineConfig
 
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(OptionError, match=r"pip install 'ray"):
+    with pytest.raises(OptionError, match=r"pip install 'dro-grasp\[ray\]'"):
         RayPool(Job(0, EngineConfig()), 1, 60.0)

@@ -367,7 +367,7 @@ def test_shards_that_cannot_be_shared_are_refused(monkeypatch: pytest.MonkeyPatc
 def test_tensorboard_that_is_not_installed_is_told_before_any_work(
     stage: str, bundle: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    monkeypatch.setitem(sys.modules, "tensorboard", None)
     with pytest.raises(OptionError, match=r"pip install '\.\[tensorboard\]' in the folder"):
         run_stage(stage, bundle, tmp_path / "run", dataclasses.replace(SCHEDULE, tensorboard=True))
     # The command asks before it so much as reads the bundle, which does not exist.
@@ -394,6 +394,7 @@ def test_tensorboard_gets_the_log(bundle: Bundle, tmp_path: Path, monkeypatch: p
     module = ModuleType("torch.utils.tensorboard")
     module.__dict__["SummaryWriter"] = SummaryWriter
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", module)
+    monkeypatch.setattr("dro_grasp.extras.find_spec", lambda _: object())
     run_stage("pretrain", bundle, tmp_path / "with", schedule)
     log = curve(tmp_path / "with")
     assert written == [*(("total", line["total"], line["step"]) for line in log), ("closed", 0.0, 0)]

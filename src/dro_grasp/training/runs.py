@@ -18,6 +18,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from dro_grasp.devices import fast_products, require_device
 from dro_grasp.errors import OptionError, TrainingError
+from dro_grasp.extras import require_extra
 from dro_grasp.files import make_folder
 from dro_grasp.training.config import ScheduleConfig
 from dro_grasp.training.processes import Processes, join, process_count
@@ -56,15 +57,6 @@ def console_report(title: str) -> Report:
         print(f"{title} {run.step}/{run.steps}  {text}  {left}", file=sys.stderr, flush=True)
 
     return report
-
-
-def require_tensorboard() -> None:
-    """Refuse to log for TensorBoard where it is not installed."""
-    try:
-        from torch.utils.tensorboard import SummaryWriter  # noqa: F401
-    except ImportError as error:
-        raise OptionError("--tensorboard needs TensorBoard, which is not installed; run pip install '.[tensorboard]' "
-                          "in the folder of the clone, or leave the option out: log.jsonl holds the same numbers") from error
 
 
 def tensorboard_report(folder: Path) -> Report:
@@ -261,7 +253,7 @@ def check_schedule(schedule: ScheduleConfig) -> None:
         raise OptionError(f"{process_count()} processes cannot share {schedule.shards} shards a step; give a multiple of "
                           f"{process_count()}")
     if schedule.tensorboard:
-        require_tensorboard()
+        require_extra("tensorboard")
 
 
 @torch.no_grad()

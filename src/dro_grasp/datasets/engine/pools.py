@@ -21,6 +21,7 @@ from pebble import ProcessExpired, ProcessPool
 from dro_grasp.datasets.engine.threads import use_one_thread
 from dro_grasp.datasets.engine.worker import FinishedShard, Job, Task, make_shard
 from dro_grasp.errors import DroGraspError, OptionError
+from dro_grasp.extras import require_extra
 
 if TYPE_CHECKING:
     import ray
@@ -168,10 +169,9 @@ class RayPool:
         Raises:
             OptionError: Ray is not installed, or there is no cluster at the address.
         """
-        try:
-            import ray
-        except ImportError as error:
-            raise OptionError("the engine 'ray' needs Ray: pip install 'ray>=2.40'; or use --engine local") from error
+        require_extra("ray")
+        import ray
+
         self.limit, self.started_here = limit, False
         if not ray.is_initialized():
             self.started_here = True
