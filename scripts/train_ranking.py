@@ -37,7 +37,7 @@ from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.proposal import ProposalConfig, propose
 from dro_grasp.pipeline.settling import settled
 from dro_grasp.pipeline.stages import complete, optimise, refine
-from dro_grasp.ranking.features import FEATURE_NAMES, grasp_features
+from dro_grasp.ranking.features import feature_names, grasp_features
 from dro_grasp.ranking.score import SHIPPED, ScoreConfig, ScoreNetwork, load_score_network, save_score_network
 from dro_grasp.simulation.trial import simulate
 
@@ -46,7 +46,7 @@ HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand", 
 """Training hands."""
 TRIALS = ("strict", "dexgraspbench")
 """Protocols whose outcome the network predicts; the score is the mean of their log-odds."""
-FEATURES = f"{crc32(repr(FEATURE_NAMES).encode()):08x}"
+FEATURES = f"{crc32(repr(feature_names()).encode()):08x}"
 """Part of the names of stored trials: trials stored with other features are not used."""
 TEMPERATURES = (0.2, 0.5, 0.8, 1.0)
 """Temperatures of z, one drawn for each object."""

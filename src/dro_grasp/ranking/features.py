@@ -108,8 +108,9 @@ class GraspFeatures(NamedTuple):
     whole: Float[Tensor, "n grasp_features"]
 
 
-FEATURE_NAMES = [*LINK_FEATURES, *GRASP_FEATURES]
-"""Names of all features."""
+def feature_names() -> list[str]:
+    """Names of all features."""
+    return [*LINK_FEATURES, *GRASP_FEATURES]
 
 
 def grasp_features(energy: GraspEnergy, grasps: GraspBatch, terms: Float[Tensor, "n terms"]) -> GraspFeatures:

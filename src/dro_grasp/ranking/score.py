@@ -20,7 +20,7 @@ from dro_grasp.errors import WeightsError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.kinds import Checked
 from dro_grasp.models.checkpoints import SHIPPED_FOLDER, history_of, load_small, save_weights
-from dro_grasp.ranking.features import FEATURE_NAMES, GRASP_FEATURES, LINK_FEATURES, grasp_features
+from dro_grasp.ranking.features import GRASP_FEATURES, LINK_FEATURES, feature_names, grasp_features
 
 SHIPPED = SHIPPED_FOLDER / "ranking" / "quality.safetensors"
 """The network that ships."""
@@ -54,14 +54,14 @@ def save_score_network(
     network: ScoreNetwork, path: Path, about: dict[str, Any] | None = None, history: Sequence[dict[str, Any]] = ()
 ) -> None:
     """Write weights as `save_weights` does, with the features they were trained with."""
-    save_weights(network, path, {FEATURES_KEY: FEATURE_NAMES} | (about or {}), history)
+    save_weights(network, path, {FEATURES_KEY: feature_names()} | (about or {}), history)
 
 
 def load_score_network(path: Path) -> ScoreNetwork:
     """Read weights, which must state that they were trained with LINK_FEATURES and GRASP_FEATURES."""
     trained = next((entry.get(FEATURES_KEY) for entry in reversed(history_of(path))), None)
-    if trained != FEATURE_NAMES:
-        raise WeightsError(f"{path} states the features {trained}; this version computes {FEATURE_NAMES}; train "
+    if trained != feature_names():
+        raise WeightsError(f"{path} states the features {trained}; this version computes {feature_names()}; train "
                            "the network again (scripts/train_ranking.py)")
     return load_small(
         path, lambda tensors: ScoreNetwork(len(tensors["grasp.4.bias"]), len(tensors["link.0.bias"])),
