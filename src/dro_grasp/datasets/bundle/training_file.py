@@ -85,6 +85,11 @@ class Bundle:
     """By hand name. A hand may have none: pretraining needs its kinematics alone."""
 
     @property
+    def object_names(self) -> tuple[str, ...]:
+        """Names in the order of object_index."""
+        return tuple(self.objects)
+
+    @property
     def n_grasps(self) -> int:
         """Grasps of all hands."""
         return sum(len(g.joints) for g in self.grasps.values())
