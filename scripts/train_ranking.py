@@ -39,8 +39,7 @@ from dro_grasp.predict.sources.network import ProposalConfig, propose
 from dro_grasp.predict.sources.optimiser import OptimiserSource
 from dro_grasp.predict.stages import complete, refine
 from dro_grasp.ranking.features import feature_names, grasp_features
-from dro_grasp.ranking.score import ScoreConfig
-from dro_grasp.ranking.score_network import SHIPPED, ScoreNetwork, load_score_network, save_score_network
+from dro_grasp.ranking.score import SHIPPED, ScoreConfig, ScoreNetwork, load_score_network, save_score_network
 from dro_grasp.simulation.trial import simulate
 
 HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand", "assets/leaphand", "assets/allegro_right",

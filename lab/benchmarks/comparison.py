@@ -154,7 +154,7 @@ def made(source: Source, problem: GraspProblem) -> tuple[GraspBatch, float]:
     """Grasps of a pair, and the CPU time of each [s]; what all methods need of an object is not counted."""
     _ = problem.field, problem.obj.parts
     begin, seed, method = time.process_time(), pair_seed(0, problem.hand, problem.obj), source.method
-    grasps = method.propose(problem, source.num, seed).grasps if source.raw else method.returned(problem, source.num, seed).grasps
+    grasps = (method.propose if source.raw else method.returned)(problem, source.num, seed).grasps
     seconds = (time.process_time() - begin) / source.num
     return grasps.with_asked(method.asked(problem.obj, source.num)), seconds
 

@@ -14,9 +14,8 @@ from torch import Tensor, nn
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.kinds import Checked
 from dro_grasp.training.config import ScheduleConfig
-from dro_grasp.training.reports import Report
-from dro_grasp.training.run_plan import run_plan
-from dro_grasp.training.runs import Losses, TrainingRun, begin, recalibrate
+from dro_grasp.training.run_folder import run_plan
+from dro_grasp.training.runs import Losses, Report, TrainingRun, begin, recalibrate
 from lab.methods.bundle_draws import BundleDraws
 
 Network = TypeVar("Network", bound=nn.Module)
@@ -84,7 +83,6 @@ def train_autoencoder(
     run = TrainingRun(folder, model, config.schedule, generator, processes, run_plan(config, bundle))
     model.train()
     run.train(lambda: losses(forward(model, draws, config, generator), config, run.progress), report)
-    model.load_state_dict(run.average.module.state_dict())
     run.seed_shard()
     recalibrate(model, lambda: forward(model, draws, config, generator), config.schedule.recalibration)
     return model.cpu().eval()

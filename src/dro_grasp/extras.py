@@ -6,8 +6,12 @@ from importlib.util import find_spec
 
 from dro_grasp.errors import OptionError
 
-EXTRAS = {"apps": ("viser", "fastapi", "uvicorn", "cachetools"), "arm": ("mink", "daqp", "ompl", "toppra")}
-"""What an extra installs: pages in the browser and the grasp server; or kinematics, its solver, motion planning and timing."""
+EXTRAS = {
+    "apps": ("viser", "fastapi", "uvicorn", "cachetools"), "arm": ("mink", "daqp", "ompl", "toppra"), "ray": ("ray",),
+    "tensorboard": ("tensorboard",),
+}
+"""What an extra installs: pages in the browser and the grasp server; kinematics, its solver, motion planning and timing;
+workers on clusters; curves of training."""
 
 
 def require_extra(name: str) -> None:

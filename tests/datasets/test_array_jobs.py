@@ -19,8 +19,7 @@ import pytest
 from dro_grasp.cli.main import main
 from dro_grasp.datasets.engine import schedule
 from dro_grasp.datasets.engine.pools import Outcome, Work
-from dro_grasp.datasets.engine.schedule import own_pairs, synthesize_dataset
-from dro_grasp.datasets.engine.settings import SETTINGS, require_settings
+from dro_grasp.datasets.engine.schedule import SETTINGS, own_pairs, require_settings, synthesize_dataset
 from dro_grasp.datasets.engine.shards import Shard, find_shards, sole_run
 from dro_grasp.datasets.engine.worker import EngineConfig, Job, Task
 from dro_grasp.errors import GraspFileError, OptionError, OutputError

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from dro_grasp.cli.main import main
-from dro_grasp.datasets.collections import checking
+from dro_grasp.datasets.collections import checking, collection
 from dro_grasp.datasets.collections.checking import check, keep_passing
 from dro_grasp.datasets.collections.collection import PairGrasps, read_collection
-from dro_grasp.datasets.engine import finger_labels
+from dro_grasp.datasets.engine import worker
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
@@ -141,7 +141,7 @@ def test_closed_fingers_are_not_kept_where_one_link_alone_touches(lazy, monkeypa
         trials.append(found)
         return found
 
-    for module in (checking, finger_labels):
+    for module in (checking, worker):
         monkeypatch.setattr(module, "simulate", few)
     ((pair, kept),) = keep_passing(lazy[:1], changed("dro"), close_fingers=True)
     assert int((trials[1].success & (trials[1].contacts == 1)).sum()) > 1
@@ -193,7 +193,7 @@ def test_two_hands_of_one_name_are_refused_before_any_trial(stored, tmp_path, ca
         raise AssertionError("a trial")
 
     monkeypatch.setattr(checking, "simulate", none)
-    monkeypatch.setattr(checking, "hand_of", none)
+    monkeypatch.setattr(collection, "hand_of", none)
     GraspBatch.load(stored).replace(hand_sha256="0123456789abcdef").save(tmp_path / "other.parquet")
     output = tmp_path / "kept"
     more = ["--output", str(output)] if command == "filter" else []

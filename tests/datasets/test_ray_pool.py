@@ -21,7 +21,7 @@ CLUSTER = """
 import json, sys
 from ray.cluster_utils import Cluster
 from dro_grasp.datasets.engine.schedule import synthesize_dataset
-from dro_grasp.datasets.engine.ray_pool import RayPool
+from dro_grasp.datasets.engine.pools import RayPool
 from tests.helpers.engine_work import slow
 
 class Watched(RayPool):
@@ -74,7 +74,7 @@ def test_a_node_that_dies_costs_nothing(tmp_path):
 
 def test_an_address_where_nobody_listens_is_told_at_once():
     pytest.importorskip("ray")
-    from dro_grasp.datasets.engine.ray_pool import RayPool
+    from dro_grasp.datasets.engine.pools import RayPool
     from dro_grasp.datasets.engine.worker import EngineConfig
 
     with socket.socket() as taken:
@@ -85,9 +85,9 @@ def test_an_address_where_nobody_listens_is_told_at_once():
 
 
 def test_without_ray_the_engine_says_what_to_install(monkeypatch):
-    from dro_grasp.datasets.engine.ray_pool import RayPool
+    from dro_grasp.datasets.engine.pools import RayPool
     from dro_grasp.datasets.engine.worker import EngineConfig
 
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(OptionError, match=r"pip install 'ray"):
+    with pytest.raises(OptionError, match=r"pip install 'dro-grasp\[ray\]'"):
         RayPool(Job(0, EngineConfig()), 1, 60.0)

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from dro_grasp.datasets.engine.settings import SETTINGS
+from dro_grasp.datasets.engine.schedule import SETTINGS
 from dro_grasp.datasets.engine.worker import EngineConfig
 from dro_grasp.energy.contact_candidates import ContactConfig
 from dro_grasp.errors import GraspFileError, OptionError

@@ -12,8 +12,8 @@ from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.training.config import PretrainConfig, ScheduleConfig, TrainConfig
 from dro_grasp.training.loop import train
 from dro_grasp.training.pretraining import pretrain
-from dro_grasp.training.reports import Report, RunProgress
 from dro_grasp.training.run_folder import LOG
+from dro_grasp.training.runs import Report, RunProgress
 from tests.helpers.tiny_bundle import TINY
 
 SCHEDULE = ScheduleConfig(

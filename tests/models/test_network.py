@@ -12,10 +12,9 @@ from torch.nn import functional
 
 from dro_grasp import devices
 from dro_grasp.devices import fast_products
-from dro_grasp.models.attention import Attention
 from dro_grasp.models.encoder import SLOPE, EdgeLayer, StaticGraphEncoder, nearest_neighbours
 from dro_grasp.models.latent import FlowPrior
-from dro_grasp.models.network import DistanceNetwork, untrained_network
+from dro_grasp.models.network import Attention, DistanceNetwork, untrained_network
 from dro_grasp.models.presets import NetworkConfig
 
 SMALL = NetworkConfig(
@@ -185,15 +184,14 @@ def test_a_latent_that_moves_the_hand_moves_its_points_apart() -> None:
 
 
 @pytest.mark.parametrize("changes", [{}, {"frame": "palm"}], ids=["paper", "ours"])
-def test_a_drawn_z_predicts_in_training_what_it_does_at_inference(changes: dict, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_z_predicts_in_training_what_it_does_at_inference(changes: dict, monkeypatch: pytest.MonkeyPatch) -> None:
     hand, obj, grasp = torch.randn(3, 2, 40, 3, generator=torch.Generator().manual_seed(0)) * 0.1
     network = untrained_network(dataclasses.replace(SMALL, **changes), seed=3).eval()
-    assert network(hand, obj, grasp, torch.Generator(), columns=20).drawn is None
-    drawn, honest = [], torch.randn
-    monkeypatch.setattr(torch, "randn", lambda *a, **k: drawn.append(honest(*a, **k)) or drawn[-1])
-    found = network(hand, obj, grasp, torch.Generator().manual_seed(1), columns=20, draw=True).drawn
-    expected = network.predict(hand, obj, drawn[-1])[:, :, :20]
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+    noise = torch.randn(2, SMALL.latent, generator=torch.Generator().manual_seed(1))
+    moves = network.move(hand, obj, noise[:, None])
+    monkeypatch.setattr("dro_grasp.models.latent.sample_posterior", lambda *_: moves.z[:, 0])
+    found = network(hand, obj, grasp, torch.Generator(), columns=20).distances
+    torch.testing.assert_close(found, network.predict(hand, obj, noise)[:, :, :20], rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("changes", [{}, {"frame": "palm"}], ids=["paper", "ours"])
@@ -202,10 +200,10 @@ def test_all_randomness_comes_from_the_generator(changes: dict) -> None:
     network = untrained_network(dataclasses.replace(SMALL, **changes), seed=3).eval()
     state = torch.get_rng_state()
     again = untrained_network(network.config, seed=3).eval()
-    first = network(hand, obj, grasp, torch.Generator().manual_seed(1), draw=True)
+    first = network(hand, obj, grasp, torch.Generator().manual_seed(1))
     assert torch.equal(torch.get_rng_state(), state), "the global generator is left alone"
     torch.manual_seed(99)
-    second = again(hand, obj, grasp, torch.Generator().manual_seed(1), draw=True)
+    second = again(hand, obj, grasp, torch.Generator().manual_seed(1))
     for name, value in vars(first).items():
         assert torch.equal(value, getattr(second, name)), name
     other = network(hand, obj, grasp, torch.Generator().manual_seed(2))

@@ -27,7 +27,7 @@ from dro_grasp.ranking.features import (
     GraspFeatures,
     grasp_features,
 )
-from dro_grasp.ranking.score_network import ScoreNetwork, load_score_network, save_score_network, shipped_score_network
+from dro_grasp.ranking.score import ScoreNetwork, load_score_network, save_score_network, shipped_score_network
 from tests.helpers.tiny_bundle import made_up_grasps
 from tests.helpers.toy_hand import toy_hand
 

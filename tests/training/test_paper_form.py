@@ -113,7 +113,7 @@ def test_losses_of_the_release_are_one_option(home: Path, bundle: Bundle, monkey
     monkeypatch.setattr(loop, "train", keep)
     command = ["train", "--bundle", str(home / "bundle.safetensors"), "--preset", "paper-slim", "--run-folder",
                str(home / "none"), "--output", str(home / "none.safetensors")]
-    for options in ([], ["--losses", "release"], ["--losses", "release", "--divergence", "0.003", "--free-bits", "0.1"]):
+    for options in ([], ["--losses", "release"], ["--losses", "release", "--divergence", "0.003"]):
         assert main([*command, *options]) == 2
     assert {network for network, _ in asked} == {PRESETS["paper-slim"]}
     ours, release, changed = (losses for _, losses in asked)
@@ -121,4 +121,4 @@ def test_losses_of_the_release_are_one_option(home: Path, bundle: Bundle, monkey
     # configs/train.yaml of the release: distance 1, pose 0.01, penetration 1, divergence 0.01.
     assert (release.distance, release.pose, release.penetration, release.divergence) == (1.0, 0.01, 1.0, 0.01)
     assert release.divergence_form == "official"
-    assert changed == dataclasses.replace(release, divergence=0.003, free_bits=0.1)
+    assert changed == dataclasses.replace(release, divergence=0.003)

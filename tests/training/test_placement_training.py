@@ -14,7 +14,7 @@ from dro_grasp.errors import TrainingError
 from dro_grasp.models.checkpoints import describe_weights, load_weights, save_weights
 from dro_grasp.models.network import DistanceNetwork, untrained_network
 from dro_grasp.training.config import AugmentationConfig, PlacementConfig
-from dro_grasp.training.placement_training import placement_losses, train_placement
+from dro_grasp.training.loop import placement_losses, train_placement
 from dro_grasp.training.samples import SampleSource
 from tests.helpers.tiny_bundle import TINY
 from tests.helpers.training_stages import SCHEDULE, curve, quiet

@@ -11,6 +11,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import ModuleType
 
@@ -24,9 +25,8 @@ from dro_grasp.errors import OptionError, OutputError, TrainingError
 from dro_grasp.models.network import DistanceNetwork, untrained_network
 from dro_grasp.training import loop, losses, pretraining
 from dro_grasp.training.config import AugmentationConfig, LossConfig, ScheduleConfig, TrainConfig
-from dro_grasp.training.run_folder import CHECKPOINT, LOG, RunFolder
-from dro_grasp.training.run_plan import run_plan
-from dro_grasp.training.runs import TrainingRun, check_schedule, learning_rate_share
+from dro_grasp.training.run_folder import CHECKPOINT, LOG, RunFolder, run_plan
+from dro_grasp.training.runs import RunProgress, TrainingRun, check_schedule, console_report, learning_rate_share
 from tests.helpers.tiny_bundle import TINY
 from tests.helpers.training_stages import SCHEDULE, SHARDED, STAGES, curve, quiet, run_stage
 
@@ -305,11 +305,12 @@ def test_the_average_is_the_moving_average_of_the_weights(tmp_path: Path) -> Non
         return {"total": model(torch.ones(1, 2)).square().sum()}
 
     run.train(losses, quiet)
+    last = torch.load(tmp_path / "run" / CHECKPOINT)["model"]["weight"]
     expected = weights[1]
-    for value in [*weights[2:], model.weight.detach()]:
+    for value in [*weights[2:], last]:
         expected = 0.9 * expected + 0.1 * value
-    torch.testing.assert_close(run.average.module.weight.detach(), expected)
-    assert not torch.allclose(expected, model.weight)
+    torch.testing.assert_close(model.weight.detach(), expected)
+    assert not torch.allclose(expected, last)
 
 
 def test_a_time_limit_ends_the_schedule(bundle: Bundle, tmp_path: Path) -> None:
@@ -366,7 +367,7 @@ def test_shards_that_cannot_be_shared_are_refused(monkeypatch: pytest.MonkeyPatc
 def test_tensorboard_that_is_not_installed_is_told_before_any_work(
     stage: str, bundle: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    monkeypatch.setitem(sys.modules, "tensorboard", None)
     with pytest.raises(OptionError, match=r"pip install '\.\[tensorboard\]' in the folder"):
         run_stage(stage, bundle, tmp_path / "run", dataclasses.replace(SCHEDULE, tensorboard=True))
     # The command asks before it so much as reads the bundle, which does not exist.
@@ -393,6 +394,22 @@ def test_tensorboard_gets_the_log(bundle: Bundle, tmp_path: Path, monkeypatch: p
     module = ModuleType("torch.utils.tensorboard")
     module.__dict__["SummaryWriter"] = SummaryWriter
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", module)
+    monkeypatch.setattr("dro_grasp.extras.find_spec", lambda _: object())
     run_stage("pretrain", bundle, tmp_path / "with", schedule)
     log = curve(tmp_path / "with")
     assert written == [*(("total", line["total"], line["step"]) for line in log), ("closed", 0.0, 0)]
+
+
+def test_a_line_now_and_then_with_the_time_that_is_left(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = [1000.0]
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    report = console_report("training")
+    for step, seconds in ((10, 0.0), (11, 1.0), (40, 60.0), (100, 61.0)):
+        clock[0] = 1000.0 + seconds
+        report(RunProgress(step, 100, step / 100), {"total": 0.5})
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split()[1] for line in lines] == ["10/100", "40/100", "100/100"], "not within ten seconds, but at the end"
+    assert lines[1].endswith("  2 min left"), "three tenths took a minute, so the other six take two"
+    assert "total 0.5000" in lines[0]

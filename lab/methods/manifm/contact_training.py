@@ -12,8 +12,7 @@ from torch import Tensor
 
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.hands.hand import Hand
-from dro_grasp.training.reports import Report, console_report
-from dro_grasp.training.runs import Losses
+from dro_grasp.training.runs import Losses, Report, console_report
 from lab.methods.bundle_draws import BundleDraws
 from lab.methods.manifm.contact_network import LATENT, ContactNetwork, ContactOutput
 from lab.methods.manifm.fingertip_contacts import ContactMaps, contact_maps

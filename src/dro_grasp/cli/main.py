@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import sys
 import traceback
@@ -22,7 +23,7 @@ from dro_grasp.cli.onboard import Onboard
 from dro_grasp.cli.robots import Plan, RobotCommand, Tabletop
 from dro_grasp.cli.serve import Serve
 from dro_grasp.cli.synthesize import Synthesize
-from dro_grasp.cli.train import Pretrain, Train
+from dro_grasp.cli.train import Pretrain, Train, former_options
 from dro_grasp.cli.view import Picture, View
 from dro_grasp.cli.weights import Weights
 from dro_grasp.errors import DroGraspError, OptionError
@@ -70,16 +71,18 @@ def parse(arguments: Sequence[str]) -> Any:
     Raises:
         SystemExit: With code 2 after a message about invalid arguments, with code 0 after `--help`.
     """
+    rest, former = former_options(arguments) if arguments[:1] in (["train"], ["pretrain"]) else (list(arguments), {})
     command = tyro.cli(
         Command,  # type: ignore[arg-type]
         prog="dro-grasp",
         description="Any robot hand description in, simulation-checked dexterous grasps out. "
         "--version prints the version. At any place, --verbose shows tracebacks, and --threads N computes in N threads "
         "(default: one for each core).",
-        args=list(arguments),
+        args=rest,
         config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes),
     )
-    return getattr(command, "command", command)
+    command = getattr(command, "command", command)
+    return dataclasses.replace(command, former=former) if former else command
 
 
 def without_threads(arguments: Sequence[str]) -> list[str]:

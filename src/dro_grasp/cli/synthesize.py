@@ -79,11 +79,10 @@ class Synthesize:
             self.hand, objects, self.grasps, self.output, self._ray_pool if self.engine == "ray" else self.workers, self.seed,
             config, say_aside)
         failures = [{"hand": h, "object": o, "reason": why} for (h, o), why in report.failures.items()]
-        values = {"output": str(self.output), "grasps": report.grasps, "added": report.added, "shards": report.shards,
-                  "seconds": round(report.seconds, 2), "failures": failures}
+        counts = {"grasps": report.grasps, "added": report.added, "shards": report.shards, "seconds": round(report.seconds, 2)}
         code = 2 if failures and not report.grasps else 0
-        print_result(self.json, values, "synthesis", ["grasps", "added", "shards", "seconds"],
-                     [[report.grasps, report.added, report.shards, report.seconds]])
+        print_result(self.json, {"output": str(self.output), **counts, "failures": failures}, "synthesis", [*counts],
+                     [[*counts.values()]])
         if not self.json:
             for failure in failures:
                 say_aside(f"{failure['hand']} on {failure['object']}: {failure['reason']}")
@@ -92,7 +91,6 @@ class Synthesize:
         return code
 
     def _check_numbers(self) -> None:
-        """Refuse invalid numbers by the names of their options."""
         from dro_grasp.errors import OptionError
 
         for option, value in (("--grasps", self.grasps), ("--workers", self.workers)):
@@ -114,6 +112,6 @@ class Synthesize:
         return int(found[1]), int(found[2])
 
     def _ray_pool(self, job: Job) -> Pool:
-        from dro_grasp.datasets.engine.ray_pool import RayPool
+        from dro_grasp.datasets.engine.pools import RayPool
 
         return RayPool(job, self.workers, job.config.shard_seconds, self.ray_address)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -17,8 +18,22 @@ if TYPE_CHECKING:
     from dro_grasp.training.config import ScheduleConfig
 
 
-FORMER_OPTION = optional("NAME", "not given")
-"""Help of an option that is still read, so that commands of before are answered with more than that it is unknown."""
+FORMER_OPTIONS = ("--method", "--latent", "--latent-form", "--prior", "--placement-hand", "--divergence-warmup", "--free-bits",
+                  "--drawn")
+"""Options of training that are no longer a choice; they are still read, so that commands of before get more of an answer than
+that they are unknown."""
+
+
+def former_options(arguments: Sequence[str]) -> tuple[list[str], dict[str, str]]:
+    """The arguments without options that are no longer a choice, and these with their values."""
+    rest, former, words = [], {}, iter(arguments)
+    for word in words:
+        option, given, value = word.partition("=")
+        if option in FORMER_OPTIONS:
+            former[option] = value if given else next(words, "")
+        else:
+            rest.append(word)
+    return rest, former
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,10 +52,6 @@ class Stage:
     ] = None
     """Network: multi, or slim (that of the default weights: narrow, told the placement), paper, or paper-slim (the paper's,
     as narrow)."""
-    latent: Annotated[int | None, optional("N", "the preset's")] = None
-    """Numbers in z."""
-    latent_form: Annotated[str | None, FORMER_OPTION] = None
-    """No longer a choice: the preset decides."""
     initial: Annotated[str | None, optional("NAME|PATH", "none")] = None
     """Weights to begin with. They decide the network; `train` keeps their hand encoder as it is."""
     learning_rate: float = 1e-3
@@ -57,6 +68,29 @@ class Stage:
     """Seed of everything."""
     json: Flag = False
     """Print one JSON object at the end."""
+    former: tyro.conf.Suppress[dict[str, str]] = field(default_factory=dict)
+    """Options of `FORMER_OPTIONS` that were given."""
+
+    def network(self, initial: DistanceNetwork | None) -> NetworkConfig:
+        """The configuration of the preset, else of the initial weights, else of `multi`.
+
+        Raises:
+            OptionError: A former option asks for something else than there is.
+        """
+        from dro_grasp.errors import OptionError
+        from dro_grasp.models.presets import FORMER, LAST_WITH_OTHERS, NetworkConfig
+
+        given = None if initial is None or self.preset is not None else initial.config
+        network = given or NetworkConfig.preset(self.preset or "multi")
+        kept = {"method": "dro", "latent": network.latent, "divergence_warmup": 0, "free_bits": 0, "drawn": 0}
+        for option, asked in self.former.items():
+            fixed = str((kept | FORMER[network.frame])[option.removeprefix("--").replace("-", "_")])
+            if asked.removesuffix(".0") != fixed:
+                raise OptionError(f"{option} is no longer a choice: it is {fixed} in frame '{network.frame}', and {asked} was "
+                                  f"last possible in {LAST_WITH_OTHERS}; leave it out, or choose another --preset. Other "
+                                  "methods are trained by `python -m lab.methods.train` in a clone of the repository")
+            say_aside(f"warning: {option} is no longer a choice; {fixed} is what there is, so leave the option out")
+        return network
 
     def schedule(self, **more: Any) -> ScheduleConfig:
         """The schedule, which can be carried out here.
@@ -68,42 +102,11 @@ class Stage:
         from dro_grasp.training.config import ScheduleConfig
         from dro_grasp.training.runs import check_schedule
 
-        schedule = ScheduleConfig(minutes=self.minutes, shards=self.shards, tensorboard=self.tensorboard,
-                                  device=choose_device(self.device), seed=self.seed, **more)
+        schedule = ScheduleConfig(
+            learning_rate=self.learning_rate, minutes=self.minutes, shards=self.shards, tensorboard=self.tensorboard,
+            device=choose_device(self.device), seed=self.seed, **more)
         check_schedule(schedule)
         return schedule
-
-
-def network_config(
-    preset: str | None, latent: int | None, initial: DistanceNetwork | None = None, **former: str | None
-) -> NetworkConfig:
-    """The configuration of a preset, else of the initial weights, with numbers in z if they are given.
-
-    Args:
-        preset: Its name; None takes that of the initial weights, or `multi`.
-        latent: Numbers in z.
-        initial: Weights to begin with.
-        former: Options that are no longer a choice, by the names of the settings they were.
-
-    Raises:
-        OptionError: There is no number in z, or a former option asks for something else than the network is.
-    """
-    import dataclasses
-
-    from dro_grasp.errors import OptionError
-    from dro_grasp.models.presets import FORMER, LAST_WITH_OTHERS, NetworkConfig
-
-    if latent is not None and latent < 1:
-        raise OptionError(f"latent is {latent}; z needs at least one number")
-    network = NetworkConfig.preset(preset or "multi") if initial is None or preset is not None else initial.config
-    for name, asked in former.items():
-        option, fixed = f"--{name.replace('_', '-')}", FORMER[network.frame][name]
-        if asked not in (None, fixed):
-            raise OptionError(f"{option} is no longer a choice: it is {fixed} in frame '{network.frame}', and {asked} was last "
-                              f"possible in {LAST_WITH_OTHERS}; leave it out, or choose another --preset")
-        if asked is not None:
-            say_aside(f"warning: {option} is no longer a choice; {fixed} is what this network has, so leave the option out")
-    return network if latent is None else dataclasses.replace(network, latent=latent)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,8 +138,8 @@ class Pretrain(Stage):
 
         check_output(self.output, ".safetensors")
         initial = None if self.initial is None else load_weights(self.initial)
-        network = network_config(self.preset, self.latent, initial, latent_form=self.latent_form)
-        schedule = self.schedule(steps=self.steps, learning_rate=self.learning_rate)
+        network = self.network(initial)
+        schedule = self.schedule(steps=self.steps)
         bundle = load_bundle(self.bundle)
         config = PretrainConfig(schedule)
         motion = MotionConfig(dataclasses.replace(schedule, steps=self.motion_steps))
@@ -173,27 +176,15 @@ class Train(Stage):
 
     part: Literal["all", "placement"] = "all"
     """placement: train the placement prior of --initial further, alone: it shares nothing with the rest, and wants more
-    grasps (steps of 96, hands by the square root of their grasps). Options of z, losses, samples and columns do not apply."""
+    grasps (steps of 96, hands by the square root of their grasps). Options of losses, samples and columns do not apply."""
     pretrained: Annotated[str | None, optional("PATH", "none")] = None
     """Weights from `dro-grasp pretrain`; without them, and without --initial, the hand encoder is trained along."""
     steps: Annotated[int | None, optional("N", "10000, or 1300 of the placement prior")] = None
     """Optimiser steps."""
-    prior: Annotated[str | None, FORMER_OPTION] = None
-    """No longer a choice: the preset decides."""
-    placement_hand: Annotated[str | None, FORMER_OPTION] = None
-    """No longer a choice: the preset decides."""
-    method: Annotated[str | None, FORMER_OPTION] = None
-    """No longer a choice: other methods are trained outside of the package."""
     losses: Literal["ours", "release"] = "ours"
     """Weights of the losses and form of the KL divergence: ours, or those of the official release."""
     divergence: Annotated[float | None, optional("WEIGHT", "0.01")] = None
     """KL weight; a lower value lets z carry more information."""
-    divergence_warmup: float = 0.0
-    """Share of the schedule over which the KL weight grows from zero."""
-    free_bits: float = 0.0
-    """KL of each latent dimension that costs nothing [nat]."""
-    drawn: float = 0.0
-    """Weight of penetration and contact of hands that a drawn z gives, as at inference; half of the steps draw one."""
     samples_per_hand: int = 4
     """Grasps of each of the four hands in a shard."""
     by_count: float = 0.0
@@ -209,14 +200,6 @@ class Train(Stage):
     validation_samples: int = 400
     """Validation grasps of each hand."""
 
-    @property
-    def all_steps(self) -> int:
-        """Optimiser steps, given or not."""
-        from dro_grasp.training.config import PlacementConfig, ScheduleConfig
-
-        usual = PlacementConfig().schedule if self.part == "placement" else ScheduleConfig()
-        return usual.steps if self.steps is None else self.steps
-
     def run(self) -> int:
         """Train and save."""
         import dataclasses
@@ -227,28 +210,23 @@ class Train(Stage):
         from dro_grasp.files import check_output
         from dro_grasp.models.checkpoints import history_of, load_weights, locate_weights, save_weights
         from dro_grasp.training.config import LOSSES, AugmentationConfig, PlacementConfig, TrainConfig
-        from dro_grasp.training.loop import train
-        from dro_grasp.training.placement_training import train_placement
+        from dro_grasp.training.loop import train, train_placement
         from dro_grasp.training.processes import is_first
 
         check_output(self.output, ".safetensors")
-        if self.method not in (None, "dro"):
-            raise OptionError(f"train trains the D(R,O) network alone, not {self.method}; in a clone of the repository, "
-                              "`python -m lab.methods.train` trains GenDexGrasp's and ManiFM's")
         if self.part == "placement" and (self.initial is None or self.pretrained is not None):
             raise OptionError("--part placement trains the placement prior of given weights further: name them with --initial, "
                               "and leave out --pretrained")
         given = [name for name in (self.initial, self.pretrained) if name is not None]
         pretrained, initial = (None if name is None else load_weights(name) for name in (self.pretrained, self.initial))
-        network = network_config(
-            self.preset, self.latent, initial, prior=self.prior, latent_form=self.latent_form,
-            placement_hand=self.placement_hand)
-        losses = dataclasses.replace(LOSSES[self.losses], divergence_warmup=self.divergence_warmup, free_bits=self.free_bits,
-                                     drawn=self.drawn)
+        network = self.network(initial)
+        losses = LOSSES[self.losses]
         if self.divergence is not None:
             losses = dataclasses.replace(losses, divergence=self.divergence)
+        usual = PlacementConfig() if self.part == "placement" else TrainConfig()
+        steps = usual.schedule.steps if self.steps is None else self.steps
         config: Any = TrainConfig(
-            schedule=self.schedule(steps=self.all_steps, learning_rate=self.learning_rate, mixed=self.mixed),
+            schedule=self.schedule(steps=steps, mixed=self.mixed),
             samples_per_hand=self.samples_per_hand, by_count=self.by_count, columns=self.columns, losses=losses,
             augmentation=AugmentationConfig(partial=self.partial),
         )

@@ -43,7 +43,8 @@ class Method:
     """A source by the name that it has in tables."""
 
     def __init__(
-        self, source: str | Source, predictor: GraspPredictor, name: str | None = None, candidates: int = GraspRequest.candidates
+        self, source: str | Source, predictor: GraspPredictor, name: str | None = None,
+        candidates: int = GraspRequest.candidates,
     ) -> None:
         """Find the source.
 

@@ -22,6 +22,8 @@ from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.models.presets import LAST_WITH_OTHERS, NetworkConfig
 
 Network = TypeVar("Network", bound=nn.Module)
+Tensors = dict[str, Num[Tensor, "..."]]
+"""Tensors of a file by name."""
 SHIPPED_FOLDER = Path(__file__).parent.parent / "weights"
 """Folder of the shipped weights."""
 KEY = "dro_grasp_weights"
@@ -49,9 +51,6 @@ def save_weights(
         network: A network that predicts grasps, whose configuration goes along, or a small one that ships beside it.
         about: How the weights were made, and on what data.
         history: The same of the weights that training began with, oldest first (`history_of`).
-
-    Raises:
-        OutputError: The file cannot be written.
     """
     path = given_path(path)
     tensors = {
@@ -82,13 +81,12 @@ def load_weights(name: str | Path | None = None) -> DistanceNetwork:
         return _filled(DistanceNetwork(config, name=path.stem), tensors)
 
 
-def _filled(network: Network, tensors: dict[str, Num[Tensor, "..."]]) -> Network:
-    """The network with these tensors in single precision, in evaluation mode."""
+def _filled(network: Network, tensors: Tensors) -> Network:
     network.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in tensors.items()})
     return network.eval()
 
 
-def _check_tensors(expected: dict[str, Num[Tensor, "..."]], given: dict[str, Num[Tensor, "..."]], path: Path) -> None:
+def _check_tensors(expected: Tensors, given: Tensors, path: Path) -> None:
     """Refuse tensors that are missing, of another shape or type, not finite, or negative variances."""
     for name in expected.keys() | given.keys():
         wanted, tensor = expected.get(name), given.get(name)
@@ -104,26 +102,19 @@ def _check_tensors(expected: dict[str, Num[Tensor, "..."]], given: dict[str, Num
 
 
 def load_into(network: Network, path: Path) -> Network:
-    """A network of a method beside D(R,O) with the weights of a file, in evaluation mode.
-
-    Raises:
-        WeightsError: The file is missing, truncated, foreign, or of another network.
-    """
+    """A network of a method beside D(R,O) with the weights of a file, in evaluation mode."""
     tensors = _read(locate_weights(path))[1]
     _check_tensors(network.state_dict(), tensors, path)
     return _filled(network, tensors)
 
 
-def load_small(path: Path, make: Callable[[dict[str, Num[Tensor, "..."]]], Network], expected: str) -> Network:
+def load_small(path: Path, make: Callable[[Tensors], Network], expected: str) -> Network:
     """A small network that ships beside those that predict D(R,O), in evaluation mode; its gradients are switched off.
 
     Args:
         path: The file.
         make: Makes the network of the size that the file's tensors have.
         expected: What the file should be, and a remedy, in words.
-
-    Raises:
-        WeightsError: The file is missing, truncated, foreign, or of another network.
     """
     tensors = _read(path)[1]
     with reading(path, WeightsError, expected):
@@ -171,11 +162,7 @@ def describe_weights(name: str | Path | None = None) -> dict[str, Any]:
 
 
 def verify_weights(name: str | Path | None = None) -> str:
-    """SHA-256 of a weights file, or of one of `SMALL`, that loads and, if it ships, is unchanged.
-
-    Raises:
-        WeightsError: As in `load_weights`; or shipped weights are missing or changed.
-    """
+    """SHA-256 of a weights file, or of one of `SMALL`, that loads and, if it ships, is unchanged."""
     path = SHIPPED_FOLDER / f"{name}.safetensors" if name in SMALL else locate_weights(name)
     try:
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -192,11 +179,12 @@ def verify_weights(name: str | Path | None = None) -> str:
     return digest
 
 
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, Num[Tensor, "..."]]]:
-    if _starts_like_a_pickle(path):
-        raise WeightsError(f"{path} is a pickled PyTorch file, which can run code and is refused; expected safetensors "
-                           "written by `dro-grasp train`")
+def _read(path: Path) -> tuple[dict[str, Any], Tensors]:
     with reading(path, WeightsError, "a weights file that is not cut short; copy or train it again"):
+        with path.open("rb") as file:
+            if file.read(2) in PICKLES:
+                raise WeightsError(f"{path} is a pickled PyTorch file, which can run code and is refused; expected "
+                                   "safetensors written by `dro-grasp train`")
         with safe_open(path, "pt") as file:
             text = (file.metadata() or {}).get(KEY)
             tensors = {key: file.get_tensor(key) for key in file.keys()}
@@ -212,11 +200,3 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Num[Tensor, "..."]]]:
         raise WeightsError(f"{path}: its configuration and 'about' must be objects, and 'history' a list of objects; train "
                            "again")
     return entry, tensors
-
-
-def _starts_like_a_pickle(path: Path) -> bool:
-    try:
-        with path.open("rb") as file:
-            return file.read(2) in PICKLES
-    except OSError:
-        return False

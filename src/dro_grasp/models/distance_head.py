@@ -39,12 +39,7 @@ class DistanceHead(nn.Module):
     def forward(
         self, hand: Float[Tensor, "b n width"], obj: Float[Tensor, "b m width"], base: Float[Tensor, "b n m"] | None = None
     ) -> Float[Tensor, "b n m"]:
-        """Distances [m].
-
-        Args:
-            hand: Features of the hand's points, latent included; `obj` likewise.
-            base: Distances [m] that the kernel corrects, before the softplus; None in the paper's form.
-        """
+        """Distances [m], from features of the points with z, and from distances that the kernel corrects, if any [m]."""
         left, right = self.first.weight.chunk(2, 1)
         both = torch.cat([left, right])
         hand_sides = _sides(hand @ both.T)

@@ -178,11 +178,6 @@ class Modulated(nn.Module):
         return x
 
 
-def with_latent(features: Float[Tensor, "b n c"], z: Float[Tensor, "b latent"]) -> Float[Tensor, "b n d"]:
-    """Features of points, with z appended to each."""
-    return torch.cat([features, z[:, None].expand(-1, features.shape[1], -1)], -1)
-
-
 def sample_posterior(
     mean: Float[Tensor, "b latent"], log_variance: Float[Tensor, "b latent"], generator: torch.Generator
 ) -> Float[Tensor, "b latent"]:

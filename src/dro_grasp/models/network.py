@@ -8,14 +8,71 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+from torch.nn import functional
 
 from dro_grasp.devices import fast_products
+from dro_grasp.errors import WeightsError
 from dro_grasp.models import latent
-from dro_grasp.models.attention import CrossTransformer
 from dro_grasp.models.distance_head import DistanceHead
 from dro_grasp.models.encoder import StaticGraphEncoder
 from dro_grasp.models.placement import PlacementPrior
 from dro_grasp.models.presets import NetworkConfig
+
+
+class Attention(nn.Module):
+    """Multi-head attention of queries to a memory."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.query = nn.Linear(width, width)
+        self.memory = nn.Linear(width, 2 * width)
+        self.output = nn.Linear(width, width)
+
+    def forward(self, x: Float[Tensor, "b n c"], memory: Float[Tensor, "b m c"]) -> Float[Tensor, "b n c"]:
+        """Attended values."""
+        query = self.query(x).unflatten(-1, (self.heads, -1)).transpose(1, 2)
+        key, value = (
+            part.unflatten(-1, (self.heads, -1)).transpose(1, 2) for part in self.memory(memory).chunk(2, -1)
+        )
+        if query.is_cuda or not torch.is_grad_enabled():
+            mixed = functional.scaled_dot_product_attention(query, key, value)
+        else:
+            # On a CPU at these sizes the fused kernel is faster forwards, but several times slower backwards.
+            scores = query @ key.mT / query.shape[-1] ** 0.5
+            mixed = scores.softmax(-1) @ value
+        return self.output(mixed.transpose(1, 2).flatten(2))
+
+
+class FeedForward(nn.Sequential):
+    """Two linear layers."""
+
+    def __init__(self, width: int, hidden: int) -> None:
+        super().__init__(nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, width))
+
+
+class CrossTransformer(nn.Module):
+    """Relates one cloud's features to another's; no positional encoding, since points carry none.
+
+    The memory passes a self-attention layer, the queries a self-attention and a cross-attention layer, each with
+    residual and layer normalisation.
+    """
+
+    def __init__(self, width: int, heads: int, hidden: int) -> None:
+        super().__init__()
+        self.memory_attention, self.memory_forward = Attention(width, heads), FeedForward(width, hidden)
+        self.self_attention, self.cross_attention = Attention(width, heads), Attention(width, heads)
+        self.forward_layer = FeedForward(width, hidden)
+        self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(7))
+
+    def forward(self, x: Float[Tensor, "b n c"], memory: Float[Tensor, "b m c"]) -> Float[Tensor, "b n c"]:
+        """Features of x that know the memory; the caller adds the paper's residual."""
+        memory = self.norms[0](memory + self.memory_attention(memory, memory))
+        memory = self.norms[2](self.norms[1](memory + self.memory_forward(memory)))
+        x = self.norms[3](x + self.self_attention(x, x))
+        x = self.norms[4](x + self.cross_attention(x, memory))
+        return self.norms[6](self.norms[5](x + self.forward_layer(x)))
+
 
 EXACT = "donot_use_mm_for_euclid_dist"
 """Mode of `torch.cdist` for the placed hand's distances: the matrix-product form loses half of the digits."""
@@ -28,15 +85,12 @@ class Moves:
     """Open hands as draws of z move them, before any distance is predicted."""
 
     hand_features: Float[Tensor, "b n width"]
-    """Of the open hand's points."""
     object_features: Float[Tensor, "b m width"]
-    """Of the object's points."""
     obj: Float[Tensor, "b m 3"]
-    """The object, in the network's frame [m]."""
+    """In the network's frame [m]."""
     z: Float[Tensor, "b k latent"]
-    """Draws of z, k for each hand."""
     points: Float[Tensor, "b k n 3"]
-    """The hand that each of them moves, in the network's frame [m]; where z moves nothing, the open hand."""
+    """The hand that each z moves, in the network's frame [m]; where z moves nothing, the open hand."""
 
     def pick(self, rows: Int[Tensor, " c"], draws: Int[Tensor, " c"]) -> Moves:
         """One draw each of some of the hands."""
@@ -51,15 +105,12 @@ class NetworkOutput:
     distances: Float[Tensor, "b n columns"]
     """D(R,O) [m]."""
     mean: Float[Tensor, "b latent"]
-    """Mean of the posterior of z."""
+    """Of the posterior of z, as its log-variance."""
     log_variance: Float[Tensor, "b latent"]
-    """Its log-variance."""
     flow_error: Float[Tensor, " b"]
     """Squared velocity error of the flow to z; zero in the paper's form."""
     moved: Float[Tensor, "b n 3"]
     """The placed hand, moved by z if z moves it [m]."""
-    drawn: Float[Tensor, "b n columns"] | None = None
-    """D(R,O) of a z that was drawn from its prior [m]; None if none was asked for."""
 
 
 class DistanceNetwork(nn.Module):
@@ -109,7 +160,7 @@ class DistanceNetwork(nn.Module):
 
     def forward(
         self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], grasp: Float[Tensor, "b n 3"],
-        generator: torch.Generator, columns: int | None = None, draw: bool = False,
+        generator: torch.Generator, columns: int | None = None,
     ) -> NetworkOutput:
         """One training pass: z comes from the true grasp.
 
@@ -119,10 +170,9 @@ class DistanceNetwork(nn.Module):
             grasp: The hand in the grasp pose, in the same frame [m].
             generator: Source of the draws of z, on the clouds' device.
             columns: Compute distances to this many leading object points only; the order must be random.
-            draw: Also predict with a z that is drawn as at inference.
         """
         phi_hand, phi_object = self.encode(hand, obj)
-        psi = None  # in the paper's form z moves nothing, so that one relation serves every z
+        psi = None  # in the paper's form z moves nothing, so the clouds are related before z is known
         if self.motion is not None:
             mean, log_variance = self.motion.encode(phi_hand, hand, grasp)
         else:
@@ -132,29 +182,18 @@ class DistanceNetwork(nn.Module):
                 mean, log_variance = self.latent_encoder(torch.cat([grasp, obj], 1), torch.cat(psi, 1))
             mean, log_variance = mean.float(), log_variance.float()
         z = latent.sample_posterior(mean, log_variance, generator)
-
-        def predicted(moved: Float[Tensor, "b n 3"], z: Float[Tensor, "b latent"]) -> Float[Tensor, "b n columns"]:
-            psi_hand, psi_object = psi or self.relate(phi_hand, phi_object, moved)
-            return self._distances(psi_hand, psi_object[:, :columns], z, moved, obj[:, :columns])
-
         moved = self._moved(phi_hand, hand, z[:, None])[:, 0]
-        distances, flow_error, condition = predicted(moved, z), z.new_zeros(len(z)), None
+        psi_hand, psi_object = psi or self.relate(phi_hand, phi_object, moved)
+        distances = self._distances(psi_hand, psi_object[:, :columns], z, moved, obj[:, :columns])
+        flow_error = z.new_zeros(len(z))
         if self.prior is not None and self.condition is not None:
-            condition = self.condition(phi_hand, phi_object, hand, obj)
-            flow_error = self.prior.loss(z, condition, generator)
-        drawn = None
-        if draw:
-            other = torch.randn(z.shape, generator=generator, device=z.device)
-            if self.prior is not None and condition is not None:
-                other = self.prior(other, condition)
-            drawn = predicted(self._moved(phi_hand, hand, other[:, None])[:, 0], other)
-        return NetworkOutput(distances, mean, log_variance, flow_error, moved, drawn)
+            flow_error = self.prior.loss(z, self.condition(phi_hand, phi_object, hand, obj), generator)
+        return NetworkOutput(distances, mean, log_variance, flow_error, moved)
 
     def _moved(
         self, features: Float[Tensor, "b n width"], hand: Float[Tensor, "b n 3"], z: Float[Tensor, "b k latent"]
     ) -> Float[Tensor, "b k n 3"]:
-        """The hand as each z moves it [m]; as it is where z moves nothing."""
-        if self.motion is None:
+        if self.motion is None:  # z moves nothing
             return hand[:, None].expand(-1, z.shape[1], -1, -1)
         return self.motion(features, hand, z)
 
@@ -166,13 +205,7 @@ class DistanceNetwork(nn.Module):
     def predict(
         self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], noise: Float[Tensor, "b latent"]
     ) -> Float[Tensor, "b n m"]:
-        """D(R,O) [m] of one z for each hand.
-
-        Args:
-            hand: As in `forward`.
-            obj: As in `forward`.
-            noise: Draws of `sample_latent`, which the prior turns into z.
-        """
+        """D(R,O) [m] of one z for each hand, which the prior makes of draws of `sample_latent`."""
         return self.distances(self.move(hand, obj, noise[:, None]))
 
     def move(
@@ -199,24 +232,20 @@ class DistanceNetwork(nn.Module):
         hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"],
     ) -> Float[Tensor, "b n m"]:
         base = torch.cdist(hand, obj, compute_mode=EXACT) if self.config.placed else None
-        return self.head(latent.with_latent(psi_hand, z), latent.with_latent(psi_object, z), base)
+        with_z = (torch.cat([psi, z[:, None].expand(-1, psi.shape[1], -1)], -1) for psi in (psi_hand, psi_object))
+        return self.head(*with_z, base)
 
     def to_frame(
         self, points: Float[Tensor, "b n 3"], centre: Float[Tensor, "b 3"], rotation: Float[Tensor, "b 3 3"]
     ) -> Float[Tensor, "b n 3"]:
-        """Points of the object's frame in the network's frame, about the object's centre.
+        """Points of the object's frame in the network's frame, about the centre of the object's cloud [m].
 
-        Args:
-            points: In the object's frame [m].
-            centre: Mean of the object's cloud [m].
-            rotation: The given hand's axes (`NetworkConfig.axes`) in the object's frame.
+        `rotation` are the hand's axes (`NetworkConfig.axes`) in the object's frame.
         """
         centred = points - centre[:, None]
         return centred @ rotation if self.config.placed else centred
 
-    def sample_latent(
-        self, num: int, generator: torch.Generator, temperature: float = 1.0
-    ) -> Float[Tensor, "num latent"]:
+    def sample_latent(self, num: int, generator: torch.Generator, temperature: float = 1.0) -> Float[Tensor, "num latent"]:
         """Draws that `predict` and `move` turn into z, on the network's device; in the paper's form they are z.
 
         Their standard deviation is `temperature`: 1 as in training, 0 for the likeliest z.
@@ -251,3 +280,48 @@ def untrained_network(config: NetworkConfig, seed: int, name: str = "untrained")
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(seed)
         return DistanceNetwork(config, name)
+
+
+def take_initial(model: DistanceNetwork, initial: DistanceNetwork) -> None:
+    """Copy all weights of a network of the same configuration.
+
+    Raises:
+        WeightsError: The configurations differ.
+    """
+    # Settings such as the frame change what the weights mean, but no shape.
+    if other := model.config.differences(initial.config):
+        told = ", ".join(f"{name} {mine} instead of {theirs}" for name, (mine, theirs) in other.items())
+        raise WeightsError(f"the initial weights '{initial.name}' have another configuration than is asked for: {told}; train "
+                           "with theirs, which `train --initial` does without --preset")
+    model.load_state_dict(initial.state_dict())
+
+
+def take_weights(model: nn.Module, given: nn.Module, name: str) -> None:
+    """Copy the weights of a part of another network; `name` is that network's.
+
+    Raises:
+        WeightsError: The two differ in a tensor's name or shape.
+    """
+    try:
+        model.load_state_dict(given.state_dict())
+    except RuntimeError as error:
+        first = str(error).split("\n\t")[1].rstrip(". ")
+        raise WeightsError(f"weights '{name}' do not fit this network: {first}; train with the configuration of these "
+                           "weights") from error
+
+
+def take_pretrained(model: DistanceNetwork, pretrained: DistanceNetwork) -> None:
+    """Copy the hand encoder, and the motion where z moves the hand.
+
+    Raises:
+        WeightsError: They do not fit, or there is a pretrained motion and z does not move the hand.
+    """
+    if pretrained.config.neighbours != model.config.neighbours:
+        raise WeightsError(f"the hand encoder of '{pretrained.name}' sees {pretrained.config.neighbours} neighbours of each "
+                           f"point, this network at {model.config.neighbours}; pretrain with the network that is trained")
+    take_weights(model.hand_encoder, pretrained.hand_encoder, pretrained.name)
+    if pretrained.motion is not None and model.motion is None:
+        raise WeightsError(f"weights '{pretrained.name}' hold a pretrained motion, but z does not move the hand in this "
+                           "network; train in frame 'palm' (--preset multi)")
+    if pretrained.motion is not None and model.motion is not None:
+        take_weights(model.motion, pretrained.motion, pretrained.name)

@@ -25,8 +25,6 @@ ROTATIONS_PER_PART = 16
 """Rotations whose hidden layers exist at a time: those of more do not fit a processor's cache. Source: ours, timed."""
 COLDEST = 1e-3
 """Lower temperatures choose components as this one does: the heaviest. Source: ours."""
-
-
 PROPORTIONS = 72
 """Numbers of a hand's proportions (`dro_grasp.hands.proportions`)."""
 LEAST_SPREAD = 0.05
@@ -63,7 +61,6 @@ class PlacementPrior(nn.Module):
     """
 
     def __init__(self, width: int, components: int) -> None:
-        """Untrained, with hidden layers of a `width` and a mixture of `components`."""
         super().__init__()
         self.components = components
         self.standardised = Standardised()
@@ -78,9 +75,7 @@ class PlacementPrior(nn.Module):
     ) -> tuple[Float[Tensor, "b k"], Float[Tensor, "b k 3"], Float[Tensor, "b k 3"], Float[Tensor, " b"]]:
         """Mixture logits, means [m], standard deviations [m], and the score of the rotation.
 
-        Args:
-            obj: Object points in the hand's axes about the object's centre [m].
-            hand: Proportions of the hand.
+        `obj` are object points in the hand's axes about the object's centre [m], `hand` proportions of the hand.
         """
         x = torch.cat([self.points(obj * (1 / LENGTH)).amax(1), self.hand(self.standardised(hand))], -1)
         out = self.head(x)

@@ -73,7 +73,6 @@ class NetworkConfig:
     """Scale of the spread of placements drawn at inference."""
 
     def __post_init__(self) -> None:
-        """Refuse sizes that no network has, and unknown forms."""
         for name, kind in get_type_hints(NetworkConfig).items():
             if not _fits(value := getattr(self, name), kind):
                 raise OptionError(f"{name} is {str(value)[:60]}, which no network has; the paper's is "
@@ -100,12 +99,8 @@ class NetworkConfig:
     def preset(name: str) -> NetworkConfig:
         """A named configuration.
 
-        Args:
-            name: `paper` (14 M parameters), `paper-slim`, the same form as narrow as the default weights, or `multi`, that of
-                the default weights (1.5 M), which is also called `slim`.
-
-        Raises:
-            OptionError: No configuration has the name.
+        That is `paper` (14 M parameters), `paper-slim`, the same form as narrow as the default weights, or `multi`, that of
+        the default weights (1.5 M), which is also called `slim`.
         """
         if name not in PRESETS:
             raise OptionError(f"no network is called '{name}'; choose {', '.join(PRESETS)}")
@@ -137,7 +132,6 @@ class NetworkConfig:
 
 
 def _fits(value: Any, kind: Any) -> bool:
-    """Whether a setting is of its type, and of a size that a network can have."""
     if get_origin(kind) is Literal:
         return isinstance(value, str) and value in get_args(kind)
     if kind is float:

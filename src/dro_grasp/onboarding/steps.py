@@ -236,8 +236,8 @@ class _Onboarding:
     def _asked(self) -> dict[str, Any]:
         """What decides on the results, beside the hand and the time."""
         return {"weights": self.config.weights or DEFAULT, "objects": self.objects, "held_out": self.held_out,
-                "num": self.config.num, "source": FORMER_NAMES.get(self.config.source, self.config.source), "learning_rate": self.config.learning_rate,
-                "seed": self.config.seed}
+                "num": self.config.num, "source": FORMER_NAMES.get(self.config.source, self.config.source),
+                "learning_rate": self.config.learning_rate, "seed": self.config.seed}
 
     def run(self) -> None:
         """Run every step that is not finished."""

@@ -41,9 +41,8 @@ class GraspState:
     gap: Float[Tensor, "n l"]
     """Signed distance to the object [m]."""
     object_normal: Float[Tensor, "n l 3"]
-    """Outward normal of the object there."""
+    """Outward, as that of the link."""
     link_normal: Float[Tensor, "n l 3"]
-    """Outward normal of the link."""
     position: Float[Tensor, "n l 3"]
     """Position relative to the object's centre [m]."""
     arriving: Float[Tensor, "n l 3"]
@@ -110,18 +109,12 @@ class GraspFeatures(NamedTuple):
 
 
 def feature_names() -> list[str]:
-    """Names of all features, links first."""
+    """Names of all features."""
     return [*LINK_FEATURES, *GRASP_FEATURES]
 
 
 def grasp_features(energy: GraspEnergy, grasps: GraspBatch, terms: Float[Tensor, "n terms"]) -> GraspFeatures:
-    """Features of grasps.
-
-    Args:
-        energy: Energy of the hand on the object.
-        grasps: Grasps of the two.
-        terms: Weighted terms of the energy.
-    """
+    """Features of grasps of one hand on one object, whose energy has these weighted terms."""
     state = grasp_state(energy, grasps, terms)
 
     def table(features: dict[str, Feature], *shape: int) -> Float[Tensor, "*shape features"]:

@@ -30,17 +30,10 @@ class HoldingScore(nn.Module):
     """A small network on a dozen numbers of each grasp."""
 
     mean: Float[Tensor, " features"]
-    """Of each number over the training grasps."""
+    """Of each number over the training grasps, as their `deviation`."""
     deviation: Float[Tensor, " features"]
-    """The same, standard deviation."""
 
     def __init__(self, trials: int, width: int) -> None:
-        """Random weights.
-
-        Args:
-            trials: Kinds of trial whose outcome is predicted.
-            width: Width of the hidden layer.
-        """
         super().__init__()
         self.layers = nn.Sequential(nn.Linear(FEATURES, width), nn.SiLU(), nn.Linear(width, trials))
         self.register_buffer("mean", torch.zeros(FEATURES))
@@ -52,12 +45,7 @@ class HoldingScore(nn.Module):
 
 
 def holding_features(score: Float[Tensor, " n"], holding: Holding) -> Float[Tensor, "n features"]:
-    """The network's inputs.
-
-    Args:
-        score: What the ranking network says of the grasps [log-odds].
-        holding: How they hold the object.
-    """
+    """The network's inputs, from what the ranking network says of grasps [log-odds] and how they hold the object."""
     motion = torch.stack([holding.shift, holding.turn, holding.speed, holding.spin], 1).clamp_min(LEAST_MOTION).log()
     amounts = torch.stack([holding.contacts, holding.links, holding.pressure], 1).log1p()
     return torch.cat([score[:, None], motion, amounts, holding.slip[:, None].clamp_max(2), holding.unanswered], 1)
@@ -65,21 +53,12 @@ def holding_features(score: Float[Tensor, " n"], holding: Holding) -> Float[Tens
 
 @torch.no_grad()
 def holding_score(score: Float[Tensor, " n"], holding: Holding) -> Float[Tensor, " n"]:
-    """Mean log-odds of success in trials; higher is better, comparable among hands and objects.
-
-    Args:
-        score: What the ranking network says of the grasps [log-odds].
-        holding: How they hold the object.
-    """
+    """Mean log-odds of success in trials; higher is better, comparable among hands and objects. Arguments as above."""
     return shipped_holding_score()(holding_features(score, holding)).mean(1)
 
 
 def load_holding_score(path: Path) -> HoldingScore:
-    """Read a model.
-
-    Raises:
-        WeightsError: There is no such file, or it is no such model.
-    """
+    """Read a model."""
     return load_small(
         path, lambda tensors: HoldingScore(len(tensors["layers.2.bias"]), len(tensors["layers.0.bias"])),
         "a score of settled grasps; train it again (scripts/train_holding_score.py)")

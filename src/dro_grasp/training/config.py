@@ -43,22 +43,10 @@ class LossConfig(Checked):
     divergence: float = 0.01
     divergence_form: Literal["batch_mean", "official"] = "batch_mean"
     """Sum over latents and mean over the batch, or the release's sum over all and sqrt(1 + x^2) - 1."""
-    divergence_warmup: float = 0.0
-    """Share of the schedule over which the divergence's weight grows from zero."""
-    free_bits: float = 0.0
-    """Divergence of each latent dimension that costs nothing [nat]."""
     motion: float = 1.0
     """Weight of the mean distance between the hand as z moves it and the true grasp; not in the paper's form."""
     flow: float = 0.01
     """Weight of the flow's loss; not in the paper's form."""
-    drawn: float = 0.0
-    """Weight of penetration and contact of the hands that a z drawn from its prior gives, as at inference. Source: ours."""
-    drawn_share: float = 0.5
-    """Share of the steps that draw one."""
-    touching: float = 0.006
-    """Distance between points of hand and object that counts as contact, half of that between an object's points [m]."""
-    reach: float = 0.03
-    """Fingers farther away from the object are not drawn to it [m]."""
     placement: float = 0.01
     """Weight of the placement prior's loss; it shares no parameter with the rest."""
 
@@ -72,7 +60,6 @@ class ScheduleConfig(Checked):
     """Optimiser and bookkeeping of both loops."""
 
     steps: int = 10_000
-    """Optimiser steps."""
     minutes: float | None = None
     """Time limit [min]; the learning rate follows steps or time, whichever is further on."""
     learning_rate: float = 1e-3
@@ -109,9 +96,7 @@ class TrainConfig(Checked):
     losses: LossConfig = LossConfig()
     augmentation: AugmentationConfig = AugmentationConfig()
     hands_per_step: int = 4
-    """Different hands in one step."""
     samples_per_hand: int = 4
-    """Grasps of each of these hands."""
     by_count: float = 0.0
     """Hands are drawn in proportion to the number of their grasps to this power; at 0 each as often as any other."""
     columns: int = 48
@@ -120,17 +105,10 @@ class TrainConfig(Checked):
     """Keep a pretrained or given hand encoder as it is. Source: paper section III-C."""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be drawn or weighed.
-
-        Raises:
-            OptionError: `by_count` is not between 0 and 1, or the weight of drawn hands is negative or not finite.
-        """
         super().__post_init__()
         if not 0 <= self.by_count <= 1:
             raise OptionError(f"by_count is {self.by_count}; give 0 to draw all hands equally often, 1 to draw them by their "
                               "grasps, or a number between")
-        if not 0 <= self.losses.drawn < math.inf:
-            raise OptionError(f"drawn is {self.losses.drawn}; give a weight from 0 on, for example 1")
 
 
 @dataclass(frozen=True)
@@ -142,7 +120,6 @@ class PlacementConfig(Checked):
     hands_per_step: int = 8
     samples_per_hand: int = 12
     by_count: float = 0.5
-    """As in main training."""
 
 
 @dataclass(frozen=True)

@@ -1,26 +1,27 @@
-"""Main training of the D(R,O) network. Source: paper section III-E."""
+"""Main training of the D(R,O) network, and of its placement prior alone, which shares no parameter with the rest.
+
+Source: paper section III-E; the prior is ours.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp import distance_matrix
 from dro_grasp.datasets.bundle.training_file import Bundle
+from dro_grasp.errors import TrainingError
 from dro_grasp.geometry.se3 import apply
-from dro_grasp.hands.hand import Hand
-from dro_grasp.models.network import DistanceNetwork, untrained_network
+from dro_grasp.models.network import DistanceNetwork, take_initial, take_pretrained, untrained_network
+from dro_grasp.models.placement import PlacementPrior
 from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.training import losses
-from dro_grasp.training.config import TrainConfig
-from dro_grasp.training.given_weights import take_initial, take_pretrained
-from dro_grasp.training.placement_training import measure_hands, placement_losses
-from dro_grasp.training.reports import Report, console_report
-from dro_grasp.training.run_plan import run_plan
-from dro_grasp.training.runs import Losses, TrainingRun, begin, recalibrate
+from dro_grasp.training.config import PlacementConfig, TrainConfig
+from dro_grasp.training.run_folder import run_plan
+from dro_grasp.training.runs import Losses, Report, TrainingRun, begin, console_report, recalibrate
 from dro_grasp.training.samples import HandSamples, SampleSource
 
 
@@ -69,8 +70,7 @@ def train(
         names = source.draw_hands(config.hands_per_step, generator, config.by_count)
         return [source.draw(hand, config.samples_per_hand, generator) for hand in names]
 
-    run.train(lambda: step_losses(model, draw(), config, generator, run.progress), report or console_report("training"))
-    model.load_state_dict(run.average.module.state_dict())
+    run.train(lambda: step_losses(model, draw(), config, generator), report or console_report("training"))
     run.seed_shard()
     recalibrate(model, lambda: model(*_clouds(draw()), generator, columns=1), config.schedule.recalibration)
     model.mixed = False
@@ -78,59 +78,89 @@ def train(
 
 
 def step_losses(
-    model: DistanceNetwork, groups: list[HandSamples], config: TrainConfig, generator: torch.Generator, progress: float = 1.0
+    model: DistanceNetwork, groups: list[HandSamples], config: TrainConfig, generator: torch.Generator
 ) -> Losses:
-    """All losses of one batch, by name, with their weighted sum as `total`, and the plain divergence as `nats`.
-
-    The model is in training mode; `progress` is the share of the schedule that is done.
-    """
+    """All losses of one batch, by name, with their weighted sum as `total`, and the plain divergence as `nats`."""
     placed, obj, grasp = _clouds(groups)
-    draw = config.losses.drawn > 0 and bool(
-        torch.rand((), generator=generator, device=generator.device) < config.losses.drawn_share)
-    output = model(placed, obj, grasp, generator, columns=config.columns, draw=draw)
+    output = model(placed, obj, grasp, generator, columns=config.columns)
     anchors = obj[:, : config.columns]
     parts = {"distance": losses.distance_loss(output.distances, distance_matrix.build(grasp, anchors))}
-    poses, penetrations, drawn = [], [], []
+    poses, penetrations = [], []
     start = 0
     for group in groups:
         rows = slice(start, start + len(group.placed))
-        links, posed, _ = _posed(group.hand, output.distances[rows], anchors[rows])
+        links = distance_matrix.decode(group.hand, output.distances[rows], anchors[rows])
         poses.append(losses.pose_loss(links.T_world_link, group.T_frame_link, links.valid))
+        kept = links.valid[group.hand.link_index]
+        posed = apply(links.T_world_link[:, group.hand.link_index[kept]], group.hand.link_points[kept])
         penetrations.append(losses.penetration_loss(posed, group.obj, group.normals))
-        if output.drawn is not None:
-            _, posed, finger = _posed(group.hand, output.drawn[rows], anchors[rows])
-            inside = losses.penetration_loss(posed, group.obj, group.normals)
-            apart = losses.contact_loss(posed, finger, group.obj, config.losses.touching, config.losses.reach)
-            drawn.append(config.losses.penetration * inside + apart)
         start = rows.stop
     parts["pose"] = torch.cat(poses).mean()
     parts["penetration"] = torch.cat(penetrations).mean()
-    if config.losses.drawn > 0:
-        parts["drawn"] = torch.cat(drawn).mean() if drawn else output.distances.new_zeros(())
     nats = losses.divergence(output.mean, output.log_variance)
-    parts["divergence"] = losses.divergence_loss(nats, config.losses.divergence_form, config.losses.free_bits)
+    parts["divergence"] = losses.divergence_loss(nats, config.losses.divergence_form)
     if model.placement is not None:
         parts["motion"] = (output.moved - grasp).norm(dim=-1).mean()
         parts["flow"] = output.flow_error.mean()
         parts["placement"] = placement_losses(model.placement, groups, config.augmentation.proportions, generator)["total"]
     weights = {name: getattr(config.losses, name) for name in parts}
-    if progress < config.losses.divergence_warmup:
-        weights["divergence"] *= progress / config.losses.divergence_warmup
     total = torch.stack([weights[name] * value for name, value in parts.items()]).sum()
     return {"total": total, **parts, "nats": nats.sum(-1).mean()}
 
 
-def _posed(
-    hand: Hand, distances: Float[Tensor, "b n columns"], anchors: Float[Tensor, "b columns 3"]
-) -> tuple[distance_matrix.LinkPoses, Float[Tensor, "b k 3"], Int[Tensor, " k"]]:
-    """Link poses of predicted distances, the points of links that have one [m], and the finger of each point."""
-    links = distance_matrix.decode(hand, distances, anchors)
-    kept = links.valid[hand.link_index]
-    index = hand.link_index[kept]
-    return links, apply(links.T_world_link[:, index], hand.link_points[kept]), hand.finger_of_link[index]
-
-
 def _clouds(groups: list[HandSamples]) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b m 3"], Float[Tensor, "b n 3"]]:
-    """The network's inputs: open hands, objects, grasps [m]."""
     placed, obj, grasp = (torch.cat([getattr(g, n) for g in groups]) for n in ("placed", "obj", "grasp"))
     return placed, obj, grasp
+
+
+def train_placement(
+    bundle: Bundle, network: NetworkConfig, config: PlacementConfig, folder: Path, initial: DistanceNetwork,
+    report: Report | None = None, name: str = "trained",
+) -> DistanceNetwork:
+    """Train the placement prior of given weights, and nothing else; arguments, result and errors as those of `train`.
+
+    Raises:
+        TrainingError: The network has no placement prior.
+    """
+    processes, device = begin(config.schedule)
+    model = untrained_network(network, config.schedule.seed, name)
+    take_initial(model, initial)
+    model.to(device).eval()
+    prior, generator = model.placement, torch.Generator(device)
+    if prior is None:
+        raise TrainingError(
+            f"'{initial.name}' has no placement prior: in frame '{network.frame}' the network knows no placement")
+    source = SampleSource(bundle, network, config.augmentation, device)
+    plan = run_plan(config, bundle, network, initial=initial)
+    run = TrainingRun(folder, prior, config.schedule, generator, processes, plan)
+
+    def step() -> Losses:
+        names = source.draw_hands(config.hands_per_step, generator, config.by_count)
+        groups = [source.draw(hand, config.samples_per_hand, generator) for hand in names]
+        return placement_losses(prior, groups, config.augmentation.proportions, generator)
+
+    run.train(step, report or console_report("placement"))
+    return model.cpu().eval()
+
+
+def measure_hands(model: DistanceNetwork, source: SampleSource) -> None:
+    """Let a placement prior know the proportions of the hands in training."""
+    if model.placement is not None:
+        model.placement.standardised.measure(torch.stack([source.proportions[name] for name in source.names]))
+
+
+def placement_losses(
+    prior: PlacementPrior, groups: list[HandSamples], noise: float, generator: torch.Generator
+) -> Losses:
+    """The prior's loss as `total`, and what it has learned, with `noise` on proportions, in their spreads.
+
+    `log_density` is that of true positions [nat], `preferred` the share of pairs of a true and a random rotation in which the
+    true one has the higher score.
+    """
+    rows = torch.cat([group.proportions.expand(len(group.placed), -1) for group in groups])
+    hand = rows + noise * prior.standardised.spread * torch.randn(rows.shape, generator=generator, device=rows.device)
+    obj, other, position = (torch.cat([getattr(g, n) for g in groups]) for n in ("obj_hand", "obj_random", "position"))
+    density, score = prior.log_density(obj, hand, position)
+    other_score = prior(other, hand)[3]
+    preferred = (score[:, None] > other_score).float().mean()
+    return {"total": losses.placement_loss(density, score, other_score), "log_density": density.mean(), "preferred": preferred}

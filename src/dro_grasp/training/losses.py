@@ -5,11 +5,9 @@ from __future__ import annotations
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
-
-from dro_grasp.geometry.point_clouds import point_distances
 
 
 def distance_loss(predicted: Float[Tensor, "b n m"], true: Float[Tensor, "b n m"]) -> Float[Tensor, ""]:
@@ -55,43 +53,16 @@ def penetration_loss(
     return functional.relu(-signed).mean(-1)
 
 
-def contact_loss(
-    hand: Float[Tensor, "b n 3"], finger: Int[Tensor, " n"], obj: Float[Tensor, "b m 3"], touching: float, reach: float
-) -> Float[Tensor, " b"]:
-    """Mean over fingers of how far each is from touching the object [m]; those out of reach cost the same everywhere. Ours.
-
-    Args:
-        hand: Points of the hand [m].
-        finger: Finger of each point; negative for the palm, whose points do not count.
-        obj: Points of the object [m].
-        touching: Distance between points of the two that counts as contact [m].
-        reach: Distance beyond which a finger is not drawn near [m].
-    """
-    offset = point_distances(hand, obj).amin(-1)
-    nearest = torch.stack([offset[:, finger == i].amin(1) for i in finger[finger >= 0].unique().tolist()], 1)
-    return (nearest.clamp(touching, reach) - touching).mean(1)
-
-
-def divergence(
-    mean: Float[Tensor, "b d"], log_variance: Float[Tensor, "b d"]
-) -> Float[Tensor, "b d"]:
+def divergence(mean: Float[Tensor, "b d"], log_variance: Float[Tensor, "b d"]) -> Float[Tensor, "b d"]:
     """KL divergence of the posterior from N(0, I) [nat], per grasp and latent dimension."""
     return 0.5 * (log_variance.exp() + mean.square() - 1 - log_variance)
 
 
-def divergence_loss(
-    divergence: Float[Tensor, "b d"], form: Literal["batch_mean", "official"], free_bits: float = 0.0
-) -> Float[Tensor, ""]:
-    """Loss of the divergences of a batch.
-
-    Args:
-        form: `batch_mean` sums over latents and takes the mean over the batch; `official` is the release's, summed over
-            the whole batch, then sqrt(1 + x^2) - 1.
-        free_bits: Nats of each dimension that cost nothing, on average over the batch. Source: Kingma et al. 2016.
-    """
+def divergence_loss(divergence: Float[Tensor, "b d"], form: Literal["batch_mean", "official"]) -> Float[Tensor, ""]:
+    """Sum over latents and mean over the batch, or `official`: the release's, summed over all, then sqrt(1 + x^2) - 1."""
     if form == "official":
         return (1 + divergence.sum().square()).sqrt() - 1
-    return divergence.mean(0).clamp_min(free_bits).sum()
+    return divergence.mean(0).sum()
 
 
 def contrastive_loss(

@@ -12,14 +12,12 @@ from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.errors import TrainingError
 from dro_grasp.models.encoder import StaticGraphEncoder
 from dro_grasp.models.latent import HandMotion, sample_posterior
-from dro_grasp.models.network import DistanceNetwork, untrained_network
+from dro_grasp.models.network import DistanceNetwork, take_initial, untrained_network
 from dro_grasp.models.presets import NetworkConfig
 from dro_grasp.training.config import AugmentationConfig, MotionConfig, PretrainConfig
-from dro_grasp.training.given_weights import take_initial
 from dro_grasp.training.losses import contrastive_loss, divergence
-from dro_grasp.training.reports import Report, console_report
-from dro_grasp.training.run_plan import run_plan
-from dro_grasp.training.runs import Losses, TrainingRun, begin, recalibrate
+from dro_grasp.training.run_folder import run_plan
+from dro_grasp.training.runs import Losses, Report, TrainingRun, begin, console_report, recalibrate
 from dro_grasp.training.samples import SampleSource, random_turns
 
 
@@ -29,18 +27,10 @@ def pretrain(
 ) -> DistanceNetwork:
     """Pretrain the hand encoder on the bundle's hands: on their grasps, and on any pose of those without.
 
-    Args:
-        folder: Run folder; a checkpoint in it is resumed.
-        report: Called every few steps; the console by default.
-        initial: Weights to begin with; `network` must be their configuration.
+    Arguments and errors are those of `train`.
 
     Returns:
         A network with a trained hand encoder and otherwise as it began, on the CPU, in evaluation mode.
-
-    Raises:
-        OptionError: The schedule cannot be carried out here.
-        TrainingError: A loss is not finite.
-        WeightsError: `initial` does not fit the network.
     """
     processes, device = begin(config.schedule)
     whole = untrained_network(network, config.schedule.seed, "pretrained")
@@ -58,7 +48,6 @@ def pretrain(
         return {"total": contrastive_step(encoder, source, config, generator)}
 
     run.train(losses, report or console_report("pretraining"))
-    encoder.load_state_dict(run.average.module.state_dict())
     run.seed_shard()
     recalibrate(encoder, losses, config.schedule.recalibration)
     return whole.cpu().eval()
@@ -67,19 +56,12 @@ def pretrain(
 def pretrain_motion(
     model: DistanceNetwork, bundle: Bundle, config: MotionConfig, folder: Path, report: Report | None = None
 ) -> DistanceNetwork:
-    """Train z to encode how hands move, without objects; the hand encoder stays as it is.
+    """Train z to encode how hands move, without objects, in a network whose pretrained hand encoder stays as it is.
 
-    Args:
-        model: A network whose z moves the hand, with a pretrained hand encoder.
-        folder: Run folder; a checkpoint in it is resumed.
-        report: Called every few steps; the console by default.
-
-    Returns:
-        The same network, on the CPU, in evaluation mode.
+    Arguments and errors are those of `train`; the network is returned on the CPU, in evaluation mode.
 
     Raises:
-        OptionError: The schedule cannot be carried out here.
-        TrainingError: A loss is not finite, or z does not move the hand in this network.
+        TrainingError: z does not move the hand in this network.
     """
     if model.motion is None:
         raise TrainingError(f"a network in frame '{model.config.frame}' has no motion to pretrain; choose frame 'palm'")
@@ -90,12 +72,7 @@ def pretrain_motion(
     plan = run_plan(config, bundle, model.config)
     run = TrainingRun(folder, motion, config.schedule, generator, processes, plan)
     motion.train()
-
-    def losses() -> Losses:
-        return motion_losses(motion, encoder, source, config, generator)
-
-    run.train(losses, report or console_report("motion"))
-    motion.load_state_dict(run.average.module.state_dict())
+    run.train(lambda: motion_losses(motion, encoder, source, config, generator), report or console_report("motion"))
     return model.cpu().eval()
 
 
@@ -119,8 +96,6 @@ def contrastive_step(
     encoder: StaticGraphEncoder, source: SampleSource, config: PretrainConfig, generator: torch.Generator
 ) -> Float[Tensor, ""]:
     """Loss of one batch: grasps (cloud A) against the open hand (cloud B) with a similar wrist rotation.
-
-    A hand without grasps takes any joint values instead.
 
     A network that does not know the placement gets both as in its training: the grasp as it is stored, the open hand tilted.
     """

@@ -17,12 +17,10 @@ from dro_grasp.errors import OptionError
 
 @dataclass(frozen=True)
 class Processes:
-    """This process among those that train together; a process alone by default."""
+    """This process, by its number, among those that train together; a process alone by default."""
 
     rank: int = 0
-    """Number of this process."""
     count: int = 1
-    """Number of processes."""
 
     @property
     def first(self) -> bool:
@@ -63,9 +61,6 @@ def join(device: str) -> tuple[Processes, str]:
 
     Processes stay joined until they end, so a second stage of training finds them joined. Device `cuda` stands for the GPU
     with this process's number on its machine.
-
-    Raises:
-        OptionError: torchrun started more processes on this machine than it has GPUs.
     """
     if process_count() == 1:
         return Processes(), device

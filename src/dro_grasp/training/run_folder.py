@@ -1,4 +1,4 @@
-"""The folder of a training run: its log, and the checkpoint from which it resumes."""
+"""The folder of a training run: its log, the checkpoint from which it resumes, and what it must have in common with it."""
 
 from __future__ import annotations
 
@@ -9,13 +9,18 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.errors import OutputError, TrainingError
 from dro_grasp.files import FOREIGN, UNTYPED, is_unread, reason_of, replacing, set_aside
+from dro_grasp.models.network import DistanceNetwork
+from dro_grasp.models.presets import NetworkConfig
+from dro_grasp.records import flat
 
 CHECKPOINT = "checkpoint.pt"
 """File with everything that a run needs to resume."""
@@ -47,10 +52,6 @@ class RunFolder:
 
         A damaged one is set aside with its log, and the run begins anew: there is nothing else to go on from. One that
         cannot be read now may be sound, and is left alone.
-
-        Raises:
-            TrainingError: The checkpoint cannot be read, or is of a run with another plan.
-            OutputError: A damaged one cannot be set aside.
         """
         path = self.path / CHECKPOINT
         if not path.is_file():
@@ -112,12 +113,7 @@ class RunFolder:
 
 
 def _state(path: Path) -> dict[str, Any]:
-    """The entries of a checkpoint. Its bytes are read first, as PyTorch's reader hides a failing disk in a RuntimeError.
-
-    Raises:
-        ValueError: It lacks some, or holds something else.
-    """
-    content = io.BytesIO(path.read_bytes())
+    content = io.BytesIO(path.read_bytes())  # PyTorch's reader would hide a failing disk in a RuntimeError
     try:
         state = torch.load(content, weights_only=True, map_location="cpu")
     except UNTYPED as error:  # PyTorch takes a damaged pickle's entries for what they should be
@@ -132,3 +128,29 @@ def _state(path: Path) -> dict[str, Any]:
 def last_logged(folder: Path) -> dict[str, float]:
     """The last line of a run's log: steps, seconds and losses at its end."""
     return json.loads((folder / LOG).read_text().splitlines()[-1])
+
+
+BOOKKEEPING = frozenset({"minutes", "device", "log_every", "checkpoint_seconds", "tensorboard"})
+"""Settings of a schedule that a resumed run may change: how long it goes on, where, and what it tells."""
+
+
+def run_plan(
+    config: Any, bundle: Bundle, network: NetworkConfig | None = None, **given: DistanceNetwork | None
+) -> dict[str, Any]:
+    """What determines the curve of a run, by name: settings of the stage and its network, content of the data, weights.
+
+    `given` are weights that the run begins with or takes parts of, by role; their parameters count, not their names.
+    """
+    settings = {name: value for name, value in flat(config).items() if name.removeprefix("schedule.") not in BOOKKEEPING}
+    weights = {role: None if each is None else _digest(each) for role, each in given.items()}
+    about = {} if network is None else flat(network, "network.")
+    return {name.removeprefix("schedule."): value for name, value in settings.items()} | about | weights | {
+        "bundle": bundle.fingerprint}
+
+
+def _digest(network: DistanceNetwork) -> str:
+    """Twelve digits that tell parameters apart; statistics of BatchNorm do not count, as each sitting measures its own."""
+    digest = sha256()
+    for parameter in network.parameters():
+        digest.update(parameter.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()[:12]

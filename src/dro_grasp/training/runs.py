@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +18,61 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from dro_grasp.devices import fast_products, require_device
 from dro_grasp.errors import OptionError, TrainingError
+from dro_grasp.extras import require_extra
 from dro_grasp.files import make_folder
 from dro_grasp.training.config import ScheduleConfig
 from dro_grasp.training.processes import Processes, join, process_count
-from dro_grasp.training.reports import Report, RunProgress, require_tensorboard, tensorboard_report
 from dro_grasp.training.run_folder import RunFolder
+
+SECONDS_BETWEEN_LINES = 10.0
+"""Least time between two lines on the console [s]. Source: ours."""
+
+
+@dataclass(frozen=True)
+class RunProgress:
+    """How far a run is: steps done, those of the schedule, and the share of it that is done, from 0 to 1."""
+
+    step: int
+    steps: int
+    share: float
+
+
+Report = Callable[[RunProgress, dict[str, float]], None]
+"""Called with a run's progress and the mean losses since the last call."""
+
+
+def console_report(title: str) -> Report:
+    """Prints losses and the time left to stderr, every few seconds and at the end."""
+    printed, begin, first = 0.0, time.monotonic(), -1.0
+
+    def report(run: RunProgress, means: dict[str, float]) -> None:
+        nonlocal printed, first
+        now = time.monotonic()
+        first = run.share if first < 0 else first
+        if now - printed < SECONDS_BETWEEN_LINES and run.share < 1:
+            return
+        printed = now
+        left = f"{(now - begin) / (run.share - first) * (1 - run.share) / 60:.0f} min left" if run.share > first else ""
+        text = "  ".join(f"{name} {value:.4f}" for name, value in means.items())
+        print(f"{title} {run.step}/{run.steps}  {text}  {left}", file=sys.stderr, flush=True)
+
+    return report
+
+
+def tensorboard_report(folder: Path) -> Report:
+    """Writes losses for TensorBoard, which must be installed."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    writer = SummaryWriter(str(folder))
+
+    def report(run: RunProgress, means: dict[str, float]) -> None:
+        for name, value in means.items():
+            writer.add_scalar(name, value, run.step)
+        if run.share >= 1:
+            writer.close()
+
+    return report
+
 
 Losses = dict[str, Float[Tensor, ""]]
 """Losses of a batch by name; `total` is minimised."""
@@ -42,7 +94,6 @@ class TrainingRun:
         Args:
             model: What is trained, on its device; parameters that require no gradient stay as they are.
             generator: Source of all random numbers of the losses, on the model's device.
-            processes: Those that train together; this one alone by default.
             plan: What determines the curve beside the schedule (see `run_plan`): a checkpoint resumes only with the same.
         """
         self.folder, self.model, self.schedule, self.generator = RunFolder(folder), model, schedule, generator
@@ -66,7 +117,7 @@ class TrainingRun:
         return steps if limit is None else max(steps, self.seconds / (60 * limit))
 
     def train(self, losses: Callable[[], Losses], report: Report) -> None:
-        """Make the folder or resume from its checkpoint, then step until the schedule ends; it reports every few steps.
+        """Make the folder or resume from its checkpoint, step until the schedule ends, and give the model the average.
 
         Raises:
             TrainingError: A loss or the gradient is not finite, or the folder holds the checkpoint of another run.
@@ -82,6 +133,7 @@ class TrainingRun:
         with fast_products():
             self._steps(losses, reports)
         self.save()
+        self.model.load_state_dict(self.average.module.state_dict())
 
     def seed_shard(self, shard: int = 0) -> None:
         """Seed the random numbers of a shard of the next step."""
@@ -179,7 +231,7 @@ class TrainingRun:
 
 
 def begin(schedule: ScheduleConfig) -> tuple[Processes, str]:
-    """Check a schedule before any work for it, join the other processes, and take a device."""
+    """Check a schedule, join the other processes, and take a device."""
     check_schedule(schedule)
     return join(schedule.device)
 
@@ -191,12 +243,7 @@ def learning_rate_share(step: int, progress: float, schedule: ScheduleConfig) ->
 
 
 def check_schedule(schedule: ScheduleConfig) -> None:
-    """Refuse a schedule that cannot be carried out here.
-
-    Raises:
-        OptionError: A number is not positive and finite, this machine lacks the device, TensorBoard is asked for and not
-            installed, or the processes would get different numbers of shards.
-    """
+    """Refuse a schedule that cannot be carried out here."""
     require_device(schedule.device)
     for name in ("steps", "minutes", "learning_rate", "log_every", "recalibration", "shards"):
         value = getattr(schedule, name)
@@ -206,7 +253,7 @@ def check_schedule(schedule: ScheduleConfig) -> None:
         raise OptionError(f"{process_count()} processes cannot share {schedule.shards} shards a step; give a multiple of "
                           f"{process_count()}")
     if schedule.tensorboard:
-        require_tensorboard()
+        require_extra("tensorboard")
 
 
 @torch.no_grad()

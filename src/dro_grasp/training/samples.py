@@ -32,17 +32,15 @@ class HandSamples:
     obj: Float[Tensor, "b m 3"]
     """The object [m], in random order."""
     normals: Float[Tensor, "b m 3"]
-    """Its normals."""
     T_frame_link: Float[Tensor, "b l 4 4"]
     """True poses of all links in the grasp."""
     obj_hand: Float[Tensor, "b m 3"]
     """The object in the axes of the true hand [m], for the placement prior."""
     obj_random: Float[Tensor, "b m 3"]
-    """The object in the axes of a random hand [m], for the placement prior."""
+    """The same in the axes of a random hand."""
     position: Float[Tensor, "b 3"]
     """True position of the grasp centre in the hand's axes [m]."""
     proportions: Float[Tensor, " f"]
-    """The hand's proportions, for the placement prior."""
 
 
 class SampleSource:
@@ -51,34 +49,23 @@ class SampleSource:
     def __init__(
         self, bundle: Bundle, network: NetworkConfig, augmentation: AugmentationConfig, device: torch.device | str = "cpu"
     ) -> None:
-        """Put hands, grasps and objects on the device of the samples, and of the generators that draw them.
-
-        Raises:
-            BundleError: The bundle holds no grasps.
-        """
         self.network, self.augmentation = network, augmentation
         if bundle.n_grasps == 0:
             raise BundleError("the bundle holds no grasps; synthesise some first")
         self.hands = {name: hand.with_points(network.n_hand).to(device) for name, hand in bundle.hands.items()}
         self.grasps = {name: grasps.to(device) for name, grasps in bundle.grasps.items()}
         self.names = [name for name, grasps in bundle.grasps.items() if len(grasps.joints)]
-        """Hands with grasps."""
-        self.without = [name for name in bundle.hands if name not in self.names]
-        """Hands without, for pretraining."""
+        self.without = [name for name in bundle.hands if name not in self.names]  # for pretraining
         self.proportions = {
             name: proportions(self.hands[name], network.axes(self.hands[name].palm_axes_wrist)) for name in self.names}
-        """Proportions of each hand with grasps, in the network's axes."""
         self.points = torch.stack([cloud.points for cloud in bundle.objects.values()]).to(device)
         self.normals = torch.stack([cloud.normals for cloud in bundle.objects.values()]).to(device)
         self.centres = self.points.mean(1)
 
     def draw_hands(self, count: int, generator: torch.Generator, by_count: float = 0.0) -> list[str]:
-        """Names of the hands of one step.
+        """Names of the hands of one step; none comes twice where there are enough.
 
-        Args:
-            count: How many; none comes twice where there are enough.
-            generator: Source of randomness.
-            by_count: A hand is drawn in proportion to the number of its grasps to this power; at 0 as often as any other.
+        A hand is drawn in proportion to the number of its grasps to the power `by_count`, at 0 as often as any other.
         """
         device = generator.device
         if by_count == 0:
@@ -98,20 +85,24 @@ class SampleSource:
         self, name: str, count: int, generator: torch.Generator
     ) -> tuple[Float[Tensor, "b 4 4"], Float[Tensor, "b n_dof"], Float[Tensor, "b 3"]]:
         """Wrist poses, joints, and centres of the objects [m] of random grasps; for a hand without, anything within limits."""
-        hand, grasps = self.hands[name], self.grasps[name]
-        if not len(grasps.joints):
+        hand = self.hands[name]
+        if name in self.without:
             T = compose(random_rotations(count, generator), hand.grasp_centre_wrist.new_zeros(count, 3))
             return T, hand.random_joints(count, generator), hand.grasp_centres(T)
+        T, joints, index = self._grasps(name, count, generator)
+        return T, joints, self.centres[index]
+
+    def _grasps(
+        self, name: str, count: int, generator: torch.Generator
+    ) -> tuple[Float[Tensor, "b 4 4"], Float[Tensor, "b n_dof"], Int[Tensor, " b"]]:
+        grasps = self.grasps[name]
         chosen = torch.randint(len(grasps.joints), (count,), generator=generator, device=generator.device)
-        T = grasps.T_object_wrist[chosen]
-        return T, grasps.joints[chosen], self.centres[grasps.object_index[chosen]]
+        return grasps.T_object_wrist[chosen], grasps.joints[chosen], grasps.object_index[chosen]
 
     def draw(self, name: str, count: int, generator: torch.Generator) -> HandSamples:
         """Samples of one hand."""
-        hand, grasps = self.hands[name], self.grasps[name]
-        chosen = torch.randint(len(grasps.joints), (count,), generator=generator, device=generator.device)
-        T, q = grasps.T_object_wrist[chosen], grasps.joints[chosen]
-        points, normals = self._objects(grasps.object_index[chosen], generator)
+        hand, (T, q, index) = self.hands[name], self._grasps(name, count, generator)
+        points, normals = self._objects(index, generator)
         centre = points.mean(1)
         T_placed = self._placements(hand, T, generator) if self.network.placed else self._centred(hand, T, centre, generator)
         own = self.network.axes(hand.palm_axes_wrist)
@@ -153,13 +144,7 @@ class SampleSource:
     def tilted(
         self, T: Float[Tensor, "b 4 4"], centre: Float[Tensor, "b 3"], generator: torch.Generator
     ) -> Float[Tensor, "b 3 3"]:
-        """Wrist rotations of open hands near those of grasps, for a network that does not know the placement.
-
-        Args:
-            T: Wrist poses of grasps.
-            centre: Centres of their objects, in the same frame [m].
-            generator: Source of randomness.
-        """
+        """Wrist rotations of open hands near grasps with wrists T of objects about `centre` [m], if no placement is known."""
         toward = torch.nn.functional.normalize(centre - T[:, :3, 3], dim=-1)
         return random_turns(len(T), self.augmentation.tilt, generator, toward) @ T[:, :3, :3]
 
@@ -173,7 +158,6 @@ class SampleSource:
     def _objects(
         self, index: Int[Tensor, " b"], generator: torch.Generator
     ) -> tuple[Float[Tensor, "b m 3"], Float[Tensor, "b m 3"]]:
-        """Random object points with noise [m], and their normals."""
         m, device = self.network.n_object, generator.device
         twice = torch.randint(self.points.shape[1], (len(index), 2 * m), generator=generator, device=device)
         direction = torch.randn(len(index), 3, generator=generator, device=device)

@@ -54,12 +54,10 @@ def split_of(hand: str, object_split: str) -> str:
 
 @dataclass(frozen=True)
 class ObjectCloud:
-    """Surface points of an object."""
+    """Surface points of an object [m], with outward unit normals."""
 
     points: Float[Tensor, "k 3"]
-    """[m]"""
     normals: Float[Tensor, "k 3"]
-    """Outward unit normals."""
 
 
 @dataclass(frozen=True)
@@ -67,11 +65,10 @@ class HandGrasps:
     """All grasps of one hand."""
 
     T_object_wrist: Float[Tensor, "n 4 4"]
-    """Wrist poses."""
     joints: Float[Tensor, "n n_dof"]
     """Independent joints [rad or m]."""
     object_index: Int[Tensor, " n"]
-    """Index into the bundle's object names."""
+    """Index into the bundle's objects."""
 
     def to(self, device: torch.device | str) -> HandGrasps:
         """The same grasps on another device."""
@@ -100,11 +97,8 @@ class Bundle:
     @cached_property
     def fingerprint(self) -> str:
         """Twelve digits that tell bundles with other hands, objects or grasps apart."""
-        digest = sha256()
-        for name, hand in self.hands.items():
-            digest.update(f"{name} {hand.sha256}".encode())
-        for name in self.objects:
-            digest.update(name.encode())
+        named = [*(f"{name} {hand.sha256}" for name, hand in self.hands.items()), *self.objects]
+        digest = sha256("".join(named).encode())
         clouds = [tensor for cloud in self.objects.values() for tensor in (cloud.points, cloud.normals)]
         grasps = [tensor for g in self.grasps.values() for tensor in (g.T_object_wrist, g.joints, g.object_index)]
         for tensor in (*clouds, *grasps):
@@ -113,10 +107,8 @@ class Bundle:
 
     def summary(self) -> dict[str, Any]:
         """Counts of hands, objects and grasps."""
-        return {
-            "hands": {name: len(g.joints) for name, g in self.grasps.items()},
-            "objects": len(self.objects), "grasps": self.n_grasps,
-        }
+        return {"hands": {name: len(g.joints) for name, g in self.grasps.items()}, "objects": len(self.objects),
+                "grasps": self.n_grasps}
 
 
 def write_bundle(
@@ -126,12 +118,9 @@ def write_bundle(
     """Write a training bundle of grasps of some splits, by these hands on objects with these clouds.
 
     Args:
-        path: File to write.
-        hands: Hands of the grasps.
-        objects: Clouds by name.
         grasps: At least one grasp of each of these hands.
         splits: Splits that the grasps may be of.
-        without_grasps: Hands without grasps, for pretraining.
+        without_grasps: Further hands, for pretraining.
 
     Raises:
         BundleError: A grasp is of another split, its hand or object is missing, two hands share a name, or the file grows
@@ -153,12 +142,12 @@ def write_bundle(
     header: dict[str, Any] = {"format_version": FORMAT_VERSION, "objects": names, "hands": []}
     for i, (name, cloud) in enumerate(objects.items()):
         tensors |= _pack_cloud(f"object.{i}", cloud, name)
-    for i, hand in enumerate(hands):
+    for i, hand in enumerate((*hands, *without_grasps)):
         header["hands"].append(_pack_hand(f"hand.{i}", hand, tensors))
-        tensors |= _pack_grasps(f"grasps.{i}", hand, [b for b in grasps if b.hand_sha256 == hand.sha256], names, splits)
-    for i, hand in enumerate(without_grasps, len(hands)):
-        header["hands"].append(_pack_hand(f"hand.{i}", hand, tensors))
-        tensors |= _grasp_tensors(f"grasps.{i}", torch.zeros(0, 4, 4), torch.zeros(0, hand.tree.n_dof), [])
+        if i < len(hands):
+            tensors |= _pack_grasps(f"grasps.{i}", hand, [b for b in grasps if b.hand_sha256 == hand.sha256], names, splits)
+        else:
+            tensors |= _grasp_tensors(f"grasps.{i}", torch.zeros(0, 4, 4), torch.zeros(0, hand.tree.n_dof), [])
     size = sum(t.numel() * t.element_size() for t in tensors.values())
     if size > MAX_BYTES:
         raise BundleError(f"the bundle would have {size / 1e6:.1f} MB, at most {MAX_BYTES / 1e6:.0f} MB are allowed; take "
@@ -193,11 +182,7 @@ def load_bundle(path: Path | str) -> Bundle:
 
 
 def _checked(bundle: Bundle) -> Bundle:
-    """Refuse hands, clouds and grasps that do not fit each other.
-
-    Raises:
-        ValueError: As said; its text names the part.
-    """
+    """Refuse, by a ValueError, hands, clouds and grasps that do not fit each other."""
     for name, cloud in bundle.objects.items():
         if cloud.points.shape != cloud.normals.shape or cloud.points.shape[1:] != (3,) or not len(cloud.points):
             raise ValueError(f"the cloud of object '{name}' has points {tuple(cloud.points.shape)}")
@@ -242,8 +227,7 @@ def _unpack_cloud(key: str, tensors: Tensors) -> ObjectCloud:
 
 
 def _pack_hand(key: str, hand: Hand, tensors: Tensors) -> dict[str, Any]:
-    """Tensors go into the file, plain values into its header."""
-    plain = {}
+    plain = {}  # values for the file's header; tensors go into the file
     for field, value in hand.to_tensors().items():
         if isinstance(value, Tensor):
             tensors[f"{key}.{field}"] = value.contiguous().clone()
@@ -269,7 +253,6 @@ def _pack_grasps(key: str, hand: Hand, batches: list[GraspBatch], names: list[st
 
 
 def _grasp_tensors(key: str, T: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"], objects: list[int]) -> Tensors:
-    """Grasps of one hand, or none."""
     quaternion = roma.rotmat_to_unitquat(T[:, :3, :3]) if len(T) else T.new_zeros(0, 4)
     return {
         f"{key}.position": T[:, :3, 3].contiguous(), f"{key}.quaternion_wxyz": roma.quat_xyzw_to_wxyz(quaternion).contiguous(),
@@ -281,8 +264,8 @@ def _unpack_grasps(key: str, tensors: Tensors) -> HandGrasps:
     quaternion = tensors[f"{key}.quaternion_wxyz"]
     if quaternion.shape[-1:] != (4,) or not quaternion.is_floating_point():
         raise ValueError(f"'{key}.quaternion_wxyz' is {quaternion.dtype} of shape {tuple(quaternion.shape)}")
-    quaternion = roma.quat_wxyz_to_xyzw(quaternion)
-    if not len(quaternion):
-        return HandGrasps(torch.zeros(0, 4, 4), tensors[f"{key}.joints"], tensors[f"{key}.object"].long())
-    rotation = roma.unitquat_to_rotmat(torch.nn.functional.normalize(quaternion, dim=-1))
-    return HandGrasps(compose(rotation, tensors[f"{key}.position"]), tensors[f"{key}.joints"], tensors[f"{key}.object"].long())
+    T = torch.zeros(0, 4, 4)
+    if len(quaternion):
+        quaternion = torch.nn.functional.normalize(roma.quat_wxyz_to_xyzw(quaternion), dim=-1)
+        T = compose(roma.unitquat_to_rotmat(quaternion), tensors[f"{key}.position"])
+    return HandGrasps(T, tensors[f"{key}.joints"], tensors[f"{key}.object"].long())

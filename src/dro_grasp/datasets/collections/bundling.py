@@ -5,19 +5,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence, Set
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from dro_grasp.datasets.bundle.training_file import SPLITS, Bundle, ObjectCloud, write_bundle
-from dro_grasp.datasets.collections.collection import read_collection
+from dro_grasp.datasets.collections.collection import Sources, read_collection
 from dro_grasp.datasets.collections.merging import require_choice, spread
 from dro_grasp.errors import BundleError
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.sources import hand_of, object_of, pair_keys, require_same
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import checked
-from dro_grasp.objects.shape import ObjectModel
 
 CLOUD_POINTS = 4096
 """Points of an object in a bundle (ours), of the 16,384 that it has in memory: a sample has 128 to 512 of them."""
@@ -82,23 +79,16 @@ def _why_none(split: str, seen: Counter[str], hands: Sequence[str], hands_seen: 
 def sources(batches: list[GraspBatch]) -> tuple[list[Hand], dict[str, ObjectCloud], list[GraspBatch]]:
     """The hands and object clouds of batches of one hand and one object, each once, and the batches with the hashes of these.
 
-    Hashes that the batches state are checked.
-
     Raises:
         BundleError: Different files have one name.
         GraspFileError: A hand or an object has changed since.
     """
-    hands: dict[Any, Hand] = {}
-    objects: dict[Any, ObjectModel] = {}
-    stated = []
+    loaded, stated = Sources(), []
     for grasps in batches:
-        whose, of = pair_keys(grasps)
-        hand = hands[whose] = hands.get(whose) or hand_of(grasps, None)
-        obj = objects[of] = objects.get(of) or object_of(grasps, None, 1.0)
-        require_same(grasps, hand, obj)
+        hand, obj = loaded.of(grasps)
         stated.append(grasps.replace(hand_sha256=hand.sha256, object_sha256=(obj.sha256,) * len(grasps)))
-    found = {hand.sha256: hand for hand in reversed(hands.values())}
-    named = {(name, obj.sha256): obj for (name, _), obj in objects.items()}
+    found = {hand.sha256: hand for hand in reversed(loaded.hands.values())}
+    named = {(name, obj.sha256): obj for (name, _), obj in loaded.objects.items()}
     for kind, names in (("hand", [hand.name for hand in found.values()]), ("object", [name for name, _ in named])):
         double = sorted({name for name in names if names.count(name) > 1})
         if double:
@@ -106,4 +96,4 @@ def sources(batches: list[GraspBatch]) -> tuple[list[Hand], dict[str, ObjectClou
     clouds = {
         name: ObjectCloud(torch.from_numpy(obj.cloud[:CLOUD_POINTS]), torch.from_numpy(obj.cloud_normals[:CLOUD_POINTS]))
         for (name, _), obj in named.items()}
-    return [found[sha256] for sha256 in dict.fromkeys(hand.sha256 for hand in hands.values())], clouds, stated
+    return [found[sha256] for sha256 in dict.fromkeys(hand.sha256 for hand in loaded.hands.values())], clouds, stated

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import torch
 
-from dro_grasp.datasets.collections.collection import PairGrasps
-from dro_grasp.datasets.engine.finger_labels import closed_where_it_holds
+from dro_grasp.datasets.collections.collection import PairGrasps, Sources
+from dro_grasp.datasets.engine.worker import closed_where_it_holds
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.sources import hand_of, object_of, pair_keys, require_same
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.outcome import TrialResult
@@ -30,13 +28,11 @@ class Agreement:
     """Stored verdicts against those of new trials, for some grasps."""
 
     protocol: str
-    """Protocol of the new trials."""
+    """Of the new trials."""
     evaluated: int = 0
-    """Number of new trials."""
     agreed: int = 0
-    """Trials with the stored verdict."""
+    """Of the trials, those with the stored verdict."""
     succeeded: int = 0
-    """Grasps that pass the new trial."""
     reasons: Counter[str] = field(default_factory=Counter)
     """Why stored successes fail now, counted."""
     hands: dict[str, tuple[int, int]] = field(default_factory=dict)
@@ -62,11 +58,7 @@ class Agreement:
 def check(
     pairs: Iterable[PairGrasps], sample: int, rules: Protocol, seed: int = 0, progress: Progress | None = None
 ) -> Agreement:
-    """Evaluate a random sample of stored grasps again and compare verdicts.
-
-    Args:
-        pairs: The data set, failures included if they are to be checked as well.
-        sample: Number of grasps, drawn evenly; all of them if there are fewer.
+    """Evaluate a random sample of stored grasps again, all of them if there are fewer, and compare verdicts.
 
     Raises:
         OptionError: `sample` is not positive.
@@ -93,16 +85,7 @@ def keep_passing(
 ) -> list[tuple[PairGrasps, GraspBatch]]:
     """Evaluate all grasps and keep those that pass, with their new results: each pair and the grasps left of it.
 
-    Args:
-        pairs: The data set.
-        rules: The trial.
-        progress: Called with (grasps evaluated, grasps in all).
-        close_fingers: Also evaluate grasps with their idle fingers closed, and keep these instead where they pass, no fewer
-            fingers touch, and as many links as a synthesised grasp must touch with. Column `relabelled` marks them; their
-            energies stay those by which the grasp was once chosen.
-
-    Raises:
-        GraspFileError: A hand or an object is not the one the grasps were made for.
+    With `close_fingers`, idle fingers are closed as `closed_where_it_holds` does.
     """
     parts = [pair for pair in pairs if len(pair.grasps)]
     kept = []
@@ -115,21 +98,11 @@ def keep_passing(
 
 
 def _loaded(parts: Sequence[GraspBatch], progress: Progress | None) -> Iterator[tuple[Hand, ObjectModel]]:
-    """Hand and object of the grasps of one pair after the other.
-
-    All of them are found before the first pair: no trial is lost to a file that has changed, or to a bare cloud.
-    """
-    total, done = sum(map(len, parts)), 0
-    hands: dict[Any, Hand] = {}
-    objects: dict[Any, ObjectModel] = {}
-    pairs = []
-    for grasps in parts:
-        whose, of = pair_keys(grasps)
-        hand = hands[whose] = hands.get(whose) or hand_of(grasps, None)
-        obj = objects[of] = objects.get(of) or object_of(grasps, None, 1.0)
-        require_same(grasps, hand, obj)
-        require_simulable(hand, obj)
-        pairs.append((hand, obj))
+    total, done, sources = sum(map(len, parts)), 0, Sources()
+    # All are found before the first trial: none is lost to a file that has changed, or to a bare cloud.
+    pairs = [sources.of(grasps) for grasps in parts]
+    for pair in pairs:
+        require_simulable(*pair)
     for grasps, pair in zip(parts, pairs, strict=True):
         yield pair
         done += len(grasps)

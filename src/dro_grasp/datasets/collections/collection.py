@@ -13,8 +13,11 @@ from dro_grasp.datasets.engine.shards import Yield, find_shards, read_yield
 from dro_grasp.errors import GraspFileError
 from dro_grasp.files import given_path
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.sources import hand_of, object_of, pair_keys, require_same
 from dro_grasp.grasps.table import read_footer
+from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import checked
+from dro_grasp.objects.shape import ObjectModel
 
 YIELDS = "yields"
 """Entry of a file's notes with the yield of each of its objects."""
@@ -33,6 +36,22 @@ class PairGrasps:
     made: Yield
     """Yield of their production. A merged file may hold a choice of the valid grasps; for grasps from elsewhere only
     `valid` is known."""
+
+
+class Sources:
+    """Hands and objects of grasps, each loaded once."""
+
+    def __init__(self) -> None:
+        self.hands: dict[Any, Hand] = {}
+        self.objects: dict[Any, ObjectModel] = {}
+
+    def of(self, grasps: GraspBatch) -> tuple[Hand, ObjectModel]:
+        """Those of grasps of one pair; the hashes that the grasps state are checked."""
+        whose, of = pair_keys(grasps)
+        hand = self.hands[whose] = self.hands.get(whose) or hand_of(grasps, None)
+        obj = self.objects[of] = self.objects.get(of) or object_of(grasps, None, 1.0)
+        require_same(grasps, hand, obj)
+        return hand, obj
 
 
 def yield_notes(yields: Mapping[str, Yield]) -> dict[str, Any]:
@@ -70,21 +89,16 @@ def read_collection(path: Path | str, only_successful: bool = True) -> Iterator[
 
 
 def count_collection(path: Path | str) -> dict[str, dict[str, int]]:
-    """Number of grasps by hand and object; shards are counted by their footers alone.
-
-    Raises:
-        GraspFileError: As `read_collection`.
-    """
-    counts: dict[str, dict[str, int]] = {}
+    """Number of grasps by hand and object; shards are counted by their footers alone."""
     path = given_path(path)
     if path.is_dir() and (shards := find_shards(path)):
-        for shard in shards:
-            of_hand = counts.setdefault(shard.hand, {})
-            of_hand[shard.object] = of_hand.get(shard.object, 0) + read_yield(path, shard).valid
-        return counts
-    for pair in read_collection(path, only_successful=False):
-        of_hand = counts.setdefault(pair.hand, {})
-        of_hand[pair.object] = of_hand.get(pair.object, 0) + len(pair.grasps)
+        found = ((shard.hand, shard.object, read_yield(path, shard).valid) for shard in shards)
+    else:
+        found = ((pair.hand, pair.object, len(pair.grasps)) for pair in read_collection(path, only_successful=False))
+    counts: dict[str, dict[str, int]] = {}
+    for hand, obj, number in found:
+        of_hand = counts.setdefault(hand, {})
+        of_hand[obj] = of_hand.get(obj, 0) + number
     return counts
 
 

@@ -57,13 +57,11 @@ class ForeignGrasp:
     """One grasp in a file's own terms."""
 
     hand: str
-    """Name of the hand; empty if the format has none."""
+    """Empty if the format names none; so is `object`."""
     object: str
-    """Name of the object; empty if the format has none."""
     scale: float
-    """Scale of the object."""
+    """Of the object."""
     T_object_wrist: Float[np.ndarray, "4 4"]
-    """Wrist pose [m]."""
     joints: Joints
     """[rad or m]"""
     pregrasp: Joints | None = None
@@ -104,7 +102,6 @@ class _NoEntry(Exception):
 
 
 def _entry(entries: dict[str, Any], name: str) -> Any:
-    """One entry of a file's dictionary."""
     if not isinstance(entries, dict):
         raise TypeError(f"it holds a {type(entries).__name__} where named entries should be")
     if name not in entries:
@@ -113,7 +110,6 @@ def _entry(entries: dict[str, Any], name: str) -> Any:
 
 
 def _load_tensors(path: Path) -> Any:
-    """Read a torch file of tensors and containers only."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -195,12 +191,7 @@ def read_npy(path: Path) -> Shaped[np.ndarray, "..."]:
 
 
 def in_order(joints: Joints, moving: Sequence[str], independent: Sequence[str]) -> list[float]:
-    """Values of the independent joints.
-
-    Args:
-        joints: Of a grasp of any format.
-        moving: Names of all the hand's moving joints, followers included, in the order of the description.
-        independent: Names of the joints that others follow.
+    """Values of the independent joints, of the names of these and of all that move, followers included.
 
     Raises:
         GraspFileError: The grasp has other joints.
@@ -257,7 +248,6 @@ def import_grasps(
 
 
 def _batch(hand_name: str, obj_name: str, scale: float, grasps: list[ForeignGrasp], origin: str) -> GraspBatch:
-    """Grasps of one hand on one object."""
     hand, obj = load_hand(hand_name), load_object(obj_name, scale=scale)
     T = torch.from_numpy(np.stack([grasp.T_object_wrist for grasp in grasps])).float()
     names = hand.tree.moving_names, hand.tree.joint_names

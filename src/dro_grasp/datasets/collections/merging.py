@@ -51,7 +51,6 @@ class Merged:
     table: pa.Table
     """The grasps as columns of their file, which take a fifth of the memory."""
     header: dict[str, Any]
-    """Of the file."""
     yields: dict[str, Yield]
     """By object."""
     duplicates: int
@@ -70,13 +69,8 @@ class Merged:
         return table_bytes(columns, self.header | {"notes": yield_notes(self.yields)})
 
     def save(self, path: Path) -> None:
-        """Write the grasp file.
-
-        Raises:
-            OutputError: The path cannot be written.
-        """
-        path = check_output(path)
-        with replacing(path) as temporary:
+        """Write the grasp file."""
+        with replacing(check_output(path)) as temporary:
             temporary.write_bytes(self.to_bytes())
 
 
@@ -112,11 +106,7 @@ def merge(
 
 
 def require_choice(per_pair: int | None) -> None:
-    """Refuse a number of grasps of a pair with which none would be left.
-
-    Raises:
-        OptionError: It is less than 1.
-    """
+    """Refuse a number of grasps of a pair with which none would be left."""
     if per_pair is not None and per_pair < 1:
         raise OptionError(f"per_pair is {per_pair}; give at least 1, or leave it out to keep all grasps (--per-pair)")
 
@@ -151,7 +141,6 @@ def _by_pair(paths: Sequence[Path | str], folder: Path) -> dict[str, dict[str, l
 
 
 def _merge_hand(name: str, pairs: dict[str, list[Waiting]], per_pair: int | None, file_bytes: int) -> Iterator[Merged]:
-    """The hand's grasps, a file's worth at a time."""
     hand, row_bytes, number = None, 0.0, 1
     kept: list[pa.Table] = []
     header: dict[str, Any] = {}
@@ -176,8 +165,7 @@ def _merge_hand(name: str, pairs: dict[str, list[Waiting]], per_pair: int | None
 
 
 def _joined(tables: Sequence[pa.Table]) -> pa.Table:
-    """One table after the other; columns that some lack are unknown for their grasps."""
-    return pa.concat_tables(tables, promote_options="permissive")
+    return pa.concat_tables(tables, promote_options="permissive")  # columns that some lack are unknown for their grasps
 
 
 def spread(hand: Hand, grasps: GraspBatch, count: int) -> Int[Tensor, " k"]:
@@ -185,9 +173,6 @@ def spread(hand: Hand, grasps: GraspBatch, count: int) -> Int[Tensor, " k"]:
 
     Farthest-first: the choice starts with the first grasp and adds the one whose palm direction is farthest from all
     chosen ones.
-
-    Raises:
-        OptionError: `count` is less than 1.
     """
     require_choice(count)
     if len(grasps) <= count:

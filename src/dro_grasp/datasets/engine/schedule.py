@@ -6,25 +6,29 @@ Killing a run at any time loses at most the shards in flight; a rerun makes only
 from __future__ import annotations
 
 import itertools
+import json
 import math
+import os
+import secrets
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from dro_grasp.datasets.engine.pools import Failed, LocalPool, Outcome, Pool
-from dro_grasp.datasets.engine.settings import require_settings
 from dro_grasp.datasets.engine.shards import Shard, Yield, find_shards, read_yield, remove_leftovers, sole_run
 from dro_grasp.datasets.engine.worker import EngineConfig, Job, Task
 from dro_grasp.devices import require_device
-from dro_grasp.errors import GraspFileError, OptionError
-from dro_grasp.files import given_path, is_unread, make_folder, set_aside
+from dro_grasp.errors import GraspFileError, OptionError, OutputError
+from dro_grasp.files import given_path, is_unread, make_folder, reading, set_aside
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand, locate_hand
 from dro_grasp.kinds import checked
 from dro_grasp.objects.catalogue import ASSET_PREFIX, load_object, locate_object, object_names
+from dro_grasp.records import flat
 
 REPORT_EVERY = 10.0
 """Time between lines of progress [s]. Ours."""
@@ -39,7 +43,6 @@ class PairState:
     """Progress of one (hand, object) pair."""
 
     total: Yield = field(default_factory=Yield)
-    """Sum over its shards."""
     done: set[int] = field(default_factory=set)
     """Finished rounds; damaged shards leave gaps."""
     barren: int = 0
@@ -84,11 +87,11 @@ class DatasetReport:
     """Result of one run."""
 
     grasps: int
-    """Grasps in the folder for the pairs asked for."""
+    """In the folder, for the pairs asked for."""
     added: int
-    """Grasps added in this run."""
+    """Of them in this run."""
     shards: int
-    """Shards made in this run."""
+    """Made in this run."""
     seconds: float
     """Wall time [s]."""
     failures: dict[Pair, str]
@@ -141,12 +144,7 @@ def synthesize_dataset(
 
 
 def require_known(hands: Sequence[str], objects: Sequence[str]) -> None:
-    """Refuse unknown names and missing files, without reading any file that exists; folders and groups are no objects.
-
-    Raises:
-        HandError: A hand's name or file is missing.
-        ObjectError: Likewise of an object.
-    """
+    """Refuse unknown names and missing files, without reading any file that exists; folders and groups are no objects."""
     for hand in hands:
         if not locate_hand(hand).path.is_file():
             load_hand(hand)  # its error says what is wrong
@@ -157,11 +155,7 @@ def require_known(hands: Sequence[str], objects: Sequence[str]) -> None:
 
 
 def require_distinct(hands: Sequence[str], objects: Sequence[str]) -> None:
-    """Refuse different files of one name, before their grasps are made: merged and bundled grasps know their names alone.
-
-    Raises:
-        OptionError: Two hands or two objects have one name.
-    """
+    """Refuse different files of one name, before their grasps are made: merged and bundled grasps know their names alone."""
     for kind, given, locate in (("hand", hands, locate_hand), ("object", objects, locate_object)):
         found: dict[str, tuple[str, Path]] = {}
         for source in given:
@@ -186,29 +180,21 @@ def resume(folder: Path, states: dict[Pair, PairState], goal: int, say: Callable
     for pair, own in itertools.groupby(find_shards(folder), lambda shard: (shard.hand, shard.object)):
         if pair in states:
             sound = _readable(folder, own, read_yield, say)
-            if sum(made.valid for _, made in sound) < goal:
-                whole = _readable(folder, (shard for shard, _ in sound), _load, say)
-                sound = [(shard, made) for shard, made in sound if shard in {one for one, _ in whole}]
-            for shard, made in sound:
+            if sum(made.valid for made in sound.values()) < goal:
+                whole = _readable(folder, sound, lambda folder, shard: GraspBatch.load(shard.path(folder)), say)
+                sound = {shard: sound[shard] for shard in whole}
+            for shard, made in sound.items():
                 states[pair].note(shard, made)
-
-
-def _load(folder: Path, shard: Shard) -> GraspBatch:
-    return GraspBatch.load(shard.path(folder))
 
 
 def _readable(
     folder: Path, shards: Iterable[Shard], read: Callable[[Path, Shard], Content], say: Callable[[str], None]
-) -> list[tuple[Shard, Content]]:
-    """The shards that can be read, with what was read; damaged ones are named and set aside.
-
-    Raises:
-        GraspFileError: Disk or memory fails.
-    """
-    found = []
+) -> dict[Shard, Content]:
+    """What can be read of the shards; damaged ones are named and set aside, unless disk or memory fails."""
+    found = {}
     for shard in shards:
         try:
-            found.append((shard, read(folder, shard)))
+            found[shard] = read(folder, shard)
         except GraspFileError as error:
             if is_unread(error):  # a disk that fails once must not cost a sound shard
                 raise
@@ -221,10 +207,8 @@ def next_pair(states: dict[Pair, PairState], busy: set[Pair], goal: int, config:
 
     New objects are spread over the workers, as preparing one can take minutes; pairs on which a worker died come last.
     """
-    open_pairs = [
-        pair for pair, s in states.items()
-        if pair not in busy and s.grasps < goal and not s.why_given_up(goal, config)
-    ]
+    open_pairs = [pair for pair, s in states.items()
+                  if pair not in busy and s.grasps < goal and not s.why_given_up(goal, config)]
     prepared_now = {obj for hand, obj in busy if not states[hand, obj].total.candidates}
     return min(
         open_pairs, key=lambda pair: (states[pair].crashes, pair[1] in prepared_now, len(states[pair].done)), default=None
@@ -293,9 +277,69 @@ class Production:
             self.say(f"{pair[0]} on {pair[1]}: {state.error}")
 
     def _summary(self, seconds: float) -> str:
-        """One line about the state of the run."""
         states = self.states.values()
         going = [s for s in states if not s.why_given_up(self.goal, self.config)]
         return (f"{sum(s.grasps for s in states)} grasps; {sum(s.grasps >= self.goal for s in states)} of {len(states)} pairs "
                 f"full, {len(states) - len(going)} given up, round {min((len(s.done) for s in going), default=0)}; "
                 f"{seconds:.0f} s")
+
+
+SETTINGS = "settings.json"
+"""File of the settings in a data set's folder."""
+FREE = frozenset({
+    "seconds", "candidates", "min_candidates", "max_candidates", "max_barren_rounds", "candidate_budget", "max_crashes",
+    "shard", "shard_seconds", "synthesis.device"})
+"""Settings that a rerun may change: how long it goes on, where, in how large shards, and when it gives up a pair."""
+
+
+def require_settings(folder: Path, job: Job) -> None:
+    """Refuse a job with other settings than those that a folder was begun with; a new folder is begun with the job's.
+
+    The note is there before the first shard. So a folder with shards and without a note is of an earlier version: it is taken
+    as it is, and gets none, as nobody knows its settings. Of several processes that begin a folder at once, one writes.
+    """
+    path, asked = folder / SETTINGS, _asked(job)
+    found = _noted(path)
+    if found is None:
+        if not find_shards(folder):
+            _write_once(path, json.dumps(asked, indent=1))
+        found = _noted(path) or {}
+    if differing := [name for name, value in asked.items() if found.get(name, value) != value]:
+        made, given = (", ".join(f"{name} {values[name]}" for name in differing) for values in (found, asked))
+        raise OptionError(f"{folder} was begun with {made}, {given} was asked for; use the same to go on, or name another "
+                          "folder, and join both with `dro-grasp dataset merge`")
+
+
+def _noted(path: Path) -> dict[str, Any] | None:
+    with reading(path, GraspFileError, "the settings of the grasps in its folder; remove it to go on with any"):
+        try:
+            found = json.loads(path.read_text())
+        except FileNotFoundError:
+            return None
+        if not isinstance(found, dict):
+            raise ValueError(f"it holds a {type(found).__name__}")
+        return found
+
+
+def _asked(job: Job) -> dict[str, Any]:
+    """What determines the grasps, beside hand, object and the sizes of shards, as plain values by name."""
+    values = {"seed": job.seed} | {name: value for name, value in flat(job.config).items() if name not in FREE}
+    return json.loads(json.dumps(values, default=str))
+
+
+def _write_once(path: Path, text: str) -> None:
+    """Write a file, whole, unless somebody else has."""
+    temporary = path.with_name(f".{path.name}{secrets.token_hex(4)}.part")
+    try:
+        temporary.write_text(text)
+        try:
+            os.link(temporary, path)
+        except FileExistsError:
+            return
+        except OSError:  # a file system without links
+            os.replace(temporary, path)
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}; free some space or choose another folder") from error
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)

@@ -91,11 +91,7 @@ class Yield:
 
     @staticmethod
     def from_dict(values: Any) -> Yield:
-        """The inverse of `to_dict`; entries of other versions are ignored.
-
-        Raises:
-            GraspFileError: An entry is no count, or no time.
-        """
+        """The inverse of `to_dict`, whose entries must be counts and times; those of other versions are ignored."""
         known = {f.name for f in dataclasses.fields(Yield)}
         given: dict[str, Any] = values if isinstance(values, dict) else {"valid": [values]}
         own = {name: value for name, value in given.items() if name in known}
@@ -113,9 +109,7 @@ class Shard:
     """One unit of work and the file that holds its result."""
 
     hand: str
-    """Name of the hand."""
     object: str
-    """Name of the object."""
     round: int
     """Counts up from 0 for each pair."""
 
@@ -124,11 +118,7 @@ class Shard:
         return folder / quote(self.hand, safe="") / quote(self.object, safe="+") / f"{self.round:05d}.parquet"
 
     def save(self, payload: bytes, folder: Path) -> None:
-        """Write the shard's file; it appears whole or not at all.
-
-        Raises:
-            OutputError: The folder cannot be written.
-        """
+        """Write the shard's file; it appears whole or not at all."""
         path = self.path(folder)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -162,19 +152,12 @@ def find_shards(folder: Path | str) -> list[Shard]:
     except FileNotFoundError as error:
         raise GraspFileError(f"{error.filename} disappeared while {folder} was listed; wait for what removes files there, or "
                              f"give the folder that `dro-grasp synthesize` wrote") from error
-    shards = []
-    for path in paths:
-        if re.fullmatch(r"\d+", path.stem):
-            shards.append(Shard(unquote(path.parts[-3]), unquote(path.parts[-2]), int(path.stem)))
-    return sorted(shards)
+    return sorted(Shard(unquote(path.parts[-3]), unquote(path.parts[-2]), int(path.stem))
+                  for path in paths if re.fullmatch(r"\d+", path.stem))
 
 
 def read_yield(folder: Path, shard: Shard) -> Yield:
-    """Yield of a shard, from the file's footer; `valid` is the number of grasps it holds.
-
-    Raises:
-        GraspFileError: The file cannot be read, or is of another version.
-    """
+    """Yield of a shard, from the file's footer; `valid` is the number of grasps it holds."""
     rows, header = read_footer(shard.path(folder))
     notes = header.get("notes") or {}
     return dataclasses.replace(Yield.from_dict(notes.get("yield") or {}), valid=rows)
@@ -206,11 +189,7 @@ def sole_run(folder: Path, part: tuple[int, int] = (1, 1)) -> Iterator[None]:
 
 
 def _take(lock: FileLock, folder: Path) -> None:
-    """Acquire a lock where the file system has locks.
-
-    Raises:
-        OutputError: Another run holds it.
-    """
+    """Acquire a lock where the file system has locks, unless another run holds it."""
     try:
         lock.acquire()
     except Timeout as error:

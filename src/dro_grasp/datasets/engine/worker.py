@@ -10,12 +10,14 @@ from collections import Counter
 from dataclasses import dataclass, field
 from functools import lru_cache
 
+import torch
+
 from dro_grasp.datasets.bundle.training_file import split_of
-from dro_grasp.datasets.engine.finger_labels import MIN_CONTACT_LINKS, closed_where_it_holds
 from dro_grasp.datasets.engine.shards import Shard, Yield, notes_of
+from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.columns import DEPTH
+from dro_grasp.grasps.columns import DEPTH, RELABELLED
 from dro_grasp.grasps.duplicates import distinct
 from dro_grasp.grasps.sources import with_sources
 from dro_grasp.hands.hand import Hand
@@ -23,8 +25,10 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.optimization.finger_closing import close_idle_fingers
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
 from dro_grasp.simulation.closed_poses import hand_shift, settle
+from dro_grasp.simulation.protocols import Protocol
 from dro_grasp.simulation.trial import simulate
 
 LOOSE = "held by too few links"
@@ -55,8 +59,8 @@ class EngineConfig(Checked):
     """Take the labels after the hand has closed on the object in simulation, which drives out penetration."""
     max_shift: float = 0.03
     """Candidates that closing moves farther relative to the object get no trial [m]."""
-    min_contact_links: int = MIN_CONTACT_LINKS
-    """Links that must touch the object after closing; with fewer, a success is a cage or luck."""
+    min_contact_links: int = 2
+    """Links that must touch the object after closing; with fewer, a success is a cage or luck (ours)."""
     close_fingers: bool = True
     """Close the idle fingers of valid grasps onto the object, where the grasp then passes as well with no fewer fingers."""
     max_barren_rounds: int = 3
@@ -74,11 +78,6 @@ class EngineConfig(Checked):
     """The optimiser."""
 
     def __post_init__(self) -> None:
-        """Refuse a part that is none.
-
-        Raises:
-            OptionError: As said.
-        """
         super().__post_init__()
         if not 1 <= self.shard[0] <= self.shard[1]:
             raise OptionError(f"shard is {self.shard[0]}/{self.shard[1]}; give a part from 1 on, and of how many, such as 3/16")
@@ -98,7 +97,6 @@ class Task:
 
     shard: Shard
     candidates: int
-    """Grasps to synthesise."""
     earlier: tuple[bytes, ...] = ()
     """The pair's shards so far, as files; a grasp close to one of theirs is a duplicate."""
 
@@ -132,13 +130,10 @@ def make_shard(job: Job, task: Task) -> FinishedShard:
     earlier = [GraspBatch.load(io.BytesIO(payload)) for payload in task.earlier]
     grasps, result = valid_grasps(
         hand, obj, shard_seed(job.seed, task.shard), job.config, task.candidates,
-        GraspBatch.concatenate(earlier) if earlier else None,
-    )
+        GraspBatch.concatenate(earlier) if earlier else None)
     grasps = with_sources(grasps, task.shard.hand, task.shard.object, job.config.scale)
     grasps = grasps.replace(split=tuple(split_of(task.shard.hand, split) for split in grasps.split))
-    result = dataclasses.replace(
-        result, cpu_seconds=time.process_time() - prepared, preparation_seconds=prepared - started
-    )
+    result = dataclasses.replace(result, cpu_seconds=time.process_time() - prepared, preparation_seconds=prepared - started)
     return FinishedShard(task.shard, grasps.to_bytes(notes_of(result)), result)
 
 
@@ -146,13 +141,7 @@ def valid_grasps(
     hand: Hand, obj: ObjectModel, seed: int, config: EngineConfig, candidates: int | None = None,
     earlier: GraspBatch | None = None,
 ) -> tuple[GraspBatch, Yield]:
-    """Candidates of one seed that pass the protocol, near-duplicates once, best energy first.
-
-    Args:
-        obj: An object with a mesh.
-        candidates: Grasps to synthesise; the config's number by default.
-        earlier: Grasps that the pair has already.
-    """
+    """Candidates of one seed that pass the protocol, best energy first, without near-duplicates of them and of earlier ones."""
     count = candidates or config.candidates
     drawn = synthesize(hand, obj, count, seed, config.synthesis)
     ranked = drawn[0 : max(1, round(config.trial_share * count))]
@@ -172,7 +161,30 @@ def valid_grasps(
     failures = Counter(failure.value for failure in trial.failure if failure)
     if loose.any():
         failures[LOOSE] += int(loose.sum())
-    made = dataclasses.replace(
-        made, failures=dict(failures), duplicates=int((~new).sum()), valid=int(new.sum())
-    )
-    return passed[new], made
+    return passed[new], dataclasses.replace(
+        made, failures=dict(failures), duplicates=int((~new).sum()), valid=int(new.sum()))
+
+
+def closed_where_it_holds(
+    hand: Hand, obj: ObjectModel, evaluated: GraspBatch, protocol: str | Protocol,
+    min_links: int = EngineConfig.min_contact_links, workers: int | None = None,
+) -> GraspBatch:
+    """Grasps after a trial of the protocol; with idle fingers closed where these pass too, no fewer touch, and enough links.
+
+    Column `relabelled` marks them. Their energies stay those by which the grasp was once chosen.
+    """
+    known = evaluated.extra.get(RELABELLED, [None] * len(evaluated))
+    relabelled = torch.tensor([bool(mark) for mark in known], dtype=torch.bool)
+    energy = GraspEnergy.of_object(hand, obj, EnergyConfig(hand_points=hand.n_points))
+    closed = close_idle_fingers(energy, evaluated).replace(energy=evaluated.energy, extra=evaluated.extra)
+    rows = (closed.joints != evaluated.joints).any(1).nonzero()[:, 0]
+    if not len(rows):
+        return evaluated.replace(extra=evaluated.extra | {RELABELLED: relabelled})
+    trial = simulate(hand, obj, closed[rows], protocol, workers=workers)
+    better = trial.success & (trial.contacts >= min_links)
+    better &= trial.fingers_in_contact >= evaluated.fingers_in_contact[rows]
+    order = torch.arange(len(evaluated))
+    order[rows[better]] = len(evaluated) + better.nonzero()[:, 0]
+    chosen = GraspBatch.concatenate([evaluated, closed[rows].with_trial(trial)])[order]
+    relabelled = relabelled | (order >= len(evaluated))
+    return chosen.replace(extra=chosen.extra | {RELABELLED: relabelled})
