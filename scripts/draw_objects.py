@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from dro_grasp.objects.catalogue import load_object, resolve_objects
-from dro_grasp.rendering.camera import Camera
-from dro_grasp.rendering.rasterizer import render
+from dro_grasp.rendering.rasterizer import Camera, render
 from dro_grasp.viewer.appearance import object_meshes
 from dro_grasp.viewer.pictures import contact_sheet
 

@@ -24,7 +24,7 @@ from torch.nn import functional
 
 from dro_grasp.energy.grasp_energy import GraspEnergy
 from dro_grasp.evaluation.metrics import roc_area
-from dro_grasp.geometry.rotations import roma
+from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand

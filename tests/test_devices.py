@@ -10,14 +10,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from dro_grasp.devices import choose_device, cores, require_device, side_by_side
+from dro_grasp.devices import choose_device, cores, on_device, require_device, side_by_side
 from dro_grasp.energy.grasp_energy import link_spheres
 from dro_grasp.errors import OptionError
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.refinement import RefineConfig
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predictor import GraspPredictor
-from dro_grasp.records import on_device
 from tests.helpers.claw import ball
 from tests.helpers.toy_hand import toy_hand
 from tests.helpers.weights import untrained_weights

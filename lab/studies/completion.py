@@ -24,9 +24,7 @@ from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.completion import complete_cloud, to_view_axes
 from dro_grasp.perception.partial_views import visible_side
-from dro_grasp.rendering.camera import Camera
-from dro_grasp.rendering.meshes import Mesh, dots
-from dro_grasp.rendering.rasterizer import render
+from dro_grasp.rendering.rasterizer import Camera, Mesh, dots, render
 from dro_grasp.viewer.pictures import contact_sheet
 from lab.benchmarks.report import emit
 

@@ -11,11 +11,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dro_grasp.geometry.mirrored_sides import SideConfig, choose_sides
-from dro_grasp.geometry.multilateration import MultilaterationConfig, distance_misfit, multilaterate
+from dro_grasp.geometry.multilateration import MultilaterationConfig, SideConfig, choose_sides, distance_misfit, multilaterate
 from dro_grasp.geometry.point_clouds import point_distances
-from dro_grasp.geometry.registration import register
-from dro_grasp.geometry.se3 import apply, apply_to_cloud
+from dro_grasp.geometry.se3 import apply, apply_to_cloud, register
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
 from dro_grasp.kinematics.joint_reading import read_joints

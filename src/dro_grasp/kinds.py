@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import inspect
 import operator
@@ -136,3 +137,13 @@ def _is_known(kind: Any) -> bool:
 def _hints(owner: Any) -> dict[str, Any]:
     """The kinds of a dataclass's fields or of a function's arguments, without those that are not checked."""
     return {name: kind for name, kind in get_type_hints(owner).items() if name != "return" and _is_known(kind)}
+
+
+def flat(record: Any, prefix: str = "") -> dict[str, Any]:
+    """The values of a dataclass and of those in it, by name; what is nested has dots in its name."""
+    values: dict[str, Any] = {}
+    for field in dataclasses.fields(record):
+        value = getattr(record, field.name)
+        name = f"{prefix}{field.name}"
+        values |= flat(value, f"{name}.") if dataclasses.is_dataclass(value) else {name: value}
+    return values

@@ -34,8 +34,7 @@ from dro_grasp.evaluation.success_rates import (
 )
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
-from dro_grasp.objects.catalogue import load_object
-from dro_grasp.objects.mesh_process import SCALES
+from dro_grasp.objects.catalogue import SCALES, load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.settling import settled

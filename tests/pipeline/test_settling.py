@@ -9,7 +9,7 @@ import torch
 
 from dro_grasp.energy.grasp_energy import EnergyConfig
 from dro_grasp.errors import ObjectError
-from dro_grasp.geometry.rotations import roma
+from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.catalogue import load_object

@@ -14,7 +14,7 @@ import torch
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.rendering.camera import Camera
+from dro_grasp.rendering.rasterizer import Camera
 from dro_grasp.viewer.app import GraspViewer, describe
 from dro_grasp.viewer.appearance import success_colour
 from dro_grasp.viewer.scene_view import HOST, ServedPage, viewpoint
@@ -48,7 +48,7 @@ def viewer(grasps: GraspBatch):
 
 
 def test_links_stand_where_kinematics_puts_them(viewer: GraspViewer, grasps: GraspBatch) -> None:
-    from dro_grasp.geometry.rotations import roma
+    from dro_grasp.geometry.se3 import roma
 
     for posture in ("open", "pregrasp", "grasp", "squeeze"):
         viewer.show(1, posture)

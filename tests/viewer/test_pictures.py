@@ -21,8 +21,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.partial_views import partial_view
-from dro_grasp.rendering.camera import Camera
-from dro_grasp.rendering.rasterizer import render
+from dro_grasp.rendering.rasterizer import Camera, render
 from dro_grasp.viewer import pictures
 from dro_grasp.viewer.appearance import (
     OBJECT_COLOUR,

@@ -25,9 +25,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand_description
 from dro_grasp.hands.opening_notes import opening_notes
 from dro_grasp.hands.whole_robots import LONGEST_REACH, reach
-from dro_grasp.rendering.camera import Camera
-from dro_grasp.rendering.meshes import Mesh, arrow
-from dro_grasp.rendering.rasterizer import render
+from dro_grasp.rendering.rasterizer import Camera, Mesh, arrow, render
 
 TILE = (560, 520)
 """Width and height of one view [pixels]."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 
+from dro_grasp.objects.convex_parts import as_part
 from dro_grasp.objects.loading import mesh_object
 from dro_grasp.objects.primitives import Solid, box, frustum, hollow, hull, ring, superquadric, tilted, turned
 from dro_grasp.objects.shape import ObjectModel
@@ -172,5 +173,5 @@ def assemble(name: str, pieces: Pieces, *, scale: float, split: str) -> ObjectMo
     solids = [piece if isinstance(piece, Solid) else Solid(piece, [piece]) for piece in pieces]
     meshes = [solid.mesh for solid in solids]
     mesh = meshes[0] if len(meshes) == 1 else trimesh.boolean.union(meshes, engine="manifold")
-    parts = tuple((np.asarray(part.vertices), np.asarray(part.faces)) for solid in solids for part in solid.parts)
+    parts = tuple(as_part(part) for solid in solids for part in solid.parts)
     return mesh_object(name, mesh, origin=name, scale=scale, split=split, parts=parts)

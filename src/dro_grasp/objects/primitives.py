@@ -9,13 +9,6 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-SEGMENTS = 24
-"""Corners of round cross-sections (ours)."""
-TUBE_CORNERS = 10
-"""Corners of the tube of a ring (ours)."""
-SAME_POINT = 1e-6
-"""Points closer than this are merged [m] (ours)."""
-
 Point = tuple[float, float, float]
 """Coordinates [m]."""
 
@@ -40,8 +33,8 @@ def hull(points: Float[np.ndarray, "n 3"]) -> trimesh.Trimesh:
     mesh = trimesh.convex.convex_hull(points)
     if mesh.is_watertight and mesh.is_convex:
         return mesh
-    # Points that nearly coincide, for example at the pole of a superquadric, leave slivers.
-    first = np.unique(np.round(points / SAME_POINT), axis=0, return_index=True)[1]
+    # Points that nearly coincide, for example at the pole of a superquadric, leave slivers: merge those within a micrometre.
+    first = np.unique(np.round(points / 1e-6), axis=0, return_index=True)[1]
     return trimesh.convex.convex_hull(points[first])
 
 
@@ -52,7 +45,7 @@ def box(size: Point, at: Point = (0, 0, 0)) -> trimesh.Trimesh:
 
 
 def frustum(
-    radii: tuple[float, float], heights: tuple[float, float], at: Point = (0, 0, 0), axis: str = "z", corners: int = SEGMENTS
+    radii: tuple[float, float], heights: tuple[float, float], at: Point = (0, 0, 0), axis: str = "z", corners: int = 24
 ) -> trimesh.Trimesh:
     """A cone frustum between two heights along an axis [m]; equal radii make a cylinder."""
     angle = np.linspace(0, 2 * np.pi, corners, endpoint=False)
@@ -115,7 +108,7 @@ def ring(radius: float, thickness: float, corners: int = 16, arc: float = 2 * np
     """A torus, or an arc of one, from convex segments: radius of the middle line and of the tube [m]."""
     closed = bool(np.isclose(arc, 2 * np.pi))
     angles = np.linspace(start, start + arc, corners + 1)[: corners if closed else None]
-    tube = np.linspace(0, 2 * np.pi, TUBE_CORNERS, endpoint=False)
+    tube = np.linspace(0, 2 * np.pi, 10, endpoint=False)
     loops = [
         _along(np.array([((radius + thickness * np.cos(t)) * np.cos(s), (radius + thickness * np.cos(t)) * np.sin(s),
                           thickness * np.sin(t)) for t in tube]), axis) + at

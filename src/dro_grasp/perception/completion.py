@@ -31,16 +31,6 @@ MARGIN = 0.01
 """Distance that the grid extends beyond all guesses [m] (ours)."""
 SPREAD = 40_000
 """Points that are moved onto the surface (ours)."""
-STEPS = 4
-"""Newton steps of these points (ours)."""
-CLOSE = 0.0005
-"""Distance from the surface within which a point counts as arrived [m] (ours)."""
-THINNING = 40
-"""One visible point is kept per cube; its edge is the object's width over this (ours)."""
-FINEST = 0.002
-"""Shortest edge of these cubes [m] (ours), unless it is more than a share of the width; see COARSEST."""
-COARSEST = 10
-"""The shortest edge is at most the object's width over this (ours)."""
 SMALL = 0.01
 """Distance that the network receives as about 1/2 [m] (ours)."""
 LENGTH = 0.05
@@ -89,7 +79,8 @@ def complete_cloud(
         return CompletedCloud(points, normals, np.zeros(len(points), bool))
     guesses = side.guesses(None if up is None else up @ axes, GUESSES)
     surface, outward = extract_surface(side, guesses, network or shipped_surface())
-    apart = max(side.width / THINNING, min(FINEST, side.width / COARSEST))
+    # One visible point is kept per cube of a fortieth of the width, but not below 2 mm or a tenth of the width (ours).
+    apart = max(side.width / 40, min(0.002, side.width / 10))
     seen, seen_normals = _thinned(side.points, side.normals, apart)
     between = 2 * float(np.median(KDTree(seen).query(seen, k=2)[0][:, 1]))
     near = side.tree.query(surface)[0] < 1.5 * max(apart, between)
@@ -157,11 +148,12 @@ def extract_surface(
         return guesses[0].points, guesses[0].normals
     points = close[rng.integers(len(close), size=SPREAD)] + rng.uniform(-0.5, 0.5, (SPREAD, 3)) * spacing
     # Newton steps x - s grad s / |grad s|^2; the floor on the slope limits steps where the field is flat.
-    for _ in range(STEPS):
+    for _ in range(4):  # (ours)
         here = values(points)
         points = points - here[:, :1] * here[:, 1:] / np.maximum((here[:, 1:] ** 2).sum(1, keepdims=True), 0.1)
     here = values(points)
-    kept = (np.abs(here[:, 0]) < CLOSE) & (points > low).all(1) & (points < high).all(1)
+    arrived = np.abs(here[:, 0]) < 0.0005  # [m] (ours)
+    kept = arrived & (points > low).all(1) & (points < high).all(1)
     outward = here[kept, 1:]
     return points[kept], outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
 

@@ -23,9 +23,9 @@ from dro_grasp.descriptions.xml_files import parse_xml
 from dro_grasp.errors import HandError, RobotError
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand, locate_hand
+from dro_grasp.kinds import flat
 from dro_grasp.kinematics.tree import PRISMATIC, REVOLUTE, KinematicTree
 from dro_grasp.planning.robot_file import CameraMount, RobotFile, Table, is_number, locate_robot, read_robot_file
-from dro_grasp.records import flat
 
 LONGEST_ARM = 5.0
 """A farther link must be in another unit [m] (ours)."""

@@ -17,8 +17,8 @@ from dro_grasp.descriptions.part import named, split_part
 from dro_grasp.errors import RobotError
 from dro_grasp.files import given_path
 from dro_grasp.frames import motion_fault
-from dro_grasp.geometry.rotations import roma
-from dro_grasp.rendering.camera import Camera
+from dro_grasp.geometry.se3 import roma
+from dro_grasp.rendering.rasterizer import Camera
 
 BUILTIN_ROBOTS = Path(__file__).parent / "builtin"
 """Folder of the built-in robots."""

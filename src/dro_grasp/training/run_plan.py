@@ -6,9 +6,9 @@ from hashlib import sha256
 from typing import Any
 
 from dro_grasp.datasets.bundle.training_file import Bundle
+from dro_grasp.kinds import flat
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.models.presets import NetworkConfig
-from dro_grasp.records import flat
 
 BOOKKEEPING = frozenset({"minutes", "device", "log_every", "checkpoint_seconds", "tensorboard"})
 """Settings of a schedule that a resumed run may change: how long it goes on, where, and what it tells."""

@@ -15,8 +15,7 @@ from dro_grasp.geometry.point_clouds import even_directions
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.rendering.camera import Camera
-from dro_grasp.rendering.meshes import OBJECT_COLOUR, Colour, Mesh, dots
+from dro_grasp.rendering.rasterizer import OBJECT_COLOUR, Camera, Colour, Mesh, dots
 
 PALM_COLOUR: Colour = (0.58, 0.62, 0.69)
 """Grey of links that belong to no finger."""

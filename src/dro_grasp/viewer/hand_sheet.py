@@ -12,8 +12,7 @@ from jaxtyping import UInt8
 from dro_grasp.errors import OutputError
 from dro_grasp.files import replacing
 from dro_grasp.hands.hand import Hand
-from dro_grasp.rendering.camera import Camera
-from dro_grasp.rendering.rasterizer import render
+from dro_grasp.rendering.rasterizer import Camera, render
 from dro_grasp.viewer.appearance import hand_meshes
 from dro_grasp.viewer.pictures import contact_sheet
 

@@ -25,8 +25,7 @@ from dro_grasp.planning.reachability import carried
 from dro_grasp.planning.robot import Robot, load_robot
 from dro_grasp.planning.robot_check import robot_meshes, robot_shapes, shape_poses, table_meshes
 from dro_grasp.predictor import GraspPredictor
-from dro_grasp.rendering.camera import Camera
-from dro_grasp.rendering.meshes import OBJECT_COLOUR, Colour
+from dro_grasp.rendering.rasterizer import OBJECT_COLOUR, Camera, Colour
 from dro_grasp.viewer.appearance import SOLVED_COLOUR, SUCCESS_COLOUR
 from dro_grasp.viewer.scene_view import HOST, POINT_SIZE, ServedPage, escaped, rgb
 

@@ -20,8 +20,7 @@ from dro_grasp.errors import OptionError
 from dro_grasp.extras import require_extra
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.rendering.camera import Camera
-from dro_grasp.rendering.meshes import OBJECT_COLOUR, Colour
+from dro_grasp.rendering.rasterizer import OBJECT_COLOUR, Camera, Colour
 from dro_grasp.viewer import appearance
 from dro_grasp.web.origins import own_names, refusal
 

@@ -13,7 +13,7 @@ from dro_grasp.datasets.engine.shards import find_shards
 from dro_grasp.datasets.engine.worker import Job
 from dro_grasp.errors import GraspFileError, OptionError, OutputError
 from dro_grasp.files import reading
-from dro_grasp.records import flat
+from dro_grasp.kinds import flat
 
 SETTINGS = "settings.json"
 """File of the settings in a data set's folder."""
