@@ -7,7 +7,7 @@ import os
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import cache, cached_property
 from typing import Any, TypeVar
 
@@ -25,11 +25,7 @@ def choose_device(name: str) -> str:
 
 
 def require_device(name: str) -> None:
-    """Refuse a device that this machine does not have.
-
-    Raises:
-        OptionError: The name is no device, or this machine has no such device.
-    """
+    """Refuse a name that is no device, and a device that this machine does not have, by an OptionError."""
     try:
         device = torch.device(name)
     except RuntimeError:
@@ -59,11 +55,10 @@ def one_thread() -> Iterator[None]:
 
 
 def side_by_side(work: Callable[..., Result], *parts: Iterable[Any]) -> list[Result]:
-    """The results for all parts of a task, as `map` gives them, computed by as many threads as PyTorch may use.
+    """The results for all parts of a task, as `map` gives them, by as many threads as PyTorch may use, one for each part.
 
-    Each part is computed in one thread. Threads that share a part wait for each other after every operation, which costs
-    more than they gain where operations are small or other programs are at work; these wait once. Parts on another
-    device follow each other.
+    Threads that share a part wait for each other after every operation, which costs more than they gain where operations are
+    small or other programs are at work; these wait once. Parts on another device follow each other.
     """
     jobs, threads, gradients = list(zip(*parts, strict=True)), torch.get_num_threads(), torch.is_grad_enabled()
     on_cpu = all(value.device.type == "cpu" for job in jobs for value in job if isinstance(value, torch.Tensor))
@@ -79,20 +74,16 @@ def side_by_side(work: Callable[..., Result], *parts: Iterable[Any]) -> list[Res
         return list(pool.map(lambda job: work(*job), jobs))
 
 
-@contextmanager
-def fast_products() -> Iterator[None]:
+def fast_products() -> AbstractContextManager[None]:
     """Within the block, single-precision products on the CPU take the quick path if it is accurate here.
 
     The setting "medium" lets PyTorch choose another library, which is 2-4 times as fast on some processors at the same
-    accuracy. On others it rounds to half precision: a test product decides, once. It is never used where CUDA is
-    present, whose products it would round. The caller's setting comes back at the end, of blocks in several threads
-    with the last one.
+    accuracy. On others it rounds to half precision: a test product decides, once. CUDA's products it would round.
     """
-    with nullcontext() if torch.cuda.is_available() or not quick_path_is_accurate() else _QUICK_PATH:
-        yield
+    return nullcontext() if torch.cuda.is_available() or not quick_path_is_accurate() else _QUICK_PATH
 
 
-class _QuickPath:
+class _QuickPath(AbstractContextManager[None]):
     """The setting, which is the process's: the first block that begins sets it, the last that ends gives the caller's back."""
 
     def __init__(self) -> None:

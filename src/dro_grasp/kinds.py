@@ -27,11 +27,7 @@ class Checked:
     """
 
     def __post_init__(self) -> None:
-        """Make the numbers Python's.
-
-        Raises:
-            OptionError: A field holds something else than its annotation says.
-        """
+        """Make the numbers Python's; an OptionError if a field holds something else than its annotation says."""
         for name, kind in _hints(type(self)).items():
             given = getattr(self, name)
             if (value := plain(name, given, kind)) is not given:
@@ -54,11 +50,7 @@ def checked(call: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
 
 
 def plain(name: str, given: Any, kind: Any) -> Any:
-    """A value as Python's own of its kind: of WORDS, a choice, or a tuple of these.
-
-    Raises:
-        OptionError: It is of another kind; the error says what was given and what is expected.
-    """
+    """A value as Python's own of its kind, of WORDS, a choice, or a tuple of these; an OptionError if it is of another."""
     for each in _members(kind):
         try:
             return _converted(given, each)
@@ -72,11 +64,7 @@ def plain(name: str, given: Any, kind: Any) -> Any:
 
 
 def _converted(given: Any, kind: Any) -> Any:
-    """The value as one of this kind, the same object where it is one.
-
-    Raises:
-        TypeError, ValueError, RuntimeError: It is none.
-    """
+    """The value as one of this kind, the same object where it is one; TypeError, ValueError or RuntimeError if it is none."""
     if kind is NoneType or get_origin(kind) is Literal:
         if not any(given is each or (isinstance(given, type(each)) and given == each) for each in (get_args(kind) or [None])):
             raise ValueError

@@ -54,14 +54,10 @@ def multilaterate(
 
     The closed form is the minimiser of the linear least-squares problem that is left when the anchors' mean is
     subtracted from the squared distances. If the anchors are thin, a point and its mirror image fit alike: both are
-    refined to minima of the sum of (|p - anchor| - distance)^2.
+    refined to minima of the sum of (|p - anchor| - distance)^2. They are equal elsewhere; the mask tells which clouds are thin.
 
     Differs from the paper: its argmin of squared distances to the fourth power is replaced by the linear problem,
     which has one minimum, and on thin clouds by unsquared distances, which weigh noise evenly.
-
-    Returns:
-        The candidates on the two sides of the anchors' plane [m], equal where the cloud is not thin; and the mask of
-        thin clouds.
     """
     config = config or MultilaterationConfig()
     cloud = _spread(anchors)
@@ -137,8 +133,7 @@ def _refine(
 ) -> Float[Tensor, "*b n 3"]:
     """Gauss-Newton steps; autograd sees the last one alone.
 
-    At the minimum, the derivative of one Gauss-Newton step with respect to the distances is the derivative of the minimum
-    itself (up to second-order terms), so earlier steps need no graph.
+    At the minimum, its derivative by the distances is that of the minimum itself (up to second-order terms).
     """
     stride = max(1, anchors.shape[-2] // config.approach_anchors)
     with torch.no_grad():
@@ -207,9 +202,10 @@ def choose_sides(
 ) -> Bool[Tensor, "b l p"]:
     """Whether each point takes its second candidate.
 
-    Each body is registered from four starts: all points on one side, all on the other, and the two ways in which the
-    plane may cut it. From each start, points pick their nearer candidates and the body is registered again; the smallest
-    error wins.
+    Distances to a flat cloud leave two positions for each point, mirrored in its plane. The body's known shape resolves the
+    ambiguity, because a rigid motion cannot mirror it. Each body is registered from four starts: all points on one side, all on
+    the other, and the two ways in which the plane may cut it. From each start, points pick their nearer candidates and the body
+    is registered again; the smallest error wins.
 
     Args:
         local: Points of l bodies in their own frames [m], padded.

@@ -84,18 +84,11 @@ def rotation_between(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tens
 def register(
     source: Float[Tensor, "*b n 3"], target: Float[Tensor, "*b n 3"], weights: Float[Tensor, "*b n"] | None = None
 ) -> tuple[Float[Tensor, "*b 4 4"], Float[Tensor, "*b"]]:
-    """The rigid motion, never a reflection, that maps source points closest to target points.
+    """The motion, never a reflection, that maps source points closest to target points: T_target_source, and the distance left.
 
-    roma regularises the backward pass, so gradients stay finite on thin and even on collinear sets. If all weights are
-    zero, they count as one: check the rank of the points before using such a pose.
-
-    Args:
-        source: Points in their own frame [m].
-        target: The same points in the target frame [m].
-        weights: Weight of each pair; 1 by default, 0 leaves a pair out.
-
-    Returns:
-        T_target_source, and the remaining weighted root mean square distance [m].
+    Points are in metres, the distance is the weighted root mean square [m]. A weight of 0 leaves a pair out; if all are zero,
+    they count as one: check the rank of the points before using such a pose. roma regularises the backward pass, so gradients
+    stay finite on thin and even on collinear sets. Source: paper section III-D, 6D pose estimation of links.
     """
     weights = source.new_ones(source.shape[:-1]) if weights is None else weights
     weights = torch.where(weights.sum(-1, keepdim=True) > 0, weights, torch.ones_like(weights))

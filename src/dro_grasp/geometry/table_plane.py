@@ -17,12 +17,7 @@ LEAST_REST = 16
 def table_plane(
     points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, "3"] | None = None
 ) -> Float[np.ndarray, "4"] | None:
-    """Upward unit normal of the table in a cloud, and its height along the normal [m]; None if no plane looks like one.
-
-    Args:
-        points: The cloud [m].
-        camera: Where it was seen from; a table is seen from above.
-    """
+    """Upward normal and height [m] of the table in a cloud [m], which the camera sees from above; None if there is none."""
     if len(points) < 2 * LEAST_REST or not np.abs(points).max() < 100.0:
         return None  # farther [m], it is in another unit (ours)
     plane = largest_plane(points, THICKNESS)

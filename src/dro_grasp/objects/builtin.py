@@ -89,7 +89,7 @@ def _duck() -> Pieces:
     ]))
     body = superquadric((0.046, 0.034, 0.03), (1, 1))
     head = superquadric((0.024, 0.024, 0.024), (1, 1), (0.022, 0, 0.043))
-    return [body, head, beak, *tilted([box((0.03, 0.03, 0.012), (-0.045, 0, 0.0))], 0.5)]
+    return [body, head, beak, tilted(box((0.03, 0.03, 0.012), (-0.045, 0, 0.0)), 0.5)]
 
 
 def _joystick() -> Pieces:

@@ -98,13 +98,9 @@ def object_names() -> dict[str, str]:
 
 
 def resolve_objects(names: list[str]) -> list[str]:
-    """Names with folders replaced by the object files in them, and groups by their members.
+    """Names and paths with folders replaced by the object files in them, and groups by their members.
 
-    Args:
-        names: Names, paths, and groups such as `assets:train` and `procedural:0-99`.
-
-    Raises:
-        ObjectError: A folder or a group holds no object.
+    Groups are such as `assets:train` and `procedural:0-99`. A folder or a group that holds no object is an ObjectError.
     """
     found: list[str] = []
     for name in names:
@@ -186,11 +182,7 @@ def processed_folder(path: Path) -> Path | None:
 
 
 def processed_objects(folder: Path | str) -> list[Path]:
-    """Folders of all objects of DexGraspBench at any depth of a folder, such as a clone of it or its archive, sorted.
-
-    Raises:
-        ObjectError: There is none.
-    """
+    """Folders of all objects of DexGraspBench at any depth of a folder, such as a clone of it or its archive, sorted."""
     folder = given_path(folder)
     found = sorted(path.parent.parent for path in folder.rglob(MESH) if processed_folder(path))
     if not found:
@@ -200,11 +192,7 @@ def processed_objects(folder: Path | str) -> list[Path]:
 
 
 def load_processed(folder: Path, scale: float) -> ObjectModel:
-    """The object of a folder, with the convex parts that the benchmark collides; its name is the folder's and the scale.
-
-    Raises:
-        ObjectError: A file in the folder is unusable.
-    """
+    """The object of a folder, with the convex parts that the benchmark collides; its name is the folder's and the scale."""
     parts = tuple(as_part(_read_mesh(file)) for file in sorted((folder / PARTS).glob("*.obj")))
     obj = mesh_object(
         f"{folder.name}@{scale:g}", _read_mesh(folder / MESH), origin=str(folder), scale=scale, parts=parts or None)

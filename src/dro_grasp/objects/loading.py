@@ -36,13 +36,7 @@ NEIGHBOURS = 16
 def load_file(path: Path, *, scale: float = 1.0, keep_table: bool = False) -> ObjectModel:
     """Read a mesh in any format trimesh knows, or a point cloud (PLY without faces, NPY, PCD).
 
-    Args:
-        path: The file. A unit stated in it (glTF, 3MF, DAE) is honoured.
-        scale: Multiplies all coordinates; 0.001 for files in millimetres that state no unit.
-        keep_table: As for `cloud_object`.
-
-    Raises:
-        ObjectError: The file cannot be used; the message says why and what to do.
+    A unit stated in the file (glTF, 3MF, DAE) is honoured; `scale` multiplies all coordinates.
     """
     path = given_path(path)
     if not path.is_file():
@@ -74,9 +68,6 @@ def mesh_object(
         origin: Source of the mesh, for messages.
         scale: Multiplies all coordinates, including those of the parts.
         split: `train`, `validate`, `test`, or None for a user's object.
-
-    Raises:
-        ObjectError: NaN vertices, no faces, no volume, or an implausible size in metres.
     """
     notes: list[str] = []
     vertices, faces = np.asarray(mesh.vertices, np.float64) * scale, np.asarray(mesh.faces, np.int64)
@@ -111,15 +102,9 @@ def cloud_object(
     """An object from a bare point cloud (n 3), or a cloud with normals (n 6); only the points are scaled.
 
     Args:
-        name: What to call it.
-        points: The cloud.
         origin: Source of the cloud, for messages.
-        scale: Multiplies all coordinates.
         keep_table: Take every point for the object's, also those of a table.
         seen: What was seen of it, where the rest of the cloud is a guess [m].
-
-    Raises:
-        ObjectError: Another shape, NaN, too few distinct points, or an implausible size in metres.
     """
     if points.ndim != 2 or points.shape[1] not in (3, 6):
         raise ObjectError(f"{origin} holds an array of shape {points.shape}; expected (n, 3) points or (n, 6) points "

@@ -28,18 +28,11 @@ ATTEMPTS = 20
 
 
 def procedural_object(seed: int, *, scale: float = 1.0) -> ObjectModel:
-    """The object of a seed, the same one every time.
-
-    Args:
-        seed: From 0 on.
-        scale: Multiplies all coordinates.
-
-    Raises:
-        ObjectError: `scale` makes it implausibly large or small.
-    """
+    """The object of a seed (0 or more), the same one every time; `scale` multiplies all coordinates."""
     generator = np.random.default_rng([seed, 15])
     for _ in range(ATTEMPTS):
-        solids = [piece if isinstance(piece, Solid) else Solid(piece, [piece]) for piece in _draw(generator)]
+        pieces = FAMILIES[generator.integers(len(FAMILIES))](generator)
+        solids = [piece if isinstance(piece, Solid) else Solid(piece, [piece]) for piece in pieces]
         factors = _factors(solids, generator)
         if factors is None:
             continue
@@ -47,11 +40,6 @@ def procedural_object(seed: int, *, scale: float = 1.0) -> ObjectModel:
         if all(solid.mesh.is_volume for solid in stretched):
             return assemble(f"procedural_{seed}", stretched, scale=scale, split="train")
     raise ObjectError(f"seed {seed} makes no object in {ATTEMPTS} attempts; give another one")
-
-
-def _draw(generator: Generator) -> Pieces:
-    """A shape of one of the families, of any size."""
-    return FAMILIES[generator.integers(len(FAMILIES))](generator)
 
 
 def _factors(solids: list[Solid], generator: Generator) -> Float[np.ndarray, "3"] | None:
@@ -86,34 +74,23 @@ def _lump(g: Generator, size: float, at: Point) -> trimesh.Trimesh:
         return box((x, y, z), at)
     height = size * g.uniform(0.4, 1)
     wide, narrow = size * g.uniform(0.5, 1), size * g.uniform(0.2, 1)
-    return frustum((wide, narrow), (-height, height), at, axis=_axis(g), corners=_corners(g))
-
-
-def _axis(g: Generator) -> str:
-    return "xyz"[g.integers(3)]
+    return frustum((wide, narrow), (-height, height), at, axis="xyz"[g.integers(3)], corners=_corners(g))
 
 
 def _corners(g: Generator) -> int:
     return int(g.choice([4, 6, 24, 24]))
 
 
-def _convex(g: Generator) -> Pieces:
-    return [_blob(g)]
-
-
 def _prism(g: Generator) -> Pieces:
     return [frustum((1, g.uniform(0.05, 1)), (-g.uniform(0.3, 2), 1), corners=int(g.choice([3, 4, 5, 6, 8, 24])))]
 
 
-def _profile(g: Generator, steps: int) -> list[tuple[float, float]]:
-    """Radii at rising heights; neighbours differ by a step or a slope."""
+def _vase(g: Generator) -> Pieces:
+    """Radii at rising heights, turned; neighbours differ by a step or a slope."""
+    steps = int(g.integers(3, 7))
     heights = np.cumsum(g.uniform(0.15, 1, steps))
     radii = np.clip(np.cumsum(g.normal(0, 0.35, steps)) + 1, 0.3, 1.8)
-    return [(float(r), float(h)) for r, h in zip(radii, heights, strict=True)]
-
-
-def _vase(g: Generator) -> Pieces:
-    return turned(_profile(g, int(g.integers(3, 7))))
+    return turned(list(zip(radii.tolist(), heights.tolist(), strict=True)))
 
 
 def _vessel(g: Generator) -> Pieces:
@@ -124,10 +101,6 @@ def _vessel(g: Generator) -> Pieces:
         return [body]
     radius = height * g.uniform(0.2, 0.33)
     return [body, ring(radius, 0.12, 9, arc=np.pi, axis="y", at=(low - 0.02, 0, height / 2), start=0.0)]
-
-
-def _ring(g: Generator) -> Pieces:
-    return [ring(1.0, g.uniform(0.15, 0.6))]
 
 
 def _blocks(g: Generator) -> Pieces:
@@ -161,5 +134,6 @@ def _creature(g: Generator) -> Pieces:
 
 
 FAMILIES: tuple[Callable[[Generator], Pieces], ...] = (
-    _convex, _prism, _vase, _vessel, _ring, _blocks, _tool, _tool, _creature, _creature)
+    lambda g: [_blob(g)], _prism, _vase, _vessel, lambda g: [ring(1.0, g.uniform(0.15, 0.6))], _blocks, _tool, _tool,
+    _creature, _creature)
 """How shapes are made; those that stand twice come twice as often."""

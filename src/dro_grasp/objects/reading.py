@@ -31,9 +31,14 @@ def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
     geometry, unit = read_geometry(path)
     if not isinstance(geometry, np.ndarray):
         raise ObjectError(f"{path} is a mesh, not a camera cloud; leave out --camera, or give a cloud (PLY, NPY, PCD)")
-    if geometry.ndim != 2 or geometry.shape[1] < 3:
-        raise ObjectError(f"{path} holds an array of shape {geometry.shape}; expected (n, 3) points")
-    return geometry[:, :3] * unit
+    return coordinates(geometry, str(path)) * unit
+
+
+def coordinates(cloud: Shaped[np.ndarray, "..."], origin: str) -> Float[np.ndarray, "n 3"]:
+    """The points of a cloud, NaN included, without normals or colours; an ObjectError if they are none."""
+    if cloud.ndim != 2 or cloud.shape[1] < 3:
+        raise ObjectError(f"{origin} holds an array of shape {cloud.shape}; expected (n, 3) points")
+    return np.asarray(cloud[:, :3], np.float64)
 
 
 def read_geometry(path: Path) -> tuple[trimesh.Trimesh | Float[np.ndarray, "..."], float]:

@@ -23,10 +23,7 @@ MassProperties = tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]
 
 
 def check_surface(mesh: trimesh.Trimesh, origin: str) -> None:
-    """Refuse faces without area, and soups, for which inside and outside take minutes to tell, by an ObjectError.
-
-    The mesh has merged vertices.
-    """
+    """Refuse faces without area, and soups of faces, in which inside and outside take minutes to tell, by an ObjectError."""
     if not (len(mesh.faces) and mesh.nondegenerate_faces().any()):
         raise ObjectError(f"{origin} has {len(mesh.faces)} faces, none of which has an area; give a triangle mesh of a solid")
     edges = mesh.faces_unique_edges[mesh.unique_faces()]  # a face and its reverse side count once
@@ -37,10 +34,7 @@ def check_surface(mesh: trimesh.Trimesh, origin: str) -> None:
 
 
 def repair(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
-    """Decimate, close, turn outward and join, as far as that is safe; a sound mesh is returned unchanged.
-
-    The mesh has merged vertices; `notes` gets a line for each finding.
-    """
+    """Decimate, close, turn outward and join a mesh with merged vertices, as far as that is safe; `notes` gets each finding."""
     if (before := len(mesh.faces)) > 100_000:  # (ours)
         mesh = mesh.simplify_quadric_decimation(face_count=50_000)
         notes.append(f"decimated from {before} to {len(mesh.faces)} faces")

@@ -16,9 +16,10 @@ from scipy.spatial import KDTree
 from dro_grasp.errors import ObjectError
 from dro_grasp.files import given_path
 from dro_grasp.geometry.distance_field import DistanceField
+from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.kinds import checked
 from dro_grasp.objects.loading import FARTHEST, check_scale
-from dro_grasp.objects.reading import ObjectSource, geometry_in_memory, read_geometry
+from dro_grasp.objects.reading import ObjectSource, coordinates, geometry_in_memory, read_geometry
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.objects.surface_distances import banded_values, search_tree, signed_distances
 
@@ -114,9 +115,7 @@ def load_scene(source: ObjectSource, name: str | None = None, scale: float = 1.0
             raise ObjectError(f"{origin} has {len(faces)} faces, or vertices that are absent or not finite; repair the mesh, "
                               "or give a cloud")
     else:
-        if geometry.ndim != 2 or geometry.shape[1] < 3:
-            raise ObjectError(f"{origin} holds an array of shape {geometry.shape}; expected (n, 3) points")
-        points, faces = np.asarray(geometry[:, :3], np.float64), None
+        points, faces = coordinates(geometry, origin), None
         points = points[np.isfinite(points).all(1)]
     points = points * (scale * unit)
     if not len(points):
@@ -127,13 +126,6 @@ def load_scene(source: ObjectSource, name: str | None = None, scale: float = 1.0
     if faces is None:
         points = points[one_per_cell(points, 0.004)]  # [m] (ours): cameras see far more
     return Scene(label, points, faces)
-
-
-def one_per_cell(points: Float[np.ndarray, "n 3"], edge: float) -> Int[np.ndarray, " k"]:
-    """Which of some points to keep so that each cube of this edge [m] keeps one."""
-    cells = np.floor(points / edge).astype(np.int64)
-    cells -= cells.min(0)
-    return np.unique(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(0) + 1)), return_index=True)[1]
 
 
 def _ball_distances(points: Float[np.ndarray, "n 3"]) -> Any:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.geometry.distance_field import Balls, DistanceField
-from dro_grasp.geometry.point_clouds import random_half
+from dro_grasp.geometry.point_clouds import one_per_cell, random_half
 from dro_grasp.objects.cache import cached_arrays, content_hash
 from dro_grasp.objects.convex_parts import Part, coarse_parts, decompose, pack
 from dro_grasp.objects.surface_distances import GRID_SPACING, bake_grid, closed_cloud_distances, signed_distances
@@ -176,9 +176,8 @@ def _enclosed(obj: ObjectModel) -> tuple[float, Float[np.ndarray, "n 3"]]:
 
 def _spread(cloud: Float[np.ndarray, "m 3"], spacing: float) -> Int[np.ndarray, " k"]:
     """Rows of points about this far apart [m]: the one nearest to the middle of each cell of a grid."""
-    cells = np.floor(cloud / spacing)
-    order = np.linalg.norm(cloud / spacing - cells - 0.5, axis=1).argsort(kind="stable")
-    return order[np.unique(cells[order], axis=0, return_index=True)[1]]
+    order = np.linalg.norm(cloud / spacing - np.floor(cloud / spacing) - 0.5, axis=1).argsort(kind="stable")
+    return order[one_per_cell(cloud[order], spacing)]
 
 
 def _balls(obj: ObjectModel) -> Balls:

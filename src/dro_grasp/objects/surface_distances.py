@@ -30,13 +30,7 @@ Distances = Callable[[Float[np.ndarray, "_ 3"]], Float[np.ndarray, " _"]]
 
 
 def bake_grid(surface: Float[np.ndarray, "n 3"], distance: Distances, banded: bool = False) -> Arrays:
-    """Signed distances on a grid around a surface: `values` (nx ny nz), `origin` (3) and `spacing` [m].
-
-    Args:
-        surface: What the grid surrounds [m].
-        distance: Signed distances to it.
-        banded: Fill the grid coarsely away from the surface; see `banded_values`.
-    """
+    """Signed distances on a grid around a surface: `values` (nx ny nz), `origin` (3) and `spacing` [m]; see `banded_values`."""
     low, high = surface.min(0) - GRID_PADDING, surface.max(0) + GRID_PADDING
     spacing = max(GRID_SPACING, float((np.prod(high - low) / LARGEST_GRID) ** (1 / 3)))
     counts = np.ceil((high - low) / spacing).astype(int) + 1

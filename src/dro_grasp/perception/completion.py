@@ -15,6 +15,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.models.completion_network import SurfaceNetwork, shipped_surface
 from dro_grasp.objects.surface_distances import cloud_distances
 from dro_grasp.perception.symmetry import Guess, VisibleSide, project
@@ -69,8 +70,7 @@ def complete_cloud(
     Args:
         points: Points of the visible side [m].
         normals: Their outward unit normals.
-        camera: Position of the camera [m]. Without it, the points are taken to be all points on one side of a plane, whose
-            normal is the mean of theirs.
+        camera: Its position [m]; without it, the points are all on one side of a plane, whose normal is the mean of theirs.
         up: Up direction, if known; symmetries that preserve it are preferred.
         network: Chooses between symmetries; the shipped one by default.
     """
@@ -81,7 +81,8 @@ def complete_cloud(
     surface, outward = extract_surface(side, guesses, network or shipped_surface())
     # One visible point is kept per cube of a fortieth of the width, but not below 2 mm or a tenth of the width (ours).
     apart = max(side.width / 40, min(0.002, side.width / 10))
-    seen, seen_normals = _thinned(side.points, side.normals, apart)
+    first = one_per_cell(side.points, apart)
+    seen, seen_normals = side.points[first], side.normals[first]
     between = 2 * float(np.median(KDTree(seen).query(seen, k=2)[0][:, 1]))
     near = side.tree.query(surface)[0] < 1.5 * max(apart, between)
     # Extracted points near the visible side cover the same area as the thinned visible points: the ratio of the two
@@ -156,11 +157,3 @@ def extract_surface(
     kept = arrived & (points > low).all(1) & (points < high).all(1)
     outward = here[kept, 1:]
     return points[kept], outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
-
-
-def _thinned(
-    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], spacing: float
-) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
-    """The first point in each cell of a grid."""
-    first = np.unique(np.floor(points / spacing).astype(np.int64), axis=0, return_index=True)[1]
-    return points[first], normals[first]

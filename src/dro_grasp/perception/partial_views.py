@@ -50,10 +50,7 @@ def partial_view(obj: ObjectModel, view: View, seed: int, camera: DepthCamera | 
 def visible_side(
     obj: ObjectModel, view: Literal["half", "depth"], seed: int, camera: DepthCamera | None = None
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Float[np.ndarray, "3"] | None]:
-    """Points of the visible side alone [m], their normals, and the camera's position if there is one [m].
-
-    Arguments are those of `partial_view`.
-    """
+    """As `partial_view`: the visible side's points alone [m], their normals, and the camera's position if there is one [m]."""
     generator = torch.Generator().manual_seed(seed)
     if view == "half":
         half = cloud_object(obj.name, obj.sample_partial(POINTS, generator).numpy(), origin=obj.name, keep_table=True)
@@ -120,7 +117,10 @@ def visible_points(
     T_object_camera = _looking_at(_middle(obj), towards.double().numpy() / length, camera.distance)
     image = _depth_of_cloud if obj.is_cloud else _depth_of_mesh
     rays, depth = image(obj, T_object_camera, radius, camera)
-    return _measured(rays, depth, T_object_camera, camera, generator)
+    kept = torch.rand(len(depth), generator=generator).numpy() >= camera.lost
+    error = torch.randn(len(depth), generator=generator).numpy() * camera.noise * (depth / 0.5) ** 2
+    points = (rays * (depth + error)[:, None])[kept]
+    return torch.from_numpy((points @ T_object_camera[:3, :3].T + T_object_camera[:3, 3]).astype(np.float32))
 
 
 def _middle(obj: ObjectModel) -> Float[np.ndarray, "3"]:
@@ -171,14 +171,3 @@ def _depth_of_cloud(
     hull = ConvexHull(np.concatenate([flipped, np.zeros((1, 3))]), qhull_options="QJ").vertices
     visible = local[np.sort(hull[hull < len(local)])]
     return visible / visible[:, 2:], visible[:, 2]
-
-
-def _measured(
-    rays: Float[np.ndarray, "pixels 3"], depth: Float[np.ndarray, " pixels"], T_object_camera: Float[np.ndarray, "4 4"],
-    camera: DepthCamera, generator: torch.Generator,
-) -> Float[Tensor, "n 3"]:
-    """Points in the object's frame from noisy depths, without lost pixels [m]."""
-    kept = torch.rand(len(depth), generator=generator).numpy() >= camera.lost
-    error = torch.randn(len(depth), generator=generator).numpy() * camera.noise * (depth / 0.5) ** 2
-    points = (rays * (depth + error)[:, None])[kept]
-    return torch.from_numpy((points @ T_object_camera[:3, :3].T + T_object_camera[:3, 3]).astype(np.float32))

@@ -63,12 +63,7 @@ def depth_points(depth: ArrayLike, intrinsics: ArrayLike, mask: ArrayLike | None
 def load_scan(
     path: Path, T_frame_camera: Float[np.ndarray, "4 4"], scale: float = 1.0, keep_table: bool = False
 ) -> ObjectModel:
-    """The object in a cloud file (PLY, NPY, PCD) in the camera's frame, times `scale`; see `scanned_object`.
-
-    Raises:
-        ObjectError: The file holds no cloud, or none of an object's size, or `scale` is not positive.
-        OptionError: The pose is no rigid motion.
-    """
+    """The object in a cloud file (PLY, NPY, PCD) in the camera's frame, times `scale`; see `scanned_object`."""
     check_scale(scale)
     return scanned_object(path.stem, read_points(path) * scale, T_frame_camera, keep_table=keep_table)
 

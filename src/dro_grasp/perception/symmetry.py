@@ -111,10 +111,7 @@ class VisibleSide:
         return cls(points, normals, camera_distance, shuffled[:SAMPLE], rim, expected, smooth, width, float(end), float(top))
 
     def guesses(self, up: Float[np.ndarray, "3"] | None, count: int) -> list[Guess]:
-        """Both sides by the best symmetries that differ, best first; the last one repeats if there are too few.
-
-        Symmetries that preserve `up` [view axes] are preferred.
-        """
+        """Both sides by the best symmetries that differ, best first; those that preserve `up` [view axes] are preferred."""
         motions = self.symmetries(up)
         leaning = [up is not None and not np.allclose(linear @ up, up, atol=1e-6) for linear, _ in motions]
         costs = np.array([self.cost(*motion) for motion in motions]) + 0.1 * np.array(leaning)  # (ours)

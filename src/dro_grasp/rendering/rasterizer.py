@@ -68,11 +68,7 @@ def dots(points: Num[np.ndarray, "n 3"], colour: Colour, radius: float = 0.0015)
 def corner_normals(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"], crease: float
 ) -> Float[np.ndarray, "m 3 3"]:
-    """Unit normals at the corners of each face: smooth, but flat where the surface folds.
-
-    Args:
-        crease: Cosine between face normal and vertex normal below which the corner takes the face normal.
-    """
+    """Unit normals at the corners of faces: smooth, but flat where the cosine between face and vertex is below `crease`."""
     triangle = vertices[faces]
     face = np.cross(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0])
     # Files repeat a vertex for every face that uses it: vertices at the same place share their normal.
@@ -111,12 +107,9 @@ class Camera:
         points: Num[np.ndarray, "n 3"], direction: tuple[float, float, float], up: tuple[float, float, float] = (0.0, 0.0, 1.0),
         field_of_view: float = 0.6, aspect: float = 4 / 3, margin: float = 0.06,
     ) -> Camera:
-        """The nearest camera in a direction that has all points in its picture.
+        """The nearest camera in a direction, from the points [m] towards it, that has all of them in its picture.
 
-        Args:
-            direction: From the points [m] towards the camera.
-            aspect: Width of the picture over its height.
-            margin: Share of the picture that stays free at each edge.
+        `aspect` is the picture's width over its height, `margin` the share that stays free at each edge.
         """
         axes = Camera(direction, (0.0, 0.0, 0.0), up).axes()
         turned = points.astype(float) @ axes.T
@@ -191,8 +184,13 @@ class _Triangles:
 
     @cached_property
     def shares(self) -> Float[np.ndarray, "3 3 f"]:
-        """Coefficients (of x, of y, constant) of each corner's barycentric coordinate over the picture."""
-        return _barycentric(self.screen)
+        """Coefficients (of x, of y, constant) of each corner's barycentric coordinate; negative for slivers."""
+        x, y = self.screen[..., 0].T, self.screen[..., 1].T
+        (x1, y1), (x2, y2) = ((x[order], y[order]) for order in ([1, 2, 0], [2, 0, 1]))
+        twice = np.stack([y1 - y2, x2 - x1, x1 * y2 - x2 * y1])
+        area = twice[2].sum(0)
+        drawn = np.abs(area) > 1e-9  # twice the area [pixels^2] (ours)
+        return np.where(drawn, twice / np.where(drawn, area, 1.0), np.array([0.0, 0.0, -1.0])[:, None, None])
 
     @cached_property
     def depths(self) -> Float[np.ndarray, "3 f"]:
@@ -216,11 +214,7 @@ def render(
     meshes: Sequence[Mesh], camera: Camera, width: int = 640, height: int = 480, *, background: Colour = (1.0, 1.0, 1.0),
     oversampling: int = 2, style: Style | None = None,
 ) -> UInt8[np.ndarray, "{height} {width} 3"]:
-    """Draw meshes with perspective, smooth shading and soft outlines, on a picture of `width` times `height` pixels.
-
-    Args:
-        oversampling: Samples per pixel and axis; 2 smooths the edges.
-    """
+    """Draw meshes with perspective, smooth shading and soft outlines; `oversampling` is the samples per pixel and axis."""
     style = style or Style()
     samples = width * height * oversampling**2
     canvas = _Canvas(width * oversampling, height * oversampling, np.zeros(samples), np.zeros(samples, np.int64))
@@ -311,16 +305,6 @@ def _shaded(triangles: _Triangles, canvas: _Canvas, background: Colour, style: S
     return colours
 
 
-def _barycentric(screen: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "3 3 f"]:
-    """Coefficients (of x, of y, constant) of the three barycentric coordinates over the picture; negative for slivers."""
-    x, y = screen[..., 0].T, screen[..., 1].T
-    (x1, y1), (x2, y2) = ((x[order], y[order]) for order in ([1, 2, 0], [2, 0, 1]))
-    twice = np.stack([y1 - y2, x2 - x1, x1 * y2 - x2 * y1])
-    area = twice[2].sum(0)
-    drawn = np.abs(area) > 1e-9  # twice the area [pixels^2] (ours)
-    return np.where(drawn, twice / np.where(drawn, area, 1.0), np.array([0.0, 0.0, -1.0])[:, None, None])
-
-
 def shade(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], colours: Float[np.ndarray, "n 3"], style: Style
 ) -> Float[np.ndarray, "n 3"]:
@@ -340,12 +324,7 @@ def _units(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 
 
 def outlines(depth: Float[np.ndarray, "h w"], radius: int, style: Style) -> Float[np.ndarray, "h w"]:
-    """Factor on the colour of each pixel that darkens what lies behind its neighbours: eye-dome lighting.
-
-    Args:
-        depth: Depth of each pixel [m], infinite where nothing is drawn.
-        radius: Distance of the eight neighbours [pixels].
-    """
+    """Factor on the colour of each pixel that darkens what lies behind its neighbours `radius` pixels away; depths in [m]."""
     padded = np.pad(depth, radius, mode="edge")
     h, w = depth.shape
     total = np.zeros((h, w), np.float32)
