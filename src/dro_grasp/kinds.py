@@ -87,16 +87,12 @@ def _row(given: Any, kinds: tuple[Any, ...]) -> tuple[Any, ...]:
     each = kinds[:1] * len(values) if kinds[1:] == (...,) else kinds
     if len(values) != len(each):
         raise ValueError
-    made = tuple(_first(value, kind) for value, kind in zip(values, each, strict=True))
-    same = isinstance(given, tuple) and all(a is b for a, b in zip(given, made, strict=True))
-    return given if same else made
-
-
-def _first(given: Any, kind: Any) -> Any:
     try:
-        return plain("", given, kind)
+        made = tuple(plain("", value, kind) for value, kind in zip(values, each, strict=True))
     except OptionError as error:
         raise ValueError from error
+    same = isinstance(given, tuple) and all(a is b for a, b in zip(given, made, strict=True))
+    return given if same else made
 
 
 def _members(kind: Any) -> tuple[Any, ...]:

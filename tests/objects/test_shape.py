@@ -13,7 +13,7 @@ from dro_grasp.objects import shape, surface_distances
 from dro_grasp.objects.cache import cache_folder, cached_arrays, content_hash
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.loading import cloud_object, mesh_object
-from dro_grasp.objects.shape import DENSITY, OUTSIDE, RADII, SPACING, ObjectModel, solid_of
+from dro_grasp.objects.shape import BALL_OUTSIDE, BALL_RADII, BALL_SPACING, DENSITY, ObjectModel, solid_of
 from tests.helpers.clouds import cloud_of
 
 
@@ -285,12 +285,12 @@ def sphere() -> ObjectModel:
 def test_balls_touch_a_sphere_from_inside_and_leave_no_gap(sphere: ObjectModel) -> None:
     centres, radii = balls_of(sphere)
     reach = np.linalg.norm(centres - CENTRE, axis=1) + radii
-    assert np.abs(reach - RADIUS).max() < OUTSIDE
-    assert (radii == RADII[0]).mean() > 0.95
+    assert np.abs(reach - RADIUS).max() < BALL_OUTSIDE
+    assert (radii == BALL_RADII[0]).mean() > 0.95
     towards = np.random.default_rng(0).normal(size=(2000, 3))
     places = CENTRE + RADIUS * towards / np.linalg.norm(towards, axis=1, keepdims=True)
     gap = (np.linalg.norm(places[:, None] - centres, axis=2) - radii).min(1)
-    assert gap.max() < SPACING / 4  # a finger meets the surface some 2 mm low at most
+    assert gap.max() < BALL_SPACING / 4  # a finger meets the surface some 2 mm low at most
 
 
 def test_a_sphere_weighs_what_it_weighs(sphere: ObjectModel) -> None:
@@ -315,19 +315,19 @@ def test_a_turned_box_has_the_inertia_of_the_box() -> None:
 
 def test_a_cup_stays_hollow() -> None:
     centres, radii = balls_of(cloud_of(trimesh.creation.annulus(0.03, 0.036, 0.08), "cup"))
-    assert (np.linalg.norm(centres[:, :2], axis=1) - radii > 0.03 - 2 * OUTSIDE).all()
-    assert (np.linalg.norm(centres[:, :2], axis=1) + radii < 0.036 + 2 * OUTSIDE).all()
+    assert (np.linalg.norm(centres[:, :2], axis=1) - radii > 0.03 - 2 * BALL_OUTSIDE).all()
+    assert (np.linalg.norm(centres[:, :2], axis=1) + radii < 0.036 + 2 * BALL_OUTSIDE).all()
 
 
 def test_a_large_thing_has_larger_balls_and_not_more_of_them(sphere: ObjectModel, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a thing of 30 cm is for the usual number of balls, a small one is for fewer."""
     usual = len(balls_of(sphere)[1])
-    monkeypatch.setattr("dro_grasp.objects.shape.MOST", usual // 4)
+    monkeypatch.setattr("dro_grasp.objects.shape.MOST_BALLS", usual // 4)
     centres, radii = balls_of(sphere)
     assert usual // 8 < len(radii) <= usual // 4
-    assert radii.max() > 1.5 * RADII[0]
+    assert radii.max() > 1.5 * BALL_RADII[0]
     reach = np.linalg.norm(centres - CENTRE, axis=1) + radii
-    assert np.abs(reach - RADIUS).max() < OUTSIDE
+    assert np.abs(reach - RADIUS).max() < BALL_OUTSIDE
 
 
 def test_a_plate_thinner_than_the_grid_has_a_small_mass_all_the_same() -> None:

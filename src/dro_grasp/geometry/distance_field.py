@@ -1,4 +1,4 @@
-"""Signed distances to a surface, with gradient, normal and curvature by one look-up per point."""
+"""Signed distances to a surface or to balls, with gradient, and of a surface normal and curvature, by one look-up per point."""
 
 from __future__ import annotations
 

@@ -75,15 +75,12 @@ def largest_plane(
     best = (np.abs(some @ normal.T - heights) <= near).sum(0).argmax()
     plane = np.append(normal[best], heights[best])
     for _ in range(fits):
-        plane = _least_squares(points[np.abs(points @ plane[:3] - plane[3]) <= near])
+        own = points[np.abs(points @ plane[:3] - plane[3]) <= near]
+        middle = own.mean(0)
+        across = np.linalg.eigh((own - middle).T @ (own - middle))[1][:, 0]
+        across = across * np.copysign(1.0, across[2])
+        plane = np.append(across, across @ middle)
     return plane
-
-
-def _least_squares(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4"]:
-    middle = points.mean(0)
-    normal = np.linalg.eigh((points - middle).T @ (points - middle))[1][:, 0]
-    normal = normal * np.copysign(1.0, normal[2])
-    return np.append(normal, normal @ middle)
 
 
 def _area(points: Float[np.ndarray, "n 3"], plane: Float[np.ndarray, "4"]) -> float:

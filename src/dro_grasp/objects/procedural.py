@@ -7,7 +7,6 @@ from collections.abc import Callable
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
 from numpy.random import Generator
 
 from dro_grasp.errors import ObjectError
@@ -33,29 +32,25 @@ def procedural_object(seed: int, *, scale: float = 1.0) -> ObjectModel:
     for _ in range(ATTEMPTS):
         pieces = FAMILIES[generator.integers(len(FAMILIES))](generator)
         solids = [piece if isinstance(piece, Solid) else Solid(piece, [piece]) for piece in pieces]
-        factors = _factors(solids, generator)
-        if factors is None:
-            continue
-        stretched = [_stretched(solid, factors) for solid in solids]
-        if all(solid.mesh.is_volume for solid in stretched):
-            return assemble(f"procedural_{seed}", stretched, scale=scale, split="train")
+        sized = _sized(solids, generator)
+        if sized is not None and all(solid.mesh.is_volume for solid in sized):
+            return assemble(f"procedural_{seed}", sized, scale=scale, split="train")
     raise ObjectError(f"seed {seed} makes no object in {ATTEMPTS} attempts; give another one")
 
 
-def _factors(solids: list[Solid], generator: Generator) -> Float[np.ndarray, "3"] | None:
-    """Factors along the axes that stretch a shape and give it a size; None for a shape that is too thin."""
+def _sized(solids: list[Solid], generator: Generator) -> list[Solid] | None:
+    """A shape stretched along the axes and given a size; None if it is too thin."""
     corners = np.concatenate([np.asarray(solid.mesh.vertices) for solid in solids])
     extent = np.ptp(corners, axis=0) * (stretch := generator.uniform(*STRETCH, 3))
     size = np.exp(generator.uniform(*np.log(SIZE)))
+    if extent.min() * size / extent.max() < THINNEST:
+        return None
     factors = stretch * size / extent.max()
-    return factors if extent.min() * size / extent.max() >= THINNEST else None
 
-
-def _stretched(solid: Solid, factors: Float[np.ndarray, "3"]) -> Solid:
     def stretched(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         return trimesh.Trimesh(np.asarray(mesh.vertices) * factors, np.asarray(mesh.faces), process=False)
 
-    return Solid(stretched(solid.mesh), [stretched(part) for part in solid.parts])
+    return [Solid(stretched(solid.mesh), [stretched(part) for part in solid.parts]) for solid in solids]
 
 
 def _blob(g: Generator, size: float = 1.0, at: Point = (0, 0, 0)) -> trimesh.Trimesh:

@@ -21,13 +21,13 @@ DENSITY = 500.0
 """Density of every object in trials [kg/m^3]. Source: the official release."""
 CLOUD_POINTS = 16384
 """Points of an object's stored cloud (ours)."""
-RADII = (0.008, 0.006, 0.004, 0.003, 0.002)
+BALL_RADII = (0.008, 0.006, 0.004, 0.003, 0.002)
 """Radii of balls [m]; each point gets the largest that stays inside, or else the smallest (ours)."""
-SPACING = 0.008
+BALL_SPACING = 0.008
 """Distance between the points that are touched [m] (ours): between the largest balls the surface is 1 mm low."""
-MOST = 2000
+MOST_BALLS = 2000
 """Balls of a solid at most (ours): larger things get larger balls, farther apart. Hands take in a few hundred."""
-OUTSIDE = 0.0012
+BALL_OUTSIDE = 0.0012
 """How far a ball may reach through the surface elsewhere [m] (ours)."""
 ROUND = 1e-12
 """Added to the inertia at unit density [m^5], so that a flat cloud has one about every axis (ours)."""
@@ -182,13 +182,13 @@ def _spread(cloud: Float[np.ndarray, "m 3"], spacing: float) -> Int[np.ndarray, 
 
 def _balls(obj: ObjectModel) -> Balls:
     """Balls that touch a cloud with normals from inside."""
-    cloud, radii, spacing = obj.cloud.astype(float), np.array(RADII), SPACING
-    while len(rows := _spread(cloud, spacing)) > MOST:
+    cloud, radii, spacing = obj.cloud.astype(float), np.array(BALL_RADII), BALL_SPACING
+    while len(rows := _spread(cloud, spacing)) > MOST_BALLS:
         spacing *= 1.25  # (ours)
-        radii = np.array([RADII[0] * spacing / SPACING, *RADII])
+        radii = np.array([BALL_RADII[0] * spacing / BALL_SPACING, *BALL_RADII])
     centres = cloud[rows] - radii[:, None, None] * obj.cloud_normals[rows]
     depth = -obj.distance_field.distances(torch.from_numpy(centres).float())[0].numpy()
-    fits = depth > radii[:, None] - OUTSIDE
+    fits = depth > radii[:, None] - BALL_OUTSIDE
     fits[-1] = True
     largest = fits.argmax(0)
     return Balls(torch.from_numpy(centres[largest, np.arange(len(rows))]), torch.from_numpy(radii[largest]))
