@@ -56,8 +56,7 @@ def load_object(source: ObjectSource, *, scale: float = 1.0, name: str | None = 
         ObjectError: The object does not exist, it is unusable, or `scale` is not positive.
     """
     check_scale(scale)
-    load = _load if isinstance(source, str | Path) else object_in_memory
-    obj = load(source, scale, keep_table)
+    obj = _load(source, scale, keep_table) if isinstance(source, str | Path) else object_in_memory(source, scale, keep_table)
     return obj if name is None else replace(obj, name=name)
 
 
