@@ -24,9 +24,7 @@ from dro_grasp.planning.robot import Robot, load_robot
 from dro_grasp.planning.robot_check import robot_meshes, table_meshes
 from dro_grasp.planning.tabletop import read_attempts
 from dro_grasp.planning.workcell import Workcell
-from dro_grasp.rendering.camera import Camera
-from dro_grasp.rendering.meshes import Mesh
-from dro_grasp.rendering.rasterizer import render
+from dro_grasp.rendering.rasterizer import Camera, Mesh, render
 
 TILE = (170, 150)
 """Width and height of a picture [pixels]; each attempt has two."""

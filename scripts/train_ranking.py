@@ -19,12 +19,13 @@ from typing import Any, get_args
 from zlib import crc32
 
 import torch
+from dro_grasp.geometry.rotations import roma
 from torch import Tensor
 from torch.nn import functional
 
 from dro_grasp.compare.metrics import roc_area
 from dro_grasp.energy.grasp_energy import GraspEnergy
-from dro_grasp.geometry.rotations import roma
+from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from dro_grasp.devices import choose_device, cores, require_device, side_by_side
+from dro_grasp.devices import choose_device, cores, on_device, require_device, side_by_side
 from dro_grasp.energy.grasp_energy import link_spheres
 from dro_grasp.errors import OptionError
 from dro_grasp.objects.catalogue import load_object
@@ -19,7 +19,6 @@ from dro_grasp.predict.config import PredictorConfig, RescueConfig
 from dro_grasp.predict.finish import FinishConfig
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.sources.optimiser import OptimiserConfig
-from dro_grasp.records import on_device
 from tests.helpers.claw import ball
 from tests.helpers.toy_hand import toy_hand
 from tests.helpers.weights import untrained_weights

@@ -9,7 +9,7 @@ import torch
 
 from dro_grasp import distance_matrix
 from dro_grasp.geometry.point_clouds import random_half
-from dro_grasp.geometry.rotations import roma
+from dro_grasp.geometry.se3 import roma
 from dro_grasp.hands.hand import Hand
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.toy_hand import toy_hand

@@ -23,8 +23,7 @@ from dro_grasp.datasets.collections.importing import ForeignGrasp, in_order, rea
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
-from dro_grasp.objects.catalogue import load_object
-from dro_grasp.objects.mesh_process import SCALES, processed_objects
+from dro_grasp.objects.catalogue import SCALES, load_object, processed_objects
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.predictor import GraspPredictor

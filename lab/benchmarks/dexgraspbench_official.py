@@ -23,12 +23,11 @@ import numpy as np
 import torch
 
 from dro_grasp.datasets.collections.importing import read_npy
-from dro_grasp.geometry.rotations import roma
+from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
-from dro_grasp.objects.catalogue import load_object
-from dro_grasp.objects.mesh_process import processed_objects
+from dro_grasp.objects.catalogue import load_object, processed_objects
 from dro_grasp.simulation.protocols import changed
 from dro_grasp.simulation.trial import simulate
 from lab.benchmarks.dexgraspbench import OFFICIAL, OURS, PALM

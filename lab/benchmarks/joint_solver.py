@@ -24,8 +24,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp import distance_matrix
-from dro_grasp.geometry.rotations import roma
-from dro_grasp.geometry.se3 import compose
+from dro_grasp.geometry.se3 import compose, roma
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.kinematics import joint_solver

@@ -25,9 +25,7 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.completion import complete_cloud, to_view_axes
 from dro_grasp.perception.partial_views import visible_side
 from dro_grasp.pictures.sheets import contact_sheet
-from dro_grasp.rendering.camera import Camera
-from dro_grasp.rendering.meshes import Mesh, dots
-from dro_grasp.rendering.rasterizer import render
+from dro_grasp.rendering.rasterizer import Camera, Mesh, dots, render
 from lab.benchmarks.report import emit
 
 GROUPS = ("assets:train", "assets:validate")

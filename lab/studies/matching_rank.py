@@ -24,9 +24,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.models.checkpoints import load_weights
 from dro_grasp.models.encoder import StaticGraphEncoder
 from dro_grasp.pictures.sheets import contact_sheet
-from dro_grasp.rendering.camera import Camera
-from dro_grasp.rendering.meshes import dots
-from dro_grasp.rendering.rasterizer import render
+from dro_grasp.rendering.rasterizer import Camera, dots, render
 from dro_grasp.training.config import AugmentationConfig
 from dro_grasp.training.samples import SampleSource
 from lab.benchmarks.distance_error import validation_bundle

@@ -1,13 +1,14 @@
-"""Devices and cores of this machine: which there are, and how work is spread over them."""
+"""Devices and cores of this machine: which there are, and how work and records are spread over them."""
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
-from functools import cache
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import cache, cached_property
 from typing import Any, TypeVar
 
 import torch
@@ -15,10 +16,7 @@ import torch
 from dro_grasp.errors import OptionError
 
 Result = TypeVar("Result")
-LARGEST_DEVIATION = 1e-5
-"""Largest relative deviation of a test product with which the quick path is taken. Source: ours; single precision has 4e-7."""
-PROBE_SIZE = 256
-"""Rows and columns of the test product's matrices. Source: ours."""
+Record = TypeVar("Record")
 
 
 def choose_device(name: str) -> str:
@@ -27,11 +25,7 @@ def choose_device(name: str) -> str:
 
 
 def require_device(name: str) -> None:
-    """Refuse a device that this machine does not have.
-
-    Raises:
-        OptionError: The name is no device, or this machine has no such device.
-    """
+    """Refuse a name that is no device, and a device that this machine does not have, by an OptionError."""
     try:
         device = torch.device(name)
     except RuntimeError:
@@ -61,11 +55,10 @@ def one_thread() -> Iterator[None]:
 
 
 def side_by_side(work: Callable[..., Result], *parts: Iterable[Any]) -> list[Result]:
-    """The results for all parts of a task, as `map` gives them, computed by as many threads as PyTorch may use.
+    """The results for all parts of a task, as `map` gives them, by as many threads as PyTorch may use, one for each part.
 
-    Each part is computed in one thread. Threads that share a part wait for each other after every operation, which costs
-    more than they gain where operations are small or other programs are at work; these wait once. Parts on another
-    device follow each other.
+    Threads that share a part wait for each other after every operation, which costs more than they gain where operations are
+    small or other programs are at work; these wait once. Parts on another device follow each other.
     """
     jobs, threads, gradients = list(zip(*parts, strict=True)), torch.get_num_threads(), torch.is_grad_enabled()
     on_cpu = all(value.device.type == "cpu" for job in jobs for value in job if isinstance(value, torch.Tensor))
@@ -81,20 +74,16 @@ def side_by_side(work: Callable[..., Result], *parts: Iterable[Any]) -> list[Res
         return list(pool.map(lambda job: work(*job), jobs))
 
 
-@contextmanager
-def fast_products() -> Iterator[None]:
+def fast_products() -> AbstractContextManager[None]:
     """Within the block, single-precision products on the CPU take the quick path if it is accurate here.
 
     The setting "medium" lets PyTorch choose another library, which is 2-4 times as fast on some processors at the same
-    accuracy. On others it rounds to half precision: a test product decides, once. It is never used where CUDA is
-    present, whose products it would round. The caller's setting comes back at the end, of blocks in several threads
-    with the last one.
+    accuracy. On others it rounds to half precision: a test product decides, once. CUDA's products it would round.
     """
-    with nullcontext() if torch.cuda.is_available() or not quick_path_is_accurate() else _QUICK_PATH:
-        yield
+    return nullcontext() if torch.cuda.is_available() or not quick_path_is_accurate() else _QUICK_PATH
 
 
-class _QuickPath:
+class _QuickPath(AbstractContextManager[None]):
     """The setting, which is the process's: the first block that begins sets it, the last that ends gives the caller's back."""
 
     def __init__(self) -> None:
@@ -122,8 +111,23 @@ _QUICK_PATH = _QuickPath()
 def quick_path_is_accurate() -> bool:
     """Whether a product on the quick path agrees with double precision."""
     generator = torch.Generator().manual_seed(0)
-    a, b = torch.randn(2, PROBE_SIZE, PROBE_SIZE, generator=generator)
+    a, b = torch.randn(2, 256, 256, generator=generator)
     with _QUICK_PATH:
         product = a @ b
     exact = a.double() @ b.double()
-    return bool((product - exact).abs().max() <= LARGEST_DEVIATION * exact.abs().max())
+    return bool((product - exact).abs().max() <= 1e-5 * exact.abs().max())  # (ours); single precision deviates by 4e-7
+
+
+def on_device(record: Record, device: torch.device | str) -> Record:
+    """Copy a frozen dataclass to a device: its tensors, and its records that have a `to`."""
+    values = {f.name: getattr(record, f.name) for f in dataclasses.fields(record)}  # type: ignore[arg-type]
+    moved = {name: value.to(device) for name, value in values.items() if hasattr(value, "to")}
+    return dataclasses.replace(record, **moved)  # type: ignore[type-var]
+
+
+class cached_tensor(cached_property):  # type: ignore[type-arg]  # reads like the decorator it extends
+    """A cached property whose tensors still work in training after inference has computed them."""
+
+    def __get__(self, instance: Any, owner: type | None = None) -> Any:
+        with torch.inference_mode(False):
+            return super().__get__(instance, owner)

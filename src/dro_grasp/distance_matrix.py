@@ -11,11 +11,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dro_grasp.geometry.mirrored_sides import SideConfig, choose_sides
-from dro_grasp.geometry.multilateration import MultilaterationConfig, distance_misfit, multilaterate
+from dro_grasp.devices import on_device
+from dro_grasp.geometry.multilateration import MultilaterationConfig, SideConfig, choose_sides, distance_misfit, multilaterate
 from dro_grasp.geometry.point_clouds import point_distances
-from dro_grasp.geometry.registration import register
-from dro_grasp.geometry.se3 import apply, apply_to_cloud
+from dro_grasp.geometry.se3 import apply, apply_to_cloud, register
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
 from dro_grasp.kinematics.joint_reading import read_joints
@@ -47,7 +46,7 @@ class LinkPoses:
 
     def to(self, device: torch.device | str) -> LinkPoses:
         """The same poses on another device."""
-        return LinkPoses(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+        return on_device(self, device)
 
 
 @dataclass(frozen=True)
@@ -71,16 +70,10 @@ def build(hand_points: Float[Tensor, "*b n 3"], object_points: Float[Tensor, "*b
 def decode(
     hand: Hand, distances: Float[Tensor, "*b n m"], object_points: Float[Tensor, "*b m 3"], config: DecodeConfig | None = None
 ) -> LinkPoses:
-    """Multilaterate each row and register each link; differentiable.
+    """Multilaterate each row of D(R,O), predicted or exact [m], and register each link of the hand; differentiable.
 
     A flat object cloud leaves two mirrored candidates per point. Each link takes the candidates that it fits without a
     reflection; in doubt it takes the palm's side.
-
-    Args:
-        hand: The hand of the rows.
-        distances: D(R,O), predicted or exact [m].
-        object_points: The object points of the columns [m].
-        config: See DecodeConfig.
     """
     config = config or DecodeConfig()
     batch, (n, m) = distances.shape[:-2], distances.shape[-2:]
@@ -97,10 +90,8 @@ def decode(
     T = torch.eye(4, dtype=points.dtype, device=points.device).expand(len(points), hand.tree.n_links, 4, 4)
     T = T.index_copy(1, segments.links, poses)
     residual = points.new_zeros(T.shape[:2]).index_copy(1, segments.links, residual)
-    return LinkPoses(
-        T.reshape(*batch, *T.shape[1:]), residual.reshape(*batch, T.shape[1]), hand.registrable.to(points.device),
-        points.reshape(*batch, n, 3),
-    )
+    return LinkPoses(T.reshape(*batch, *T.shape[1:]), residual.reshape(*batch, T.shape[1]), hand.registrable.to(points.device),
+                     points.reshape(*batch, n, 3))
 
 
 def _segments(hand: Hand, device: torch.device, dtype: torch.dtype) -> _Segments:
@@ -122,8 +113,7 @@ def _sides(
     misfit = torch.stack([distance_misfit(both[:, side], distances, object_points) for side in (0, 1)], 1)
     palm = int((segments.links == hand.palm).float().argmax())
     chosen = choose_sides(
-        segments.local, segments.weight, both[:, :, segments.index], misfit[:, :, segments.index], palm, config.sides
-    )
+        segments.local, segments.weight, both[:, :, segments.index], misfit[:, :, segments.index], palm, config.sides)
     second = chosen.new_zeros(both.shape[0], both.shape[2])
     used = segments.weight.bool()
     second[:, segments.index[used]] = chosen[:, used]
@@ -131,10 +121,7 @@ def _sides(
 
 
 def targets(hand: Hand, poses: LinkPoses) -> Targets:
-    """Targets of the joint solver: origins of the registered links, and the extra point beyond each fingertip.
-
-    A fingertip without a pose of its own gives no extra target.
-    """
+    """Targets of the joint solver: origins of the registered links, and the extra point beyond each registered fingertip."""
     device = poses.points.device
     links = poses.valid.nonzero()[:, 0]
     tips = torch.tensor(hand.tips, device=device)
@@ -151,14 +138,8 @@ def solve(
 ) -> JointSolution:
     """Wrist pose and joints whose links come closest to decoded link poses.
 
-    The wrist starts at the registered pose of the palm. The joints start at `q_start` or at the values that the relative
-    poses of neighbouring links imply, whichever is closer to the targets.
-
-    Args:
-        hand: The hand that was decoded.
-        link_poses: From `decode`.
-        q_start: Joints of the open hand that the network was given; the canonical ones by default [rad or m].
-        config: See JointSolverConfig.
+    The wrist starts at the registered pose of the palm. The joints start at `q_start` (default: the canonical ones) [rad or m]
+    or at the values that the relative poses of neighbouring links imply, whichever is closer to the targets.
     """
     link_poses = link_poses.to(hand.tree.origin.device)
     wanted = targets(hand, link_poses)

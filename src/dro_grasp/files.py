@@ -22,11 +22,8 @@ from dro_grasp.errors import DroGraspError, OptionError, OutputError
 
 TOLD = 200
 """Characters of a path or a reason that an error repeats (ours)."""
-
 SAME = {".yaml": ".yml", ".html": ".htm"}
 """Endings of file names, and others that mean the same."""
-
-
 FOREIGN = (
     OSError, MemoryError, ValueError, LookupError, ArithmeticError, EOFError, RuntimeError, UnpicklingError, struct.error,
     zlib.error, lzma.LZMAError, BadZipFile, TokenError, SafetensorError)
@@ -40,10 +37,9 @@ UNTYPED = (TypeError, AttributeError)
 
 
 def given_path(name: Path | str) -> Path:
-    """The path that a user gives, with `~` expanded; there may be nothing at it.
+    """The path that a user gives, with `~` expanded, whatever is there.
 
-    Raises:
-        OptionError: It is none: too long, of a user who does not exist, or with characters that no file system takes.
+    It is an OptionError if it is too long, of a user who does not exist, or with characters that no file system takes.
     """
     try:
         path = Path(name).expanduser()
@@ -62,9 +58,7 @@ def command(*words: object) -> str:
 
 
 @contextmanager
-def reading(
-    path: object, refuse: type[DroGraspError], expected: str, *others: type[Exception]
-) -> Iterator[None]:
+def reading(path: object, refuse: type[DroGraspError], expected: str, *others: type[Exception]) -> Iterator[None]:
     """Turn what damaged or foreign bytes raise into one error that names the file; our own errors and our faults pass.
 
     Args:
@@ -72,9 +66,6 @@ def reading(
         refuse: Kind of the error.
         expected: What the file should be, in words.
         others: What the library behind this reader raises beside FOREIGN.
-
-    Raises:
-        refuse: The block raised one of FOREIGN or of `others`.
     """
     try:
         yield
@@ -99,10 +90,9 @@ def is_unread(error: BaseException | None) -> bool:
 
 
 def set_aside(path: Path, *beside: Path) -> Path:
-    """Rename a file that is damaged, so that it counts no longer and nothing in it is lost; returns its new path.
+    """Rename a damaged file, and those that belong to it, under one number, so that nothing is lost; returns its new path.
 
-    Earlier ones keep their names: the next is `.damaged.2`. Files that belong to it go with it, where they exist, under
-    the same number.
+    Earlier ones keep their names: the next is `.damaged.2`.
     """
     endings = (".damaged" if number == 1 else f".damaged.{number}" for number in count(1))
     ending = next(e for e in endings if not any(p.with_name(p.name + e).exists() for p in (path, *beside)))
@@ -113,15 +103,9 @@ def set_aside(path: Path, *beside: Path) -> Path:
 
 
 def check_output(path: Path | str, *endings: str) -> Path:
-    """Refuse a path that cannot be written, before any work is done.
+    """Refuse a path of a file that cannot be written, by an OutputError, before any work is done.
 
-    Args:
-        path: Of a file.
-        endings: What its name may end in, the usual one first, and what stands for these in SAME; anything by default.
-
-    Raises:
-        OutputError: The parent folder is missing or read-only, the path is a folder, a device or a read-only file, or its name
-            ends otherwise.
+    `endings` is what its name may end in, the usual one first, and what stands for these in SAME; anything by default.
     """
     path = given_path(path)
     parent = path.absolute().parent
@@ -134,19 +118,14 @@ def check_output(path: Path | str, *endings: str) -> Path:
         raise OutputError(f"cannot write {path}: give a name that ends in {' or '.join(allowed)}, such as "
                           f"{path.with_suffix(endings[0]).name}")
     if path.exists() and not path.is_file():
-        raise OutputError(f"cannot write {path}: it is a device or a pipe, which writing would replace; give the name of a "
-                          "file")
+        raise OutputError(f"cannot write {path}: it is a device or a pipe, which writing would replace; give a file's name")
     if not os.access(parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
         raise OutputError(f"cannot write {path}: no permission; choose another path")
     return path
 
 
 def check_folder(path: Path | str) -> Path:
-    """Refuse a folder that cannot be created or written to, without creating it; its parents may be missing too.
-
-    Raises:
-        OutputError: It or a folder above it is a file, or permission is missing.
-    """
+    """Refuse a folder that is or lies in a file, or may not be written to, by an OutputError; nothing is created."""
     path = given_path(path)
     there = next(place for place in (path.absolute(), *path.absolute().parents) if place.exists())
     if not there.is_dir():
@@ -157,11 +136,7 @@ def check_folder(path: Path | str) -> Path:
 
 
 def make_folder(path: Path | str) -> Path:
-    """Create a folder to write to, with its parents, unless it exists.
-
-    Raises:
-        OutputError: It or a folder above it is a file, or permission is missing.
-    """
+    """Create a folder to write to, with its parents, unless it exists; see `check_folder`."""
     path = check_folder(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -172,11 +147,9 @@ def make_folder(path: Path | str) -> Path:
 
 @contextmanager
 def replacing(path: Path | str, what: str = "") -> Iterator[Path]:
-    """A temporary path that replaces `path` when the block ends; a failure leaves `path` as it was, its error names `what`.
+    """A temporary path that replaces `path` when the block ends.
 
-    Raises:
-        OptionError: The path is none.
-        OutputError: The file cannot be written.
+    A failure leaves `path` as it was; its OutputError names `what`.
     """
     path, temporary = given_path(path), None
     try:

@@ -44,11 +44,7 @@ class NamedMotion(NamedTuple):
 
 
 def read_motion(path: Path, key: str) -> NamedMotion:
-    """A frame's name and a matrix from a JSON file `{"frame": NAME, key: 4x4}`, with a key such as `T_frame_object`.
-
-    Raises:
-        OptionError: No such file, no such content, or no rigid motion.
-    """
+    """A frame's name and a matrix from a JSON file `{"frame": NAME, key: 4x4}`, with a key such as `T_frame_object`."""
     path = given_path(path)
     wanted = f'{path} must hold {{"frame": NAME, "{key}": [4 rows of 4 numbers]}}, in metres'
     if not os.path.isfile(path):  # nothing is read from devices and pipes

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import inspect
 import operator
@@ -26,11 +27,7 @@ class Checked:
     """
 
     def __post_init__(self) -> None:
-        """Make the numbers Python's.
-
-        Raises:
-            OptionError: A field holds something else than its annotation says.
-        """
+        """Make the numbers Python's; an OptionError if a field holds something else than its annotation says."""
         for name, kind in _hints(type(self)).items():
             given = getattr(self, name)
             if (value := plain(name, given, kind)) is not given:
@@ -53,11 +50,7 @@ def checked(call: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
 
 
 def plain(name: str, given: Any, kind: Any) -> Any:
-    """A value as Python's own of its kind: of WORDS, a choice, or a tuple of these.
-
-    Raises:
-        OptionError: It is of another kind; the error says what was given and what is expected.
-    """
+    """A value as Python's own of its kind, of WORDS, a choice, or a tuple of these; an OptionError if it is of another."""
     for each in _members(kind):
         try:
             return _converted(given, each)
@@ -71,11 +64,7 @@ def plain(name: str, given: Any, kind: Any) -> Any:
 
 
 def _converted(given: Any, kind: Any) -> Any:
-    """The value as one of this kind, the same object where it is one.
-
-    Raises:
-        TypeError, ValueError, RuntimeError: It is none.
-    """
+    """The value as one of this kind, the same object where it is one; TypeError, ValueError or RuntimeError if it is none."""
     if kind is NoneType or get_origin(kind) is Literal:
         if not any(given is each or (isinstance(given, type(each)) and given == each) for each in (get_args(kind) or [None])):
             raise ValueError
@@ -98,16 +87,12 @@ def _row(given: Any, kinds: tuple[Any, ...]) -> tuple[Any, ...]:
     each = kinds[:1] * len(values) if kinds[1:] == (...,) else kinds
     if len(values) != len(each):
         raise ValueError
-    made = tuple(_first(value, kind) for value, kind in zip(values, each, strict=True))
-    same = isinstance(given, tuple) and all(a is b for a, b in zip(given, made, strict=True))
-    return given if same else made
-
-
-def _first(given: Any, kind: Any) -> Any:
     try:
-        return plain("", given, kind)
+        made = tuple(plain("", value, kind) for value, kind in zip(values, each, strict=True))
     except OptionError as error:
         raise ValueError from error
+    same = isinstance(given, tuple) and all(a is b for a, b in zip(given, made, strict=True))
+    return given if same else made
 
 
 def _members(kind: Any) -> tuple[Any, ...]:
@@ -136,3 +121,13 @@ def _is_known(kind: Any) -> bool:
 def _hints(owner: Any) -> dict[str, Any]:
     """The kinds of a dataclass's fields or of a function's arguments, without those that are not checked."""
     return {name: kind for name, kind in get_type_hints(owner).items() if name != "return" and _is_known(kind)}
+
+
+def flat(record: Any, prefix: str = "") -> dict[str, Any]:
+    """The values of a dataclass and of those in it, by name; what is nested has dots in its name."""
+    values: dict[str, Any] = {}
+    for field in dataclasses.fields(record):
+        value = getattr(record, field.name)
+        name = f"{prefix}{field.name}"
+        values |= flat(value, f"{name}.") if dataclasses.is_dataclass(value) else {name: value}
+    return values

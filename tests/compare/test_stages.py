@@ -29,8 +29,7 @@ from dro_grasp.compare.stages import (
     pair_seed,
 )
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.objects.catalogue import load_object
-from dro_grasp.objects.mesh_process import SCALES
+from dro_grasp.objects.catalogue import SCALES, load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.synthesis import SynthesisConfig
 from dro_grasp.perception.partial_views import View

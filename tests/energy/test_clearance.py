@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy, Room
 from dro_grasp.energy.surroundings import Surroundings
-from dro_grasp.geometry.balls import Balls
+from dro_grasp.geometry.distance_field import Balls
 from dro_grasp.geometry.se3 import turned_about
 from dro_grasp.grasps.controller_config import ControllerConfig
 from tests.helpers.energy_samples import near_kinks, precise, rounded_box

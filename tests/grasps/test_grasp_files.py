@@ -11,7 +11,7 @@ import torch
 
 from dro_grasp.errors import GraspFileError, OutputError
 from dro_grasp.files import check_output
-from dro_grasp.geometry.rotations import roma
+from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
 from tests.helpers.toy_batches import BALL, CUBE, HAND, evaluated, make
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dro_grasp.energy.grasp_energy import GraspEnergy
 from dro_grasp.geometry.distance_field import DistanceField
-from dro_grasp.geometry.rotations import roma
+from dro_grasp.geometry.se3 import roma
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinematics.tree import KinematicTree
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from dro_grasp.datasets.bundle.training_file import Bundle, ObjectCloud, write_bundle
-from dro_grasp.geometry.rotations import roma
+from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.models.presets import NetworkConfig

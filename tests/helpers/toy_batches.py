@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import torch
 
-from dro_grasp.geometry.rotations import roma
+from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.simulation.outcome import Failure
 

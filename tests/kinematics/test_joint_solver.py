@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from dro_grasp.errors import OptionError
-from dro_grasp.geometry.rotations import roma
+from dro_grasp.geometry.se3 import roma
 from dro_grasp.kinematics.joint_reading import read_joints
 from dro_grasp.kinematics.joint_solver import JointSolverConfig, Targets, solve_joints
 from dro_grasp.kinematics.joint_step import StepConfig, best_step

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from dro_grasp.compare.methods import make_method
 from dro_grasp.geometry.se3 import apply
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.sources.registry import make_method
 from lab.methods import train
 from lab.methods.bundle_draws import BundleDraws
 from lab.methods.manifm.contact_method import ContactMethod, ContactMethodConfig, reached

@@ -11,7 +11,7 @@ import trimesh
 
 from dro_grasp.errors import WeightsError
 from dro_grasp.models.checkpoints import save_weights
-from dro_grasp.objects.in_memory import object_in_memory
+from dro_grasp.objects.loading import object_in_memory
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.training.runs import recalibrate
 from lab.methods.gendexgrasp.map_fitting import FittingConfig

@@ -42,8 +42,7 @@ from dro_grasp.pictures.sheets import (
     draw_grasps,
     heading,
 )
-from dro_grasp.rendering.camera import Camera
-from dro_grasp.rendering.rasterizer import render
+from dro_grasp.rendering.rasterizer import Camera, render
 from tests.helpers.loaded_hands import loaded_hand
 
 

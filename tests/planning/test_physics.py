@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 import dro_grasp as dro
-from dro_grasp.objects.ball_solid import solid_of
+from dro_grasp.objects.shape import solid_of
 from dro_grasp.planning.candidates import grasps_in_world
 from dro_grasp.planning.physics import DEVIATIONS, MEMORY, Deviation, LiftScene, Rehearsal
 from dro_grasp.planning.planner import PlanConfig, plan

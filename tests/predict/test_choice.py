@@ -11,7 +11,7 @@ import torch
 from dro_grasp.energy.grasp_energy import Room
 from dro_grasp.energy.surroundings import Surroundings
 from dro_grasp.errors import OptionError
-from dro_grasp.geometry.balls import Balls
+from dro_grasp.geometry.distance_field import Balls
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.models.network import DistanceNetwork, Moves
 from dro_grasp.models.presets import NetworkConfig

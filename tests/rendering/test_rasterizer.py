@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from dro_grasp.rendering.camera import Camera
-from dro_grasp.rendering.meshes import Mesh, arrow, corner_normals, dots
-from dro_grasp.rendering.rasterizer import Style, render
+from dro_grasp.rendering.rasterizer import Camera, Mesh, Style, arrow, corner_normals, dots, render
 
 RED, BLUE = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 FLAT = Style(ambient=1.0, diffuse=0.0, specular=0.0, outline=0.0)

@@ -15,7 +15,7 @@ from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.pictures.appearance import success_colour
-from dro_grasp.rendering.camera import Camera
+from dro_grasp.rendering.rasterizer import Camera
 from dro_grasp.viewer.grasp_page import GraspViewer, describe, postures_of
 from dro_grasp.viewer.scene_view import HOST, ServedPage, viewpoint
 from tests.helpers.browser import free_port, page_of
@@ -48,7 +48,7 @@ def viewer(grasps: GraspBatch):
 
 
 def test_links_stand_where_kinematics_puts_them(viewer: GraspViewer, grasps: GraspBatch) -> None:
-    from dro_grasp.geometry.rotations import roma
+    from dro_grasp.geometry.se3 import roma
 
     hand = loaded_hand("gripper3")
     for posture, joints in postures_of(hand, load_object("sphere"), grasps).items():

@@ -12,8 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.geometry.distance_field import DistanceField
-from dro_grasp.geometry.rotations import roma
-from dro_grasp.geometry.se3 import apply_to_cloud, compose, random_rotations, rotate
+from dro_grasp.geometry.se3 import apply_to_cloud, compose, random_rotations, roma, rotate
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
 from lab.methods.gendexgrasp.contact_maps import FITTING_GAMMA, contact_map

@@ -16,8 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.geometry.registration import register
-from dro_grasp.geometry.se3 import apply, rotate
+from dro_grasp.geometry.se3 import apply, register, rotate
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked

@@ -135,8 +135,7 @@ class Benchmark:
 
     def _objects(self) -> list[ObjectModel]:
         """The objects, loaded."""
-        from dro_grasp.objects.catalogue import load_object, resolve_objects
-        from dro_grasp.objects.mesh_process import SCALES, processed_objects
+        from dro_grasp.objects.catalogue import SCALES, load_object, processed_objects, resolve_objects
 
         if self.dexgraspbench is None:
             return [load_object(name) for name in resolve_objects(list(self.objects))]

@@ -130,7 +130,8 @@ class Plan:
         from dro_grasp.files import given_path
         from dro_grasp.frames import read_motion
         from dro_grasp.objects.catalogue import load_object
-        from dro_grasp.objects.loading import read_geometry, read_points
+        from dro_grasp.objects.loading import read_geometry
+        from dro_grasp.objects.reading import read_points
         from dro_grasp.perception.scan import load_scan
         from dro_grasp.planning.robot import Table
         from dro_grasp.planning.table_scene import PickedObject, pick_object, sees_table

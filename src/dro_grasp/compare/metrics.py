@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dro_grasp.geometry.rotations import roma
+from dro_grasp.geometry.se3 import roma
 
 NORMAL_95 = 1.959963984540054
 """Standard deviations of a normal distribution within which 95 % of it lie."""

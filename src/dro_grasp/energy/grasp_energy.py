@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dro_grasp.devices import on_device
 from dro_grasp.energy import terms as energies
 from dro_grasp.energy.clearance import Clearance
 from dro_grasp.energy.contact_candidates import ContactCandidates, ContactConfig, contact_candidates
@@ -18,12 +19,10 @@ from dro_grasp.energy.link_spheres import link_spheres
 from dro_grasp.energy.surroundings import Surroundings
 from dro_grasp.energy.touching import Touching
 from dro_grasp.geometry import se3
-from dro_grasp.geometry.balls import Balls
-from dro_grasp.geometry.distance_field import DistanceField
+from dro_grasp.geometry.distance_field import Balls, DistanceField
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.records import on_device
 
 TERMS = ("force_closure", "distance", "penetration", "self_penetration", "alignment", "joints")
 """Names of the terms, in the order of every array of terms."""

@@ -8,9 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.geometry.balls import Balls
-from dro_grasp.geometry.distance_field import DistanceField
-from dro_grasp.records import on_device
+from dro_grasp.devices import on_device
+from dro_grasp.geometry.distance_field import Balls, DistanceField
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dro_grasp.energy.terms import PointTerm
-from dro_grasp.geometry.balls import Balls
+from dro_grasp.geometry.distance_field import Balls
 
 
 class Touching:

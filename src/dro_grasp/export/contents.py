@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dro_grasp.errors import OptionError
 from dro_grasp.frames import is_name, motion_fault, read_motion
-from dro_grasp.geometry.rotations import roma
+from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import frame_of
 

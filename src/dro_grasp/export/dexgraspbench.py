@@ -10,7 +10,7 @@ import torch
 
 from dro_grasp.export.contents import Frame, postures
 from dro_grasp.export.formats import ExportJob
-from dro_grasp.geometry.rotations import roma
+from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import camera_pose
 

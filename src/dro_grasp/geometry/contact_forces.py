@@ -12,10 +12,7 @@ from torch import Tensor
 def nonnegative_least_squares(
     a: Float[Tensor, "n m k"], b: Float[Tensor, "n m"], ridge: float, iterations: int
 ) -> Float[Tensor, "n k"]:
-    """Minimise |a x - b|^2 + ridge |x|^2 over x >= 0, for n problems at once; accelerated projected gradients.
-
-    Source: Beck and Teboulle 2009 (FISTA).
-    """
+    """Minimise |a x - b|^2 + ridge |x|^2 over x >= 0, for n problems at once. Source: Beck and Teboulle 2009 (FISTA)."""
     hessian = a.mT @ a + ridge * torch.eye(a.shape[-1], dtype=a.dtype, device=a.device)
     slope = (a.mT @ b[..., None])[..., 0]
     step = 1 / hessian.abs().sum(-1).amax(-1, keepdim=True)  # at most one over the largest eigenvalue

@@ -1,7 +1,8 @@
-"""Signed distances to a surface, with gradient, normal and curvature by one look-up per point."""
+"""Signed distances to a surface or to balls, with gradient, and of a surface normal and curvature, by one look-up per point."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -11,6 +12,10 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from dro_grasp.geometry.point_clouds import point_distances
+
+Ball = tuple[float, float, float, float]
+"""Centre and radius [m]."""
 BLUR = (0.25, 0.5, 0.25)
 """Binomial weights that smooth the gradient field along each axis [1] (ours): edges of voxels are not edges of the object."""
 
@@ -92,6 +97,29 @@ class DistanceField:
         offset = (place - index) * self.spacing
         strides = place.new_tensor([self.shape[1] * self.shape[2], self.shape[2], 1])
         return (index @ strides).to(torch.int64), offset
+
+
+@dataclass(frozen=True, eq=False)
+class Balls:
+    """The union of balls, with signed distances as of a `DistanceField`."""
+
+    centres: Float[Tensor, "k 3"]
+    """[m]"""
+    radii: Float[Tensor, " k"]
+    """[m]"""
+
+    @staticmethod
+    def of(balls: Sequence[Ball]) -> Balls | None:
+        """From centres and radii; None for none."""
+        values = torch.tensor(balls, dtype=torch.float32)
+        return Balls(values[:, :3], values[:, 3]) if len(balls) else None
+
+    def distances(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
+        """Distance to the surface of the nearest ball, negative inside [m], and its gradient."""
+        apart = point_distances(points, self.centres.to(points))
+        distance, index = (apart - self.radii.to(points)).min(-1)
+        offset = points - self.centres.to(points)[index]
+        return distance, torch.nn.functional.normalize(offset, dim=-1)
 
 
 def _smooth(values: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:

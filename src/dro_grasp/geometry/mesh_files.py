@@ -24,11 +24,7 @@ def open_mesh(path: Path, **options: Any) -> trimesh.Geometry:
 
 
 def check_bytes(path: Path) -> None:
-    """Refuse a file that is too large, or an archive that unpacks to too much.
-
-    Raises:
-        ValueError: As said.
-    """
+    """Refuse a file that is too large, or an archive that unpacks to too much, by a ValueError."""
     size = path.stat().st_size
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:

@@ -31,11 +31,7 @@ def enclosed_volume(triangles: Float[np.ndarray, "n 3 3"]) -> float:
 def sample_surface(
     vertices: Float[Tensor, "n_vertices 3"], faces: Int[Tensor, "n_faces 3"], count: int, generator: torch.Generator
 ) -> tuple[Float[Tensor, "count 3"], Float[Tensor, "count 3"], Int[Tensor, " count"]]:
-    """Points uniform on a triangle mesh [m], their unit normals (outward for counter-clockwise faces), and their faces.
-
-    Raises:
-        ValueError: The mesh has no area.
-    """
+    """Points uniform on a triangle mesh [m], their unit normals (outward for counter-clockwise faces), and their faces."""
     corners = vertices[faces]
     cross = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = cross.norm(dim=-1)
@@ -52,11 +48,7 @@ def sample_surface(
 
 
 def farthest_points(points: Float[Tensor, "*batch n 3"], count: int, start: int = 0) -> Int[Tensor, "*batch count"]:
-    """Farthest point sampling: each next point is the one farthest from all before it; the first of several wins.
-
-    Raises:
-        ValueError: `count` exceeds the number of points.
-    """
+    """Farthest point sampling: each next point is the one farthest from all before it; the first of several wins."""
     n = points.shape[-2]
     if count > n:
         raise ValueError(f"{count} points were asked for, the cloud has {n}; ask for fewer or give more")
@@ -81,14 +73,17 @@ def distinct_points(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " k"]:
     return np.sort(order[first])
 
 
+def one_per_cell(points: Float[np.ndarray, "n 3"], edge: float) -> Int[np.ndarray, " k"]:
+    """Which of some points to keep so that each cube of this edge [m] keeps one, the first in it."""
+    cells = np.floor(points / edge).astype(np.int64)
+    cells -= cells.min(0)
+    return np.unique(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(0) + 1)), return_index=True)[1]
+
+
 def random_half(points: Float[Tensor, "n 3"], count: int, generator: torch.Generator) -> Int[Tensor, " count"]:
-    """Indices of random points in the half of a cloud that lies along a random direction.
+    """Indices of random points in the half of a cloud that lies along a random direction. Source: appendix, partial clouds.
 
-    Source: appendix, partial object point cloud sampling: draw twice as many points as wanted, and remove the half with
-    the smaller product of position and direction.
-
-    Raises:
-        ValueError: The cloud has fewer than 2 * count points.
+    Twice as many points as wanted are drawn, and those with the smaller product of position and direction removed.
     """
     if len(points) < 2 * count:
         raise ValueError(f"a random half of {count} points needs a cloud of {2 * count} points, got {len(points)}")

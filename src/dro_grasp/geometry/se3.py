@@ -1,12 +1,30 @@
-"""Rigid motions as 4x4 matrices: the verbs that the package needs, over roma."""
+"""Rigid motions as 4x4 matrices: the verbs that the package needs, over roma, and poses from corresponding points.
+
+roma is imported here for the whole package, without PyTorch's compiler: that takes longer to import than all the rest.
+"""
 
 from __future__ import annotations
+
+import sys
+from types import ModuleType
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.geometry.rotations import roma
+COMPILER = "torch._dynamo"
+"""Module whose `disable` roma applies to two functions as it is imported; nothing here is compiled (ours)."""
+
+if COMPILER in sys.modules:
+    import roma
+else:
+    sys.modules[COMPILER] = ModuleType(COMPILER)
+    sys.modules[COMPILER].__dict__["disable"] = lambda function: function
+    try:
+        import roma
+    finally:
+        del sys.modules[COMPILER]
 
 
 def rotate(rotation: Float[Tensor, "*#b 3 3"], vectors: Float[Tensor, "*#b 3"]) -> Float[Tensor, "*b 3"]:
@@ -61,3 +79,28 @@ def rotation_between(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tens
         axis = torch.linalg.cross(a, torch.eye(3).to(a)[a.abs().argmin()])
     angle = torch.atan2(torch.linalg.cross(a, b).norm(), a @ b)
     return roma.rotvec_to_rotmat(axis / axis.norm() * angle)
+
+
+def register(
+    source: Float[Tensor, "*b n 3"], target: Float[Tensor, "*b n 3"], weights: Float[Tensor, "*b n"] | None = None
+) -> tuple[Float[Tensor, "*b 4 4"], Float[Tensor, "*b"]]:
+    """The motion, never a reflection, that maps source points closest to target points: T_target_source, and the distance left.
+
+    Points are in metres, the distance is the weighted root mean square [m]. A weight of 0 leaves a pair out; if all are zero,
+    they count as one: check the rank of the points before using such a pose. roma regularises the backward pass, so gradients
+    stay finite on thin and even on collinear sets. Source: paper section III-D, 6D pose estimation of links.
+    """
+    weights = source.new_ones(source.shape[:-1]) if weights is None else weights
+    weights = torch.where(weights.sum(-1, keepdim=True) > 0, weights, torch.ones_like(weights))
+    with torch.no_grad():
+        # roma's regularisation is absolute and would dominate the gradients of a finger link in metres: scale the points
+        # to unit size.
+        share = weights / weights.sum(-1, keepdim=True)
+        centred = source - (share[..., None] * source).sum(-2, keepdim=True)
+        size = (share * centred.square().sum(-1)).sum(-1).sqrt().clamp(min=1e-6)[..., None]
+    motion: Any = roma.rigid_points_registration(source / size[..., None], target / size[..., None], weights=share)
+    rotation, shift = motion[0], motion[1] * size
+    error = target - source @ rotation.mT - shift[..., None, :]
+    # The root has an infinite slope at zero error; the floor is far below a micrometre.
+    residual = ((error.square().sum(-1) * share).sum(-1) + 1e-16).sqrt()
+    return compose(rotation, shift), residual

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.geometry import se3
-from dro_grasp.geometry.rotations import roma
+from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps import columns
 from dro_grasp.grasps.columns import CAMERA, FRAME, OBJECT_SCALE
 from dro_grasp.grasps.schema import ASKED, ASKED_OF

@@ -23,9 +23,7 @@ from dro_grasp.hands.library import load_hand_description
 from dro_grasp.hands.opening import FingerMotion, opening_notes
 from dro_grasp.hands.palm import fixed_jaw_of
 from dro_grasp.kinematics.tree import KinematicTree
-from dro_grasp.rendering.camera import Camera
-from dro_grasp.rendering.meshes import Mesh, arrow
-from dro_grasp.rendering.rasterizer import render
+from dro_grasp.rendering.rasterizer import Camera, Mesh, arrow, render
 
 TILE = (560, 520)
 """Width and height of one view [pixels]."""

@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dro_grasp.devices import cached_tensor, on_device
 from dro_grasp.errors import OptionError
 from dro_grasp.geometry import se3
 from dro_grasp.geometry.point_clouds import farthest_points
 from dro_grasp.hands.anatomy import PALM, THUMB_CLOSING, Finger, find_fingers, find_thumb, measure_opposition, rigid_groups
 from dro_grasp.kinematics.tree import KinematicTree
-from dro_grasp.records import cached_tensor, on_device
 
 if TYPE_CHECKING:
     from dro_grasp.descriptions.loader import Description

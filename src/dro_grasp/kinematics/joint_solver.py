@@ -21,8 +21,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
-from dro_grasp.geometry.rotations import roma
-from dro_grasp.geometry.se3 import apply, compose
+from dro_grasp.geometry.se3 import apply, compose, roma
 from dro_grasp.kinds import Checked
 from dro_grasp.kinematics.joint_step import StepConfig, best_step, point_norms, smoothed_norms
 from dro_grasp.kinematics.tree import KinematicTree

@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dro_grasp.devices import cached_tensor
 from dro_grasp.geometry.se3 import apply, rotate
-from dro_grasp.records import cached_tensor
 
 FIXED = 0
 """Kind of a link that does not move against its parent (ours)."""

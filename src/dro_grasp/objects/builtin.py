@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 
+from dro_grasp.objects.convex_parts import as_part
 from dro_grasp.objects.loading import mesh_object
 from dro_grasp.objects.primitives import Solid, box, frustum, hollow, hull, ring, superquadric, tilted, turned
 from dro_grasp.objects.shape import ObjectModel
@@ -25,11 +26,6 @@ class BuiltinObject:
     """`train` or `test`."""
 
 
-def _mug() -> Pieces:
-    body = hollow([(0.036, -0.045), (0.038, 0.0), (0.04, 0.045)], wall=0.006, floor=0.006)
-    return [body, ring(0.026, 0.006, 9, arc=np.pi, axis="y", at=(0.036, 0, 0))]
-
-
 def _teapot() -> Pieces:
     profile = [(0.03, -0.045), (0.05, -0.02), (0.05, 0.015), (0.03, 0.04), (0.012, 0.045), (0.012, 0.058)]
     spout = hull(np.concatenate([
@@ -45,11 +41,6 @@ def _hammer() -> Pieces:
             frustum((0.016, 0.006), (-0.06, -0.035), head, axis="x")]
 
 
-def _screwdriver() -> Pieces:
-    grip = turned([(0.012, -0.09), (0.017, -0.075), (0.017, -0.02), (0.010, -0.005)])
-    return [*grip, frustum((0.0045, 0.0045), (-0.005, 0.09))]
-
-
 def _wrench() -> Pieces:
     jaw = [box((0.012, 0.028, 0.014), (x, 0, 0.078)) for x in (0.014, -0.014)]
     return [box((0.02, 0.014, 0.15), (0, 0, -0.005)), box((0.04, 0.028, 0.018), (0, 0, 0.066)), *jaw]
@@ -58,11 +49,6 @@ def _wrench() -> Pieces:
 def _spray_bottle() -> Pieces:
     body = turned([(0.036, -0.08), (0.036, 0.02), (0.016, 0.05), (0.016, 0.065)])
     return [*body, box((0.075, 0.026, 0.028), (0.012, 0, 0.078)), box((0.01, 0.016, 0.04), (0.04, 0, 0.048))]
-
-
-def _light_bulb() -> Pieces:
-    globe = superquadric((0.032, 0.032, 0.032), (1, 1), (0, 0, 0.02))
-    return [globe, *turned([(0.014, -0.045), (0.014, -0.02), (0.026, 0.005)])]
 
 
 def _camera() -> Pieces:
@@ -88,7 +74,7 @@ def _duck() -> Pieces:
     ]))
     body = superquadric((0.046, 0.034, 0.03), (1, 1))
     head = superquadric((0.024, 0.024, 0.024), (1, 1), (0.022, 0, 0.043))
-    return [body, head, beak, *tilted([box((0.03, 0.03, 0.012), (-0.045, 0, 0.0))], 0.5)]
+    return [body, head, beak, tilted(box((0.03, 0.03, 0.012), (-0.045, 0, 0.0)), 0.5)]
 
 
 def _joystick() -> Pieces:
@@ -97,8 +83,7 @@ def _joystick() -> Pieces:
 
 
 def _chess_pawn() -> Pieces:
-    profile = [(0.032, -0.05), (0.032, -0.04), (0.022, -0.03), (0.012, 0.0), (0.012, 0.02), (0.02, 0.024),
-               (0.02, 0.028)]
+    profile = [(0.032, -0.05), (0.032, -0.04), (0.022, -0.03), (0.012, 0.0), (0.012, 0.02), (0.02, 0.024), (0.02, 0.028)]
     return [*turned(profile), superquadric((0.021, 0.021, 0.021), (1, 1), (0, 0, 0.044))]
 
 
@@ -106,10 +91,6 @@ def _wine_glass() -> Pieces:
     stem = turned([(0.034, -0.085), (0.034, -0.08), (0.006, -0.074), (0.006, -0.015), (0.02, 0.0), (0.034, 0.02)])
     cup = hollow([(0.034, 0.0), (0.037, 0.03), (0.032, 0.06)], wall=0.005, floor=0.005)
     return [*stem, cup.moved((0, 0, 0.019))]
-
-
-def _jar() -> Pieces:
-    return turned([(0.036, -0.05), (0.04, -0.04), (0.04, 0.03), (0.034, 0.038), (0.036, 0.04), (0.036, 0.055)])
 
 
 BUILTIN: dict[str, BuiltinObject] = {name: BuiltinObject(make, split) for name, make, split in (
@@ -133,7 +114,8 @@ BUILTIN: dict[str, BuiltinObject] = {name: BuiltinObject(make, split) for name, 
     ("hexagon", lambda: [frustum((0.035, 0.035), (-0.045, 0.045), corners=6)], "train"),
     ("pyramid", lambda: [frustum((0.055, 0.003), (-0.035, 0.05), corners=4)], "train"),
     ("bottle", lambda: turned([(0.034, -0.09), (0.036, -0.08), (0.036, 0.02), (0.014, 0.06), (0.014, 0.09)]), "train"),
-    ("jar", _jar, "train"),
+    ("jar", lambda: turned(
+        [(0.036, -0.05), (0.04, -0.04), (0.04, 0.03), (0.034, 0.038), (0.036, 0.04), (0.036, 0.055)]), "train"),
     ("vase", lambda: turned([(0.025, -0.075), (0.04, -0.03), (0.036, 0.01), (0.018, 0.05), (0.026, 0.075)]), "train"),
     ("cup", lambda: [hollow([(0.03, -0.045), (0.034, 0.0), (0.038, 0.045)], wall=0.006, floor=0.006)], "train"),
     ("bowl", lambda: [hollow([(0.03, -0.025), (0.05, -0.005), (0.062, 0.025)], wall=0.008, floor=0.008)], "train"),
@@ -143,13 +125,16 @@ BUILTIN: dict[str, BuiltinObject] = {name: BuiltinObject(make, split) for name, 
     ("cross", lambda: [box((0.12, 0.034, 0.034)), box((0.034, 0.12, 0.034))], "train"),
     ("hammer", _hammer, "train"),
     ("dumbbell", _dumbbell, "train"),
-    ("light_bulb", _light_bulb, "train"),
+    ("light_bulb", lambda: [superquadric((0.032, 0.032, 0.032), (1, 1), (0, 0, 0.02)),
+                            *turned([(0.014, -0.045), (0.014, -0.02), (0.026, 0.005)])], "train"),
     ("toy_airplane", _airplane, "train"),
     ("joystick", _joystick, "train"),
     ("wrench", _wrench, "train"),
-    ("mug", _mug, "test"),
+    ("mug", lambda: [hollow([(0.036, -0.045), (0.038, 0.0), (0.04, 0.045)], wall=0.006, floor=0.006),
+                     ring(0.026, 0.006, 9, arc=np.pi, axis="y", at=(0.036, 0, 0))], "test"),
     ("teapot", _teapot, "test"),
-    ("screwdriver", _screwdriver, "test"),
+    ("screwdriver", lambda: [*turned([(0.012, -0.09), (0.017, -0.075), (0.017, -0.02), (0.010, -0.005)]),
+                             frustum((0.0045, 0.0045), (-0.005, 0.09))], "test"),
     ("spray_bottle", _spray_bottle, "test"),
     ("camera", _camera, "test"),
     ("rubber_duck", _duck, "test"),
@@ -172,5 +157,5 @@ def assemble(name: str, pieces: Pieces, *, scale: float, split: str) -> ObjectMo
     solids = [piece if isinstance(piece, Solid) else Solid(piece, [piece]) for piece in pieces]
     meshes = [solid.mesh for solid in solids]
     mesh = meshes[0] if len(meshes) == 1 else trimesh.boolean.union(meshes, engine="manifold")
-    parts = tuple((np.asarray(part.vertices), np.asarray(part.faces)) for solid in solids for part in solid.parts)
+    parts = tuple(as_part(part) for solid in solids for part in solid.parts)
     return mesh_object(name, mesh, origin=name, scale=scale, split=split, parts=parts)

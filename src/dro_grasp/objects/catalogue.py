@@ -18,29 +18,29 @@ from dro_grasp.errors import ObjectError
 from dro_grasp.files import given_path
 from dro_grasp.kinds import checked
 from dro_grasp.objects.builtin import BUILTIN, make_builtin
-from dro_grasp.objects.convex_parts import Part
-from dro_grasp.objects.in_memory import ObjectSource, object_in_memory
-from dro_grasp.objects.loading import check_scale, load_file, mesh_object, read_geometry
-from dro_grasp.objects.mesh_process import load_processed, processed_folder
+from dro_grasp.objects.convex_parts import as_part
+from dro_grasp.objects.loading import check_scale, load_file, mesh_object, object_in_memory
 from dro_grasp.objects.procedural import NAME as PROCEDURAL, procedural_object
+from dro_grasp.objects.reading import ObjectSource, read_geometry
 from dro_grasp.objects.shape import ObjectModel
 
 ASSET_PREFIX = "assets/"
 """Prefix of a name that forces the asset."""
-GROUP = re.compile(r"(builtin|assets):(\w+)")
-"""A group of objects: their source and split."""
-SEEDS = re.compile(r"procedural:(\d{1,9})-(\d{1,9})")
-"""A group of objects that do not exist: their first and last seed."""
 MOST_SEEDS = 100_000
 """Largest such group (ours)."""
 MESH_SUFFIXES = {".obj", ".stl", ".ply", ".glb", ".gltf", ".off", ".dae", ".npy", ".pcd", ".3mf"}
 """Suffixes of the files in a folder that count as objects."""
+MESH = "mesh/simplified.obj"
+"""The mesh of an object that MeshProcess prepared for DexGraspBench, in the object's folder; its largest extent is about 2.
+Source: the readme and the example objects of DexGraspBench."""
+PARTS = "urdf/meshes"
+"""Folder of its convex parts."""
+SCALES = (0.06, 0.08, 0.1, 0.12)
+"""Scales of every object in the official grasps."""
 
 
 @checked
-def load_object(
-    source: ObjectSource, *, scale: float = 1.0, name: str | None = None, keep_table: bool = False
-) -> ObjectModel:
+def load_object(source: ObjectSource, *, scale: float = 1.0, name: str | None = None, keep_table: bool = False) -> ObjectModel:
     """Load an object by name, from a mesh or point cloud file, or from a mesh or points in memory.
 
     Args:
@@ -56,8 +56,7 @@ def load_object(
         ObjectError: The object does not exist, it is unusable, or `scale` is not positive.
     """
     check_scale(scale)
-    obj = (
-        _load(source, scale, keep_table) if isinstance(source, str | Path) else object_in_memory(source, scale, keep_table))
+    obj = _load(source, scale, keep_table) if isinstance(source, str | Path) else object_in_memory(source, scale, keep_table)
     return obj if name is None else replace(obj, name=name)
 
 
@@ -93,26 +92,21 @@ def locate_object(name: str) -> tuple[Path, str]:
 
 def object_names() -> dict[str, str]:
     """Names that `load_object` takes, with their split."""
-    names = {name: kind.split for name, kind in BUILTIN.items()}
-    names.update({name: entry["multidex_split"] or "extra" for name, entry in _assets().items()})
-    return names
+    assets = {name: entry["multidex_split"] or "extra" for name, entry in _assets().items()}
+    return {name: kind.split for name, kind in BUILTIN.items()} | assets
 
 
 def resolve_objects(names: list[str]) -> list[str]:
-    """Names with folders replaced by the object files in them, and groups by their members.
+    """Names and paths with folders replaced by the object files in them, and groups by their members.
 
-    Args:
-        names: Names, paths, and groups such as `assets:train` and `procedural:0-99`.
-
-    Raises:
-        ObjectError: A folder or a group holds no object.
+    Groups are such as `assets:train` and `procedural:0-99`. A folder or a group that holds no object is an ObjectError.
     """
     found: list[str] = []
     for name in names:
-        if (group := GROUP.fullmatch(name)) is not None:
+        if (group := re.fullmatch(r"(builtin|assets):(\w+)", name)) is not None:
             found.extend(_members(group[1], group[2]))
             continue
-        if (seeds := SEEDS.fullmatch(name)) is not None:
+        if (seeds := re.fullmatch(r"procedural:(\d{1,9})-(\d{1,9})", name)) is not None:
             found.extend(_procedural(int(seeds[1]), int(seeds[2])))
             continue
         folder = given_path(name)
@@ -161,11 +155,12 @@ def _manifest(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def _load_asset(entry: dict[str, Any], scale: float) -> ObjectModel:
-    folder, collision = entry["folder"], entry.get("collision")
-    return mesh_object(
-        entry["name"], _read_mesh(folder / entry["file"]), origin=entry["name"], scale=scale,
-        split=entry["multidex_split"], parts=_read_parts(folder / collision["file"]) if collision else None,
-    )
+    folder, collision, parts = entry["folder"], entry.get("collision"), None
+    if collision:
+        bodies = _read_mesh(folder / collision["file"]).split(only_watertight=False)
+        parts = tuple(map(as_part, (body for body in bodies if len(body.vertices) >= 4)))  # fewer have no volume
+    return mesh_object(entry["name"], _read_mesh(folder / entry["file"]), origin=entry["name"], scale=scale,
+                       split=entry["multidex_split"], parts=parts)
 
 
 def _read_mesh(path: Path) -> trimesh.Trimesh:
@@ -173,14 +168,34 @@ def _read_mesh(path: Path) -> trimesh.Trimesh:
         raise ObjectError(f"the assets' manifest names {path}, which does not exist; repair the assets folder")
     mesh = read_geometry(path)[0]
     if isinstance(mesh, np.ndarray):
-        raise ObjectError(f"{path} has no faces; repair the assets folder")
+        raise ObjectError(f"{path} has no faces; prepare the object, or the assets folder, again")
     return mesh
 
 
-def _read_parts(path: Path) -> tuple[Part, ...]:
-    """Convex parts of an asset: the bodies of its collision file that have a volume."""
-    hulls = _read_mesh(path).split(only_watertight=False)
-    return tuple((np.asarray(h.vertices), np.asarray(h.faces)) for h in hulls if len(h.vertices) >= 4)
+def processed_folder(path: Path) -> Path | None:
+    """The folder of an object of DexGraspBench if the path is it, or the mesh in it; else None."""
+    for folder in (path, path.parent.parent):
+        if (folder / PARTS).is_dir() and (folder / MESH).is_file() and path in {folder, folder / MESH}:
+            return folder
+    return None
+
+
+def processed_objects(folder: Path | str) -> list[Path]:
+    """Folders of all objects of DexGraspBench at any depth of a folder, such as a clone of it or its archive, sorted."""
+    folder = given_path(folder)
+    found = sorted(path.parent.parent for path in folder.rglob(MESH) if processed_folder(path))
+    if not found:
+        raise ObjectError(f"{folder} holds no object of DexGraspBench (a folder with {MESH} and {PARTS}); name the folder of "
+                          "its clone, or of the unpacked archive of objects")
+    return found
+
+
+def load_processed(folder: Path, scale: float) -> ObjectModel:
+    """The object of a folder, with the convex parts that the benchmark collides; its name is the folder's and the scale."""
+    parts = tuple(as_part(_read_mesh(file)) for file in sorted((folder / PARTS).glob("*.obj")))
+    obj = mesh_object(
+        f"{folder.name}@{scale:g}", _read_mesh(folder / MESH), origin=str(folder), scale=scale, parts=parts or None)
+    return replace(obj, file=str((folder / MESH).resolve()), scale=scale)
 
 
 def _unknown(name: str) -> str:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int
+from scipy.spatial import ConvexHull
 
 from dro_grasp.errors import ObjectError
-from dro_grasp.objects.cache import Arrays, cached_arrays
+from dro_grasp.geometry.point_clouds import even_directions
+from dro_grasp.objects.cache import Arrays, cached_arrays, content_hash
 from dro_grasp.objects.repair import OPEN_FILL
 from dro_grasp.objects.surface_distances import signed_distances
 
@@ -19,16 +22,10 @@ MAX_PARTS = 24
 """Most parts of one object (ours)."""
 MAX_VERTICES = 64
 """Most vertices of one part (ours): collision cost grows with them."""
-SEARCH = 60
-"""CoACD's search iterations per cut (ours)."""
-RESOLUTION = 1000
-"""Points with which CoACD measures concavity (ours)."""
-CONVEX = 0.97
-"""Share of its hull that a mesh must fill to count as convex (ours)."""
-CLOSING = 64
-"""Cells along the longest side of the grid that closes a mesh with holes (ours)."""
-CLOSED_FACES = 6000
-"""Most faces of a closed mesh (ours)."""
+COARSE_VERTICES = 48
+"""Most vertices of a coarse part. Ours: the surface of a ball then lies up to 9 % of its radius inside."""
+COARSE_SHARE = 0.5
+"""Share of the parts that is left, rounded up (ours)."""
 
 Part = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
 """Vertices [m] and faces of a convex part."""
@@ -50,16 +47,15 @@ def _run(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> l
         mesh = closed_surface(vertices, faces)
         if mesh is None or mesh.volume < OPEN_FILL * hull.volume:
             mesh = hull
-    if mesh.volume > CONVEX * hull.volume:
-        return [(np.asarray(hull.vertices), np.asarray(hull.faces))]
+    if mesh.volume > 0.97 * hull.volume:  # it counts as convex (ours)
+        return [as_part(hull)]
     import coacd
 
     coacd.set_log_level("error")
     try:
         parts = coacd.run_coacd(
             coacd.Mesh(mesh.vertices, mesh.faces), threshold=THRESHOLD, max_convex_hull=MAX_PARTS,
-            mcts_iterations=SEARCH, resolution=RESOLUTION, decimate=True, max_ch_vertex=MAX_VERTICES, seed=0,
-        )
+            mcts_iterations=60, resolution=1000, decimate=True, max_ch_vertex=MAX_VERTICES, seed=0)
     except (RuntimeError, ValueError, MemoryError) as error:  # C++ errors, as its bindings translate them
         raise ObjectError(f"the mesh cannot be cut into convex parts ({error}); repair or simplify it") from error
     if not parts:
@@ -72,7 +68,7 @@ def closed_surface(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m
     import igl
 
     low, high = vertices.min(0), vertices.max(0)
-    spacing = float((high - low).max()) / CLOSING
+    spacing = float((high - low).max()) / 64  # cells along the longest side (ours)
     counts = np.ceil((high - low) / spacing).astype(int) + 5
     axes = [low[i] + spacing * (np.arange(counts[i]) - 2) for i in range(3)]
     # In libigl's grids the first axis is the fastest.
@@ -83,23 +79,60 @@ def closed_surface(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m
     nx, ny, nz = (int(n) for n in counts)
     corners, triangles = igl.marching_cubes(distance, points, nx, ny, nz, 0.0)[:2]
     surface = trimesh.Trimesh(corners, triangles)
-    if len(surface.faces) > CLOSED_FACES:
-        surface = surface.simplify_quadric_decimation(face_count=CLOSED_FACES)
+    if len(surface.faces) > (most := 6000):  # (ours)
+        surface = surface.simplify_quadric_decimation(face_count=most)
     trimesh.repair.fix_normals(surface)
     return surface
 
 
+def as_part(mesh: trimesh.Trimesh) -> Part:
+    """A convex mesh as a part."""
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+
 def pack(parts: Sequence[Part]) -> Arrays:
     """Parts as three arrays: all vertices, all faces, and the counts of each part."""
-    return {
-        "vertices": np.concatenate([v for v, _ in parts]), "faces": np.concatenate([f for _, f in parts]),
-        "counts": np.array([(len(v), len(f)) for v, f in parts]),
-    }
+    vertices, faces = zip(*parts, strict=True)
+    return {"vertices": np.concatenate(vertices), "faces": np.concatenate(faces),
+            "counts": np.array([(len(v), len(f)) for v, f in parts])}
 
 
 def unpack(stored: Arrays) -> tuple[Part, ...]:
     """The inverse of `pack`."""
     ends = np.cumsum(stored["counts"], axis=0)[:-1]
-    vertices = np.split(stored["vertices"], ends[:, 0])
-    faces = np.split(stored["faces"], ends[:, 1])
-    return tuple(zip(vertices, faces, strict=True))
+    pieces = (np.split(stored[name], ends[:, k]) for k, name in enumerate(("vertices", "faces")))
+    return tuple(zip(*pieces, strict=True))
+
+
+def coarse_parts(parts: Sequence[Part]) -> tuple[Part, ...]:
+    """Half as many parts: those whose common hull adds the least volume are joined, pair by pair; each is then simplified.
+
+    A part keeps the vertices that are outermost in evenly spread directions, so thin parts stay solid. Cached.
+    """
+    key = content_hash(*(array for part in parts for array in part))
+    settings = f"{COARSE_VERTICES}-{COARSE_SHARE * 100:.0f}"
+    stored = cached_arrays(f"coarse-{key[:24]}-{settings}", lambda: pack(_joined(parts)))
+    return unpack(stored)
+
+
+def _joined(parts: Sequence[Part]) -> list[Part]:
+    vertices = {i: _outermost(np.asarray(v, np.float64)) for i, (v, _) in enumerate(parts)}
+    volume = {i: float(ConvexHull(v).volume) for i, v in vertices.items()}
+
+    def added(i: int, j: int) -> float:
+        return float(ConvexHull(np.concatenate([vertices[i], vertices[j]])).volume) - volume[i] - volume[j]
+
+    price = {pair: added(*pair) for pair in combinations(vertices, 2)}
+    for new in range(len(parts), len(parts) + int((1 - COARSE_SHARE) * len(parts))):
+        pair = min(price, key=price.__getitem__)
+        price = {other: p for other, p in price.items() if not set(pair) & set(other)}
+        both = np.concatenate([vertices.pop(i) for i in pair])
+        vertices[new], volume[new] = _outermost(both), float(ConvexHull(both).volume)
+        price |= {(i, new): added(i, new) for i in vertices if i != new}
+    return [as_part(trimesh.convex.convex_hull(v)) for v in vertices.values()]
+
+
+def _outermost(vertices: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "_ 3"]:
+    """The vertices that are farthest in each of the directions, of the part stretched to a cube."""
+    cube = vertices / np.ptp(vertices, axis=0)
+    return vertices[np.unique((cube @ even_directions(COARSE_VERTICES).T.numpy()).argmax(0))]

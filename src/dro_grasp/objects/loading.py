@@ -1,9 +1,10 @@
-"""From a file to an ObjectModel: reading, checks and safe repairs, each reported in a note."""
+"""From a mesh or a cloud to an ObjectModel: checks and safe repairs, each reported in a note."""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -11,13 +12,12 @@ from jaxtyping import Float, Int, Num
 from scipy.spatial import KDTree
 
 from dro_grasp.errors import ObjectError
-from dro_grasp.files import given_path, reading
-from dro_grasp.geometry.mesh_files import open_mesh
+from dro_grasp.files import given_path
 from dro_grasp.geometry.point_clouds import distinct_points
 from dro_grasp.geometry.table_plane import above_plane, table_plane
 from dro_grasp.objects.cache import content_hash
-from dro_grasp.objects.cloud_files import CLOUD_SUFFIXES, read_cloud
 from dro_grasp.objects.convex_parts import Part
+from dro_grasp.objects.reading import ORIGIN, geometry_in_memory, read_geometry
 from dro_grasp.objects.repair import check_surface, mass_properties, repair
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
 
@@ -25,31 +25,18 @@ LARGEST = 1.0
 """Largest extent of an object that counts as metres [m] (ours)."""
 SMALLEST = 0.005
 """Smallest such extent [m] (ours)."""
-USUAL = 0.03
-"""A suggested scale gives an extent between this and ten times this [m] (ours)."""
 FARTHEST = 100.0
 """Largest coordinate [m] (ours): single precision rounds it by 4 micrometres."""
-MOST_UNEQUAL = 1.2
-"""Largest ratio of the lengths of the normals of a cloud (ours); what differs more is something else, such as colours."""
 MIN_CLOUD = 16
 """Fewest distinct points of a bare cloud (ours)."""
 NEIGHBOURS = 16
 """Neighbours that estimate the normals of a bare cloud (ours)."""
-ONE_SIDED = 0.3
-"""Length of the mean of estimated normals above which a cloud looks like one side of an object (ours): over closed surfaces
-normals add up to nothing, and over half a ball they have a mean of 0.5. A bowl seen from everywhere is above it, too."""
 
 
 def load_file(path: Path, *, scale: float = 1.0, keep_table: bool = False) -> ObjectModel:
     """Read a mesh in any format trimesh knows, or a point cloud (PLY without faces, NPY, PCD).
 
-    Args:
-        path: The file. A unit stated in it (glTF, 3MF, DAE) is honoured.
-        scale: Multiplies all coordinates; 0.001 for files in millimetres that state no unit.
-        keep_table: As for `cloud_object`.
-
-    Raises:
-        ObjectError: The file cannot be used; the message says why and what to do.
+    A unit stated in the file (glTF, 3MF, DAE) is honoured; `scale` multiplies all coordinates.
     """
     path = given_path(path)
     if not path.is_file():
@@ -63,51 +50,12 @@ def load_file(path: Path, *, scale: float = 1.0, keep_table: bool = False) -> Ob
     return mesh_object(path.stem, geometry, origin=str(path), scale=scale)
 
 
-def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
-    """Points of a cloud file, NaN and outliers included [the file's unit; metres if it states one]."""
-    if not path.is_file():
-        raise ObjectError(f"no file at {path}; with --camera give a cloud file (PLY, NPY, PCD), because named objects "
-                          "are meshes, not camera clouds")
-    geometry, unit = read_geometry(path)
-    if not isinstance(geometry, np.ndarray):
-        raise ObjectError(f"{path} is a mesh, not a camera cloud; leave out --camera, or give a cloud (PLY, NPY, PCD)")
-    if geometry.ndim != 2 or geometry.shape[1] < 3:
-        raise ObjectError(f"{path} holds an array of shape {geometry.shape}; expected (n, 3) points")
-    return geometry[:, :3] * unit
-
-
-def read_geometry(path: Path) -> tuple[trimesh.Trimesh | Float[np.ndarray, "..."], float]:
-    """One mesh, scenes merged, or the points of a file without faces; and the file's unit [m], 1 if it states none."""
-    if path.suffix.lower() in CLOUD_SUFFIXES:
-        return read_cloud(path), 1.0
-    # trimesh alone is called here, and its many readers raise whatever they stumble over.
-    with reading(path, ObjectError, "a mesh or cloud that trimesh reads (STL, OBJ, PLY, GLB, OFF, ...), NPY or PCD", Exception):
-        loaded = open_mesh(path, process=False)
-        unit = trimesh.units.unit_conversion(loaded.units, "meters") if loaded.units else 1.0
-        geometry = merge_scene(loaded) if isinstance(loaded, trimesh.Scene) else loaded
-    if isinstance(geometry, trimesh.PointCloud):
-        return _with_normals(geometry), unit
-    if not isinstance(geometry, trimesh.Trimesh):
-        raise ObjectError(f"{path} holds a {type(geometry).__name__}, which has no faces; give a triangle mesh, or a "
-                          "point cloud as PLY, NPY or PCD")
-    return geometry, unit
-
-
-def _with_normals(cloud: trimesh.PointCloud) -> Float[np.ndarray, "n k"]:
-    """The points of a cloud, and the normals that a PLY file has of them, which trimesh keeps aside."""
-    points = np.asarray(cloud.vertices, np.float64)
-    raw = cloud.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
-    names = ("nx", "ny", "nz")
-    if not isinstance(raw, dict) or any(name not in raw or len(raw[name]) != len(points) for name in names):
-        return points
-    return np.column_stack([points, *(np.asarray(raw[name], np.float64).reshape(len(points)) for name in names)])
-
-
-def merge_scene(scene: trimesh.Scene) -> trimesh.Trimesh | trimesh.PointCloud:
-    """All meshes of a scene in its frame, or its point clouds if it has no mesh."""
-    mesh = scene.to_mesh()
-    clouds = [part.vertices for part in scene.dump() if isinstance(part, trimesh.PointCloud)]
-    return trimesh.PointCloud(np.concatenate(clouds)) if clouds and len(mesh.faces) == 0 else mesh
+def object_in_memory(source: Any, scale: float = 1.0, keep_table: bool = False) -> ObjectModel:
+    """An object from a trimesh mesh, cloud or scene, from (vertices, faces), or from points (n 3) or with normals (n 6)."""
+    geometry, unit = geometry_in_memory(source)
+    if isinstance(geometry, trimesh.Trimesh):
+        return mesh_object("mesh", geometry, origin=ORIGIN, scale=scale * unit)
+    return cloud_object("cloud", geometry, origin=ORIGIN, scale=scale * unit, keep_table=keep_table)
 
 
 def mesh_object(
@@ -120,9 +68,6 @@ def mesh_object(
         origin: Source of the mesh, for messages.
         scale: Multiplies all coordinates, including those of the parts.
         split: `train`, `validate`, `test`, or None for a user's object.
-
-    Raises:
-        ObjectError: NaN vertices, no faces, no volume, or an implausible size in metres.
     """
     notes: list[str] = []
     vertices, faces = np.asarray(mesh.vertices, np.float64) * scale, np.asarray(mesh.faces, np.int64)
@@ -147,8 +92,7 @@ def mesh_object(
         cloud=np.asarray(points, np.float32), cloud_normals=np.asarray(clean.face_normals[face], np.float32),
         sha256=content_hash(vertices.astype(np.float32), faces.astype(np.int32)), vertices=vertices, faces=faces,
         volume=volume, centre_of_mass=centre, inertia=inertia,
-        exact_parts=None if parts is None else tuple((v * scale, f) for v, f in parts),
-    )
+        exact_parts=None if parts is None else tuple((v * scale, f) for v, f in parts))
 
 
 def cloud_object(
@@ -158,15 +102,9 @@ def cloud_object(
     """An object from a bare point cloud (n 3), or a cloud with normals (n 6); only the points are scaled.
 
     Args:
-        name: What to call it.
-        points: The cloud.
         origin: Source of the cloud, for messages.
-        scale: Multiplies all coordinates.
         keep_table: Take every point for the object's, also those of a table.
         seen: What was seen of it, where the rest of the cloud is a guess [m].
-
-    Raises:
-        ObjectError: Another shape, NaN, too few distinct points, or an implausible size in metres.
     """
     if points.ndim != 2 or points.shape[1] not in (3, 6):
         raise ObjectError(f"{origin} holds an array of shape {points.shape}; expected (n, 3) points or (n, 6) points "
@@ -192,7 +130,7 @@ def cloud_object(
     given = points[keep, 3:]
     length = np.linalg.norm(given, axis=1, keepdims=True)
     has_normals = points.shape[1] == 6 and length.min() > 1e-6
-    if has_normals and not length.max() < MOST_UNEQUAL * length.min():
+    if has_normals and not length.max() < 1.2 * length.min():  # (ours) something else, such as colours
         raise ObjectError(f"{origin} has vectors of length {length.min():.3g} to {length.max():.3g} in its columns 4 to 6, "
                           "which are no normals; expected unit normals, or (n, 3) points alone: normals are then estimated")
     normals = given / length if has_normals else estimate_normals(cloud)
@@ -204,13 +142,13 @@ def cloud_object(
         centre_of_mass=cloud.mean(0, dtype=np.float64), sha256=content_hash(cloud),
         table=table, seen=None if seen is None else seen.astype(np.float32),
         notes=(f"bare point cloud of {len(points)} points{fewer}{estimated}: no trial is possible without a mesh", *merged,
-               *cut, *(() if has_normals else _one_sided(normals))),
-    )
+               *cut, *(() if has_normals else _one_sided(normals))))
 
 
 def _one_sided(normals: Float[np.ndarray, "n 3"]) -> tuple[str, ...]:
     """A question if all points face one way, as if one camera had seen them."""
-    if np.linalg.norm(normals.mean(0)) <= ONE_SIDED:
+    # Over closed surfaces normals add up to nothing, over half a ball their mean is 0.5; a bowl seen from everywhere asks, too.
+    if np.linalg.norm(normals.mean(0)) <= 0.3:  # (ours)
         return ()
     return ("its points face mostly one way, and all of them count as the whole object; if they are what one camera saw, give "
             "its pose with --camera, scanned_object in Python: the side that it did not see is then added",)
@@ -249,20 +187,15 @@ def _check_numbers(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, ".
 
 
 def check_scale(scale: float) -> None:
-    """Refuse a factor that is no positive number.
-
-    Raises:
-        ObjectError: As said.
-    """
+    """Refuse a factor that is no positive number, by an ObjectError."""
     if not (math.isfinite(scale) and scale > 0):
         raise ObjectError(f"scale is {scale}; give a positive number, for example --scale 0.001 for millimetres")
 
 
 def check_extent(points: Float[np.ndarray, "n 3"], origin: str, scale: float = 1.0) -> None:
-    """Refuse sizes and places that are implausible in metres: most files state no unit, and a wrong guess would grasp air.
+    """Refuse sizes and places that are implausible in metres, by an ObjectError that suggests a scale.
 
-    Raises:
-        ObjectError: As said; for a wrong unit, it suggests a scale.
+    Most files state no unit, and a wrong guess would grasp air.
     """
     largest, farthest = float(np.ptp(points, axis=0).max()), float(np.abs(points).max())
     if SMALLEST <= largest <= LARGEST and farthest > FARTHEST:
@@ -274,6 +207,6 @@ def check_extent(points: Float[np.ndarray, "n 3"], origin: str, scale: float = 1
         raise ObjectError(f"{origin} is a single point; give a mesh or cloud that has an extent")
     size, change = (f"{largest:.4g} m, too large", "--scale: 0.001 for millimetres;") if largest > LARGEST else (
         f"{largest * 1000:.3g} mm, too small", "a larger --scale:")
-    power = 10.0 ** math.ceil(math.log10(USUAL / largest))
+    power = 10.0 ** math.ceil(math.log10(0.03 / largest))  # suggests 3 to 30 cm (ours)
     raise ObjectError(f"{origin} measures {size} for a hand to grasp; if its unit is not the metre, give {change} "
                       f"{scale * power:.3g} makes it {largest * power * 100:.2g} cm")

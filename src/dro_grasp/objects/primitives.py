@@ -9,13 +9,6 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-SEGMENTS = 24
-"""Corners of round cross-sections (ours)."""
-TUBE_CORNERS = 10
-"""Corners of the tube of a ring (ours)."""
-SAME_POINT = 1e-6
-"""Points closer than this are merged [m] (ours)."""
-
 Point = tuple[float, float, float]
 """Coordinates [m]."""
 
@@ -32,7 +25,8 @@ class Solid:
 
     def moved(self, by: Point) -> Solid:
         """The same solid elsewhere [m]."""
-        return Solid(_at(self.mesh, by), [_at(part, by) for part in self.parts])
+        mesh, *parts = (each.copy().apply_translation(by) for each in (self.mesh, *self.parts))
+        return Solid(mesh, parts)
 
 
 def hull(points: Float[np.ndarray, "n 3"]) -> trimesh.Trimesh:
@@ -40,8 +34,8 @@ def hull(points: Float[np.ndarray, "n 3"]) -> trimesh.Trimesh:
     mesh = trimesh.convex.convex_hull(points)
     if mesh.is_watertight and mesh.is_convex:
         return mesh
-    # Points that nearly coincide, for example at the pole of a superquadric, leave slivers.
-    first = np.unique(np.round(points / SAME_POINT), axis=0, return_index=True)[1]
+    # Points that nearly coincide, for example at the pole of a superquadric, leave slivers: merge those within a micrometre.
+    first = np.unique(np.round(points / 1e-6), axis=0, return_index=True)[1]
     return trimesh.convex.convex_hull(points[first])
 
 
@@ -52,7 +46,7 @@ def box(size: Point, at: Point = (0, 0, 0)) -> trimesh.Trimesh:
 
 
 def frustum(
-    radii: tuple[float, float], heights: tuple[float, float], at: Point = (0, 0, 0), axis: str = "z", corners: int = SEGMENTS
+    radii: tuple[float, float], heights: tuple[float, float], at: Point = (0, 0, 0), axis: str = "z", corners: int = 24
 ) -> trimesh.Trimesh:
     """A cone frustum between two heights along an axis [m]; equal radii make a cylinder."""
     angle = np.linspace(0, 2 * np.pi, corners, endpoint=False)
@@ -64,10 +58,7 @@ def frustum(
 
 
 def superquadric(size: Point, exponents: tuple[float, float], at: Point = (0, 0, 0)) -> trimesh.Trimesh:
-    """A convex superquadric: half axes [m] and exponents in (0, 2].
-
-    An exponent of 1 makes an ellipsoid, near 0 a box, 2 an octahedron.
-    """
+    """A convex superquadric: half axes [m], and exponents: 1 makes an ellipsoid, near 0 a box, 2 an octahedron."""
 
     def power(values: Float[np.ndarray, "..."], exponent: float) -> Float[np.ndarray, "..."]:
         return np.sign(values) * np.abs(values) ** exponent
@@ -82,9 +73,9 @@ def superquadric(size: Point, exponents: tuple[float, float], at: Point = (0, 0,
     return hull(points * size + at)
 
 
-def turned(profile: list[tuple[float, float]], at: Point = (0, 0, 0)) -> list[trimesh.Trimesh]:
+def turned(profile: list[tuple[float, float]]) -> list[trimesh.Trimesh]:
     """A solid of revolution about z from (radius, height) pairs, bottom to top: one frustum a step [m]."""
-    return [frustum((a[0], b[0]), (a[1], b[1]), at) for a, b in pairwise(profile)]
+    return [frustum((a[0], b[0]), (a[1], b[1])) for a, b in pairwise(profile)]
 
 
 def hollow(profile: list[tuple[float, float]], wall: float, floor: float, corners: int = 16) -> Solid:
@@ -115,7 +106,7 @@ def ring(radius: float, thickness: float, corners: int = 16, arc: float = 2 * np
     """A torus, or an arc of one, from convex segments: radius of the middle line and of the tube [m]."""
     closed = bool(np.isclose(arc, 2 * np.pi))
     angles = np.linspace(start, start + arc, corners + 1)[: corners if closed else None]
-    tube = np.linspace(0, 2 * np.pi, TUBE_CORNERS, endpoint=False)
+    tube = np.linspace(0, 2 * np.pi, 10, endpoint=False)
     loops = [
         _along(np.array([((radius + thickness * np.cos(t)) * np.cos(s), (radius + thickness * np.cos(t)) * np.sin(s),
                           thickness * np.sin(t)) for t in tube]), axis) + at
@@ -125,11 +116,10 @@ def ring(radius: float, thickness: float, corners: int = 16, arc: float = 2 * np
     return Solid(_swept(loops, closed), [hull(np.concatenate(pair)) for pair in segments])
 
 
-def tilted(parts: list[trimesh.Trimesh], angle: float, axis: str = "y") -> list[trimesh.Trimesh]:
-    """Parts turned about an axis through the origin [rad]."""
-    direction = {"x": [1, 0, 0], "y": [0, 1, 0], "z": [0, 0, 1]}[axis]
-    T = trimesh.transformations.rotation_matrix(angle, direction)
-    return [hull(trimesh.transform_points(p.vertices, T)) for p in parts]
+def tilted(part: trimesh.Trimesh, angle: float) -> trimesh.Trimesh:
+    """A part turned about the y axis [rad]."""
+    T = trimesh.transformations.rotation_matrix(angle, [0, 1, 0])
+    return hull(trimesh.transform_points(part.vertices, T))
 
 
 def _revolved(outline: list[tuple[float, float]], corners: int) -> trimesh.Trimesh:
@@ -173,13 +163,6 @@ def _outward(points: Float[np.ndarray, "n 3"], faces: list[tuple[int, int, int]]
     """A mesh with all faces turned outward."""
     mesh = trimesh.Trimesh(points, faces)
     trimesh.repair.fix_normals(mesh)
-    return mesh
-
-
-def _at(mesh: trimesh.Trimesh, by: Point) -> trimesh.Trimesh:
-    """A copy of a mesh, shifted [m]."""
-    mesh = mesh.copy()
-    mesh.apply_translation(by)
     return mesh
 
 

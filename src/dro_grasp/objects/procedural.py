@@ -7,7 +7,6 @@ from collections.abc import Callable
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
 from numpy.random import Generator
 
 from dro_grasp.errors import ObjectError
@@ -28,46 +27,30 @@ ATTEMPTS = 20
 
 
 def procedural_object(seed: int, *, scale: float = 1.0) -> ObjectModel:
-    """The object of a seed, the same one every time.
-
-    Args:
-        seed: From 0 on.
-        scale: Multiplies all coordinates.
-
-    Raises:
-        ObjectError: `scale` makes it implausibly large or small.
-    """
+    """The object of a seed (0 or more), the same one every time; `scale` multiplies all coordinates."""
     generator = np.random.default_rng([seed, 15])
     for _ in range(ATTEMPTS):
-        solids = [piece if isinstance(piece, Solid) else Solid(piece, [piece]) for piece in _draw(generator)]
-        factors = _factors(solids, generator)
-        if factors is None:
-            continue
-        stretched = [_stretched(solid, factors) for solid in solids]
-        if all(solid.mesh.is_volume for solid in stretched):
-            return assemble(f"procedural_{seed}", stretched, scale=scale, split="train")
+        pieces = FAMILIES[generator.integers(len(FAMILIES))](generator)
+        solids = [piece if isinstance(piece, Solid) else Solid(piece, [piece]) for piece in pieces]
+        sized = _sized(solids, generator)
+        if sized is not None and all(solid.mesh.is_volume for solid in sized):
+            return assemble(f"procedural_{seed}", sized, scale=scale, split="train")
     raise ObjectError(f"seed {seed} makes no object in {ATTEMPTS} attempts; give another one")
 
 
-def _draw(generator: Generator) -> Pieces:
-    """A shape of one of the families, of any size."""
-    return FAMILIES[generator.integers(len(FAMILIES))](generator)
-
-
-def _factors(solids: list[Solid], generator: Generator) -> Float[np.ndarray, "3"] | None:
-    """Factors along the axes that stretch a shape and give it a size; None for a shape that is too thin."""
+def _sized(solids: list[Solid], generator: Generator) -> list[Solid] | None:
+    """A shape stretched along the axes and given a size; None if it is too thin."""
     corners = np.concatenate([np.asarray(solid.mesh.vertices) for solid in solids])
     extent = np.ptp(corners, axis=0) * (stretch := generator.uniform(*STRETCH, 3))
     size = np.exp(generator.uniform(*np.log(SIZE)))
+    if extent.min() * size / extent.max() < THINNEST:
+        return None
     factors = stretch * size / extent.max()
-    return factors if extent.min() * size / extent.max() >= THINNEST else None
 
-
-def _stretched(solid: Solid, factors: Float[np.ndarray, "3"]) -> Solid:
     def stretched(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         return trimesh.Trimesh(np.asarray(mesh.vertices) * factors, np.asarray(mesh.faces), process=False)
 
-    return Solid(stretched(solid.mesh), [stretched(part) for part in solid.parts])
+    return [Solid(stretched(solid.mesh), [stretched(part) for part in solid.parts]) for solid in solids]
 
 
 def _blob(g: Generator, size: float = 1.0, at: Point = (0, 0, 0)) -> trimesh.Trimesh:
@@ -86,34 +69,23 @@ def _lump(g: Generator, size: float, at: Point) -> trimesh.Trimesh:
         return box((x, y, z), at)
     height = size * g.uniform(0.4, 1)
     wide, narrow = size * g.uniform(0.5, 1), size * g.uniform(0.2, 1)
-    return frustum((wide, narrow), (-height, height), at, axis=_axis(g), corners=_corners(g))
-
-
-def _axis(g: Generator) -> str:
-    return "xyz"[g.integers(3)]
+    return frustum((wide, narrow), (-height, height), at, axis="xyz"[g.integers(3)], corners=_corners(g))
 
 
 def _corners(g: Generator) -> int:
     return int(g.choice([4, 6, 24, 24]))
 
 
-def _convex(g: Generator) -> Pieces:
-    return [_blob(g)]
-
-
 def _prism(g: Generator) -> Pieces:
     return [frustum((1, g.uniform(0.05, 1)), (-g.uniform(0.3, 2), 1), corners=int(g.choice([3, 4, 5, 6, 8, 24])))]
 
 
-def _profile(g: Generator, steps: int) -> list[tuple[float, float]]:
-    """Radii at rising heights; neighbours differ by a step or a slope."""
+def _vase(g: Generator) -> Pieces:
+    """Radii at rising heights, turned; neighbours differ by a step or a slope."""
+    steps = int(g.integers(3, 7))
     heights = np.cumsum(g.uniform(0.15, 1, steps))
     radii = np.clip(np.cumsum(g.normal(0, 0.35, steps)) + 1, 0.3, 1.8)
-    return [(float(r), float(h)) for r, h in zip(radii, heights, strict=True)]
-
-
-def _vase(g: Generator) -> Pieces:
-    return turned(_profile(g, int(g.integers(3, 7))))
+    return turned(list(zip(radii.tolist(), heights.tolist(), strict=True)))
 
 
 def _vessel(g: Generator) -> Pieces:
@@ -124,10 +96,6 @@ def _vessel(g: Generator) -> Pieces:
         return [body]
     radius = height * g.uniform(0.2, 0.33)
     return [body, ring(radius, 0.12, 9, arc=np.pi, axis="y", at=(low - 0.02, 0, height / 2), start=0.0)]
-
-
-def _ring(g: Generator) -> Pieces:
-    return [ring(1.0, g.uniform(0.15, 0.6))]
 
 
 def _blocks(g: Generator) -> Pieces:
@@ -161,5 +129,6 @@ def _creature(g: Generator) -> Pieces:
 
 
 FAMILIES: tuple[Callable[[Generator], Pieces], ...] = (
-    _convex, _prism, _vase, _vessel, _ring, _blocks, _tool, _tool, _creature, _creature)
+    lambda g: [_blob(g)], _prism, _vase, _vessel, lambda g: [ring(1.0, g.uniform(0.15, 0.6))], _blocks, _tool, _tool,
+    _creature, _creature)
 """How shapes are made; those that stand twice come twice as often."""

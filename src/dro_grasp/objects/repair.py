@@ -10,53 +10,33 @@ from scipy.spatial import QhullError
 from dro_grasp.errors import ObjectError
 from dro_grasp.geometry.point_clouds import enclosed_volume
 
-MANY_FACES = 100_000
-"""Meshes with more faces are decimated (ours)."""
-KEPT_FACES = 50_000
-"""Faces after decimation (ours)."""
-LEAST_VOLUME = 1e-9
-"""Smallest volume of a convex hull [m^3] (ours); less encloses nothing."""
 LEAST_FILL = 1e-3
 """Share of its bounding box that a hull must fill, and share of its hull that a closed mesh must fill (ours); less is a
 sheet."""
 OPEN_FILL = 0.05
 """Share of its hull that a mesh with holes must fill (ours); a bent sheet appears to fill a little."""
-FEW_FACES = 100
-"""Meshes with fewer faces are quick, whatever they are (ours)."""
-MOST_ALONE = 0.9
-"""Largest share of edges that belong to one face alone (ours)."""
 OVERLAP = 1e-3
 """Share of the volume by which bodies may overlap without being joined (ours)."""
-PROBES = 48
-"""Points along the longest side of the grid that measures a mesh with holes (ours)."""
 
 MassProperties = tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]
 """Volume [m^3], centre of mass [m], and inertia about it at unit density [m^5]."""
 
 
 def check_surface(mesh: trimesh.Trimesh, origin: str) -> None:
-    """Refuse faces that are no surface: those without area, and soups, for which inside and outside take minutes to tell.
-
-    Raises:
-        ObjectError: As said. The mesh has merged vertices.
-    """
+    """Refuse faces without area, and soups of faces, in which inside and outside take minutes to tell, by an ObjectError."""
     if not (len(mesh.faces) and mesh.nondegenerate_faces().any()):
         raise ObjectError(f"{origin} has {len(mesh.faces)} faces, none of which has an area; give a triangle mesh of a solid")
     edges = mesh.faces_unique_edges[mesh.unique_faces()]  # a face and its reverse side count once
     alone = float((np.unique(edges, return_counts=True)[1] == 1).mean())
-    if len(mesh.faces) > FEW_FACES and alone > MOST_ALONE:
+    if len(mesh.faces) > 100 and alone > 0.9:  # (ours) fewer faces are quick, whatever they are
         raise ObjectError(f"{origin} is no surface: {alone:.0%} of the edges of its {len(mesh.faces)} faces belong to one face "
                           "alone; join the faces (merge vertices), or give a point cloud of the surface")
 
 
 def repair(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
-    """Decimate, close, turn outward and join, as far as that is safe; a sound mesh is returned unchanged.
-
-    The mesh has merged vertices; `notes` gets a line for each finding.
-    """
-    if len(mesh.faces) > MANY_FACES:
-        before = len(mesh.faces)
-        mesh = mesh.simplify_quadric_decimation(face_count=KEPT_FACES)
+    """Decimate, close, turn outward and join a mesh with merged vertices, as far as that is safe; `notes` gets each finding."""
+    if (before := len(mesh.faces)) > 100_000:  # (ours)
+        mesh = mesh.simplify_quadric_decimation(face_count=50_000)
         notes.append(f"decimated from {before} to {len(mesh.faces)} faces")
     if not mesh.is_watertight:
         _close(mesh, notes)
@@ -66,16 +46,13 @@ def repair(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
 
 
 def mass_properties(mesh: trimesh.Trimesh, origin: str, notes: list[str]) -> MassProperties:
-    """Volume, centre of mass and inertia.
+    """Volume, centre of mass and inertia; an ObjectError if not even the convex hull encloses a volume.
 
     A mesh with holes is measured by the points inside by their winding number, a sheet by its convex hull.
-
-    Raises:
-        ObjectError: Not even the convex hull encloses a volume.
     """
     hull = _hull(mesh)
     box = float(np.prod(mesh.extents))
-    if hull is None or hull.volume < max(LEAST_FILL * box, LEAST_VOLUME):
+    if hull is None or hull.volume < max(LEAST_FILL * box, 1e-9):  # [m^3] (ours)
         raise ObjectError(f"{origin} encloses no volume (extents {np.round(mesh.extents * 1000, 2).tolist()} mm); "
                           "give a closed solid, or a point cloud if only its surface is known")
     if _is_solid(mesh) and LEAST_FILL * hull.volume < _volume(mesh) <= (1 + OVERLAP) * hull.volume:
@@ -144,7 +121,7 @@ def _winding(mesh: trimesh.Trimesh) -> tuple[Float[np.ndarray, " n"], Float[np.n
     """Winding numbers on a grid over the mesh's box, the grid's points [m], and the volume of a cell [m^3]."""
     import igl
 
-    spacing = float(mesh.extents.max()) / PROBES
+    spacing = float(mesh.extents.max()) / 48  # probes along the longest side (ours)
     axes = [np.arange(low + spacing / 2, high, spacing) for low, high in mesh.bounds.T]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     winding = igl.fast_winding_number(

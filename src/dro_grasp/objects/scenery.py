@@ -16,9 +16,10 @@ from scipy.spatial import KDTree
 from dro_grasp.errors import ObjectError
 from dro_grasp.files import given_path
 from dro_grasp.geometry.distance_field import DistanceField
+from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.kinds import checked
-from dro_grasp.objects.in_memory import ObjectSource, geometry_in_memory
-from dro_grasp.objects.loading import FARTHEST, check_scale, read_geometry
+from dro_grasp.objects.loading import FARTHEST, check_scale
+from dro_grasp.objects.reading import ObjectSource, coordinates, geometry_in_memory, read_geometry
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.objects.surface_distances import banded_values, search_tree, signed_distances
 
@@ -28,15 +29,8 @@ LARGEST_GRID = 4_000_000
 """Most points of such a grid; a larger one gets a wider spacing (ours)."""
 MARGIN = 0.03
 """Distance around a scene that its grid covers [m] (ours); beyond, distances grow as they do at its border."""
-CELL = 0.004
-"""A cloud keeps one point for each cube of this edge [m] (ours): cameras see far more."""
 TOUCH = 0.003
 """Distance to a scene at which a point of an object's surface lies on it [m] (ours)."""
-LARGEST_SHARE = {"cloud": 0.2, "mesh": 0.5}
-"""Share of an object's surface on a scene above which the scene is taken to contain the object (ours): objects touch what they
-stand on."""
-SAME_SIDE = 0.85
-"""Length of the mean normal above which the touching surface is one flat side, on which the object stands (ours)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,20 +73,16 @@ class Scene:
         return DistanceField.from_values(torch.from_numpy(values).float(), torch.from_numpy(low).float(), spacing)
 
     def require_apart(self, obj: ObjectModel) -> None:
-        """Refuse a scene that contains the object itself: no hand could touch it.
-
-        Raises:
-            ObjectError: It does.
-        """
+        """Refuse a scene that contains the object itself, by an ObjectError: no hand could touch it."""
         if self.faces is None:
-            distance, kind = KDTree(self.points).query(obj.cloud)[0], "cloud"
+            distance, most = KDTree(self.points).query(obj.cloud)[0], 0.2
         else:
-            distance, kind = signed_distances(self.points, self.faces, obj.cloud.astype(np.float64)), "mesh"
+            distance, most = signed_distances(self.points, self.faces, obj.cloud.astype(np.float64)), 0.5
         on = distance < TOUCH
-        if on.mean() <= LARGEST_SHARE[kind]:
+        if on.mean() <= most:  # (ours) objects touch what they stand on
             return
         flat = float(np.linalg.norm(obj.cloud_normals[on].mean(0)))
-        if flat < SAME_SIDE or on.mean() > 0.5:
+        if flat < 0.85 or on.mean() > 0.5:  # (ours) otherwise it is the flat side on which the object stands
             raise ObjectError(f"the scene to avoid, '{self.name}', contains object '{obj.name}': {100 * on.mean():.0f} % of "
                               "the object's surface lies on it or inside. Cut the object out of the scene, or check that "
                               "both are in one frame and in metres")
@@ -125,9 +115,7 @@ def load_scene(source: ObjectSource, name: str | None = None, scale: float = 1.0
             raise ObjectError(f"{origin} has {len(faces)} faces, or vertices that are absent or not finite; repair the mesh, "
                               "or give a cloud")
     else:
-        if geometry.ndim != 2 or geometry.shape[1] < 3:
-            raise ObjectError(f"{origin} holds an array of shape {geometry.shape}; expected (n, 3) points")
-        points, faces = np.asarray(geometry[:, :3], np.float64), None
+        points, faces = coordinates(geometry, origin), None
         points = points[np.isfinite(points).all(1)]
     points = points * (scale * unit)
     if not len(points):
@@ -136,15 +124,8 @@ def load_scene(source: ObjectSource, name: str | None = None, scale: float = 1.0
         raise ObjectError(f"{origin} has coordinates of up to {np.abs(points).max():.3g} m; divide millimetres by 1000 "
                           f"(scale), and leave out what is farther away than {FARTHEST:g} m")
     if faces is None:
-        points = points[one_per_cell(points, CELL)]
+        points = points[one_per_cell(points, 0.004)]  # [m] (ours): cameras see far more
     return Scene(label, points, faces)
-
-
-def one_per_cell(points: Float[np.ndarray, "n 3"], edge: float) -> Int[np.ndarray, " k"]:
-    """Which of some points to keep so that each cube of this edge [m] keeps one."""
-    cells = np.floor(points / edge).astype(np.int64)
-    cells -= cells.min(0)
-    return np.unique(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(0) + 1)), return_index=True)[1]
 
 
 def _ball_distances(points: Float[np.ndarray, "n 3"]) -> Any:

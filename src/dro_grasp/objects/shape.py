@@ -11,18 +11,26 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dro_grasp.errors import ObjectError
-from dro_grasp.geometry.balls import Balls
-from dro_grasp.geometry.distance_field import DistanceField
-from dro_grasp.geometry.point_clouds import random_half
+from dro_grasp.geometry.distance_field import Balls, DistanceField
+from dro_grasp.geometry.point_clouds import one_per_cell, random_half
 from dro_grasp.objects.cache import cached_arrays, content_hash
-from dro_grasp.objects.coarse_parts import coarse_parts
-from dro_grasp.objects.convex_parts import Part, decompose, pack
+from dro_grasp.objects.convex_parts import Part, coarse_parts, decompose, pack
 from dro_grasp.objects.surface_distances import GRID_SPACING, bake_grid, closed_cloud_distances, signed_distances
 
 DENSITY = 500.0
 """Density of every object in trials [kg/m^3]. Source: the official release."""
 CLOUD_POINTS = 16384
 """Points of an object's stored cloud (ours)."""
+BALL_RADII = (0.008, 0.006, 0.004, 0.003, 0.002)
+"""Radii of balls [m]; each point gets the largest that stays inside, or else the smallest (ours)."""
+BALL_SPACING = 0.008
+"""Distance between the points that are touched [m] (ours): between the largest balls the surface is 1 mm low."""
+MOST_BALLS = 2000
+"""Balls of a solid at most (ours): larger things get larger balls, farther apart. Hands take in a few hundred."""
+BALL_OUTSIDE = 0.0012
+"""How far a ball may reach through the surface elsewhere [m] (ours)."""
+ROUND = 1e-12
+"""Added to the inertia at unit density [m^5], so that a flat cloud has one about every axis (ours)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,3 +146,49 @@ class ObjectModel:
         if len(cloud) < 2 * count:
             cloud = self.sample_points(2 * count, generator)
         return cloud[random_half(cloud, count, generator)]
+
+
+def solid_of(obj: ObjectModel) -> ObjectModel:
+    """What the closing of a hand is simulated on: a mesh as it is; a bare cloud with balls, and the mass of what it encloses.
+
+    Trials take the cloud itself, and refuse it: what becomes of an estimate is no outcome.
+    """
+    if not obj.is_cloud or obj.balls is not None:
+        return obj
+    cell, inside = _enclosed(obj)
+    centre = inside.mean(0)
+    apart = inside - centre
+    products = cell * apart.T @ apart
+    return replace(
+        obj, balls=_balls(obj), volume=cell * len(inside), centre_of_mass=centre,
+        inertia=np.trace(products) * np.eye(3) - products + ROUND * np.eye(3))
+
+
+def _enclosed(obj: ObjectModel) -> tuple[float, Float[np.ndarray, "n 3"]]:
+    """Volume [m^3] and middles [m] of the cells inside a cloud; of those with points if it encloses none."""
+    field = obj.distance_field
+    nodes = np.indices(field.shape).reshape(3, -1).T[field.slopes[:, 0].numpy() < 0]
+    inside = nodes * field.spacing + field.origin.numpy()
+    if not len(inside):
+        inside = (np.unique(np.floor(obj.cloud / field.spacing), axis=0) + 0.5) * field.spacing
+    return field.spacing**3, inside.astype(float)
+
+
+def _spread(cloud: Float[np.ndarray, "m 3"], spacing: float) -> Int[np.ndarray, " k"]:
+    """Rows of points about this far apart [m]: the one nearest to the middle of each cell of a grid."""
+    order = np.linalg.norm(cloud / spacing - np.floor(cloud / spacing) - 0.5, axis=1).argsort(kind="stable")
+    return order[one_per_cell(cloud[order], spacing)]
+
+
+def _balls(obj: ObjectModel) -> Balls:
+    """Balls that touch a cloud with normals from inside."""
+    cloud, radii, spacing = obj.cloud.astype(float), np.array(BALL_RADII), BALL_SPACING
+    while len(rows := _spread(cloud, spacing)) > MOST_BALLS:
+        spacing *= 1.25  # (ours)
+        radii = np.array([BALL_RADII[0] * spacing / BALL_SPACING, *BALL_RADII])
+    centres = cloud[rows] - radii[:, None, None] * obj.cloud_normals[rows]
+    depth = -obj.distance_field.distances(torch.from_numpy(centres).float())[0].numpy()
+    fits = depth > radii[:, None] - BALL_OUTSIDE
+    fits[-1] = True
+    largest = fits.argmax(0)
+    return Balls(torch.from_numpy(centres[largest, np.arange(len(rows))]), torch.from_numpy(radii[largest]))

@@ -22,28 +22,15 @@ NEAR = 0.008
 """Distance from a surface up to which a grid that is filled coarsely far away is as exact as one that is not [m] (ours)."""
 STRIDE = 3
 """Grid points of such a grid, per axis, for each that is computed far away (ours)."""
-SURE = 0.003
-"""Distance from a cloud up to which the disc around the nearest point tells inside from outside [m] (ours)."""
-MOSTLY_INSIDE = 0.4
-"""Winding number above which a place farther away is inside (ours): 1/2 where a side of the object is missing."""
-LEAF = 32
-"""Points of a leaf of a search tree (ours): half the time that 10 take."""
 DISC_NEIGHBOURS = 7
 """Points of a bare cloud within the disc around each point, itself included (ours)."""
-
 
 Distances = Callable[[Float[np.ndarray, "_ 3"]], Float[np.ndarray, " _"]]
 """Signed distances of points to one surface [m]."""
 
 
 def bake_grid(surface: Float[np.ndarray, "n 3"], distance: Distances, banded: bool = False) -> Arrays:
-    """Signed distances on a grid around a surface: `values` (nx ny nz), `origin` (3) and `spacing` [m].
-
-    Args:
-        surface: What the grid surrounds [m].
-        distance: Signed distances to it.
-        banded: Fill the grid coarsely away from the surface; see `banded_values`.
-    """
+    """Signed distances on a grid around a surface: `values` (nx ny nz), `origin` (3) and `spacing` [m]; see `banded_values`."""
     low, high = surface.min(0) - GRID_PADDING, surface.max(0) + GRID_PADDING
     spacing = max(GRID_SPACING, float((np.prod(high - low) / LARGEST_GRID) ** (1 / 3)))
     counts = np.ceil((high - low) / spacing).astype(int) + 1
@@ -84,7 +71,7 @@ def search_tree(points: Float[np.ndarray, "n 3"]) -> KDTree:
     Nodes keep the whole of their cells: those that shrink to their points lie alike far before a flat surface, and the search
     visits most of them, which takes ten times as long.
     """
-    return KDTree(points, leafsize=LEAF, compact_nodes=False)
+    return KDTree(points, leafsize=32, compact_nodes=False)  # (ours) half the time that 10 take
 
 
 def cloud_distances(
@@ -118,11 +105,12 @@ def closed_cloud_distances(
     count = min(DISC_NEIGHBOURS, len(cloud))
     radius = KDTree(cloud).query(cloud, k=count)[0][:, -1]
     area = np.pi * radius**2 / max(1, count - 1)
-    far = np.abs(distance) > SURE
+    far = np.abs(distance) > 0.003  # [m] (ours): nearer, the disc around the nearest point tells
     distance[far] = np.abs(distance[far])
     deep = far & ((points > cloud.min(0)) & (points < cloud.max(0))).all(1)
     winding = igl.fast_winding_number(cloud, normals, area, np.ascontiguousarray(points[deep]))
-    distance[deep] *= np.where(np.asarray(winding) > MOSTLY_INSIDE, -1.0, 1.0)
+    # The winding number is 1/2 where a side of the object is missing.
+    distance[deep] *= np.where(np.asarray(winding) > 0.4, -1.0, 1.0)
     return distance
 
 

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from dro_grasp.energy.grasp_energy import EnergyConfig
 from dro_grasp.energy.surroundings import Surroundings
-from dro_grasp.geometry.rotations import roma
-from dro_grasp.geometry.se3 import apply_to_cloud, random_rotations, rotation_between
+from dro_grasp.geometry.se3 import apply_to_cloud, random_rotations, roma, rotation_between
 from dro_grasp.hands.hand import Hand
 
 Direction = tuple[float, float, float]

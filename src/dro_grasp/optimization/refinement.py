@@ -14,8 +14,7 @@ from torch import Tensor
 
 from dro_grasp.devices import side_by_side
 from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
-from dro_grasp.geometry.rotations import roma
-from dro_grasp.geometry.se3 import turned_about
+from dro_grasp.geometry.se3 import roma, turned_about
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.kinds import Checked
 from dro_grasp.optimization.finger_closing import ClosingConfig

@@ -10,8 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.energy.surroundings import Surroundings
-from dro_grasp.geometry.balls import Ball, Balls
-from dro_grasp.geometry.distance_field import DistanceField
+from dro_grasp.geometry.distance_field import Ball, Balls, DistanceField
 from dro_grasp.geometry.se3 import compose, rotate
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked

@@ -13,8 +13,7 @@ from dro_grasp._version import __version__
 from dro_grasp.energy.contact_candidates import ContactConfig
 from dro_grasp.energy.grasp_energy import TERMS, EnergyConfig, Evaluation, GraspEnergy
 from dro_grasp.errors import ObjectError, OptionError
-from dro_grasp.geometry.rotations import roma
-from dro_grasp.geometry.se3 import turned_about
+from dro_grasp.geometry.se3 import roma, turned_about
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import DEPTH, ENERGY_TERM
 from dro_grasp.hands.hand import Hand

@@ -15,6 +15,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.models.completion_network import SurfaceNetwork, shipped_surface
 from dro_grasp.objects.surface_distances import cloud_distances
 from dro_grasp.perception.symmetry import Guess, VisibleSide, project
@@ -31,16 +32,6 @@ MARGIN = 0.01
 """Distance that the grid extends beyond all guesses [m] (ours)."""
 SPREAD = 40_000
 """Points that are moved onto the surface (ours)."""
-STEPS = 4
-"""Newton steps of these points (ours)."""
-CLOSE = 0.0005
-"""Distance from the surface within which a point counts as arrived [m] (ours)."""
-THINNING = 40
-"""One visible point is kept per cube; its edge is the object's width over this (ours)."""
-FINEST = 0.002
-"""Shortest edge of these cubes [m] (ours), unless it is more than a share of the width; see COARSEST."""
-COARSEST = 10
-"""The shortest edge is at most the object's width over this (ours)."""
 SMALL = 0.01
 """Distance that the network receives as about 1/2 [m] (ours)."""
 LENGTH = 0.05
@@ -79,8 +70,7 @@ def complete_cloud(
     Args:
         points: Points of the visible side [m].
         normals: Their outward unit normals.
-        camera: Position of the camera [m]. Without it, the points are taken to be all points on one side of a plane, whose
-            normal is the mean of theirs.
+        camera: Its position [m]; without it, the points are all on one side of a plane, whose normal is the mean of theirs.
         up: Up direction, if known; symmetries that preserve it are preferred.
         network: Chooses between symmetries; the shipped one by default.
     """
@@ -89,8 +79,10 @@ def complete_cloud(
         return CompletedCloud(points, normals, np.zeros(len(points), bool))
     guesses = side.guesses(None if up is None else up @ axes, GUESSES)
     surface, outward = extract_surface(side, guesses, network or shipped_surface())
-    apart = max(side.width / THINNING, min(FINEST, side.width / COARSEST))
-    seen, seen_normals = _thinned(side.points, side.normals, apart)
+    # One visible point is kept per cube of a fortieth of the width, but not below 2 mm or a tenth of the width (ours).
+    apart = max(side.width / 40, min(0.002, side.width / 10))
+    first = one_per_cell(side.points, apart)
+    seen, seen_normals = side.points[first], side.normals[first]
     between = 2 * float(np.median(KDTree(seen).query(seen, k=2)[0][:, 1]))
     near = side.tree.query(surface)[0] < 1.5 * max(apart, between)
     # Extracted points near the visible side cover the same area as the thinned visible points: the ratio of the two
@@ -157,18 +149,11 @@ def extract_surface(
         return guesses[0].points, guesses[0].normals
     points = close[rng.integers(len(close), size=SPREAD)] + rng.uniform(-0.5, 0.5, (SPREAD, 3)) * spacing
     # Newton steps x - s grad s / |grad s|^2; the floor on the slope limits steps where the field is flat.
-    for _ in range(STEPS):
+    for _ in range(4):  # (ours)
         here = values(points)
         points = points - here[:, :1] * here[:, 1:] / np.maximum((here[:, 1:] ** 2).sum(1, keepdims=True), 0.1)
     here = values(points)
-    kept = (np.abs(here[:, 0]) < CLOSE) & (points > low).all(1) & (points < high).all(1)
+    arrived = np.abs(here[:, 0]) < 0.0005  # [m] (ours)
+    kept = arrived & (points > low).all(1) & (points < high).all(1)
     outward = here[kept, 1:]
     return points[kept], outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
-
-
-def _thinned(
-    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], spacing: float
-) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]:
-    """The first point in each cell of a grid."""
-    first = np.unique(np.floor(points / spacing).astype(np.int64), axis=0, return_index=True)[1]
-    return points[first], normals[first]

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from dro_grasp.errors import OptionError
 from dro_grasp.kinds import Checked
-from dro_grasp.objects.in_memory import numbers
 from dro_grasp.objects.loading import cloud_object, estimate_normals
+from dro_grasp.objects.reading import numbers
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.completion import complete_cloud
 
@@ -24,10 +24,6 @@ View = Literal["whole", "cloud", "half", "depth"]
 """The mesh; all surface points without the mesh; half of them; the points of a depth image."""
 POINTS = 1024
 """Points of the paper's half of a cloud (twice the network's 512 points)."""
-FLIP = 300.0
-"""Radius of the sphere that inverts a cloud, in units of its largest distance (ours): larger sees more, smaller hides more."""
-REFERENCE_DEPTH = 0.5
-"""Depth for which the camera's noise is stated [m] (ours)."""
 
 
 def partial_view(obj: ObjectModel, view: View, seed: int, camera: DepthCamera | None = None) -> ObjectModel:
@@ -54,10 +50,7 @@ def partial_view(obj: ObjectModel, view: View, seed: int, camera: DepthCamera | 
 def visible_side(
     obj: ObjectModel, view: Literal["half", "depth"], seed: int, camera: DepthCamera | None = None
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Float[np.ndarray, "3"] | None]:
-    """Points of the visible side alone [m], their normals, and the camera's position if there is one [m].
-
-    Arguments are those of `partial_view`.
-    """
+    """As `partial_view`: the visible side's points alone [m], their normals, and the camera's position if there is one [m]."""
     generator = torch.Generator().manual_seed(seed)
     if view == "half":
         half = cloud_object(obj.name, obj.sample_partial(POINTS, generator).numpy(), origin=obj.name, keep_table=True)
@@ -124,7 +117,10 @@ def visible_points(
     T_object_camera = _looking_at(_middle(obj), towards.double().numpy() / length, camera.distance)
     image = _depth_of_cloud if obj.is_cloud else _depth_of_mesh
     rays, depth = image(obj, T_object_camera, radius, camera)
-    return _measured(rays, depth, T_object_camera, camera, generator)
+    kept = torch.rand(len(depth), generator=generator).numpy() >= camera.lost
+    error = torch.randn(len(depth), generator=generator).numpy() * camera.noise * (depth / 0.5) ** 2
+    points = (rays * (depth + error)[:, None])[kept]
+    return torch.from_numpy((points @ T_object_camera[:3, :3].T + T_object_camera[:3, 3]).astype(np.float32))
 
 
 def _middle(obj: ObjectModel) -> Float[np.ndarray, "3"]:
@@ -163,27 +159,15 @@ def _depth_of_mesh(
 def _depth_of_cloud(
     obj: ObjectModel, T_object_camera: Float[np.ndarray, "4 4"], radius: float, camera: DepthCamera
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    """Like `_depth_of_mesh`, for the points that no others hide.
+    """Like `_depth_of_mesh`, for the points that no others hide. Source: Katz, Tal and Basri 2007.
 
-    Reflect every point in a sphere about the camera: a point is visible exactly if its image lies on the convex hull of
-    all images and the camera.
-
-    Source: Katz, Tal and Basri, Direct visibility of point sets, 2007.
+    Reflect every point in a sphere about the camera: it is visible exactly if its image lies on the convex hull of all images
+    and the camera.
     """
     local = (obj.cloud.astype(np.float64) - T_object_camera[:3, 3]) @ T_object_camera[:3, :3]
     away = np.linalg.norm(local, axis=1, keepdims=True)
-    flipped = local + 2 * (FLIP * away.max() - away) * local / away
+    radius = 300.0 * away.max()  # (ours): a larger sphere sees more, a smaller one hides more
+    flipped = local + 2 * (radius - away) * local / away
     hull = ConvexHull(np.concatenate([flipped, np.zeros((1, 3))]), qhull_options="QJ").vertices
     visible = local[np.sort(hull[hull < len(local)])]
     return visible / visible[:, 2:], visible[:, 2]
-
-
-def _measured(
-    rays: Float[np.ndarray, "pixels 3"], depth: Float[np.ndarray, " pixels"], T_object_camera: Float[np.ndarray, "4 4"],
-    camera: DepthCamera, generator: torch.Generator,
-) -> Float[Tensor, "n 3"]:
-    """Points in the object's frame from noisy depths, without lost pixels [m]."""
-    kept = torch.rand(len(depth), generator=generator).numpy() >= camera.lost
-    error = torch.randn(len(depth), generator=generator).numpy() * camera.noise * (depth / REFERENCE_DEPTH) ** 2
-    points = (rays * (depth + error)[:, None])[kept]
-    return torch.from_numpy((points @ T_object_camera[:3, :3].T + T_object_camera[:3, 3]).astype(np.float32))

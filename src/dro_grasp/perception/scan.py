@@ -16,22 +16,16 @@ from dro_grasp.frames import motion_fault
 from dro_grasp.geometry.point_clouds import distinct_points
 from dro_grasp.geometry.table_plane import above_plane, moved_plane, table_plane
 from dro_grasp.kinds import checked
-from dro_grasp.objects.in_memory import numbers
-from dro_grasp.objects.loading import check_extent, check_scale, cloud_object, estimate_normals, read_points, table_note
+from dro_grasp.objects.loading import check_extent, check_scale, cloud_object, estimate_normals, table_note
+from dro_grasp.objects.reading import numbers, read_points
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
 from dro_grasp.perception.completion import complete_cloud
 
 NEIGHBOURS = 12
 """Neighbours that decide whether a point is an outlier (ours)."""
-TOLERANCE = 2.5
-"""Outliers are farther from their neighbours than the mean by this many standard deviations (ours)."""
-FARTHEST = 10.0
-"""Larger depths are taken to be in another unit [m] (ours)."""
 
 
-def depth_points(
-    depth: ArrayLike, intrinsics: ArrayLike, mask: ArrayLike | None = None
-) -> Float[np.ndarray, "n 3"]:
+def depth_points(depth: ArrayLike, intrinsics: ArrayLike, mask: ArrayLike | None = None) -> Float[np.ndarray, "n 3"]:
     """Points of a depth image in the camera's frame: x right, y down, z forward [m].
 
     Arrays, tensors and nested lists are taken.
@@ -58,7 +52,7 @@ def depth_points(
     if not valid.any():
         raise ObjectError("no pixel of the depth image has a depth" + ("" if mask is None else " within the mask")
                           + "; give depths in metres, and a mask that is true on the object")
-    if float(np.median(image[valid])) > FARTHEST:
+    if float(np.median(image[valid])) > 10.0:  # [m] (ours)
         raise ObjectError(f"the median depth is {np.median(image[valid]):g}, too far for metres; divide millimetres by 1000")
     row, column = np.nonzero(valid)
     z = image[valid].astype(np.float64)
@@ -69,12 +63,7 @@ def depth_points(
 def load_scan(
     path: Path, T_frame_camera: Float[np.ndarray, "4 4"], scale: float = 1.0, keep_table: bool = False
 ) -> ObjectModel:
-    """The object in a cloud file (PLY, NPY, PCD) in the camera's frame, times `scale`; see `scanned_object`.
-
-    Raises:
-        ObjectError: The file holds no cloud, or none of an object's size, or `scale` is not positive.
-        OptionError: The pose is no rigid motion.
-    """
+    """The object in a cloud file (PLY, NPY, PCD) in the camera's frame, times `scale`; see `scanned_object`."""
     check_scale(scale)
     return scanned_object(path.stem, read_points(path) * scale, T_frame_camera, keep_table=keep_table)
 
@@ -134,11 +123,7 @@ def scanned_object(
 
 
 def given_points(points: ArrayLike, origin: str) -> Float[np.ndarray, "n 3"]:
-    """The points of a cloud, NaN included [m].
-
-    Raises:
-        ObjectError: They are no points.
-    """
+    """The points of a cloud, NaN included [m]; an ObjectError if they are none."""
     array = numbers(points, origin).astype(np.float64)
     if array.ndim != 2 or array.shape[1] != 3:
         raise ObjectError(f"{origin} holds an array of shape {array.shape}; expected (n, 3) points")
@@ -146,11 +131,7 @@ def given_points(points: ArrayLike, origin: str) -> Float[np.ndarray, "n 3"]:
 
 
 def given_pose(T_frame_camera: ArrayLike) -> Float[np.ndarray, "4 4"]:
-    """The pose of a camera in the wanted frame [m].
-
-    Raises:
-        OptionError: It is no rigid motion.
-    """
+    """The pose of a camera in the wanted frame [m]; an OptionError if it is no rigid motion."""
     T = numbers(T_frame_camera, "T_frame_camera").astype(np.float64)
     if (fault := motion_fault(torch.from_numpy(T))) is not None:
         raise OptionError(f"T_frame_camera is not the camera's pose in the wanted frame, in metres: {fault}")
@@ -160,4 +141,4 @@ def given_pose(T_frame_camera: ArrayLike) -> Float[np.ndarray, "4 4"]:
 def without_outliers(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
     """Remove points whose mean distance to their neighbours is unusually large. Source: Rusu et al. 2008."""
     distance = KDTree(points).query(points, k=min(NEIGHBOURS, len(points) - 1) + 1)[0][:, 1:].mean(1)
-    return points[distance <= distance.mean() + TOLERANCE * distance.std()]
+    return points[distance <= distance.mean() + 2.5 * distance.std()]  # (ours)

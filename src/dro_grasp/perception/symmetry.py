@@ -21,42 +21,20 @@ from scipy.spatial import KDTree
 
 SAMPLE = 300
 """Visible points that judge a symmetry (ours)."""
-RIM_SAMPLE = 1200
-"""Visible points among which the rim is searched (ours)."""
 DEPTHS = (-0.1, -0.05, 0.0, 0.05, 0.1, 0.2, 0.3, 0.5)
 """Depths of the centre c behind the rim [widths] (ours)."""
 TILTS = (0.3, 0.6, 0.9)
 """Angles between mirror planes and the image [rad] (ours)."""
 TURNS = 8
 """Directions of the tilt, and axes of half turns in the image (ours)."""
-VISIBLE_WEIGHT = 3.0
-"""Weight of points that the camera should have seen (ours)."""
-GAP_WEIGHT = 1.0
-"""Weight of gaps at the rim (ours)."""
-CUT_KINK_WEIGHT = 0.5
-"""Weight of kinks at the rim of a cloud cut by a plane (ours)."""
-IMAGE_KINK_WEIGHT = 0.1
-"""Weight of kinks at the rim of a depth image, where normals are less certain (ours)."""
-LEANING = 0.1
-"""Cost of a symmetry that does not keep the vertical (ours)."""
 STRAIGHT_DOWN = 0.999
 """Cosine between view and vertical above which a camera counts as looking straight down (ours)."""
-SAME_GUESS = 0.05
-"""Guesses with a smaller mean distance count as one [widths] (ours)."""
-WORST = 0.5
-"""Larger distances cost no more than this one [widths] (ours)."""
 TOLERANCE = 0.003
 """Deviation from the visible side that counts as noise [m] (ours)."""
 STRAY = 0.02
 """Share of points that may lie below the end of the visible side, and above its top (ours)."""
-CUT_RIM = 0.12
-"""Share of the lowest points that form the rim if there is no camera (ours)."""
 RIM_RADIUS = 0.12
 """With a camera: radius of the neighbourhood that tells rim points [widths] (ours)."""
-LOPSIDED = 0.35
-"""A rim point is this far from the middle of its neighbours, in units of RIM_RADIUS (ours)."""
-FEWEST_RIM = 8
-"""Fewest rim points (ours)."""
 TURNS_AWAY = 0.35
 """Cosine between normal and ray below which the surface at the rim turns away; above, it ends at an edge (ours)."""
 
@@ -114,38 +92,36 @@ class VisibleSide:
         end, top = np.quantile(height, (STRAY, 1 - STRAY))
         shuffled = np.random.default_rng(0).permutation(len(points))
         if camera_distance is None:
-            rim = shuffled[height[shuffled] <= np.quantile(height, CUT_RIM)][:SAMPLE]
+            rim = shuffled[height[shuffled] <= np.quantile(height, 0.12)][:SAMPLE]  # the lowest points (ours)
             rays, flat = np.array([[0.0, 0.0, 1.0]]), 0.0
         else:
-            some = shuffled[:RIM_SAMPLE]
+            some = shuffled[:1200]  # (ours)
             near = KDTree(image).query_ball_point(image[some], RIM_RADIUS * width)
             aside = np.array([np.linalg.norm(image[i].mean(0) - image[k]) for i, k in zip(near, some, strict=True)])
-            rim = some[aside >= min(LOPSIDED * RIM_RADIUS * width, np.sort(aside)[-min(FEWEST_RIM, len(aside))])]
+            # A rim point is as far as this from the middle of its neighbours; there are eight at least (ours).
+            rim = some[aside >= min(0.35 * RIM_RADIUS * width, np.sort(aside)[-min(8, len(aside))])]
             rays, flat = np.array([0.0, 0.0, camera_distance]) - points[rim], max(0.0, width - float(top - end))
         facing = np.clip((normals[rim] * rays).sum(1) / np.linalg.norm(rays, axis=1), 0, 1)
         # A surface that turns away continues as a circle: where the ray meets a circle of diameter w with the cosine f to
         # its normal, the chord is f w. One that faces the camera ends at an edge: it is taken to be as thick as wide, less
         # the depth that is visible.
         expected = facing * np.where(facing < TURNS_AWAY, width, flat)
-        in_image = IMAGE_KINK_WEIGHT * np.clip(1 - facing / TURNS_AWAY, 0, 1)
-        smooth = CUT_KINK_WEIGHT * (1 - facing) if camera_distance is None else in_image
+        # In an image normals are less certain than at a cut (ours).
+        smooth = 0.5 * (1 - facing) if camera_distance is None else 0.1 * np.clip(1 - facing / TURNS_AWAY, 0, 1)
         return cls(points, normals, camera_distance, shuffled[:SAMPLE], rim, expected, smooth, width, float(end), float(top))
 
     def guesses(self, up: Float[np.ndarray, "3"] | None, count: int) -> list[Guess]:
-        """Both sides by the best symmetries that differ, best first; the last one repeats if there are too few.
-
-        Symmetries that preserve `up` [view axes] are preferred.
-        """
+        """Both sides by the best symmetries that differ, best first; those that preserve `up` [view axes] are preferred."""
         motions = self.symmetries(up)
         leaning = [up is not None and not np.allclose(linear @ up, up, atol=1e-6) for linear, _ in motions]
-        costs = np.array([self.cost(*motion) for motion in motions]) + LEANING * np.array(leaning)
+        costs = np.array([self.cost(*motion) for motion in motions]) + 0.1 * np.array(leaning)  # (ours)
         found: list[Guess] = []
         sampled: list[KDTree] = []
         for k in costs.argsort():
             linear, centre = motions[k]
             some = (self.points[self.sample] - centre) @ linear.T + centre
-            if any(tree.query(some)[0].mean() < SAME_GUESS * self.width for tree in sampled):
-                continue
+            if any(tree.query(some)[0].mean() < 0.05 * self.width for tree in sampled):
+                continue  # guesses that are so near count as one (ours)
             sampled.append(KDTree(some))
             behind = (self.points - centre) @ linear.T + centre
             found.append(Guess(np.concatenate([self.points, behind]),
@@ -193,9 +169,9 @@ class VisibleSide:
         # In front of the visible side the thickness would be negative.
         gap = gap * np.where(moved[:, 2] > self.points[nearest, 2], -1.0, 1.0)
         kink = 1 - (self.normals[nearest] @ linear.T * self.normals[self.rim]).sum(1)
-        most = WORST * self.width
+        most = 0.5 * self.width  # larger distances cost no more (ours)
         misfit = np.minimum(np.abs(gap - self.expected_gap), most)
-        far = VISIBLE_WEIGHT * np.minimum(wrong, most).mean() + GAP_WEIGHT * misfit.mean()
+        far = 3.0 * np.minimum(wrong, most).mean() + misfit.mean()  # the weight is ours
         return float(far / self.width + (kink * self.smoothness).mean())
 
     @cached_property

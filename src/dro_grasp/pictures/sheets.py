@@ -24,12 +24,9 @@ from dro_grasp.grasps.sources import require_pair
 from dro_grasp.grasps.summary import percent
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked, checked
-from dro_grasp.objects.ball_solid import solid_of
-from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.objects.shape import ObjectModel, solid_of
 from dro_grasp.pictures.appearance import CONTACT_COLOUR, best_camera, hand_meshes, object_meshes, success_colour
-from dro_grasp.rendering.camera import Camera
-from dro_grasp.rendering.meshes import dots
-from dro_grasp.rendering.rasterizer import render
+from dro_grasp.rendering.rasterizer import Camera, dots, render
 from dro_grasp.simulation.closed_poses import held
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 

@@ -22,9 +22,7 @@ from dro_grasp.planning.robot_check import robot_meshes, table_meshes
 from dro_grasp.planning.table_scene import PickedObject
 from dro_grasp.planning.tabletop import TabletopRun
 from dro_grasp.predict.predictor import GraspPredictor
-from dro_grasp.rendering.camera import Camera
-from dro_grasp.rendering.meshes import OBJECT_COLOUR, Colour, Mesh
-from dro_grasp.rendering.rasterizer import render
+from dro_grasp.rendering.rasterizer import OBJECT_COLOUR, Camera, Colour, Mesh, render
 
 FORMATS = {".gif": "GIF", ".webp": "WEBP"}
 """Endings of animation files."""

@@ -17,9 +17,8 @@ import torch
 from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
-from dro_grasp.geometry.rotations import roma
-from dro_grasp.objects.ball_solid import solid_of
-from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.geometry.se3 import roma
+from dro_grasp.objects.shape import ObjectModel, solid_of
 from dro_grasp.planning.reachability import Feasible, Postures
 from dro_grasp.planning.robot import Robot
 from dro_grasp.planning.workcell import ARM, TABLE, RobotJoints, Workcell, moved, robot_spec, wxyz

@@ -16,9 +16,7 @@ from dro_grasp.descriptions.loader import Description
 from dro_grasp.files import check_output, replacing
 from dro_grasp.planning.robot import Robot, Table, load_robot
 from dro_grasp.planning.workcell import CLEARANCE, TABLE, WORLD, Workcell
-from dro_grasp.rendering.camera import Camera
-from dro_grasp.rendering.meshes import Colour, Mesh, arrow
-from dro_grasp.rendering.rasterizer import render
+from dro_grasp.rendering.rasterizer import Camera, Colour, Mesh, arrow, render
 from dro_grasp.simulation.hand_part import PREFIX
 
 SIZE = (900, 660)

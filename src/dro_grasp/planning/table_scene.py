@@ -14,8 +14,8 @@ from scipy.spatial import KDTree
 from dro_grasp.errors import ObjectError, RobotError
 from dro_grasp.geometry.table_plane import largest_plane
 from dro_grasp.kinds import checked
-from dro_grasp.objects.in_memory import numbers
 from dro_grasp.objects.loading import MIN_CLOUD, cloud_object
+from dro_grasp.objects.reading import numbers
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.scan import given_points, given_pose, scanned_object
 from dro_grasp.planning.robot import Robot, Table

@@ -16,9 +16,10 @@ from jaxtyping import Bool, Float, Int
 
 from dro_grasp.descriptions.compiling import collide
 from dro_grasp.errors import PlanError, RobotError
+from dro_grasp.geometry.point_clouds import one_per_cell
 from dro_grasp.geometry.table_plane import moved_plane
 from dro_grasp.objects.cache import content_hash
-from dro_grasp.objects.scenery import Scene, one_per_cell
+from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.planning.robot import Robot, Table
 from dro_grasp.simulation.hand_part import HULL_VERTICES, PREFIX, attach, hand_spec, joint_addresses, let_touch

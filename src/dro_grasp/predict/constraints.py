@@ -14,7 +14,7 @@ from dro_grasp.energy.grasp_energy import Room
 from dro_grasp.energy.surroundings import Surroundings
 from dro_grasp.errors import OptionError
 from dro_grasp.files import TOLD
-from dro_grasp.geometry.balls import Ball, Balls
+from dro_grasp.geometry.distance_field import Ball, Balls
 from dro_grasp.kinds import Checked, plain
 from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel

@@ -8,19 +8,142 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Num, UInt8
 
-from dro_grasp.rendering.camera import Camera
-from dro_grasp.rendering.meshes import Colour, Mesh, corner_normals, unit
-
+Colour = tuple[float, float, float]
+"""Red, green, blue between 0 and 1."""
+OBJECT_COLOUR: Colour = (0.95, 0.62, 0.28)
+"""Orange of objects that are grasped."""
+NEAR = 1e-3
+"""Triangles closer to the camera than this are not drawn [m] (ours)."""
 ROWS_AT_ONCE = 200_000
 """Rows of pixels, of all triangles, that are drawn together (ours): bounds the memory."""
 SAMPLES_AT_ONCE = 500_000
 """Samples that are shaded together (ours); likewise."""
-SLIVER = 1e-9
-"""Twice the area of a triangle below which it is not drawn [pixels^2] (ours)."""
-WHITE = (1.0, 1.0, 1.0)
-"""Default background: red, green, blue."""
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles of one colour."""
+
+    vertices: Num[np.ndarray, "n 3"]
+    """World coordinates [m]."""
+    faces: Int[np.ndarray, "m 3"]
+    """Vertex indices."""
+    colour: Colour
+    """Before shading."""
+
+
+def arrow(
+    start: Num[np.ndarray, "3"], end: Num[np.ndarray, "3"], colour: Colour, radius: float = 0.002, sides: int = 12
+) -> Mesh:
+    """A shaft with a head, from `start` to `end` [m]."""
+    along = np.asarray(end, float) - np.asarray(start, float)
+    length = float(np.linalg.norm(along))
+    head = min(5 * radius, 0.5 * length)
+    profile = [(0, 0.0), (0, radius), (length - head, radius), (length - head, 2.5 * radius), (length, 0.0)]
+    forward = along / max(length, 1e-12)
+    side = unit(np.cross(forward, np.eye(3)[np.abs(forward).argmin()]))
+    other = np.cross(forward, side)
+    angles = np.arange(sides) * 2 * np.pi / sides
+    ring = np.cos(angles)[:, None] * side + np.sin(angles)[:, None] * other
+    vertices = np.concatenate([np.asarray(start) + z * forward + r * ring for z, r in profile])
+    i = np.arange(sides)
+    j = (i + 1) % sides
+    # Two triangles per side between each ring of the profile and the next.
+    quads = [np.stack([[a * sides + i, a * sides + j, a * sides + j + sides],
+                       [a * sides + i, a * sides + j + sides, a * sides + i + sides]]).transpose(0, 2, 1).reshape(-1, 3)
+             for a in range(len(profile) - 1)]
+    return Mesh(vertices, np.concatenate(quads), colour)
+
+
+def dots(points: Num[np.ndarray, "n 3"], colour: Colour, radius: float = 0.0015) -> Mesh:
+    """Small octahedra at points [m]."""
+    corners = np.concatenate([np.eye(3), -np.eye(3)]) * radius
+    one = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])
+    vertices = (np.asarray(points, float)[:, None] + corners).reshape(-1, 3)
+    return Mesh(vertices, (one + 6 * np.arange(len(points))[:, None, None]).reshape(-1, 3), colour)
+
+
+def corner_normals(
+    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"], crease: float
+) -> Float[np.ndarray, "m 3 3"]:
+    """Unit normals at the corners of faces: smooth, but flat where the cosine between face and vertex is below `crease`."""
+    triangle = vertices[faces]
+    face = np.cross(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0])
+    # Files repeat a vertex for every face that uses it: vertices at the same place share their normal.
+    _, place = np.unique(np.round(vertices, 6), axis=0, return_inverse=True)
+    place = place.reshape(-1)
+    total = np.zeros((place.max(initial=-1) + 1, 3))
+    for k in range(3):
+        np.add.at(total, place[faces[:, k]], face)
+    flat = face / np.maximum(np.linalg.norm(face, axis=1, keepdims=True), 1e-20)
+    smooth = total[place[faces]]
+    smooth = smooth / np.maximum(np.linalg.norm(smooth, axis=2, keepdims=True), 1e-20)
+    sharp = (smooth * flat[:, None]).sum(2, keepdims=True) < crease
+    return np.where(sharp, flat[:, None], smooth)
+
+
+def unit(v: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """The vector at length 1; zero stays zero."""
+    return v / max(float(np.linalg.norm(v)), 1e-12)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera."""
+
+    position: tuple[float, float, float]
+    """Optical centre [m]."""
+    target: tuple[float, float, float]
+    """The point in the middle of the picture [m]."""
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Direction that points up in the picture."""
+    field_of_view: float = 0.6
+    """Angle between the upper and lower edges [rad]."""
+
+    @staticmethod
+    def around(
+        points: Num[np.ndarray, "n 3"], direction: tuple[float, float, float], up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+        field_of_view: float = 0.6, aspect: float = 4 / 3, margin: float = 0.06,
+    ) -> Camera:
+        """The nearest camera in a direction, from the points [m] towards it, that has all of them in its picture.
+
+        `aspect` is the picture's width over its height, `margin` the share that stays free at each edge.
+        """
+        axes = Camera(direction, (0.0, 0.0, 0.0), up).axes()
+        turned = points.astype(float) @ axes.T
+        centre = (turned.min(0) + turned.max(0)) / 2
+        turned = turned - centre
+        half = np.tan(field_of_view / 2) * (1 - 2 * margin)
+        distance = float((np.abs(turned[:, :2]) / (half * aspect, half) + turned[:, 2:]).max()) + 10 * NEAR
+        target = centre @ axes
+        position = target + distance * axes[2]
+        return Camera(tuple(position.tolist()), tuple(target.tolist()), up, field_of_view)
+
+    def axes(self) -> Float[np.ndarray, "3 3"]:
+        """Right, up and backward of the picture in world coordinates, as rows."""
+        backward = unit(np.subtract(self.position, self.target))
+        up = np.asarray(self.up, float)
+        if np.linalg.norm(np.cross(up, backward)) < 1e-6 * np.linalg.norm(up):
+            up = np.eye(3)[np.abs(backward).argmin()]
+        right = unit(np.cross(up, backward))
+        return np.stack([right, np.cross(backward, right), backward])
+
+    def project(
+        self, corners: Float[np.ndarray, "f 3 3"], width: int, height: int
+    ) -> tuple[Float[np.ndarray, "f 3 3"], Bool[np.ndarray, " f"]]:
+        """Pixel coordinates and inverse depth [1/m] of triangle corners, and which triangles lie before the camera.
+
+        Corners are in the camera's axes [m], width and height those of the picture [pixels].
+        """
+        depth = -corners[..., 2]
+        visible = np.asarray((depth > NEAR).all(1))
+        focal = height / 2 / np.tan(self.field_of_view / 2)
+        inverse = 1 / np.maximum(depth, NEAR)
+        x = width / 2 + focal * corners[..., 0] * inverse
+        y = height / 2 - focal * corners[..., 1] * inverse
+        return np.stack([x, y, inverse], -1), visible
 
 
 @dataclass(frozen=True)
@@ -61,8 +184,13 @@ class _Triangles:
 
     @cached_property
     def shares(self) -> Float[np.ndarray, "3 3 f"]:
-        """Coefficients (of x, of y, constant) of each corner's barycentric coordinate over the picture."""
-        return _barycentric(self.screen)
+        """Coefficients (of x, of y, constant) of each corner's barycentric coordinate; negative for slivers."""
+        x, y = self.screen[..., 0].T, self.screen[..., 1].T
+        (x1, y1), (x2, y2) = ((x[order], y[order]) for order in ([1, 2, 0], [2, 0, 1]))
+        twice = np.stack([y1 - y2, x2 - x1, x1 * y2 - x2 * y1])
+        area = twice[2].sum(0)
+        drawn = np.abs(area) > 1e-9  # twice the area [pixels^2] (ours)
+        return np.where(drawn, twice / np.where(drawn, area, 1.0), np.array([0.0, 0.0, -1.0])[:, None, None])
 
     @cached_property
     def depths(self) -> Float[np.ndarray, "3 f"]:
@@ -81,23 +209,15 @@ class _Canvas:
     face: Int[np.ndarray, " samples"]
     """That triangle, where there is one."""
 
-    @staticmethod
-    def empty(width: int, height: int) -> _Canvas:
-        """A canvas with nothing drawn on it."""
-        return _Canvas(width, height, np.zeros(height * width), np.zeros(height * width, np.int64))
-
 
 def render(
-    meshes: Sequence[Mesh], camera: Camera, width: int = 640, height: int = 480, *, background: Colour = WHITE,
+    meshes: Sequence[Mesh], camera: Camera, width: int = 640, height: int = 480, *, background: Colour = (1.0, 1.0, 1.0),
     oversampling: int = 2, style: Style | None = None,
 ) -> UInt8[np.ndarray, "{height} {width} 3"]:
-    """Draw meshes with perspective, smooth shading and soft outlines, on a picture of `width` times `height` pixels.
-
-    Args:
-        oversampling: Samples per pixel and axis; 2 smooths the edges.
-    """
+    """Draw meshes with perspective, smooth shading and soft outlines; `oversampling` is the samples per pixel and axis."""
     style = style or Style()
-    canvas = _Canvas.empty(width * oversampling, height * oversampling)
+    samples = width * height * oversampling**2
+    canvas = _Canvas(width * oversampling, height * oversampling, np.zeros(samples), np.zeros(samples, np.int64))
     triangles = _gather(meshes, camera, canvas, style)
     rows = _rows(triangles, canvas)
     for start in range(0, len(rows), ROWS_AT_ONCE):
@@ -185,16 +305,6 @@ def _shaded(triangles: _Triangles, canvas: _Canvas, background: Colour, style: S
     return colours
 
 
-def _barycentric(screen: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "3 3 f"]:
-    """Coefficients (of x, of y, constant) of the three barycentric coordinates over the picture; negative for slivers."""
-    x, y = screen[..., 0].T, screen[..., 1].T
-    (x1, y1), (x2, y2) = ((x[order], y[order]) for order in ([1, 2, 0], [2, 0, 1]))
-    twice = np.stack([y1 - y2, x2 - x1, x1 * y2 - x2 * y1])
-    area = twice[2].sum(0)
-    drawn = np.abs(area) > SLIVER
-    return np.where(drawn, twice / np.where(drawn, area, 1.0), np.array([0.0, 0.0, -1.0])[:, None, None])
-
-
 def shade(
     points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], colours: Float[np.ndarray, "n 3"], style: Style
 ) -> Float[np.ndarray, "n 3"]:
@@ -214,12 +324,7 @@ def _units(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 
 
 def outlines(depth: Float[np.ndarray, "h w"], radius: int, style: Style) -> Float[np.ndarray, "h w"]:
-    """Factor on the colour of each pixel that darkens what lies behind its neighbours: eye-dome lighting.
-
-    Args:
-        depth: Depth of each pixel [m], infinite where nothing is drawn.
-        radius: Distance of the eight neighbours [pixels].
-    """
+    """Factor on the colour of each pixel that darkens what lies behind its neighbours `radius` pixels away; depths in [m]."""
     padded = np.pad(depth, radius, mode="edge")
     h, w = depth.shape
     total = np.zeros((h, w), np.float32)

@@ -25,7 +25,8 @@ from dro_grasp.grasps.columns import REASON
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
-from dro_grasp.objects.loading import check_scale, read_points
+from dro_grasp.objects.loading import check_scale
+from dro_grasp.objects.reading import read_points
 from dro_grasp.objects.scenery import Scene, load_scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.perception.scan import scanned_object

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.geometry import se3
-from dro_grasp.geometry.rotations import roma
+from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.simulation.protocols import Perturbations
 

@@ -18,9 +18,9 @@ import torch
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.errors import OutputError, TrainingError
 from dro_grasp.files import FOREIGN, UNTYPED, is_unread, reason_of, replacing, set_aside
+from dro_grasp.kinds import flat
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.models.presets import NetworkConfig
-from dro_grasp.records import flat
 
 CHECKPOINT = "checkpoint.pt"
 """File with everything that a run needs to resume."""

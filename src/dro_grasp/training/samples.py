@@ -11,8 +11,7 @@ from torch import Tensor
 from dro_grasp.datasets.bundle.training_file import Bundle
 from dro_grasp.errors import BundleError
 from dro_grasp.geometry.point_clouds import nearer_half
-from dro_grasp.geometry.rotations import roma
-from dro_grasp.geometry.se3 import compose, invert, random_rotations, rotate
+from dro_grasp.geometry.se3 import compose, invert, random_rotations, roma, rotate
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.proportions import proportions
 from dro_grasp.models.presets import NetworkConfig

@@ -10,7 +10,7 @@ import viser
 
 from dro_grasp.errors import OptionError
 from dro_grasp.frames import HALF_AXES, half_axis_direction
-from dro_grasp.geometry.balls import Ball
+from dro_grasp.geometry.distance_field import Ball
 from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.constraints import Constraints

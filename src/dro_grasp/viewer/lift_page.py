@@ -23,8 +23,7 @@ from dro_grasp.planning.reachability import carried
 from dro_grasp.planning.robot import Robot, load_robot
 from dro_grasp.planning.robot_check import robot_meshes, robot_shapes, shape_poses, table_meshes
 from dro_grasp.predict.predictor import GraspPredictor
-from dro_grasp.rendering.camera import Camera
-from dro_grasp.rendering.meshes import OBJECT_COLOUR, Colour
+from dro_grasp.rendering.rasterizer import OBJECT_COLOUR, Camera, Colour
 from dro_grasp.viewer.scene_view import HOST, POINT_SIZE, Page, ServedPage, escaped, move, rgb
 
 RATE = 25.0

@@ -21,13 +21,12 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from dro_grasp.devices import on_device
 from dro_grasp.errors import BundleError
 from dro_grasp.files import UNTYPED, given_path, reading, replacing
-from dro_grasp.geometry.rotations import roma
-from dro_grasp.geometry.se3 import compose
+from dro_grasp.geometry.se3 import compose, roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
-from dro_grasp.records import on_device
 
 Tensors = dict[str, Shaped[Tensor, "..."]]
 """The tensors of a file by key."""

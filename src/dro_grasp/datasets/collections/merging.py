@@ -17,8 +17,7 @@ from dro_grasp.datasets.collections.collection import read_collection, yield_not
 from dro_grasp.datasets.engine.shards import Yield
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.files import check_output, replacing
-from dro_grasp.geometry.rotations import roma
-from dro_grasp.geometry.se3 import compose
+from dro_grasp.geometry.se3 import compose, roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.codec import encode
 from dro_grasp.grasps.columns import CAMERA, FAILURE, OBJECT_SCALE, POSTURES, REASON

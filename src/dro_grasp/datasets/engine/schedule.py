@@ -26,9 +26,8 @@ from dro_grasp.errors import GraspFileError, OptionError, OutputError
 from dro_grasp.files import given_path, is_unread, make_folder, reading, set_aside
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand, locate_hand
-from dro_grasp.kinds import checked
+from dro_grasp.kinds import checked, flat
 from dro_grasp.objects.catalogue import ASSET_PREFIX, load_object, locate_object, object_names
-from dro_grasp.records import flat
 
 REPORT_EVERY = 10.0
 """Time between lines of progress [s]. Ours."""

@@ -11,8 +11,7 @@ from scipy.spatial import ConvexHull
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.objects.coarse_parts import COARSE_VERTICES, coarse_parts
-from dro_grasp.objects.convex_parts import Part
+from dro_grasp.objects.convex_parts import COARSE_VERTICES, Part, coarse_parts
 from tests.helpers.claw import ball
 
 

@@ -1,0 +1,177 @@
+"""Meshes and clouds as they are, before any check: from files, and from what a program already holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, Num, Shaped
+from torch import Tensor
+
+from dro_grasp.errors import ObjectError
+from dro_grasp.files import reading
+from dro_grasp.geometry.mesh_files import check_bytes, open_mesh
+
+ObjectSource = (str | Path | trimesh.Trimesh | trimesh.PointCloud | trimesh.Scene | tuple[Any, Any] | Num[np.ndarray, "..."]
+                | Num[Tensor, "..."])
+"""What an object can be loaded from: its name or file, a mesh, a pair (vertices, faces), or points."""
+ORIGIN = "the given object"
+"""What messages call it."""
+CLOUD_SUFFIXES = {".npy", ".pcd"}
+"""Files that hold a bare cloud."""
+
+
+def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
+    """Points of a cloud file, NaN and outliers included [the file's unit; metres if it states one]."""
+    if not path.is_file():
+        raise ObjectError(f"no file at {path}; with --camera give a cloud file (PLY, NPY, PCD), because named objects "
+                          "are meshes, not camera clouds")
+    geometry, unit = read_geometry(path)
+    if not isinstance(geometry, np.ndarray):
+        raise ObjectError(f"{path} is a mesh, not a camera cloud; leave out --camera, or give a cloud (PLY, NPY, PCD)")
+    return coordinates(geometry, str(path)) * unit
+
+
+def coordinates(cloud: Shaped[np.ndarray, "..."], origin: str) -> Float[np.ndarray, "n 3"]:
+    """The points of a cloud, NaN included, without normals or colours; an ObjectError if they are none."""
+    if cloud.ndim != 2 or cloud.shape[1] < 3:
+        raise ObjectError(f"{origin} holds an array of shape {cloud.shape}; expected (n, 3) points")
+    return np.asarray(cloud[:, :3], np.float64)
+
+
+def read_geometry(path: Path) -> tuple[trimesh.Trimesh | Float[np.ndarray, "..."], float]:
+    """One mesh, scenes merged, or the points of a file without faces; and the file's unit [m], 1 if it states none."""
+    if path.suffix.lower() in CLOUD_SUFFIXES:
+        return read_cloud(path), 1.0
+    # trimesh alone is called here, and its many readers raise whatever they stumble over.
+    with reading(path, ObjectError, "a mesh or cloud that trimesh reads (STL, OBJ, PLY, GLB, OFF, ...), NPY or PCD", Exception):
+        loaded = open_mesh(path, process=False)
+        unit = trimesh.units.unit_conversion(loaded.units, "meters") if loaded.units else 1.0
+        geometry = merge_scene(loaded) if isinstance(loaded, trimesh.Scene) else loaded
+    if isinstance(geometry, trimesh.PointCloud):
+        return _with_normals(geometry), unit
+    if not isinstance(geometry, trimesh.Trimesh):
+        raise ObjectError(f"{path} holds a {type(geometry).__name__}, which has no faces; give a triangle mesh, or a "
+                          "point cloud as PLY, NPY or PCD")
+    return geometry, unit
+
+
+def _with_normals(cloud: trimesh.PointCloud) -> Float[np.ndarray, "n k"]:
+    """The points of a cloud, and the normals that a PLY file has of them, which trimesh keeps aside."""
+    points = np.asarray(cloud.vertices, np.float64)
+    raw = cloud.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
+    names = ("nx", "ny", "nz")
+    if not isinstance(raw, dict) or any(name not in raw or len(raw[name]) != len(points) for name in names):
+        return points
+    return np.column_stack([points, *(np.asarray(raw[name], np.float64).reshape(len(points)) for name in names)])
+
+
+def merge_scene(scene: trimesh.Scene) -> trimesh.Trimesh | trimesh.PointCloud:
+    """All meshes of a scene in its frame, or its point clouds if it has no mesh."""
+    mesh = scene.to_mesh()
+    clouds = [part.vertices for part in scene.dump() if isinstance(part, trimesh.PointCloud)]
+    return trimesh.PointCloud(np.concatenate(clouds)) if clouds and len(mesh.faces) == 0 else mesh
+
+
+def geometry_in_memory(source: Any) -> tuple[trimesh.Trimesh | Float[np.ndarray, "..."], float]:
+    """One mesh, scenes merged, or points; and their unit [m], 1 where none is stated. Other things are an ObjectError."""
+    if isinstance(source, trimesh.Trimesh | trimesh.PointCloud | trimesh.Scene):
+        unit = trimesh.units.unit_conversion(source.units, "meters") if source.units else 1.0
+        geometry = merge_scene(source) if isinstance(source, trimesh.Scene) else source
+        return (np.asarray(geometry.vertices, np.float64) if isinstance(geometry, trimesh.PointCloud) else geometry), unit
+    if isinstance(source, tuple) and len(source) == 2:
+        vertices, faces = numbers(source[0]), numbers(source[1])
+        for what, array in (("vertices", vertices), ("faces", faces)):
+            if array.ndim != 2 or array.shape[1] != 3:
+                raise ObjectError(f"the {what} have shape {array.shape}; expected (n, 3)")
+        if faces.dtype.kind not in "iu":
+            raise ObjectError(f"the faces are numbers of type {faces.dtype}; give the indices of their vertices as integers")
+        return trimesh.Trimesh(vertices, faces, process=False), 1.0
+    if isinstance(source, np.ndarray | Tensor):
+        return numbers(source).astype(np.float64), 1.0
+    raise ObjectError(f"an object cannot be loaded from a {type(source).__name__}; give a name, the path of a mesh or cloud, a "
+                      "trimesh mesh, a pair (vertices, faces), or an array of points (n, 3)")
+
+
+def numbers(values: Any, origin: str = ORIGIN, kinds: str = "iuf") -> Shaped[np.ndarray, "..."]:
+    """An array of numbers from an array, a tensor or nested lists, or an ObjectError; `kinds` has NumPy's letters of types."""
+    try:
+        array = np.asarray(values.detach().cpu() if isinstance(values, Tensor) else values)
+    except (TypeError, ValueError) as error:
+        raise ObjectError(f"{origin} is no array of numbers ({error}); give one whose rows have equal lengths") from error
+    if array.dtype.kind not in kinds:
+        raise ObjectError(f"{origin} holds {array.dtype} instead of numbers; give arrays of floats, and of integers for faces")
+    return array
+
+
+def read_cloud(path: Path) -> Float[np.ndarray, "..."]:
+    """Points of an NPY or PCD file: (n 3), or (n 6) with normals; an NPY file may hold any shape."""
+    if path.suffix.lower() == ".npy":
+        with reading(path, ObjectError, "a plain NPY array; save it with numpy.save as floats"):
+            check_bytes(path)
+            _check_npy(path)
+            # A mapped file is never larger than it is, whatever its header says.
+            try:
+                mapped = np.load(path, mmap_mode="r", allow_pickle=False)
+            except TypeError as error:  # its header is a dictionary of other things than NumPy wrote
+                raise ValueError(str(error)) from error
+            if mapped.size > path.stat().st_size:  # entries of no size
+                raise ValueError(f"its header promises {mapped.size} numbers")
+            return np.array(mapped, np.float64)
+    with reading(path, ObjectError, "a PCD file with x y z and all its points; it is damaged"):
+        check_bytes(path)
+        return _read_pcd(path)
+
+
+def _check_npy(path: Path) -> None:
+    """Refuse a header that claims to be longer than the file, by a ValueError, before as much memory is asked for."""
+    with path.open("rb") as file:
+        version, length = np.lib.format.read_magic(file), file.read(4)
+    claimed = int.from_bytes(length[: 2 if version[0] == 1 else 4], "little")
+    if claimed > path.stat().st_size:
+        raise ValueError(f"its header claims {claimed} bytes")
+
+
+def _read_pcd(path: Path) -> Float[np.ndarray, "n columns"]:
+    """Points, and normals if there are any. A field may take several columns (COUNT)."""
+    raw = path.read_bytes()
+    header, start = _pcd_header(raw, path)
+    fields, count, kind = header["FIELDS"], int(header["POINTS"][0]), header["DATA"][0]
+    names = [*"xyz"]
+    if {"normal_x", "normal_y", "normal_z"} <= set(fields):
+        names += ["normal_x", "normal_y", "normal_z"]
+    widths = [int(c) for c in header.get("COUNT", ["1"] * len(fields))]
+    if kind == "ascii":
+        columns = [sum(widths[: fields.index(name)]) for name in names]
+        lines = [line.split() for line in raw[start:].splitlines() if line.strip()][:count]
+        table = np.array(lines, dtype=np.float64).reshape(len(lines), -1)[:, columns]
+    elif kind == "binary":
+        letters, sizes = {"F": "f", "I": "i", "U": "u"}, zip(header["TYPE"], header["SIZE"], widths, strict=True)
+        try:
+            layout = np.dtype([(f"{i}", f"<{letters[t]}{s}", (c,)) for i, (t, s, c) in enumerate(sizes)])
+        except TypeError as error:  # there is no number of such a size
+            raise ValueError(str(error)) from error
+        rows = np.frombuffer(raw, layout, count=count, offset=start)
+        table = np.stack([rows[f"{fields.index(name)}"][:, 0].astype(np.float64) for name in names], 1)
+    else:
+        raise ObjectError(f"{path} holds {kind} data; save the cloud as ascii or binary PCD")
+    if len(table) != count:
+        raise ObjectError(f"{path} is truncated: its header promises {count} points, it holds {len(table)}")
+    return table
+
+
+def _pcd_header(raw: bytes, path: Path) -> tuple[dict[str, list[str]], int]:
+    """Header entries, and the offset of the data."""
+    header: dict[str, list[str]] = {}
+    position = 0
+    while "DATA" not in header:
+        end = raw.find(b"\n", position)
+        if end < 0:
+            raise ObjectError(f"{path} is no PCD file: its header has no DATA line")
+        words = raw[position:end].decode("ascii", "replace").split()
+        position = end + 1
+        if words and not words[0].startswith("#"):
+            header[words[0]] = words[1:]
+    return header, position
