@@ -14,7 +14,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.models.network import Moves
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimization.palm_directions import Spread, wrist_rotations
+from dro_grasp.optimization.starts import Spread, wrist_rotations
 from dro_grasp.pipeline.admission import TURNED
 from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem

@@ -17,7 +17,7 @@ import time
 import torch
 
 from dro_grasp.datasets.engine.worker import EngineConfig, valid_grasps
-from dro_grasp.energy.contact_candidates import ContactConfig
+from dro_grasp.energy.contacts import ContactConfig
 from dro_grasp.evaluation.metrics import diversity
 from dro_grasp.evaluation.rows import finger_contact
 from dro_grasp.grasps.batch import GraspBatch

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from dro_grasp.baselines.method import Made, Method, finished
-from dro_grasp.energy.contact_candidates import ContactConfig
+from dro_grasp.energy.contacts import ContactConfig
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.optimization.starts import StartConfig
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize_with

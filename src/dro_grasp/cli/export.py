@@ -72,7 +72,7 @@ class Export:
     def _load(self) -> GraspBatch:
         """The requested grasps."""
         from dro_grasp.errors import GraspFileError
-        from dro_grasp.grasps.reading import load_grasps
+        from dro_grasp.grasps.batch import load_grasps
 
         grasps = load_grasps(self.file)
         if not self.only_successful:

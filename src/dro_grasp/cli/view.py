@@ -75,7 +75,7 @@ class View:
 
             serve(lift_page(self.file, self.attempt, self.robot, self.weights, self.port, self.host))
             return 0
-        from dro_grasp.grasps.reading import load_grasps
+        from dro_grasp.grasps.batch import load_grasps
         from dro_grasp.grasps.sources import hand_of
 
         grasps = load_grasps(self.file)
@@ -149,7 +149,7 @@ class Picture:
         """Load the file and draw."""
         from dro_grasp.errors import OptionError
         from dro_grasp.files import check_output
-        from dro_grasp.grasps.reading import load_grasps
+        from dro_grasp.grasps.batch import load_grasps
         from dro_grasp.grasps.sources import hand_of
         from dro_grasp.viewer.pictures import PictureStyle, draw_sheet
 

@@ -18,8 +18,8 @@ from dro_grasp.geometry.rotations import roma
 from dro_grasp.geometry.se3 import turned_about
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.kinds import Checked
-from dro_grasp.optimization.finger_closing import ClosingConfig
-from dro_grasp.optimization.grip import GripConfig
+from dro_grasp.optimization.fingers import ClosingConfig
+from dro_grasp.optimization.squeeze import GripConfig
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,9 @@ from dro_grasp.energy.grasp_energy import EnergyConfig
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import completed
 from dro_grasp.kinds import checked
-from dro_grasp.optimization.finger_closing import close_idle_fingers
-from dro_grasp.optimization.finger_easing import ease_fingers
-from dro_grasp.optimization.grip import gripping
+from dro_grasp.optimization.fingers import close_idle_fingers, ease_fingers
 from dro_grasp.optimization.refinement import RefineConfig, refine_grasps
+from dro_grasp.optimization.squeeze import gripping
 from dro_grasp.optimization.starts import StartConfig
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize_with
 from dro_grasp.pipeline.admission import facing, opened_wide, permitted

@@ -1,10 +1,11 @@
-"""The moving part of a trial: close the hand on the object, then push the object."""
+"""The moving part of a trial: close the hand on the object, then push the object, under the conditions of one trial."""
 
 from __future__ import annotations
 
+import hashlib
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 
 import mujoco
@@ -12,17 +13,84 @@ import mujoco.batch
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
 from dro_grasp.devices import cores
+from dro_grasp.geometry import se3
+from dro_grasp.geometry.rotations import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import completed
 from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.outcome import FORCES, GIVE_UP
-from dro_grasp.simulation.perturbation import Conditions
-from dro_grasp.simulation.protocols import Protocol, protocol as find_protocol
+from dro_grasp.simulation.protocols import Perturbations, Protocol, protocol as find_protocol
 from dro_grasp.simulation.scene import TrialScene, cached_scene, object_mass
+
+FACTORS = ("friction", "mass", "gain")
+"""Conditions that are factors, as in Perturbations."""
+
+RESOLUTION = 1e-4
+"""Grasps that agree to this have the same draws [m or rad]. Ours: another machine rounds otherwise."""
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What differs from the protocol in n trials."""
+
+    shift: Float[np.ndarray, "n 3"]
+    """Displacement of the object, in its own frame [m]."""
+    turn: Float[np.ndarray, "n 3"]
+    """Rotation vector of the object about its centre of mass, in its own frame [rad]."""
+    friction: Float[np.ndarray, " n"]
+    """Factor of the friction, torsional friction included."""
+    mass: Float[np.ndarray, " n"]
+    """Factor of the object's mass and of the disturbing forces."""
+    gain: Float[np.ndarray, " n"]
+    """Factor of the servos' stiffness and damping."""
+
+    def rows(self, index: slice) -> Conditions:
+        """The conditions of some of the trials."""
+        return Conditions(*(getattr(self, f.name)[index] for f in fields(self)))
+
+    def displaced(self, grasps: GraspBatch, centre_of_mass: Float[np.ndarray, "3"]) -> GraspBatch:
+        """The grasps with each object moved away from where it is expected; the hand does not know."""
+        centre = torch.from_numpy(centre_of_mass)
+        rotation = roma.rotvec_to_rotmat(torch.from_numpy(self.turn))
+        T = se3.compose(rotation, centre + torch.from_numpy(self.shift) - rotation @ centre)
+        moved = se3.invert(T) @ grasps.T_object_wrist.double()
+        return grasps.replace(T_object_wrist=moved.to(grasps.T_object_wrist.dtype))
+
+
+def draw(config: Perturbations, grasps: GraspBatch) -> Conditions:
+    """Conditions of all trials but the first: the second trial of every grasp, then the third, and so on.
+
+    A grasp's position and joints are the seed of its draws, so they depend neither on its company nor on a file between.
+    """
+    k = config.trials - 1
+    drawn = [_draw(config, k, _generator(p, q)) for p, q in zip(grasps.T_object_wrist[:, :3, 3], grasps.joints, strict=True)]
+    columns = {name: np.stack([d[name] for d in drawn], 1) for name in ("shift", "turn", *FACTORS)}
+    return Conditions(**{name: column.reshape(-1, *column.shape[2:]) for name, column in columns.items()})
+
+
+def _generator(position: Float[Tensor, "3"], joints: Float[Tensor, " n_dof"]) -> np.random.Generator:
+    """The random numbers of a grasp."""
+    content = (torch.cat([position, joints]).double() / RESOLUTION).round().long().numpy().tobytes()
+    return np.random.default_rng(int.from_bytes(hashlib.sha256(content).digest()[:16], "big"))
+
+
+def _draw(config: Perturbations, k: int, generator: np.random.Generator) -> dict[str, Float[np.ndarray, "k *_"]]:
+    """Conditions of k trials of one grasp; each factor takes one value from each of k equal parts of its range."""
+    drawn = {}
+    for name, size in (("shift", config.shift), ("turn", config.turn)):
+        direction = generator.normal(size=(k, 3))
+        drawn[name] = size * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    for name in FACTORS:
+        low, high = getattr(config, name)
+        share = (generator.permutation(k) + generator.random(k)) / k
+        drawn[name] = low * (high / low) ** share
+    return drawn
+
 
 RAMP = 10
 """Number of stages in which a gradual protocol moves the servos' targets from one posture to the next. Ours."""

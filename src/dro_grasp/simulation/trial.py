@@ -20,9 +20,8 @@ from dro_grasp.kinds import checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.contacts import Penetration, count_fingers, find_contact_links, measure_penetration
 from dro_grasp.simulation.outcome import DIRECTIONS, GIVE_UP, Failure, Measurements, TrialResult, verdict
-from dro_grasp.simulation.perturbation import draw
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
-from dro_grasp.simulation.rollout import Rollout, rollouts, scene_of
+from dro_grasp.simulation.rollout import Rollout, draw, rollouts, scene_of
 from dro_grasp.simulation.scene import TrialScene, cached_scene
 
 __all__ = ["DIRECTIONS", "Failure", "TrialResult", "record", "simulate"]

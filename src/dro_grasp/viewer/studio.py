@@ -25,7 +25,7 @@ from dro_grasp.pipeline.constraints import Constraints
 from dro_grasp.pipeline.problem import GraspProblem
 from dro_grasp.pipeline.stages import evaluate
 from dro_grasp.predictor import GraspPredictor, GraspRequest, Method
-from dro_grasp.simulation.diagnosis import diagnose
+from dro_grasp.simulation.outcome import diagnose
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 from dro_grasp.viewer.appearance import waiting_pose
 from dro_grasp.viewer.constraint_panel import ConstraintPanel

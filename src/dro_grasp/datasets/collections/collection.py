@@ -13,7 +13,7 @@ from dro_grasp.datasets.engine.shards import Yield, find_shards, read_yield
 from dro_grasp.errors import GraspFileError
 from dro_grasp.files import given_path
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.table import read_footer
+from dro_grasp.grasps.grasp_file import read_footer
 from dro_grasp.kinds import checked
 
 YIELDS = "yields"

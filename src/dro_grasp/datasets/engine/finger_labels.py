@@ -9,7 +9,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import RELABELLED
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimization.finger_closing import close_idle_fingers
+from dro_grasp.optimization.fingers import close_idle_fingers
 from dro_grasp.simulation.protocols import Protocol
 from dro_grasp.simulation.trial import simulate
 

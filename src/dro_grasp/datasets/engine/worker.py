@@ -14,9 +14,8 @@ from dro_grasp.datasets.bundle.training_file import split_of
 from dro_grasp.datasets.engine.finger_labels import MIN_CONTACT_LINKS, closed_where_it_holds
 from dro_grasp.datasets.engine.shards import Shard, Yield, notes_of
 from dro_grasp.errors import OptionError
-from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.batch import GraspBatch, distinct
 from dro_grasp.grasps.columns import DEPTH
-from dro_grasp.grasps.duplicates import distinct
 from dro_grasp.grasps.sources import with_sources
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand

@@ -1,4 +1,4 @@
-"""How refined grasps close: joint targets whose contact forces balance.
+"""The squeeze of refined grasps: joint targets whose contact forces balance.
 
 A hand that bends every joint by a share of its range pushes the object away where its fingers do not oppose each other. Here
 the forces come first: at the contacts, within friction cones, without a net wrench on the object, shared by the fingers. The
@@ -15,13 +15,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from dro_grasp.energy.grasp_energy import GraspEnergy
-from dro_grasp.energy.nearest_points import NearestPoints
+from dro_grasp.energy.grasp_energy import GraspEnergy, NearestPoints
 from dro_grasp.geometry.contact_forces import friction_cone, nonnegative_least_squares
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
 from dro_grasp.kinds import Checked
-from dro_grasp.optimization.finger_closing import finger_joints
+from dro_grasp.optimization.fingers import finger_joints
 
 
 @dataclass(frozen=True)
