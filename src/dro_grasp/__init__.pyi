@@ -11,11 +11,13 @@ from .datasets.engine.schedule import synthesize_dataset as synthesize_dataset
 from .datasets.engine.worker import EngineConfig as EngineConfig
 from .errors import DroGraspError as DroGraspError
 from .evaluation.metrics import wilson_interval as wilson_interval
-from .export.contents import Frame as Frame
-from .export.csv_table import csv_table as csv_table
-from .export.dexgraspbench import dexgraspbench as dexgraspbench
-from .export.isaac_grasp import isaac_grasp as isaac_grasp
-from .export.moveit import moveit_grasps as moveit_grasps
+from .export.writers import (
+    Frame as Frame,
+    csv_table as csv_table,
+    dexgraspbench as dexgraspbench,
+    isaac_grasp as isaac_grasp,
+    moveit_grasps as moveit_grasps,
+)
 from .grasps.batch import GraspBatch as GraspBatch, load_grasps as load_grasps
 from .hands.check import HandReport as HandReport, check_hand as check_hand
 from .hands.hand import Hand as Hand

@@ -13,7 +13,7 @@ from dro_grasp.cli.output import print_json, say
 from dro_grasp.export.formats import FORMATS, ExportJob
 
 if TYPE_CHECKING:
-    from dro_grasp.export.contents import Frame
+    from dro_grasp.export.writers import Frame
     from dro_grasp.grasps.batch import GraspBatch
 
 
@@ -44,7 +44,7 @@ class Export:
 
     def run(self) -> int:
         """Complete the grasps, then write a file for each object."""
-        from dro_grasp.export.contents import Frame
+        from dro_grasp.export.writers import Frame
         from dro_grasp.files import check_folder, check_output, make_folder
         from dro_grasp.grasps.sources import require_one_object
 
