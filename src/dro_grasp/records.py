@@ -1,4 +1,4 @@
-"""Records, which are frozen dataclasses: moved to a device, with tensors that are computed once, and as flat settings."""
+"""Records, which are frozen dataclasses: moved to a device, by rows, with tensors that are computed once, as settings."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from functools import cached_property
 from typing import Any, TypeVar
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 Record = TypeVar("Record")
 
@@ -26,6 +28,21 @@ def flat(record: Any, prefix: str = "") -> dict[str, Any]:
         name = f"{prefix}{field.name}"
         values |= flat(value, f"{name}.") if dataclasses.is_dataclass(value) else {name: value}
     return values
+
+
+class Rows:
+    """Base of dataclasses each of whose fields has one entry a row: a tensor, an array, or such a record again."""
+
+    def rows(self: Record, index: Any) -> Record:
+        """Some of the rows."""
+        return type(self)(*(getattr(self, f.name)[index] for f in dataclasses.fields(self)))  # type: ignore[arg-type]
+
+    def where(self: Record, mask: Bool[Tensor, " n"], other: Record) -> Record:
+        """These rows where the mask holds, the other's elsewhere."""
+        pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in dataclasses.fields(self))  # type: ignore[arg-type]
+        return type(self)(*(
+            a.where(mask, b) if isinstance(a, Rows) else torch.where(mask.view(-1, *[1] * (a.ndim - 1)), a, b)
+            for a, b in pairs))
 
 
 class cached_tensor(cached_property):  # type: ignore[type-arg]  # reads like the decorator it extends

@@ -7,7 +7,7 @@ from copy import copy
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from dro_grasp.energy import terms as energies
@@ -19,7 +19,7 @@ from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.records import on_device
+from dro_grasp.records import Rows, on_device
 
 TERMS = ("force_closure", "distance", "penetration", "self_penetration", "alignment", "joints")
 """Names of the terms, in the order of every array of terms."""
@@ -60,7 +60,7 @@ class EnergyConfig(Checked):
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class Evaluation(Rows):
     """Energy and gradient of n grasps."""
 
     terms: Float[Tensor, "n 6"]
@@ -77,12 +77,6 @@ class Evaluation:
     def total(self) -> Float[Tensor, " n"]:
         """Sum of the terms, the clearance included."""
         return self.terms.sum(-1) + self.clearance[:, 0]
-
-    def where(self, keep: Bool[Tensor, " n"], other: Evaluation) -> Evaluation:
-        """The other's rows where `keep` is true, these elsewhere."""
-        return Evaluation(*(
-            torch.where(keep[:, None], getattr(other, name), getattr(self, name))
-            for name in ("terms", "clearance", "by_pose", "by_joint")))
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,18 +157,12 @@ class GraspEnergy:
     def __call__(
         self, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], contacts: Int[Tensor, "n c"] | None = None
     ) -> Evaluation:
-        """Energy and gradient of n grasps.
-
-        Args:
-            T_object_wrist: Wrist poses [m].
-            q: Joints [rad or m].
-            contacts: Indices of their contact candidates; those nearest to the surface by default.
-        """
+        """Energy and gradient of n grasps; their contacts are candidates by index, those nearest to the surface by default."""
         if contacts is None:
             contacts = self.nearest_contacts(T_object_wrist, q)
         tree, config = self.hand.tree, self.config
         poses = T_object_wrist[:, None] @ tree.forward(q)
-        contact_terms, wrenches = self._contacts(poses, contacts)
+        contact_terms, pulled, wrenches = self._contacts(poses, contacts)
         body = self.body.place(poses)
         distance, gradient = self.field.distances(body)
         inside = energies.penetration(distance - config.margin, gradient)
@@ -182,8 +170,7 @@ class GraspEnergy:
         if self.touching is not None:
             off = self.touching.push(body, distance, gradient)
             beside, by_point = config.clearance * off.value.sum(-1, keepdim=True), by_point + config.clearance * off.by_point
-            pulled, by_link = self._pull(self.touching, poses, contacts)
-            beside, wrenches = beside + pulled, wrenches + by_link
+            beside = beside + pulled
         wrenches = wrenches + energies.link_wrenches(body, by_point, self.body.members)
         spheres = self.ball.place(poses)
         own = energies.self_penetration(spheres, self.spheres.radii, self.spheres.pairs)
@@ -241,8 +228,8 @@ class GraspEnergy:
 
     def _contacts(
         self, poses: Float[Tensor, "n n_links 4 4"], contacts: Int[Tensor, "n c"]
-    ) -> tuple[tuple[Float[Tensor, " n"], ...], Float[Tensor, "n n_links 6"]]:
-        """Force closure, distance and alignment of the contacts, and their wrenches on the links."""
+    ) -> tuple[tuple[Float[Tensor, " n"], ...], Float[Tensor, "n 1"], Float[Tensor, "n n_links 6"]]:
+        """Force closure, distance and alignment of contacts, weighted distance to the place to hold, and wrenches on links."""
         config, candidates = self.config, self.candidates
         links = candidates.links[contacts]
         chosen = poses[torch.arange(len(poses), device=links.device)[:, None], links]
@@ -260,23 +247,15 @@ class GraspEnergy:
             + (by_object_normal[..., None, :] @ bend)[..., 0, :]
         )
         moment = torch.linalg.cross(points, by_point, dim=-1)
-        moment = moment + torch.linalg.cross(outward, config.alignment * align.by_normal, dim=-1)
-        members = self.one_hot[links]
-        wrenches = members.transpose(-1, -2) @ torch.cat([by_point, moment], -1)
-        return (closure.value.sum(-1), apart.value.sum(-1), align.value.sum(-1)), wrenches
-
-    def _pull(
-        self, touching: Touching, poses: Float[Tensor, "n n_links 4 4"], contacts: Int[Tensor, "n c"]
-    ) -> tuple[Float[Tensor, "n 1"], Float[Tensor, "n n_links 6"]]:
-        """Weighted distance of the contacts to the place to hold, and their wrenches on the links."""
-        links = self.candidates.links[contacts]
-        chosen = poses[torch.arange(len(poses), device=links.device)[:, None], links]
-        points = se3.apply(chosen, self.candidates.points[contacts])
-        pull = touching.pull(points)
-        by_point = self.config.clearance * pull.by_point
-        moment = torch.linalg.cross(points, by_point, dim=-1)
-        wrenches = self.one_hot[links].transpose(-1, -2) @ torch.cat([by_point, moment], -1)
-        return self.config.clearance * pull.value.sum(-1, keepdim=True), wrenches
+        moment = moment + torch.linalg.cross(outward, config.alignment * normal, dim=-1)
+        members = self.one_hot[links].transpose(-1, -2)
+        wrenches, pulled = members @ torch.cat([by_point, moment], -1), torch.zeros_like(points[:, :1, 0])
+        if self.touching is not None:
+            pull = self.touching.pull(points)
+            by_point = config.clearance * pull.by_point
+            pulled = config.clearance * pull.value.sum(-1, keepdim=True)
+            wrenches = wrenches + members @ torch.cat([by_point, torch.linalg.cross(points, by_point, dim=-1)], -1)
+        return (closure.value.sum(-1), apart.value.sum(-1), align.sum(-1)), pulled, wrenches
 
 
 @dataclass(frozen=True)

@@ -28,15 +28,6 @@ class PointTerm(NamedTuple):
     """Derivative of the summed values by the points given [unit of the value per m]."""
 
 
-class NormalTerm(NamedTuple):
-    """Values of a term that depends on directions."""
-
-    value: Float[Tensor, "*b k"]
-    """Unreduced."""
-    by_normal: Float[Tensor, "*b c 3"]
-    """Derivative of the summed values by the normals given."""
-
-
 class ContactTerm(NamedTuple):
     """Values of a term that depends on positions and directions."""
 
@@ -45,7 +36,7 @@ class ContactTerm(NamedTuple):
     by_point: Float[Tensor, "*b c 3"]
     """As in PointTerm."""
     by_normal: Float[Tensor, "*b c 3"]
-    """As in NormalTerm."""
+    """Derivative of the summed values by the normals given."""
 
 
 def force_closure(points: Float[Tensor, "*b c 3"], normals: Float[Tensor, "*b c 3"], length: float) -> ContactTerm:
@@ -73,12 +64,12 @@ def contact_distance(distance: Float[Tensor, "*b c"], gradient: Float[Tensor, "*
     return PointTerm(distance.abs(), distance.sign()[..., None] * gradient)
 
 
-def normal_alignment(hand_normals: Float[Tensor, "*b c 3"], object_normals: Float[Tensor, "*b c 3"]) -> NormalTerm:
+def normal_alignment(hand_normals: Float[Tensor, "*b c 3"], object_normals: Float[Tensor, "*b c 3"]) -> Float[Tensor, "*b c"]:
     """One plus the cosine between hand normal and object normal at each contact: 0 if they are opposite.
 
-    `by_normal` is the derivative by the hand's normals; the derivative by the object's normals is `hand_normals`.
+    Its derivative by the normals of one is the normals of the other.
     """
-    return NormalTerm(1 + (hand_normals * object_normals).sum(-1), object_normals)
+    return 1 + (hand_normals * object_normals).sum(-1)
 
 
 def penetration(distance: Float[Tensor, "*b p"], gradient: Float[Tensor, "*b p 3"]) -> PointTerm:

@@ -72,12 +72,7 @@ class Touching:
     """A place on an object, as balls, in which all contacts are to be."""
 
     def __init__(self, place: Balls, clear: float) -> None:
-        """On the device of the evaluations.
-
-        Args:
-            place: Where the hand may touch the object.
-            clear: Distance that it keeps from the object elsewhere [m].
-        """
+        """Contacts are to be in `place`; elsewhere the hand keeps a distance `clear` [m]. On the device of the evaluations."""
         self.place, self.clear = place, clear
 
     def beside(self, points: Float[Tensor, "*b p 3"]) -> Bool[Tensor, "*b p"]:
@@ -93,13 +88,7 @@ class Touching:
     def push(
         self, points: Float[Tensor, "*b p 3"], distance: Float[Tensor, "*b p"], gradient: Float[Tensor, "*b p 3"]
     ) -> PointTerm:
-        """How much nearer than `clear` each hand point outside the place is to the object [m].
-
-        Args:
-            points: Hand points [m].
-            distance: Their signed distances to the object [m].
-            gradient: The distances' gradients.
-        """
+        """How much nearer than `clear` each hand point outside the place is to the object [m], by its signed distance [m]."""
         near = (self.beside(points) & (distance < self.clear)).to(distance.dtype)
         return PointTerm((self.clear - distance) * near, -gradient * near[..., None])
 
@@ -123,8 +112,7 @@ class Clearance:
 
         Args:
             body: Surface points.
-            ball: Centres of the spheres.
-            radii: Their radii [m].
+            ball: Centres of the spheres, whose radii follow [m].
             clear: Distance to keep [m].
             weight: Of the summed penetration [1/m].
         """
@@ -142,14 +130,7 @@ class Clearance:
         self, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], poses: Float[Tensor, "n n_links 4 4"],
         pivot: Float[Tensor, "n 3"],
     ) -> ClearanceTerm:
-        """The term of n grasps.
-
-        Args:
-            T: Wrist poses [m].
-            q: Joints [rad or m].
-            poses: Poses of their links [m].
-            pivot: Points about which the hands turn [m].
-        """
+        """The term of n grasps, from wrist poses, joints, poses of links, and the points about which hands turn [m]."""
         tree, n = self.hand.tree, len(q)
         joints = torch.cat([q + share * (end - q) for end, share in self.postures])
         follow = torch.cat([torch.ones_like(q), *((1 - share).expand_as(q) for _, share in self.postures)])

@@ -37,11 +37,7 @@ class Frame:
     """Takes coordinates of the object's frame to this one [m]."""
 
     def __post_init__(self) -> None:
-        """Refuse names that would break the files, and what is no rigid motion.
-
-        Raises:
-            OptionError: As said.
-        """
+        """Refuse names that would break the files, and what is no rigid motion: OptionError."""
         if not is_name(self.name):
             raise OptionError(f"the frame is called {self.name!r}; expected a name on one line, without control characters")
         if (fault := motion_fault(self.T_frame_object)) is not None:
@@ -84,11 +80,7 @@ class Frame:
 
 
 def postures(grasps: GraspBatch) -> dict[str, Float[Tensor, "n n_dof"]]:
-    """Joints of pregrasp, grasp and squeeze, in the order in which a hand goes through them [rad or m].
-
-    Raises:
-        OptionError: A grasp states no pregrasp or squeeze.
-    """
+    """Joints of pregrasp, grasp and squeeze, in this order [rad or m]; OptionError: a grasp states no pregrasp or squeeze."""
     if not bool(grasps.states_closing.all()):
         raise OptionError("these grasps have no pregrasp and squeeze; `dro-grasp export` makes them, and so does "
                           "`dro_grasp.complete(problem, grasps)`")

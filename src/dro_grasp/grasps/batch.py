@@ -89,11 +89,7 @@ class GraspBatch:
     """How many grasps of an object were asked for, by its name and hash, where that is known; see `asked`."""
 
     def __post_init__(self) -> None:
-        """Refuse columns of unequal length and successes without a trial.
-
-        Raises:
-            ValueError: The columns do not fit together.
-        """
+        """Refuse columns of unequal length and successes without a trial: ValueError."""
         columns.require_fit(self, len(self.joint_names))
 
     @staticmethod
@@ -320,11 +316,7 @@ class GraspBatch:
         return pa.table(encode(self)[0]).to_pandas()
 
     def require_hand(self, hand: Hand) -> None:
-        """Refuse a hand whose joints are not those of these grasps.
-
-        Raises:
-            GraspFileError: The joint names or the wrist link differ.
-        """
+        """Refuse a hand whose joints are not those of these grasps: GraspFileError."""
         if tuple(hand.tree.joint_names) != self.joint_names or hand.tree.link_names[0] != self.wrist_link:
             raise GraspFileError(
                 f"these grasps are for hand '{self.hand}' with joints {list(self.joint_names)}; "
@@ -372,7 +364,6 @@ def _folder(folder: Path) -> GraspBatch:
 
 
 def _told_apart(batches: list[tuple[Path, GraspBatch]]) -> Iterator[GraspBatch]:
-    """The batches, where objects that share their name with another one have the name of their file."""
     versions: dict[str, set[str]] = {}
     for _, batch in batches:
         for name, sha256 in zip(batch.object, batch.object_sha256, strict=True):
@@ -392,11 +383,7 @@ HAND_POINTS = 64
 
 
 def distinct(hand: Hand, grasps: GraspBatch, earlier: GraspBatch | None = None) -> Bool[Tensor, " n"]:
-    """Grasps that are not near-duplicates of an earlier grasp of the same object.
-
-    Args:
-        earlier: Grasps that come before these; none by default.
-    """
+    """Grasps that are not near-duplicates of an earlier grasp of the same object, be it in this batch or in `earlier`."""
     n_earlier = 0 if earlier is None else len(earlier)
     joined = grasps if earlier is None else GraspBatch.concatenate([earlier.bare(), grasps.bare()])
     thin = hand.with_points(min(HAND_POINTS, hand.n_points))

@@ -16,11 +16,7 @@ from dro_grasp.hands.hand import Hand
 
 
 def completed(hand: Hand, grasps: GraspBatch, centre: Float[Tensor, "3"], config: ControllerConfig | None = None) -> GraspBatch:
-    """The same grasps of one object, each with pregrasp and squeeze; rows that are stated stay.
-
-    Args:
-        centre: The object's centre of mass, in the object's frame [m].
-    """
+    """The same grasps of one object, each with pregrasp and squeeze; rows that are stated stay. `centre` as below."""
     open_rows = ~grasps.states_closing
     if not bool(open_rows.any()):
         return grasps

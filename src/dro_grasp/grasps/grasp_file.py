@@ -65,11 +65,7 @@ KINDS: tuple[tuple[str, Callable[[pa.DataType], bool], tuple[str, ...]], ...] = 
 
 
 def check_header(header: dict[str, Any], path: object) -> None:
-    """Refuse a header whose entries are missing or of another type.
-
-    Raises:
-        GraspFileError: As said; it names the entry.
-    """
+    """Refuse a header whose entries are missing or of another type: GraspFileError."""
     expected = {name: (isinstance(header.get(name), str), what) for name, what in HEADER.items()}
     names, notes = header.get(JOINTS), header.get(NOTES)
     named = isinstance(names, list) and all(isinstance(name, str) for name in names) and len(set(names)) == len(names) > 0
@@ -89,11 +85,7 @@ def _is_asked(entry: Any) -> bool:
 
 
 def check_columns(schema: pa.Schema, path: object) -> None:
-    """Refuse columns that occur twice, or hold something else than their name says.
-
-    Raises:
-        GraspFileError: As said; it names the column.
-    """
+    """Refuse columns that occur twice, or hold something else than their name says: GraspFileError."""
     if twice := [name for name in schema.names if schema.names.count(name) > 1]:
         raise GraspFileError(f"{path} has two columns '{twice[0]}'; write the file again")
     for what, fits, names in KINDS:
@@ -151,11 +143,7 @@ def read_table(path: Path | str | io.BytesIO) -> tuple[pa.Table, dict[str, Any]]
 
 
 def read_footer(path: Path | str) -> tuple[int, dict[str, Any]]:
-    """Number of grasps in a grasp file, and its header, from the footer alone.
-
-    Raises:
-        GraspFileError: As `read_table`.
-    """
+    """Number of grasps in a grasp file, and its header, from the footer alone; errors are those of `read_table`."""
     with reading(path, GraspFileError, EXPECTED, pa.ArrowException):
         footer = pq.read_metadata(_existing(path))
         return footer.num_rows, read_header(path, footer.schema.to_arrow_schema())
@@ -171,11 +159,7 @@ def _existing(path: Path | str | io.BytesIO) -> Path | io.BytesIO:
 
 
 def read_header(path: Path | str | io.BytesIO, schema: pa.Schema) -> dict[str, Any]:
-    """The JSON header of a grasp file's schema.
-
-    Raises:
-        GraspFileError: The header is missing, garbled or of another version.
-    """
+    """The JSON header of a grasp file's schema; GraspFileError: it is missing, garbled or of another version."""
     raw = (schema.metadata or {}).get(METADATA_KEY)
     if raw is None:
         raise GraspFileError(f"{path} is Parquet, but no grasp file: its schema has no 'dro_grasp' metadata")
@@ -211,15 +195,10 @@ def fixed_column(values: Float[Tensor, "n k"]) -> pa.Array:
 
 
 def floats(column: pa.ChunkedArray, width: int | None, where: str) -> Float[Tensor, "n *width"]:
-    """The inverse of `float_column` and `fixed_column`; null becomes NaN.
-
-    Args:
-        column: Numbers (width None) or lists of numbers.
-        width: Expected length of each list.
-        where: File and column, for the message.
+    """The inverse of `float_column` and `fixed_column`, for lists of length `width` or plain numbers; null becomes NaN.
 
     Raises:
-        GraspFileError: A list has another length, or the column does not hold numbers.
+        GraspFileError: A list has another length, or the column does not hold numbers; it names the file and column, `where`.
     """
     array = column.combine_chunks()
     try:
@@ -278,11 +257,7 @@ def _further_column(name: str, value: Any) -> pa.Array:
 
 
 def decode(table: pa.Table, header: dict[str, Any], path: str) -> dict[str, Any]:
-    """Constructor arguments of a GraspBatch from a grasp file's table and header.
-
-    Raises:
-        GraspFileError: Columns are missing, or poses are not finite.
-    """
+    """Constructor arguments of a GraspBatch; GraspFileError: columns are missing, or poses are not finite."""
     missing = [name for name in REQUIRED if name not in table.column_names]
     if missing:
         raise GraspFileError(f"{path} lacks columns {missing} of a grasp file")

@@ -26,6 +26,7 @@ from dro_grasp.geometry.se3 import apply, compose
 from dro_grasp.kinds import Checked
 from dro_grasp.kinematics.joint_step import StepConfig, best_step, point_norms, smoothed_norms
 from dro_grasp.kinematics.tree import KinematicTree
+from dro_grasp.records import Rows
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ class _Problem:
 
 
 @dataclass(frozen=True)
-class _State:
+class _State(Rows):
     """The iterate of each grasp, with the kinematics linearised there."""
 
     T: Float[Tensor, "b 4 4"]
@@ -125,15 +126,6 @@ class _State:
     stalled: Int[Tensor, " b"]
     """Sum over the steps since the last real gain: 2 for a step that gained little, 1 for a step that was undone."""
 
-    def rows(self, index: Bool[Tensor, " b"]) -> _State:
-        """Some of the grasps."""
-        return _State(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
-
-    def where(self, mask: Bool[Tensor, " b"], other: _State) -> _State:
-        """This state where the mask holds, the other elsewhere."""
-        pairs = ((getattr(self, name), getattr(other, name)) for name in self.__dataclass_fields__)
-        return _State(*(torch.where(mask.view(-1, *[1] * (a.ndim - 1)), a, b) for a, b in pairs))
-
 
 @torch.no_grad()
 def solve_joints(
@@ -142,11 +134,10 @@ def solve_joints(
 ) -> JointSolution:
     """Wrist pose and joints that bring points on links closest to target positions.
 
-    Minimises the sum of un-squared distances within the joint limits. Each grasp stops on its own criterion, and its
-    result does not depend on the other grasps in the batch.
+    Minimises the sum of un-squared distances within the joint limits; couplings hold exactly. Each grasp stops on its own
+    criterion, and its result does not depend on the other grasps in the batch.
 
     Args:
-        tree: The hand's kinematic tree; its couplings hold exactly.
         T_world_wrist: Initial pose of the root link.
         q: Initial independent joints; clamped to the limits [rad or m].
         movable: False for joints that keep their initial value, inside the limits or not; all move by default.

@@ -55,11 +55,6 @@ def close_idle_fingers(energy: GraspEnergy, grasps: GraspBatch, config: ClosingC
     Of a finger that touches the object, the joints bend that move none of its touching links. What still meets nothing rests:
     bent as far as the fingers that hold, on average.
     Whatever belongs to the grasps before (pregrasp, squeeze, scores, energies, outcomes) is dropped.
-
-    Args:
-        energy: Of the grasps' hand on their object.
-        grasps: Any grasps of the two.
-        config: Distances and steps.
     """
     config = config or ClosingConfig()
     if not len(grasps):
@@ -106,23 +101,15 @@ class _Closer:
         rows = waiting.any(1)
         if not bool(rows.any()):
             return q, waiting
-        some = replace(self, T=self.T[rows])
-        new_q, still = some.all_waiting(q[rows], start[rows], moving[rows], waiting[rows])
-        return q.index_put((rows,), new_q), waiting.index_put((rows,), still)
-
-    def all_waiting(
-        self, q: Float[Tensor, "n n_dof"], start: Float[Tensor, "n n_dof"], moving: Bool[Tensor, "n n_tips n_dof"],
-        waiting: Bool[Tensor, "n n_tips"],
-    ) -> tuple[Float[Tensor, "n n_dof"], Bool[Tensor, "n n_tips"]]:
-        """`contact` of grasps each of which has a finger that waits."""
-        waiting = waiting.clone()
-        share, meets = self.first_contact(start, moving)
-        for finger in (meets & waiting).any(0).nonzero()[:, 0].tolist():
-            new = torch.where(self.bends[finger], self.along(start, moving[:, finger], share[:, finger, None]), q)
-            kept = (meets & waiting)[:, finger] & self.roomy(new, q)
-            q = torch.where(kept[:, None], new, q)
-            waiting[:, finger] &= ~kept
-        return q, waiting
+        some, now, still = replace(self, T=self.T[rows]), q[rows], waiting[rows]
+        start, moving = start[rows], moving[rows]
+        share, meets = some.first_contact(start, moving)
+        for finger in (meets & still).any(0).nonzero()[:, 0].tolist():
+            new = torch.where(self.bends[finger], self.along(start, moving[:, finger], share[:, finger, None]), now)
+            kept = (meets & still)[:, finger] & some.roomy(new, now)
+            now = torch.where(kept[:, None], new, now)
+            still[:, finger] &= ~kept
+        return q.index_put((rows,), now), waiting.index_put((rows,), still)
 
     def rest(
         self, q: Float[Tensor, "n n_dof"], moving: Bool[Tensor, "n n_tips n_dof"], waiting: Bool[Tensor, "n n_tips"],
@@ -209,9 +196,7 @@ class _Closer:
         return energies.self_penetration(centres, energy.spheres.radii, energy.spheres.pairs).value.sum(-1)
 
 
-def body_points(
-    energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"]
-) -> Float[Tensor, "n p 3"]:
+def body_points(energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"]) -> Float[Tensor, "n p 3"]:
     """The hand's surface points, for wrist poses and joints on the energy's device [m]."""
     return energy.body.place(T[:, None] @ energy.hand.tree.forward(q))
 
@@ -261,16 +246,11 @@ def ease_fingers(
 ) -> GraspBatch:
     """The grasps with fingers clear of the object, as far as their pregrasps open; wrist, pregrasp and squeeze stay.
 
-    Args:
-        energy: Of the grasps' hand on their object.
-        grasps: Complete grasps of the two.
-        seen: Points of the object that were seen, where the rest is a guess [m].
-        config: Room and steps.
+    `seen` are points of the object that were seen, where the rest is a guess [m].
     """
-    config = config or EasingConfig()
+    config, tree = config or EasingConfig(), None if seen is None else KDTree(seen)
     if not len(grasps):
         return grasps
-    tree = _tree(seen)
     return grasps.replace(joints=torch.cat([_eased(energy, part, tree, config) for part in grasps.in_parts(config.batch_size)]))
 
 
@@ -278,28 +258,16 @@ def ease_fingers(
 def lacking_room(
     energy: GraspEnergy, grasps: GraspBatch, seen: Float[np.ndarray, "m 3"] | None = None, config: EasingConfig | None = None
 ) -> Float[Tensor, " n"]:
-    """How much less room the opened hands leave than fingers should, where it is least, palm included [m]; 0 for none.
-
-    Args:
-        energy: Of the grasps' hand on their object.
-        grasps: Complete grasps of the two.
-        seen: As in `ease_fingers`.
-        config: Room.
-    """
+    """How much less room the opened hands leave than fingers should, where it is least, palm included [m]; 0 for none."""
     config, device = config or EasingConfig(), energy.centre.device
-    lacking, tree = [torch.zeros(0)], _tree(seen)
+    lacking, tree = [torch.zeros(0)], None if seen is None else KDTree(seen)
     for part in grasps.in_parts(config.batch_size):
         _, spare = _room(energy, part.T_object_wrist.to(device), part.pregrasp_joints.to(device), tree, config)
         lacking.append((-spare).amax(-1).clamp_min(0).cpu())
     return torch.cat(lacking)
 
 
-def _tree(seen: Float[np.ndarray, "m 3"] | None) -> KDTree | None:
-    return None if seen is None else KDTree(seen)
-
-
 def _eased(energy: GraspEnergy, grasps: GraspBatch, seen: KDTree | None, config: EasingConfig) -> Float[Tensor, "n n_dof"]:
-    """Joints of some of the grasps, on the CPU."""
     device, hand = energy.centre.device, energy.hand
     T, q, opened = (x.to(device) for x in (grasps.T_object_wrist, grasps.joints, grasps.pregrasp_joints))
     moved = finger_joints(hand)

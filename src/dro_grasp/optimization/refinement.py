@@ -60,12 +60,8 @@ class RefineConfig(Checked):
 def refine_grasps(energy: GraspEnergy, grasps: GraspBatch, config: RefineConfig | None = None) -> GraspBatch:
     """The grasps after the descent; none has a higher energy than before.
 
-    Whatever belongs to the grasps before (pregrasp, squeeze, scores, energies, outcomes) is dropped.
-
-    Args:
-        energy: Of the grasps' hand on their object, with the weights of the configuration.
-        grasps: Any grasps of the two.
-        config: Steps and bounds.
+    Whatever belongs to the grasps before (pregrasp, squeeze, scores, energies, outcomes) is dropped. The energy has the
+    weights of the configuration.
     """
     config = config or RefineConfig()
     if not len(grasps):
@@ -110,7 +106,7 @@ def _descend(
         chosen = lower_energy[:, None]
         move, turn = torch.where(chosen, new_move, move), torch.where(chosen, new_turn, turn)
         T, q = torch.where(chosen[..., None], new_T, T), torch.where(chosen, new_q, q)
-        now = now.where(lower_energy, new)
+        now = new.where(lower_energy, now)
         pace = pace * torch.where(chosen, config.growth, config.shrinkage)
     return T, q
 

@@ -57,10 +57,7 @@ class GripConfig(Checked):
 def gripping(energy: GraspEnergy, grasps: GraspBatch, config: GripConfig | None = None) -> GraspBatch:
     """The same grasps with pregrasp and squeeze: the usual pregrasp, and a squeeze of balanced forces.
 
-    Args:
-        energy: Of the grasps' hand on their object.
-        grasps: Grasps whose fingers touch, as after refinement; a squeeze that they state is replaced.
-        config: Contacts, forces and servos.
+    Their fingers touch, as after refinement; a squeeze that they state is replaced.
     """
     config = config or GripConfig()
     made = [_targets(energy, part, config) for part in grasps.in_parts(config.batch_size)]
@@ -99,16 +96,8 @@ def contact_forces(
 ) -> Float[Tensor, "n l 3"]:
     """Forces of the links on the object [N]: inside their friction cones, balanced as well as possible.
 
-    They minimise the squared net wrench, with torques about `centre` over `length`; the fingers that touch share the force
-    about equally, and links of no finger, such as the palm, answer with any force.
-
-    Args:
-        near: The contacts.
-        touches: Which of them touch.
-        finger: The links of each finger.
-        centre: The object's centre of mass [m].
-        length: Typical distance of its surface from there [m].
-        config: Weights and friction.
+    They minimise the squared net wrench, with torques about `centre` over `length` [m]; the fingers that touch share the force
+    about equally, and links of no finger, such as the palm, answer with any force. `touches` says which of the contacts touch.
     """
     n, count = len(near.gap), min(config.contacts, near.gap.shape[1])
     kept = torch.where(touches, near.gap, torch.inf).topk(count, largest=False).indices

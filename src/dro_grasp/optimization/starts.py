@@ -39,12 +39,7 @@ def lack_of_room(
 ) -> Float[Tensor, "*b"]:
     """How deep hands get into their surroundings on a straight approach [m], and for how much of a tilt from the direction.
 
-    Args:
-        hand: The hand.
-        T: Wrist poses [m].
-        points: The hand's surface points in the wrist frame [m].
-        direction: The palm direction that was wanted; tilts from it cost something.
-        surroundings: What the hand stays clear of.
+    Points are the hand's surface points in the wrist frame [m]. Tilts from a palm direction that was wanted cost something.
     """
     placed = apply_to_cloud(T, points[..., hand.spread_rank < ROOM_POINTS, :])
     back = -APPROACH * hand.palm_directions(T)[..., None, :]
@@ -89,15 +84,9 @@ def wrist_rotations(
     hand: Hand, count: int, direction: Direction | None, spread: Spread, generator: torch.Generator,
     up: Float[Tensor, "3"] | None = None,
 ) -> Float[Tensor, "count 3 3"]:
-    """Random wrist rotations: uniform, or with the palm near a direction and any roll.
+    """Random wrist rotations: uniform, or with the palm near a direction in the object's frame and any roll.
 
-    Args:
-        hand: The hand; its device is the result's.
-        count: How many.
-        direction: Palm direction in the object's frame.
-        spread: Of palm directions around it.
-        generator: Source of randomness, on the CPU.
-        up: Normal of a plane towards which palms also tilt, by up to LARGEST_TILT; not in a cone.
+    `up` is the normal of a plane towards which palms also tilt, by up to LARGEST_TILT; not in a cone.
     """
     palm = hand.palm_direction_wrist
     if direction is None:
@@ -166,19 +155,9 @@ def starts(
 ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n n_dof"]]:
     """Wrist poses and joints to start from.
 
-    Each palm aims at a point between the object's centre and a random surface point, from a random side
-    with a random roll, and approaches until the hand is within the gap or the point is enclosed.
-
-    Args:
-        hand: The hand.
-        field: Signed distances of the object.
-        surface: Points of its surface [m].
-        centre: Its centre of mass [m].
-        n: How many.
-        config: Their distribution.
-        generator: Source of randomness.
-        surroundings: What the hands stay clear of: more palms are turned than are needed, those with most room start, and
-            those that would start under a plane are lifted.
+    Each palm aims at a point between the object's centre and a random surface point [m], from a random side with a random roll,
+    and approaches until the hand is within the gap or the point is enclosed. In surroundings, more palms are turned than are
+    needed, those with most room start, and those that would start under a plane are lifted.
     """
     q = start_joints(hand, n, config, generator)
     points = hand.points(q)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from dro_grasp._version import __version__
@@ -21,6 +21,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked, checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimization.starts import StartConfig, starts
+from dro_grasp.records import Rows
 
 PROVENANCE = f"dro-grasp {__version__}, synthesis 2"
 """Provenance of synthesised grasps; the number counts up when the method changes."""
@@ -61,7 +62,7 @@ class SynthesisConfig(Checked):
 
 
 @dataclass(frozen=True)
-class State:
+class State(Rows):
     """n grasps during the optimisation."""
 
     T: Float[Tensor, "n 4 4"]
@@ -74,13 +75,6 @@ class State:
     """The slot that each contact draws its candidates from."""
     result: Evaluation
     """Energy and gradient there."""
-
-    def where(self, keep: Bool[Tensor, " n"], other: State) -> State:
-        """The other state's grasps where `keep` is true, these elsewhere."""
-        row = keep[:, None]
-        result = self.result.where(keep, other.result)
-        T, q = torch.where(row[..., None], other.T, self.T), torch.where(row, other.q, self.q)
-        return State(T, q, torch.where(row, other.contacts, self.contacts), self.slots, result)
 
 
 @checked
@@ -114,13 +108,7 @@ def synthesize_with(
 ) -> GraspBatch:
     """The same with an energy that is there already, on its device; a bare cloud will do.
 
-    Args:
-        energy: Of the hand on the object.
-        obj: The object.
-        num: How many grasps.
-        seed: The same seed gives the same grasps.
-        config: The optimiser.
-        progress: Called with (grasps optimised, grasps wanted).
+    `progress` is called with (grasps optimised, grasps wanted).
     """
     hand, generator = energy.source, torch.Generator().manual_seed(seed)
     surface, centre = torch.as_tensor(obj.cloud, dtype=torch.float32), energy.centre.cpu()
@@ -150,15 +138,7 @@ def descend(
     energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], config: SynthesisConfig,
     generator: torch.Generator,
 ) -> State:
-    """Run n grasps from where they start to the end of the annealing.
-
-    Args:
-        energy: Of the hand on the object.
-        T: Wrist poses to start from [m], on the CPU.
-        q: Joints to start from [rad or m], on the CPU.
-        config: The optimiser.
-        generator: Source of randomness, on the CPU.
-    """
+    """Run n grasps from where they start, all on the CPU, to the end of the annealing."""
     n, device = len(T), energy.centre.device
     T, q = T.to(device), q.to(device)
     slots = energy.candidates.assign(n, config.contacts.idle, generator).to(device)
@@ -172,7 +152,7 @@ def descend(
         proposal = propose(energy, state, squares, pace, config, generator)
         rise = proposal.result.total - state.result.total
         accepted = torch.rand(n, generator=generator).to(device) < torch.exp(-rise.clamp_min(0) / temperature)
-        state = state.where(accepted, proposal)
+        state = proposal.where(accepted, state)
         squares = config.smoothing * squares + (1 - config.smoothing) * _squares(state.result)
     return state
 
@@ -187,8 +167,7 @@ def propose(
     bend = -pace * state.result.by_joint * scale[:, 6:]
     T = turned_about(state.T, energy.pivot(state.T), config.translation_step * move, config.rotation_step * turn)
     hand = energy.hand
-    step = config.joint_step * hand.tree.joint_unit
-    q = (state.q + step * bend).clamp(hand.lower, hand.upper)
+    q = (state.q + config.joint_step * hand.tree.joint_unit * bend).clamp(hand.lower, hand.upper)
     contacts = switched(energy, state, config.switch, generator)
     return State(T, q, contacts, state.slots, energy(T, q, contacts))
 

@@ -27,11 +27,7 @@ def settle(
     grasp whose simulation is unstable keeps its label. Energies and depth stay those before settling; scores and
     outcomes are dropped.
 
-    Raises:
-        ObjectError: The object is a bare point cloud, without balls that stand for it.
-        HandError: The hand came without its description.
-        GraspFileError: The grasps are of another hand.
-        OptionError: The protocol does not exist.
+    Errors are those of `simulate`.
     """
     scene = scene_of(hand, obj, grasps, protocol)
     joints, poses = [grasps.joints[:0]], [grasps.T_object_wrist[:0]]
@@ -56,11 +52,7 @@ def held(
 
     A grasp whose simulation is unstable, or that pushes the object farther than GIVE_UP, stays as it is.
 
-    Raises:
-        ObjectError: The object is a bare point cloud.
-        HandError: The hand came without its description.
-        GraspFileError: The grasps are of another hand.
-        OptionError: The protocol does not exist.
+    Errors are those of `simulate`.
     """
     scene, parts = scene_of(hand, obj, grasps, protocol), [(grasps.joints[:0], grasps.T_object_wrist[:0])]
     for part, rollout in rollouts(scene, hand, grasps, workers):

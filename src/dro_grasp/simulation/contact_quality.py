@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass, fields
 
-import mujoco
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -17,11 +16,11 @@ from scipy.optimize import nnls
 from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
-from dro_grasp.descriptions.collision import collide
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.simulation.contacts import Contacts, find_contacts
 from dro_grasp.simulation.hand_part import PREFIX
 from dro_grasp.simulation.protocols import PROTOCOLS, Protocol, protocol as find_protocol
 from dro_grasp.simulation.scene import TrialScene, cached_scene
@@ -39,13 +38,9 @@ HARD = 1e4
 def q1(points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], friction: float) -> float:
     """Radius of the largest ball about the origin within the wrenches of contacts whose normal forces are at most 1 each.
 
-    The wrench space is the convex hull of the contacts' wrenches and of none. Torques are about the mean of the points, with
-    their mean distance to it as the unit of length. Zero: some wrench cannot be resisted at all.
-
-    Args:
-        points: Contact points [m].
-        normals: Unit normals, from hand to object.
-        friction: Coefficient of friction.
+    The wrench space is the convex hull of the contacts' wrenches and of none. Torques are about the mean of the points [m],
+    with their mean distance to it as the unit of length. Zero: some wrench cannot be resisted at all. Normals have length 1 and
+    point from hand to object.
     """
     offset = points - points.mean(0)
     grasp = _grasp_maps(offset / (np.linalg.norm(offset, axis=1).mean() + 1e-6), normals)
@@ -65,14 +60,8 @@ def wrench_error(
 ) -> float:
     """What the best contact forces leave of a force along each half-axis, averaged: the QP form of force closure.
 
-    Forces obey friction; no contact presses with more than 1, all together press with at least 1. The error is the length of
-    the remaining wrench, its torque about the mean of the points in metres of lever arm.
-
-    Args:
-        points: Contact points [m].
-        normals: Unit normals, from hand to object.
-        friction: Coefficient of friction.
-        torsional: Coefficient of torsional friction [m].
+    Forces obey friction, torsional too [m]; no contact presses with more than 1, all together press with at least 1. The error
+    is the length of the remaining wrench, its torque about the mean of the points in metres of lever arm. Points as in `q1`.
     """
     n = len(points)
     edges = np.zeros((6, 6))
@@ -147,24 +136,16 @@ NAMES = tuple(field.name for field in fields(ContactQuality))
 def measure_contacts(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = PROTOCOLS["dexgraspbench"]
 ) -> ContactQuality:
-    """The analytic metrics of each grasp.
+    """The analytic metrics of each grasp on an object with a mesh; pregrasp and squeeze play no role.
 
-    Args:
-        hand: The hand of the grasps.
-        obj: Their object; it needs a mesh.
-        grasps: Any; pregrasp and squeeze play no role.
-        protocol: States the friction, of which CAUTION is counted on.
-
-    Raises:
-        ObjectError: The object is a bare point cloud.
-        HandError: The hand came without its description.
-        GraspFileError: The grasps are of another hand.
-        OptionError: The protocol does not exist.
+    The protocol states the friction, of which CAUTION is counted on. Errors are those of `simulate`.
     """
     require_pair(hand, obj)
     grasps.require_hand(hand)
     scene = cached_scene(hand, obj, find_protocol(protocol))
-    rows = [_measured(scene, contacts) for contacts in _near_contacts(scene, grasps)]
+    model = copy.copy(scene.model)
+    model.geom_gap[model.geom_bodyid == scene.object_body] = REACH
+    rows = [_measured(scene, contacts) for contacts in find_contacts(model, scene.qpos(grasps.T_object_wrist, grasps.joints))]
     values = torch.tensor(rows, dtype=torch.float32).reshape(-1, len(NAMES))
     return ContactQuality(*values.unbind(1))
 
@@ -177,32 +158,7 @@ def with_contacts(
     return grasps.replace(extra=grasps.extra | {name: getattr(found, name) for name in NAMES})
 
 
-@dataclass(frozen=True)
-class _Contacts:
-    """k contacts of one configuration."""
-
-    bodies: Int[np.ndarray, "k 2"]
-    distance: Float[np.ndarray, " k"]
-    """Negative inside [m]."""
-    position: Float[np.ndarray, "k 3"]
-    normal: Float[np.ndarray, "k 3"]
-    """From the first body to the second."""
-
-
-def _near_contacts(scene: TrialScene, grasps: GraspBatch) -> list[_Contacts]:
-    """Contacts of each grasp, those of hand and object up to REACH apart."""
-    model = copy.copy(scene.model)
-    model.geom_gap[model.geom_bodyid == scene.object_body] = REACH
-    data, found = mujoco.MjData(model), []
-    for q in scene.qpos(grasps.T_object_wrist, grasps.joints):
-        data.qpos[:] = np.nan_to_num(q)
-        collide(model, data)
-        bodies = model.geom_bodyid[data.contact.geom].reshape(-1, 2)
-        found.append(_Contacts(bodies, data.contact.dist.copy(), data.contact.pos.copy(), data.contact.frame[:, :3].copy()))
-    return found
-
-
-def _measured(scene: TrialScene, contacts: _Contacts) -> tuple[float, ...]:
+def _measured(scene: TrialScene, contacts: Contacts) -> tuple[float, ...]:
     """The metrics of one grasp, in the order of NAMES."""
     hand, rules, obj = scene.hand, scene.protocol, scene.object_body
     on_object = (contacts.bodies == obj).any(1)

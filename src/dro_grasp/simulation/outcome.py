@@ -122,12 +122,9 @@ class TrialResult:
 
 
 def verdict(trials: TrialResult, count: int, needed: int) -> TrialResult:
-    """The outcome of grasps from several trials of each.
+    """The outcome of grasps from `count` trials of each, of which a success holds in as many as are needed.
 
-    Args:
-        trials: The first trial of every grasp, then the second of every grasp, and so on.
-        count: Trials of each grasp.
-        needed: Trials that a success holds in.
+    The trials are the first of every grasp, then the second of every grasp, and so on.
     """
     held = trials.success.reshape(count, -1)
     total = held.sum(0)

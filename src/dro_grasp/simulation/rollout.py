@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
 
 import mujoco
@@ -23,6 +23,7 @@ from dro_grasp.grasps.controller import completed
 from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.records import Rows
 from dro_grasp.simulation.outcome import FORCES, GIVE_UP
 from dro_grasp.simulation.protocols import Perturbations, Protocol, protocol as find_protocol
 from dro_grasp.simulation.scene import TrialScene, cached_scene, object_mass
@@ -35,7 +36,7 @@ RESOLUTION = 1e-4
 
 
 @dataclass(frozen=True)
-class Conditions:
+class Conditions(Rows):
     """What differs from the protocol in n trials."""
 
     shift: Float[np.ndarray, "n 3"]
@@ -48,10 +49,6 @@ class Conditions:
     """Factor of the object's mass and of the disturbing forces."""
     gain: Float[np.ndarray, " n"]
     """Factor of the servos' stiffness and damping."""
-
-    def rows(self, index: slice) -> Conditions:
-        """The conditions of some of the trials."""
-        return Conditions(*(getattr(self, f.name)[index] for f in fields(self)))
 
     def displaced(self, grasps: GraspBatch, centre_of_mass: Float[np.ndarray, "3"]) -> GraspBatch:
         """The grasps with each object moved away from where it is expected; the hand does not know."""
@@ -74,7 +71,6 @@ def draw(config: Perturbations, grasps: GraspBatch) -> Conditions:
 
 
 def _generator(position: Float[Tensor, "3"], joints: Float[Tensor, " n_dof"]) -> np.random.Generator:
-    """The random numbers of a grasp."""
     content = (torch.cat([position, joints]).double() / RESOLUTION).round().long().numpy().tobytes()
     return np.random.default_rng(int.from_bytes(hashlib.sha256(content).digest()[:16], "big"))
 
@@ -101,7 +97,7 @@ STATE = ("qpos", "qvel", "qacc_warmstart")
 
 
 @dataclass(frozen=True)
-class ObjectState:
+class ObjectState(Rows):
     """The object in n trials, in the wrist frame."""
 
     position: Float[np.ndarray, "n 3"]
@@ -122,10 +118,6 @@ class ObjectState:
         sine = np.linalg.norm(np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], 1), axis=1)
         return np.arctan2(sine, np.trace(relative, axis1=1, axis2=2) - 1)
 
-    def rows(self, index: Int[np.ndarray, " k"]) -> ObjectState:
-        """The state in some of the trials."""
-        return ObjectState(self.position[index], self.rotation[index], self.stable[index])
-
 
 class Rollout:
     """Trials of several grasps side by side; each hand waits at its start."""
@@ -137,7 +129,6 @@ class Rollout:
         """Place hands and objects.
 
         Args:
-            scene: TrialScene of the hand and the object.
             grasps: At least one; each states its pregrasp and squeeze if the protocol closes the hand.
             workers: Threads.
             stride: Record a frame every so many time steps; None records nothing.
@@ -237,7 +228,6 @@ class Rollout:
         self.batch.set_const()
 
     def _steps(self, seconds: float) -> int:
-        """Time steps of a duration."""
         return round(seconds / self.scene.protocol.timestep)
 
     def _set_force(self, axis: Float[np.ndarray, "3"], rows: Int[np.ndarray, " k"]) -> None:

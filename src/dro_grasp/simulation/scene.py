@@ -91,12 +91,7 @@ class SceneKey:
 
 
 def cached_scene(hand: Hand, obj: ObjectModel, protocol: Protocol) -> TrialScene:
-    """The scene of a pair; the process keeps the last few, least recently used first to go.
-
-    Raises:
-        ObjectError: The object is a bare point cloud, without balls that stand for it.
-        HandError: The hand came without its description.
-    """
+    """The scene of a pair; the process keeps the last few, least recently used first to go. Errors as below."""
     require_simulable(hand, obj)
     return _build_once(SceneKey(hand.sha256, obj.solid_sha256, protocol, hand, obj))
 
