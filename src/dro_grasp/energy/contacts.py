@@ -51,9 +51,7 @@ class LinkSpheres:
     radii: Float[Tensor, " s"]
     """[m]"""
     links: Int[Tensor, " s"]
-    """The link of each sphere."""
     pairs: Int[Tensor, "k 2"]
-    """Pairs to keep apart."""
 
 
 def link_spheres(hand: Hand) -> LinkSpheres:
@@ -137,7 +135,6 @@ class ContactCandidates:
     normals: Float[Tensor, "k 3"]
     """Outward unit normals in their links' frames."""
     links: Int[Tensor, " k"]
-    """The link of each candidate."""
     fingers: Int[Tensor, " k"]
     """Index of the finger of each candidate, or PALM."""
     slot_weights: Float[Tensor, "n_slots k"]

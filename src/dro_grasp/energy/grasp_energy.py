@@ -71,7 +71,6 @@ class Evaluation(Rows):
     by_pose: Float[Tensor, "n 6"]
     """Derivative by the hand's translation [1/m] and rotation about its grasp centre [1/rad]."""
     by_joint: Float[Tensor, "n n_dof"]
-    """Derivative by the joints."""
 
     @property
     def total(self) -> Float[Tensor, " n"]:
@@ -263,7 +262,6 @@ class NearestPoints:
     """For n grasps, the point nearest to the object on each of the l links that have surface points."""
 
     links: Int[Tensor, " l"]
-    """The links."""
     index: Int[Tensor, "n l"]
     """Which of the hand's surface points."""
     points: Float[Tensor, "n l 3"]

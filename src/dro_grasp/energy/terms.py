@@ -20,21 +20,18 @@ from dro_grasp.kinematics.tree import KinematicTree
 
 
 class PointTerm(NamedTuple):
-    """Values of a term that depends on positions."""
+    """Unreduced values of a term that depends on positions."""
 
     value: Float[Tensor, "*b k"]
-    """Unreduced."""
     by_point: Float[Tensor, "*b c 3"]
     """Derivative of the summed values by the points given [unit of the value per m]."""
 
 
 class ContactTerm(NamedTuple):
-    """Values of a term that depends on positions and directions."""
+    """The same of a term that depends on positions and directions."""
 
     value: Float[Tensor, "*b k"]
-    """Unreduced."""
     by_point: Float[Tensor, "*b c 3"]
-    """As in PointTerm."""
     by_normal: Float[Tensor, "*b c 3"]
     """Derivative of the summed values by the normals given."""
 

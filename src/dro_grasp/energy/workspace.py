@@ -68,12 +68,13 @@ class Surroundings:
         return Surroundings(plane, obstacles, None if self.spared is None else on_device(self.spared, device))
 
 
+@dataclass(frozen=True)
 class Touching:
     """A place on an object, as balls, in which all contacts are to be."""
 
-    def __init__(self, place: Balls, clear: float) -> None:
-        """Contacts are to be in `place`; elsewhere the hand keeps a distance `clear` [m]. On the device of the evaluations."""
-        self.place, self.clear = place, clear
+    place: Balls
+    clear: float
+    """Distance that the hand keeps from the object elsewhere [m]."""
 
     def beside(self, points: Float[Tensor, "*b p 3"]) -> Bool[Tensor, "*b p"]:
         """Which points are outside the place."""

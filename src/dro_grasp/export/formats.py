@@ -18,7 +18,6 @@ class ExportJob:
     grasps: GraspBatch
     """Each states pregrasp and squeeze."""
     frame: Frame
-    """Frame of the poses written."""
     hand: Hand | None = None
     """The grasps' hand, for formats that need it."""
     object_path: str = ""
@@ -34,9 +33,7 @@ class ExportFormat:
     name: str
     """Name in FORMATS and WRITERS."""
     title: str
-    """Name in lists of choices."""
     suffix: str
-    """Ending of its files."""
     explanation: str
     """What the files hold."""
     needs_hand: bool = False

@@ -103,11 +103,6 @@ def comment(grasps: GraspBatch, frame: Frame) -> str:
     )
 
 
-def by_joint(grasps: GraspBatch, joints: Float[Tensor, " n_dof"]) -> dict[str, float]:
-    """Joint values by name."""
-    return dict(zip(grasps.joint_names, plain(joints), strict=True))
-
-
 def plain(values: Float[Tensor, " k"]) -> list[float]:
     """Numbers that read well: a ten-millionth is finer than any robot."""
     return [round(float(v), 7) for v in values]
@@ -137,15 +132,15 @@ def isaac_grasp(grasps: GraspBatch, frame: Frame) -> str:
     """
     position, quaternion = frame.place(grasps)
     pregrasp = postures(grasps)["pregrasp"]
-    entries, unknown = {}, 0
+    entries, unknown, names = {}, 0, grasps.joint_names
     for i in range(len(grasps)):
         w, *xyz = plain(quaternion[i])
         known = confidence(grasps, i)
         unknown += known is None
         entries[f"grasp_{i}"] = {
             "confidence": NO_CONFIDENCE if known is None else known, "position": plain(position[i]),
-            "orientation": {"w": w, "xyz": xyz}, "cspace_position": by_joint(grasps, grasps.joints[i]),
-            "pregrasp_cspace_position": by_joint(grasps, pregrasp[i]),
+            "orientation": {"w": w, "xyz": xyz}, "cspace_position": dict(zip(names, plain(grasps.joints[i]), strict=True)),
+            "pregrasp_cspace_position": dict(zip(names, plain(pregrasp[i]), strict=True)),
         }
     content = {"format": "isaac_grasp", "format_version": 1.0, "object_frame_link": frame.name_for(grasps),
                "gripper_frame_link": grasps.wrist_link, "grasps": entries}

@@ -36,7 +36,6 @@ class Targets:
     positions: Float[Tensor, "*b t 3"]
     """Where each point should be [m]."""
     links: Int[Tensor, " t"]
-    """The link that each point is fixed to."""
     local: Float[Tensor, "t 3"]
     """Each point in the frame of its link [m]."""
 
@@ -46,7 +45,6 @@ class JointSolverConfig(Checked):
     """Stopping, step limits and damping. Values are ours unless a source is given."""
 
     max_iterations: int = 32
-    """Linearisations per grasp."""
     step_limit: float = 0.5
     """Largest change of a joint or of a wrist coordinate per iteration [rad or m]. Source: section III-D."""
     tolerance: float = 2e-5
@@ -69,7 +67,6 @@ class JointSolverConfig(Checked):
     sharpen_below: float = 0.1
     """Steps whose largest coordinate is below this count as small [rad or m]."""
     step: StepConfig = field(default_factory=StepConfig)
-    """How each step is solved."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +74,6 @@ class JointSolution:
     """Result of the solver, per grasp."""
 
     T_world_wrist: Float[Tensor, "*b 4 4"]
-    """Pose of the root link."""
     joints: Float[Tensor, "*b n_dof"]
     """Independent joints, inside their limits [rad or m]."""
     residual: Float[Tensor, "*b"]
@@ -85,7 +81,6 @@ class JointSolution:
     converged: Bool[Tensor, "*b"]
     """Whether steps or gains fell below their tolerances."""
     iterations: Int[Tensor, "*b"]
-    """Linearisations taken."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +113,6 @@ class _State(Rows):
     residual: Float[Tensor, "b k"]
     """Points minus targets in the wrist frame, coordinate-major [m]."""
     jacobian: Float[Tensor, "b p k"]
-    """Transposed derivative of the residual."""
     cost: Float[Tensor, " b"]
     """Sum of smoothed norms [m]."""
     damping: Float[Tensor, " b"]

@@ -44,7 +44,6 @@ class ClosingConfig(Checked):
     overlap: float = 0.001
     """Most that the self-penetration of a grasp may grow [m]."""
     batch_size: int = 64
-    """Grasps treated at once."""
 
 
 @torch.no_grad()
@@ -237,7 +236,6 @@ class EasingConfig(Checked):
     steps: int = 11
     """Samples of the way from the grasp to the pregrasp."""
     batch_size: int = 64
-    """Grasps treated at once."""
 
 
 @torch.no_grad()

@@ -27,7 +27,6 @@ class RefineConfig(Checked):
     """Steps of the descent, and how far a grasp may move (ours)."""
 
     steps: int = 40
-    """Steps of the descent."""
     farthest: float = 0.02
     """Largest displacement of the grasp centre [m]."""
     largest_turn: float = math.radians(15)
@@ -52,9 +51,7 @@ class RefineConfig(Checked):
     closing: ClosingConfig = field(default_factory=ClosingConfig)
     """How idle fingers close before the descent."""
     grip: GripConfig = field(default_factory=GripConfig)
-    """How the refined grasps squeeze."""
     batch_size: int = 32
-    """Grasps refined at once."""
 
 
 def refine_grasps(energy: GraspEnergy, grasps: GraspBatch, config: RefineConfig | None = None) -> GraspBatch:

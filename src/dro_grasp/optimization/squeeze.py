@@ -34,7 +34,6 @@ class GripConfig(Checked):
     friction: float = 0.4
     """Coefficient of friction that the forces rely on; less than there will be."""
     edges: int = 6
-    """Edges of a friction cone."""
     force: float = 10.0
     """Sum of the normal forces [N]."""
     stiffness: float = 3.0
@@ -48,9 +47,7 @@ class GripConfig(Checked):
     idle: float = 0.7
     """The same for fingers that do not touch, and for those that share their joints."""
     iterations: int = 200
-    """Steps of the solver."""
     batch_size: int = 64
-    """Grasps treated at once."""
 
 
 @torch.no_grad()

@@ -54,11 +54,8 @@ class SynthesisConfig(Checked):
     device: str = "cpu"
     """Where energies are computed. Random numbers are drawn on the CPU, so that a seed means the same everywhere."""
     energy: EnergyConfig = field(default_factory=lambda: EnergyConfig(filled=True))
-    """Weights of the terms."""
     starts: StartConfig = field(default_factory=StartConfig)
-    """Distribution of the starts."""
     contacts: ContactConfig = field(default_factory=ContactConfig)
-    """Contact candidates of the hand."""
 
 
 @dataclass(frozen=True)
@@ -68,29 +65,21 @@ class State(Rows):
     T: Float[Tensor, "n 4 4"]
     """T_object_wrist [m]."""
     q: Float[Tensor, "n n_dof"]
-    """Joints [rad or m]."""
     contacts: Int[Tensor, "n c"]
-    """Chosen contact candidates."""
     slots: Int[Tensor, "n c"]
     """The slot that each contact draws its candidates from."""
     result: Evaluation
-    """Energy and gradient there."""
 
 
 @checked
 def synthesize(hand: Hand, obj: ObjectModel, num: int, seed: int = 0, config: SynthesisConfig | None = None) -> GraspBatch:
     """Synthesise grasps of an object by a hand, lowest energy first, not evaluated.
 
-    Args:
-        hand: Any hand.
-        obj: An object with a mesh.
-        num: How many grasps.
-        seed: The same seed gives the same grasps.
-        config: The optimiser.
+    The same seed gives the same grasps.
 
     Raises:
         OptionError: `num` is not positive.
-        ObjectError: The object is a bare cloud.
+        ObjectError: The object is a bare cloud; it needs a mesh.
     """
     if num < 1:
         raise OptionError(f"num is {num}; ask for at least one grasp")

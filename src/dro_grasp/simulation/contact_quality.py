@@ -17,13 +17,12 @@ from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.contacts import Contacts, find_contacts
 from dro_grasp.simulation.hand_part import PREFIX
-from dro_grasp.simulation.protocols import PROTOCOLS, Protocol, protocol as find_protocol
-from dro_grasp.simulation.scene import TrialScene, cached_scene
+from dro_grasp.simulation.protocols import PROTOCOLS, Protocol
+from dro_grasp.simulation.scene import TrialScene, scene_of
 
 EDGES = 8
 """Edges of the pyramid that stands for a friction cone in Q1. Source: DexGraspBench."""
@@ -140,9 +139,7 @@ def measure_contacts(
 
     The protocol states the friction, of which CAUTION is counted on. Errors are those of `simulate`.
     """
-    require_pair(hand, obj)
-    grasps.require_hand(hand)
-    scene = cached_scene(hand, obj, find_protocol(protocol))
+    scene = scene_of(hand, obj, grasps, protocol)
     model = copy.copy(scene.model)
     model.geom_gap[model.geom_bodyid == scene.object_body] = REACH
     rows = [_measured(scene, contacts) for contacts in find_contacts(model, scene.qpos(grasps.T_object_wrist, grasps.joints))]

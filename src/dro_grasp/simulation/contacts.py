@@ -13,13 +13,12 @@ from torch import Tensor
 
 from dro_grasp.descriptions.collision import collide
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.records import Rows
 from dro_grasp.simulation.hand_part import PREFIX
-from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol, protocol as find_protocol
-from dro_grasp.simulation.scene import TrialScene, cached_scene
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
+from dro_grasp.simulation.scene import TrialScene, scene_of
 
 
 @dataclass(frozen=True)
@@ -53,9 +52,7 @@ def deepest_penetration(
 
     Pregrasp, squeeze and the protocol's forces play no role. Errors are those of `simulate`.
     """
-    require_pair(hand, obj)
-    grasps.require_hand(hand)
-    found = measure_penetration(cached_scene(hand, obj, find_protocol(protocol)), grasps)
+    found = measure_penetration(scene_of(hand, obj, grasps, protocol), grasps)
     return torch.as_tensor(np.maximum(found.object, found.own), dtype=torch.float32)
 
 

@@ -20,7 +20,8 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.records import Rows
 from dro_grasp.simulation.outcome import FORCES
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
-from dro_grasp.simulation.rollout import Rollout, quiet, rollouts, scene_of
+from dro_grasp.simulation.rollout import Rollout, quiet, rollouts
+from dro_grasp.simulation.scene import scene_of
 
 CONTACTS = 16
 """Most contacts of a grasp that are weighed, those that press hardest (ours)."""

@@ -75,7 +75,6 @@ class TrialResult:
     shown: Int[Tensor, " n"]
     """The trial that was measured; 0 is the protocol's own, without perturbation."""
     protocol: str
-    """Name and version."""
     asked: int | None = None
     """How many grasps were asked for, as `GraspBatch.asked`."""
 

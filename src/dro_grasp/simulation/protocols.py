@@ -25,7 +25,6 @@ class Perturbations(Checked):
     """
 
     trials: int = 1
-    """Trials of each grasp."""
     needed: int = 1
     """Trials that a success holds in."""
     coarse: int = 0
@@ -114,7 +113,6 @@ class Protocol(Checked):
     lever: float = 0.03
     """Lever arm of sliding joints [m]: they get the servo of a turning joint that acts at this distance."""
     perturbations: Perturbations = field(default_factory=Perturbations)
-    """Further trials of each grasp, under other conditions."""
 
     def __post_init__(self) -> None:
         """Refuse a name that labels could not be told apart with: OptionError."""

@@ -20,13 +20,11 @@ from dro_grasp.geometry import se3
 from dro_grasp.geometry.rotations import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import completed
-from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
-from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.records import Rows
 from dro_grasp.simulation.outcome import FORCES, GIVE_UP
-from dro_grasp.simulation.protocols import Perturbations, Protocol, protocol as find_protocol
-from dro_grasp.simulation.scene import TrialScene, cached_scene, object_mass
+from dro_grasp.simulation.protocols import Perturbations
+from dro_grasp.simulation.scene import TrialScene, object_mass
 
 FACTORS = ("friction", "mass", "gain")
 """Conditions that are factors, as in Perturbations."""
@@ -37,18 +35,15 @@ RESOLUTION = 1e-4
 
 @dataclass(frozen=True)
 class Conditions(Rows):
-    """What differs from the protocol in n trials."""
+    """What differs from the protocol in n trials; the factors are those of Perturbations."""
 
     shift: Float[np.ndarray, "n 3"]
     """Displacement of the object, in its own frame [m]."""
     turn: Float[np.ndarray, "n 3"]
     """Rotation vector of the object about its centre of mass, in its own frame [rad]."""
     friction: Float[np.ndarray, " n"]
-    """Factor of the friction, torsional friction included."""
     mass: Float[np.ndarray, " n"]
-    """Factor of the object's mass and of the disturbing forces."""
     gain: Float[np.ndarray, " n"]
-    """Factor of the servos' stiffness and damping."""
 
     def displaced(self, grasps: GraspBatch, centre_of_mass: Float[np.ndarray, "3"]) -> GraspBatch:
         """The grasps with each object moved away from where it is expected; the hand does not know."""
@@ -244,13 +239,6 @@ class Rollout:
                 self.batch.step(rows.tolist(), nstep=min(stride, steps - done))
                 if self.stride is not None:
                     self.frames.append(self.poses())
-
-
-def scene_of(hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol) -> TrialScene:
-    """The scene in which the grasps are simulated."""
-    require_pair(hand, obj)
-    grasps.require_hand(hand)
-    return cached_scene(hand, obj, find_protocol(protocol))
 
 
 def rollouts(

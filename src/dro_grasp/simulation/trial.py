@@ -21,8 +21,8 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.contacts import Penetration, count_fingers, find_contact_links, measure_penetration
 from dro_grasp.simulation.outcome import DIRECTIONS, GIVE_UP, Failure, Measurements, TrialResult, verdict
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
-from dro_grasp.simulation.rollout import Rollout, draw, rollouts, scene_of
-from dro_grasp.simulation.scene import TrialScene, cached_scene
+from dro_grasp.simulation.rollout import Rollout, draw, rollouts
+from dro_grasp.simulation.scene import TrialScene, cached_scene, scene_of
 
 __all__ = ["DIRECTIONS", "Failure", "TrialResult", "record", "simulate"]
 
