@@ -106,8 +106,7 @@ class GraspEnergy:
             field: Signed distances of the object.
             centre: The object's centre of mass [m].
             length: Typical distance of its surface from there [m].
-            device: Device of the evaluations; hand, field and centre are on the CPU.
-            room: Where the hand may be, and where it may touch the object, on the CPU.
+            device: Device of the evaluations; all that is given is on the CPU.
         """
         self.length, room = length, room or Room()
         self.room = room.to(device)

@@ -39,12 +39,8 @@ class ContactTerm(NamedTuple):
 def force_closure(points: Float[Tensor, "*b c 3"], normals: Float[Tensor, "*b c 3"], length: float) -> ContactTerm:
     """Squared six components of the net wrench of unit forces along the contact normals.
 
-    Zero means that equal normal forces alone hold the object: a differentiable relaxation of force closure.
-
-    Args:
-        points: Contacts relative to the object's centre of mass [m].
-        normals: Outward unit normals of the object at the contacts.
-        length: Torques are divided by this length [m], so force and torque have equal weight.
+    Zero means that equal normal forces alone hold the object: a differentiable relaxation of force closure. Points are from
+    the centre of mass [m]. Torques are divided by `length` [m], so that force and torque have equal weight.
     """
     # Differs from DexGraspNet: torques are about the centre of mass and scaled by the object's size.
     force = normals.sum(-2)
@@ -120,14 +116,9 @@ def joint_gradient(
     tree: KinematicTree, T_world_link: Float[Tensor, "*b n_links 4 4"], wrenches: Float[Tensor, "*b n_links 6"],
     pivot: Float[Tensor, "*b 3"],
 ) -> tuple[Float[Tensor, "*b 6"], Float[Tensor, "*b n_dof"]]:
-    """Derivatives by a small motion of the whole hand and by each independent joint.
+    """Derivatives by a small motion of the whole hand (translation, rotation about the pivot [m]) and by independent joints.
 
-    Args:
-        wrenches: Derivatives by each link's translation and by its rotation about the world's origin.
-        pivot: Point about which the whole hand turns [m].
-
-    Returns:
-        Derivative by the hand's (translation, rotation about the pivot), and by the joints.
+    The wrenches are derivatives by each link's translation and by its rotation about the world's origin.
     """
     # A joint moves every link below it, so its wrench is the sum of theirs.
     carried = tree.descends.to(wrenches.dtype).T @ wrenches
