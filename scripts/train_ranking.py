@@ -19,7 +19,6 @@ from typing import Any, get_args
 from zlib import crc32
 
 import torch
-from dro_grasp.geometry.rotations import roma
 from torch import Tensor
 from torch.nn import functional
 

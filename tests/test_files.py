@@ -111,7 +111,7 @@ def test_a_fault_of_ours_is_not_taken_for_a_damaged_file(fault: Exception) -> No
 
 
 def test_a_fault_of_ours_in_the_decoder_of_grasp_files_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from dro_grasp.grasps import codec
+    from dro_grasp.grasps import grasp_file
     from tests.helpers.toy_batches import make
 
     make(2).save(tmp_path / "a.parquet")
@@ -119,7 +119,7 @@ def test_a_fault_of_ours_in_the_decoder_of_grasp_files_is_seen(tmp_path: Path, m
     def broken(*_: object) -> None:
         raise NameError("no_such_name")
 
-    monkeypatch.setattr(codec, "decode", broken)
+    monkeypatch.setattr(grasp_file, "decode", broken)
     with pytest.raises(NameError):
         type(make(1)).load(tmp_path / "a.parquet")
 

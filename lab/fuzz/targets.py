@@ -25,8 +25,8 @@ from dro_grasp.datasets.collections.importing import read_foreign
 from dro_grasp.files import check_folder, check_output
 from dro_grasp.frames import read_motion
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.grasp_file import METADATA_KEY
 from dro_grasp.grasps.sources import frame_of, hand_of, object_of, with_sources
-from dro_grasp.grasps.table import METADATA_KEY
 from dro_grasp.hands.library import load_hand
 from dro_grasp.models.checkpoints import describe_weights, history_of, load_weights, save_weights, verify_weights
 from dro_grasp.models.network import DistanceNetwork, untrained_network

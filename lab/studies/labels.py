@@ -19,7 +19,7 @@ import torch
 from dro_grasp.compare.metrics import diversity
 from dro_grasp.compare.rows import finger_contact
 from dro_grasp.datasets.engine.worker import EngineConfig, valid_grasps
-from dro_grasp.energy.contact_candidates import ContactConfig
+from dro_grasp.energy.contacts import ContactConfig
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object

@@ -9,13 +9,14 @@ from .datasets.collections.collection import read_collection as read_collection
 from .datasets.engine.schedule import synthesize_dataset as synthesize_dataset
 from .datasets.engine.worker import EngineConfig as EngineConfig
 from .errors import DroGraspError as DroGraspError
-from .export.contents import Frame as Frame
-from .export.csv_table import csv_table as csv_table
-from .export.dexgraspbench import dexgraspbench as dexgraspbench
-from .export.isaac_grasp import isaac_grasp as isaac_grasp
-from .export.moveit import moveit_grasps as moveit_grasps
-from .grasps.batch import GraspBatch as GraspBatch
-from .grasps.reading import load_grasps as load_grasps
+from .export.writers import (
+    Frame as Frame,
+    csv_table as csv_table,
+    dexgraspbench as dexgraspbench,
+    isaac_grasp as isaac_grasp,
+    moveit_grasps as moveit_grasps,
+)
+from .grasps.batch import GraspBatch as GraspBatch, load_grasps as load_grasps
 from .hands.check import HandReport as HandReport, check_hand as check_hand
 from .hands.hand import Hand as Hand
 from .hands.library import hand_names as hand_names, load_hand as load_hand
@@ -26,9 +27,9 @@ from .models.presets import NetworkConfig as NetworkConfig
 from .objects.catalogue import load_object as load_object, object_names as object_names
 from .objects.scenery import Scene as Scene, load_scene as load_scene
 from .objects.shape import ObjectModel as ObjectModel
-from .optimization.finger_closing import ClosingConfig as ClosingConfig
-from .optimization.grip import GripConfig as GripConfig
+from .optimization.fingers import ClosingConfig as ClosingConfig
 from .optimization.refinement import RefineConfig as RefineConfig
+from .optimization.squeeze import GripConfig as GripConfig
 from .optimization.synthesis import SynthesisConfig as SynthesisConfig, synthesize as synthesize
 from .perception.partial_views import DepthCamera as DepthCamera, visible_points as visible_points
 from .perception.scan import depth_points as depth_points, scanned_object as scanned_object

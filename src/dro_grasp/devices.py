@@ -12,6 +12,8 @@ from functools import cache, cached_property
 from typing import Any, TypeVar
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from dro_grasp.errors import OptionError
 
@@ -123,6 +125,21 @@ def on_device(record: Record, device: torch.device | str) -> Record:
     values = {f.name: getattr(record, f.name) for f in dataclasses.fields(record)}  # type: ignore[arg-type]
     moved = {name: value.to(device) for name, value in values.items() if hasattr(value, "to")}
     return dataclasses.replace(record, **moved)  # type: ignore[type-var]
+
+
+class Rows:
+    """Base of dataclasses each of whose fields has one entry a row: a tensor, an array, or such a record again."""
+
+    def rows(self: Record, index: Any) -> Record:
+        """Some of the rows."""
+        return type(self)(*(getattr(self, f.name)[index] for f in dataclasses.fields(self)))  # type: ignore[arg-type]
+
+    def where(self: Record, mask: Bool[Tensor, " n"], other: Record) -> Record:
+        """These rows where the mask holds, the other's elsewhere."""
+        pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in dataclasses.fields(self))  # type: ignore[arg-type]
+        return type(self)(*(
+            a.where(mask, b) if isinstance(a, Rows) else torch.where(mask.view(-1, *[1] * (a.ndim - 1)), a, b)
+            for a, b in pairs))
 
 
 class cached_tensor(cached_property):  # type: ignore[type-arg]  # reads like the decorator it extends

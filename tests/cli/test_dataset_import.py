@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from dro_grasp.cli.main import main
-from dro_grasp.grasps.table import read_footer
+from dro_grasp.grasps.grasp_file import read_footer
 from tests.helpers.loaded_hands import loaded_hand
 
 

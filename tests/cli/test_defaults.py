@@ -15,7 +15,7 @@ from dro_grasp.cli.inputs import ConstraintOptions
 from dro_grasp.cli.main import THREADS, WAIT_POLICY, main
 from dro_grasp.cli.synthesize import Synthesize
 from dro_grasp.datasets.engine.worker import EngineConfig
-from dro_grasp.energy.contact_candidates import ContactConfig
+from dro_grasp.energy.contacts import ContactConfig
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.constraints import Constraints

@@ -13,8 +13,7 @@ from PIL import Image
 
 from dro_grasp.cli.main import main
 from dro_grasp.errors import GraspFileError
-from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.reading import load_grasps
+from dro_grasp.grasps.batch import GraspBatch, load_grasps
 from dro_grasp.grasps.sources import object_of, with_own_files
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.pictures.sheets import CAPTION, HEADER, TILE

@@ -10,7 +10,7 @@ from scipy.special import expit
 
 from dro_grasp.cli.main import main
 from dro_grasp.cli.output import print_table
-from dro_grasp.grasps.summary import percent
+from dro_grasp.grasps.batch import percent
 from dro_grasp.models.checkpoints import SMALL, weights_names
 from dro_grasp.pictures.dataset_report import LABEL, short_names
 from tests.helpers.tiny_bundle import made_up_grasps

@@ -16,9 +16,8 @@ from dro_grasp.datasets.engine.schedule import PairState, next_pair, synthesize_
 from dro_grasp.datasets.engine.shards import Shard, Yield, find_shards
 from dro_grasp.datasets.engine.worker import EngineConfig, make_shard, shard_seed, valid_grasps
 from dro_grasp.errors import OptionError, OutputError
-from dro_grasp.grasps import table
-from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.duplicates import DUPLICATE_DISTANCE
+from dro_grasp.grasps import grasp_file
+from dro_grasp.grasps.batch import DUPLICATE_DISTANCE, GraspBatch
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimization.synthesis import SynthesisConfig
 from dro_grasp.simulation.trial import simulate
@@ -75,7 +74,7 @@ def test_a_damaged_shard_is_named_and_made_again(tmp_path, damage):
 
 def test_a_shard_of_another_version_is_named_and_made_again(tmp_path, monkeypatch):
     path = Shard("a", "x", 0).path(tmp_path)
-    monkeypatch.setattr(table, "FORMAT_VERSION", 9)
+    monkeypatch.setattr(grasp_file, "FORMAT_VERSION", 9)
     run(tmp_path, ["a"], ["x"], 5)
     monkeypatch.undo()
     _, tasks, lines = run(tmp_path, ["a"], ["x"], 5)

@@ -8,7 +8,7 @@ import pytest
 
 from dro_grasp.datasets.engine.schedule import SETTINGS
 from dro_grasp.datasets.engine.worker import EngineConfig
-from dro_grasp.energy.contact_candidates import ContactConfig
+from dro_grasp.energy.contacts import ContactConfig
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.optimization.synthesis import SynthesisConfig
 from tests.helpers.engine_work import GRASPS

@@ -13,9 +13,8 @@ from dro_grasp.datasets.bundle.training_file import FEW_SHOT, HELD_OUT_HANDS
 from dro_grasp.datasets.collections.checking import check
 from dro_grasp.datasets.collections.collection import YIELDS, read_collection
 from dro_grasp.datasets.collections.merging import file_name
-from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.duplicates import DUPLICATE_DISTANCE
-from dro_grasp.grasps.table import read_footer
+from dro_grasp.grasps.batch import DUPLICATE_DISTANCE, GraspBatch
+from dro_grasp.grasps.grasp_file import read_footer
 from dro_grasp.objects.catalogue import object_names
 from dro_grasp.simulation.protocols import changed
 from tests.helpers.loaded_hands import loaded_hand

@@ -87,11 +87,11 @@ def test_distance_terms_follow_the_field(name):
 
 def test_alignment_is_zero_where_the_normals_oppose():
     normals = unit(random(2, 3, 3))
-    assert energies.normal_alignment(normals, -normals).value.abs().max() < 1e-12
+    assert energies.normal_alignment(normals, -normals).abs().max() < 1e-12
     other = unit(random(2, 3, 3, seed=5))
-    by_normal = numeric(lambda n: energies.normal_alignment(n, other).value.sum(-1), normals)
-    torch.testing.assert_close(energies.normal_alignment(normals, other).by_normal, by_normal, rtol=1e-6, atol=1e-6)
-    by_object = numeric(lambda n: energies.normal_alignment(normals, n).value.sum(-1), other)
+    by_normal = numeric(lambda n: energies.normal_alignment(n, other).sum(-1), normals)
+    torch.testing.assert_close(other, by_normal, rtol=1e-6, atol=1e-6)
+    by_object = numeric(lambda n: energies.normal_alignment(normals, n).sum(-1), other)
     torch.testing.assert_close(normals, by_object, rtol=1e-6, atol=1e-6)
 
 

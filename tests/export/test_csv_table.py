@@ -14,9 +14,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from dro_grasp.errors import OptionError
-from dro_grasp.export.contents import Frame
-from dro_grasp.export.csv_table import csv_table
-from dro_grasp.export.isaac_grasp import isaac_grasp
+from dro_grasp.export.writers import Frame, csv_table, isaac_grasp
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import CAMERA, FRAME
 from tests.helpers.tiny_bundle import made_up_grasps

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 import dro_grasp as dro
 from dro_grasp.cli.main import main
 from dro_grasp.errors import OptionError
-from dro_grasp.export.contents import Frame
+from dro_grasp.export.writers import Frame
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
 from dro_grasp.objects.catalogue import load_object

@@ -11,8 +11,7 @@ import pytest
 import torch
 
 from dro_grasp.errors import GraspFileError, OptionError
-from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.reading import load_grasps
+from dro_grasp.grasps.batch import GraspBatch, load_grasps
 from dro_grasp.pictures.sheets import heading
 from dro_grasp.simulation.outcome import TrialResult
 from tests.helpers.claw import ball

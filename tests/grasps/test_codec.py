@@ -7,7 +7,7 @@ import pyarrow as pa
 import torch
 from scipy.spatial.transform import Rotation
 
-from dro_grasp.grasps.codec import decode, encode
+from dro_grasp.grasps.grasp_file import decode, encode
 from tests.helpers.tiny_bundle import made_up_grasps
 from tests.helpers.toy_hand import toy_hand
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from dro_grasp.energy.contact_candidates import contact_candidates
+from dro_grasp.energy.contacts import contact_candidates
 from dro_grasp.hands.anatomy import PALM, find_fingers
 from dro_grasp.hands.hand import Hand
 from dro_grasp.pictures.appearance import link_colours

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from dro_grasp.energy.contact_candidates import contact_candidates
+from dro_grasp.energy.contacts import contact_candidates
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.check import check_hand
 from dro_grasp.hands.hand import Hand

@@ -10,7 +10,7 @@ import torch
 
 from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.optimization.finger_closing import ClosingConfig, close_idle_fingers
+from dro_grasp.optimization.fingers import ClosingConfig, close_idle_fingers
 from tests.helpers.claw import ball, grasps_of, wrist_below
 from tests.helpers.toy_hand import toy_hand
 

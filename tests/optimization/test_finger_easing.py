@@ -9,8 +9,8 @@ import torch
 
 from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.optimization import finger_easing
-from dro_grasp.optimization.finger_easing import EasingConfig, ease_fingers, lacking_room
+from dro_grasp.optimization import fingers
+from dro_grasp.optimization.fingers import EasingConfig, ease_fingers, lacking_room
 from tests.helpers.claw import ball, grasps_of, wrist_below
 from tests.helpers.toy_hand import coupled_hand, toy_hand
 
@@ -104,7 +104,7 @@ def test_a_finger_that_finds_no_room_beside_a_guess_comes_no_nearer_to_the_surfa
     spares = iter(torch.linspace(-0.02, -0.01, CONFIG.steps).tolist())
     before = complete(TOUCHING, OPENED)
     ones = torch.ones(1, len(ENERGY.body.members))
-    monkeypatch.setattr(finger_easing, "_room", lambda *_: (next(gaps) * ones, next(spares) * ones))
+    monkeypatch.setattr(fingers, "_room", lambda *_: (next(gaps) * ones, next(spares) * ones))
     assert torch.equal(ease_fingers(ENERGY, before, BALL.cloud).joints, TOUCHING[None])
 
 

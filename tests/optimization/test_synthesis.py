@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from dro_grasp.energy.contact_candidates import contact_candidates
+from dro_grasp.energy.contacts import contact_candidates
 from dro_grasp.energy.grasp_energy import GraspEnergy, link_spheres
 from dro_grasp.errors import ObjectError, OptionError
-from dro_grasp.grasps.duplicates import distinct
+from dro_grasp.grasps.batch import distinct
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel

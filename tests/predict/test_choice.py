@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from dro_grasp.energy.grasp_energy import Room
-from dro_grasp.energy.surroundings import Surroundings
+from dro_grasp.energy.workspace import Surroundings
 from dro_grasp.errors import OptionError
 from dro_grasp.geometry.distance_field import Balls
 from dro_grasp.hands.anatomy import PALM

@@ -11,7 +11,7 @@ import torch
 
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.optimization.finger_easing import EasingConfig
+from dro_grasp.optimization.fingers import EasingConfig
 from dro_grasp.optimization.refinement import RefineConfig
 from dro_grasp.perception.partial_views import partial_view
 from dro_grasp.predict.admission import TURNED, AdmissionConfig, permitted, reasons_against

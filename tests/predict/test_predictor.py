@@ -17,7 +17,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimization.palm_directions import Spread, wrist_rotations
+from dro_grasp.optimization.starts import Spread, wrist_rotations
 from dro_grasp.optimization.synthesis import SynthesisConfig
 from dro_grasp.predict.admission import PLANE, TURNED, AdmissionConfig
 from dro_grasp.predict.config import GraspRequest, PredictorConfig, RescueConfig, RetryConfig

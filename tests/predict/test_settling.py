@@ -11,10 +11,10 @@ import torch
 
 from dro_grasp.energy.grasp_energy import EnergyConfig
 from dro_grasp.errors import ObjectError
-from dro_grasp.geometry.rotations import roma
+from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.optimization.finger_easing import lacking_room
+from dro_grasp.optimization.fingers import lacking_room
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
 from dro_grasp.perception.partial_views import partial_view
 from dro_grasp.predict.admission import permitted

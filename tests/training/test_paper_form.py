@@ -20,7 +20,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.models.presets import PRESETS, NetworkConfig
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.optimization.palm_directions import Direction
+from dro_grasp.optimization.starts import Direction
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.network import ProposalConfig, _placements

@@ -22,8 +22,8 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
 from dro_grasp.kinematics.joint_solver import Targets, solve_joints
 from dro_grasp.models.checkpoints import load_into
-from dro_grasp.optimization.grip import gripping
 from dro_grasp.optimization.refinement import RefineConfig, refine_grasps
+from dro_grasp.optimization.squeeze import gripping
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.source import Progress, Source
 from lab.methods import WEIGHTS

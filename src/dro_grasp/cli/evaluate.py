@@ -54,8 +54,7 @@ class Evaluate:
     def run(self) -> int:
         """Evaluate object by object, then report."""
         from dro_grasp.files import check_output
-        from dro_grasp.grasps.batch import GraspBatch
-        from dro_grasp.grasps.reading import load_grasps
+        from dro_grasp.grasps.batch import GraspBatch, load_grasps
         from dro_grasp.grasps.sources import hand_of, require_one_object
         from dro_grasp.predict.stages import evaluate
         from dro_grasp.simulation.contact_quality import with_contacts
@@ -122,7 +121,7 @@ class Evaluate:
         from dro_grasp.compare.metrics import mean_share, success_rate
         from dro_grasp.grasps.batch import GraspBatch
         from dro_grasp.simulation.contact_quality import NAMES
-        from dro_grasp.simulation.diagnosis import count_failures, diagnose, next_steps
+        from dro_grasp.simulation.outcome import count_failures, diagnose, next_steps
 
         rows = []
         for name, part in evaluated.items():

@@ -13,7 +13,7 @@ from dro_grasp.cli.output import print_json, say
 from dro_grasp.export.formats import FORMATS, ExportJob
 
 if TYPE_CHECKING:
-    from dro_grasp.export.contents import Frame
+    from dro_grasp.export.writers import Frame
     from dro_grasp.grasps.batch import GraspBatch
 
 
@@ -44,7 +44,7 @@ class Export:
 
     def run(self) -> int:
         """Complete the grasps, then write a file for each object."""
-        from dro_grasp.export.contents import Frame
+        from dro_grasp.export.writers import Frame
         from dro_grasp.files import check_folder, check_output, make_folder
         from dro_grasp.grasps.sources import require_one_object
 
@@ -72,7 +72,7 @@ class Export:
     def _load(self) -> GraspBatch:
         """The requested grasps."""
         from dro_grasp.errors import GraspFileError
-        from dro_grasp.grasps.reading import load_grasps
+        from dro_grasp.grasps.batch import load_grasps
 
         grasps = load_grasps(self.file)
         if not self.only_successful:

@@ -140,7 +140,7 @@ class Generate:
         from dro_grasp.errors import OptionError
         from dro_grasp.grasps.sources import with_sources
         from dro_grasp.predict.problem import GraspProblem
-        from dro_grasp.simulation.diagnosis import count_failures, next_steps
+        from dro_grasp.simulation.outcome import count_failures, next_steps
 
         begin = time.perf_counter()
         obj = self._load(name, job.camera)
@@ -229,9 +229,9 @@ class Generate:
             return evaluate(problem, grasps, protocol, progress)
 
     def _show(self, report: dict[str, Any], grasps: GraspBatch, origin: list[str]) -> None:
+        from dro_grasp.grasps.batch import percent
         from dro_grasp.grasps.columns import CONTACT_LINKS, REASON
-        from dro_grasp.grasps.summary import percent
-        from dro_grasp.simulation.diagnosis import diagnose
+        from dro_grasp.simulation.outcome import diagnose
 
         rows = []
         for i in range(min(len(grasps), ROWS_SHOWN)):

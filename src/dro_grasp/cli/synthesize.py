@@ -63,7 +63,7 @@ class Synthesize:
         """Check numbers and names, then fill the folder; the exit code is 2 if every pair fails and there is no grasp."""
         from dro_grasp.datasets.engine.schedule import require_distinct, require_known, synthesize_dataset
         from dro_grasp.datasets.engine.worker import EngineConfig
-        from dro_grasp.energy.contact_candidates import ContactConfig
+        from dro_grasp.energy.contacts import ContactConfig
         from dro_grasp.objects.catalogue import resolve_objects
         from dro_grasp.optimization.synthesis import SynthesisConfig
 

@@ -75,7 +75,7 @@ class View:
 
     def _opened(self, file: Path) -> Callable[[Client, Lock], Studio]:
         """What makes a page that shows the grasps of a file."""
-        from dro_grasp.grasps.reading import load_grasps
+        from dro_grasp.grasps.batch import load_grasps
         from dro_grasp.grasps.sources import hand_of
 
         grasps = load_grasps(file)
@@ -97,6 +97,7 @@ class View:
 
     def _pages(self, fill: Callable[[Studio], None] | None) -> Callable[[Client, Lock], Studio]:
         """What makes the page of a browser, which is filled with what was given, and with a first pair otherwise."""
+        from dro_grasp.predict.predictor import GraspPredictor
         from dro_grasp.viewer.studio import Studio
 
         predictor = GraspPredictor(self.weights, self.device)
@@ -146,7 +147,7 @@ class Picture:
         """Load the file and draw."""
         from dro_grasp.errors import OptionError
         from dro_grasp.files import check_output
-        from dro_grasp.grasps.reading import load_grasps
+        from dro_grasp.grasps.batch import load_grasps
         from dro_grasp.grasps.sources import hand_of
         from dro_grasp.pictures.sheets import PictureStyle, draw_sheet
 

@@ -7,17 +7,13 @@ from copy import copy
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from dro_grasp.devices import on_device
+from dro_grasp.devices import Rows, on_device
 from dro_grasp.energy import terms as energies
-from dro_grasp.energy.clearance import Clearance
-from dro_grasp.energy.contact_candidates import ContactCandidates, ContactConfig, contact_candidates
-from dro_grasp.energy.link_points import LinkPoints
-from dro_grasp.energy.link_spheres import link_spheres
-from dro_grasp.energy.surroundings import Surroundings
-from dro_grasp.energy.touching import Touching
+from dro_grasp.energy.contacts import ContactCandidates, ContactConfig, LinkPoints, contact_candidates, link_spheres
+from dro_grasp.energy.workspace import Clearance, Surroundings, Touching
 from dro_grasp.geometry import se3
 from dro_grasp.geometry.distance_field import Balls, DistanceField
 from dro_grasp.hands.hand import Hand
@@ -63,7 +59,7 @@ class EnergyConfig(Checked):
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class Evaluation(Rows):
     """Energy and gradient of n grasps."""
 
     terms: Float[Tensor, "n 6"]
@@ -74,18 +70,11 @@ class Evaluation:
     by_pose: Float[Tensor, "n 6"]
     """Derivative by the hand's translation [1/m] and rotation about its grasp centre [1/rad]."""
     by_joint: Float[Tensor, "n n_dof"]
-    """Derivative by the joints."""
 
     @property
     def total(self) -> Float[Tensor, " n"]:
         """Sum of the terms, the clearance included."""
         return self.terms.sum(-1) + self.clearance[:, 0]
-
-    def where(self, keep: Bool[Tensor, " n"], other: Evaluation) -> Evaluation:
-        """The other's rows where `keep` is true, these elsewhere."""
-        return Evaluation(*(
-            torch.where(keep[:, None], getattr(other, name), getattr(self, name))
-            for name in ("terms", "clearance", "by_pose", "by_joint")))
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,8 +105,7 @@ class GraspEnergy:
             field: Signed distances of the object.
             centre: The object's centre of mass [m].
             length: Typical distance of its surface from there [m].
-            device: Device of the evaluations; hand, field and centre are on the CPU.
-            room: Where the hand may be, and where it may touch the object, on the CPU.
+            device: Device of the evaluations; all that is given is on the CPU.
         """
         self.length, room = length, room or Room()
         self.room = room.to(device)
@@ -166,18 +154,12 @@ class GraspEnergy:
     def __call__(
         self, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], contacts: Int[Tensor, "n c"] | None = None
     ) -> Evaluation:
-        """Energy and gradient of n grasps.
-
-        Args:
-            T_object_wrist: Wrist poses [m].
-            q: Joints [rad or m].
-            contacts: Indices of their contact candidates; those nearest to the surface by default.
-        """
+        """Energy and gradient of n grasps; their contacts are candidates by index, those nearest to the surface by default."""
         if contacts is None:
             contacts = self.nearest_contacts(T_object_wrist, q)
         tree, config = self.hand.tree, self.config
         poses = T_object_wrist[:, None] @ tree.forward(q)
-        contact_terms, wrenches = self._contacts(poses, contacts)
+        contact_terms, pulled, wrenches = self._contacts(poses, contacts)
         body = self.body.place(poses)
         distance, gradient = self.field.distances(body)
         inside = energies.penetration(distance - config.margin, gradient)
@@ -185,8 +167,7 @@ class GraspEnergy:
         if self.touching is not None:
             off = self.touching.push(body, distance, gradient)
             beside, by_point = config.clearance * off.value.sum(-1, keepdim=True), by_point + config.clearance * off.by_point
-            pulled, by_link = self._pull(self.touching, poses, contacts)
-            beside, wrenches = beside + pulled, wrenches + by_link
+            beside = beside + pulled
         wrenches = wrenches + energies.link_wrenches(body, by_point, self.body.members)
         spheres = self.ball.place(poses)
         own = energies.self_penetration(spheres, self.spheres.radii, self.spheres.pairs)
@@ -244,8 +225,8 @@ class GraspEnergy:
 
     def _contacts(
         self, poses: Float[Tensor, "n n_links 4 4"], contacts: Int[Tensor, "n c"]
-    ) -> tuple[tuple[Float[Tensor, " n"], ...], Float[Tensor, "n n_links 6"]]:
-        """Force closure, distance and alignment of the contacts, and their wrenches on the links."""
+    ) -> tuple[tuple[Float[Tensor, " n"], ...], Float[Tensor, "n 1"], Float[Tensor, "n n_links 6"]]:
+        """Force closure, distance and alignment of contacts, weighted distance to the place to hold, and wrenches on links."""
         config, candidates = self.config, self.candidates
         links = candidates.links[contacts]
         chosen = poses[torch.arange(len(poses), device=links.device)[:, None], links]
@@ -263,20 +244,50 @@ class GraspEnergy:
             + (by_object_normal[..., None, :] @ bend)[..., 0, :]
         )
         moment = torch.linalg.cross(points, by_point, dim=-1)
-        moment = moment + torch.linalg.cross(outward, config.alignment * align.by_normal, dim=-1)
-        members = self.one_hot[links]
-        wrenches = members.transpose(-1, -2) @ torch.cat([by_point, moment], -1)
-        return (closure.value.sum(-1), apart.value.sum(-1), align.value.sum(-1)), wrenches
+        moment = moment + torch.linalg.cross(outward, config.alignment * normal, dim=-1)
+        members = self.one_hot[links].transpose(-1, -2)
+        wrenches, pulled = members @ torch.cat([by_point, moment], -1), torch.zeros_like(points[:, :1, 0])
+        if self.touching is not None:
+            pull = self.touching.pull(points)
+            by_point = config.clearance * pull.by_point
+            pulled = config.clearance * pull.value.sum(-1, keepdim=True)
+            wrenches = wrenches + members @ torch.cat([by_point, torch.linalg.cross(points, by_point, dim=-1)], -1)
+        return (closure.value.sum(-1), apart.value.sum(-1), align.sum(-1)), pulled, wrenches
 
-    def _pull(
-        self, touching: Touching, poses: Float[Tensor, "n n_links 4 4"], contacts: Int[Tensor, "n c"]
-    ) -> tuple[Float[Tensor, "n 1"], Float[Tensor, "n n_links 6"]]:
-        """Weighted distance of the contacts to the place to hold, and their wrenches on the links."""
-        links = self.candidates.links[contacts]
-        chosen = poses[torch.arange(len(poses), device=links.device)[:, None], links]
-        points = se3.apply(chosen, self.candidates.points[contacts])
-        pull = touching.pull(points)
-        by_point = self.config.clearance * pull.by_point
-        moment = torch.linalg.cross(points, by_point, dim=-1)
-        wrenches = self.one_hot[links].transpose(-1, -2) @ torch.cat([by_point, moment], -1)
-        return self.config.clearance * pull.value.sum(-1, keepdim=True), wrenches
+
+@dataclass(frozen=True)
+class NearestPoints:
+    """For n grasps, the point nearest to the object on each of the l links that have surface points."""
+
+    links: Int[Tensor, " l"]
+    index: Int[Tensor, "n l"]
+    """Which of the hand's surface points."""
+    points: Float[Tensor, "n l 3"]
+    """Where they are, in the object's frame [m]."""
+    link_normals: Float[Tensor, "n l 3"]
+    """Outward normals of the links there."""
+    gap: Float[Tensor, "n l"]
+    """Signed distance to the object [m]."""
+    object_normals: Float[Tensor, "n l 3"]
+    """Outward normals of the object there."""
+
+    @staticmethod
+    def of(energy: GraspEnergy, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"]) -> NearestPoints:
+        """Those of grasps on the energy's device."""
+        hand = energy.hand
+        points, normals = hand.points_and_normals(q, T_object_wrist)
+        distance, gradient = energy.field.distances(points)
+        links = hand.link_index.unique()
+        # Points of other links are infinitely far away.
+        index = torch.stack([
+            torch.where(hand.link_index == link, distance, torch.inf).argmin(1) for link in links.tolist()], 1)
+        outward = torch.nn.functional.normalize(_at(gradient, index), dim=-1)
+        return NearestPoints(links, index, _at(points, index), _at(normals, index), distance.gather(1, index), outward)
+
+    def pick(self, values: Float[Tensor, "n p 3"]) -> Float[Tensor, "n l 3"]:
+        """The rows of these points among those of all surface points."""
+        return _at(values, self.index)
+
+
+def _at(values: Float[Tensor, "n p 3"], index: Int[Tensor, "n l"]) -> Float[Tensor, "n l 3"]:
+    return values.gather(1, index[..., None].expand(-1, -1, 3))

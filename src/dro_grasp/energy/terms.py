@@ -20,43 +20,27 @@ from dro_grasp.kinematics.tree import KinematicTree
 
 
 class PointTerm(NamedTuple):
-    """Values of a term that depends on positions."""
+    """Unreduced values of a term that depends on positions."""
 
     value: Float[Tensor, "*b k"]
-    """Unreduced."""
     by_point: Float[Tensor, "*b c 3"]
     """Derivative of the summed values by the points given [unit of the value per m]."""
 
 
-class NormalTerm(NamedTuple):
-    """Values of a term that depends on directions."""
+class ContactTerm(NamedTuple):
+    """The same of a term that depends on positions and directions."""
 
     value: Float[Tensor, "*b k"]
-    """Unreduced."""
+    by_point: Float[Tensor, "*b c 3"]
     by_normal: Float[Tensor, "*b c 3"]
     """Derivative of the summed values by the normals given."""
-
-
-class ContactTerm(NamedTuple):
-    """Values of a term that depends on positions and directions."""
-
-    value: Float[Tensor, "*b k"]
-    """Unreduced."""
-    by_point: Float[Tensor, "*b c 3"]
-    """As in PointTerm."""
-    by_normal: Float[Tensor, "*b c 3"]
-    """As in NormalTerm."""
 
 
 def force_closure(points: Float[Tensor, "*b c 3"], normals: Float[Tensor, "*b c 3"], length: float) -> ContactTerm:
     """Squared six components of the net wrench of unit forces along the contact normals.
 
-    Zero means that equal normal forces alone hold the object: a differentiable relaxation of force closure.
-
-    Args:
-        points: Contacts relative to the object's centre of mass [m].
-        normals: Outward unit normals of the object at the contacts.
-        length: Torques are divided by this length [m], so force and torque have equal weight.
+    Zero means that equal normal forces alone hold the object: a differentiable relaxation of force closure. Points are from
+    the centre of mass [m]. Torques are divided by `length` [m], so that force and torque have equal weight.
     """
     # Differs from DexGraspNet: torques are about the centre of mass and scaled by the object's size.
     force = normals.sum(-2)
@@ -73,12 +57,12 @@ def contact_distance(distance: Float[Tensor, "*b c"], gradient: Float[Tensor, "*
     return PointTerm(distance.abs(), distance.sign()[..., None] * gradient)
 
 
-def normal_alignment(hand_normals: Float[Tensor, "*b c 3"], object_normals: Float[Tensor, "*b c 3"]) -> NormalTerm:
+def normal_alignment(hand_normals: Float[Tensor, "*b c 3"], object_normals: Float[Tensor, "*b c 3"]) -> Float[Tensor, "*b c"]:
     """One plus the cosine between hand normal and object normal at each contact: 0 if they are opposite.
 
-    `by_normal` is the derivative by the hand's normals; the derivative by the object's normals is `hand_normals`.
+    Its derivative by the normals of one is the normals of the other.
     """
-    return NormalTerm(1 + (hand_normals * object_normals).sum(-1), object_normals)
+    return 1 + (hand_normals * object_normals).sum(-1)
 
 
 def penetration(distance: Float[Tensor, "*b p"], gradient: Float[Tensor, "*b p 3"]) -> PointTerm:
@@ -132,14 +116,9 @@ def joint_gradient(
     tree: KinematicTree, T_world_link: Float[Tensor, "*b n_links 4 4"], wrenches: Float[Tensor, "*b n_links 6"],
     pivot: Float[Tensor, "*b 3"],
 ) -> tuple[Float[Tensor, "*b 6"], Float[Tensor, "*b n_dof"]]:
-    """Derivatives by a small motion of the whole hand and by each independent joint.
+    """Derivatives by a small motion of the whole hand (translation, rotation about the pivot [m]) and by independent joints.
 
-    Args:
-        wrenches: Derivatives by each link's translation and by its rotation about the world's origin.
-        pivot: Point about which the whole hand turns [m].
-
-    Returns:
-        Derivative by the hand's (translation, rotation about the pivot), and by the joints.
+    The wrenches are derivatives by each link's translation and by its rotation about the world's origin.
     """
     # A joint moves every link below it, so its wrench is the sum of theirs.
     carried = tree.descends.to(wrenches.dtype).T @ wrenches

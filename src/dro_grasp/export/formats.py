@@ -1,13 +1,12 @@
-"""The export formats by name: a new one is a module beside this file, with a function `content`, and one entry here."""
+"""The export formats by name: a new one is one entry here, and one in `writers.WRITERS`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from dro_grasp.export.contents import Frame
+    from dro_grasp.export.writers import Frame
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.hands.hand import Hand
 
@@ -19,7 +18,6 @@ class ExportJob:
     grasps: GraspBatch
     """Each states pregrasp and squeeze."""
     frame: Frame
-    """Frame of the poses written."""
     hand: Hand | None = None
     """The grasps' hand, for formats that need it."""
     object_path: str = ""
@@ -30,14 +28,12 @@ class ExportJob:
 
 @dataclass(frozen=True)
 class ExportFormat:
-    """One format: how its files are called, and the module that writes it."""
+    """One format and how its files are called."""
 
-    module: str
-    """Module of this package; its `content` takes an ExportJob."""
+    name: str
+    """Name in FORMATS and WRITERS."""
     title: str
-    """Name in lists of choices."""
     suffix: str
-    """Ending of its files."""
     explanation: str
     """What the files hold."""
     needs_hand: bool = False
@@ -47,7 +43,9 @@ class ExportFormat:
 
     def content(self, job: ExportJob) -> bytes | list[bytes]:
         """The object's file, or one file per grasp."""
-        return import_module(f"dro_grasp.export.{self.module}").content(job)
+        from dro_grasp.export.writers import WRITERS  # with PyTorch, which lists of choices do without
+
+        return WRITERS[self.name](job)
 
 
 FORMATS = {
@@ -55,6 +53,6 @@ FORMATS = {
     "moveit": ExportFormat("moveit", "MoveIt (YAML)", ".yaml", "moveit_msgs/Grasp as YAML", needs_hand=True),
     "dexgraspbench": ExportFormat(
         "dexgraspbench", "DexGraspBench (NPY)", ".npy", "one npy file per grasp, in a folder", file_per_grasp=True),
-    "csv": ExportFormat("csv_table", "table (CSV)", ".csv", "one line per grasp"),
+    "csv": ExportFormat("csv", "table (CSV)", ".csv", "one line per grasp"),
 }
-"""All formats, in the order of lists of choices. Modules load on first use."""
+"""All formats, in the order of lists of choices."""

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import html
+import importlib.util
+import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -10,21 +14,21 @@ from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import pyarrow as pa
 import torch
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 from torch import Tensor
 
 from dro_grasp.errors import GraspFileError, OptionError
-from dro_grasp.files import check_output, reading, replacing
-from dro_grasp.grasps import codec, columns, summary
-from dro_grasp.grasps.table import EXPECTED, read_table, table_bytes
+from dro_grasp.files import check_output, given_path, reading, replacing
+from dro_grasp.grasps import columns, grasp_file
+from dro_grasp.grasps.columns import NOT_EVALUATED, REASON
+from dro_grasp.grasps.grasp_file import EXPECTED, encode, quaternions_wxyz, read_table, table_bytes
 
 if TYPE_CHECKING:
     from dro_grasp.hands.hand import Hand
     from dro_grasp.objects.shape import ObjectModel
-
-__all__ = ["GraspBatch"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,11 +89,7 @@ class GraspBatch:
     """How many grasps of an object were asked for, by its name and hash, where that is known; see `asked`."""
 
     def __post_init__(self) -> None:
-        """Refuse columns of unequal length and successes without a trial.
-
-        Raises:
-            ValueError: The columns do not fit together.
-        """
+        """Refuse columns of unequal length and successes without a trial: ValueError."""
         columns.require_fit(self, len(self.joint_names))
 
     @staticmethod
@@ -185,7 +185,7 @@ class GraspBatch:
     @cached_property
     def evaluated(self) -> Bool[Tensor, " n"]:
         """Which grasps have been through a trial."""
-        return torch.tensor([p != columns.NOT_EVALUATED for p in self.protocol], dtype=torch.bool, device=self.joints.device)
+        return torch.tensor([p != NOT_EVALUATED for p in self.protocol], dtype=torch.bool, device=self.joints.device)
 
     @property
     def asked(self) -> int | None:
@@ -217,7 +217,7 @@ class GraspBatch:
     @property
     def wrist_quaternion_wxyz(self) -> Float[Tensor, "n 4"]:
         """Orientation of the root link in the object's frame, a unit quaternion."""
-        return codec.quaternions_wxyz(self.T_object_wrist)
+        return quaternions_wxyz(self.T_object_wrist)
 
     @property
     def confidence(self) -> Float[Tensor, " n"]:
@@ -297,7 +297,7 @@ class GraspBatch:
 
     def to_bytes(self, notes: dict[str, Any] | None = None) -> bytes:
         """The grasp file that `save` writes."""
-        table, header = codec.encode(self)
+        table, header = encode(self)
         return table_bytes(table, header if notes is None else header | {"notes": notes})
 
     @staticmethod
@@ -308,7 +308,7 @@ class GraspBatch:
             GraspFileError: No such file, or a truncated or foreign one, or one of another version.
         """
         with reading(path, GraspFileError, EXPECTED):
-            return GraspBatch(**codec.decode(*read_table(path), str(path)))
+            return GraspBatch(**grasp_file.decode(*read_table(path), str(path)))
 
     def to_pandas(self) -> Any:
         """The batch as a pandas DataFrame with the grasp file's columns.
@@ -316,14 +316,12 @@ class GraspBatch:
         Raises:
             OptionError: pandas is not installed.
         """
-        return codec.data_frame(self)
+        if importlib.util.find_spec("pandas") is None:
+            raise OptionError("to_pandas needs pandas, which is not installed; install it with: pip install pandas")
+        return pa.table(encode(self)[0]).to_pandas()
 
     def require_hand(self, hand: Hand) -> None:
-        """Refuse a hand whose joints are not those of these grasps.
-
-        Raises:
-            GraspFileError: The joint names or the wrist link differ.
-        """
+        """Refuse a hand whose joints are not those of these grasps: GraspFileError."""
         if tuple(hand.tree.joint_names) != self.joint_names or hand.tree.link_names[0] != self.wrist_link:
             raise GraspFileError(
                 f"these grasps are for hand '{self.hand}' with joints {list(self.joint_names)}; "
@@ -331,7 +329,131 @@ class GraspBatch:
             )
 
     def __repr__(self) -> str:
-        return f"GraspBatch({summary.sentence(self)})"
+        return f"GraspBatch({sentence(self)})"
 
     def _repr_html_(self) -> str:
-        return summary.html_table(self)
+        return html_table(self)
+
+
+PATTERN = "*.parquet"
+"""Names of the files that are read in a folder."""
+
+
+def load_grasps(path: Path | str) -> GraspBatch:
+    """Read a grasp file, or all of one hand in a folder, such as `generate` writes for a folder of objects.
+
+    Where objects of two files have the same name and are not the same, they are called as their files.
+
+    Raises:
+        GraspFileError: There is no file and no grasp, a file is foreign, or the files of the folder are of several hands.
+    """
+    path = given_path(path)
+    batch = _folder(path) if path.is_dir() else GraspBatch.load(path)
+    if len(batch) == 0:
+        raise GraspFileError(f"{path} holds no grasp; generate again, perhaps without --only-successful")
+    return batch
+
+
+def _folder(folder: Path) -> GraspBatch:
+    files = sorted(folder.glob(PATTERN))
+    batches = [(file, batch) for file in files if len(batch := GraspBatch.load(file)) or batch.asked]
+    if not any(len(batch) for _, batch in batches):
+        held = "only grasp files without any grasp" if files else "no grasp file (.parquet)"
+        raise GraspFileError(f"folder {folder} holds {held}; give a grasp file, or a folder that `generate --output` filled")
+    first, one = batches[0]
+    for file, batch in batches[1:]:
+        if (batch.hand_sha256, batch.joint_names) != (one.hand_sha256, one.joint_names):
+            raise GraspFileError(f"{first} has grasps of hand '{one.hand}', {file} of '{batch.hand}'; give the files one by "
+                                 "one, or a folder for each hand")
+    return GraspBatch.concatenate(list(_told_apart(batches)))
+
+
+def _told_apart(batches: list[tuple[Path, GraspBatch]]) -> Iterator[GraspBatch]:
+    versions: dict[str, set[str]] = {}
+    for _, batch in batches:
+        for name, sha256 in zip(batch.object, batch.object_sha256, strict=True):
+            versions.setdefault(name, set()).add(sha256)
+    for file, batch in batches:
+        def label(name: str, stem: str = file.stem) -> str:
+            return stem if len(versions.get(name, ())) > 1 else name
+
+        asked_of = {(label(name), sha256): num for (name, sha256), num in batch.asked_of.items()}
+        yield batch.replace(object=tuple(map(label, batch.object)), asked_of=asked_of)
+
+
+DUPLICATE_DISTANCE = 0.005
+"""Two posed hands whose surface points lie closer together on average count as one grasp [m] (ours)."""
+HAND_POINTS = 64
+"""Surface points that are compared (ours)."""
+
+
+def distinct(hand: Hand, grasps: GraspBatch, earlier: GraspBatch | None = None) -> Bool[Tensor, " n"]:
+    """Grasps that are not near-duplicates of an earlier grasp of the same object, be it in this batch or in `earlier`."""
+    n_earlier = 0 if earlier is None else len(earlier)
+    joined = grasps if earlier is None else GraspBatch.concatenate([earlier.bare(), grasps.bare()])
+    thin = hand.with_points(min(HAND_POINTS, hand.n_points))
+    points = thin.points(joined.joints, joined.T_object_wrist)
+    keep = torch.ones(len(joined), dtype=torch.bool)
+    names = sorted(set(joined.object))
+    owner = torch.tensor([names.index(name) for name in joined.object])
+    for i in range(max(1, n_earlier), len(joined)):
+        before = (keep[:i] & (owner[:i] == owner[i])).nonzero()[:, 0]
+        if len(before):
+            apart = (points[before] - points[i]).norm(dim=-1).mean(-1)
+            keep[i] = bool(apart.min() >= DUPLICATE_DISTANCE)
+    return keep[n_earlier:]
+
+
+ROWS = 10
+"""Most grasps in the HTML table (ours)."""
+NAMES = 3
+"""Most objects that are named (ours)."""
+
+
+def percent(confidence: float) -> str | None:
+    """A probability for people; None for NaN, which is unknown."""
+    return None if math.isnan(confidence) else f"{100 * confidence:.0f} %"
+
+
+def sentence(grasps: Any) -> str:
+    """Number of grasps, hand, objects, outcome and range of score or energy."""
+    missing = grasps.out_of - len(grasps)
+    short = f" of {grasps.out_of} asked for" if missing else ""
+    parts = [f"{len(grasps)} grasp{'' if len(grasps) == 1 else 's'}{short}", f"hand '{grasps.hand}'", _objects(grasps)]
+    protocols = Counter(p for p in grasps.protocol if p != NOT_EVALUATED)
+    for protocol, count in protocols.items():
+        held = sum(s for s, p in zip(grasps.trial_success.tolist(), grasps.protocol, strict=True) if p == protocol)
+        count += missing if len(protocols) == 1 else 0
+        parts.append(f"{held} of {count} hold under {protocol}")
+    if not grasps.evaluated.all():
+        parts.append("not evaluated" if not grasps.evaluated.any() else f"{int((~grasps.evaluated).sum())} not evaluated")
+    for name in ("score", "energy"):
+        known = getattr(grasps, name)
+        known = known[known.isfinite()]
+        if len(known):
+            parts.append(f"{name} {float(known.min()):.2f} to {float(known.max()):.2f}")
+    return ", ".join(part for part in parts if part)
+
+
+def _objects(grasps: Any) -> str:
+    names = list(dict.fromkeys(grasps.object))
+    if not names:
+        return ""
+    named = ", ".join(f"'{name}'" for name in names[:NAMES])
+    more = f" and {len(names) - NAMES} more" if len(names) > NAMES else ""
+    return f"object{'s' if len(names) > 1 else ''} {named}{more}"
+
+
+def html_table(grasps: Any) -> str:
+    """The sentence above a table of the first grasps."""
+    reasons = grasps.extra.get(REASON) or [None] * len(grasps)
+    lines = []
+    for i in range(min(len(grasps), ROWS)):
+        outcome = ("success" if grasps.success[i] else "failure") if grasps.evaluated[i] else ""
+        numbers = [float(column[i]) for column in (grasps.score, grasps.energy)]
+        cells = [i, grasps.object[i], *("" if x != x else f"{x:.2f}" for x in numbers), outcome, reasons[i] or ""]
+        lines.append("".join(f"<td>{html.escape(str(cell))}</td>" for cell in cells))
+    heads = "".join(f"<th>{head}</th>" for head in ("grasp", "object", "score", "energy", "trial", "reason"))
+    body = "".join(f"<tr>{line}</tr>" for line in lines)
+    more = f"<p>and {len(grasps) - ROWS} more</p>" if len(grasps) > ROWS else ""
+    return f"<p>{html.escape(sentence(grasps))}</p><table><tr>{heads}</tr>{body}</table>{more}"

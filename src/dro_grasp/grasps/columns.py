@@ -63,11 +63,7 @@ Asked = Mapping[tuple[str, str], int]
 
 
 def require_fit(batch: Any, n_names: int) -> None:
-    """Refuse columns of a batch that do not fit together.
-
-    Raises:
-        ValueError: They have unequal lengths, other numbers of joints than names, or successes without a trial.
-    """
+    """Refuse columns of a batch that do not fit together: ValueError."""
     every = {name: getattr(batch, name) for name in COLUMNS} | batch.extra
     if wrong := {name: len(column) for name, column in every.items() if len(column) != len(batch)}:
         raise ValueError(f"a batch of {len(batch)} grasps has columns of other lengths: {wrong}")
@@ -80,11 +76,7 @@ def require_fit(batch: Any, n_names: int) -> None:
 
 
 def placed(T_object_wrist: Any, joints: Any, n_dof: int) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n n_dof"]]:
-    """Poses and joints of grasps as tensors in single precision.
-
-    Raises:
-        OptionError: They have another shape, are not finite, or a pose is no rigid motion.
-    """
+    """Poses and joints of grasps in single precision; OptionError: they are of another shape, not finite, or not rigid."""
     try:
         T, q = (torch.as_tensor(_own(values)).float() for values in (T_object_wrist, joints))
     except (TypeError, ValueError, RuntimeError) as error:
@@ -110,9 +102,8 @@ def _named(wrong: Sequence[int]) -> str:
 def rows_at(index: Any, n: int) -> Int[Tensor, " k"]:
     """The rows of a batch of n grasps that an index, slice, list, index tensor or mask chooses.
 
-    Raises:
-        OptionError: It is none of these. True and False are no rows: as masks without axes they would choose all or none.
-        IndexError: There is no such grasp.
+    Errors are those of `GraspBatch.__getitem__`; True and False are no rows: as masks without axes they would choose all or
+    none.
     """
     if isinstance(index, slice):
         return torch.tensor(range(n)[index], dtype=torch.long)
@@ -155,11 +146,7 @@ def _objects(batch: Any) -> set[tuple[str, str]]:
 
 
 def asked_once(batch: Any, num: int) -> Asked:
-    """What one request for `num` grasps asked for, of which the batch is what was found.
-
-    Raises:
-        OptionError: There are more grasps, or they are of several objects.
-    """
+    """What one request for `num` grasps of one object asked for; OptionError: there are more grasps, or several objects."""
     objects = sorted(_objects(batch))
     if len(objects) > 1:
         raise OptionError(f"one request is for one object, the grasps are of {', '.join(name for name, _ in objects)}; state "
@@ -190,11 +177,7 @@ def asked_joined(batches: Sequence[Any]) -> Asked:
 
 
 def filled(joints: Float[Tensor, "n n_dof"], known: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """All fields of a batch but poses and joints: those known, those given, and the others unknown.
-
-    Raises:
-        OptionError: There is no such column, or one holds something else, or has another shape.
-    """
+    """All fields of a batch but poses and joints: known, given or unknown; OptionError: a column is none, or does not fit."""
     n = len(joints)
     fields: dict[str, Any] = {name: unknown(name, joints) for name in COLUMNS[2:]} | dict(known)
     names = [name.replace("trial_success", "success") for name in fields]

@@ -16,11 +16,7 @@ from dro_grasp.hands.hand import Hand
 
 
 def completed(hand: Hand, grasps: GraspBatch, centre: Float[Tensor, "3"], config: ControllerConfig | None = None) -> GraspBatch:
-    """The same grasps of one object, each with pregrasp and squeeze; rows that are stated stay.
-
-    Args:
-        centre: The object's centre of mass, in the object's frame [m].
-    """
+    """The same grasps of one object, each with pregrasp and squeeze; rows that are stated stay. `centre` as below."""
     open_rows = ~grasps.states_closing
     if not bool(open_rows.any()):
         return grasps
@@ -38,15 +34,11 @@ def pregrasp_and_squeeze(
     hand: Hand, T_object_wrist: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"], centre: Float[Tensor, "3"],
     config: ControllerConfig | None = None,
 ) -> tuple[Float[Tensor, "n n_dof"], Float[Tensor, "n n_dof"]]:
-    """Joint values q_outer and q_inner of each grasp.
+    """Joint values q_outer and q_inner of each grasp [rad or m].
 
-    Each finger joint moves away from the object's centre, and towards it. The derivative of the mean distance between the
-    downstream points and the centre gives the direction, for each grasp and joint. Joints that only spread the fingers,
+    Each finger joint moves away from the object's centre [m], and towards it. The derivative of the mean distance between
+    the downstream points and the centre gives the direction, for each grasp and joint. Joints that only spread the fingers,
     joints above the palm and the wrist stay.
-
-    Args:
-        joints: The grasps' independent joints [rad or m].
-        centre: The object's centre of mass, in the object's frame [m].
     """
     config = config or ControllerConfig()
     slope = distance_slope(hand, T_object_wrist, joints, centre)

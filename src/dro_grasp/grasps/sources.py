@@ -21,13 +21,9 @@ if TYPE_CHECKING:
 
 
 def with_sources(grasps: GraspBatch, hand: str, obj: str, scale: float, camera: NamedMotion | None = None) -> GraspBatch:
-    """Grasps that record the files of their hand and object; built-in names are not recorded.
+    """Grasps of one object that record the files of their hand and object, unless their names are built-in.
 
-    Args:
-        grasps: Grasps of one object.
-        hand: Name or path.
-        obj: Name or path.
-        camera: Pose of the camera that saw the object, in the frame of the grasps.
+    `camera` is the pose of the camera that saw the object, in the frame of the grasps.
     """
     import torch
 
@@ -57,11 +53,7 @@ def with_own_files(grasps: GraspBatch, hand: Hand, obj: ObjectModel) -> GraspBat
 
 
 def require_pair(hand: Any, obj: Any) -> None:
-    """Refuse anything but a hand and an object, in this order.
-
-    Raises:
-        OptionError: They are swapped, or not loaded yet.
-    """
+    """Refuse anything but a hand and an object, in this order: OptionError."""
     from dro_grasp.hands.hand import Hand
     from dro_grasp.objects.shape import ObjectModel
 
@@ -75,11 +67,7 @@ def require_pair(hand: Any, obj: Any) -> None:
 
 
 def hand_of(grasps: GraspBatch, given: str | None) -> Hand:
-    """The hand of a file's grasps, or the given one instead.
-
-    Raises:
-        HandError: The hand is not found; the message asks for --hand.
-    """
+    """The hand of a file's grasps, or the given one; HandError: it is not found; the message asks for --hand."""
     from dro_grasp.hands.library import load_hand
 
     if given is not None:
@@ -93,14 +81,9 @@ def hand_of(grasps: GraspBatch, given: str | None) -> Hand:
 
 
 def object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectModel:
-    """The object of grasps of one object, or the given one instead; a table in its cloud is kept if the grasps kept it.
+    """The object of grasps of one object, or the given one; a table in its cloud is kept if the grasps kept it.
 
-    Args:
-        given: Name or path that replaces the one in the file.
-        scale: Scale of the object, unless the grasps record one.
-
-    Raises:
-        ObjectError: The object is not found; the message asks for --object.
+    `scale` is that of an object whose grasps record none. ObjectError: it is not found; the message asks for --object.
     """
     from dro_grasp.objects.catalogue import load_object
     from dro_grasp.perception.scan import load_scan
@@ -128,11 +111,7 @@ def object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectMode
 
 
 def require_one_object(grasps: GraspBatch, given: str | None, file: Path) -> None:
-    """Refuse an object that is to stand for the one in a file, where the file has several.
-
-    Raises:
-        OptionError: It has.
-    """
+    """Refuse an object that is to stand for the one in a file, where the file has several: OptionError."""
     if given is not None and (number := len(list(grasps.by_object()))) > 1:
         raise OptionError(f"{file} holds grasps of {number} objects; --object fits a file with one")
 
@@ -170,11 +149,7 @@ def made_for_another(name: str, given: str) -> str:
 
 
 def require_same(grasps: GraspBatch, hand: Hand, obj: ObjectModel) -> None:
-    """Refuse a hand or an object that has changed since grasps of one object were made.
-
-    Raises:
-        GraspFileError: A hash differs.
-    """
+    """Refuse a hand or an object that has changed since grasps of one object were made: GraspFileError."""
     for kind, name, stored, found in (
         ("hand", hand.name, grasps.hand_sha256, hand.sha256), ("object", obj.name, _known_hash(grasps), obj.sha256)
     ):

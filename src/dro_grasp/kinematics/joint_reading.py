@@ -26,12 +26,9 @@ def read_joints(
     tree: KinematicTree, T_world_link: Float[Tensor, "*b n_links 4 4"], valid: Bool[Tensor, " n_links"],
     q: Float[Tensor, "*b n_dof"],
 ) -> Float[Tensor, "*b n_dof"]:
-    """Joints that reproduce the relative poses of neighbouring known links, inside their limits.
+    """Joints that reproduce the relative poses of neighbouring known links, inside their limits; noise is allowed.
 
-    Args:
-        T_world_link: Link poses; noise is allowed.
-        valid: Links whose pose is known.
-        q: Where the sweeps start; joints that no pair of known links encloses keep these values [rad or m].
+    Joints that no pair of links with a `valid` pose encloses keep the values from which the sweeps start, q [rad or m].
     """
     segments = _segments(tree, valid)
     if not segments:

@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dro_grasp.devices import Rows
 from dro_grasp.errors import OptionError
 from dro_grasp.geometry.se3 import apply, compose, roma
 from dro_grasp.kinds import Checked
@@ -34,7 +35,6 @@ class Targets:
     positions: Float[Tensor, "*b t 3"]
     """Where each point should be [m]."""
     links: Int[Tensor, " t"]
-    """The link that each point is fixed to."""
     local: Float[Tensor, "t 3"]
     """Each point in the frame of its link [m]."""
 
@@ -44,7 +44,6 @@ class JointSolverConfig(Checked):
     """Stopping, step limits and damping. Values are ours unless a source is given."""
 
     max_iterations: int = 32
-    """Linearisations per grasp."""
     step_limit: float = 0.5
     """Largest change of a joint or of a wrist coordinate per iteration [rad or m]. Source: section III-D."""
     tolerance: float = 2e-5
@@ -67,7 +66,6 @@ class JointSolverConfig(Checked):
     sharpen_below: float = 0.1
     """Steps whose largest coordinate is below this count as small [rad or m]."""
     step: StepConfig = field(default_factory=StepConfig)
-    """How each step is solved."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,6 @@ class JointSolution:
     """Result of the solver, per grasp."""
 
     T_world_wrist: Float[Tensor, "*b 4 4"]
-    """Pose of the root link."""
     joints: Float[Tensor, "*b n_dof"]
     """Independent joints, inside their limits [rad or m]."""
     residual: Float[Tensor, "*b"]
@@ -83,7 +80,6 @@ class JointSolution:
     converged: Bool[Tensor, "*b"]
     """Whether steps or gains fell below their tolerances."""
     iterations: Int[Tensor, "*b"]
-    """Linearisations taken."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +104,7 @@ class _Problem:
 
 
 @dataclass(frozen=True)
-class _State:
+class _State(Rows):
     """The iterate of each grasp, with the kinematics linearised there."""
 
     T: Float[Tensor, "b 4 4"]
@@ -116,22 +112,12 @@ class _State:
     residual: Float[Tensor, "b k"]
     """Points minus targets in the wrist frame, coordinate-major [m]."""
     jacobian: Float[Tensor, "b p k"]
-    """Transposed derivative of the residual."""
     cost: Float[Tensor, " b"]
     """Sum of smoothed norms [m]."""
     damping: Float[Tensor, " b"]
     sharpness: Float[Tensor, " b"]
     stalled: Int[Tensor, " b"]
     """Sum over the steps since the last real gain: 2 for a step that gained little, 1 for a step that was undone."""
-
-    def rows(self, index: Bool[Tensor, " b"]) -> _State:
-        """Some of the grasps."""
-        return _State(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
-
-    def where(self, mask: Bool[Tensor, " b"], other: _State) -> _State:
-        """This state where the mask holds, the other elsewhere."""
-        pairs = ((getattr(self, name), getattr(other, name)) for name in self.__dataclass_fields__)
-        return _State(*(torch.where(mask.view(-1, *[1] * (a.ndim - 1)), a, b) for a, b in pairs))
 
 
 @torch.no_grad()
@@ -141,11 +127,10 @@ def solve_joints(
 ) -> JointSolution:
     """Wrist pose and joints that bring points on links closest to target positions.
 
-    Minimises the sum of un-squared distances within the joint limits. Each grasp stops on its own criterion, and its
-    result does not depend on the other grasps in the batch.
+    Minimises the sum of un-squared distances within the joint limits; couplings hold exactly. Each grasp stops on its own
+    criterion, and its result does not depend on the other grasps in the batch.
 
     Args:
-        tree: The hand's kinematic tree; its couplings hold exactly.
         T_world_wrist: Initial pose of the root link.
         q: Initial independent joints; clamped to the limits [rad or m].
         movable: False for joints that keep their initial value, inside the limits or not; all move by default.

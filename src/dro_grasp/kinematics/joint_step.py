@@ -17,9 +17,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from dro_grasp.devices import Rows
 from dro_grasp.kinds import Checked
 
 
@@ -34,17 +35,13 @@ class StepConfig(Checked):
 
 
 @dataclass(frozen=True)
-class _Quadratic:
+class _Quadratic(Rows):
     """d^T H d / 2 + g^T d over the box [lower, upper]."""
 
     matrix: Float[Tensor, "b p p"]
     gradient: Float[Tensor, "b p"]
     lower: Float[Tensor, "b p"]
     upper: Float[Tensor, "b p"]
-
-    def rows(self, index: Int[Tensor, " r"]) -> _Quadratic:
-        """Some of the problems."""
-        return _Quadratic(self.matrix[index], self.gradient[index], self.lower[index], self.upper[index])
 
 
 def best_step(

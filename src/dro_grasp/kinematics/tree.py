@@ -108,7 +108,6 @@ class KinematicTree:
 
     @cached_tensor
     def _level_order(self) -> Int[Tensor, " n_links"]:
-        """Position of each link in the concatenated levels."""
         joined = torch.cat([self._roots, *[links for links, _ in self._levels]])
         return joined.argsort()
 
@@ -197,12 +196,9 @@ class KinematicTree:
         self, T_world_link: Float[Tensor, "*batch n_links 4 4"], points: Float[Tensor, "*batch n_points 3"],
         links: Int[Tensor, " n_points"],
     ) -> Float[Tensor, "*batch n_points 3 n_dof"]:
-        """Derivative of world points, each fixed to a link, with respect to the independent joints.
+        """Derivative of world points [m], each fixed to a link, by the independent joints.
 
-        Args:
-            T_world_link: Poses of all links, from `forward`, in any world frame.
-            points: Positions in that world frame [m].
-            links: The link that each point is fixed to.
+        The poses of all links are in the same world frame as the points.
         """
         linear, angular = self.motion_axes(T_world_link)
         velocity = linear[..., None, :, :] + torch.linalg.cross(

@@ -17,8 +17,8 @@ from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.geometry.se3 import roma, turned_about
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.kinds import Checked
-from dro_grasp.optimization.finger_closing import ClosingConfig
-from dro_grasp.optimization.grip import GripConfig
+from dro_grasp.optimization.fingers import ClosingConfig
+from dro_grasp.optimization.squeeze import GripConfig
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,6 @@ class RefineConfig(Checked):
     """Steps of the descent, and how far a grasp may move (ours)."""
 
     steps: int = 40
-    """Steps of the descent."""
     farthest: float = 0.02
     """Largest displacement of the grasp centre [m]."""
     largest_turn: float = math.radians(15)
@@ -51,20 +50,14 @@ class RefineConfig(Checked):
     closing: ClosingConfig = field(default_factory=ClosingConfig)
     """How idle fingers close before the descent."""
     grip: GripConfig = field(default_factory=GripConfig)
-    """How the refined grasps squeeze."""
     batch_size: int = 32
-    """Grasps refined at once."""
 
 
 def refine_grasps(energy: GraspEnergy, grasps: GraspBatch, config: RefineConfig | None = None) -> GraspBatch:
     """The grasps after the descent; none has a higher energy than before.
 
-    Whatever belongs to the grasps before (pregrasp, squeeze, scores, energies, outcomes) is dropped.
-
-    Args:
-        energy: Of the grasps' hand on their object, with the weights of the configuration.
-        grasps: Any grasps of the two.
-        config: Steps and bounds.
+    Whatever belongs to the grasps before (pregrasp, squeeze, scores, energies, outcomes) is dropped. The energy has the
+    weights of the configuration.
     """
     config = config or RefineConfig()
     if not len(grasps):
@@ -109,7 +102,7 @@ def _descend(
         chosen = lower_energy[:, None]
         move, turn = torch.where(chosen, new_move, move), torch.where(chosen, new_turn, turn)
         T, q = torch.where(chosen[..., None], new_T, T), torch.where(chosen, new_q, q)
-        now = now.where(lower_energy, new)
+        now = new.where(lower_energy, now)
         pace = pace * torch.where(chosen, config.growth, config.shrinkage)
     return T, q
 

@@ -1,20 +1,108 @@
-"""Starts of synthesis: palms that face the object from all sides, fingers half open, nothing in penetration."""
+"""Starts of synthesis: palms that face the object from wanted sides, fingers half open, nothing in penetration."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.energy.surroundings import Surroundings
+from dro_grasp.energy.grasp_energy import EnergyConfig
+from dro_grasp.energy.workspace import Surroundings
 from dro_grasp.geometry.distance_field import Ball, Balls, DistanceField
-from dro_grasp.geometry.se3 import compose, rotate
+from dro_grasp.geometry.se3 import apply_to_cloud, compose, random_rotations, roma, rotate, rotation_between
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
-from dro_grasp.optimization.palm_directions import CLEAR, Direction, Spread, lack_of_room, wrist_rotations
+
+Direction = tuple[float, float, float]
+"""A vector in the object's frame, of any length but zero."""
+CLEAR = EnergyConfig.clear
+"""Distance from its surroundings at which a hand starts [m]: the one that it keeps later."""
+LARGEST_TILT = math.radians(60.0)
+"""How far palms tilt from the wanted direction towards a plane, where the hand needs room [rad] (ours)."""
+TILT_COST = 0.03
+"""Depth in the surroundings that a tilt of one radian is worth [m/rad] (ours)."""
+APPROACH = 0.10
+"""Length of the straight approach along the palm direction, which a hand has room for [m] (ours)."""
+ROOM_POINTS = 96
+"""Hand points, spread evenly, at which room is measured (ours)."""
+
+
+def lack_of_room(
+    hand: Hand, T: Float[Tensor, "*b 4 4"], points: Float[Tensor, "*n p 3"], direction: Direction | None,
+    surroundings: Surroundings,
+) -> Float[Tensor, "*b"]:
+    """How deep hands get into their surroundings on a straight approach [m], and for how much of a tilt from the direction.
+
+    Points are the hand's surface points in the wrist frame [m]. Tilts from a palm direction that was wanted cost something.
+    """
+    placed = apply_to_cloud(T, points[..., hand.spread_rank < ROOM_POINTS, :])
+    back = -APPROACH * hand.palm_directions(T)[..., None, :]
+    nearest = [surroundings.distances(placed + share * back)[0].amin(-1) for share in (0.0, 0.5, 1.0)]
+    lack = (CLEAR - torch.stack(nearest).amin(0)).clamp_min(0)
+    if direction is None:
+        return lack
+    wanted = torch.nn.functional.normalize(torch.tensor(direction).to(T), dim=0)
+    return lack + TILT_COST * torch.acos((hand.palm_directions(T) @ wanted).clamp(-1, 1))
+
+
+def angle_to_arc(
+    palm: Float[Tensor, "n 3"], wanted: Float[Tensor, "3"], up: Float[Tensor, "3"] | None
+) -> Float[Tensor, " n"]:
+    """Angles between palm directions and the nearest that is allowed [rad]: the wanted one, or tilted from there to a plane."""
+    nearest = wanted.expand_as(palm)
+    if up is not None:
+        axis, most = _tilt(wanted, up)
+        beside = torch.linalg.cross(axis, wanted)
+        tilt = torch.atan2(palm @ beside, palm @ wanted).clamp_min(0).clamp_max(most)[:, None]
+        nearest = tilt.cos() * wanted + tilt.sin() * beside
+    return torch.atan2(torch.linalg.cross(palm, nearest).norm(dim=-1), (palm * nearest).sum(-1))
+
+
+def _tilt(wanted: Float[Tensor, "3"], up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, ""]]:
+    """The axis about which a palm direction tilts towards a plane, and the largest angle [rad]."""
+    across = torch.linalg.cross(wanted, -up)
+    most = torch.atan2(across.norm(), -wanted @ up).clamp_max(LARGEST_TILT)
+    return torch.nn.functional.normalize(across, dim=0), most
+
+
+class Spread(NamedTuple):
+    """How palm directions are spread around the wanted one."""
+
+    deviation: float
+    """Standard deviation [rad]."""
+    cone: float | None = None
+    """Evenly within a cone of this half angle instead [rad]."""
+
+
+def wrist_rotations(
+    hand: Hand, count: int, direction: Direction | None, spread: Spread, generator: torch.Generator,
+    up: Float[Tensor, "3"] | None = None,
+) -> Float[Tensor, "count 3 3"]:
+    """Random wrist rotations: uniform, or with the palm near a direction in the object's frame and any roll.
+
+    `up` is the normal of a plane towards which palms also tilt, by up to LARGEST_TILT; not in a cone.
+    """
+    palm = hand.palm_direction_wrist
+    if direction is None:
+        return random_rotations(count, generator).to(palm)
+    wanted = torch.tensor(direction, dtype=torch.float32)
+    wanted = wanted / wanted.norm()
+    roll = torch.rand(count, generator=generator) * 2 * math.pi
+    tilt = torch.randn(count, 3, generator=generator) * spread.deviation
+    tilt = tilt - (tilt @ wanted)[:, None] * wanted
+    align = rotation_between(palm.cpu(), wanted)
+    if spread.cone is not None:
+        height = 1 - torch.rand(count, 1, generator=generator) * (1 - math.cos(spread.cone))
+        tilt = torch.nn.functional.normalize(tilt, dim=-1) * torch.acos(height)
+    elif up is not None:
+        axis, most = _tilt(wanted, up.cpu())
+        tilt = tilt + torch.rand(count, 1, generator=generator) * most * axis
+    return (roma.rotvec_to_rotmat(tilt) @ roma.rotvec_to_rotmat(roll[:, None] * wanted) @ align).to(palm)
+
 
 CHOICES = 8
 """Wrist rotations among which each hand takes the one with most room (ours)."""
@@ -65,19 +153,9 @@ def starts(
 ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n n_dof"]]:
     """Wrist poses and joints to start from.
 
-    Each palm aims at a point between the object's centre and a random surface point, from a random side
-    with a random roll, and approaches until the hand is within the gap or the point is enclosed.
-
-    Args:
-        hand: The hand.
-        field: Signed distances of the object.
-        surface: Points of its surface [m].
-        centre: Its centre of mass [m].
-        n: How many.
-        config: Their distribution.
-        generator: Source of randomness.
-        surroundings: What the hands stay clear of: more palms are turned than are needed, those with most room start, and
-            those that would start under a plane are lifted.
+    Each palm aims at a point between the object's centre and a random surface point [m], from a random side with a random roll,
+    and approaches until the hand is within the gap or the point is enclosed. In surroundings, more palms are turned than are
+    needed, those with most room start, and those that would start under a plane are lifted.
     """
     q = start_joints(hand, n, config, generator)
     points = hand.points(q)

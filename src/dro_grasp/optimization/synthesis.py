@@ -6,11 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from dro_grasp._version import __version__
-from dro_grasp.energy.contact_candidates import ContactConfig
+from dro_grasp.devices import Rows
+from dro_grasp.energy.contacts import ContactConfig
 from dro_grasp.energy.grasp_energy import TERMS, EnergyConfig, Evaluation, GraspEnergy
 from dro_grasp.errors import ObjectError, OptionError
 from dro_grasp.geometry.se3 import roma, turned_about
@@ -52,50 +53,32 @@ class SynthesisConfig(Checked):
     device: str = "cpu"
     """Where energies are computed. Random numbers are drawn on the CPU, so that a seed means the same everywhere."""
     energy: EnergyConfig = field(default_factory=lambda: EnergyConfig(filled=True))
-    """Weights of the terms."""
     starts: StartConfig = field(default_factory=StartConfig)
-    """Distribution of the starts."""
     contacts: ContactConfig = field(default_factory=ContactConfig)
-    """Contact candidates of the hand."""
 
 
 @dataclass(frozen=True)
-class State:
+class State(Rows):
     """n grasps during the optimisation."""
 
     T: Float[Tensor, "n 4 4"]
     """T_object_wrist [m]."""
     q: Float[Tensor, "n n_dof"]
-    """Joints [rad or m]."""
     contacts: Int[Tensor, "n c"]
-    """Chosen contact candidates."""
     slots: Int[Tensor, "n c"]
     """The slot that each contact draws its candidates from."""
     result: Evaluation
-    """Energy and gradient there."""
-
-    def where(self, keep: Bool[Tensor, " n"], other: State) -> State:
-        """The other state's grasps where `keep` is true, these elsewhere."""
-        row = keep[:, None]
-        result = self.result.where(keep, other.result)
-        T, q = torch.where(row[..., None], other.T, self.T), torch.where(row, other.q, self.q)
-        return State(T, q, torch.where(row, other.contacts, self.contacts), self.slots, result)
 
 
 @checked
 def synthesize(hand: Hand, obj: ObjectModel, num: int, seed: int = 0, config: SynthesisConfig | None = None) -> GraspBatch:
     """Synthesise grasps of an object by a hand, lowest energy first, not evaluated.
 
-    Args:
-        hand: Any hand.
-        obj: An object with a mesh.
-        num: How many grasps.
-        seed: The same seed gives the same grasps.
-        config: The optimiser.
+    The same seed gives the same grasps.
 
     Raises:
         OptionError: `num` is not positive.
-        ObjectError: The object is a bare cloud.
+        ObjectError: The object is a bare cloud; it needs a mesh.
     """
     if num < 1:
         raise OptionError(f"num is {num}; ask for at least one grasp")
@@ -113,13 +96,7 @@ def synthesize_with(
 ) -> GraspBatch:
     """The same with an energy that is there already, on its device; a bare cloud will do.
 
-    Args:
-        energy: Of the hand on the object.
-        obj: The object.
-        num: How many grasps.
-        seed: The same seed gives the same grasps.
-        config: The optimiser.
-        progress: Called with (grasps optimised, grasps wanted).
+    `progress` is called with (grasps optimised, grasps wanted).
     """
     hand, generator = energy.source, torch.Generator().manual_seed(seed)
     surface, centre = torch.as_tensor(obj.cloud, dtype=torch.float32), energy.centre.cpu()
@@ -149,15 +126,7 @@ def descend(
     energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], config: SynthesisConfig,
     generator: torch.Generator,
 ) -> State:
-    """Run n grasps from where they start to the end of the annealing.
-
-    Args:
-        energy: Of the hand on the object.
-        T: Wrist poses to start from [m], on the CPU.
-        q: Joints to start from [rad or m], on the CPU.
-        config: The optimiser.
-        generator: Source of randomness, on the CPU.
-    """
+    """Run n grasps from where they start, all on the CPU, to the end of the annealing."""
     n, device = len(T), energy.centre.device
     T, q = T.to(device), q.to(device)
     slots = energy.candidates.assign(n, config.contacts.idle, generator).to(device)
@@ -171,7 +140,7 @@ def descend(
         proposal = propose(energy, state, squares, pace, config, generator)
         rise = proposal.result.total - state.result.total
         accepted = torch.rand(n, generator=generator).to(device) < torch.exp(-rise.clamp_min(0) / temperature)
-        state = state.where(accepted, proposal)
+        state = proposal.where(accepted, state)
         squares = config.smoothing * squares + (1 - config.smoothing) * _squares(state.result)
     return state
 
@@ -186,8 +155,7 @@ def propose(
     bend = -pace * state.result.by_joint * scale[:, 6:]
     T = turned_about(state.T, energy.pivot(state.T), config.translation_step * move, config.rotation_step * turn)
     hand = energy.hand
-    step = config.joint_step * hand.tree.joint_unit
-    q = (state.q + step * bend).clamp(hand.lower, hand.upper)
+    q = (state.q + config.joint_step * hand.tree.joint_unit * bend).clamp(hand.lower, hand.upper)
     contacts = switched(energy, state, config.switch, generator)
     return State(T, q, contacts, state.slots, energy(T, q, contacts))
 

@@ -19,9 +19,8 @@ from torch import Tensor
 from dro_grasp.devices import cores
 from dro_grasp.errors import OutputError
 from dro_grasp.files import replacing
-from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.batch import GraspBatch, percent
 from dro_grasp.grasps.sources import require_pair
-from dro_grasp.grasps.summary import percent
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked, checked
 from dro_grasp.objects.shape import ObjectModel, solid_of

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dro_grasp.errors import PlanError
-from dro_grasp.export.contents import yaml_text
+from dro_grasp.export.writers import yaml_text
 from dro_grasp.files import UNTYPED, check_output, given_path, reading, replacing
 
 STAGES = ("reach", "shape", "approach", "close", "lift")

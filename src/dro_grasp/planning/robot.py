@@ -25,12 +25,11 @@ from dro_grasp.descriptions.xml_files import parse_xml
 from dro_grasp.errors import HandError, RobotError
 from dro_grasp.files import given_path
 from dro_grasp.frames import motion_fault
-from dro_grasp.geometry.rotations import roma
+from dro_grasp.geometry.se3 import roma
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand, locate_hand
 from dro_grasp.kinds import flat
 from dro_grasp.kinematics.tree import PRISMATIC, REVOLUTE, KinematicTree
-from dro_grasp.planning.robot import CameraMount, Table, locate_robot
 from dro_grasp.rendering.rasterizer import Camera
 
 BUILTIN_ROBOTS = Path(__file__).parent / "builtin"

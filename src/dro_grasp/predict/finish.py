@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.kinds import Checked
-from dro_grasp.optimization.finger_easing import EasingConfig
+from dro_grasp.optimization.fingers import EasingConfig
 from dro_grasp.optimization.refinement import RefineConfig
 from dro_grasp.predict.admission import TURNED, AdmissionConfig, permitted, reasons_against
 from dro_grasp.predict.problem import GraspProblem

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dro_grasp.devices import require_device
 from dro_grasp.errors import NoGraspError, OptionError
-from dro_grasp.geometry.balls import Ball
+from dro_grasp.geometry.distance_field import Ball
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import with_own_files
 from dro_grasp.hands.hand import Hand
@@ -21,7 +21,7 @@ from dro_grasp.models.checkpoints import load_weights
 from dro_grasp.models.network import DistanceNetwork
 from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimization.palm_directions import Direction
+from dro_grasp.optimization.starts import Direction
 from dro_grasp.predict.admission import shortage_in_words
 from dro_grasp.predict.config import AUTO, GraspRequest, PredictorConfig
 from dro_grasp.predict.constraints import Constraints

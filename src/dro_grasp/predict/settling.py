@@ -17,7 +17,7 @@ from torch import Tensor
 from dro_grasp.energy.grasp_energy import EnergyConfig
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.kinds import Checked
-from dro_grasp.optimization.finger_easing import lacking_room
+from dro_grasp.optimization.fingers import lacking_room
 from dro_grasp.optimization.refinement import RefineConfig
 from dro_grasp.predict.admission import AdmissionConfig, permitted
 from dro_grasp.predict.problem import GraspProblem

@@ -12,10 +12,9 @@ from dro_grasp.energy.grasp_energy import EnergyConfig
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import completed
 from dro_grasp.kinds import checked
-from dro_grasp.optimization.finger_closing import close_idle_fingers
-from dro_grasp.optimization.finger_easing import EasingConfig, ease_fingers
-from dro_grasp.optimization.grip import gripping
+from dro_grasp.optimization.fingers import EasingConfig, close_idle_fingers, ease_fingers
 from dro_grasp.optimization.refinement import RefineConfig, refine_grasps
+from dro_grasp.optimization.squeeze import gripping
 from dro_grasp.predict.admission import AdmissionConfig, opened_wide, permitted
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.ranking.score import ScoreConfig, score_grasps

@@ -16,8 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.energy.grasp_energy import TERMS, GraspEnergy
-from dro_grasp.energy.nearest_points import NearestPoints
+from dro_grasp.energy.grasp_energy import TERMS, GraspEnergy, NearestPoints
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import completed
 

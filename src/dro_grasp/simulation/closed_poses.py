@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -14,7 +12,8 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.contacts import contact_mask, find_contact_links
 from dro_grasp.simulation.outcome import GIVE_UP
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
-from dro_grasp.simulation.rollout import Rollout, rollouts, scene_of
+from dro_grasp.simulation.rollout import Rollout, rollouts
+from dro_grasp.simulation.scene import scene_of
 
 
 def settle(
@@ -25,19 +24,14 @@ def settle(
     A joint above a link that touches the object takes the value it reached, held back by the contact, so that the
     label touches the surface. The other joints keep their values: closing would only drive them towards a fist. A
     grasp whose simulation is unstable keeps its label. Energies and depth stay those before settling; scores and
-    outcomes are dropped.
-
-    Raises:
-        ObjectError: The object is a bare point cloud, without balls that stand for it.
-        HandError: The hand came without its description.
-        GraspFileError: The grasps are of another hand.
-        OptionError: The protocol does not exist.
+    outcomes are dropped. Errors are those of `simulate`.
     """
     scene = scene_of(hand, obj, grasps, protocol)
     joints, poses = [grasps.joints[:0]], [grasps.T_object_wrist[:0]]
     for part, rollout in rollouts(scene, hand, grasps, workers):
         reached, T_object_wrist = _reached(part, rollout, hand, torch.from_numpy(rollout.close().stable))
-        holding = _holding_joints(hand, find_contact_links(scene, rollout.qpos))
+        touching = contact_mask(hand, find_contact_links(scene, rollout.qpos))
+        holding = touching.float() @ hand.tree.moves.float() > 0  # joints that move a contact link
         joints.append(torch.where(holding, reached, part.joints))
         poses.append(T_object_wrist)
     unsettled = grasps.without("pregrasp_joints", "squeeze_joints", "score").without_trial()
@@ -54,13 +48,8 @@ def held(
 ) -> GraspBatch:
     """The same grasps, outcomes included, in the poses of hand and object after closing, from where a trial goes on.
 
-    A grasp whose simulation is unstable, or that pushes the object farther than GIVE_UP, stays as it is.
-
-    Raises:
-        ObjectError: The object is a bare point cloud.
-        HandError: The hand came without its description.
-        GraspFileError: The grasps are of another hand.
-        OptionError: The protocol does not exist.
+    A grasp whose simulation is unstable, or that pushes the object farther than GIVE_UP, stays as it is. Errors are those of
+    `simulate`.
     """
     scene, parts = scene_of(hand, obj, grasps, protocol), [(grasps.joints[:0], grasps.T_object_wrist[:0])]
     for part, rollout in rollouts(scene, hand, grasps, workers):
@@ -79,8 +68,3 @@ def _reached(
     q = q.to(part.joints.dtype).clamp(hand.tree.lower, hand.tree.upper)
     T_object_wrist = torch.linalg.inv(torch.where(sound[:, None, None], T, torch.eye(4, dtype=T.dtype))).to(q.dtype)
     return torch.where(sound[:, None], q, part.joints), torch.where(sound[:, None, None], T_object_wrist, part.T_object_wrist)
-
-
-def _holding_joints(hand: Hand, contact_links: Sequence[Sequence[str]]) -> Bool[Tensor, "n n_dof"]:
-    """Joints that move a contact link."""
-    return contact_mask(hand, contact_links).float() @ hand.tree.moves.float() > 0

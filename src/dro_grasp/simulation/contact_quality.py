@@ -1,25 +1,100 @@
-"""Contact quality of grasps as they are labelled, without any step of time: the analytic metrics of DexGraspBench."""
+"""Contact quality of grasps as they are labelled, without any step of time: the analytic metrics of DexGraspBench.
+
+Definitions, scales and tangents are those of its evaluation, so that values compare. Q1 is Ferrari and Canny's, the least
+wrench that breaks the grasp.
+"""
 
 from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, fields
 
-import mujoco
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy.optimize import nnls
+from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
-from dro_grasp.descriptions.compiling import collide
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.simulation.force_closure import q1, wrench_error
+from dro_grasp.simulation.contacts import Contacts, find_contacts
 from dro_grasp.simulation.hand_part import PREFIX
-from dro_grasp.simulation.protocols import PROTOCOLS, Protocol, protocol as find_protocol
-from dro_grasp.simulation.scene import TrialScene, cached_scene
+from dro_grasp.simulation.protocols import PROTOCOLS, Protocol
+from dro_grasp.simulation.scene import TrialScene, scene_of
+
+EDGES = 8
+"""Edges of the pyramid that stands for a friction cone in Q1. Source: DexGraspBench."""
+DISTURBANCE = 0.1
+"""Force to be resisted, of the largest normal force of a contact [1]. Source: DexGraspBench."""
+ALONG_Y = 0.99
+"""Cosine to the y axis from which tangents are taken from the z axis instead [1]. Source: DexGraspBench."""
+HARD = 1e4
+"""Weight of an equation that must hold, beside one of weight 1 (ours): it is off by about its inverse square."""
+
+
+def q1(points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], friction: float) -> float:
+    """Radius of the largest ball about the origin within the wrenches of contacts whose normal forces are at most 1 each.
+
+    The wrench space is the convex hull of the contacts' wrenches and of none. Torques are about the mean of the points [m],
+    with their mean distance to it as the unit of length. Zero: some wrench cannot be resisted at all. Normals have length 1 and
+    point from hand to object.
+    """
+    offset = points - points.mean(0)
+    grasp = _grasp_maps(offset / (np.linalg.norm(offset, axis=1).mean() + 1e-6), normals)
+    angles = 2 * np.pi * np.arange(EDGES) / EDGES
+    cone = np.stack([np.ones(EDGES), friction * np.sin(angles), friction * np.cos(angles)])
+    wrenches = (grasp[:, :, :3] @ cone).transpose(0, 2, 1).reshape(-1, 6)
+    try:
+        hull = ConvexHull(np.concatenate([wrenches, np.zeros((1, 6))]))
+    except QhullError:
+        # Flat: there are wrenches that no force resists.
+        return 0.0
+    return float(np.abs(hull.equations[:, 6]).min())
+
+
+def wrench_error(
+    points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], friction: float, torsional: float
+) -> float:
+    """What the best contact forces leave of a force along each half-axis, averaged: the QP form of force closure.
+
+    Forces obey friction, torsional too [m]; no contact presses with more than 1, all together press with at least 1. The error
+    is the length of the remaining wrench, its torque about the mean of the points in metres of lever arm. Points as in `q1`.
+    """
+    n = len(points)
+    edges = np.zeros((6, 6))
+    edges[0] = 1.0
+    edges[1, :2] = edges[2, 2:4] = friction, -friction
+    edges[3, 4:] = torsional, -torsional
+    columns = (_grasp_maps(points - points.mean(0), normals) @ edges).transpose(1, 0, 2).reshape(6, 6 * n)
+    # Inequalities become equations with slacks; all unknowns are then non-negative.
+    system = np.zeros((6 + n + 1, 6 * n + n + 1))
+    system[:6, : 6 * n] = columns
+    system[6:-1, : 6 * n] = HARD * np.kron(np.eye(n), np.ones(6))
+    system[6:-1, 6 * n : -1] = HARD * np.eye(n)
+    system[-1, : 6 * n] = HARD
+    system[-1, -1] = -HARD
+    target, errors = np.zeros(len(system)), []
+    target[6:] = HARD
+    for force in DISTURBANCE * np.concatenate([np.eye(3), -np.eye(3)]):
+        target[:3] = force
+        errors.append(np.linalg.norm(columns @ nnls(system, target)[0][: 6 * n] - target[:6]))
+    return float(np.mean(errors))
+
+
+def _grasp_maps(levers: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 6 6"]:
+    """Force and torque along normal and tangents of each contact, to force and torque at the origin."""
+    along_y = np.abs(normals[:, 1:2]) > ALONG_Y
+    tangent = np.where(along_y, [0.0, 0.0, 1.0], [0.0, 1.0, 0.0])
+    tangent = tangent - (tangent * normals).sum(1, keepdims=True) * normals
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    axes = np.stack([normals, tangent, np.cross(normals, tangent)], -1)
+    maps = np.zeros((len(levers), 6, 6))
+    maps[:, :3, :3] = maps[:, 3:, 3:] = axes
+    maps[:, 3:, :3] = np.cross(levers[:, :, None], axes, axis=1)
+    return maps
+
 
 REACH = 0.01
 """Largest distance that is measured between a finger and the object [m]. Source: DexGraspBench."""
@@ -60,24 +135,14 @@ NAMES = tuple(field.name for field in fields(ContactQuality))
 def measure_contacts(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = PROTOCOLS["dexgraspbench"]
 ) -> ContactQuality:
-    """The analytic metrics of each grasp.
+    """The analytic metrics of each grasp on an object with a mesh; pregrasp and squeeze play no role.
 
-    Args:
-        hand: The hand of the grasps.
-        obj: Their object; it needs a mesh.
-        grasps: Any; pregrasp and squeeze play no role.
-        protocol: States the friction, of which CAUTION is counted on.
-
-    Raises:
-        ObjectError: The object is a bare point cloud.
-        HandError: The hand came without its description.
-        GraspFileError: The grasps are of another hand.
-        OptionError: The protocol does not exist.
+    The protocol states the friction, of which CAUTION is counted on. Errors are those of `simulate`.
     """
-    require_pair(hand, obj)
-    grasps.require_hand(hand)
-    scene = cached_scene(hand, obj, find_protocol(protocol))
-    rows = [_measured(scene, contacts) for contacts in _near_contacts(scene, grasps)]
+    scene = scene_of(hand, obj, grasps, protocol)
+    model = copy.copy(scene.model)
+    model.geom_gap[model.geom_bodyid == scene.object_body] = REACH
+    rows = [_measured(scene, contacts) for contacts in find_contacts(model, scene.qpos(grasps.T_object_wrist, grasps.joints))]
     values = torch.tensor(rows, dtype=torch.float32).reshape(-1, len(NAMES))
     return ContactQuality(*values.unbind(1))
 
@@ -90,32 +155,7 @@ def with_contacts(
     return grasps.replace(extra=grasps.extra | {name: getattr(found, name) for name in NAMES})
 
 
-@dataclass(frozen=True)
-class _Contacts:
-    """k contacts of one configuration."""
-
-    bodies: Int[np.ndarray, "k 2"]
-    distance: Float[np.ndarray, " k"]
-    """Negative inside [m]."""
-    position: Float[np.ndarray, "k 3"]
-    normal: Float[np.ndarray, "k 3"]
-    """From the first body to the second."""
-
-
-def _near_contacts(scene: TrialScene, grasps: GraspBatch) -> list[_Contacts]:
-    """Contacts of each grasp, those of hand and object up to REACH apart."""
-    model = copy.copy(scene.model)
-    model.geom_gap[model.geom_bodyid == scene.object_body] = REACH
-    data, found = mujoco.MjData(model), []
-    for q in scene.qpos(grasps.T_object_wrist, grasps.joints):
-        data.qpos[:] = np.nan_to_num(q)
-        collide(model, data)
-        bodies = model.geom_bodyid[data.contact.geom].reshape(-1, 2)
-        found.append(_Contacts(bodies, data.contact.dist.copy(), data.contact.pos.copy(), data.contact.frame[:, :3].copy()))
-    return found
-
-
-def _measured(scene: TrialScene, contacts: _Contacts) -> tuple[float, ...]:
+def _measured(scene: TrialScene, contacts: Contacts) -> tuple[float, ...]:
     """The metrics of one grasp, in the order of NAMES."""
     hand, rules, obj = scene.hand, scene.protocol, scene.object_body
     on_object = (contacts.bodies == obj).any(1)

@@ -12,17 +12,17 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.descriptions.compiling import collide
+from dro_grasp.devices import Rows
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.hand_part import PREFIX
-from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol, protocol as find_protocol
-from dro_grasp.simulation.scene import TrialScene, cached_scene
+from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
+from dro_grasp.simulation.scene import TrialScene, scene_of
 
 
 @dataclass(frozen=True)
-class Penetration:
+class Penetration(Rows):
     """Penetration in n grasps."""
 
     object: Float[np.ndarray, " n"]
@@ -30,16 +30,12 @@ class Penetration:
     own: Float[np.ndarray, " n"]
     """Summed over pairs of hand links, the deepest contact of each pair [m]."""
 
-    def rows(self, index: Int[np.ndarray, " k"]) -> Penetration:
-        """The penetration in some of the grasps."""
-        return Penetration(self.object[index], self.own[index])
-
 
 def measure_penetration(scene: TrialScene, grasps: GraspBatch) -> Penetration:
     """Penetration of the collision shapes in the labelled pose, without any step of time."""
     depth, own = np.zeros(len(grasps)), np.zeros(len(grasps))
-    for i, (bodies, distance) in enumerate(_contacts(scene, scene.qpos(grasps.T_object_wrist, grasps.joints))):
-        inside = np.maximum(-distance, 0.0)
+    for i, contacts in enumerate(find_contacts(scene.model, scene.qpos(grasps.T_object_wrist, grasps.joints))):
+        inside, bodies = np.maximum(-contacts.distance, 0.0), contacts.bodies
         with_object = (bodies == scene.object_body).any(1)
         depth[i] = inside[with_object].max(initial=0.0)
         deepest: dict[tuple[int, int], float] = {}
@@ -54,21 +50,9 @@ def deepest_penetration(
 ) -> Float[Tensor, " n"]:
     """Penetration of hand and object, or summed over pairs of the hand's links, the deeper one, in the labelled pose [m].
 
-    Args:
-        hand: The hand of the grasps.
-        obj: Their object, with a mesh or with balls.
-        grasps: Any; pregrasp and squeeze play no role.
-        protocol: Of the scene; its forces play no role.
-
-    Raises:
-        ObjectError: The object is a bare point cloud, without balls that stand for it.
-        HandError: The hand came without its description.
-        GraspFileError: The grasps are of another hand.
-        OptionError: The protocol does not exist.
+    Pregrasp, squeeze and the protocol's forces play no role. Errors are those of `simulate`.
     """
-    require_pair(hand, obj)
-    grasps.require_hand(hand)
-    found = measure_penetration(cached_scene(hand, obj, find_protocol(protocol)), grasps)
+    found = measure_penetration(scene_of(hand, obj, grasps, protocol), grasps)
     return torch.as_tensor(np.maximum(found.object, found.own), dtype=torch.float32)
 
 
@@ -76,8 +60,8 @@ def find_contact_links(scene: TrialScene, qpos: Float[np.ndarray, "n nq"]) -> tu
     """Names of the links that touch the object in each configuration, sorted."""
     names = [scene.model.body(i).name.removeprefix(PREFIX) for i in range(scene.model.nbody)]
     found = []
-    for bodies, _ in _contacts(scene, qpos):
-        involved = bodies[(bodies == scene.object_body).any(1)]
+    for contacts in find_contacts(scene.model, qpos):
+        involved = contacts.bodies[(contacts.bodies == scene.object_body).any(1)]
         found.append(tuple(sorted({names[i] for i in involved[involved != scene.object_body]})))
     return tuple(found)
 
@@ -98,12 +82,23 @@ def count_fingers(hand: Hand, contact_links: Sequence[Sequence[str]]) -> Int[Ten
     return torch.stack(fingers).sum(0) if fingers else mask.new_zeros(len(mask), dtype=torch.int64)
 
 
-def _contacts(
-    scene: TrialScene, qpos: Float[np.ndarray, "n nq"]
-) -> Iterator[tuple[Int[np.ndarray, "k 2"], Float[np.ndarray, " k"]]]:
-    """The two bodies and the distance [m] of each contact, one configuration after the other."""
-    data = mujoco.MjData(scene.model)
+@dataclass(frozen=True)
+class Contacts:
+    """k contacts of one configuration."""
+
+    bodies: Int[np.ndarray, "k 2"]
+    distance: Float[np.ndarray, " k"]
+    """Negative inside [m]."""
+    position: Float[np.ndarray, "k 3"]
+    normal: Float[np.ndarray, "k 3"]
+    """From the first body to the second."""
+
+
+def find_contacts(model: mujoco.MjModel, qpos: Float[np.ndarray, "n nq"]) -> Iterator[Contacts]:
+    """The contacts of one configuration after the other, without any step of time."""
+    data = mujoco.MjData(model)
     for q in qpos:
         data.qpos[:] = np.nan_to_num(q)
-        collide(scene.model, data)
-        yield scene.model.geom_bodyid[data.contact.geom].reshape(-1, 2), data.contact.dist.copy()
+        collide(model, data)
+        found, bodies = data.contact, model.geom_bodyid[data.contact.geom].reshape(-1, 2)
+        yield Contacts(bodies, found.dist.copy(), found.pos.copy(), found.frame[:, :3].copy())

@@ -10,16 +10,18 @@ from dataclasses import dataclass, fields
 import mujoco
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
+from dro_grasp.devices import Rows
 from dro_grasp.geometry.contact_forces import friction_cone, nonnegative_least_squares
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.outcome import FORCES
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
-from dro_grasp.simulation.rollout import Rollout, quiet, rollouts, scene_of
+from dro_grasp.simulation.rollout import Rollout, quiet, rollouts
+from dro_grasp.simulation.scene import scene_of
 
 CONTACTS = 16
 """Most contacts of a grasp that are weighed, those that press hardest (ours)."""
@@ -46,7 +48,7 @@ NO_ANSWER = 3.0
 
 
 @dataclass(frozen=True)
-class Holding:
+class Holding(Rows):
     """How the object is held in n closed grasps."""
 
     shift: Float[Tensor, " n"]
@@ -67,10 +69,6 @@ class Holding:
     """Largest ratio of tangential to normal force at a contact that bears; NO_ANSWER without one."""
     unanswered: Float[Tensor, "n 2"]
     """What is missing for contacts near their present forces to answer a push: for the worst direction, and on average."""
-
-    def rows(self, index: Bool[Tensor, " n"]) -> Holding:
-        """Some of the grasps."""
-        return Holding(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
 
 @dataclass(frozen=True)
@@ -97,21 +95,7 @@ class ContactForces:
 def holding(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *, workers: int | None = None
 ) -> Holding:
-    """Close hands as a trial does, and look at what holds the object then.
-
-    Args:
-        hand: The hand of the grasps.
-        obj: Their object, with a mesh or with balls.
-        grasps: The controller makes each pregrasp and squeeze that a grasp does not state.
-        protocol: Its closing, friction and servos.
-        workers: Threads; all cores by default. The result does not depend on it.
-
-    Raises:
-        ObjectError: The object is a bare point cloud, without balls that stand for it.
-        HandError: The hand came without its description.
-        GraspFileError: The grasps are of another hand.
-        OptionError: The protocol does not exist.
-    """
+    """Close hands as a trial does, and look at what holds the object then; arguments and errors are those of `simulate`."""
     scene = scene_of(hand, obj, grasps, protocol)
     parts = [Holding(**{f.name: torch.zeros(0, 2) if f.name == "unanswered" else torch.zeros(0) for f in fields(Holding)})]
     parts += [_observed(rollout) for _, rollout in rollouts(scene, hand, grasps, workers)]

@@ -25,7 +25,6 @@ class Perturbations(Checked):
     """
 
     trials: int = 1
-    """Trials of each grasp."""
     needed: int = 1
     """Trials that a success holds in."""
     coarse: int = 0
@@ -42,11 +41,7 @@ class Perturbations(Checked):
     """Factor of the servos' stiffness and damping."""
 
     def __post_init__(self) -> None:
-        """Refuse numbers that make no sense.
-
-        Raises:
-            OptionError: A value is out of range.
-        """
+        """Refuse numbers that make no sense: OptionError."""
         super().__post_init__()
         if not (1 <= self.needed <= self.trials and 0 <= self.coarse < self.trials):
             raise OptionError(f"{self.trials} trials, {self.needed} of them needed and {self.coarse} coarse; "
@@ -118,14 +113,9 @@ class Protocol(Checked):
     lever: float = 0.03
     """Lever arm of sliding joints [m]: they get the servo of a turning joint that acts at this distance."""
     perturbations: Perturbations = field(default_factory=Perturbations)
-    """Further trials of each grasp, under other conditions."""
 
     def __post_init__(self) -> None:
-        """Refuse a name that labels could not be told apart with.
-
-        Raises:
-            OptionError: As said.
-        """
+        """Refuse a name that labels could not be told apart with: OptionError."""
         if not NAME.fullmatch(self.name):
             raise OptionError(f"'{self.name}' is no name of a protocol; use letters, digits, '_', '-' and '.'")
 
@@ -189,11 +179,7 @@ DEFAULT_PROTOCOL = "strict"
 
 
 def protocol(name: str | Protocol) -> Protocol:
-    """The protocol of a name; a Protocol is returned unchanged.
-
-    Raises:
-        OptionError: No protocol has this name.
-    """
+    """The protocol of a name; a Protocol is returned unchanged. OptionError: no protocol has this name."""
     if isinstance(name, Protocol):
         return name
     if name not in PROTOCOLS:
@@ -202,12 +188,7 @@ def protocol(name: str | Protocol) -> Protocol:
 
 
 def changed(name: str | Protocol, *, friction: float | None = None, mass_factor: float = 1.0) -> Protocol:
-    """A protocol with another friction or mass.
-
-    Args:
-        name: The protocol.
-        friction: Coefficient between hand and object; None keeps the protocol's.
-        mass_factor: Multiplies the object's mass.
+    """A protocol with another friction, unless that is None, or with another multiple of the object's mass.
 
     Raises:
         OptionError: A value is out of range, or no protocol has the name.

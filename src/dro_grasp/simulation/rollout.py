@@ -1,7 +1,8 @@
-"""The moving part of a trial: close the hand on the object, then push the object."""
+"""The moving part of a trial: close the hand on the object, then push the object, under the conditions of one trial."""
 
 from __future__ import annotations
 
+import hashlib
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,17 +13,74 @@ import mujoco.batch
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
-from dro_grasp.devices import cores
+from dro_grasp.devices import Rows, cores
+from dro_grasp.geometry import se3
+from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import completed
-from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
-from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.outcome import FORCES, GIVE_UP
-from dro_grasp.simulation.perturbation import Conditions
-from dro_grasp.simulation.protocols import Protocol, protocol as find_protocol
-from dro_grasp.simulation.scene import TrialScene, cached_scene, object_mass
+from dro_grasp.simulation.protocols import Perturbations
+from dro_grasp.simulation.scene import TrialScene, object_mass
+
+FACTORS = ("friction", "mass", "gain")
+"""Conditions that are factors, as in Perturbations."""
+
+RESOLUTION = 1e-4
+"""Grasps that agree to this have the same draws [m or rad]. Ours: another machine rounds otherwise."""
+
+
+@dataclass(frozen=True)
+class Conditions(Rows):
+    """What differs from the protocol in n trials; the factors are those of Perturbations."""
+
+    shift: Float[np.ndarray, "n 3"]
+    """Displacement of the object, in its own frame [m]."""
+    turn: Float[np.ndarray, "n 3"]
+    """Rotation vector of the object about its centre of mass, in its own frame [rad]."""
+    friction: Float[np.ndarray, " n"]
+    mass: Float[np.ndarray, " n"]
+    gain: Float[np.ndarray, " n"]
+
+    def displaced(self, grasps: GraspBatch, centre_of_mass: Float[np.ndarray, "3"]) -> GraspBatch:
+        """The grasps with each object moved away from where it is expected; the hand does not know."""
+        centre = torch.from_numpy(centre_of_mass)
+        rotation = roma.rotvec_to_rotmat(torch.from_numpy(self.turn))
+        T = se3.compose(rotation, centre + torch.from_numpy(self.shift) - rotation @ centre)
+        moved = se3.invert(T) @ grasps.T_object_wrist.double()
+        return grasps.replace(T_object_wrist=moved.to(grasps.T_object_wrist.dtype))
+
+
+def draw(config: Perturbations, grasps: GraspBatch) -> Conditions:
+    """Conditions of all trials but the first: the second trial of every grasp, then the third, and so on.
+
+    A grasp's position and joints are the seed of its draws, so they depend neither on its company nor on a file between.
+    """
+    k = config.trials - 1
+    drawn = [_draw(config, k, _generator(p, q)) for p, q in zip(grasps.T_object_wrist[:, :3, 3], grasps.joints, strict=True)]
+    columns = {name: np.stack([d[name] for d in drawn], 1) for name in ("shift", "turn", *FACTORS)}
+    return Conditions(**{name: column.reshape(-1, *column.shape[2:]) for name, column in columns.items()})
+
+
+def _generator(position: Float[Tensor, "3"], joints: Float[Tensor, " n_dof"]) -> np.random.Generator:
+    content = (torch.cat([position, joints]).double() / RESOLUTION).round().long().numpy().tobytes()
+    return np.random.default_rng(int.from_bytes(hashlib.sha256(content).digest()[:16], "big"))
+
+
+def _draw(config: Perturbations, k: int, generator: np.random.Generator) -> dict[str, Float[np.ndarray, "k *_"]]:
+    """Conditions of k trials of one grasp; each factor takes one value from each of k equal parts of its range."""
+    drawn = {}
+    for name, size in (("shift", config.shift), ("turn", config.turn)):
+        direction = generator.normal(size=(k, 3))
+        drawn[name] = size * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    for name in FACTORS:
+        low, high = getattr(config, name)
+        share = (generator.permutation(k) + generator.random(k)) / k
+        drawn[name] = low * (high / low) ** share
+    return drawn
+
 
 RAMP = 10
 """Number of stages in which a gradual protocol moves the servos' targets from one posture to the next. Ours."""
@@ -33,7 +91,7 @@ STATE = ("qpos", "qvel", "qacc_warmstart")
 
 
 @dataclass(frozen=True)
-class ObjectState:
+class ObjectState(Rows):
     """The object in n trials, in the wrist frame."""
 
     position: Float[np.ndarray, "n 3"]
@@ -54,10 +112,6 @@ class ObjectState:
         sine = np.linalg.norm(np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], 1), axis=1)
         return np.arctan2(sine, np.trace(relative, axis1=1, axis2=2) - 1)
 
-    def rows(self, index: Int[np.ndarray, " k"]) -> ObjectState:
-        """The state in some of the trials."""
-        return ObjectState(self.position[index], self.rotation[index], self.stable[index])
-
 
 class Rollout:
     """Trials of several grasps side by side; each hand waits at its start."""
@@ -69,7 +123,6 @@ class Rollout:
         """Place hands and objects.
 
         Args:
-            scene: TrialScene of the hand and the object.
             grasps: At least one; each states its pregrasp and squeeze if the protocol closes the hand.
             workers: Threads.
             stride: Record a frame every so many time steps; None records nothing.
@@ -169,7 +222,6 @@ class Rollout:
         self.batch.set_const()
 
     def _steps(self, seconds: float) -> int:
-        """Time steps of a duration."""
         return round(seconds / self.scene.protocol.timestep)
 
     def _set_force(self, axis: Float[np.ndarray, "3"], rows: Int[np.ndarray, " k"]) -> None:
@@ -186,13 +238,6 @@ class Rollout:
                 self.batch.step(rows.tolist(), nstep=min(stride, steps - done))
                 if self.stride is not None:
                     self.frames.append(self.poses())
-
-
-def scene_of(hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol) -> TrialScene:
-    """The scene in which the grasps are simulated."""
-    require_pair(hand, obj)
-    grasps.require_hand(hand)
-    return cached_scene(hand, obj, find_protocol(protocol))
 
 
 def rollouts(

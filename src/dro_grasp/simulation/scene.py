@@ -18,11 +18,13 @@ from torch import Tensor
 from dro_grasp.descriptions.compiling import collide
 from dro_grasp.errors import HandError, ObjectError
 from dro_grasp.geometry.se3 import roma
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.opening import open_side_by_side
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.hand_part import HULL_VERTICES, add_servos, attach, hand_spec, joint_addresses, servo_joints
-from dro_grasp.simulation.protocols import Protocol
+from dro_grasp.simulation.protocols import Protocol, protocol as find_protocol
 
 SOLVER_ITERATIONS = 20
 """Most iterations of the contact solver. Ours: trials usually need two, and a hundred give the same verdicts."""
@@ -91,12 +93,7 @@ class SceneKey:
 
 
 def cached_scene(hand: Hand, obj: ObjectModel, protocol: Protocol) -> TrialScene:
-    """The scene of a pair; the process keeps the last few, least recently used first to go.
-
-    Raises:
-        ObjectError: The object is a bare point cloud, without balls that stand for it.
-        HandError: The hand came without its description.
-    """
+    """The scene of a pair; the process keeps the last few, least recently used first to go. Errors as below."""
     require_simulable(hand, obj)
     return _build_once(SceneKey(hand.sha256, obj.solid_sha256, protocol, hand, obj))
 
@@ -104,6 +101,13 @@ def cached_scene(hand: Hand, obj: ObjectModel, protocol: Protocol) -> TrialScene
 @lru_cache(maxsize=CACHED_SCENES)
 def _build_once(key: SceneKey) -> TrialScene:
     return build_scene(key.hand, key.obj, key.protocol)
+
+
+def scene_of(hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol) -> TrialScene:
+    """The scene in which the grasps are simulated; errors are those of `simulate`."""
+    require_pair(hand, obj)
+    grasps.require_hand(hand)
+    return cached_scene(hand, obj, find_protocol(protocol))
 
 
 def require_simulable(hand: Hand, obj: ObjectModel) -> None:
@@ -188,17 +192,13 @@ def _exclude_resting_contacts(scene: mujoco.MjSpec, hand: Hand) -> None:
         q = open_side_by_side(hand, openness)
         data.qpos[addresses] = (hand.tree.coupling @ q + hand.tree.offset).numpy()[moving]
         collide(model, data)
-        pairs |= {_pair(model, int(a), int(b)) for a, b in data.contact.geom}
+        pairs |= {_named(model, *map(int, model.geom_bodyid[geoms])) for geoms in data.contact.geom}
     for body in range(1, model.nbody):
         parent = int(model.body_parentid[body])
         if parent > 0 and model.body_weldid[parent] == 0:
             pairs |= {_named(model, body, other) for other in range(1, model.nbody) if model.body_weldid[other] == 0}
     for first, second in sorted(p for p in pairs if p[0] != p[1] and "object" not in p):
         scene.add_exclude(bodyname1=first, bodyname2=second)
-
-
-def _pair(model: mujoco.MjModel, a: int, b: int) -> tuple[str, str]:
-    return _named(model, int(model.geom_bodyid[a]), int(model.geom_bodyid[b]))
 
 
 def _named(model: mujoco.MjModel, a: int, b: int) -> tuple[str, str]:

@@ -20,10 +20,9 @@ from dro_grasp.kinds import checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.contacts import Penetration, count_fingers, find_contact_links, measure_penetration
 from dro_grasp.simulation.outcome import DIRECTIONS, GIVE_UP, Failure, Measurements, TrialResult, verdict
-from dro_grasp.simulation.perturbation import draw
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
-from dro_grasp.simulation.rollout import Rollout, rollouts, scene_of
-from dro_grasp.simulation.scene import TrialScene, cached_scene
+from dro_grasp.simulation.rollout import Rollout, draw, rollouts
+from dro_grasp.simulation.scene import TrialScene, cached_scene, scene_of
 
 __all__ = ["DIRECTIONS", "Failure", "TrialResult", "record", "simulate"]
 
@@ -67,26 +66,16 @@ def record(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, index: int, protocol: str | Protocol = DEFAULT_PROTOCOL, *,
     stride: int = 10,
 ) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames n_dof"]]:
-    """Frames of one grasp's trial, as `simulate` runs it: it ends where the trial ends.
+    """Frames of one grasp's trial, as `simulate` runs it: it ends where the trial ends; arguments and errors are the same.
 
     Of several trials under a protocol that perturbs, it is the one that `simulate` measures.
 
     Args:
-        hand: The hand of the grasps.
-        obj: Their object; it needs a mesh.
-        grasps: As in `simulate`.
         index: Which grasp.
-        protocol: As in `simulate`.
         stride: Time steps between two frames; the end of closing and of each force gets a frame in any case.
 
     Returns:
         Object poses in the wrist frame [m], and joints [rad or m].
-
-    Raises:
-        ObjectError: The object is a bare point cloud.
-        HandError: The hand came without its description.
-        GraspFileError: The grasps are of another hand.
-        OptionError: The protocol does not exist.
     """
     scene = scene_of(hand, obj, grasps, protocol)
     (grasp, rollout), = rollouts(scene, hand, grasps[index], workers=1, stride=stride)

@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
-from dro_grasp.export.contents import Frame
 from dro_grasp.export.formats import FORMATS, ExportJob
+from dro_grasp.export.writers import Frame
 from dro_grasp.frames import HALF_AXES, half_axis
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import CONTACT_LINKS, REASON

@@ -29,7 +29,6 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pictures import appearance
 from dro_grasp.rendering.rasterizer import OBJECT_COLOUR, Camera, Colour
-from dro_grasp.viewer import appearance
 from dro_grasp.web.origins import own_names, refusal
 
 MAX_CONNECTIONS = 64

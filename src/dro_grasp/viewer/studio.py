@@ -27,7 +27,7 @@ from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.registry import source_names
 from dro_grasp.predict.stages import evaluate
-from dro_grasp.simulation.diagnosis import diagnose
+from dro_grasp.simulation.outcome import diagnose
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 from dro_grasp.viewer.constraint_panel import OBJECT_FILES, ConstraintPanel
 from dro_grasp.viewer.grasp_page import GraspPage, ShownGrasps

@@ -13,8 +13,8 @@ from dro_grasp.datasets.engine.shards import Yield, find_shards, read_yield
 from dro_grasp.errors import GraspFileError
 from dro_grasp.files import given_path
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.grasp_file import read_footer
 from dro_grasp.grasps.sources import hand_of, object_of, pair_keys, require_same
-from dro_grasp.grasps.table import read_footer
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import checked
 from dro_grasp.objects.shape import ObjectModel

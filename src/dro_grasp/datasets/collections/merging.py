@@ -18,12 +18,10 @@ from dro_grasp.datasets.engine.shards import Yield
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.files import check_output, replacing
 from dro_grasp.geometry.se3 import compose, roma
-from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.codec import encode
+from dro_grasp.grasps.batch import GraspBatch, distinct
 from dro_grasp.grasps.columns import CAMERA, FAILURE, OBJECT_SCALE, POSTURES, REASON
-from dro_grasp.grasps.duplicates import distinct
+from dro_grasp.grasps.grasp_file import encode, table_bytes
 from dro_grasp.grasps.sources import hand_of
-from dro_grasp.grasps.table import table_bytes
 from dro_grasp.hands.hand import Hand
 
 POSITION_STEP = 2.0**-16

@@ -23,7 +23,7 @@ from filelock import FileLock, Timeout
 from dro_grasp._version import __version__
 from dro_grasp.errors import GraspFileError, OutputError
 from dro_grasp.files import replacing
-from dro_grasp.grasps.table import read_footer
+from dro_grasp.grasps.grasp_file import read_footer
 
 LOCK = ".lock"
 """File in a data set's folder that a run locks while it fills the folder; one for each part of a run that is divided."""

@@ -16,16 +16,15 @@ from dro_grasp.datasets.bundle.training_file import split_of
 from dro_grasp.datasets.engine.shards import Shard, Yield, notes_of
 from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.errors import OptionError
-from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.batch import GraspBatch, distinct
 from dro_grasp.grasps.columns import DEPTH, RELABELLED
-from dro_grasp.grasps.duplicates import distinct
 from dro_grasp.grasps.sources import with_sources
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimization.finger_closing import close_idle_fingers
+from dro_grasp.optimization.fingers import close_idle_fingers
 from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
 from dro_grasp.simulation.closed_poses import hand_shift, settle
 from dro_grasp.simulation.protocols import Protocol

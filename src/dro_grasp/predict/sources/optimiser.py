@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
-from dro_grasp.energy.contact_candidates import ContactConfig
+from dro_grasp.energy.contacts import ContactConfig
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.kinds import Checked
 from dro_grasp.optimization.starts import StartConfig

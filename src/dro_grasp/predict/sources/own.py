@@ -8,8 +8,7 @@ from typing import Any
 import torch
 
 from dro_grasp.errors import DroGraspError, GraspFileError, OptionError
-from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.reading import load_grasps
+from dro_grasp.grasps.batch import GraspBatch, load_grasps
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.problem import GraspProblem

@@ -1,4 +1,4 @@
-"""How refined grasps close: joint targets whose contact forces balance.
+"""The squeeze of refined grasps: joint targets whose contact forces balance.
 
 A hand that bends every joint by a share of its range pushes the object away where its fingers do not oppose each other. Here
 the forces come first: at the contacts, within friction cones, without a net wrench on the object, shared by the fingers. The
@@ -15,13 +15,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from dro_grasp.energy.grasp_energy import GraspEnergy
-from dro_grasp.energy.nearest_points import NearestPoints
+from dro_grasp.energy.grasp_energy import GraspEnergy, NearestPoints
 from dro_grasp.geometry.contact_forces import friction_cone, nonnegative_least_squares
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
 from dro_grasp.kinds import Checked
-from dro_grasp.optimization.finger_closing import finger_joints
+from dro_grasp.optimization.fingers import finger_joints
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,6 @@ class GripConfig(Checked):
     friction: float = 0.4
     """Coefficient of friction that the forces rely on; less than there will be."""
     edges: int = 6
-    """Edges of a friction cone."""
     force: float = 10.0
     """Sum of the normal forces [N]."""
     stiffness: float = 3.0
@@ -49,19 +47,14 @@ class GripConfig(Checked):
     idle: float = 0.7
     """The same for fingers that do not touch, and for those that share their joints."""
     iterations: int = 200
-    """Steps of the solver."""
     batch_size: int = 64
-    """Grasps treated at once."""
 
 
 @torch.no_grad()
 def gripping(energy: GraspEnergy, grasps: GraspBatch, config: GripConfig | None = None) -> GraspBatch:
     """The same grasps with pregrasp and squeeze: the usual pregrasp, and a squeeze of balanced forces.
 
-    Args:
-        energy: Of the grasps' hand on their object.
-        grasps: Grasps whose fingers touch, as after refinement; a squeeze that they state is replaced.
-        config: Contacts, forces and servos.
+    Their fingers touch, as after refinement; a squeeze that they state is replaced.
     """
     config = config or GripConfig()
     made = [_targets(energy, part, config) for part in grasps.in_parts(config.batch_size)]
@@ -100,16 +93,8 @@ def contact_forces(
 ) -> Float[Tensor, "n l 3"]:
     """Forces of the links on the object [N]: inside their friction cones, balanced as well as possible.
 
-    They minimise the squared net wrench, with torques about `centre` over `length`; the fingers that touch share the force
-    about equally, and links of no finger, such as the palm, answer with any force.
-
-    Args:
-        near: The contacts.
-        touches: Which of them touch.
-        finger: The links of each finger.
-        centre: The object's centre of mass [m].
-        length: Typical distance of its surface from there [m].
-        config: Weights and friction.
+    They minimise the squared net wrench, with torques about `centre` over `length` [m]; the fingers that touch share the force
+    about equally, and links of no finger, such as the palm, answer with any force. `touches` says which of the contacts touch.
     """
     n, count = len(near.gap), min(config.contacts, near.gap.shape[1])
     kept = torch.where(touches, near.gap, torch.inf).topk(count, largest=False).indices

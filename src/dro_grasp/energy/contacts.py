@@ -1,4 +1,4 @@
-"""Candidate contacts: points on the inner sides of a hand's fingers and palm, and the slots that draw from them."""
+"""Points and spheres on a hand's links, and the candidates from which contacts are drawn."""
 
 from __future__ import annotations
 
@@ -8,9 +8,103 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from dro_grasp.geometry import se3
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.opening import open_side_by_side
 from dro_grasp.kinds import Checked
+
+
+@dataclass(frozen=True)
+class LinkPoints:
+    """Points fixed to links, laid out so that one matrix product places them all.
+
+    The poses of a grasp, as one row of 4 n_links entries for each of x, y and z, times the layout give the coordinates of all
+    points: each point's column holds its homogeneous coordinates in the four rows of its own link, and zeros elsewhere.
+    """
+
+    layout: Float[Tensor, "rows p"]
+    """The columns; rows is 4 n_links [m]."""
+    members: Float[Tensor, "p n_links"]
+    """One-hot link of each point."""
+
+    @staticmethod
+    def of(local: Float[Tensor, "p 3"], links: Int[Tensor, " p"], n_links: int) -> LinkPoints:
+        """Lay out points given in their links' frames."""
+        members = torch.eye(n_links, dtype=local.dtype, device=local.device)[links]
+        homogeneous = torch.cat([local, torch.ones_like(local[:, :1])], -1)
+        layout = (members[:, :, None] * homogeneous[:, None, :]).flatten(1).T.contiguous()
+        return LinkPoints(layout, members)
+
+    def place(self, poses: Float[Tensor, "n n_links 4 4"]) -> Float[Tensor, "n p 3"]:
+        """The points in the world [m]."""
+        rows = poses[:, :, :3].transpose(1, 2).reshape(3 * len(poses), -1)
+        return (rows @ self.layout).unflatten(0, (-1, 3)).mT
+
+
+@dataclass(frozen=True)
+class LinkSpheres:
+    """Spheres that fill the links, and the pairs of them that must not overlap."""
+
+    centres: Float[Tensor, "s 3"]
+    """In their links' frames [m]."""
+    radii: Float[Tensor, " s"]
+    """[m]"""
+    links: Int[Tensor, " s"]
+    pairs: Int[Tensor, "k 2"]
+
+
+def link_spheres(hand: Hand) -> LinkSpheres:
+    """Spheres along the longest axis of each link, from its surface points.
+
+    Pairs on links of one rigid group or of neighbouring groups, and pairs that overlap in the open hand, fingers side by side,
+    may touch.
+    """
+    centres, radii, links = [], [], []
+    for link in hand.link_index.unique().tolist():
+        points = hand.link_points[hand.link_index == link]
+        if len(points) < 4:
+            continue
+        for centre, radius in _fill(points):
+            centres.append(centre)
+            radii.append(radius)
+            links.append(link)
+    centre, radius, link_of = torch.stack(centres), torch.stack(radii), torch.tensor(links)
+    pairs = torch.combinations(torch.arange(len(links)), 2)
+    near = _neighbours(hand)
+    pairs = pairs[~near[link_of[pairs[:, 0]], link_of[pairs[:, 1]]]]
+    poses = hand.tree.forward(open_side_by_side(hand, 0.9))[link_of]
+    placed = se3.apply(poses, centre)
+    apart = (placed[pairs[:, 0]] - placed[pairs[:, 1]]).norm(dim=-1)
+    pairs = pairs[apart > radius[pairs[:, 0]] + radius[pairs[:, 1]]]
+    return LinkSpheres(centre, radius, link_of, pairs)
+
+
+def _fill(points: Float[Tensor, "n 3"]) -> list[tuple[Float[Tensor, "3"], Float[Tensor, ""]]]:
+    """Centres [m] and radii [m] of spheres along the longest axis of a set of surface points."""
+    middle = (points.amin(0) + points.amax(0)) / 2
+    axes = torch.linalg.svd(points - points.mean(0), full_matrices=False)[2]
+    local = (points - middle) @ axes.T
+    low, high = local.amin(0), local.amax(0)
+    half = (high - low) / 2
+    radius = half[1:].amin().clamp_min(0.002)
+    count = max(1, min(6, round(float(half[0] / radius))))
+    along = (high[0] + low[0]) / 2 + (half[0] - radius).clamp_min(0) * torch.linspace(-1, 1, count)
+    if count == 1:
+        along = ((high[0] + low[0]) / 2)[None]
+    across = (high + low) / 2
+    return [(middle + torch.stack([a, across[1], across[2]]) @ axes, radius) for a in along]
+
+
+def _neighbours(hand: Hand) -> Bool[Tensor, "n_links n_links"]:
+    """Whether at most one moving joint lies between two links."""
+    group = torch.tensor(hand.rigid_group)
+    adjacent = torch.eye(hand.tree.n_links, dtype=torch.bool)
+    for link, parent in enumerate(hand.tree.parent):
+        if parent >= 0:
+            above, below = hand.rigid_group[parent], hand.rigid_group[link]
+            adjacent[above, below] = adjacent[below, above] = True
+    return adjacent[group[:, None], group]
 
 
 @dataclass(frozen=True)
@@ -41,7 +135,6 @@ class ContactCandidates:
     normals: Float[Tensor, "k 3"]
     """Outward unit normals in their links' frames."""
     links: Int[Tensor, " k"]
-    """The link of each candidate."""
     fingers: Int[Tensor, " k"]
     """Index of the finger of each candidate, or PALM."""
     slot_weights: Float[Tensor, "n_slots k"]

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy, Room
-from dro_grasp.energy.surroundings import Surroundings
+from dro_grasp.energy.workspace import Surroundings
 from dro_grasp.geometry.distance_field import Balls
 from dro_grasp.geometry.se3 import turned_about
 from dro_grasp.grasps.controller_config import ControllerConfig

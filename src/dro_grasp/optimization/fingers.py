@@ -1,16 +1,21 @@
-"""Idle fingers close: whatever of a finger touches nothing moves alone until it meets the object, or rests.
+"""Fingers close on an object that they do not touch, and stand clear of a surface that is an estimate.
 
 A person holds with all fingers that reach, and bends the others beside them. Neither the network nor the descent of the
 energy sees to that: the energy's few contacts choose the fingers that are near anyway. Differs from the paper, which leaves
 idle fingers where the network puts them.
+
+A camera sees one side of an object. The other side is a guess that errs by some millimetres, and by more the farther it is from
+what was seen. Fingers that rest on the guess end up inside the object, so each opens until it leaves room. Ours.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from dro_grasp.energy import terms as energies
@@ -39,7 +44,6 @@ class ClosingConfig(Checked):
     overlap: float = 0.001
     """Most that the self-penetration of a grasp may grow [m]."""
     batch_size: int = 64
-    """Grasps treated at once."""
 
 
 @torch.no_grad()
@@ -50,11 +54,6 @@ def close_idle_fingers(energy: GraspEnergy, grasps: GraspBatch, config: ClosingC
     Of a finger that touches the object, the joints bend that move none of its touching links. What still meets nothing rests:
     bent as far as the fingers that hold, on average.
     Whatever belongs to the grasps before (pregrasp, squeeze, scores, energies, outcomes) is dropped.
-
-    Args:
-        energy: Of the grasps' hand on their object.
-        grasps: Any grasps of the two.
-        config: Distances and steps.
     """
     config = config or ClosingConfig()
     if not len(grasps):
@@ -101,23 +100,15 @@ class _Closer:
         rows = waiting.any(1)
         if not bool(rows.any()):
             return q, waiting
-        some = replace(self, T=self.T[rows])
-        new_q, still = some.all_waiting(q[rows], start[rows], moving[rows], waiting[rows])
-        return q.index_put((rows,), new_q), waiting.index_put((rows,), still)
-
-    def all_waiting(
-        self, q: Float[Tensor, "n n_dof"], start: Float[Tensor, "n n_dof"], moving: Bool[Tensor, "n n_tips n_dof"],
-        waiting: Bool[Tensor, "n n_tips"],
-    ) -> tuple[Float[Tensor, "n n_dof"], Bool[Tensor, "n n_tips"]]:
-        """`contact` of grasps each of which has a finger that waits."""
-        waiting = waiting.clone()
-        share, meets = self.first_contact(start, moving)
-        for finger in (meets & waiting).any(0).nonzero()[:, 0].tolist():
-            new = torch.where(self.bends[finger], self.along(start, moving[:, finger], share[:, finger, None]), q)
-            kept = (meets & waiting)[:, finger] & self.roomy(new, q)
-            q = torch.where(kept[:, None], new, q)
-            waiting[:, finger] &= ~kept
-        return q, waiting
+        some, now, still = replace(self, T=self.T[rows]), q[rows], waiting[rows]
+        start, moving = start[rows], moving[rows]
+        share, meets = some.first_contact(start, moving)
+        for finger in (meets & still).any(0).nonzero()[:, 0].tolist():
+            new = torch.where(self.bends[finger], self.along(start, moving[:, finger], share[:, finger, None]), now)
+            kept = (meets & still)[:, finger] & some.roomy(new, now)
+            now = torch.where(kept[:, None], new, now)
+            still[:, finger] &= ~kept
+        return q.index_put((rows,), now), waiting.index_put((rows,), still)
 
     def rest(
         self, q: Float[Tensor, "n n_dof"], moving: Bool[Tensor, "n n_tips n_dof"], waiting: Bool[Tensor, "n n_tips"],
@@ -204,9 +195,7 @@ class _Closer:
         return energies.self_penetration(centres, energy.spheres.radii, energy.spheres.pairs).value.sum(-1)
 
 
-def body_points(
-    energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"]
-) -> Float[Tensor, "n p 3"]:
+def body_points(energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"]) -> Float[Tensor, "n p 3"]:
     """The hand's surface points, for wrist poses and joints on the energy's device [m]."""
     return energy.body.place(T[:, None] @ energy.hand.tree.forward(q))
 
@@ -234,3 +223,78 @@ def _first(hand: Hand, bends: Bool[Tensor, "n_tips n_dof"]) -> Bool[Tensor, "n_t
     moved = torch.where(bends, hand.tree.moves.sum(0), 0)
     first = torch.zeros_like(bends)
     return first.scatter(1, moved.argmax(1, keepdim=True), True) & bends
+
+
+@dataclass(frozen=True)
+class EasingConfig(Checked):
+    """How much room fingers leave (ours)."""
+
+    clearance: float = 0.004
+    """Distance from which on a finger stands clear [m]: 6 mm cost a little where the cloud is whole."""
+    unseen: float = 0.015
+    """The same at most, where the surface is a guess: as far as it is from the nearest point that was seen [m]."""
+    steps: int = 11
+    """Samples of the way from the grasp to the pregrasp."""
+    batch_size: int = 64
+
+
+@torch.no_grad()
+def ease_fingers(
+    energy: GraspEnergy, grasps: GraspBatch, seen: Float[np.ndarray, "m 3"] | None = None, config: EasingConfig | None = None
+) -> GraspBatch:
+    """The grasps with fingers clear of the object, as far as their pregrasps open; wrist, pregrasp and squeeze stay.
+
+    `seen` are points of the object that were seen, where the rest is a guess [m].
+    """
+    config, tree = config or EasingConfig(), None if seen is None else KDTree(seen)
+    if not len(grasps):
+        return grasps
+    return grasps.replace(joints=torch.cat([_eased(energy, part, tree, config) for part in grasps.in_parts(config.batch_size)]))
+
+
+@torch.no_grad()
+def lacking_room(
+    energy: GraspEnergy, grasps: GraspBatch, seen: Float[np.ndarray, "m 3"] | None = None, config: EasingConfig | None = None
+) -> Float[Tensor, " n"]:
+    """How much less room the opened hands leave than fingers should, where it is least, palm included [m]; 0 for none."""
+    config, device = config or EasingConfig(), energy.centre.device
+    lacking, tree = [torch.zeros(0)], None if seen is None else KDTree(seen)
+    for part in grasps.in_parts(config.batch_size):
+        _, spare = _room(energy, part.T_object_wrist.to(device), part.pregrasp_joints.to(device), tree, config)
+        lacking.append((-spare).amax(-1).clamp_min(0).cpu())
+    return torch.cat(lacking)
+
+
+def _eased(energy: GraspEnergy, grasps: GraspBatch, seen: KDTree | None, config: EasingConfig) -> Float[Tensor, "n n_dof"]:
+    device, hand = energy.centre.device, energy.hand
+    T, q, opened = (x.to(device) for x in (grasps.T_object_wrist, grasps.joints, grasps.pregrasp_joints))
+    moved = finger_joints(hand)
+    bends = moved.any(0) & hand.movable & ~hand.abduction
+    stays = ~(hand.tree.moves & bends).any(-1)[energy.body.members.argmax(-1)]
+    shares = torch.linspace(0, 1, config.steps, device=device)
+    gaps, spares = [], []
+    for share in shares:
+        distance, spare = _room(energy, T, torch.where(bends, q + share * (opened - q), q), seen, config)
+        gaps.append(least_by_finger(energy, distance.masked_fill(stays, torch.inf)))
+        spares.append(least_by_finger(energy, spare.masked_fill(stays, torch.inf)))
+    gap, spare = torch.stack(gaps), torch.stack(spares)
+    # The first share at which a finger is clear; else the one at which it is clearest, of those as far from the surface itself
+    # as they have to be at least. Fingers that share a joint open alike.
+    spare = torch.where(gap >= gap.amax(0).clamp_max(config.clearance), spare, -torch.inf)
+    first = torch.where((spare >= 0).any(0), (spare >= 0).float().argmax(0), spare.argmax(0))
+    share = torch.where(moved, shares[first][..., None], 0).amax(1)
+    return torch.where(bends, q + share * (opened - q), q).cpu()
+
+
+def _room(
+    energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], seen: KDTree | None, config: EasingConfig
+) -> tuple[Float[Tensor, "n p"], Float[Tensor, "n p"]]:
+    """Distance of each of the hand's surface points to the object, and how much more room it leaves than it should [m]."""
+    points = body_points(energy, T, q)
+    distance = energy.field.distances(points)[0]
+    if seen is None:
+        return distance, distance - config.clearance
+    # The surface there is as much of a guess as it is farther away than what was seen.
+    away = torch.from_numpy(seen.query(points.flatten(0, 1).cpu().numpy())[0]).to(distance).view_as(distance)
+    guessed = away - distance.clamp_min(0)
+    return distance, distance - guessed.clamp(config.clearance, max(config.clearance, config.unseen))

@@ -6,7 +6,7 @@ import dataclasses
 
 import torch
 
-from dro_grasp.energy.contact_candidates import ContactConfig, contact_candidates
+from dro_grasp.energy.contacts import ContactConfig, contact_candidates
 from dro_grasp.geometry import se3
 from dro_grasp.hands.hand import Hand
 from tests.helpers.toy_hand import toy_hand

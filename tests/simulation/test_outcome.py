@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.simulation.diagnosis import REMEDIES, count_failures, diagnose, next_steps
-from dro_grasp.simulation.outcome import Failure
+from dro_grasp.simulation.outcome import REMEDIES, Failure, count_failures, diagnose, next_steps
 from tests.helpers.toy_hand import toy_hand
 
 

@@ -10,11 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from dro_grasp.energy.grasp_energy import GraspEnergy
-from dro_grasp.energy.nearest_points import NearestPoints
+from dro_grasp.energy.grasp_energy import GraspEnergy, NearestPoints
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
-from dro_grasp.optimization.grip import GripConfig, contact_forces, gripping
+from dro_grasp.optimization.squeeze import GripConfig, contact_forces, gripping
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.claw import ball, claw, grasps_of, power_grasp, wrist_below
 from tests.helpers.toy_hand import coupled_hand, toy_hand

@@ -1,0 +1,354 @@
+"""Grasp files: what their columns and header must be, Parquet in and out, and a GraspBatch from and to them."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dro_grasp.errors import GraspFileError
+from dro_grasp.files import given_path, reading
+from dro_grasp.geometry import se3
+from dro_grasp.geometry.se3 import roma
+from dro_grasp.grasps import columns
+from dro_grasp.grasps.columns import CAMERA, FRAME, HAND_FILE, OBJECT_FILE, OBJECT_SCALE
+
+HEADER = {"hand": "a name", "hand_sha256": "a hash, or ''", "wrist_link": "a name"}
+"""Texts of the header."""
+JOINTS = "joint_names"
+"""Entry of the header with the names of the joints."""
+ASKED = "asked"
+"""Entry of the header with how many grasps of each object were asked for; files that do not know it lack it."""
+ASKED_OF = ("object", "object_sha256", "num")
+"""What it states of each."""
+NOTES = "notes"
+"""Entry of the header with plain values about the making, or null."""
+
+
+def _is_text(kind: pa.DataType) -> bool:
+    if pa.types.is_dictionary(kind):
+        return _is_text(kind.value_type)
+    return pa.types.is_string(kind) or pa.types.is_large_string(kind)
+
+
+def _is_number(kind: pa.DataType) -> bool:
+    return pa.types.is_floating(kind) or pa.types.is_integer(kind)
+
+
+def _is_list_of(test: Callable[[pa.DataType], bool]) -> Callable[[pa.DataType], bool]:
+    def check(kind: pa.DataType) -> bool:
+        lists = pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind) or pa.types.is_large_list(kind)
+        return lists and test(kind.value_type)
+    return check
+
+
+KINDS: tuple[tuple[str, Callable[[pa.DataType], bool], tuple[str, ...]], ...] = (
+    ("texts", _is_text, (*columns.TEXTS, "protocol", columns.REASON, columns.FAILURE, HAND_FILE, OBJECT_FILE, FRAME)),
+    ("numbers", _is_number, (*columns.FLOATS, OBJECT_SCALE)),
+    ("whole numbers", pa.types.is_integer, ("seed",)),
+    ("truth values", pa.types.is_boolean, ("success",)),
+    ("lists of numbers", _is_list_of(_is_number),
+     ("joints", "wrist_position", "wrist_quaternion_wxyz", *columns.POSTURES, CAMERA)),
+    ("lists of texts", _is_list_of(_is_text), (columns.CONTACT_LINKS,)),
+)
+"""What columns hold, in words and as a test of their type, and which columns do; all may be null."""
+
+
+def check_header(header: dict[str, Any], path: object) -> None:
+    """Refuse a header whose entries are missing or of another type: GraspFileError."""
+    expected = {name: (isinstance(header.get(name), str), what) for name, what in HEADER.items()}
+    names, notes = header.get(JOINTS), header.get(NOTES)
+    named = isinstance(names, list) and all(isinstance(name, str) for name in names) and len(set(names)) == len(names) > 0
+    expected[ASKED] = _is_asked(header.get(ASKED, [])), "a list of objects with a name, a hash and a number"
+    expected |= {JOINTS: (named, "a list of different names"), NOTES: (notes is None or isinstance(notes, dict), "an object")}
+    for name, (fits, what) in expected.items():
+        if not fits:
+            raise GraspFileError(f"{path}: the header's '{name}' is {str(header.get(name))[:60]}, expected {what}; write the "
+                                 "file again")
+
+
+def _is_asked(entry: Any) -> bool:
+    """Whether an entry states how many grasps of each object were asked for."""
+    return isinstance(entry, list) and all(
+        isinstance(one, dict) and set(one) >= set(ASKED_OF) and isinstance(one["object"], str)
+        and isinstance(one["object_sha256"], str) and type(one["num"]) is int and one["num"] >= 0 for one in entry)
+
+
+def check_columns(schema: pa.Schema, path: object) -> None:
+    """Refuse columns that occur twice, or hold something else than their name says: GraspFileError."""
+    if twice := [name for name in schema.names if schema.names.count(name) > 1]:
+        raise GraspFileError(f"{path} has two columns '{twice[0]}'; write the file again")
+    for what, fits, names in KINDS:
+        for name in names:
+            kind = schema.field(name).type if name in schema.names else pa.null()
+            if not (pa.types.is_null(kind) or fits(kind)):
+                raise GraspFileError(f"{path}: column '{name}' holds {kind}, expected {what}; write the file again")
+    if FRAME in schema.names and CAMERA not in schema.names:
+        raise GraspFileError(f"{path} names the frame of its grasps in '{FRAME}', and lacks the column '{CAMERA}' with the "
+                             "camera's pose in it; write the file again")
+
+
+FORMAT_VERSION = 1
+"""Version of the grasp file that this code writes and reads."""
+METADATA_KEY = b"dro_grasp"
+"""Key of the JSON header in the schema metadata."""
+EXPECTED = "a Parquet file that dro-grasp wrote, whole; write it again"
+"""A grasp file, for messages (ours)."""
+
+
+def table_bytes(columns: dict[str, pa.Array | pa.ChunkedArray], header: dict[str, Any]) -> bytes:
+    """A grasp file of Arrow arrays of equal length by name; the format version is added to the header."""
+    metadata = {METADATA_KEY: json.dumps({"format_version": FORMAT_VERSION, **header}).encode()}
+    table, file = pa.table(columns).replace_schema_metadata(metadata), io.BytesIO()
+    # Byte-stream split puts bytes of equal weight side by side: rounded floats then take half the space.
+    split = [path for path, kind in _leaves(table.schema) if pa.types.is_floating(kind)]
+    texts = [path for path, kind in _leaves(table.schema) if not pa.types.is_floating(kind)]
+    pq.write_table(
+        table, file, compression="zstd", compression_level=9,
+        use_dictionary=texts, use_byte_stream_split=split,  # type: ignore[arg-type]  # the stubs know bool alone
+    )
+    return file.getvalue()
+
+
+def _leaves(schema: pa.Schema) -> list[tuple[str, pa.DataType]]:
+    """Parquet path and type of every column, lists by their elements."""
+    lists = (pa.types.is_list, pa.types.is_fixed_size_list)
+    return [
+        (f"{f.name}.list.element", f.type.value_type) if any(test(f.type) for test in lists) else (f.name, f.type)
+        for f in schema
+    ]
+
+
+def read_table(path: Path | str | io.BytesIO) -> tuple[pa.Table, dict[str, Any]]:
+    """Read a grasp file's table and header.
+
+    Raises:
+        GraspFileError: No such file, a truncated or foreign one, or one of another version.
+    """
+    with reading(path, GraspFileError, EXPECTED, pa.ArrowException):
+        table = pq.read_table(_existing(path))
+        header = read_header(path, table.schema)
+        check_columns(table.schema, path)
+    return table, header
+
+
+def read_footer(path: Path | str) -> tuple[int, dict[str, Any]]:
+    """Number of grasps in a grasp file, and its header, from the footer alone; errors are those of `read_table`."""
+    with reading(path, GraspFileError, EXPECTED, pa.ArrowException):
+        footer = pq.read_metadata(_existing(path))
+        return footer.num_rows, read_header(path, footer.schema.to_arrow_schema())
+
+
+def _existing(path: Path | str | io.BytesIO) -> Path | io.BytesIO:
+    if isinstance(path, io.BytesIO):
+        return path
+    path = given_path(path)
+    if not path.is_file():
+        raise GraspFileError(f"no grasp file {path}; give the path of a .parquet file that dro-grasp wrote")
+    return path
+
+
+def read_header(path: Path | str | io.BytesIO, schema: pa.Schema) -> dict[str, Any]:
+    """The JSON header of a grasp file's schema; GraspFileError: it is missing, garbled or of another version."""
+    raw = (schema.metadata or {}).get(METADATA_KEY)
+    if raw is None:
+        raise GraspFileError(f"{path} is Parquet, but no grasp file: its schema has no 'dro_grasp' metadata")
+    with reading(path, GraspFileError, "a 'dro_grasp' header, which is garbled; write the file again"):
+        header = json.loads(raw)
+        if not isinstance(header, dict):
+            raise ValueError(f"it holds a {type(header).__name__}")
+        version = header["format_version"]
+    if version != FORMAT_VERSION:
+        raise GraspFileError(
+            f"{path} has grasp file version {version}, this dro-grasp reads version {FORMAT_VERSION}; "
+            "install the release that wrote it, or write the file again"
+        )
+    check_header(header, path)
+    return header
+
+
+def float_column(values: Float[Tensor, "n *k"]) -> pa.Array:
+    """A float tensor (n) or (n k) as a column; rows with NaN become null."""
+    array = values.detach().cpu().to(torch.float32).numpy()
+    missing = np.isnan(array) if array.ndim == 1 else np.isnan(array).any(1)
+    if array.ndim == 1:
+        return pa.array(array, mask=missing)
+    offsets = np.arange(len(array) + 1, dtype=np.int32) * array.shape[1]
+    flat = pa.array(np.ascontiguousarray(array).ravel())
+    return pa.ListArray.from_arrays(pa.array(offsets), flat, mask=pa.array(missing))
+
+
+def fixed_column(values: Float[Tensor, "n k"]) -> pa.Array:
+    """A float tensor (n k) without missing rows as a column of fixed-size lists."""
+    array = np.ascontiguousarray(values.detach().cpu().to(torch.float32).numpy())
+    return pa.FixedSizeListArray.from_arrays(pa.array(array.ravel()), array.shape[1])
+
+
+def floats(column: pa.ChunkedArray, width: int | None, where: str) -> Float[Tensor, "n *width"]:
+    """The inverse of `float_column` and `fixed_column`, for lists of length `width` or plain numbers; null becomes NaN.
+
+    Raises:
+        GraspFileError: A list has another length, or the column does not hold numbers; it names the file and column, `where`.
+    """
+    array = column.combine_chunks()
+    try:
+        if width is None:
+            return torch.from_numpy(_numbers(array))
+        result = np.full((len(array), width), np.nan, np.float32)
+        present = ~np.array(array.is_null())
+        flat = _numbers(array.drop_null().flatten())
+        lengths = np.array(array.drop_null().value_lengths()) if present.any() else np.zeros(0, int)
+        if not (lengths == width).all():
+            raise GraspFileError(f"{where}: lists of length {set(lengths.tolist())}, expected {width}")
+        result[present] = flat.reshape(-1, width)
+    except (pa.ArrowException, AttributeError, ValueError) as error:
+        raise GraspFileError(f"{where}: expected numbers, found {array.type} ({error})") from error
+    return torch.from_numpy(result)
+
+
+def _numbers(array: pa.Array) -> Float[np.ndarray, " n"]:
+    return np.array(array.cast(pa.float32()).to_numpy(zero_copy_only=False), np.float32)
+
+
+REQUIRED = ("object", "wrist_position", "wrist_quaternion_wxyz", "joints")
+"""Columns without which a file holds no grasps."""
+TEXT_TYPES = {columns.REASON: pa.string(), columns.FAILURE: pa.string(), columns.CONTACT_LINKS: pa.list_(pa.string())}
+"""Types of the trial's further columns, which their values do not tell when all are unknown."""
+SYNTHESISED = re.compile(r"\bsynthesis \d+\b")
+"""Provenance of synthesised grasps, whose `score` is minus the energy in files without a column `energy`."""
+
+
+def encode(batch: Any) -> tuple[dict[str, pa.Array], dict[str, Any]]:
+    """Columns and header of a GraspBatch's file."""
+    stored: dict[str, pa.Array] = {
+        "object": pa.array(list(batch.object), pa.string()),
+        "wrist_position": fixed_column(batch.T_object_wrist[:, :3, 3]),
+        "wrist_quaternion_wxyz": fixed_column(batch.wrist_quaternion_wxyz),
+        "joints": float_column(batch.joints),
+    }
+    stored |= {name: float_column(getattr(batch, name)) for name in (*columns.POSTURES, *columns.FLOATS)}
+    stored["success"] = pa.array(batch.trial_success.cpu().numpy(), mask=(~batch.evaluated).cpu().numpy())
+    stored["protocol"] = pa.array([p or None for p in batch.protocol], pa.string())
+    for name in columns.TEXTS[1:]:
+        stored[name] = pa.array(list(getattr(batch, name)), pa.string())
+    stored["seed"] = pa.array(batch.seed.cpu().numpy())
+    stored |= {name: _further_column(name, value) for name, value in batch.extra.items()}
+    header = {"hand": batch.hand, "hand_sha256": batch.hand_sha256, "wrist_link": batch.wrist_link,
+              "joint_names": list(batch.joint_names)}
+    if batch.asked_of:
+        header[ASKED] = [dict(zip(ASKED_OF, (*key, num), strict=True)) for key, num in batch.asked_of.items()]
+    return stored, header
+
+
+def _further_column(name: str, value: Any) -> pa.Array:
+    if isinstance(value, Tensor):
+        return float_column(value) if value.is_floating_point() else pa.array(value.cpu().numpy().tolist())
+    return pa.array(list(value), TEXT_TYPES.get(name))
+
+
+def decode(table: pa.Table, header: dict[str, Any], path: str) -> dict[str, Any]:
+    """Constructor arguments of a GraspBatch; GraspFileError: columns are missing, or poses are not finite."""
+    missing = [name for name in REQUIRED if name not in table.column_names]
+    if missing:
+        raise GraspFileError(f"{path} lacks columns {missing} of a grasp file")
+    n, n_dof = table.num_rows, len(header["joint_names"])
+
+    def text(name: str) -> tuple[str, ...]:
+        return tuple(v or "" for v in shared(table[name])) if name in table.column_names else ("",) * n
+
+    def numbers(name: str, width: int | None) -> Float[Tensor, "n *width"]:
+        if name not in table.column_names or table[name].null_count == n:
+            return torch.full((n,) if width is None else (n, width), torch.nan)
+        return floats(table[name], width, f"{path}, column {name}")
+
+    joints = numbers("joints", n_dof)
+    T = _poses(numbers("wrist_position", 3), numbers("wrist_quaternion_wxyz", 4))
+    if not (T.isfinite().all() and joints.isfinite().all()):
+        raise GraspFileError(f"{path} has grasps with missing or non-finite poses; write it without them")
+    success = table["success"].to_pylist() if "success" in table.column_names else [None] * n
+    protocol = tuple(columns.NOT_EVALUATED if s is None else p or columns.UNKNOWN_PROTOCOL
+                     for p, s in zip(text("protocol"), success, strict=True))
+    fields: dict[str, Any] = {name: text(name) for name in columns.TEXTS}
+    fields |= {name: numbers(name, n_dof) for name in columns.POSTURES} | {name: numbers(name, None) for name in columns.FLOATS}
+    if "energy" not in table.column_names:
+        fields |= _energy_apart(fields["score"], fields["provenance"], table)
+    known = {*columns.COLUMNS, *REQUIRED, "success"}
+    extra = {name: _decode_further(table[name]) for name in table.column_names if name not in known}
+    if not isinstance(extra.get(OBJECT_SCALE), Tensor):  # null for every grasp
+        extra.pop(OBJECT_SCALE, None)
+    _check_frames(extra, path)
+    seed = [s or 0 for s in table["seed"].to_pylist()] if "seed" in table.column_names else [0] * n
+    return {
+        "T_object_wrist": T, "joints": joints,
+        "hand": header["hand"], "hand_sha256": header["hand_sha256"], "wrist_link": header["wrist_link"],
+        "joint_names": tuple(header["joint_names"]), "seed": torch.tensor(seed, dtype=torch.int64),
+        "trial_success": torch.tensor([bool(s) for s in success], dtype=torch.bool), "protocol": protocol, **fields,
+        "extra": extra, "asked_of": {(name, sha256): num for name, sha256, num in (
+            (one[key] for key in ASKED_OF) for one in header.get(ASKED, ()))},
+    }
+
+
+def quaternions_wxyz(T: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 4"]:
+    """Unit quaternions of poses."""
+    return roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(T[:, :3, :3].to(torch.float64))).to(T.dtype)
+
+
+def _check_frames(extra: dict[str, Any], path: str) -> None:
+    """Refuse grasps in a named frame in which the camera's pose is not known."""
+    named = [i for i, frame in enumerate(extra.get(FRAME, ())) if frame]
+    pose = extra.get(CAMERA)
+    if named and not (isinstance(pose, Tensor) and pose.shape[1:] == (16,) and bool(pose[named].isfinite().all())):
+        raise GraspFileError(f"{path} names the frame of its grasps, and '{CAMERA}' is no pose of 16 finite numbers for each "
+                             "of them; write the file again")
+
+
+def _poses(position: Float[Tensor, "n 3"], quaternion: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4 4"]:
+    """Wrist poses of positions [m] and unit quaternions (WXYZ); NaN where a quaternion has another length."""
+    length = quaternion.norm(dim=-1, keepdim=True)
+    unit = torch.where((length - 1).abs() < 1e-2, quaternion / length, torch.nan)
+    return se3.compose(roma.unitquat_to_rotmat(roma.quat_wxyz_to_xyzw(unit)), position)
+
+
+def _energy_apart(score: Float[Tensor, " n"], provenance: tuple[str, ...], table: pa.Table) -> dict[str, Float[Tensor, " n"]]:
+    """Energy and score in a file without a column `energy`: the score of its synthesised grasps is minus the energy."""
+    terms = [name for name in table.column_names if name.startswith(columns.ENERGY_TERM)]
+    has_terms = ~torch.from_numpy(np.array(table[terms[0]].is_null())) if terms else torch.zeros(len(score), dtype=torch.bool)
+    synthesised = has_terms & torch.tensor([SYNTHESISED.search(p) is not None for p in provenance], dtype=torch.bool)
+    nothing = torch.full_like(score, torch.nan)
+    return {"energy": torch.where(synthesised, -score, nothing), "score": torch.where(synthesised, nothing, score)}
+
+
+def _decode_further(column: pa.ChunkedArray) -> Any:
+    kind = column.type
+    if pa.types.is_floating(kind):
+        return floats(column, None, "extra")
+    if column.null_count == 0 and (pa.types.is_boolean(kind) or pa.types.is_integer(kind)):
+        return torch.tensor(column.to_pylist())
+    if pa.types.is_list(kind) and pa.types.is_floating(kind.value_type):
+        lengths = {len(v) for v in column.to_pylist() if v is not None}
+        if len(lengths) == 1:
+            return floats(column, lengths.pop(), "extra")
+    return shared(column)
+
+
+def shared(column: pa.ChunkedArray) -> list[Any]:
+    """The values of a column, equal texts and lists once: of a million grasps most share their object and their maker."""
+    if pa.types.is_string(column.type):
+        coded = column.combine_chunks().dictionary_encode()
+        words = [*coded.dictionary.to_pylist(), None]
+        return [words[i] for i in coded.indices.fill_null(len(words) - 1).to_pylist()]
+    values = column.to_pylist()
+    if not (pa.types.is_list(column.type) and pa.types.is_string(column.type.value_type)):
+        return values
+    known: dict[tuple[Any, ...], Any] = {}
+    return [value and known.setdefault(tuple(value), value) for value in values]
