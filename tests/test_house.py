@@ -11,7 +11,6 @@ import pytest
 
 SOURCE = Path(__file__).parents[1] / "src" / "dro_grasp"
 LONGEST_FUNCTION = 60
-MOST_PARAMETERS = 8
 SHAPED = {"Float", "Int", "Bool", "UInt8", "Num", "Shaped", "Integer", "Real"}
 """Types of jaxtyping, which state the shape of the array that they hold."""
 
@@ -48,12 +47,6 @@ def long_functions(text: str) -> Iterator[str]:
             yield f"{f.lineno}: {f.name} has {lines} lines, at most {LONGEST_FUNCTION}: split it"
 
 
-def many_parameters(text: str) -> Iterator[str]:
-    for f in functions(parsed(text)):
-        if (count := len(parameters(f))) > MOST_PARAMETERS:
-            yield f"{f.lineno}: {f.name} has {count} parameters, at most {MOST_PARAMETERS}: gather some in a dataclass"
-
-
 def bare_arrays(text: str) -> Iterator[str]:
     tree = parsed(text)
     places = [(f"{f.name}({arg.arg})", arg.lineno, arg.annotation) for f in functions(tree) for arg in parameters(f)]
@@ -81,7 +74,7 @@ def _is_docstring(node: ast.stmt | None) -> bool:
 
 
 Rule = Callable[[str], Iterator[str]]
-RULES: list[Rule] = [long_functions, many_parameters, bare_arrays, bare_constants]
+RULES: list[Rule] = [long_functions, bare_arrays, bare_constants]
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -93,13 +86,11 @@ def test_every_module_keeps_the_rules(rule: Rule) -> None:
 
 BROKEN = {
     long_functions: "def f() -> None:\n" + "    pass\n" * LONGEST_FUNCTION,
-    many_parameters: f"def f(self, {', '.join(f'x{i}: int' for i in range(MOST_PARAMETERS))}, **others: int) -> None: ...",
     bare_arrays: "class A:\n    def f(self, x: list[np.ndarray]) -> None: ...",
     bare_constants: "A = 1\nB = 2\n'''Only of B.'''",
 }
 KEPT = {
     long_functions: "def f() -> None:\n" + "    pass\n" * (LONGEST_FUNCTION - 1),
-    many_parameters: f"def f(self, {', '.join(f'x{i}: int' for i in range(MOST_PARAMETERS))}) -> None: ...",
     bare_arrays: "class A:\n    x: Float[Tensor, '...']\n    def f(self, x: list[Int[np.ndarray, 'n']]) -> Tensors: ...",
     bare_constants: "A = 1\n'''Of A.'''\nb = 2",
 }

@@ -223,7 +223,7 @@ class _Onboarding:
         """What a run before has stored; a damaged file is set aside, and its steps are made again."""
         try:
             known = json.loads(state.read_text())
-            asked = dict(known.get("asked", {}))
+            asked = dict(known["asked"]) if "asked" in known else {}
             if "method" in asked:  # of earlier versions
                 asked["source"] = FORMER_NAMES.get(asked["method"], asked["method"])
             return {"hand": str(known["hand"]), "sha256": str(known["sha256"]), "steps": dict(known["steps"]),
@@ -235,9 +235,10 @@ class _Onboarding:
 
     def _asked(self) -> dict[str, Any]:
         """What decides on the results, beside the hand and the time."""
-        return {"weights": self.config.weights or DEFAULT, "objects": self.objects, "held_out": self.held_out,
-                "num": self.config.num, "source": FORMER_NAMES.get(self.config.source, self.config.source),
-                "learning_rate": self.config.learning_rate, "seed": self.config.seed}
+        config = self.config
+        return {"weights": config.weights or DEFAULT, "objects": self.objects, "held_out": self.held_out, "num": config.num,
+                "source": FORMER_NAMES.get(config.source, config.source), "learning_rate": config.learning_rate,
+                "seed": config.seed}
 
     def run(self) -> None:
         """Run every step that is not finished."""
