@@ -1,1 +1,0 @@
-"""Methods that make grasps, ours, others' and yours, behind one face: `predict(hand, obj, num, seed)`."""
