@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.devices import fast_products, side_by_side
+from dro_grasp.devices import side_by_side
 from dro_grasp.errors import NoGraspError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
@@ -69,9 +69,8 @@ def grasps_in_world(
         except NoGraspError:
             return None
 
-    with fast_products():
-        # Alone, a request uses all threads itself.
-        parts = side_by_side(made, problems, requests) if len(problems) > 1 else [made(problem, request)]
+    # Alone, a request uses all threads itself.
+    parts = side_by_side(made, problems, requests) if len(problems) > 1 else [made(problem, request)]
     found = [grasps for grasps in parts if grasps is not None]
     if not found:
         return GraspBatch.none(hand, obj)
