@@ -15,16 +15,16 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from dro_grasp.arm.animation import OBJECT_COLOUR, Recorder
+from dro_grasp.arm.attempts import Attempt, TabletopConfig, carry_out
+from dro_grasp.arm.motion import MotionPlan
+from dro_grasp.arm.physics import LiftScene
+from dro_grasp.arm.robot import Robot, load_robot
+from dro_grasp.arm.robot_check import robot_meshes, table_meshes
+from dro_grasp.arm.tabletop import read_attempts
+from dro_grasp.arm.workcell import Workcell
+from dro_grasp.geometry.rendering.rasterizer import Camera, Mesh, render
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.planning.animation import OBJECT_COLOUR, Recorder
-from dro_grasp.planning.attempts import Attempt, TabletopConfig, carry_out
-from dro_grasp.planning.motion import MotionPlan
-from dro_grasp.planning.physics import LiftScene
-from dro_grasp.planning.robot import Robot, load_robot
-from dro_grasp.planning.robot_check import robot_meshes, table_meshes
-from dro_grasp.planning.tabletop import read_attempts
-from dro_grasp.planning.workcell import Workcell
-from dro_grasp.rendering.rasterizer import Camera, Mesh, render
 
 TILE = (170, 150)
 """Width and height of a picture [pixels]; each attempt has two."""

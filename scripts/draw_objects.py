@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
+from dro_grasp.geometry.rendering.rasterizer import Camera, render
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.pictures.appearance import object_meshes
 from dro_grasp.pictures.sheets import contact_sheet
-from dro_grasp.rendering.rasterizer import Camera, render
 
 TILE = (200, 180)
 """Width and height of the picture of one object [pixels]."""

@@ -22,15 +22,15 @@ from train_ranking import HANDS
 
 from dro_grasp.compare.metrics import roc_area
 from dro_grasp.hands.library import load_hand
-from dro_grasp.models.checkpoints import load_weights, save_weights
-from dro_grasp.models.network import DistanceNetwork
+from dro_grasp.network.checkpoints import load_weights, save_weights
+from dro_grasp.network.network import DistanceNetwork
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.score.holding_score import SHIPPED, HoldingScore, holding_features
 from dro_grasp.predict.settling import settled
 from dro_grasp.predict.sources.network import propose
 from dro_grasp.predict.sources.optimiser import OptimiserSource
 from dro_grasp.predict.stages import refine, scored
-from dro_grasp.ranking.holding_score import SHIPPED, HoldingScore, holding_features
 from dro_grasp.simulation.holding import Holding
 from dro_grasp.simulation.trial import simulate
 

@@ -23,23 +23,23 @@ from torch import Tensor
 from torch.nn import functional
 
 from dro_grasp.compare.metrics import roc_area
-from dro_grasp.energy.grasp_energy import GraspEnergy
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
-from dro_grasp.models.checkpoints import DEFAULT, history_of, load_weights
-from dro_grasp.models.network import DistanceNetwork
+from dro_grasp.network.checkpoints import DEFAULT, history_of, load_weights
+from dro_grasp.network.network import DistanceNetwork
 from dro_grasp.objects.catalogue import load_object, resolve_objects
+from dro_grasp.objects.perception.partial_views import View, partial_view
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.perception.partial_views import View, partial_view
+from dro_grasp.optimize.grasp_energy import GraspEnergy
 from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.score.features import feature_names, grasp_features
+from dro_grasp.predict.score.score import SHIPPED, ScoreConfig, ScoreNetwork, load_score_network, save_score_network
 from dro_grasp.predict.settling import settled
 from dro_grasp.predict.sources.network import ProposalConfig, propose
 from dro_grasp.predict.sources.optimiser import OptimiserSource
 from dro_grasp.predict.stages import complete, refine
-from dro_grasp.ranking.features import feature_names, grasp_features
-from dro_grasp.ranking.score import SHIPPED, ScoreConfig, ScoreNetwork, load_score_network, save_score_network
 from dro_grasp.simulation.trial import simulate
 
 HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand", "assets/leaphand", "assets/allegro_right",

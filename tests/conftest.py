@@ -71,7 +71,7 @@ def finished(home: Path, results: dict) -> dict[str, Path]:
 @pytest.fixture(scope="session")
 def robot():
     """The built-in xArm 7 with a LEAP hand."""
-    from dro_grasp.planning.robot import load_robot
+    from dro_grasp.arm.robot import load_robot
 
     return load_robot("xarm7_leaphand")
 
@@ -81,7 +81,7 @@ def small_robot(tmp_path_factory: pytest.TempPathFactory) -> str:
     """The file of the built-in xArm 7 with a hand that loads quickly, and without a camera."""
     import yaml
 
-    from dro_grasp.planning.robot import BUILTIN_ROBOTS
+    from dro_grasp.arm.robot import BUILTIN_ROBOTS
 
     values = yaml.safe_load((BUILTIN_ROBOTS / "xarm7_leaphand.yaml").read_text())
     values |= {"arm": str(BUILTIN_ROBOTS / "xarm7.urdf"), "hand": "gripper3"}
@@ -94,7 +94,7 @@ def small_robot(tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.fixture
 def quick_statistics(monkeypatch: pytest.MonkeyPatch) -> None:
     """Commands that train measure the statistics of BatchNorm over two batches, which takes most of so short a run."""
-    from dro_grasp.training import loop
-    from dro_grasp.training.runs import recalibrate
+    from dro_grasp.train import loop
+    from dro_grasp.train.runs import recalibrate
 
     monkeypatch.setattr(loop, "recalibrate", lambda model, forward, _: recalibrate(model, forward, 2))

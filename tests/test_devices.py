@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from dro_grasp.devices import choose_device, cores, on_device, require_device, side_by_side
-from dro_grasp.energy.grasp_energy import link_spheres
 from dro_grasp.errors import OptionError
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.optimization.refinement import RefineConfig
-from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
+from dro_grasp.optimize.grasp_energy import link_spheres
+from dro_grasp.optimize.refinement import RefineConfig
+from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predict.config import PredictorConfig, RescueConfig
 from dro_grasp.predict.finish import FinishConfig
 from dro_grasp.predict.predictor import GraspPredictor

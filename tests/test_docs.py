@@ -104,7 +104,7 @@ def test_python_parses_and_uses_public_names() -> None:
 def test_the_snippets_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """The README's, then the one that reads its file; a small hand and untrained weights keep it quick."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("dro_grasp.models.checkpoints.locate_weights", lambda name=None: untrained_weights(tmp_path))
+    monkeypatch.setattr("dro_grasp.network.checkpoints.locate_weights", lambda name=None: untrained_weights(tmp_path))
     readme = next(t for d, t in blocks("python") if d == "README.md")
     reader = next(t for d, t in blocks("python") if d == "file-formats.md")
     quick = readme.replace('"allegro"', '"gripper3"').replace('"mug"', '"sphere"').replace("num=16", "num=2")

@@ -147,12 +147,12 @@ def test_files_set_aside_keep_their_content_and_what_belongs_together_its_number
 
 def test_every_reader_expands_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import dro_grasp as dro
+    from dro_grasp.apps.server.client import sent_object
+    from dro_grasp.arm.motion import MotionPlan
     from dro_grasp.compare.methods import make_method
     from dro_grasp.frames import read_motion
     from dro_grasp.hands.library import locate_hand
     from dro_grasp.objects.cache import cache_folder
-    from dro_grasp.planning.motion import MotionPlan
-    from dro_grasp.serve.client import sent_object
 
     monkeypatch.setenv("HOME", str(tmp_path))
     readers: list[tuple[Callable[[str], object], str]] = [

@@ -21,7 +21,7 @@ import torch
 import dro_grasp as dro
 from dro_grasp.errors import OptionError
 from dro_grasp.kinds import Checked, checked, plain
-from dro_grasp.models.presets import NetworkConfig
+from dro_grasp.network.presets import NetworkConfig
 
 
 def configurations() -> Iterator[type]:

@@ -27,7 +27,6 @@ import torch
 from dro_grasp.compare.methods import Method, MethodOptions, make_method
 from dro_grasp.compare.metrics import diversity, success_rate
 from dro_grasp.compare.stages import pair_seed
-from dro_grasp.datasets.bundle.training_file import load_bundle
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
@@ -36,6 +35,7 @@ from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.simulation.protocols import changed
 from dro_grasp.simulation.trial import simulate
+from dro_grasp.train.data.bundle.training_file import load_bundle
 from lab.benchmarks.report import emit, rate
 
 RAW = ":raw"

@@ -10,11 +10,11 @@ import math
 from collections import Counter
 from pathlib import Path
 
-from dro_grasp.compare.coverage import measure_coverage
 from dro_grasp.compare.rows import finger_contact
-from dro_grasp.datasets.collections.collection import read_collection
-from dro_grasp.datasets.engine.shards import Yield
-from dro_grasp.pictures.dataset_report import charts, grasps_drawn
+from dro_grasp.train.data.collections.collection import read_collection
+from dro_grasp.train.data.collections.coverage import measure_coverage
+from dro_grasp.train.data.collections.report import charts, grasps_drawn
+from dro_grasp.train.data.engine.shards import Yield
 from lab.benchmarks.report import ROOT
 
 PICTURED = "assets-shadowhand.parquet"

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import torch
 
-from dro_grasp.compare.coverage import measure_coverage
 from dro_grasp.compare.metrics import wilson_interval
-from dro_grasp.datasets.collections.checking import check
-from dro_grasp.datasets.collections.collection import PairGrasps, read_collection
-from dro_grasp.datasets.engine.shards import Yield
 from dro_grasp.simulation.protocols import changed
+from dro_grasp.train.data.collections.checking import check
+from dro_grasp.train.data.collections.collection import PairGrasps, read_collection
+from dro_grasp.train.data.collections.coverage import measure_coverage
+from dro_grasp.train.data.engine.shards import Yield
 from lab.benchmarks.report import emit
 from lab.benchmarks.synthesis import HANDS, training_objects
 

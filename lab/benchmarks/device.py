@@ -19,19 +19,19 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from dro_grasp.datasets.bundle.training_file import Bundle, load_bundle
 from dro_grasp.devices import require_device
 from dro_grasp.hands.library import load_hand
-from dro_grasp.models.checkpoints import DEFAULT, save_weights
-from dro_grasp.models.network import untrained_network
-from dro_grasp.models.presets import NetworkConfig
+from dro_grasp.network.checkpoints import DEFAULT, save_weights
+from dro_grasp.network.network import untrained_network
+from dro_grasp.network.presets import NetworkConfig
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
+from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.training.config import ScheduleConfig, TrainConfig
-from dro_grasp.training.loop import train
+from dro_grasp.train.config import ScheduleConfig, TrainConfig
+from dro_grasp.train.data.bundle.training_file import Bundle, load_bundle
+from dro_grasp.train.loop import train
 from lab.benchmarks.report import emit
 
 HAND, OBJECT = "allegro", "rubber_duck"

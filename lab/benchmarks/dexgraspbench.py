@@ -19,7 +19,6 @@ import torch
 
 from dro_grasp.compare.metrics import wilson_interval
 from dro_grasp.compare.stages import pair_seed
-from dro_grasp.datasets.collections.importing import ForeignGrasp, in_order, read_foreign, read_npy
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
@@ -30,6 +29,7 @@ from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.stages import evaluate
 from dro_grasp.simulation.contact_quality import NAMES, with_contacts
+from dro_grasp.train.data.collections.importing import ForeignGrasp, in_order, read_foreign, read_npy
 from lab.benchmarks.report import emit, rate
 
 PALM = 0.034

@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from dro_grasp.datasets.collections.importing import read_npy
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
@@ -30,6 +29,7 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, processed_objects
 from dro_grasp.simulation.protocols import changed
 from dro_grasp.simulation.trial import simulate
+from dro_grasp.train.data.collections.importing import read_npy
 from lab.benchmarks.dexgraspbench import OFFICIAL, OURS, PALM
 from lab.benchmarks.report import emit, rate
 

@@ -13,13 +13,13 @@ import torch
 
 from dro_grasp.compare.metrics import diversity
 from dro_grasp.compare.stages import pair_seed
-from dro_grasp.datasets.collections.merging import file_name
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.predict.config import PredictorConfig
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.sources.network import ProposalConfig
+from dro_grasp.train.data.collections.merging import file_name
 from lab.benchmarks.report import ROOT, emit
 from lab.benchmarks.synthesis import HANDS
 

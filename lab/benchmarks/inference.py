@@ -28,9 +28,9 @@ import torch
 from dro_grasp.cli.main import WAIT_POLICY
 from dro_grasp.devices import cores
 from dro_grasp.hands.library import load_hand
-from dro_grasp.models.checkpoints import save_weights
-from dro_grasp.models.network import DistanceNetwork
-from dro_grasp.models.presets import NetworkConfig
+from dro_grasp.network.checkpoints import save_weights
+from dro_grasp.network.network import DistanceNetwork
+from dro_grasp.network.presets import NetworkConfig
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.predictor import GraspPredictor

@@ -26,9 +26,9 @@ from torch import Tensor
 from dro_grasp import distance_matrix
 from dro_grasp.geometry.se3 import compose, roma
 from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.kinematics import joint_solver
+from dro_grasp.hands.kinematics.joint_solver import JointSolution, JointSolverConfig, Targets, solve_joints
 from dro_grasp.hands.library import load_hand
-from dro_grasp.kinematics import joint_solver
-from dro_grasp.kinematics.joint_solver import JointSolution, JointSolverConfig, Targets, solve_joints
 from lab.benchmarks.report import emit
 
 ASSET_HANDS = (

@@ -24,8 +24,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from dro_grasp.devices import fast_products
-from dro_grasp.models.distance_head import DistanceHead
-from dro_grasp.models.presets import NetworkConfig
+from dro_grasp.network.distance_head import DistanceHead
+from dro_grasp.network.presets import NetworkConfig
 from lab.benchmarks.report import emit
 
 BLOCKS = 4

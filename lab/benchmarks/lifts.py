@@ -17,23 +17,23 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from dro_grasp.arm.attempts import Attempt, TabletopConfig, attempt
+from dro_grasp.arm.planner import PlanConfig
+from dro_grasp.arm.reachability import Fault
+from dro_grasp.arm.robot import load_robot
+from dro_grasp.arm.table_scene import PickedObject
+from dro_grasp.arm.tabletop import TabletopRun, endings, failures, processor_seconds, run_tabletop
+from dro_grasp.arm.workcell import upright
 from dro_grasp.compare.methods import mean_grasps_of
 from dro_grasp.compare.metrics import wilson_interval
-from dro_grasp.datasets.bundle.training_file import load_bundle
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object, resolve_objects
-from dro_grasp.planning.attempts import Attempt, TabletopConfig, attempt
-from dro_grasp.planning.planner import PlanConfig
-from dro_grasp.planning.reachability import Fault
-from dro_grasp.planning.robot import load_robot
-from dro_grasp.planning.table_scene import PickedObject
-from dro_grasp.planning.tabletop import TabletopRun, endings, failures, processor_seconds, run_tabletop
-from dro_grasp.planning.workcell import upright
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.choice import ChoiceConfig
 from dro_grasp.predict.sources.controls import MeanGrasp, mean_grasps
 from dro_grasp.predict.stages import complete
+from dro_grasp.train.data.bundle.training_file import load_bundle
 from lab.benchmarks.report import emit
 
 ROWS = {

@@ -17,7 +17,6 @@ import numpy as np
 import torch
 
 from dro_grasp.compare.stages import pair_seed
-from dro_grasp.datasets.bundle.training_file import HELD_OUT_HANDS
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.predict.config import GraspRequest, PredictorConfig
@@ -26,6 +25,7 @@ from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.choice import ChoiceConfig
 from dro_grasp.predict.sources.network import ProposalConfig
 from dro_grasp.simulation.trial import simulate
+from dro_grasp.train.data.bundle.training_file import HELD_OUT_HANDS
 from lab.benchmarks.report import emit, rate
 
 PROTOCOLS = ("dro", "strict")

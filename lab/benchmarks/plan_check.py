@@ -19,9 +19,9 @@ import numpy as np
 import torch
 from scipy.spatial import KDTree
 
-from dro_grasp.planning.motion import STAGES, MotionPlan
-from dro_grasp.planning.robot import Robot, load_robot
-from dro_grasp.planning.workcell import Workcell, arm_addresses, robot_spec
+from dro_grasp.arm.motion import STAGES, MotionPlan
+from dro_grasp.arm.robot import Robot, load_robot
+from dro_grasp.arm.workcell import Workcell, arm_addresses, robot_spec
 from dro_grasp.simulation.hand_part import joint_addresses
 from dro_grasp.simulation.protocols import PROTOCOLS
 from lab.benchmarks.report import emit

@@ -14,12 +14,12 @@ from typing import get_args
 import torch
 
 from dro_grasp.compare.stages import KEPT, pair_seed
-from dro_grasp.energy.grasp_energy import GraspEnergy
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
+from dro_grasp.objects.perception.partial_views import View, partial_view
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.perception.partial_views import View, partial_view
+from dro_grasp.optimize.grasp_energy import GraspEnergy
 from dro_grasp.predict.config import PredictorConfig
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem

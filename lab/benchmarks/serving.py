@@ -25,7 +25,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from dro_grasp.serve.client import GraspClient
+from dro_grasp.apps.server.client import GraspClient
 from lab.benchmarks.report import emit
 
 LONE = 12

@@ -21,7 +21,7 @@ from pathlib import Path
 from dro_grasp.devices import cores
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
+from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.trial import TrialResult, simulate
 from lab.benchmarks.report import emit

@@ -19,23 +19,23 @@ import torch
 import trimesh
 from safetensors.torch import load, save
 
-from dro_grasp.datasets.bundle.training_file import ObjectCloud, load_bundle, write_bundle
-from dro_grasp.datasets.collections.collection import count_collection, read_collection
-from dro_grasp.datasets.collections.importing import read_foreign
+from dro_grasp.apps.uploads import store_upload
 from dro_grasp.files import check_folder, check_output
 from dro_grasp.frames import read_motion
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.grasp_file import METADATA_KEY
 from dro_grasp.grasps.sources import frame_of, hand_of, object_of, with_sources
 from dro_grasp.hands.library import load_hand
-from dro_grasp.models.checkpoints import describe_weights, history_of, load_weights, save_weights, verify_weights
-from dro_grasp.models.network import DistanceNetwork, untrained_network
-from dro_grasp.models.presets import NetworkConfig
+from dro_grasp.network.checkpoints import describe_weights, history_of, load_weights, save_weights, verify_weights
+from dro_grasp.network.network import DistanceNetwork, untrained_network
+from dro_grasp.network.presets import NetworkConfig
 from dro_grasp.objects.cache import cached_arrays
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.perception.scan import load_scan
-from dro_grasp.training.run_folder import CHECKPOINT, LOG, RunFolder
-from dro_grasp.web.uploads import store_upload
+from dro_grasp.objects.perception.scan import load_scan
+from dro_grasp.train.data.bundle.training_file import ObjectCloud, load_bundle, write_bundle
+from dro_grasp.train.data.collections.collection import count_collection, read_collection
+from dro_grasp.train.data.collections.importing import read_foreign
+from dro_grasp.train.run_folder import CHECKPOINT, LOG, RunFolder
 from lab.fuzz import mutations as damage
 
 Rng = random.Random

@@ -13,13 +13,13 @@ from typing import Any, Literal
 
 import tyro
 
-from dro_grasp.datasets.bundle.training_file import load_bundle
 from dro_grasp.files import check_output
-from dro_grasp.models.checkpoints import save_weights
-from dro_grasp.training.config import ScheduleConfig
-from dro_grasp.training.processes import is_first
-from dro_grasp.training.run_folder import last_logged
-from dro_grasp.training.runs import check_schedule
+from dro_grasp.network.checkpoints import save_weights
+from dro_grasp.train.config import ScheduleConfig
+from dro_grasp.train.data.bundle.training_file import load_bundle
+from dro_grasp.train.processes import is_first
+from dro_grasp.train.run_folder import last_logged
+from dro_grasp.train.runs import check_schedule
 from lab.methods.gendexgrasp.map_training import MapTrainingConfig, train_contact_maps
 from lab.methods.manifm.contact_training import ContactTrainingConfig, train_contacts
 

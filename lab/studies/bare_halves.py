@@ -17,8 +17,8 @@ from dro_grasp.compare.stages import pair_seed
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.loading import cloud_object
+from dro_grasp.objects.perception.partial_views import partial_view, visible_side
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.perception.partial_views import partial_view, visible_side
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.simulation.trial import simulate
 from lab.benchmarks.report import emit, rate

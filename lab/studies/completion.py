@@ -20,12 +20,12 @@ from jaxtyping import Float
 from PIL import Image
 from scipy.spatial import KDTree
 
+from dro_grasp.geometry.rendering.rasterizer import Camera, Mesh, dots, render
 from dro_grasp.objects.catalogue import load_object, resolve_objects
+from dro_grasp.objects.perception.completion import complete_cloud, to_view_axes
+from dro_grasp.objects.perception.partial_views import visible_side
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.perception.completion import complete_cloud, to_view_axes
-from dro_grasp.perception.partial_views import visible_side
 from dro_grasp.pictures.sheets import contact_sheet
-from dro_grasp.rendering.rasterizer import Camera, Mesh, dots, render
 from lab.benchmarks.report import emit
 
 GROUPS = ("assets:train", "assets:validate")

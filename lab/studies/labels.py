@@ -18,15 +18,15 @@ import torch
 
 from dro_grasp.compare.metrics import diversity
 from dro_grasp.compare.rows import finger_contact
-from dro_grasp.datasets.engine.worker import EngineConfig, valid_grasps
-from dro_grasp.energy.contacts import ContactConfig
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.optimization.starts import StartConfig
-from dro_grasp.optimization.synthesis import SynthesisConfig
+from dro_grasp.optimize.contacts import ContactConfig
+from dro_grasp.optimize.starts import StartConfig
+from dro_grasp.optimize.synthesis import SynthesisConfig
 from dro_grasp.simulation.protocols import changed
 from dro_grasp.simulation.trial import simulate
+from dro_grasp.train.data.engine.worker import EngineConfig, valid_grasps
 from lab.benchmarks.report import emit
 from lab.benchmarks.synthesis import HANDS, training_objects
 

@@ -19,14 +19,14 @@ from PIL import Image
 from torch import Tensor
 from torch.nn import functional
 
-from dro_grasp.compare.correspondence import matching_rank, mean_rank
+from dro_grasp.geometry.rendering.rasterizer import Camera, dots, render
 from dro_grasp.hands.hand import Hand
-from dro_grasp.models.checkpoints import load_weights
-from dro_grasp.models.encoder import StaticGraphEncoder
+from dro_grasp.network.checkpoints import load_weights
+from dro_grasp.network.encoder import StaticGraphEncoder
 from dro_grasp.pictures.sheets import contact_sheet
-from dro_grasp.rendering.rasterizer import Camera, dots, render
-from dro_grasp.training.config import AugmentationConfig
-from dro_grasp.training.samples import SampleSource
+from dro_grasp.train.config import AugmentationConfig
+from dro_grasp.train.correspondence import matching_rank, mean_rank
+from dro_grasp.train.samples import SampleSource
 from lab.benchmarks.distance_error import validation_bundle
 from lab.benchmarks.report import emit
 from lab.benchmarks.synthesis import HANDS

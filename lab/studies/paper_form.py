@@ -22,23 +22,23 @@ from typing import Any
 
 import torch
 
-from dro_grasp.compare.distance_error import distance_errors
 from dro_grasp.compare.methods import Method
 from dro_grasp.compare.metrics import wilson_interval
 from dro_grasp.compare.rows import ALL
 from dro_grasp.compare.stages import BEST, RAW, REFINED, BenchmarkConfig, benchmark
-from dro_grasp.datasets.bundle.training_file import Bundle, load_bundle
 from dro_grasp.files import replacing
 from dro_grasp.hands.library import load_hand
-from dro_grasp.models.checkpoints import describe_weights, load_weights, save_weights
-from dro_grasp.models.presets import NetworkConfig
+from dro_grasp.network.checkpoints import describe_weights, load_weights, save_weights
+from dro_grasp.network.presets import NetworkConfig
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.simulation.protocols import protocol
-from dro_grasp.training.config import LOSSES, LossConfig, PretrainConfig, ScheduleConfig, TrainConfig
-from dro_grasp.training.loop import train
-from dro_grasp.training.pretraining import pretrain
-from dro_grasp.training.run_folder import last_logged
+from dro_grasp.train.config import LOSSES, LossConfig, PretrainConfig, ScheduleConfig, TrainConfig
+from dro_grasp.train.data.bundle.training_file import Bundle, load_bundle
+from dro_grasp.train.distance_error import distance_errors
+from dro_grasp.train.loop import train
+from dro_grasp.train.pretraining import pretrain
+from dro_grasp.train.run_folder import last_logged
 from lab.benchmarks.report import emit
 from lab.benchmarks.synthesis import HANDS
 

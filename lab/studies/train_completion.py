@@ -23,14 +23,14 @@ from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from dro_grasp.errors import ObjectError
-from dro_grasp.models.checkpoints import save_weights
-from dro_grasp.models.completion_network import SHIPPED, SurfaceNetwork
+from dro_grasp.network.checkpoints import save_weights
+from dro_grasp.network.completion_network import SHIPPED, SurfaceNetwork
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.loading import mesh_object
+from dro_grasp.objects.perception.completion import GUESSES, THINNEST, surface_features, to_view_axes
+from dro_grasp.objects.perception.partial_views import DepthCamera, visible_side
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.objects.surface_distances import signed_distances
-from dro_grasp.perception.completion import GUESSES, THINNEST, surface_features, to_view_axes
-from dro_grasp.perception.partial_views import DepthCamera, visible_side
 
 Kind = Literal["half", "depth"]
 KINDS: tuple[Kind, ...] = ("half", "depth")

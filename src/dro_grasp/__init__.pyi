@@ -1,51 +1,47 @@
 """The public names: type checkers read them here, and the package loads each from its module on first use."""
 
 from ._version import __version__ as __version__
+from .apps.server.client import GraspClient as GraspClient
+from .apps.viewer.grasp_page import view_grasps as view_grasps
+from .arm.attempts import Attempt as Attempt, TabletopConfig as TabletopConfig
+from .arm.motion import (
+    MotionPlan as MotionPlan,
+    trajectory_csv as trajectory_csv,
+    trajectory_yaml as trajectory_yaml,
+)
+from .arm.planner import PlanConfig as PlanConfig, plan as plan
+from .arm.reachability import ReachConfig as ReachConfig
+from .arm.robot import Robot as Robot, load_robot as load_robot
+from .arm.robot_check import RobotReport as RobotReport, check_robot as check_robot
+from .arm.table_scene import PickedObject as PickedObject, pick_object as pick_object
+from .arm.tabletop import TabletopRun as TabletopRun, run_tabletop as run_tabletop
 from .compare.methods import Method as Method, MethodOptions as MethodOptions, make_method as make_method
 from .compare.metrics import wilson_interval as wilson_interval
-from .datasets.bundle.training_file import load_bundle as load_bundle
-from .datasets.collections.bundling import make_bundle as make_bundle
-from .datasets.collections.collection import read_collection as read_collection
-from .datasets.engine.schedule import synthesize_dataset as synthesize_dataset
-from .datasets.engine.worker import EngineConfig as EngineConfig
 from .errors import DroGraspError as DroGraspError
-from .export.writers import (
+from .grasps.batch import GraspBatch as GraspBatch, load_grasps as load_grasps
+from .grasps.export.writers import (
     Frame as Frame,
     csv_table as csv_table,
     dexgraspbench as dexgraspbench,
     isaac_grasp as isaac_grasp,
     moveit_grasps as moveit_grasps,
 )
-from .grasps.batch import GraspBatch as GraspBatch, load_grasps as load_grasps
 from .hands.check import HandReport as HandReport, check_hand as check_hand
 from .hands.hand import Hand as Hand
 from .hands.library import hand_names as hand_names, load_hand as load_hand
-from .hands.procedural.making import MadeHand as MadeHand, make_hand as make_hand
 from .hands.variants import vary_hand as vary_hand
-from .models.checkpoints import load_weights as load_weights, save_weights as save_weights
-from .models.presets import NetworkConfig as NetworkConfig
+from .network.checkpoints import load_weights as load_weights, save_weights as save_weights
+from .network.presets import NetworkConfig as NetworkConfig
 from .objects.catalogue import load_object as load_object, object_names as object_names
+from .objects.perception.partial_views import DepthCamera as DepthCamera, visible_points as visible_points
+from .objects.perception.scan import depth_points as depth_points, scanned_object as scanned_object
 from .objects.scenery import Scene as Scene, load_scene as load_scene
 from .objects.shape import ObjectModel as ObjectModel
-from .optimization.fingers import ClosingConfig as ClosingConfig
-from .optimization.refinement import RefineConfig as RefineConfig
-from .optimization.squeeze import GripConfig as GripConfig
-from .optimization.synthesis import SynthesisConfig as SynthesisConfig, synthesize as synthesize
-from .perception.partial_views import DepthCamera as DepthCamera, visible_points as visible_points
-from .perception.scan import depth_points as depth_points, scanned_object as scanned_object
+from .optimize.fingers import ClosingConfig as ClosingConfig
+from .optimize.refinement import RefineConfig as RefineConfig
+from .optimize.squeeze import GripConfig as GripConfig
+from .optimize.synthesis import SynthesisConfig as SynthesisConfig, synthesize as synthesize
 from .pictures.sheets import PictureStyle as PictureStyle, draw_grasps as draw_grasps
-from .planning.attempts import Attempt as Attempt, TabletopConfig as TabletopConfig
-from .planning.motion import (
-    MotionPlan as MotionPlan,
-    trajectory_csv as trajectory_csv,
-    trajectory_yaml as trajectory_yaml,
-)
-from .planning.planner import PlanConfig as PlanConfig, plan as plan
-from .planning.reachability import ReachConfig as ReachConfig
-from .planning.robot import Robot as Robot, load_robot as load_robot
-from .planning.robot_check import RobotReport as RobotReport, check_robot as check_robot
-from .planning.table_scene import PickedObject as PickedObject, pick_object as pick_object
-from .planning.tabletop import TabletopRun as TabletopRun, run_tabletop as run_tabletop
 from .predict.config import (
     GraspRequest as GraspRequest,
     PredictorConfig as PredictorConfig,
@@ -64,12 +60,11 @@ from .predict.sources.optimiser import OptimiserConfig as OptimiserConfig
 from .predict.sources.registry import make_source as make_source, register_source as register_source
 from .predict.sources.source import Candidates as Candidates, Source as Source
 from .predict.stages import complete as complete, evaluate as evaluate, rank as rank, refine as refine
-from .serve.client import GraspClient as GraspClient
 from .simulation.contact_quality import ContactQuality as ContactQuality, measure_contacts as measure_contacts
 from .simulation.outcome import Failure as Failure, TrialResult as TrialResult
 from .simulation.protocols import Perturbations as Perturbations, Protocol as Protocol
 from .simulation.trial import simulate as simulate
-from .training.config import (
+from .train.config import (
     AugmentationConfig as AugmentationConfig,
     LossConfig as LossConfig,
     MotionConfig as MotionConfig,
@@ -77,6 +72,11 @@ from .training.config import (
     ScheduleConfig as ScheduleConfig,
     TrainConfig as TrainConfig,
 )
-from .training.loop import train as train
-from .training.pretraining import pretrain as pretrain, pretrain_motion as pretrain_motion
-from .viewer.grasp_page import view_grasps as view_grasps
+from .train.data.bundle.training_file import load_bundle as load_bundle
+from .train.data.collections.bundling import make_bundle as make_bundle
+from .train.data.collections.collection import read_collection as read_collection
+from .train.data.engine.schedule import synthesize_dataset as synthesize_dataset
+from .train.data.engine.worker import EngineConfig as EngineConfig
+from .train.loop import train as train
+from .train.made_hands.making import MadeHand as MadeHand, make_hand as make_hand
+from .train.pretraining import pretrain as pretrain, pretrain_motion as pretrain_motion

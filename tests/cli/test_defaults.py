@@ -9,14 +9,14 @@ from typing import Any
 
 import pytest
 
+from dro_grasp.apps.viewer.studio import Studio
 from dro_grasp.cli.evaluate import Evaluate
 from dro_grasp.cli.generate import Generate
 from dro_grasp.cli.inputs import ConstraintOptions
 from dro_grasp.cli.main import THREADS, WAIT_POLICY, main
 from dro_grasp.cli.synthesize import Synthesize
-from dro_grasp.datasets.engine.worker import EngineConfig
-from dro_grasp.energy.contacts import ContactConfig
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.optimize.contacts import ContactConfig
 from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.predictor import GraspPredictor
@@ -24,7 +24,7 @@ from dro_grasp.predict.stages import evaluate
 from dro_grasp.simulation.closed_poses import settle
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL
 from dro_grasp.simulation.trial import record, simulate
-from dro_grasp.viewer.studio import Studio
+from dro_grasp.train.data.engine.worker import EngineConfig
 from tests.helpers.served_studio import served_studio
 
 REQUESTS = {"num": 16, "seed": 0, "candidates": 4, "refine": True, "temperature": None, "source": "auto"}

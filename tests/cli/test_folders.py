@@ -11,6 +11,7 @@ import torch
 import trimesh
 from PIL import Image
 
+from dro_grasp.apps.viewer.studio import StudioServer
 from dro_grasp.cli.main import main
 from dro_grasp.errors import GraspFileError
 from dro_grasp.grasps.batch import GraspBatch, load_grasps
@@ -18,7 +19,6 @@ from dro_grasp.grasps.sources import object_of, with_own_files
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.pictures.sheets import CAPTION, HEADER, TILE
 from dro_grasp.predict.sources.controls import palm_facing_starts
-from dro_grasp.viewer.studio import StudioServer
 from tests.helpers.browser import free_port
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.served_studio import visited
@@ -67,7 +67,7 @@ def test_picture_takes_a_folder(folder: Path, tmp_path: Path, more: list[str], t
 @pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")
 def test_view_takes_a_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     servers: list[StudioServer] = []
-    monkeypatch.setattr("dro_grasp.viewer.scene_view.serve", servers.append)
+    monkeypatch.setattr("dro_grasp.apps.viewer.scene_view.serve", servers.append)
     for more in ([], ["--object", "sphere"]):
         assert main(["view", str(folder), "--port", str(free_port()), *more]) == 0
     try:
@@ -165,7 +165,7 @@ def test_a_bare_cloud_among_the_objects_is_refused_before_any_trial(
     def none(*_: object, **__: object) -> None:
         raise AssertionError("a trial")
 
-    monkeypatch.setattr("dro_grasp.datasets.collections.checking.simulate", none)
+    monkeypatch.setattr("dro_grasp.train.data.collections.checking.simulate", none)
     assert main(["dataset", *command.split(), str(beside_a_cloud)]) == 2
     assert "object 'points' is a bare point cloud; a trial needs a mesh" in capsys.readouterr().err
 

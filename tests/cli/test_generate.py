@@ -13,7 +13,7 @@ from dro_grasp.cli.main import main
 from dro_grasp.compare.metrics import wilson_interval
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
+from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predict.admission import permitted
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from dro_grasp.apps.viewer.studio import Studio, StudioServer
 from dro_grasp.cli.main import main
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.library import BUILTIN_FOLDER
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predict.sources.controls import palm_facing_starts
-from dro_grasp.viewer.studio import Studio, StudioServer
 from tests.helpers.browser import free_port
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.served_studio import visited
@@ -39,7 +39,7 @@ def both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> GraspBatch:
 def first_page(monkeypatch: pytest.MonkeyPatch):
     """What opens the page of `view` with some arguments, and returns it."""
     servers: list[StudioServer] = []
-    monkeypatch.setattr("dro_grasp.viewer.scene_view.serve", servers.append)
+    monkeypatch.setattr("dro_grasp.apps.viewer.scene_view.serve", servers.append)
 
     def opened(*arguments: str) -> Studio:
         assert main(["view", *arguments, "--port", str(free_port())]) == 0
@@ -96,7 +96,7 @@ def test_a_hand_of_other_joints_is_refused(both: GraspBatch, command: str, capsy
 def test_a_mesh_does_not_replace_one_of_several_objects(
     both: GraspBatch, command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("dro_grasp.viewer.scene_view.serve", StudioServer.stop)
+    monkeypatch.setattr("dro_grasp.apps.viewer.scene_view.serve", StudioServer.stop)
     name, *more = COMMANDS[command]
     assert main([name, "both.parquet", "--object", "sphere", *more]) == 2
     assert "--object is 'sphere', but the grasps are of 2 objects (mug, can)" in capsys.readouterr().err

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from dro_grasp.arm.robot import BUILTIN_ROBOTS
 from dro_grasp.cli.main import main
-from dro_grasp.planning.robot import BUILTIN_ROBOTS
 
 
 def test_the_list_names_every_file_that_ships(capsys: pytest.CaptureFixture[str]) -> None:

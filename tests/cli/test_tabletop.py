@@ -11,9 +11,9 @@ import pytest
 
 import dro_grasp as dro
 from dro_grasp import extras
+from dro_grasp.arm import tabletop
+from dro_grasp.arm.attempts import Attempt, TabletopConfig
 from dro_grasp.cli.main import main
-from dro_grasp.planning import tabletop
-from dro_grasp.planning.attempts import Attempt, TabletopConfig
 
 
 @pytest.fixture

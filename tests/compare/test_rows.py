@@ -25,7 +25,7 @@ from dro_grasp.compare.stages import (
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
+from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.controls import StartSource

@@ -30,9 +30,9 @@ from dro_grasp.compare.stages import (
 )
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import SCALES, load_object
+from dro_grasp.objects.perception.partial_views import View
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimization.synthesis import SynthesisConfig
-from dro_grasp.perception.partial_views import View
+from dro_grasp.optimize.synthesis import SynthesisConfig
 from dro_grasp.predict.config import GraspRequest, PredictorConfig, RescueConfig
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 import dro_grasp as dro
-from dro_grasp.perception.partial_views import partial_view
+from dro_grasp.objects.perception.partial_views import partial_view
 from dro_grasp.simulation.protocols import PROTOCOLS
 from tests.helpers.tiny_bundle import tiny_bundle
 

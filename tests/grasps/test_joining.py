@@ -7,7 +7,7 @@ import torch
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import ControllerConfig, pregrasp_and_squeeze
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
+from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.loaded_hands import loaded_hand
 

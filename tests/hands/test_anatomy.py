@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from dro_grasp.energy.contacts import contact_candidates
 from dro_grasp.hands.anatomy import PALM, find_fingers
 from dro_grasp.hands.hand import Hand
+from dro_grasp.optimize.contacts import contact_candidates
 from dro_grasp.pictures.appearance import link_colours
 from tests.helpers.bracket_hand import bracket_hand
 from tests.helpers.loaded_hands import loaded_hand

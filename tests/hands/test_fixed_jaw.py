@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from dro_grasp.energy.contacts import contact_candidates
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.check import check_hand
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.hands.palm import find_fixed_jaw, fixed_jaw_of
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.optimization.synthesis import synthesize
+from dro_grasp.optimize.contacts import contact_candidates
+from dro_grasp.optimize.synthesis import synthesize
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.claw_urdf import claw, joint, link, written
 

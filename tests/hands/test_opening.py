@@ -16,7 +16,7 @@ from dro_grasp.hands.closing import Closing, ClosingFinder
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import hand_names
 from dro_grasp.hands.palm import EARLY_CLOSINGS
-from dro_grasp.optimization.starts import StartConfig, start_joints
+from dro_grasp.optimize.starts import StartConfig, start_joints
 from tests.helpers.bracket_hand import bracket_urdf
 from tests.helpers.claw_urdf import LIMIT, claw, joint, link, written
 from tests.helpers.folding_hands import folding_bracket, folding_claw, rolling_ring, swinging_ring

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import BUILTIN_FOLDER, load_hand
 from dro_grasp.hands.proportions import proportions
-from dro_grasp.models.network import DistanceNetwork
+from dro_grasp.network.network import DistanceNetwork
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dro_grasp.hands.proportions import OPENNESS, UNIT, proportions
-from dro_grasp.models.placement import PROPORTIONS
+from dro_grasp.network.placement import PROPORTIONS
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.toy_hand import toy_hand
 

@@ -12,10 +12,10 @@ import trimesh
 
 import dro_grasp as dro
 from dro_grasp.cli.main import main
-from dro_grasp.descriptions.loader import Description, load_description
 from dro_grasp.errors import HandError, OptionError
 from dro_grasp.geometry.point_clouds import enclosed_volume
 from dro_grasp.hands.check import hand_side
+from dro_grasp.hands.description.loader import Description, load_description
 from dro_grasp.hands.library import load_hand_description
 from tests.helpers.claw_urdf import LIMIT, claw, joint, link, written
 from tests.helpers.loaded_hands import loaded_hand

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 import torch
 
-from dro_grasp.descriptions.loader import load_description
 from dro_grasp.errors import HandError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import hand_of, with_own_files, with_sources
 from dro_grasp.hands.check import check_hand
+from dro_grasp.hands.description.loader import load_description
+from dro_grasp.hands.kinematics.tree import KinematicTree
 from dro_grasp.hands.library import load_hand, locate_hand
 from dro_grasp.hands.variants import vary_hand
-from dro_grasp.kinematics.tree import KinematicTree
 from dro_grasp.objects.catalogue import load_object
 from tests.helpers.claw_urdf import claw, joint, link, written
 from tests.helpers.whole_robot import arm_with_claw, two_arms

@@ -15,11 +15,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dro_grasp.energy.grasp_energy import GraspEnergy
 from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.hands.hand import Hand
-from dro_grasp.kinematics.tree import KinematicTree
+from dro_grasp.hands.kinematics.tree import KinematicTree
+from dro_grasp.optimize.grasp_energy import GraspEnergy
 
 SPACING = 0.004  # of the field [m]
 HALF = (0.034, 0.027, 0.02)  # of the object [m]

@@ -8,9 +8,9 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from dro_grasp.datasets.engine.shards import Yield, notes_of
-from dro_grasp.datasets.engine.worker import FinishedShard, Job, Task
 from dro_grasp.errors import HandError, ObjectError
+from dro_grasp.train.data.engine.shards import Yield, notes_of
+from dro_grasp.train.data.engine.worker import FinishedShard, Job, Task
 from tests.datasets.test_shards import grasps
 
 GRASPS = 5

@@ -9,9 +9,9 @@ from types import SimpleNamespace
 
 import viser
 
+from dro_grasp.apps.viewer.scene_view import HOST, ServedPage
+from dro_grasp.apps.viewer.studio import Studio, StudioServer
 from dro_grasp.predict.predictor import GraspPredictor
-from dro_grasp.viewer.scene_view import HOST, ServedPage
-from dro_grasp.viewer.studio import Studio, StudioServer
 from tests.helpers.browser import free_port
 from tests.helpers.weights import untrained_weights
 

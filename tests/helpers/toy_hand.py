@@ -9,7 +9,7 @@ import torch
 
 from dro_grasp.hands.anatomy import find_fingers, rigid_groups
 from dro_grasp.hands.hand import Hand
-from dro_grasp.kinematics.tree import FIXED, REVOLUTE, KinematicTree
+from dro_grasp.hands.kinematics.tree import FIXED, REVOLUTE, KinematicTree
 
 PALM = (0.06, 0.06, 0.02)
 LINK = (0.014, 0.014, 0.04)

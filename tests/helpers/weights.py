@@ -6,9 +6,9 @@ from pathlib import Path
 
 
 def untrained_weights(folder: Path) -> Path:
-    from dro_grasp.models.checkpoints import save_weights
-    from dro_grasp.models.network import untrained_network
-    from dro_grasp.models.presets import NetworkConfig
+    from dro_grasp.network.checkpoints import save_weights
+    from dro_grasp.network.network import untrained_network
+    from dro_grasp.network.presets import NetworkConfig
 
     path = folder / "untrained.safetensors"
     config = NetworkConfig(

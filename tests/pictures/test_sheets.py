@@ -14,13 +14,14 @@ from PIL import Image
 from dro_grasp.cli import view
 from dro_grasp.cli.main import main
 from dro_grasp.errors import OutputError
+from dro_grasp.geometry.rendering.rasterizer import Camera, render
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import completed
 from dro_grasp.hands.check import picture
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.perception.partial_views import partial_view
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.perception.partial_views import partial_view
 from dro_grasp.pictures import sheets as pictures
 from dro_grasp.pictures.appearance import (
     OBJECT_COLOUR,
@@ -42,7 +43,6 @@ from dro_grasp.pictures.sheets import (
     draw_grasps,
     heading,
 )
-from dro_grasp.rendering.rasterizer import Camera, render
 from tests.helpers.loaded_hands import loaded_hand
 
 

@@ -8,14 +8,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from dro_grasp.energy.grasp_energy import Room
-from dro_grasp.energy.workspace import Surroundings
 from dro_grasp.errors import OptionError
 from dro_grasp.geometry.distance_field import Balls
 from dro_grasp.hands.anatomy import PALM
-from dro_grasp.models.network import DistanceNetwork, Moves
-from dro_grasp.models.presets import NetworkConfig
+from dro_grasp.network.network import DistanceNetwork, Moves
+from dro_grasp.network.presets import NetworkConfig
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.optimize.grasp_energy import Room
+from dro_grasp.optimize.workspace import Surroundings
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.choice import CROWDING_POINTS, ChoiceConfig, ChoicePenalties, choice_scores
 from dro_grasp.predict.sources.network import ProposalConfig, propose

@@ -15,7 +15,7 @@ from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.optimization.starts import LARGEST_TILT, angle_to_arc
+from dro_grasp.optimize.starts import LARGEST_TILT, angle_to_arc
 from dro_grasp.predict.admission import permitted
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem

@@ -11,18 +11,18 @@ import torch
 
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.optimization.fingers import EasingConfig
-from dro_grasp.optimization.refinement import RefineConfig
-from dro_grasp.perception.partial_views import partial_view
+from dro_grasp.objects.perception.partial_views import partial_view
+from dro_grasp.optimize.fingers import EasingConfig
+from dro_grasp.optimize.refinement import RefineConfig
 from dro_grasp.predict.admission import TURNED, AdmissionConfig, permitted, reasons_against
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.finish import FinishConfig, finish
 from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.score.holding_score import holding_score
 from dro_grasp.predict.settling import SettleConfig, settled
 from dro_grasp.predict.sources.controls import palm_facing_starts
 from dro_grasp.predict.sources.source import Candidates
 from dro_grasp.predict.stages import complete, ease, refine, scored
-from dro_grasp.ranking.holding_score import holding_score
 from tests.helpers.loaded_hands import loaded_hand
 
 HAND, CAN = loaded_hand("gripper3"), load_object("can")

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 
+from dro_grasp.arm.candidates import grasps_in_world
 from dro_grasp.cli.main import main
 from dro_grasp.compare.methods import Method
 from dro_grasp.compare.stages import RETURNED, BenchmarkConfig, benchmark, pair_seed
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.optimization.refinement import RefineConfig
-from dro_grasp.planning.candidates import grasps_in_world
+from dro_grasp.optimize.refinement import RefineConfig
 from dro_grasp.predict.admission import AdmissionConfig
 from dro_grasp.predict.config import GraspRequest, PredictorConfig
 from dro_grasp.predict.constraints import Constraints

@@ -14,11 +14,11 @@ from torch import Tensor
 from dro_grasp.errors import NoGraspError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
-from dro_grasp.models.network import DistanceNetwork
+from dro_grasp.network.network import DistanceNetwork
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimization.starts import Spread, wrist_rotations
-from dro_grasp.optimization.synthesis import SynthesisConfig
+from dro_grasp.optimize.starts import Spread, wrist_rotations
+from dro_grasp.optimize.synthesis import SynthesisConfig
 from dro_grasp.predict.admission import PLANE, TURNED, AdmissionConfig
 from dro_grasp.predict.config import GraspRequest, PredictorConfig, RescueConfig, RetryConfig
 from dro_grasp.predict.constraints import Constraints

@@ -9,14 +9,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from dro_grasp.energy.grasp_energy import EnergyConfig
 from dro_grasp.errors import ObjectError
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.optimization.fingers import lacking_room
-from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
-from dro_grasp.perception.partial_views import partial_view
+from dro_grasp.objects.perception.partial_views import partial_view
+from dro_grasp.optimize.fingers import lacking_room
+from dro_grasp.optimize.grasp_energy import EnergyConfig
+from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predict.admission import permitted
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem

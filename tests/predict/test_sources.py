@@ -14,7 +14,7 @@ from dro_grasp.compare.methods import MethodOptions, make_method
 from dro_grasp.errors import GraspFileError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.optimization.synthesis import SynthesisConfig
+from dro_grasp.optimize.synthesis import SynthesisConfig
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.network import NetworkSource

@@ -8,12 +8,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from dro_grasp.energy.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.errors import GraspFileError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize, synthesize_with
-from dro_grasp.perception.partial_views import partial_view
+from dro_grasp.objects.perception.partial_views import partial_view
+from dro_grasp.optimize.grasp_energy import EnergyConfig, GraspEnergy
+from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize, synthesize_with
 from dro_grasp.predict.admission import AdmissionConfig, permitted
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem

@@ -9,7 +9,7 @@ import torch
 
 from dro_grasp.errors import ObjectError
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.perception.partial_views import partial_view
+from dro_grasp.objects.perception.partial_views import partial_view
 from dro_grasp.simulation.contacts import deepest_penetration
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.claw import ball, claw, grasps_of, wrist_below

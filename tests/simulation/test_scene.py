@@ -9,9 +9,9 @@ import pytest
 import torch
 from trimesh.convex import convex_hull
 
-from dro_grasp.descriptions.loader import self_penetration
 from dro_grasp.errors import HandError, ObjectError
 from dro_grasp.geometry.distance_field import Balls
+from dro_grasp.hands.description.loader import self_penetration
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import ASSET_FILES, load_hand
 from dro_grasp.objects.shape import ObjectModel

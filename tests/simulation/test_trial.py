@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
+from dro_grasp.arm.workcell import moved
 from dro_grasp.errors import GraspFileError, ObjectError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import ControllerConfig
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.planning.workcell import moved
 from dro_grasp.simulation import rollout as rollouts
 from dro_grasp.simulation.closed_poses import held, settle
 from dro_grasp.simulation.holding import holding
@@ -314,7 +314,7 @@ def test_a_cloud_cannot_be_simulated(hand, obj):
 @pytest.mark.parametrize("name", ["barrett_multidex", "allegro_left", "shadowhand"])
 def test_synthesised_grasps_of_the_paper_hands_hold(name: str, assets_folder: Path):
     from dro_grasp.objects.catalogue import load_object
-    from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize
+    from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 
     hand, can = loaded_hand(f"assets/{name}"), load_object("can")
     grasps = synthesize(hand, can, 48, config=SynthesisConfig(steps=100))[0:16]

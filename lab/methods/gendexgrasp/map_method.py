@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.models.checkpoints import load_into
+from dro_grasp.network.checkpoints import load_into
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.source import Progress, Source
 from lab.methods import WEIGHTS

@@ -19,11 +19,11 @@ from torch import Tensor
 from dro_grasp.geometry.se3 import apply, register, rotate
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.kinematics.joint_solver import Targets, solve_joints
 from dro_grasp.kinds import Checked
-from dro_grasp.kinematics.joint_solver import Targets, solve_joints
-from dro_grasp.models.checkpoints import load_into
-from dro_grasp.optimization.refinement import RefineConfig, refine_grasps
-from dro_grasp.optimization.squeeze import gripping
+from dro_grasp.network.checkpoints import load_into
+from dro_grasp.optimize.refinement import RefineConfig, refine_grasps
+from dro_grasp.optimize.squeeze import gripping
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.source import Progress, Source
 from lab.methods import WEIGHTS

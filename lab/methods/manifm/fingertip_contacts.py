@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dro_grasp.energy.contacts import contact_candidates
-from dro_grasp.energy.grasp_energy import NearestPoints
 from dro_grasp.hands.hand import Hand
-from dro_grasp.optimization.squeeze import GripConfig, contact_forces
+from dro_grasp.optimize.contacts import contact_candidates
+from dro_grasp.optimize.grasp_energy import NearestPoints
+from dro_grasp.optimize.squeeze import GripConfig, contact_forces
 
 REACH = GripConfig.reach
 """Fingers nearer than this to the object are taken to touch it [m]: as where squeezes are made."""

@@ -13,7 +13,7 @@ from dro_grasp.cli.inputs import Flag, ProtocolName, optional
 from dro_grasp.cli.output import print_result, progress_bar, records, say_aside
 
 if TYPE_CHECKING:
-    from dro_grasp.datasets.collections.collection import PairGrasps
+    from dro_grasp.train.data.collections.collection import PairGrasps
 
 
 
@@ -40,10 +40,10 @@ class Import:
 
     def run(self) -> int:
         """Read all files, find hands and objects, write grasp files."""
-        from dro_grasp.datasets.collections.importing import import_grasps
-        from dro_grasp.datasets.collections.merging import file_name
         from dro_grasp.errors import GraspFileError
         from dro_grasp.files import check_folder, make_folder
+        from dro_grasp.train.data.collections.importing import import_grasps
+        from dro_grasp.train.data.collections.merging import file_name
 
         check_folder(self.output)
         here = {theirs: ours for theirs, _, ours in (pair.rpartition("=") for pair in self.hands)}
@@ -78,7 +78,7 @@ class Info:
 
     def run(self) -> int:
         """Count."""
-        from dro_grasp.datasets.collections.collection import count_collection
+        from dro_grasp.train.data.collections.collection import count_collection
 
         counts = count_collection(self.folder)
         total = sum(sum(c.values()) for c in counts.values())
@@ -97,8 +97,8 @@ class DataSets:
 
     def pairs(self, only_successful: bool) -> Iterator[PairGrasps]:
         """The grasps of each pair in them; refuses two hands of one name, which cannot join in one file or table."""
-        from dro_grasp.compare.coverage import of_one_version
-        from dro_grasp.datasets.collections.collection import read_collection
+        from dro_grasp.train.data.collections.collection import read_collection
+        from dro_grasp.train.data.collections.coverage import of_one_version
 
         return of_one_version((path, pair) for path in self.inputs for pair in read_collection(path, only_successful))
 
@@ -117,9 +117,9 @@ class Report(DataSets):
 
     def run(self) -> int:
         """Measure, print, write the page."""
-        from dro_grasp.compare.coverage import measure_coverage
         from dro_grasp.files import check_output
-        from dro_grasp.pictures.dataset_report import write_report
+        from dro_grasp.train.data.collections.coverage import measure_coverage
+        from dro_grasp.train.data.collections.report import write_report
 
         output = None if self.output is None else check_output(self.output, ".html")
         hands = measure_coverage(self.pairs(only_successful=True))
@@ -153,8 +153,8 @@ class Merge(DataSets):
 
     def run(self) -> int:
         """Merge, and write the files."""
-        from dro_grasp.datasets.collections.merging import file_name, merge, require_choice
         from dro_grasp.files import make_folder
+        from dro_grasp.train.data.collections.merging import file_name, merge, require_choice
 
         require_choice(self.per_pair)
         folder = make_folder(self.output)
@@ -194,8 +194,8 @@ class Check(DataSets):
     def run(self) -> int:
         """Draw, evaluate, compare."""
         from dro_grasp.compare.metrics import wilson_interval
-        from dro_grasp.datasets.collections.checking import check
         from dro_grasp.simulation.protocols import changed
+        from dro_grasp.train.data.collections.checking import check
 
         rules = changed(self.protocol, friction=self.friction, mass_factor=self.mass_factor)
         with progress_bar("evaluating", self.json) as progress:
@@ -234,12 +234,12 @@ class Filter(DataSets):
 
     def run(self) -> int:
         """Evaluate, and write one file per hand."""
-        from dro_grasp.datasets.collections.checking import keep_passing
-        from dro_grasp.datasets.collections.collection import yield_notes
-        from dro_grasp.datasets.collections.merging import file_name
         from dro_grasp.files import make_folder
         from dro_grasp.grasps.batch import GraspBatch
         from dro_grasp.simulation.protocols import changed
+        from dro_grasp.train.data.collections.checking import keep_passing
+        from dro_grasp.train.data.collections.collection import yield_notes
+        from dro_grasp.train.data.collections.merging import file_name
 
         rules = changed(self.protocol, friction=self.friction)
         folder = make_folder(self.output)
@@ -282,9 +282,9 @@ class BundleCommand(DataSets):
 
     def run(self) -> int:
         """Select the grasps of the split, find their hands and objects, write the bundle."""
-        from dro_grasp.datasets.collections.bundling import make_bundle
         from dro_grasp.files import check_output
         from dro_grasp.hands.library import load_hand
+        from dro_grasp.train.data.collections.bundling import make_bundle
 
         output = check_output(self.output, ".safetensors")
         further = [load_hand(name) for name in self.hands_without_grasps]

@@ -10,11 +10,11 @@ import tyro
 
 from dro_grasp.cli.inputs import Flag, optional
 from dro_grasp.cli.output import print_json, say
-from dro_grasp.export.formats import FORMATS, ExportJob
+from dro_grasp.grasps.export.formats import FORMATS, ExportJob
 
 if TYPE_CHECKING:
-    from dro_grasp.export.writers import Frame
     from dro_grasp.grasps.batch import GraspBatch
+    from dro_grasp.grasps.export.writers import Frame
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,8 @@ class Export:
 
     def run(self) -> int:
         """Complete the grasps, then write a file for each object."""
-        from dro_grasp.export.writers import Frame
         from dro_grasp.files import check_folder, check_output, make_folder
+        from dro_grasp.grasps.export.writers import Frame
         from dro_grasp.grasps.sources import require_one_object
 
         frame = Frame() if self.frame is None else Frame.load(self.frame)

@@ -128,7 +128,7 @@ class Generate:
         if self.json:
             print_json({"results": [d.report for d in done], "failed": failed} if several else done[0].report)
         if self.view:
-            from dro_grasp.viewer.grasp_page import view_grasps
+            from dro_grasp.apps.viewer.grasp_page import view_grasps
 
             for d in (d for d in done if len(d.grasps)):
                 view_grasps(hand, d.obj, d.grasps, d.predicted_points)
@@ -203,7 +203,7 @@ class Generate:
     def _load(self, name: str, camera: NamedMotion | None) -> ObjectModel:
         from dro_grasp.files import given_path
         from dro_grasp.objects.catalogue import load_object
-        from dro_grasp.perception.scan import load_scan
+        from dro_grasp.objects.perception.scan import load_scan
 
         if camera is None:
             return load_object(name, scale=self.scale, keep_table=self.keep_table)

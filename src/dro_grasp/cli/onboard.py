@@ -47,8 +47,8 @@ class Onboard:
     def run(self) -> int:
         """Run all steps, then write the report."""
         from dro_grasp.objects.catalogue import resolve_objects
-        from dro_grasp.onboarding.report import write_report
-        from dro_grasp.onboarding.steps import WEIGHTS, OnboardingConfig, onboard
+        from dro_grasp.train.onboard.report import write_report
+        from dro_grasp.train.onboard.steps import WEIGHTS, OnboardingConfig, onboard
 
         config = OnboardingConfig(
             self.minutes, self.objects, self.held_out, self.num, self.weights, self.workers, self.source, seed=self.seed,

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Float
 
-    from dro_grasp.planning.attempts import Attempt
-    from dro_grasp.planning.robot import Robot
-    from dro_grasp.planning.table_scene import PickedObject
+    from dro_grasp.arm.attempts import Attempt
+    from dro_grasp.arm.robot import Robot
+    from dro_grasp.arm.table_scene import PickedObject
 
 
 @dataclass(frozen=True)
@@ -75,14 +75,14 @@ class Plan:
 
     def run(self) -> int:
         """Check everything that can be checked before the work, then plan and write."""
+        from dro_grasp.arm.motion import trajectory_csv, trajectory_yaml
+        from dro_grasp.arm.planner import PlanConfig, plan
+        from dro_grasp.arm.robot import load_robot
         from dro_grasp.errors import OptionError
         from dro_grasp.extras import require_extra
         from dro_grasp.files import check_output, replacing
         from dro_grasp.objects.catalogue import load_object
         from dro_grasp.objects.scenery import load_scene
-        from dro_grasp.planning.motion import trajectory_csv, trajectory_yaml
-        from dro_grasp.planning.planner import PlanConfig, plan
-        from dro_grasp.planning.robot import load_robot
         from dro_grasp.predict.predictor import GraspPredictor
 
         require_extra("arm")
@@ -126,15 +126,15 @@ class Plan:
         """The object with what stands around it, and where its frame is in the world."""
         import numpy as np
 
+        from dro_grasp.arm.robot import Table
+        from dro_grasp.arm.table_scene import PickedObject, pick_object, sees_table
         from dro_grasp.errors import OptionError
         from dro_grasp.files import given_path
         from dro_grasp.frames import read_motion
         from dro_grasp.objects.catalogue import load_object
         from dro_grasp.objects.loading import read_geometry
+        from dro_grasp.objects.perception.scan import load_scan
         from dro_grasp.objects.reading import read_points
-        from dro_grasp.perception.scan import load_scan
-        from dro_grasp.planning.robot import Table
-        from dro_grasp.planning.table_scene import PickedObject, pick_object, sees_table
 
         if sum(given is not None for given in (self.camera, self.pose, self.at)) > 1:
             raise OptionError("--camera, --pose and --at each say where the object is; give one of them")
@@ -233,12 +233,12 @@ class Tabletop:
         from dro_grasp.extras import require_extra
 
         require_extra("arm")
+        from dro_grasp.arm.animation import FORMATS, draw_attempt
+        from dro_grasp.arm.attempts import TabletopConfig
+        from dro_grasp.arm.planner import PlanConfig
+        from dro_grasp.arm.tabletop import TabletopRun, run_tabletop
         from dro_grasp.files import check_output
         from dro_grasp.objects.catalogue import resolve_objects
-        from dro_grasp.planning.animation import FORMATS, draw_attempt
-        from dro_grasp.planning.attempts import TabletopConfig
-        from dro_grasp.planning.planner import PlanConfig
-        from dro_grasp.planning.tabletop import TabletopRun, run_tabletop
 
         if self.video is not None:
             check_output(self.video, *FORMATS)
@@ -257,8 +257,8 @@ class Tabletop:
         return 0
 
     def _report(self, done: list[Attempt]) -> None:
+        from dro_grasp.arm.tabletop import endings, failures, processor_seconds
         from dro_grasp.compare.metrics import wilson_interval
-        from dro_grasp.planning.tabletop import endings, failures, processor_seconds
 
         held = sum(a.success for a in done)
         low, high = wilson_interval(held, len(done))
@@ -303,8 +303,8 @@ class CheckRobot:
 
     def run(self) -> int:
         """Check, print, draw."""
+        from dro_grasp.arm.robot_check import check_robot, draw_robot
         from dro_grasp.files import check_output
-        from dro_grasp.planning.robot_check import check_robot, draw_robot
 
         if self.picture is not None:
             check_output(self.picture, ".png")
@@ -324,7 +324,7 @@ class Robots:
 
     def run(self) -> int:
         """Print the names."""
-        from dro_grasp.planning.robot import robot_names
+        from dro_grasp.arm.robot import robot_names
 
         names = robot_names()
         print_result(self.json, {"robots": names}, "robots", ["name"], [[n] for n in names], "also: the path of a robot.yaml")

@@ -46,9 +46,9 @@ class Serve:
         from dro_grasp.extras import require_extra
 
         require_extra("apps")
-        from dro_grasp.serve.answering import ServerConfig
-        from dro_grasp.serve.http_server import Access, listening_socket, serve_grasps
-        from dro_grasp.serve.request_queue import RequestQueue
+        from dro_grasp.apps.server.answering import ServerConfig
+        from dro_grasp.apps.server.http_server import Access, listening_socket, serve_grasps
+        from dro_grasp.apps.server.request_queue import RequestQueue
 
         access = Access(self.host, self.token or os.environ.get(TOKEN), self.megabytes)
         with listening_socket(self.host, self.port) as listener:

@@ -14,8 +14,8 @@ from dro_grasp.cli.inputs import Flag, ProtocolName, optional
 from dro_grasp.cli.output import print_result, say_aside
 
 if TYPE_CHECKING:
-    from dro_grasp.datasets.engine.pools import Pool
-    from dro_grasp.datasets.engine.worker import Job
+    from dro_grasp.train.data.engine.pools import Pool
+    from dro_grasp.train.data.engine.worker import Job
 
 
 @dataclass(frozen=True)
@@ -61,11 +61,11 @@ class Synthesize:
 
     def run(self) -> int:
         """Check numbers and names, then fill the folder; the exit code is 2 if every pair fails and there is no grasp."""
-        from dro_grasp.datasets.engine.schedule import require_distinct, require_known, synthesize_dataset
-        from dro_grasp.datasets.engine.worker import EngineConfig
-        from dro_grasp.energy.contacts import ContactConfig
         from dro_grasp.objects.catalogue import resolve_objects
-        from dro_grasp.optimization.synthesis import SynthesisConfig
+        from dro_grasp.optimize.contacts import ContactConfig
+        from dro_grasp.optimize.synthesis import SynthesisConfig
+        from dro_grasp.train.data.engine.schedule import require_distinct, require_known, synthesize_dataset
+        from dro_grasp.train.data.engine.worker import EngineConfig
 
         self._check_numbers()
         objects = resolve_objects(list(self.object))
@@ -112,6 +112,6 @@ class Synthesize:
         return int(found[1]), int(found[2])
 
     def _ray_pool(self, job: Job) -> Pool:
-        from dro_grasp.datasets.engine.pools import RayPool
+        from dro_grasp.train.data.engine.pools import RayPool
 
         return RayPool(job, self.workers, job.config.shard_seconds, self.ray_address)

@@ -13,9 +13,9 @@ from dro_grasp.cli.inputs import Flag, optional
 from dro_grasp.cli.output import print_result, print_table, say_aside
 
 if TYPE_CHECKING:
-    from dro_grasp.models.network import DistanceNetwork
-    from dro_grasp.models.presets import NetworkConfig
-    from dro_grasp.training.config import ScheduleConfig
+    from dro_grasp.network.network import DistanceNetwork
+    from dro_grasp.network.presets import NetworkConfig
+    from dro_grasp.train.config import ScheduleConfig
 
 
 FORMER_OPTIONS = ("--method", "--latent", "--latent-form", "--prior", "--placement-hand", "--divergence-warmup", "--free-bits",
@@ -78,7 +78,7 @@ class Stage:
             OptionError: A former option asks for something else than there is.
         """
         from dro_grasp.errors import OptionError
-        from dro_grasp.models.presets import FORMER, LAST_WITH_OTHERS, NetworkConfig
+        from dro_grasp.network.presets import FORMER, LAST_WITH_OTHERS, NetworkConfig
 
         given = None if initial is None or self.preset is not None else initial.config
         network = given or NetworkConfig.preset(self.preset or "multi")
@@ -99,8 +99,8 @@ class Stage:
             OptionError: It cannot.
         """
         from dro_grasp.devices import choose_device
-        from dro_grasp.training.config import ScheduleConfig
-        from dro_grasp.training.runs import check_schedule
+        from dro_grasp.train.config import ScheduleConfig
+        from dro_grasp.train.runs import check_schedule
 
         schedule = ScheduleConfig(
             learning_rate=self.learning_rate, minutes=self.minutes, shards=self.shards, tensorboard=self.tensorboard,
@@ -127,14 +127,14 @@ class Pretrain(Stage):
 
         import torch
 
-        from dro_grasp.compare.correspondence import matching_rank
-        from dro_grasp.datasets.bundle.training_file import load_bundle
         from dro_grasp.files import check_output
-        from dro_grasp.models.checkpoints import history_of, load_weights, locate_weights, save_weights
-        from dro_grasp.training.config import AugmentationConfig, MotionConfig, PretrainConfig
-        from dro_grasp.training.pretraining import pretrain, pretrain_motion
-        from dro_grasp.training.processes import is_first
-        from dro_grasp.training.samples import SampleSource
+        from dro_grasp.network.checkpoints import history_of, load_weights, locate_weights, save_weights
+        from dro_grasp.train.config import AugmentationConfig, MotionConfig, PretrainConfig
+        from dro_grasp.train.correspondence import matching_rank
+        from dro_grasp.train.data.bundle.training_file import load_bundle
+        from dro_grasp.train.pretraining import pretrain, pretrain_motion
+        from dro_grasp.train.processes import is_first
+        from dro_grasp.train.samples import SampleSource
 
         check_output(self.output, ".safetensors")
         initial = None if self.initial is None else load_weights(self.initial)
@@ -204,14 +204,14 @@ class Train(Stage):
         """Train and save."""
         import dataclasses
 
-        from dro_grasp.compare.distance_error import distance_errors
-        from dro_grasp.datasets.bundle.training_file import load_bundle
         from dro_grasp.errors import OptionError
         from dro_grasp.files import check_output
-        from dro_grasp.models.checkpoints import history_of, load_weights, locate_weights, save_weights
-        from dro_grasp.training.config import LOSSES, AugmentationConfig, PlacementConfig, TrainConfig
-        from dro_grasp.training.loop import train, train_placement
-        from dro_grasp.training.processes import is_first
+        from dro_grasp.network.checkpoints import history_of, load_weights, locate_weights, save_weights
+        from dro_grasp.train.config import LOSSES, AugmentationConfig, PlacementConfig, TrainConfig
+        from dro_grasp.train.data.bundle.training_file import load_bundle
+        from dro_grasp.train.distance_error import distance_errors
+        from dro_grasp.train.loop import train, train_placement
+        from dro_grasp.train.processes import is_first
 
         check_output(self.output, ".safetensors")
         if self.part == "placement" and (self.initial is None or self.pretrained is not None):
@@ -258,7 +258,7 @@ class Train(Stage):
 
 def how_long(run_folder: Path) -> dict[str, int]:
     """Steps and seconds that a run took."""
-    from dro_grasp.training.run_folder import last_logged
+    from dro_grasp.train.run_folder import last_logged
 
     last = last_logged(run_folder)
     return {"steps": int(last["step"]), "seconds": round(last["seconds"])}

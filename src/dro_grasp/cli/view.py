@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from threading import Lock
 
+    from dro_grasp.apps.viewer.scene_view import Client
+    from dro_grasp.apps.viewer.studio import Studio
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.objects.shape import ObjectModel
-    from dro_grasp.viewer.scene_view import Client
-    from dro_grasp.viewer.studio import Studio
 
 MAX_SIDE = 4096
 """Largest width and height of one picture [pixels]."""
@@ -60,15 +60,15 @@ class View:
         from dro_grasp.extras import require_extra
 
         require_extra("apps")
-        from dro_grasp.viewer.scene_view import serve
+        from dro_grasp.apps.viewer.scene_view import serve
 
         if self.file is not None and is_motion(self.file):
             require_extra("arm")
-            from dro_grasp.viewer.lift_page import lift_page
+            from dro_grasp.apps.viewer.lift_page import lift_page
 
             serve(lift_page(self.file, self.attempt, self.robot, self.weights, self.port, self.host))
             return 0
-        from dro_grasp.viewer.studio import StudioServer
+        from dro_grasp.apps.viewer.studio import StudioServer
 
         serve(StudioServer(self._picked() if self.file is None else self._opened(self.file), self.port, self.host))
         return 0
@@ -97,8 +97,8 @@ class View:
 
     def _pages(self, fill: Callable[[Studio], None] | None) -> Callable[[Client, Lock], Studio]:
         """What makes the page of a browser, which is filled with what was given, and with a first pair otherwise."""
+        from dro_grasp.apps.viewer.studio import Studio
         from dro_grasp.predict.predictor import GraspPredictor
-        from dro_grasp.viewer.studio import Studio
 
         predictor = GraspPredictor(self.weights, self.device)
 

@@ -21,7 +21,7 @@ class List:
 
     def run(self) -> int:
         """Print the metadata of each file."""
-        from dro_grasp.models.checkpoints import DEFAULT, describe_weights, weights_names
+        from dro_grasp.network.checkpoints import DEFAULT, describe_weights, weights_names
 
         found = [describe_weights(name) for name in weights_names()]
         rows = [[w["name"], w["parameters"], w["bytes"] / 1e6, trained_on(w["about"]), w["sha256"][:16]] for w in found]
@@ -45,7 +45,7 @@ class Verify:
     def run(self) -> int:
         """Check all files, then report; the exit code is 2 if one is damaged."""
         from dro_grasp.errors import WeightsError
-        from dro_grasp.models.checkpoints import SMALL, verify_weights, weights_names
+        from dro_grasp.network.checkpoints import SMALL, verify_weights, weights_names
 
         rows = []
         for name in self.names or (*weights_names(), *SMALL):

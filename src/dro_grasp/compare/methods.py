@@ -20,7 +20,7 @@ from dro_grasp.predict.sources.registry import WITH_DATA, make_source, present_n
 from dro_grasp.predict.sources.source import AUTO, Candidates, Source, ask
 
 if TYPE_CHECKING:
-    from dro_grasp.datasets.bundle.training_file import Bundle
+    from dro_grasp.train.data.bundle.training_file import Bundle
 
 
 @dataclass(frozen=True)

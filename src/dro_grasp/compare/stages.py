@@ -17,8 +17,8 @@ from dro_grasp.errors import NoGraspError, OptionError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
+from dro_grasp.objects.perception.partial_views import View, partial_view
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.perception.partial_views import View, partial_view
 from dro_grasp.predict.finish import finish
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.settling import can_settle

@@ -27,7 +27,7 @@ def with_sources(grasps: GraspBatch, hand: str, obj: str, scale: float, camera: 
     """
     import torch
 
-    from dro_grasp.descriptions.part import named, split_part
+    from dro_grasp.hands.description.part import named, split_part
     from dro_grasp.hands.library import locate_hand
 
     n, extra = len(grasps), dict(grasps.extra)
@@ -86,7 +86,7 @@ def object_of(grasps: GraspBatch, given: str | None, scale: float) -> ObjectMode
     `scale` is that of an object whose grasps record none. ObjectError: it is not found; the message asks for --object.
     """
     from dro_grasp.objects.catalogue import load_object
-    from dro_grasp.perception.scan import load_scan
+    from dro_grasp.objects.perception.scan import load_scan
 
     if given is not None:
         return load_object(given, scale=scale)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dro_grasp.errors import HandError
 from dro_grasp.geometry import se3
-from dro_grasp.kinematics.tree import FIXED, KinematicTree
+from dro_grasp.hands.kinematics.tree import FIXED, KinematicTree
 
 Joints = Float[Tensor, " n_dof"]  # a value of each independent joint
 JointMask = Bool[Tensor, " n_dof"]

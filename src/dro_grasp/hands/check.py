@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 import torch
 
-from dro_grasp.descriptions.compiling import Note
-from dro_grasp.descriptions.loader import Description
-from dro_grasp.descriptions.part import named
 from dro_grasp.files import check_output, replacing
 from dro_grasp.geometry.point_clouds import enclosed_volume
+from dro_grasp.geometry.rendering.rasterizer import Camera, Mesh, arrow, render
 from dro_grasp.hands.anatomy import Finger
 from dro_grasp.hands.build import LONGEST_REACH, build_hand, reach
+from dro_grasp.hands.description.compiling import Note
+from dro_grasp.hands.description.loader import Description
+from dro_grasp.hands.description.part import named
 from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.kinematics.tree import KinematicTree
 from dro_grasp.hands.library import load_hand_description
 from dro_grasp.hands.opening import FingerMotion, opening_notes
 from dro_grasp.hands.palm import fixed_jaw_of
-from dro_grasp.kinematics.tree import KinematicTree
-from dro_grasp.rendering.rasterizer import Camera, Mesh, arrow, render
 
 TILE = (560, 520)
 """Width and height of one view [pixels]."""

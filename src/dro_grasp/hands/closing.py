@@ -18,10 +18,10 @@ from torch import Tensor
 
 from dro_grasp.errors import HandError
 from dro_grasp.hands.anatomy import Finger, JointMask, Joints, Point, axes_along, closing_gains
+from dro_grasp.hands.kinematics.tree import KinematicTree
 from dro_grasp.hands.opening import FingerMotion, Line, main_axis
 from dro_grasp.hands.palm import CLOSINGS, NEARLY_CLOSED, NOTHING_ENCLOSED, FixedJaw, Palm, find_fixed_jaw, find_palm
 from dro_grasp.hands.surface import LinkSurface
-from dro_grasp.kinematics.tree import KinematicTree
 
 REFINEMENTS = 3
 """Rounds in which opening signs and palm are derived from each other (ours)."""

@@ -15,10 +15,10 @@ from dro_grasp.errors import OptionError
 from dro_grasp.geometry import se3
 from dro_grasp.geometry.point_clouds import farthest_points
 from dro_grasp.hands.anatomy import PALM, THUMB_CLOSING, Finger, find_fingers, find_thumb, measure_opposition, rigid_groups
-from dro_grasp.kinematics.tree import KinematicTree
+from dro_grasp.hands.kinematics.tree import KinematicTree
 
 if TYPE_CHECKING:
-    from dro_grasp.descriptions.loader import Description
+    from dro_grasp.hands.description.loader import Description
 
 MIN_FINGER_OFFSET = 0.005
 """Fingers whose middle is nearer than this to the palm's axis surround it [m] (ours)."""

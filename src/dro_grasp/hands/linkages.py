@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from dro_grasp.descriptions.tree_reading import LinkGeometry
 from dro_grasp.hands.anatomy import rigid_groups
-from dro_grasp.kinematics.tree import KinematicTree
+from dro_grasp.hands.description.tree_reading import LinkGeometry
+from dro_grasp.hands.kinematics.tree import KinematicTree
 
 Point = Float[np.ndarray, "3"]
 POSTURES = 16

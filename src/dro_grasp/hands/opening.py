@@ -13,11 +13,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dro_grasp.descriptions.compiling import Note
 from dro_grasp.geometry import se3
 from dro_grasp.hands.anatomy import Finger, JointMask, Joints, Point
+from dro_grasp.hands.description.compiling import Note
 from dro_grasp.hands.hand import Hand
-from dro_grasp.kinematics.tree import REVOLUTE, KinematicTree
+from dro_grasp.hands.kinematics.tree import REVOLUTE, KinematicTree
 
 STEPS = 64
 """Steps in which a joint's range, or the way from closed to open, is searched (ours)."""

@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dro_grasp.descriptions.loader import Description
-from dro_grasp.descriptions.tree_reading import LinkGeometry
 from dro_grasp.errors import HandError
 from dro_grasp.geometry import se3
 from dro_grasp.geometry.point_clouds import sample_surface
-from dro_grasp.kinematics.tree import KinematicTree
+from dro_grasp.hands.description.loader import Description
+from dro_grasp.hands.description.tree_reading import LinkGeometry
+from dro_grasp.hands.kinematics.tree import KinematicTree
 
 SAMPLES_PER_LINK = 512
 """Points sampled on each link before farthest point sampling. Source: appendix, robot point cloud sampling."""

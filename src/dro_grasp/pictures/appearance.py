@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dro_grasp.geometry.point_clouds import even_directions
+from dro_grasp.geometry.rendering.rasterizer import OBJECT_COLOUR, Camera, Colour, Mesh, dots
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.rendering.rasterizer import OBJECT_COLOUR, Camera, Colour, Mesh, dots
 
 PREDICTED_COLOUR: Colour = (0.85, 0.20, 0.55)
 """Pink of hand points predicted by the network."""

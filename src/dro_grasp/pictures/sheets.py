@@ -19,13 +19,13 @@ from torch import Tensor
 from dro_grasp.devices import cores
 from dro_grasp.errors import OutputError
 from dro_grasp.files import replacing
+from dro_grasp.geometry.rendering.rasterizer import Camera, dots, render
 from dro_grasp.grasps.batch import GraspBatch, percent
 from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked, checked
 from dro_grasp.objects.shape import ObjectModel, solid_of
 from dro_grasp.pictures.appearance import CONTACT_COLOUR, best_camera, hand_meshes, object_meshes, success_colour
-from dro_grasp.rendering.rasterizer import Camera, dots, render
 from dro_grasp.simulation.closed_poses import held
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 

@@ -11,12 +11,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from dro_grasp.energy.workspace import Surroundings
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.kinds import Checked
-from dro_grasp.optimization.squeeze import GripConfig
-from dro_grasp.optimization.starts import APPROACH, angle_to_arc
+from dro_grasp.optimize.squeeze import GripConfig
+from dro_grasp.optimize.starts import APPROACH, angle_to_arc
+from dro_grasp.optimize.workspace import Surroundings
 from dro_grasp.predict.problem import GraspProblem
 
 WAYPOINTS = 9

@@ -10,15 +10,15 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from dro_grasp.energy.grasp_energy import Room
-from dro_grasp.energy.workspace import Surroundings
 from dro_grasp.errors import OptionError
 from dro_grasp.files import TOLD
 from dro_grasp.geometry.distance_field import Ball, Balls
 from dro_grasp.kinds import Checked, plain
 from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimization.starts import Direction
+from dro_grasp.optimize.grasp_energy import Room
+from dro_grasp.optimize.starts import Direction
+from dro_grasp.optimize.workspace import Surroundings
 
 ELSEWHERE = 0.01
 """A table farther than this from the one in the cloud is another [m] (ours)."""

@@ -14,15 +14,15 @@ from torch import Tensor
 
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.kinds import Checked
-from dro_grasp.optimization.fingers import EasingConfig
-from dro_grasp.optimization.refinement import RefineConfig
+from dro_grasp.optimize.fingers import EasingConfig
+from dro_grasp.optimize.refinement import RefineConfig
 from dro_grasp.predict.admission import TURNED, AdmissionConfig, permitted, reasons_against
 from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.score.score import ScoreConfig
 from dro_grasp.predict.settling import SettleConfig, can_settle, settle_best
 from dro_grasp.predict.sources.source import Candidates
 from dro_grasp.predict.stages import complete, ease, refine, scored
 from dro_grasp.predict.stopwatch import Stopwatch
-from dro_grasp.ranking.score import ScoreConfig
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,11 @@ from dro_grasp.geometry.distance_field import Ball
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import with_own_files
 from dro_grasp.hands.hand import Hand
-from dro_grasp.models.checkpoints import load_weights
-from dro_grasp.models.network import DistanceNetwork
+from dro_grasp.network.checkpoints import load_weights
+from dro_grasp.network.network import DistanceNetwork
 from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimization.starts import Direction
+from dro_grasp.optimize.starts import Direction
 from dro_grasp.predict.admission import shortage_in_words
 from dro_grasp.predict.config import AUTO, GraspRequest, PredictorConfig
 from dro_grasp.predict.constraints import Constraints

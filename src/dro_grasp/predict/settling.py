@@ -14,16 +14,16 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from dro_grasp.energy.grasp_energy import EnergyConfig
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.kinds import Checked
-from dro_grasp.optimization.fingers import lacking_room
-from dro_grasp.optimization.refinement import RefineConfig
+from dro_grasp.optimize.fingers import lacking_room
+from dro_grasp.optimize.grasp_energy import EnergyConfig
+from dro_grasp.optimize.refinement import RefineConfig
 from dro_grasp.predict.admission import AdmissionConfig, permitted
 from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.score.holding_score import holding_score
+from dro_grasp.predict.score.score import ScoreConfig
 from dro_grasp.predict.stages import complete, grip, refine, scored
-from dro_grasp.ranking.holding_score import holding_score
-from dro_grasp.ranking.score import ScoreConfig
 from dro_grasp.simulation.closed_poses import hand_shift, settle
 from dro_grasp.simulation.contacts import deepest_penetration
 from dro_grasp.simulation.holding import Holding, holding

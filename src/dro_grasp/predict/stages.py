@@ -8,16 +8,16 @@ from dataclasses import replace
 import torch
 
 from dro_grasp.devices import one_thread
-from dro_grasp.energy.grasp_energy import EnergyConfig
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import completed
 from dro_grasp.kinds import checked
-from dro_grasp.optimization.fingers import EasingConfig, close_idle_fingers, ease_fingers
-from dro_grasp.optimization.refinement import RefineConfig, refine_grasps
-from dro_grasp.optimization.squeeze import gripping
+from dro_grasp.optimize.fingers import EasingConfig, close_idle_fingers, ease_fingers
+from dro_grasp.optimize.grasp_energy import EnergyConfig
+from dro_grasp.optimize.refinement import RefineConfig, refine_grasps
+from dro_grasp.optimize.squeeze import gripping
 from dro_grasp.predict.admission import AdmissionConfig, opened_wide, permitted
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.ranking.score import ScoreConfig, score_grasps
+from dro_grasp.predict.score.score import ScoreConfig, score_grasps
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
 from dro_grasp.simulation.trial import simulate
 

@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from dro_grasp.descriptions.compiling import collide
 from dro_grasp.devices import Rows
 from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.hands.description.compiling import collide
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.hand_part import PREFIX

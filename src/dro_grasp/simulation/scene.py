@@ -15,11 +15,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dro_grasp.descriptions.compiling import collide
 from dro_grasp.errors import HandError, ObjectError
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import require_pair
+from dro_grasp.hands.description.compiling import collide
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.opening import open_side_by_side
 from dro_grasp.objects.shape import ObjectModel

@@ -13,12 +13,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dro_grasp.energy.grasp_energy import Room
 from dro_grasp.errors import OptionError
 from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
+from dro_grasp.optimize.grasp_energy import Room
 
 CROWDING_POINTS = 64
 """Hand points, spread evenly, between which the distance of fingers is measured (ours)."""

@@ -24,8 +24,8 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.proportions import proportions
 from dro_grasp.kinds import Checked
-from dro_grasp.models.network import DistanceNetwork, Moves
-from dro_grasp.optimization.starts import CHOICES, CLEAR, Spread, lack_of_room, wrist_rotations
+from dro_grasp.network.network import DistanceNetwork, Moves
+from dro_grasp.optimize.starts import CHOICES, CLEAR, Spread, lack_of_room, wrist_rotations
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.choice import ChoiceConfig, choice_scores
 from dro_grasp.predict.sources.source import Candidates, Progress, Source

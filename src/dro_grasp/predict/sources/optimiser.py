@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
-from dro_grasp.energy.contacts import ContactConfig
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.kinds import Checked
-from dro_grasp.optimization.starts import StartConfig
-from dro_grasp.optimization.synthesis import SynthesisConfig, synthesize_with
+from dro_grasp.optimize.contacts import ContactConfig
+from dro_grasp.optimize.starts import StartConfig
+from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize_with
 from dro_grasp.predict.admission import facing
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.source import POINTS, Candidates, Progress, Source

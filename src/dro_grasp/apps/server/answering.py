@@ -1,0 +1,233 @@
+"""The computing side of a grasp server: what it has loaded, and the answer to one request."""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+import time
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from cachetools import LRUCache
+from jaxtyping import Float
+from torch import Tensor
+
+from dro_grasp.apps.library import Kind, Library
+from dro_grasp.apps.server.messages import GraspAnswer, SentCamera, SentGrasp, SentObject, settings_in
+from dro_grasp.apps.uploads import store_upload
+from dro_grasp.errors import DroGraspError, HandError, ObjectError, OptionError
+from dro_grasp.files import given_path
+from dro_grasp.frames import is_name, motion_fault
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.columns import REASON
+from dro_grasp.hands.hand import Hand
+from dro_grasp.hands.library import load_hand
+from dro_grasp.objects.catalogue import load_object, resolve_objects
+from dro_grasp.objects.loading import check_scale
+from dro_grasp.objects.perception.scan import scanned_object
+from dro_grasp.objects.reading import read_points
+from dro_grasp.objects.scenery import Scene, load_scene
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.predict.config import GraspRequest
+from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.predictor import GraspPredictor, Prediction
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.source import Progress
+from dro_grasp.predict.stages import evaluate
+
+MAX_PROBLEMS = 8
+"""Most pairs of hand and object, with constraints, of which all that was derived stays (ours)."""
+MAX_CANDIDATES = 1_000
+"""Most candidates of one request (ours): a server answers robots, `generate` fills files."""
+
+
+@dataclass(frozen=True)
+class ServerConfig:
+    """What a server computes with."""
+
+    weights: str | None = None
+    """Name of shipped weights or path of a weights file; None takes the default."""
+    device: str = "cpu"
+    """Where the network and the energies run."""
+    hands: tuple[str, ...] = ()
+    """Names or files of hands that are loaded before serving; built-in ones can be asked for besides."""
+    objects: tuple[str, ...] = ()
+    """Files and folders of objects that can be asked for by the names of the files; built-in ones can be besides."""
+
+
+class Answerer:
+    """Answers requests one by one, with hands and objects that stay loaded; nothing is read but what it was given and sent."""
+
+    def __init__(self, config: ServerConfig) -> None:
+        """Load the weights and the hands.
+
+        Raises:
+            DroGraspError: Something cannot be used, or two files of hands or of objects have one name.
+        """
+        self.library = Library()
+        self._offer("object", [(Path(source).stem, source, source) for source in resolve_objects(list(config.objects))])
+        self._offer("hand", [((hand := load_hand(source)).name, source, hand) for source in dict.fromkeys(config.hands)])
+        self.predictor = GraspPredictor(config.weights, config.device)
+        self.problems: LRUCache[Hashable, GraspProblem] = LRUCache(MAX_PROBLEMS)
+
+    def _offer(self, kind: Kind, named: Sequence[tuple[str, str, Any]]) -> None:
+        """Let what lies in files be asked for by name.
+
+        Args:
+            kind: What all are.
+            named: Name, name or file that was given, and what the library takes, of each.
+
+        Raises:
+            OptionError: Two have one name.
+        """
+        first: dict[str, str] = {}
+        for name, source, content in named:
+            other = first.setdefault(name, source)
+            if given_path(other).resolve() != given_path(source).resolve():
+                raise OptionError(f"{kind}s '{other}' and '{source}' would both be asked for by the name '{name}'; rename one "
+                                  "of the files, or leave one out")
+            self.library.add(kind, name, content)
+
+    def answer(self, call: Any, progress: Progress | None = None) -> GraspAnswer:
+        """The answer to a GraspCall; `progress` is called now and then, and what it raises ends the work.
+
+        Raises:
+            DroGraspError: The request cannot be met.
+        """
+        begin = time.perf_counter()
+        request = settings_in(call, GraspRequest)
+        constraints = settings_in(call, Constraints, avoid=self.scene(call.avoid, call.camera))
+        if request.num * request.candidates > MAX_CANDIDATES:
+            raise OptionError(f"{request.num} grasps of {request.candidates} candidates each are asked for; a server makes at "
+                              f"most {MAX_CANDIDATES} candidates at once, `dro-grasp generate` more")
+        hand, (key, obj) = self.hand(call.hand), self.object(call.object, call.camera)
+        if call.protocol is not None and obj.is_cloud:
+            raise OptionError(f"protocol is '{call.protocol}', and a bare cloud gets no trial; send a mesh, or leave it out")
+        pair = hand.name, key, constraints
+        if (problem := self.problems.get(pair)) is None:
+            problem = self.problems[pair] = GraspProblem(hand, obj, self.predictor.device, constraints)
+        loaded = time.perf_counter() - begin
+        made = self.predictor.run(problem, request, progress)
+        middle = time.perf_counter()
+        grasps = made.grasps if call.protocol is None else evaluate(problem, made.grasps, call.protocol, progress)
+        doubt = constraints.doubt(obj)
+        seconds = {"load": loaded, **made.seconds, "trial": time.perf_counter() - middle, "whole": time.perf_counter() - begin}
+        return GraspAnswer(
+            id=call.id, hand=hand.name, object=obj.name, frame="object" if call.camera is None else call.camera.frame,
+            wrist_link=grasps.wrist_link, joint_names=list(grasps.joint_names), grasps=sent_grasps(grasps, made),
+            candidates=made.candidates, weights=self.predictor.weights_name, protocol=call.protocol,
+            notes=[*obj.notes, *filter(None, [doubt])], shortage=made.shortage,
+            seconds={name: round(value, 4) for name, value in seconds.items()})
+
+    def hand_names(self) -> list[str]:
+        """Names of the hands that can be asked for."""
+        return list(self.library.names("hand"))
+
+    def object_names(self) -> list[str]:
+        """Names of the objects that can be asked for."""
+        return list(self.library.names("object"))
+
+    def hand(self, name: str) -> Hand:
+        """A hand by its name.
+
+        Raises:
+            HandError: The server knows no such hand.
+        """
+        if name not in (known := self.hand_names()):
+            raise HandError(f"this server knows no hand '{name}'; it knows {', '.join(known)}. Start it with --hand FILE for "
+                            "another one")
+        return self.library.hand(name)
+
+    def object(self, sent: SentObject, camera: SentCamera | None) -> tuple[Hashable, ObjectModel]:
+        """An object that was named or sent, and the key under which it is kept.
+
+        Raises:
+            ObjectError: It cannot be used, or the server knows none of this name.
+            OptionError: It cannot be used together with a camera.
+        """
+        if sent.name is not None and camera is not None:
+            raise OptionError("a camera is given, and the object is named; send the cloud that the camera saw")
+        if sent.name is not None and sent.name not in (known := self.object_names()):
+            raise ObjectError(f"this server knows no object '{sent.name}', but {', '.join(known[:12])} and others (page "
+                              "/objects); send the mesh or cloud, or start the server with --object FILE")
+        key = content_key(sent, camera)
+        return key, self.library.loaded("object", key, lambda: self._load(sent, camera))
+
+    def scene(self, sent: SentObject | None, camera: SentCamera | None) -> Scene | None:
+        """What the hand is to avoid, in the frame of the grasps: what was sent, or an object of the server's own."""
+        if sent is None:
+            return None
+        if sent.name is not None and sent.name not in self.library.own["object"]:
+            raise ObjectError(f"avoid names '{sent.name}', which the server was not started with; send the mesh or cloud")
+
+        def load() -> Scene:
+            with unpacked(sent, self.library.own["object"]) as source:
+                scene = load_scene(source, scale=sent.scale)
+                return scene if camera is None else scene.moved(sent_pose(camera).numpy())
+
+        return self.library.loaded("scene", content_key(sent, camera), load)
+
+    def _load(self, sent: SentObject, camera: SentCamera | None) -> ObjectModel:
+        with unpacked(sent, self.library.own["object"]) as source:
+            if camera is None:
+                return replace(load_object(source, scale=sent.scale, keep_table=sent.keep_table), file=None)
+            check_scale(sent.scale)
+            T, named = sent_pose(camera), isinstance(source, Path)
+            points = read_points(source) if named else source
+            return scanned_object(source.stem if named else "cloud", points * sent.scale, T.numpy(), keep_table=sent.keep_table)
+
+
+def content_key(sent: SentObject, camera: SentCamera | None) -> bytes:
+    """What tells objects apart: all that was sent of them."""
+    key = hashlib.sha256(sent.model_dump_json(exclude={"file": {"content"}}).encode())
+    key.update(b"" if sent.file is None else sent.file.content)
+    key.update(b"" if camera is None else camera.model_dump_json().encode())
+    return key.digest()
+
+
+@contextmanager
+def unpacked(sent: SentObject, own: Mapping[str, str]) -> Iterator[Any]:
+    """What an object or scene is loaded from: a name or own file, points, or a sent file, alone in a folder of its own."""
+    if sent.name is not None:
+        yield own.get(sent.name, sent.name)
+    elif sent.file is None:
+        yield np.array(sent.points, np.float64).reshape(-1, 3)
+    else:
+        with tempfile.TemporaryDirectory(prefix="dro-grasp-") as folder:
+            try:
+                yield store_upload(sent.file.name, sent.file.content, Path(folder))
+            except DroGraspError as error:
+                raise type(error)(str(error).replace(f"{folder}/", "")) from error
+
+
+def sent_pose(camera: SentCamera) -> Float[Tensor, "4 4"]:
+    """The camera's pose in the named frame [m].
+
+    Raises:
+        OptionError: It is no rigid motion, or the frame has no proper name.
+    """
+    if not is_name(camera.frame):
+        raise OptionError(f"frame is {camera.frame!r}; expected a name on one line, without control characters")
+    T = torch.tensor(camera.T_frame_camera, dtype=torch.float64)
+    if (fault := motion_fault(T)) is not None:
+        raise OptionError(f"T_frame_camera must be 4 rows of 4 numbers, in metres; {fault}")
+    return T
+
+
+def sent_grasps(grasps: GraspBatch, made: Prediction) -> list[SentGrasp]:
+    """The grasps of a batch one by one."""
+    rows = zip(grasps.wrist_position.tolist(), grasps.wrist_quaternion_wxyz.tolist(), grasps.joints.tolist(),
+               grasps.pregrasp_joints.tolist(), grasps.squeeze_joints.tolist(), grasps.score.tolist(), made.origin, strict=True)
+    reasons = grasps.extra.get(REASON) or [None] * len(grasps)
+    return [
+        SentGrasp(
+            wrist_position=tuple(position), wrist_quaternion_wxyz=tuple(quaternion), joints=joints, pregrasp_joints=pregrasp,
+            squeeze_joints=squeeze, score=score, origin=origin,
+            success=bool(grasps.success[i]) if grasps.evaluated[i] else None, reason=reasons[i] or None)
+        for i, (position, quaternion, joints, pregrasp, squeeze, score, origin) in enumerate(rows)
+    ]

@@ -1,0 +1,260 @@
+"""A page that plays motions of an arm: a plan, or attempts to lift objects, with the camera's cloud and all grasps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+import viser
+from jaxtyping import Float
+
+from dro_grasp.apps.viewer.scene_view import HOST, POINT_SIZE, Page, ServedPage, escaped, move, rgb
+from dro_grasp.arm.animation import OTHER_COLOUR, VIEW, Recorder
+from dro_grasp.arm.attempts import Attempt, TabletopConfig, attempt
+from dro_grasp.arm.motion import CHOSEN, READY, STAGES, WAITING, MotionPlan
+from dro_grasp.arm.reachability import carried
+from dro_grasp.arm.robot import Robot, load_robot
+from dro_grasp.arm.robot_check import robot_meshes, robot_shapes, shape_poses, table_meshes
+from dro_grasp.errors import OptionError
+from dro_grasp.geometry.rendering.rasterizer import OBJECT_COLOUR, Camera, Colour
+from dro_grasp.network.checkpoints import describe_weights
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.pictures.appearance import SOLVED_COLOUR, SUCCESS_COLOUR
+from dro_grasp.predict.predictor import GraspPredictor
+
+RATE = 25.0
+"""Pictures a second (ours)."""
+DROPPED_COLOUR: Colour = (0.62, 0.62, 0.62)
+"""Grey of grasps that were dropped."""
+WAITING_COLOUR: Colour = (0.93, 0.80, 0.35)
+"""Yellow of grasps that were not tried."""
+NONE = "none"
+"""Choice of no grasps."""
+EVERY = "all"
+"""Choice of every grasp."""
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """A motion, picture by picture."""
+
+    arm: Float[np.ndarray, "k n_arm"]
+    """[rad or m]"""
+    hand: Float[np.ndarray, "k n_dof"]
+    """[rad or m]"""
+    poses: Float[np.ndarray, "k o 4 4"]
+    """Of the objects in the world [m]; of a plan, those of the cloud that it was made for."""
+    plan: MotionPlan | None
+    objects: tuple[ObjectModel, ...] = ()
+    """As simulated; none in a plan."""
+
+    @staticmethod
+    def of_plan(robot: Robot, plan: MotionPlan) -> Film:
+        """A plan as it is meant: the hand carries the object during the lift."""
+        points = list(plan.points(RATE))
+        arm, hand = np.stack([p.arm for p in points]), np.stack([p.hand for p in points])
+        wrist = robot.T_world_wrist(arm)
+        lifting = np.array([p.stage == STAGES[-1] for p in points])
+        start = robot.T_world_wrist(plan.arm.position[plan.part(STAGES[-1])][0])
+        poses = np.tile(np.eye(4), (len(points), 1, 1, 1))
+        poses[lifting, 0] = np.stack([carried(T, start) for T in wrist[lifting]])
+        return Film(arm, hand, poses, plan)
+
+    @staticmethod
+    def of_attempt(recorder: Recorder) -> Film:
+        """What was simulated.
+
+        Raises:
+            OptionError: The robot did not move.
+        """
+        if not recorder.frames:
+            raise OptionError("the attempt ended before the robot moved; there is nothing to play")
+        arm, hand, poses = (np.stack(part) for part in zip(*recorder.frames, strict=True))
+        return Film(arm, hand, poses, recorder.plan, recorder.objects)
+
+
+class LiftPage(ServedPage, Page):
+    """A running page; `stop()` ends it.
+
+    Examples:
+        >>> page = LiftPage(robot)
+        >>> page.show(Film.of_plan(robot, MotionPlan.load("plan.npz")))
+    """
+
+    def __init__(
+        self, robot: Robot, attempts: Sequence[Attempt] = (), weights: str | None = None, port: int = 8080, host: str = HOST
+    ) -> None:
+        """Start serving with the robot at home.
+
+        Args:
+            robot: The robot that is shown first.
+            attempts: Stored attempts, which can be picked and are run once more to be played, each with its own robot.
+            weights: Name or file, where those that they were made with are not meant.
+        """
+        self.robot, self.attempts, self.weights = robot, list(attempts), weights
+        ServedPage.__init__(self, port, host)
+        Page.__init__(self, self.server)
+        self.film: Film | None = None
+        self._add_controls()
+        self._put(robot)
+
+    def _put(self, robot: Robot) -> None:
+        """Show a robot at home beside its table, in the place of another one."""
+        scene, self.robot = self.server.scene, robot
+        self.name.content = f"**{escaped(robot.name)}**"
+        for name in ("/robot", "/table"):
+            scene.remove_by_name(name)
+        self._links = [
+            scene.add_mesh_simple(f"/robot/{i}", mesh.vertices, mesh.faces, color=rgb(mesh.colour), side="double")
+            for i, mesh in enumerate(robot_shapes(robot))]
+        self._place(robot.home, robot.hand.canonical_joints().double().numpy())
+        for i, mesh in enumerate(table_meshes(robot.table)):
+            scene.add_mesh_simple(f"/table/{i}", mesh.vertices, mesh.faces, color=rgb(mesh.colour))
+
+    def _place(self, arm: Float[np.ndarray, " n_arm"], hand: Float[np.ndarray, " n_dof"]) -> None:
+        for handle, T in zip(self._links, shape_poses(self.robot, arm, hand), strict=True):
+            move(handle, T)
+
+    def _add_controls(self) -> None:
+        gui = self.server.gui
+        self.name = gui.add_markdown("")
+        if self.attempts:
+            labels = [f"{i}: {a.object}, {'held' if a.success else a.stage}" for i, a in enumerate(self.attempts)]
+            self.picked = gui.add_dropdown("Attempt", labels, initial_value=labels[0])
+            self.picked.on_update(lambda _: self._guarded(lambda: self.repeat(labels.index(self.picked.value))))
+        self._add_player("Play")
+        self.cloud = gui.add_checkbox("Camera's cloud", True, hint="What was planned for, its unseen side estimated.")
+        self.shapes = gui.add_checkbox("Objects", True, hint="As they were simulated.", disabled=not self.attempts)
+        self.grasps: viser.GuiDropdownHandle[str] = gui.add_dropdown(
+            "Grasps", [str(NONE), str(EVERY)], initial_value=NONE, hint="Lines from wrist to fingertips.")
+        self.text = self.status = gui.add_markdown("")
+        for choice in (self.cloud, self.shapes, self.grasps):
+            choice.on_update(lambda _: self._show_layers())
+
+    def repeat(self, index: int) -> None:
+        """Run a stored attempt once more with its own robot and weights, and show it, and what of these has changed since.
+
+        Raises:
+            OptionError: There is no such attempt, it is of another version, or the robot did not move.
+            DroGraspError: The robot, the object or the weights cannot be used any more.
+        """
+        if not 0 <= index < len(self.attempts):
+            raise OptionError(f"attempt is {index}; give one of 0 to {len(self.attempts) - 1}")
+        stored, recorder = self.attempts[index], Recorder(RATE)
+        config = TabletopConfig.from_label(stored.settings)
+        self.text.content = f"Running attempt {index} once more: seeing, planning, lifting ..."
+        same = stored.robot_sha256 == self.robot.sha256
+        robot = self.robot if same else load_robot(stored.robot_file or stored.robot)
+        obj = load_object(stored.object_file or stored.object)
+        weights = self.weights or stored.weights or None
+        made = attempt(robot, obj, stored.number, stored.seed, GraspPredictor(weights), config, recorder)
+        film, self.film = Film.of_attempt(recorder), None
+        if robot is not self.robot:
+            self._put(robot)
+        of_object = ((stored.solid_sha256, obj.solid_sha256) if stored.solid_sha256 else (stored.object_sha256, obj.sha256))
+        others = [name for name, then, now in (
+            ("robot", stored.robot_sha256, robot.sha256), ("object", *of_object),
+            ("weights", stored.weights_sha256, describe_weights(weights)["sha256"])) if then not in {"", now}]
+        changed = f"**Not as stored**: with other content than then: {', '.join(others)}. " if others else ""
+        self.show(film, changed + ("held" if made.success else f"**{escaped(made.stage)}**: {escaped(made.reason)}"))
+
+    def show(self, film: Film, outcome: str = "") -> None:
+        """Put a film on the page, and show its first picture."""
+        scene, self.film = self.server.scene, film
+        for name in ("/things", "/seen", "/grasps"):
+            scene.remove_by_name(name)
+        self._things = []
+        for i, obj in enumerate(film.objects):
+            assert obj.vertices is not None
+            assert obj.faces is not None
+            self._things.append(scene.add_mesh_simple(
+                f"/things/{i}", obj.vertices, obj.faces, color=rgb(OTHER_COLOUR if i else OBJECT_COLOUR), side="double"))
+        self._clouds, said = [], [outcome]
+        if film.plan is not None:
+            for name, points, colour in (("object", film.plan.scene.points, SOLVED_COLOUR),
+                                         ("others", film.plan.scene.others, DROPPED_COLOUR)):
+                if len(points):
+                    self._clouds.append(scene.add_point_cloud(
+                        f"/seen/{name}", points.astype(np.float32), rgb(colour), point_size=POINT_SIZE, point_shape="circle",
+                        precision="float32"))
+            self.grasps.options = (NONE, EVERY, *dict.fromkeys(film.plan.scene.fate))
+            said += map(escaped, film.plan.lines())
+        self._said = "  \n".join(filter(None, said))
+        self.moment.max, self.moment.disabled, self.play.disabled = len(film.arm) - 1, False, False
+        self._aim()
+        self._show_layers()
+        self.show_moment(0)
+
+    def show_moment(self, moment: int) -> None:
+        """Show one picture of the film."""
+        film = self.film
+        if film is None:
+            return
+        with self.server.atomic():
+            self._place(film.arm[moment], film.hand[moment])
+            moving = self._things or self._clouds[:1]
+            for handle, T in zip(moving, film.poses[moment], strict=False):
+                move(handle, T)
+            self.text.content = f"{moment / RATE:.1f} s  \n{self._said}"
+
+    def _play(self) -> None:
+        assert self.film is not None
+        self._roll(self.film, len(self.film.arm), 1 / RATE)
+
+    def _show_layers(self) -> None:
+        """Show and hide what the controls say."""
+        if self.film is None:
+            return
+        for handles, visible in ((self._clouds, self.cloud.value), (self._things, self.shapes.value)):
+            for handle in handles:
+                handle.visible = visible
+        self.server.scene.remove_by_name("/grasps")
+        if self.film.plan is None or self.grasps.value == NONE:
+            return
+        scene, hand = self.film.plan.scene, self.robot.hand
+        kept = [i for i, fate in enumerate(scene.fate) if self.grasps.value in {EVERY, fate}]
+        T = scene.T_world_wrist[kept]
+        ends = np.stack([T[:, :3, 3], hand.grasp_centres(torch.from_numpy(T).float()).double().numpy()], 1)
+        colours = {CHOSEN: SUCCESS_COLOUR, READY: SOLVED_COLOUR, WAITING: WAITING_COLOUR}
+        rows = np.array([rgb(colours.get(scene.fate[i], DROPPED_COLOUR)) for i in kept], np.uint8)
+        self.server.scene.add_line_segments(
+            "/grasps", ends.astype(np.float32), np.repeat(rows[:, None], 2, 1), thickness=2.0, thickness_units="screen")
+
+    def _aim(self) -> None:
+        """Look at the whole motion."""
+        assert self.film is not None
+        every = max(1, len(self.film.arm) // 6)
+        meshes = [mesh for q, hand in zip(self.film.arm[::every], self.film.hand[::every], strict=True)
+                  for mesh in robot_meshes(self.robot, q, hand)]
+        self.view.aim(Camera.around(np.concatenate([m.vertices for m in meshes]), VIEW, aspect=4 / 3))
+
+
+def lift_page(
+    file: Path, chosen: int = 0, robot: str | None = None, weights: str | None = None, port: int = 8080, host: str = HOST
+) -> LiftPage:
+    """A page for what `dro-grasp plan` or `dro-grasp tabletop` wrote; of attempts, the chosen one is shown first.
+
+    Robot and weights are given, by name or file, where the file's own are not meant.
+
+    Raises:
+        DroGraspError: The file or the robot cannot be used.
+    """
+    from dro_grasp.arm.tabletop import read_attempts
+
+    if file.suffix.lower() == ".npz":
+        plan = MotionPlan.load(file)
+        page = LiftPage(load_robot(robot or plan.notes.robot), (), weights, port, host)
+        page.show(Film.of_plan(page.robot, plan))
+        return page
+    attempts = read_attempts(file)
+    if not 0 <= chosen < len(attempts):
+        raise OptionError(f"{file} has attempts 0 to {len(attempts) - 1}; --attempt is {chosen}")
+    if robot is not None:
+        attempts = [replace(a, robot_file=robot, robot_sha256="") for a in attempts]
+    page = LiftPage(load_robot(attempts[chosen].robot_file or attempts[chosen].robot), attempts, weights, port, host)
+    page.repeat(chosen)
+    return page

@@ -1,0 +1,119 @@
+"""Animations of attempts, drawn without a browser or OpenGL: robot, table and object at each moment, as GIF or WebP."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image
+
+from dro_grasp.arm.attempts import Attempt, Watcher, attempt
+from dro_grasp.arm.motion import MotionPlan
+from dro_grasp.arm.physics import LiftScene
+from dro_grasp.arm.robot import Robot, Table, load_robot
+from dro_grasp.arm.robot_check import robot_meshes, table_meshes
+from dro_grasp.arm.table_scene import PickedObject
+from dro_grasp.arm.tabletop import TabletopRun
+from dro_grasp.errors import OutputError
+from dro_grasp.files import check_output, replacing
+from dro_grasp.geometry.rendering.rasterizer import OBJECT_COLOUR, Camera, Colour, Mesh, render
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.predict.predictor import GraspPredictor
+
+FORMATS = {".gif": "GIF", ".webp": "WEBP"}
+"""Endings of animation files."""
+RATE = 10
+"""Frames per second (ours)."""
+SIZE = (480, 360)
+"""Width and height [pixels]."""
+VIEW = (0.9, -1.25, 0.75)
+"""Direction from the robot towards the camera, in the world."""
+OTHER_COLOUR: Colour = (0.62, 0.68, 0.55)
+"""Green of other objects on the table."""
+
+
+@dataclass
+class Recorder(Watcher):
+    """Keeps what a scene looks like, and the plan that is carried out in it."""
+
+    rate: float = RATE
+    """Pictures a second."""
+    frames: list[tuple[Float[np.ndarray, " n_arm"], Float[np.ndarray, " n_dof"], Float[np.ndarray, "o 4 4"]]] = field(
+        default_factory=list)
+    """Arm, hand [rad or m], and the objects' poses [m]."""
+    objects: tuple[ObjectModel, ...] = ()
+    """The objects in the scene, the one that is asked for first."""
+    plan: MotionPlan | None = None
+    next_time: float | None = None
+    """Simulated time of the next frame [s]."""
+
+    def planned(self, seen: PickedObject, made: MotionPlan) -> None:
+        """Keep the plan."""
+        self.plan = made
+
+    def moved(self, scene: LiftScene) -> None:
+        """Look at the scene."""
+        if self.next_time is None or scene.data.time >= self.next_time:
+            self.objects = scene.objects
+            self.frames.append((*scene.joints(), np.stack([scene.pose(i) for i in range(len(scene.objects))])))
+            self.next_time = scene.data.time + 1 / self.rate - scene.model.opt.timestep / 2
+
+
+def draw_animation(robot: Robot, recorder: Recorder, path: Path) -> None:
+    """Write the animation of a recorded attempt.
+
+    Raises:
+        OutputError: Nothing was recorded, the ending is unknown, or the path cannot be written.
+    """
+    check_output(path, *FORMATS)
+    if not recorder.frames:
+        raise OutputError(f"no motion to draw into {path}: the attempt ended before the robot moved")
+    camera = _camera(robot, recorder)
+    pictures = [Image.fromarray(_frame(robot, recorder.objects, camera, *frame)) for frame in recorder.frames]
+    lengths = [1000 // RATE] * (len(pictures) - 1) + [1000]
+    kind = FORMATS[path.suffix.lower()]
+    options = {"quality": 70, "method": 4} if kind == "WEBP" else {"optimize": True}
+    if kind == "GIF":
+        pictures = [p.quantize(64) for p in pictures]
+    with replacing(path, "animation") as temporary:
+        pictures[0].save(temporary, format=kind, save_all=True, append_images=pictures[1:], duration=lengths, loop=0, **options)
+
+
+def draw_attempt(run: TabletopRun, path: Path) -> Attempt:
+    """Run the first attempt of a run once more, and write its animation.
+
+    Raises:
+        OutputError: The path cannot be written, or the robot did not move.
+    """
+    robot, obj, recorder = load_robot(run.robot), load_object(run.objects[0]), Recorder()
+    result = attempt(robot, obj, 0, run.seed, GraspPredictor(run.weights), run.config, recorder)
+    draw_animation(robot, recorder, path)
+    return result
+
+
+def _frame(
+    robot: Robot, objects: Sequence[ObjectModel], camera: Camera, arm: Float[np.ndarray, " n_arm"],
+    hand: Float[np.ndarray, " n_dof"], poses: Float[np.ndarray, "o 4 4"],
+) -> UInt8[np.ndarray, "height width 3"]:
+    things = []
+    for i, (obj, T) in enumerate(zip(objects, poses, strict=True)):
+        assert obj.vertices is not None
+        assert obj.faces is not None
+        colour = OTHER_COLOUR if i else OBJECT_COLOUR
+        things.append(Mesh(obj.vertices @ T[:3, :3].T + T[:3, 3], obj.faces, colour))
+    return render([*table_meshes(robot.table), *robot_meshes(robot, arm, hand), *things], camera, *SIZE)
+
+
+def _camera(robot: Robot, recorder: Recorder) -> Camera:
+    """A camera that has the whole motion in its picture, and the part of the table around it."""
+    moved = [mesh.vertices for arm, hand, _ in recorder.frames[:: max(1, len(recorder.frames) // 8)]
+             for mesh in robot_meshes(robot, arm, hand)]
+    places = np.stack([T[0, :3, 3] for _, _, T in recorder.frames])
+    table = robot.table or Table()
+    around = places[:1, :2] + 0.15 * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+    corners = np.column_stack([around, np.full(4, table.height)])
+    return Camera.around(np.concatenate([*moved, places, corners]), VIEW, aspect=SIZE[0] / SIZE[1], margin=0.03)

@@ -1,0 +1,234 @@
+"""A motion of arm and hand, from home to the lifted object: in memory, as a plan file, and as trajectories for controllers."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from dro_grasp.errors import PlanError
+from dro_grasp.files import UNTYPED, check_output, given_path, reading, replacing
+from dro_grasp.grasps.export.writers import yaml_text
+
+STAGES = ("reach", "shape", "approach", "close", "lift")
+"""The arm travels with the hand open; the hand takes the pregrasp; straight to the grasp; the hand closes; straight up."""
+FORMAT = 2
+"""Version of plan files."""
+CHOSEN = "chosen"
+"""Fate of the grasp that the motion carries out."""
+READY = "could be carried out too"
+"""Fate of grasps that were given to the planner beside it."""
+WAITING = "not tried"
+"""Fate of grasps that were not looked at, since better ones sufficed."""
+COLUMNS = ("time", "stage", "arm", "arm_velocity", "arm_acceleration", "hand", "hand_velocity", "hand_acceleration")
+"""Arrays of a plan file."""
+SCENE = ("points", "others", "T_world_wrist", "joints", "score")
+"""Further arrays of it, what was planned for; their names begin with `scene_`."""
+DIGITS = 6
+"""Decimals of joint values in trajectories: micrometres and microradians (ours)."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Joints over time, from rest to rest."""
+
+    time: Float[np.ndarray, " k"]
+    """From zero [s]."""
+    position: Float[np.ndarray, "k n"]
+    """[rad or m]"""
+    velocity: Float[np.ndarray, "k n"]
+    """[rad/s or m/s]"""
+    acceleration: Float[np.ndarray, "k n"]
+    """[rad/s^2 or m/s^2]"""
+
+    @property
+    def seconds(self) -> float:
+        """Duration [s]."""
+        return float(self.time[-1])
+
+
+@dataclass(frozen=True)
+class MotionPoint:
+    """Where arm and hand should be at one time."""
+
+    time: float
+    """Since the start [s]."""
+    stage: str
+    """One of STAGES."""
+    arm: Float[np.ndarray, " n_arm"]
+    """[rad or m]"""
+    hand: Float[np.ndarray, " n_dof"]
+    """[rad or m]"""
+
+
+@dataclass(frozen=True)
+class PlanNotes:
+    """What a plan is for and how it came about; plain values."""
+
+    robot: str
+    object: str
+    arm_joints: tuple[str, ...]
+    hand_joints: tuple[str, ...]
+    frame: str
+    """The frame that wrist poses are in: that of the robot's world."""
+    table: float | None
+    """Height of the table that was planned for [m]."""
+    grasps: int
+    """Grasps that there were to choose from."""
+    dropped: dict[str, int]
+    """How many of them were dropped, by reason."""
+    goals: int
+    """Grasps that were given to the planner at once."""
+    chosen: int
+    """Index of the grasp in the batch, best score first."""
+    score: float
+    """Its score."""
+    T_world_wrist: list[list[float]]
+    """The wrist pose of the grasp [m], from which an arm with few joints may turn a little."""
+    seed: int
+    seconds: dict[str, float]
+    """Time spent on planning, by part [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlanScene:
+    """What a motion was planned for, in the world: for pictures, and for checks by others."""
+
+    points: Float[np.ndarray, "n 3"]
+    """Of the object [m]."""
+    others: Float[np.ndarray, "m 3"]
+    """Of obstacles [m]."""
+    T_world_wrist: Float[np.ndarray, "g 4 4"]
+    """Wrist poses of all grasps that there were [m]."""
+    joints: Float[np.ndarray, "g n_dof"]
+    """Their joints [rad or m]."""
+    score: Float[np.ndarray, " g"]
+    """Their scores."""
+    fate: tuple[str, ...]
+    """CHOSEN, READY, WAITING, or why each was dropped."""
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPlan:
+    """Arm and hand over time, from home to the lifted object."""
+
+    notes: PlanNotes
+    scene: PlanScene
+    stage: Int[np.ndarray, " k"]
+    """Index into STAGES of each sample."""
+    arm: Trajectory
+    hand: Trajectory
+
+    @property
+    def seconds(self) -> float:
+        """Duration [s]."""
+        return self.arm.seconds
+
+    def part(self, stage: str) -> slice:
+        """Rows of a stage, with the last row of the one before; that alone, where nothing moves and a stage has no rows."""
+        first, end = (int(np.searchsorted(self.stage, STAGES.index(stage), side)) for side in ("left", "right"))
+        return slice(max(0, first - 1), end)
+
+    def points(self, rate: float = 100.0) -> Iterator[MotionPoint]:
+        """Targets at a rate [1/s], the last one included, for a loop that sends them to a robot."""
+        count = int(np.ceil(self.seconds * rate - 1e-9))
+        for time in [*(i / rate for i in range(count)), self.seconds]:
+            row = min(int(np.searchsorted(self.arm.time, time, side="left")), len(self.stage) - 1)
+            yield MotionPoint(float(time), STAGES[int(self.stage[row])], *(
+                np.array([np.interp(time, t.time, column) for column in t.position.T]) for t in (self.arm, self.hand)))
+
+    def lines(self) -> list[str]:
+        """In words: what was dropped, what is done, how long it takes."""
+        n = self.notes
+        spans = ", ".join(f"{s} {np.ptp(self.arm.time[self.part(s)]):.1f} s" for s in STAGES)
+        x, y, z = (row[3] for row in n.T_world_wrist[:3])
+        return [
+            grasps_and_dropped(n.grasps, n.dropped) + f"; {n.goals} given to the planner",
+            f"grasp {n.chosen}, score {n.score:.2f}: wrist at ({x:.3f}, {y:.3f}, {z:.3f}) m in frame '{n.frame}'",
+            f"motion of {self.seconds:.1f} s: {spans}",
+            "planned in " + f"{sum(n.seconds.values()):.2f} s: " + ", ".join(f"{k} {v:.2f} s" for k, v in n.seconds.items()),
+        ]
+
+    def save(self, path: Path | str) -> None:
+        """Write a plan file (NPZ); it appears whole or not at all.
+
+        Raises:
+            OutputError: The path cannot be written.
+        """
+        header = json.dumps({"format_version": FORMAT, "stages": STAGES, "fate": self.scene.fate, **asdict(self.notes)})
+        arrays = {"time": self.arm.time, "stage": self.stage}
+        arrays |= {f"scene_{name}": getattr(self.scene, name).astype(np.float32) for name in SCENE}
+        for name, part in (("arm", self.arm), ("hand", self.hand)):
+            arrays |= {name: part.position, f"{name}_velocity": part.velocity, f"{name}_acceleration": part.acceleration}
+        with replacing(check_output(path), "plan") as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, header=np.array(header), allow_pickle=False, **arrays)
+
+    @staticmethod
+    def load(path: Path | str) -> MotionPlan:
+        """Read a plan file.
+
+        Raises:
+            PlanError: No such file, or a truncated or foreign one, or one of another version.
+        """
+        path = given_path(path)
+        expected = reading(path, PlanError, "a plan file (.npz), as `dro-grasp plan` writes it", *UNTYPED)
+        with expected, path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+            header: dict[str, Any] = json.loads(str(file["header"]))
+            if header.pop("format_version", None) != FORMAT or tuple(header.pop("stages", ())) != STAGES:
+                raise PlanError(f"{path} is a plan file of another version; plan again")
+            time, stage, *rows = (file[name] for name in COLUMNS)
+            scene = PlanScene(**{name: file[f"scene_{name}"] for name in SCENE}, fate=tuple(header.pop("fate", ())))
+            for name in ("arm_joints", "hand_joints"):
+                header[name] = tuple(header[name])
+            arm, hand = Trajectory(time, *rows[:3]), Trajectory(time, *rows[3:])
+            return MotionPlan(PlanNotes(**header), scene, stage, arm, hand)
+
+
+def grasps_and_dropped(grasps: int, dropped: dict[str, int]) -> str:
+    """How many grasps were dropped, and why."""
+    reasons = ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count)
+    return f"{grasps} grasps: {reasons or 'none dropped'}"
+
+
+def trajectory_yaml(plan: MotionPlan) -> str:
+    """One trajectory_msgs/JointTrajectory each for arm and hand, with the same times. Source: ROS 2 common_interfaces."""
+    notes, times = plan.notes, {name: round(float(plan.arm.time[plan.part(name)][-1]), DIGITS) for name in STAGES}
+    messages = {"arm": _message(notes.frame, notes.arm_joints, plan.arm),
+                "hand": _message(notes.frame, notes.hand_joints, plan.hand)}
+    return (f"# Robot '{notes.robot}' lifts object '{notes.object}'. Joints in rad or m, time in s.\n"
+            f"# The wrist pose of the grasp is in frame '{notes.frame}'. Stages end at (s): {times}\n{yaml_text(messages)}")
+
+
+def trajectory_csv(plan: MotionPlan) -> str:
+    """One row for each sample: time, stage, and the target of every joint, arm before hand."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    joints = [f"arm/{n}" for n in plan.notes.arm_joints] + [f"hand/{n}" for n in plan.notes.hand_joints]
+    table.writerow(["time", "stage", *joints])
+    for i, time in enumerate(plan.arm.time.tolist()):
+        values = _plain(np.concatenate([plan.arm.position[i], plan.hand.position[i]]))
+        table.writerow([round(time, DIGITS), STAGES[int(plan.stage[i])], *values])
+    return text.getvalue()
+
+
+def _message(frame: str, names: tuple[str, ...], part: Trajectory) -> dict[str, object]:
+    points = []
+    for i, time in enumerate(part.time.tolist()):
+        second, nanosecond = divmod(round(time * 1e9), 10**9)
+        points.append({
+            "positions": _plain(part.position[i]), "velocities": _plain(part.velocity[i]),
+            "accelerations": _plain(part.acceleration[i]), "effort": [],
+            "time_from_start": {"sec": second, "nanosec": nanosecond}})
+    header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": frame}
+    return {"header": header, "joint_names": list(names), "points": points}
+
+
+def _plain(values: Float[np.ndarray, " n"]) -> list[float]:
+    return np.round(values, DIGITS).tolist()

@@ -1,0 +1,393 @@
+"""From a robot and an object to a timed motion that grasps and lifts it.
+
+Candidates, reachable, rehearsed, path, timed motion: each stage is a function that returns what it made.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dro_grasp.arm.candidates import Directions, grasps_in_world
+from dro_grasp.arm.motion import CHOSEN, READY, WAITING, MotionPlan, PlanNotes, PlanScene, grasps_and_dropped
+from dro_grasp.arm.physics import DEVIATIONS, Deviation, Rehearsal
+from dro_grasp.arm.reachability import Fault, Feasible, Postures, Reachability, ReachConfig, reachable_directions
+from dro_grasp.arm.robot import Robot
+from dro_grasp.arm.trajectory import find_path, timed_stages
+from dro_grasp.arm.workcell import OBSTACLE, Workcell, moved, scene_solid, upright
+from dro_grasp.errors import OptionError, PlanError
+from dro_grasp.extras import require_extra
+from dro_grasp.frames import motion_fault
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.kinds import Checked, checked
+from dro_grasp.objects.scenery import load_scene
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.predict.admission import BESIDE, NARROW, SPARED, TURNED, faults
+from dro_grasp.predict.config import AUTO, GraspRequest
+from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.predictor import GraspPredictor
+from dro_grasp.predict.problem import GraspProblem
+from dro_grasp.predict.sources.source import Source
+from dro_grasp.predict.stopwatch import Stopwatch
+
+
+@dataclass(frozen=True)
+class PlanConfig(Checked):
+    """How a motion is planned. Values without a source are ours."""
+
+    num: int = 24
+    """Grasps to choose from, in each of the batches."""
+    top: int = 5
+    """Reachable grasps of best score that are given to the planner at once. Source: paper, real-robot experiment."""
+    directions: Directions = "all"
+    """Palm directions: `paper`, from above to the right side, or `all` that a table leaves room for."""
+    constraints: Constraints = field(default_factory=Constraints)
+    """What grasps have to respect, in the world's frame; the scene to avoid, the arm too. The table is the robot's."""
+    order: Literal["score", "random"] = "score"
+    """Which reachable grasps are taken: the best by score, or any, as a control."""
+    rounds: int = 3
+    """How often the planner is asked, each time with the next `top` grasps."""
+    rehearsals: int = 8
+    """Grasps of each batch whose lift is simulated, where a table is known, on the object as it is known; 0 for none."""
+    deviations: tuple[Deviation, ...] = DEVIATIONS
+    """How the rehearsals of one grasp deviate from what is known."""
+    trusted_share: float = 0.5
+    """Share of its rehearsals in which the best grasp that can be carried out should hold the object."""
+    trusted_score: float = 1.0
+    """Without rehearsals: log-odds of holding that it should have."""
+    batches: int = 3
+    """How often at most `num` grasps are made, while none of them is trusted, or none works."""
+    candidates: int = 1
+    """Candidates for each grasp, as in `GraspRequest`: which of them can be reached decides more than the best scores."""
+    source: str | Source = AUTO
+    """What proposes grasps, as in `GraspRequest`."""
+    best_seconds: float = 1.0
+    """Longest time for a path to the best grasp alone, which is tried before all goals are given at once [s]."""
+    planner_seconds: float = 3.0
+    """Longest time for one path to several goals [s]."""
+    closing_seconds: float = 1.0
+    """Least time in which the hand closes [s]. Source: as in trials."""
+    grip_seconds: float = 0.5
+    """How long the hand presses before the arm lifts [s]."""
+    reach: ReachConfig = field(default_factory=ReachConfig)
+    """Approach and lift."""
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be done.
+
+        Raises:
+            OptionError: A number is not positive or not finite, or something is stated twice.
+        """
+        super().__post_init__()
+        if self.constraints.table is not None:
+            raise OptionError("the table is the robot's: state its height in the robot file, and not in constraints")
+        if self.constraints.direction is not None and self.directions != "all":
+            raise OptionError(f"both direction and directions '{self.directions}' say whence to grasp; leave out one of them")
+        for name in ("num", "top", "rounds", "batches", "planner_seconds"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise OptionError(f"{name} is {getattr(self, name)}; give a number above 0")
+
+
+@checked
+def plan(
+    robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"] | None = None,
+    obstacles: Sequence[ObjectModel] = (), predictor: GraspPredictor | None = None, config: PlanConfig | None = None,
+    seed: int = 0, grasps: GraspBatch | Callable[[int], GraspBatch] | None = None,
+) -> MotionPlan:
+    """A motion that grasps the object and lifts it.
+
+    Args:
+        robot: Arm, hand and table.
+        obj: A mesh, or a camera's cloud.
+        T_world_object: Where it stands [m]; its frame is the world's by default.
+        obstacles: Further things, in the world's frame, that nothing may touch.
+        predictor: Proposes grasps; the default weights if omitted.
+        config: How to plan.
+        seed: Of grasps, inverse kinematics and planner; where the planner's time suffices, the same seed gives the same plan.
+        grasps: Complete grasps with scores, in the world's frame, instead of predicted ones; or what makes a batch from a seed.
+
+    Raises:
+        PlanError: The object or an obstacle collides with the robot at home, the object lies below the table, or no grasp can
+            be carried out; the message counts what was dropped where.
+        RobotError: The robot collides with the table at home.
+        OptionError: The extra `[arm]` is not installed, the pose is no rigid motion, or the constraints leave nothing of the
+            object.
+    """
+    require_extra("arm")
+    T = np.eye(4) if T_world_object is None else T_world_object
+    if (fault := motion_fault(torch.as_tensor(T).float())) is not None:
+        raise OptionError(f"T_world_object is no pose of '{obj.name}' in metres; {fault}")
+    task = Task.of(robot, obj, T, obstacles, config or PlanConfig(), seed)
+    task.check_start()
+    tries = Tries()
+    for batch, last in candidates(task, tries, grasps, predictor):
+        add(task, tries, batch)
+        for attempt in range(task.config.rounds):
+            goals = rehearsed(task, tries, reachable(task, tries))
+            if last and not goals:
+                goals = best_lost(task, tries)
+            if not goals or not (last or trusted(task, tries, goals[0].index)):
+                tries.ready = goals
+                break
+            if (made := motion(task, tries, goals, seed + attempt)) is not None:
+                return made
+    raise PlanError(f"{grasps_and_dropped(len(tries.grasps), tries.counts)}, and none is left for '{obj.name}'; "
+                    f"{task.advice(tries.counts)}")
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """One object to lift."""
+
+    cell: Workcell
+    obj: ObjectModel
+    """With a frame whose z axis points up."""
+    T: Float[np.ndarray, "4 4"]
+    """Where it stands in the world [m]."""
+    config: PlanConfig
+    constraints: Constraints
+    """Without the scene to avoid, which the cell has."""
+    seed: int
+
+    @staticmethod
+    def of(
+        robot: Robot, obj: ObjectModel, T_world_object: Float[np.ndarray, "4 4"], obstacles: Sequence[ObjectModel],
+        config: PlanConfig, seed: int,
+    ) -> Task:
+        """The object, upright, in a workcell with all that is in the way; arguments are those of `plan`."""
+        obj, T = upright(obj, T_world_object)
+        if (avoid := config.constraints.avoid) is not None:
+            reach = robot.full_reach + float(np.linalg.norm(np.ptp(obj.cloud, axis=0)))
+            obstacles = [*obstacles, *scene_solid(avoid, robot.T_world_base[:3, 3], reach)]
+        return Task(Workcell(robot, obstacles, obj, T), obj, T, config, replace(config.constraints, avoid=None), seed)
+
+    @property
+    def robot(self) -> Robot:
+        """Of the cell."""
+        return self.cell.robot
+
+    @property
+    def height(self) -> float | None:
+        """Of the table [m]."""
+        return None if self.robot.table is None else self.robot.table.height
+
+    @property
+    def distance(self) -> float:
+        """From the arm's base to the object's middle, along the ground [m]."""
+        middle = self.T[:2, :3] @ self.obj.cloud.mean(0) + self.T[:2, 3]
+        return float(np.linalg.norm(middle - self.robot.T_world_base[:2, 3]))
+
+    @cached_property
+    def reach(self) -> Reachability:
+        """Inverse kinematics, with its own draws."""
+        return Reachability(self.cell, self.config.reach, self.seed)
+
+    @cached_property
+    def rehearsal(self) -> Rehearsal | None:
+        """The simulated lift, where lifts are rehearsed."""
+        wanted = self.config.rehearsals > 0 and self.config.order == "score" and self.robot.table is not None
+        return Rehearsal(self.cell, self.config.deviations) if wanted else None
+
+    def check_start(self) -> None:
+        """Refuse robot and object that are in each other's way from the start, and constraints that leave nothing to grasp."""
+        if self.config.constraints != Constraints():
+            self.config.constraints.require_fit(moved(self.obj, self.T))
+        top = float((self.obj.cloud @ self.T[2, :3]).max() + self.T[2, 3])
+        if self.height is not None and top <= self.height:
+            raise PlanError(f"object '{self.obj.name}' ends at z = {top:.3f} m, below the table at {self.height:.3f} m; give "
+                            "the object in the robot's world frame (--camera, --pose), or correct `table` in the robot file")
+        if self.distance > (longest := self.robot.longest_reach):
+            raise PlanError(f"object '{self.obj.name}' stands {self.distance:.2f} m from the base, farther than the arm and "
+                            f"hand are long ({longest:.2f} m); give its place in the robot's world frame [m]")
+        self.cell.refuse_contacts_at_home()
+
+    def advice(self, dropped: dict[str, int]) -> str:
+        """What to change, by the reason for which most grasps were dropped."""
+        reason = max(dropped, key=lambda r: dropped[r], default="")
+        if reason in (TURNED, SPARED, BESIDE, NARROW):
+            return f"most grasps are {reason}; relax cone, hold, spare or opening, or ask for more grasps (--num)"
+        return (f"the object stands {self.distance:.2f} m from the base, and most grasps are {reason}; move the object, ask "
+                "for more grasps (--num), or for other palm directions (--directions)")
+
+
+@dataclass
+class Tries:
+    """What became of the grasps so far, by their number, in the order in which they were made."""
+
+    parts: list[GraspBatch] = field(default_factory=list)
+    waiting: list[int] = field(default_factory=list)
+    """Not tried yet, in the order of trying."""
+    ready: list[Feasible] = field(default_factory=list)
+    """Left over from the last batch: they can be carried out, but were not trusted."""
+    found: dict[int, Feasible] = field(default_factory=dict)
+    """Can be carried out."""
+    share: dict[int, float] = field(default_factory=dict)
+    """Share of the rehearsals in which a grasp holds the object."""
+    lost: list[Feasible] = field(default_factory=list)
+    """Can be carried out, but lose the object when rehearsed."""
+    dropped: dict[int, str] = field(default_factory=dict)
+    """Why."""
+    watch: Stopwatch = field(default_factory=lambda: Stopwatch("grasps", "reach", "rehearsal", "path", "timing"))
+
+    @property
+    def grasps(self) -> GraspBatch:
+        """All that were made."""
+        return GraspBatch.concatenate(self.parts)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many grasps were dropped, by reason."""
+        return dict(Counter(self.dropped.values()))
+
+
+def candidates(
+    task: Task, tries: Tries, given: GraspBatch | Callable[[int], GraspBatch] | None, predictor: GraspPredictor | None
+) -> Iterator[tuple[GraspBatch, bool]]:
+    """Batch after batch of grasps in the world's frame, as many as the configuration allows, and whether each is the last."""
+    if isinstance(given, GraspBatch):
+        yield given, True
+        return
+    make = given or _predicted(task, predictor or GraspPredictor())
+    for batch in range(task.config.batches):
+        with tries.watch("grasps"):
+            made = make(task.seed + 7919 * batch)  # far from the seeds of other plans
+        yield made, batch + 1 == task.config.batches
+
+
+def _predicted(task: Task, predictor: GraspPredictor) -> Callable[[int], GraspBatch]:
+    """What makes grasps from a seed."""
+    directions: Directions | Float[Tensor, "k 3"] = task.config.directions
+    if directions == "all" and task.constraints.direction is None and task.robot.has_few_joints:
+        middle = task.T[:3, :3] @ task.obj.cloud.mean(0) + task.T[:3, 3]
+        directions = reachable_directions(task.robot, middle, task.seed)
+    clouds = [thing.cloud for thing in task.cell.obstacles]
+    wanted = replace(
+        task.constraints, table=task.height, avoid=load_scene(np.concatenate(clouds), OBSTACLE) if clouds else None)
+    return lambda seed: grasps_in_world(
+        predictor, task.robot.hand, task.obj, task.T,
+        GraspRequest(task.config.num, seed, task.config.candidates, source=task.config.source), wanted, directions)
+
+
+def add(task: Task, tries: Tries, grasps: GraspBatch) -> None:
+    """Let further grasps wait in order, but those that do not respect the constraints or are hopeless."""
+    first = sum(len(part) for part in tries.parts)
+    tries.parts.append(grasps)
+    with tries.watch("reach"):
+        if task.constraints != Constraints():  # table and obstacles are the arm's affair
+            T = np.linalg.inv(task.T)
+            problem = GraspProblem(task.robot.hand, task.obj, constraints=task.constraints.moved(T))
+            there = grasps.replace(T_object_wrist=torch.from_numpy(T).float() @ grasps.T_object_wrist)
+            for reason, wrong in faults(problem, there).items():
+                for row in wrong.nonzero()[:, 0].tolist():
+                    tries.dropped.setdefault(first + row, reason)
+        for row, reason in task.reach.hopeless(grasps).items():
+            tries.dropped.setdefault(first + row, reason)
+    tries.waiting += [i for i in range(first, first + len(grasps)) if i not in tries.dropped]
+    tries.waiting += [goal.index for goal in tries.ready]
+    tries.ready = []
+    if task.config.order == "random":
+        np.random.default_rng(task.seed).shuffle(tries.waiting)
+    else:
+        score = tries.grasps.score.tolist()
+        tries.waiting.sort(key=lambda i: -score[i])
+
+
+def reachable(task: Task, tries: Tries) -> Iterator[Feasible]:
+    """The waiting grasps that the arm can carry out, one after the other."""
+    grasps = tries.grasps
+    while tries.waiting:
+        number = tries.waiting.pop(0)
+        with tries.watch("reach"):
+            found = tries.found.get(number) or task.reach.ways(grasps, number)
+        if isinstance(found, str):
+            tries.dropped[number] = found
+        else:
+            tries.found[number] = found
+            yield found
+
+
+def rehearsed(task: Task, tries: Tries, found: Iterator[Feasible]) -> list[Feasible]:
+    """Goals, those first that hold the object in most rehearsals; one that always does is enough."""
+    goals, count, grasps = list[Feasible](), 0, tries.grasps
+    while len(goals) < task.config.top and count < max(1, task.config.rehearsals) and (goal := next(found, None)):
+        if task.rehearsal is not None and goal.index not in tries.share:
+            count += 1
+            with tries.watch("rehearsal"):
+                tries.share[goal.index] = task.rehearsal.share(goal, Postures.of(task.robot, grasps, goal.index))
+        share = tries.share.get(goal.index)
+        if share == 0:
+            tries.lost.append(goal)
+            tries.dropped[goal.index] = Fault.LOSES
+            continue
+        goals.append(goal)
+        if share == 1:
+            break
+    return sorted(goals, key=lambda goal: -tries.share.get(goal.index, 0))
+
+
+def best_lost(task: Task, tries: Tries) -> list[Feasible]:
+    """The best of those that lose the object when rehearsed: the object may be other than it is thought to be."""
+    score = tries.grasps.score.tolist()
+    tries.lost.sort(key=lambda goal: -score[goal.index])
+    goals, tries.lost = tries.lost[:task.config.top], tries.lost[task.config.top:]
+    for goal in goals:
+        del tries.dropped[goal.index]
+    return goals
+
+
+def trusted(task: Task, tries: Tries, best: int) -> bool:
+    """Whether no further grasps are needed."""
+    if task.rehearsal is not None:
+        return tries.share[best] >= task.config.trusted_share
+    return task.config.order == "random" or float(tries.grasps.score[best]) >= task.config.trusted_score
+
+
+def motion(task: Task, tries: Tries, goals: list[Feasible], seed: int) -> MotionPlan | None:
+    """The motion to the best goal, or else to the first that a path leads to; None, with the reason noted, if there is none."""
+    left, config, robot, opened = list(goals), task.config, task.robot, task.robot.open_hand
+    for best in [True, *[False] * len(goals)]:
+        asked, seconds = (left[:1], config.best_seconds) if best else (left, config.planner_seconds)
+        standoffs = np.array([goal.approach[0] for goal in asked])
+        with tries.watch("path"):
+            path = find_path(robot.home, standoffs, lambda q: task.cell.free(q, opened), *robot.working_range, seconds,
+                             seed) if asked else None
+        if path is not None:
+            waypoints, reached = path
+            goal = left.pop(reached)
+            postures = Postures.of(robot, tries.grasps, goal.index)
+            with tries.watch("timing"):
+                made = timed_stages(task.cell, waypoints, goal, postures, config.closing_seconds, config.grip_seconds)
+            if made is not None:
+                notes, scene = _described(task, tries, goal.index, goals, left)
+                return MotionPlan(notes, scene, *made)
+            tries.dropped[goal.index] = Fault.NO_PATH
+        elif not best:
+            break
+    tries.dropped |= dict.fromkeys((goal.index for goal in left), Fault.NO_PATH)
+    return None
+
+
+def _described(
+    task: Task, tries: Tries, chosen: int, goals: list[Feasible], left: list[Feasible]
+) -> tuple[PlanNotes, PlanScene]:
+    """What a motion to the chosen goal was planned for, and how it came about."""
+    robot, obj, T, grasps, ready = task.robot, task.obj, task.T, tries.grasps, {goal.index for goal in left}
+    clouds = [np.zeros((0, 3), np.float32), *(thing.cloud for thing in task.cell.obstacles)]
+    wrists = grasps.T_object_wrist.double().numpy()
+    fate = (CHOSEN if i == chosen else READY if i in ready else tries.dropped.get(i, WAITING) for i in range(len(grasps)))
+    notes = PlanNotes(
+        robot.name, obj.name, robot.arm_joints, robot.hand_joints, "world", task.height, len(grasps), tries.counts, len(goals),
+        chosen, float(grasps.score[chosen]), wrists[chosen].tolist(), task.seed, tries.watch.seconds)
+    scene = PlanScene(
+        obj.cloud @ T[:3, :3].T + T[:3, 3], np.concatenate(clouds), wrists, grasps.joints.double().numpy(),
+        grasps.score.double().numpy(), tuple(fate))
+    return notes, scene

@@ -1,0 +1,58 @@
+"""The export formats by name: a new one is one entry here, and one in `writers.WRITERS`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from dro_grasp.grasps.batch import GraspBatch
+    from dro_grasp.grasps.export.writers import Frame
+    from dro_grasp.hands.hand import Hand
+
+
+@dataclass(frozen=True)
+class ExportJob:
+    """Grasps of one object on their way into another program's format."""
+
+    grasps: GraspBatch
+    """Each states pregrasp and squeeze."""
+    frame: Frame
+    hand: Hand | None = None
+    """The grasps' hand, for formats that need it."""
+    object_path: str = ""
+    """File or name of the object."""
+    object_scale: float = 1.0
+    """Scale of that file."""
+
+
+@dataclass(frozen=True)
+class ExportFormat:
+    """One format and how its files are called."""
+
+    name: str
+    """Name in FORMATS and WRITERS."""
+    title: str
+    suffix: str
+    explanation: str
+    """What the files hold."""
+    needs_hand: bool = False
+    """Whether it writes more of the hand than its name."""
+    file_per_grasp: bool = False
+    """Whether an object becomes a folder with one file per grasp."""
+
+    def content(self, job: ExportJob) -> bytes | list[bytes]:
+        """The object's file, or one file per grasp."""
+        from dro_grasp.grasps.export.writers import WRITERS  # with PyTorch, which lists of choices do without
+
+        return WRITERS[self.name](job)
+
+
+FORMATS = {
+    "isaac_grasp": ExportFormat("isaac_grasp", "isaac_grasp (YAML)", ".yaml", "YAML 1.0 for Isaac Sim and Isaac ROS"),
+    "moveit": ExportFormat("moveit", "MoveIt (YAML)", ".yaml", "moveit_msgs/Grasp as YAML", needs_hand=True),
+    "dexgraspbench": ExportFormat(
+        "dexgraspbench", "DexGraspBench (NPY)", ".npy", "one npy file per grasp, in a folder", file_per_grasp=True),
+    "csv": ExportFormat("csv", "table (CSV)", ".csv", "one line per grasp"),
+}
+"""All formats, in the order of lists of choices."""

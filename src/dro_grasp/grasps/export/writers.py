@@ -1,0 +1,270 @@
+"""Grasps in the formats of other programs: what all say about grasps and in which frame, and one function for each."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from jaxtyping import Float
+from torch import Tensor
+
+from dro_grasp.errors import OptionError
+from dro_grasp.frames import is_name, motion_fault, read_motion
+from dro_grasp.geometry.se3 import roma
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.export.formats import ExportJob
+from dro_grasp.grasps.sources import camera_pose, frame_of
+from dro_grasp.hands.hand import Hand
+
+OBJECT = "object"
+"""Name of the frame that grasps are stored in: that of the object's mesh or cloud."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The frame that poses are given in."""
+
+    name: str = OBJECT
+    T_frame_object: Float[Tensor, "4 4"] = field(default_factory=lambda: torch.eye(4))
+    """Takes coordinates of the object's frame to this one [m]."""
+
+    def __post_init__(self) -> None:
+        """Refuse names that would break the files, and what is no rigid motion: OptionError."""
+        if not is_name(self.name):
+            raise OptionError(f"the frame is called {self.name!r}; expected a name on one line, without control characters")
+        if (fault := motion_fault(self.T_frame_object)) is not None:
+            raise OptionError(f"T_frame_object of frame '{self.name}' must be a rigid motion, in metres; {fault}")
+
+    @staticmethod
+    def load(path: Path) -> Frame:
+        """Read `{"frame": NAME, "T_frame_object": 4x4}`.
+
+        Raises:
+            OptionError: No such file, no such content, or no rigid motion.
+        """
+        return Frame(*read_motion(path, "T_frame_object"))
+
+    def place(self, grasps: GraspBatch) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"]]:
+        """Positions [m] and unit quaternions (WXYZ, w not negative) of the wrists in this frame."""
+        T = self.T_frame_object.to(grasps.T_object_wrist) @ grasps.T_object_wrist
+        quaternion = roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(roma.special_procrustes(T[:, :3, :3].double())))
+        return T[:, :3, 3].double(), torch.where(quaternion[:, :1] < 0, -quaternion, quaternion)
+
+    def name_for(self, grasps: GraspBatch) -> str:
+        """This frame's name; the object's own frame has the name that its grasps give it, or else the object's.
+
+        Raises:
+            OptionError: The frame is the object's, and there are several objects, or none.
+        """
+        if self.name != OBJECT:
+            return self.name
+        if (named := frame_of(grasps)) is not None:
+            return named
+        if len(set(grasps.object)) != 1:
+            raise OptionError(f"{len(grasps)} grasps of {len(set(grasps.object))} objects; a file has the frame of one object, "
+                              "so export the grasps of each (GraspBatch.by_object)")
+        return grasps.object[0]
+
+    def sentence(self, grasps: GraspBatch) -> str:
+        """This frame in words."""
+        own = self.name == OBJECT and frame_of(grasps) is None
+        return f"{'the mesh frame of object' if own else 'frame'} '{self.name_for(grasps)}'"
+
+
+def postures(grasps: GraspBatch) -> dict[str, Float[Tensor, "n n_dof"]]:
+    """Joints of pregrasp, grasp and squeeze, in this order [rad or m]; OptionError: a grasp states no pregrasp or squeeze."""
+    if not bool(grasps.states_closing.all()):
+        raise OptionError("these grasps have no pregrasp and squeeze; `dro-grasp export` makes them, and so does "
+                          "`dro_grasp.complete(problem, grasps)`")
+    return {"pregrasp": grasps.pregrasp_joints, "grasp": grasps.joints, "squeeze": grasps.squeeze_joints}
+
+
+def confidence(grasps: GraspBatch, i: int) -> float | None:
+    """Predicted probability that a grasp holds, as files state it; None without a score."""
+    known = float(grasps.confidence[i])
+    return None if math.isnan(known) else round(known, 6)
+
+
+def comment(grasps: GraspBatch, frame: Frame) -> str:
+    """Three lines that a reader of the file needs: hand, frame, units and the meaning of numbers."""
+    named = f"Grasps by hand '{grasps.hand}': poses of link '{grasps.wrist_link}' in {frame.sentence(grasps)}."
+    return (
+        f"# {''.join(c if c.isprintable() else ' ' for c in named)}\n"
+        "# Metres and radians; quaternions by name or WXYZ. Joints are the independent ones; mimic joints follow them.\n"
+        "# Score: predicted log-odds that the grasp holds; confidence is its logistic function. Energy: lower is better.\n"
+    )
+
+
+def plain(values: Float[Tensor, " k"]) -> list[float]:
+    """Numbers that read well: a ten-millionth is finer than any robot."""
+    return [round(float(v), 7) for v in values]
+
+
+def yaml_text(content: Any) -> str:
+    """YAML in the order given, leaves on one line."""
+    return yaml.dump(content, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Without anchors, which other readers do not expect."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+NO_CONFIDENCE = 0.5
+"""Confidence of a grasp without a score: neither good nor bad (ours). The documented format lists the entry for every grasp,
+and readers may rely on it."""
+
+
+def isaac_grasp(grasps: GraspBatch, frame: Frame) -> str:
+    """An isaac_grasp YAML file (version 1.0) of grasps of one object, with pregrasps.
+
+    Source: documentation of isaac_grasp files in Isaac Sim (grasp editor) and Isaac ROS.
+    """
+    position, quaternion = frame.place(grasps)
+    pregrasp = postures(grasps)["pregrasp"]
+    entries, unknown, names = {}, 0, grasps.joint_names
+    for i in range(len(grasps)):
+        w, *xyz = plain(quaternion[i])
+        known = confidence(grasps, i)
+        unknown += known is None
+        entries[f"grasp_{i}"] = {
+            "confidence": NO_CONFIDENCE if known is None else known, "position": plain(position[i]),
+            "orientation": {"w": w, "xyz": xyz}, "cspace_position": dict(zip(names, plain(grasps.joints[i]), strict=True)),
+            "pregrasp_cspace_position": dict(zip(names, plain(pregrasp[i]), strict=True)),
+        }
+    content = {"format": "isaac_grasp", "format_version": 1.0, "object_frame_link": frame.name_for(grasps),
+               "gripper_frame_link": grasps.wrist_link, "grasps": entries}
+    note = f"# {unknown} of {len(grasps)} grasps have no score: their confidence {NO_CONFIDENCE} stands for unknown.\n"
+    return comment(grasps, frame) + (note if unknown else "") + yaml_text(content)
+
+
+APPROACH = 0.10
+"""Wished path of the hand along its palm direction before the grasp [m] (ours)."""
+RETREAT = 0.10
+"""Wished path away from the grasp [m] (ours)."""
+SHORTEST = 0.02
+"""Least path of either [m] (ours)."""
+
+
+def moveit_grasps(grasps: GraspBatch, hand: Hand, frame: Frame) -> str:
+    """A YAML list of moveit_msgs/Grasp, with the wrist link's pose and the fingers' postures.
+
+    The hand approaches along its palm direction and retreats along z of the frame, which is up in a robot's base. A grasp
+    without a score has no `grasp_quality`. Source: moveit_msgs/Grasp of MoveIt 2.
+    """
+    position, quaternion = frame.place(grasps)
+    joints = postures(grasps)
+    header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": frame.name_for(grasps)}
+    at_wrist = {**header, "frame_id": grasps.wrist_link}
+    palm = hand.palm_direction_wrist
+    messages = []
+    for i in range(len(grasps)):
+        orientation = dict(zip("wxyz", plain(quaternion[i]), strict=True))
+        pose = {"position": dict(zip("xyz", plain(position[i]), strict=True)), "orientation": orientation}
+        quality = confidence(grasps, i)
+        messages.append({
+            "id": f"grasp_{i}", "pre_grasp_posture": _posture(grasps, at_wrist, joints["pregrasp"][i]),
+            "grasp_posture": _posture(grasps, at_wrist, joints["squeeze"][i]),
+            "grasp_pose": {"header": header, "pose": pose}, **({} if quality is None else {"grasp_quality": quality}),
+            "pre_grasp_approach": _path(at_wrist, palm, APPROACH),
+            "post_grasp_retreat": _path(header, torch.tensor([0.0, 0.0, 1.0]), RETREAT),
+            "post_place_retreat": _path(at_wrist, -palm, RETREAT),
+            "max_contact_force": 0.0, "allowed_touch_objects": [grasps.object[i]],
+        })
+    return comment(grasps, frame) + yaml_text(messages)
+
+
+def _posture(grasps: GraspBatch, header: dict[str, Any], joints: Float[Tensor, " n_dof"]) -> dict[str, Any]:
+    """A trajectory_msgs/JointTrajectory of one point."""
+    point = {"positions": plain(joints), "velocities": [], "accelerations": [], "effort": [],
+             "time_from_start": {"sec": 0, "nanosec": 0}}
+    return {"header": header, "joint_names": list(grasps.joint_names), "points": [point]}
+
+
+def _path(header: dict[str, Any], direction: Float[Tensor, "3"], wished: float) -> dict[str, Any]:
+    """A moveit_msgs/GripperTranslation."""
+    return {"direction": {"header": header, "vector": dict(zip("xyz", plain(direction), strict=True))},
+            "desired_distance": wished, "min_distance": SHORTEST}
+
+
+def dexgraspbench(grasps: GraspBatch, frame: Frame, object_path: str, scale: float) -> list[dict[str, Any]]:
+    """One dictionary per grasp, as DexGraspBench reads it from a npy file.
+
+    Postures are wrist pose (x y z, qw qx qy qz) and joints in one row; `obj_pose` is the pose of the object's file in their
+    frame, WXYZ as well. Source: readme of DexGraspBench.
+    """
+    position, quaternion = frame.place(grasps)
+    joints = postures(grasps)
+    camera = camera_pose(grasps)  # the file of a camera's cloud is in the camera's frame
+    T = frame.T_frame_object.double() if camera is None else frame.T_frame_object.double() @ camera.double()
+    turn = roma.quat_xyzw_to_wxyz(roma.rotmat_to_unitquat(roma.special_procrustes(T[:3, :3])))
+    pose = torch.cat([T[:3, 3], turn])
+    found = []
+    for i in range(len(grasps)):
+        wrist = torch.cat([position[i], quaternion[i]])
+        qpos = {f"{name}_qpos": torch.cat([wrist, values[i].double()]).numpy() for name, values in joints.items()}
+        found.append({
+            **qpos, "obj_scale": scale, "obj_pose": pose.numpy(), "obj_path": object_path, "hand": grasps.hand,
+            "wrist_link": grasps.wrist_link, "joint_names": list(grasps.joint_names), "frame": frame.name_for(grasps),
+            "units": "m, rad",
+        })
+    return found
+
+
+def csv_table(grasps: GraspBatch, frame: Frame) -> str:
+    """One line per grasp: pose, score, energy, outcome and the joints of all postures, after comment lines."""
+    position, quaternion = frame.place(grasps)
+    joints = postures(grasps)
+    text = io.StringIO()
+    text.write(comment(grasps, frame))
+    writer = csv.writer(text, lineterminator="\n")
+    names = [f"{posture}:{joint}" for posture in joints for joint in grasps.joint_names]
+    writer.writerow(["object", "x", "y", "z", "qw", "qx", "qy", "qz", "score", "energy", "success", "protocol",
+                     "robustness", "fingers_in_contact", *names])
+    for i in range(len(grasps)):
+        writer.writerow([
+            grasps.object[i], *plain(position[i]), *plain(quaternion[i]), _known(grasps.score[i]), _known(grasps.energy[i]),
+            int(grasps.success[i]) if bool(grasps.evaluated[i]) else "", grasps.protocol[i],
+            _known(grasps.robustness[i]), _known(grasps.fingers_in_contact[i]),
+            *(value for values in joints.values() for value in plain(values[i])),
+        ])
+    return text.getvalue()
+
+
+def _known(value: Float[Tensor, ""]) -> float | str:
+    """A number, or an empty cell where it is unknown."""
+    return plain(value[None])[0] if bool(value.isfinite()) else ""
+
+
+def _dexgraspbench_files(job: ExportJob) -> list[bytes]:
+    files = []
+    for entry in dexgraspbench(job.grasps, job.frame, job.object_path, job.object_scale):
+        file = io.BytesIO()
+        np.save(file, np.array(entry, dtype=object), allow_pickle=True)
+        files.append(file.getvalue())
+    return files
+
+
+def _moveit_file(job: ExportJob) -> bytes:
+    if job.hand is None:
+        raise OptionError("MoveIt messages state the palm direction: give the hand of the grasps")
+    return moveit_grasps(job.grasps, job.hand, job.frame).encode()
+
+
+WRITERS: dict[str, Callable[[ExportJob], bytes | list[bytes]]] = {
+    "isaac_grasp": lambda job: isaac_grasp(job.grasps, job.frame).encode(),
+    "moveit": _moveit_file,
+    "dexgraspbench": _dexgraspbench_files,
+    "csv": lambda job: csv_table(job.grasps, job.frame).encode(),
+}
+"""What makes one object's file, or one file per grasp, by the format's name."""

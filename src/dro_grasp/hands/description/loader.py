@@ -1,0 +1,200 @@
+"""A hand description, URDF or MJCF, read once into a kinematic tree and link geometry.
+
+MuJoCo reads the file, so kinematics and simulation agree on every link, limit and coupling.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from dro_grasp.errors import HandError
+from dro_grasp.files import given_path
+from dro_grasp.hands.description.compiling import Note, collide, compile_hand, guess_unit, mujoco_speaks_to
+from dro_grasp.hands.description.part import arm_in_mjcf, arm_in_urdf, named, part_of_mjcf, part_of_urdf
+from dro_grasp.hands.description.reduction import keep_hand_only
+from dro_grasp.hands.description.tree_reading import Coupling, LinkGeometry, read_couplings, read_geometry, read_tree
+from dro_grasp.hands.description.urdf import as_obj, prepare_urdf
+from dro_grasp.hands.description.xml_files import included_files, parse_xml
+from dro_grasp.hands.kinematics.tree import KinematicTree
+
+OPEN = "open"
+"""Name of the state or keyframe (ours; MoveIt's own examples use it)."""
+
+
+def load_description(path: Path | str, link: str | None = None, *, arm: bool = False) -> Description:
+    """Read a URDF or MJCF file, or the part of it that begins at a link.
+
+    Args:
+        path: The file.
+        link: The link at which the hand begins; by default the file is the hand's, or the arm's.
+        arm: Read the arm instead of the hand, up to this link. Its root stands still; a hand is free, so joints that move all
+            of it are left out.
+
+    Raises:
+        HandError: The file cannot be used, or has no such link; the message gives the reason and a remedy.
+    """
+    path = given_path(path)
+    root = parse_xml(path)
+    notes: list[Note] = []
+    if root.tag == "robot":
+        if link is not None:
+            (arm_in_urdf if arm else part_of_urdf)(root, link, path)
+        spec, files = _read_urdf(root, path, notes)
+        srdf = path.with_suffix(".srdf")
+        stated = open_state(srdf) if os.path.isfile(srdf) else {}
+        files = (*files, srdf) if stated else files
+    elif root.tag == "mujoco":
+        spec, files = _read_mjcf(root, path, notes)
+        if link is not None and arm:
+            arm_in_mjcf(spec, link, path)
+        elif link is not None:
+            spec = part_of_mjcf(spec, link, path)
+        with mujoco_speaks_to(notes, path):
+            stated = open_key(spec)
+    else:
+        raise HandError(f"{path} starts with <{root.tag}>; expected a URDF (<robot>) or MJCF (<mujoco>) file")
+    notes.extend(keep_hand_only(spec, path, fixed_base=arm))
+    model = compile_hand(spec, path, notes)
+    tree = read_tree(model, path, notes)
+    return Description(path.resolve(), link, spec, model, tree, _digest(path, files, link), tuple(notes), stated)
+
+
+@dataclass(frozen=True, eq=False)
+class Description:
+    """The content of a hand's file. Each body of the compiled model is a link; the first one is the root, at identity."""
+
+    path: Path  # the file
+    link: str | None  # the link at which the hand that was read begins, or at which the arm ends; None for the whole file
+    _spec: mujoco.MjSpec
+    model: mujoco.MjModel  # the hand alone, compiled
+    tree: KinematicTree  # the kinematic tree, with couplings resolved
+    sha256: str  # hash of the file, of the files it uses, and of the part's name
+    notes: tuple[Note, ...]  # findings and repairs
+    open_posture: Mapping[str, float]
+    """The open posture that the file, or the SRDF beside it, states, by joint [rad or m]; empty if it states none."""
+
+    @property
+    def name(self) -> str:
+        """The file's stem, and the part of it."""
+        return named(self.path.stem, self.link)
+
+    @property
+    def source(self) -> str:
+        """The file, and the part of it."""
+        return named(self.path, self.link)
+
+    def spec(self) -> mujoco.MjSpec:
+        """A new copy of the hand alone: without actuators, with couplings as joint equalities."""
+        return self._spec.copy()
+
+    @cached_property
+    def couplings(self) -> tuple[Coupling, ...]:
+        """Stated couplings between joints (URDF mimic, MJCF joint equalities and shared tendons)."""
+        return read_couplings(self.model)
+
+    @cached_property
+    def link_of_body(self) -> dict[int, int]:
+        """Index of the link that carries each body's geometry."""
+        names = {name: i for i, name in enumerate(self.tree.link_names)}
+        return {b: names[self.model.body(b).name] for b in range(1, self.model.nbody)}
+
+    @cached_property
+    def geometry(self) -> tuple[LinkGeometry, ...]:
+        """All shapes of all links; a hand without any colliding shape collides with its visual ones."""
+        return read_geometry(self.model, self.link_of_body)
+
+    @cached_property
+    def masses(self) -> Float[np.ndarray, " n_links"]:
+        """Mass of each link [kg]."""
+        masses = np.zeros(self.tree.n_links)
+        for body, link in self.link_of_body.items():
+            masses[link] = self.model.body_mass[body]
+        return masses
+
+
+def _read_urdf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.MjSpec, tuple[Path, ...]]:
+    xml, files, converted = prepare_urdf(root, path, notes)
+    assets = {name: as_obj(file) for name, file in converted.items()}
+    with mujoco_speaks_to(notes, path):
+        return mujoco.MjSpec.from_string(xml, assets=assets), tuple(files)
+
+
+def _read_mjcf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[mujoco.MjSpec, tuple[Path, ...]]:
+    included = included_files(root, path)
+    if path.suffix.lower() != ".xml":
+        raise HandError(f"{path} is MJCF, which MuJoCo reads only from files that end in .xml; rename it")
+    with mujoco_speaks_to(notes, path):
+        spec = mujoco.MjSpec.from_file(str(path))
+    if not any("angle" in c.attrib for tree in (root, *map(parse_xml, included)) for c in tree.iter("compiler")):
+        notes.extend(guess_unit(spec))
+    folder, pictures = path.parent / (spec.meshdir or ""), path.parent / (spec.texturedir or "")
+    meshes = {folder / mesh.file for mesh in spec.meshes if mesh.file}
+    used = {*meshes, *(pictures / name for texture in spec.textures for name in (texture.file, *texture.cubefiles) if name)}
+    missing = sorted(str(file) for file in used if not os.path.isfile(file))
+    if missing:
+        raise HandError(f"{path}: {len(missing)} files of meshes or textures are missing (first: {missing[0]}); put them "
+                        "there or correct meshdir and texturedir")
+    return spec, (*included, *meshes)
+
+
+def _digest(path: Path, files: tuple[Path, ...], link: str | None) -> str:
+    digest = hashlib.sha256(b"" if link is None else named("", link).encode())
+    for file in (path, *sorted(set(files), key=os.fspath)):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+def open_state(srdf: Path) -> dict[str, float]:
+    """Joint values of every `<group_state name="open">` of an SRDF file [rad or m]; empty if it has none.
+
+    Raises:
+        HandError: The file is not valid XML, or a value is not a number.
+    """
+    stated = {}
+    for state in parse_xml(srdf).iter("group_state"):
+        for joint in state.iter("joint") if state.get("name") == OPEN else ():
+            try:
+                stated[joint.get("name", "")] = float(joint.get("value", ""))
+            except ValueError as error:
+                raise HandError(f"{srdf}: the state '{OPEN}' has value=\"{joint.get('value')}\" for joint "
+                                f"'{joint.get('name')}'; expected one number") from error
+    return stated
+
+
+def open_key(spec: mujoco.MjSpec) -> dict[str, float]:
+    """Joint values of the keyframe `open` of an MJCF [rad or m]; empty if it has none."""
+    if not any(key.name == OPEN for key in spec.keys):
+        return {}
+    model = spec.copy().compile()
+    values = model.key_qpos[model.key(OPEN).id]
+    single = {int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)}
+    joints = [j for j in range(model.njnt) if int(model.jnt_type[j]) in single]
+    return {model.joint(j).name: float(values[model.jnt_qposadr[j]]) for j in joints}
+
+
+def self_penetration(description: Description, q: Float[Tensor, " n_dof"]) -> dict[tuple[str, str], float]:
+    """Depth [m] by the names of each two links that penetrate each other at these joints; neighbours in the tree may."""
+    model, tree = description.model, description.tree
+    data = mujoco.MjData(model)
+    angles = (tree.coupling @ q.double().to(tree.coupling) + tree.offset).tolist()
+    for name, angle in zip(tree.moving_names, angles, strict=True):
+        data.qpos[model.joint(name).qposadr[0]] = angle
+    collide(model, data)
+    depths: dict[tuple[str, str], float] = {}
+    for contact in data.contact:
+        first, second = sorted(int(model.geom_bodyid[g]) for g in contact.geom)
+        if contact.dist < 0 and first not in (second, int(model.body_parentid[second])):
+            pair = model.body(first).name, model.body(second).name
+            depths[pair] = max(depths.get(pair, 0.0), -float(contact.dist))
+    return depths

@@ -1,0 +1,265 @@
+"""Prepare a URDF in memory for MuJoCo: check links and joints, find meshes, name the root link. No file is changed."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import math
+import os
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable
+from pathlib import Path
+from urllib.parse import unquote
+
+from dro_grasp.errors import HandError
+from dro_grasp.files import reading
+from dro_grasp.geometry.mesh_files import open_mesh
+from dro_grasp.hands.description.compiling import LEAST_INERTIA, LEAST_MASS, Note
+from dro_grasp.hands.description.xml_files import DEEPEST
+
+MOVING = {"revolute", "continuous", "prismatic"}
+"""URDF joint types with one degree of freedom."""
+
+
+def prepare_urdf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[str, list[Path], dict[str, Path]]:
+    """Check the link tree, resolve meshes and set MuJoCo's options.
+
+    Returns:
+        XML for MuJoCo, the mesh files in use, and those that MuJoCo cannot read (GLB, DAE, ...) by the names that stand in.
+
+    Raises:
+        HandError: A name is used twice, a number is not one, no joint moves, links form a cycle or several trees, or no mesh
+            is found.
+    """
+    _check_names(root, path)
+    _settle_joints(root, path, notes)
+    _drop_empty_shapes(root, path, notes)
+    base = _check_links(root, path)
+    if base == "world":
+        for place, attribute in (("link", "name"), ("joint/parent", "link"), ("joint/child", "link")):
+            for element in root.findall(f"{place}[@{attribute}='world']"):
+                element.set(attribute, "world_link")
+        notes.append(Note("info", "world", "is MuJoCo's name for the ground; this link is called 'world_link' here and in "
+                          "exported files"))
+    _check_mimic(root, notes)
+    files, converted = resolve_meshes(root, path, notes)
+    extension = root.find("mujoco")
+    extension = ET.SubElement(root, "mujoco") if extension is None else extension
+    compiler = extension.find("compiler")
+    compiler = ET.SubElement(extension, "compiler") if compiler is None else compiler
+    for stale in ("meshdir", "assetdir", "texturedir"):
+        compiler.attrib.pop(stale, None)
+    compiler.attrib.update(discardvisual="false", fusestatic="false", balanceinertia="true", boundmass=str(LEAST_MASS),
+                           boundinertia=str(LEAST_INERTIA), strippath="false")
+    return ET.tostring(root, encoding="unicode"), files, converted
+
+
+def _check_names(root: ET.Element, path: Path) -> None:
+    for kind in ("link", "joint"):
+        names = [element.get("name", "") for element in root.findall(kind)]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise HandError(f"{path}: two {kind}s are called '{twice}'; expected a name of its own for each, rename one")
+
+
+def _settle_joints(root: ET.Element, path: Path, notes: list[Note]) -> None:
+    """Make every joint fixed, or movable about one axis within sensible limits."""
+    for joint in root.findall("joint"):
+        name, kind = joint.get("name", ""), joint.get("type")
+        if kind == "floating":
+            joint.set("type", "fixed")
+            notes.append(Note("info", name, "is a floating joint and is taken as fixed: the wrist is free anyway"))
+        elif kind not in MOVING | {"fixed"}:
+            raise HandError(f"{path}: joint '{name}' has the type '{kind}'; expected one of "
+                            f"{', '.join(sorted(MOVING))}, fixed, floating")
+        elif kind != "fixed":
+            for element in joint.findall("axis"):
+                axis = _numbers(element, "xyz", path, _called(joint))
+                if len(axis) != 3 or math.hypot(*axis) < 1e-6:
+                    raise HandError(f"{path}: joint '{name}' has the axis '{element.get('xyz')}'; expected a direction of "
+                                    "three numbers, not all zero")
+            if kind != "continuous":
+                _check_limits(joint, path, notes)
+
+
+def _check_limits(joint: ET.Element, path: Path, notes: list[Note]) -> None:
+    """Refuse limits that no joint value satisfies. A limit left out is zero; a joint without range is fixed."""
+    element = joint.find("limit")
+    if element is None or not {"lower", "upper"} & element.attrib.keys():
+        return
+    for end in ("lower", "upper"):
+        element.attrib.setdefault(end, "0")
+    lower, upper = (_numbers(element, end, path, _called(joint))[0] for end in ("lower", "upper"))
+    if lower > upper:
+        raise HandError(f"{path}: joint '{joint.get('name')}' has the lower limit {lower:g} above its upper limit "
+                        f"{upper:g}; swap them")
+    if lower == upper != 0:
+        raise HandError(f"{path}: joint '{joint.get('name')}' has both limits at {lower:g}, so it cannot move; give it a "
+                        "range, or make it fixed at that value")
+    if lower == upper and joint.find("mimic") is None:
+        joint.set("type", "fixed")
+        notes.append(Note("warning", joint.get("name", ""), "has both limits at zero and is taken as fixed"))
+
+
+def _drop_empty_shapes(root: ET.Element, path: Path, notes: list[Note]) -> None:
+    """Remove boxes, spheres and cylinders without extent, which MuJoCo refuses."""
+    for link in root.findall("link"):
+        for element in [*link.findall("visual"), *link.findall("collision")]:
+            for shape in element.findall("geometry/*")[:1]:
+                stated = [name for name in ("size", "radius", "length") if name in shape.attrib]
+                sizes = [x for name in stated for x in _numbers(shape, name, path, _called(link))]
+                if min(sizes, default=1.0) > 0:
+                    continue
+                link.remove(element)
+                notes.append(Note("warning", link.get("name", ""), f"{element.tag} {shape.tag} of size "
+                                  f"{' '.join(f'{x:g}' for x in sizes)} has no volume and is left out"))
+
+
+def _called(element: ET.Element) -> str:
+    return f"{element.tag} '{element.get('name')}'"
+
+
+def _numbers(element: ET.Element, attribute: str, path: Path, owner: str) -> list[float]:
+    try:
+        values = [float(x) for x in element.get(attribute, "").split()]
+    except ValueError:
+        values = []
+    if not values or not all(math.isfinite(x) for x in values):
+        raise HandError(f"{path}: {owner} has {attribute}=\"{element.get(attribute)}\" in <{element.tag}>; expected "
+                        "finite numbers")
+    return values
+
+
+def _check_links(root: ET.Element, path: Path) -> str:
+    """The root link's name, once the links form one tree."""
+    links = [link.get("name", "") for link in root.findall("link")]
+    joints = root.findall("joint")
+    moving = [j for j in joints if j.get("type") in MOVING]
+    if not links:
+        raise HandError(f"{path} has no <link>; expected a robot hand description. Expand a xacro file first: xacro {path} > "
+                        "hand.urdf")
+    if not moving:
+        raise HandError(f"{path} has no moving joint ({len(joints)} fixed); a hand needs at least one revolute or "
+                        "prismatic joint")
+    parent: dict[str, str] = {}
+    for joint in joints:
+        above, below = (_link_of(joint, end, links, path) for end in ("parent", "child"))
+        if below in parent:
+            raise HandError(f"{path}: link '{below}' has two parents, '{parent[below]}' and '{above}'; a hand must be "
+                            "a tree, remove one of the joints")
+        parent[below] = above
+    for link in links:
+        seen = [link]
+        while seen[-1] in parent:
+            seen.append(parent[seen[-1]])
+            if len(links) >= len(seen) > DEEPEST:
+                raise HandError(f"{path} has more than {DEEPEST} links one below the other; expected a robot hand")
+            if len(seen) > len(links):
+                cycle = " -> ".join(seen[: seen.index(seen[-1]) + 2][:6])
+                raise HandError(f"{path}: the links form a cycle ({cycle} ...); a hand must be a tree with one root")
+    roots = [link for link in links if link not in parent]
+    if len(roots) > 1:
+        raise HandError(f"{path} has {len(roots)} root links ({', '.join(roots[:4])}); connect them with fixed joints "
+                        "or remove the unused ones")
+    return roots[0]
+
+
+def _link_of(joint: ET.Element, end: str, links: Iterable[str], path: Path) -> str:
+    element = joint.find(end)
+    name = "" if element is None else element.get("link", "")
+    if name not in links:
+        raise HandError(f"{path}: joint '{joint.get('name')}' names the {end} link '{name}', which does not exist")
+    return name
+
+
+def _check_mimic(root: ET.Element, notes: list[Note]) -> None:
+    kinds = {joint.get("name"): joint.get("type") for joint in root.findall("joint")}
+    for joint in root.findall("joint"):
+        for mimic in joint.findall("mimic"):
+            kind = kinds.get(target := mimic.get("joint", ""), "missing")
+            if kind not in MOVING:
+                notes.append(Note("warning", joint.get("name", ""), f"mimics joint '{target}', which is {kind}; the joint is "
+                                  "taken as free"))
+                joint.remove(mimic)
+
+
+def resolve_meshes(root: ET.Element, path: Path, notes: list[Note]) -> tuple[list[Path], dict[str, Path]]:
+    """Point every mesh to its file, in place; drop shapes whose mesh cannot be found, if any shape is left.
+
+    Returns:
+        The mesh files in use, and those in formats that MuJoCo cannot read by the names that stand in for them.
+
+    Raises:
+        HandError: No mesh can be found, and there is no other shape.
+    """
+    files: dict[str, Path] = {}
+    missing: list[str] = []
+    for link in root.iter("link"):
+        lost = [element for element in [*link.findall("visual"), *link.findall("collision")]
+                if not _resolve_mesh(element, path.parent, files)]
+        for element in lost:
+            name = element.find("geometry/mesh").get("filename", "")  # type: ignore[union-attr]
+            missing.append(name)
+            link.remove(element)
+            notes.append(Note("warning", link.get("name", ""), f"{element.tag} mesh '{name}' was not found and is left out"))
+        if any(element.tag == "collision" for element in lost) and link.find("collision") is None:
+            _collide_with_visuals(link, notes)
+    if missing and not files and root.find("link/*/geometry") is None:
+        looked = ", ".join(str(p) for p in _candidates(missing[0], path.parent)[:4])
+        raise HandError(f"{path}: none of its {len(missing)} meshes can be found (first: '{missing[0]}'; looked for "
+                        f"{looked}); put the meshes beside the URDF or correct the file names")
+    converted = {name: file for name, file in files.items() if name != str(file)}
+    return list(files.values()), converted
+
+
+def _resolve_mesh(element: ET.Element, folder: Path, files: dict[str, Path]) -> bool:
+    """Point a shape's mesh to its file, or to a name that stands in for it; False if there is no such file."""
+    mesh = element.find("geometry/mesh")
+    if mesh is None:
+        return True
+    name = mesh.get("filename", "")
+    file = find_mesh(name, folder)
+    if file is None:
+        return False
+    readable = file.suffix.lower() in {".stl", ".obj", ".msh"}  # by MuJoCo; trimesh converts the others
+    stand_in = str(file) if readable else hashlib.sha256(name.encode()).hexdigest()[:16] + ".obj"
+    mesh.set("filename", stand_in)
+    files[stand_in] = file
+    return True
+
+
+def as_obj(file: Path) -> bytes:
+    """A mesh in any format trimesh reads, as OBJ text."""
+    import trimesh
+
+    # trimesh alone is called here, and its many readers raise whatever they stumble over.
+    with reading(f"mesh {file}", HandError, "STL, OBJ, GLB, DAE or PLY, whole", Exception):
+        loaded = open_mesh(file)
+        mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
+        return trimesh.exchange.obj.export_obj(mesh, include_normals=False, include_texture=False).encode()
+
+
+def _collide_with_visuals(link: ET.Element, notes: list[Note]) -> None:
+    """Let a link whose collision meshes are all missing collide with its visual shapes."""
+    visuals = link.findall("visual")
+    for visual in visuals:
+        shape = copy.deepcopy(visual)
+        shape.tag = "collision"
+        link.append(shape)
+    if visuals:
+        notes.append(Note("warning", link.get("name", ""), "collides with its visual shapes instead"))
+
+
+def _candidates(name: str, folder: Path) -> list[Path]:
+    """Paths at which a mesh may lie, the most likely first; in URIs, %20 may stand for a space."""
+    rest = name.replace("\\", "/").split("://", 1)[-1]
+    roots, spellings = ((folder, *list(folder.parents)[:4]), (rest, unquote(rest))) if "://" in name else ((folder,), (rest,))
+    tails = dict.fromkeys(tail for spelling in spellings for tail in (spelling, spelling.split("/", 1)[-1]))
+    return [root / tail for root in roots for tail in tails]
+
+
+def find_mesh(name: str, folder: Path) -> Path | None:
+    """The file of a mesh name (relative, absolute, `package://` or `file://`); None if there is none."""
+    if not name:
+        return None
+    return next((file.resolve() for file in _candidates(name, folder) if os.path.isfile(file)), None)

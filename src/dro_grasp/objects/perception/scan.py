@@ -1,0 +1,144 @@
+"""From a camera's depth image or cloud to an object in the frame in which grasps are wanted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
+
+from dro_grasp.errors import ObjectError, OptionError
+from dro_grasp.frames import motion_fault
+from dro_grasp.geometry.point_clouds import distinct_points
+from dro_grasp.geometry.table_plane import above_plane, moved_plane, table_plane
+from dro_grasp.kinds import checked
+from dro_grasp.objects.loading import check_extent, check_scale, cloud_object, estimate_normals, table_note
+from dro_grasp.objects.perception.completion import complete_cloud
+from dro_grasp.objects.reading import numbers, read_points
+from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
+
+NEIGHBOURS = 12
+"""Neighbours that decide whether a point is an outlier (ours)."""
+
+
+def depth_points(depth: ArrayLike, intrinsics: ArrayLike, mask: ArrayLike | None = None) -> Float[np.ndarray, "n 3"]:
+    """Points of a depth image in the camera's frame: x right, y down, z forward [m].
+
+    Arrays, tensors and nested lists are taken.
+
+    Args:
+        depth: Depth along z [m], (h, w); 0 or NaN where there is no measurement.
+        intrinsics: Pinhole matrix, (3, 3): focal lengths and principal point [pixels].
+        mask: The object's pixels, (h, w), which are true or not 0; all pixels with a depth by default.
+
+    Raises:
+        ObjectError: Image, mask or matrix have wrong shapes, nothing is left, or depths are not in metres.
+    """
+    image, matrix = numbers(depth, "the depth image"), numbers(intrinsics, "the matrix of intrinsics")
+    if image.ndim != 2 or matrix.shape != (3, 3) or not abs(float(np.linalg.det(matrix))) > 0:
+        raise ObjectError(f"the depth image has shape {image.shape}, the intrinsics are {matrix.tolist()}; expected (h, w), "
+                          "and a 3x3 matrix with focal lengths and principal point in pixels")
+    with np.errstate(invalid="ignore"):
+        valid = np.isfinite(image) & (image > 0)
+    if mask is not None:
+        wanted = numbers(mask, "the mask", "biuf") != 0
+        if wanted.shape != image.shape:
+            raise ObjectError(f"the mask has shape {wanted.shape}, the depth image {image.shape}; give one of the same size")
+        valid = valid & wanted
+    if not valid.any():
+        raise ObjectError("no pixel of the depth image has a depth" + ("" if mask is None else " within the mask")
+                          + "; give depths in metres, and a mask that is true on the object")
+    if float(np.median(image[valid])) > 10.0:  # [m] (ours)
+        raise ObjectError(f"the median depth is {np.median(image[valid]):g}, too far for metres; divide millimetres by 1000")
+    row, column = np.nonzero(valid)
+    z = image[valid].astype(np.float64)
+    rays = np.linalg.solve(matrix.astype(np.float64), np.stack([column, row, np.ones_like(row)]).astype(np.float64))
+    return (rays / rays[2] * z).T
+
+
+def load_scan(
+    path: Path, T_frame_camera: Float[np.ndarray, "4 4"], scale: float = 1.0, keep_table: bool = False
+) -> ObjectModel:
+    """The object in a cloud file (PLY, NPY, PCD) in the camera's frame, times `scale`; see `scanned_object`."""
+    check_scale(scale)
+    return scanned_object(path.stem, read_points(path) * scale, T_frame_camera, keep_table=keep_table)
+
+
+@checked
+def scanned_object(
+    name: str, points: ArrayLike, T_frame_camera: ArrayLike | None = None, denoise: bool = True, complete: bool = True,
+    keep_table: bool = False,
+) -> ObjectModel:
+    """An object from the points of a camera at the origin; its grasps are in the given frame.
+
+    Arrays, tensors and nested lists are taken.
+
+    Args:
+        points: Points in the camera's frame, (n, 3) [m].
+        T_frame_camera: The camera's pose, (4, 4), in the wanted frame, whose z axis points up and in which `direction` and
+            `table` are given; the camera's own frame by default.
+        denoise: Drop outliers.
+        complete: Add the unseen side; switch it off for a scan from all sides.
+        keep_table: Take every point for the object's. By default a table in the cloud is found and cut off, said in a note, and
+            hands stay above it.
+
+    Raises:
+        ObjectError: Too few points are left, they are not in metres, or some lie behind the camera.
+        OptionError: The pose is no rigid motion.
+    """
+    T = None if T_frame_camera is None else given_pose(T_frame_camera)
+    kept = given_points(points, name)
+    kept, camera = kept[np.isfinite(kept).all(1)], np.zeros(3)
+    kept = kept[distinct_points(kept)]
+    total, table = len(kept), None if keep_table else table_plane(kept, camera)
+    if table is not None:
+        kept = kept[above_plane(kept, table)]
+    cut = total - len(kept)
+    if len(kept) > CLOUD_POINTS:
+        kept = kept[np.random.default_rng(0).permutation(len(kept))[:CLOUD_POINTS]]
+    if denoise and len(kept) > NEIGHBOURS:
+        kept = without_outliers(kept)
+    if len(kept) < NEIGHBOURS:
+        raise ObjectError(f"{name} has {len(kept)} points after cleaning; give a denser cloud or a larger mask")
+    check_extent(kept, name)
+    if float((kept @ kept.mean(0)).min()) <= 0:
+        raise ObjectError(f"{name} has points behind the camera, which is at the cloud's origin; give the cloud in the "
+                          "camera's frame")
+    normals = estimate_normals(kept.astype(np.float32), camera).astype(np.float64)
+    seen, added = kept, np.zeros(0, bool)
+    if complete:
+        up = None if T is None else T[2, :3]
+        kept, normals, added = complete_cloud(kept, normals, camera, up)
+    if T is not None:
+        R, t = T[:3, :3], T[:3, 3]
+        kept, seen, normals = kept @ R.T + t, seen @ R.T + t, normals @ R.T
+        table = None if table is None else moved_plane(table, T)
+    obj = cloud_object(
+        name, np.concatenate([kept, normals], 1), origin=name, keep_table=True, seen=seen if added.any() else None)
+    return obj if table is None else replace(obj, table=table, notes=(*obj.notes, table_note(table, cut, total)))
+
+
+def given_points(points: ArrayLike, origin: str) -> Float[np.ndarray, "n 3"]:
+    """The points of a cloud, NaN included [m]; an ObjectError if they are none."""
+    array = numbers(points, origin).astype(np.float64)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ObjectError(f"{origin} holds an array of shape {array.shape}; expected (n, 3) points")
+    return array
+
+
+def given_pose(T_frame_camera: ArrayLike) -> Float[np.ndarray, "4 4"]:
+    """The pose of a camera in the wanted frame [m]; an OptionError if it is no rigid motion."""
+    T = numbers(T_frame_camera, "T_frame_camera").astype(np.float64)
+    if (fault := motion_fault(torch.from_numpy(T))) is not None:
+        raise OptionError(f"T_frame_camera is not the camera's pose in the wanted frame, in metres: {fault}")
+    return T
+
+
+def without_outliers(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
+    """Remove points whose mean distance to their neighbours is unusually large. Source: Rusu et al. 2008."""
+    distance = KDTree(points).query(points, k=min(NEIGHBOURS, len(points) - 1) + 1)[0][:, 1:].mean(1)
+    return points[distance <= distance.mean() + 2.5 * distance.std()]  # (ours)

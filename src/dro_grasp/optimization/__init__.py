@@ -1,1 +1,0 @@
-"""Descents of the grasp energy: synthesis from nothing, refinement of any grasps."""

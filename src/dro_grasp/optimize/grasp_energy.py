@@ -1,0 +1,293 @@
+"""The grasp energy of one hand on one object: the weighted terms and their gradient, for a batch of grasps."""
+
+from __future__ import annotations
+
+import math
+from copy import copy
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from dro_grasp.devices import Rows, on_device
+from dro_grasp.geometry import se3
+from dro_grasp.geometry.distance_field import Balls, DistanceField
+from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import Checked
+from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.optimize import terms as energies
+from dro_grasp.optimize.contacts import ContactCandidates, ContactConfig, LinkPoints, contact_candidates, link_spheres
+from dro_grasp.optimize.workspace import Clearance, Surroundings, Touching
+
+TERMS = ("force_closure", "distance", "penetration", "self_penetration", "alignment", "joints")
+"""Names of the terms, in the order of every array of terms."""
+
+
+@dataclass(frozen=True)
+class EnergyConfig(Checked):
+    """Weights and geometry of the energy. Source: DexGraspNet, unless stated otherwise."""
+
+    force_closure: float = 1.0
+    """Weight of the squared net wrench."""
+    distance: float = 100.0
+    """Weight of the contacts' distance to the surface [1/m]."""
+    penetration: float = 100.0
+    """Weight of the hand points' penetration into the object [1/m]."""
+    filled: bool = False
+    """Whether penetration is also measured at the spheres that fill the links, with the same weight (ours): a thin object
+    finds its way between the hand points."""
+    self_penetration: float = 50.0
+    """Weight of self-penetration [1/m] (DexGraspNet: 10; its spheres are finer)."""
+    alignment: float = 1.0
+    """Weight of the angle between hand and object normals (ours)."""
+    joints: float = 1.0
+    """Weight of joints closer to their closed end than `closing_room` [1/rad or 1/m]."""
+    closing_room: float = 0.1
+    """Share of a joint's range that is kept for the squeeze (ours)."""
+    hand_points: int = 200
+    """Number of hand points at which penetration is measured."""
+    margin: float = 0.001
+    """Clearance that hand points keep from the object before they count as penetrating [m] (ours)."""
+    clearance: float = 100.0
+    """Weight of the hand's penetration into its surroundings, in pregrasp, grasp and squeeze, and of the distance of contacts
+    and other hand points from where they may be [1/m] (ours)."""
+    clearance_points: int = 120
+    """Number of hand points at which that is measured (ours)."""
+    clear: float = 0.005
+    """Distance that the hand keeps from its surroundings [m] (ours)."""
+
+
+@dataclass(frozen=True)
+class Evaluation(Rows):
+    """Energy and gradient of n grasps."""
+
+    terms: Float[Tensor, "n 6"]
+    """Weighted terms in the order of TERMS."""
+    clearance: Float[Tensor, "n 1"]
+    """Weighted penetration into the surroundings, and touch beside the place to hold. It says nothing about the grasp itself,
+    so it is not among the terms."""
+    by_pose: Float[Tensor, "n 6"]
+    """Derivative by the hand's translation [1/m] and rotation about its grasp centre [1/rad]."""
+    by_joint: Float[Tensor, "n n_dof"]
+
+    @property
+    def total(self) -> Float[Tensor, " n"]:
+        """Sum of the terms, the clearance included."""
+        return self.terms.sum(-1) + self.clearance[:, 0]
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """Where a hand may be, and where it may touch the object; anywhere by default."""
+
+    surroundings: Surroundings | None = None
+    """What it stays clear of."""
+    hold: Balls | None = None
+    """The only place where it touches the object."""
+
+    def to(self, device: torch.device | str) -> Room:
+        """The same on another device."""
+        around = None if self.surroundings is None else self.surroundings.to(device)
+        return Room(around, None if self.hold is None else on_device(self.hold, device))
+
+
+class GraspEnergy:
+    """The energy of a hand on an object, prepared for many evaluations."""
+
+    def __init__(
+        self, hand: Hand, field: DistanceField, centre: Float[Tensor, "3"], length: float, config: EnergyConfig | None = None,
+        contacts: ContactConfig | None = None, device: torch.device | str = "cpu", room: Room | None = None,
+    ) -> None:
+        """Prepare everything that stays the same from step to step.
+
+        Args:
+            field: Signed distances of the object.
+            centre: The object's centre of mass [m].
+            length: Typical distance of its surface from there [m].
+            device: Device of the evaluations; all that is given is on the CPU.
+        """
+        self.length, room = length, room or Room()
+        self.room = room.to(device)
+        self.candidates: ContactCandidates = on_device(contact_candidates(hand, contacts), device)
+        self.spheres = on_device(link_spheres(hand), device)
+        self.source, hand = hand, hand.to(device)
+        self.hand, self.field, self.centre = hand, on_device(field, device), centre.to(device)
+        self.one_hot = torch.eye(hand.tree.n_links, dtype=hand.tree.origin.dtype, device=device)
+        self.contact_points = LinkPoints.of(self.candidates.points, self.candidates.links, hand.tree.n_links)
+        self.ball = LinkPoints.of(self.spheres.centres, self.spheres.links, hand.tree.n_links)
+        self._weigh(config or EnergyConfig())
+
+    @staticmethod
+    def of_object(
+        hand: Hand, obj: ObjectModel, config: EnergyConfig | None = None, contacts: ContactConfig | None = None,
+        device: torch.device | str = "cpu", room: Room | None = None,
+    ) -> GraspEnergy:
+        """The energy on the object's grid of signed distances."""
+        surface = torch.as_tensor(obj.cloud, dtype=torch.float32)
+        centre = torch.as_tensor(obj.centre_of_mass, dtype=torch.float32)
+        length = float((surface - centre).norm(dim=-1).mean())
+        return GraspEnergy(hand, obj.distance_field, centre, length, config, contacts, device, room)
+
+    def weighted(self, config: EnergyConfig) -> GraspEnergy:
+        """This energy under other weights; it shares contacts, link spheres and distance field."""
+        other = copy(self)
+        other._weigh(config)
+        return other
+
+    def _weigh(self, config: EnergyConfig) -> None:
+        """Set the weights and everything that depends on them."""
+        hand = self.hand
+        thin = self.source.with_points(min(config.hand_points, hand.n_points)).to(hand.link_points.device)
+        self.config, self.body = config, LinkPoints.of(thin.link_points, thin.link_index, hand.tree.n_links)
+        room = config.closing_room * (hand.upper - hand.lower) * ~hand.abduction
+        self.clearance = None
+        if self.room.surroundings is not None:
+            few = self.source.with_points(min(config.clearance_points, hand.n_points)).to(hand.link_points.device)
+            body = LinkPoints.of(few.link_points, few.link_index, hand.tree.n_links)
+            self.clearance = Clearance(
+                hand, self.room.surroundings, body, self.ball, self.spheres.radii, config.clear, config.clearance)
+        self.touching = None if self.room.hold is None else Touching(self.room.hold, config.clear)
+        self.lower = torch.where(hand.opening_signs > 0, hand.lower + room, hand.lower)
+        self.upper = torch.where(hand.opening_signs > 0, hand.upper, hand.upper - room)
+
+    def __call__(
+        self, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], contacts: Int[Tensor, "n c"] | None = None
+    ) -> Evaluation:
+        """Energy and gradient of n grasps; their contacts are candidates by index, those nearest to the surface by default."""
+        if contacts is None:
+            contacts = self.nearest_contacts(T_object_wrist, q)
+        tree, config = self.hand.tree, self.config
+        poses = T_object_wrist[:, None] @ tree.forward(q)
+        contact_terms, pulled, wrenches = self._contacts(poses, contacts)
+        body = self.body.place(poses)
+        distance, gradient = self.field.distances(body)
+        inside = energies.penetration(distance - config.margin, gradient)
+        beside, by_point = torch.zeros_like(T_object_wrist[:, :1, 0]), config.penetration * inside.by_point
+        if self.touching is not None:
+            off = self.touching.push(body, distance, gradient)
+            beside, by_point = config.clearance * off.value.sum(-1, keepdim=True), by_point + config.clearance * off.by_point
+            beside = beside + pulled
+        wrenches = wrenches + energies.link_wrenches(body, by_point, self.body.members)
+        spheres = self.ball.place(poses)
+        own = energies.self_penetration(spheres, self.spheres.radii, self.spheres.pairs)
+        depth, by_sphere = inside.value.sum(-1), config.self_penetration * own.by_point
+        if config.filled:
+            distance, gradient = self.field.distances(spheres)
+            pierced = energies.penetration(distance - self.spheres.radii, gradient)
+            depth, by_sphere = depth + pierced.value.sum(-1), by_sphere + config.penetration * pierced.by_point
+        wrenches = wrenches + energies.link_wrenches(spheres, by_sphere, self.ball.members)
+        beyond, slope = energies.joint_margin(q, self.lower, self.upper)
+        by_pose, by_joint = energies.joint_gradient(tree, poses, wrenches, self.pivot(T_object_wrist))
+        closure, apart, alignment = contact_terms
+        terms = torch.stack([
+            config.force_closure * closure,
+            config.distance * apart,
+            config.penetration * depth,
+            config.self_penetration * own.value.sum(-1),
+            config.alignment * alignment,
+            config.joints * beyond.sum(-1),
+        ], -1)
+        by_joint = by_joint + config.joints * slope
+        if self.clearance is not None:
+            near = self.clearance(T_object_wrist, q, poses, self.pivot(T_object_wrist))
+            beside, by_pose, by_joint = beside + near.value, by_pose + near.by_pose, by_joint + near.by_joint
+        return Evaluation(terms, beside, by_pose, by_joint * self.hand.movable.to(q.dtype))
+
+    def nearest_contacts(
+        self, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], reach: float = math.inf
+    ) -> Int[Tensor, "n c"]:
+        """The candidate of each slot that is nearest to the surface; slots do not share a candidate.
+
+        A slot without a candidate within `reach` [m] takes one from the slot that is nearest to the surface.
+        """
+        candidates = self.candidates
+        poses = T_object_wrist[:, None] @ self.hand.tree.forward(q)
+        points = self.contact_points.place(poses)
+        distance = self.field.distances(points)[0].abs()
+        if self.touching is not None:
+            distance = distance + self.touching.pull(points).value
+        taken = torch.zeros_like(distance)
+        allowed = candidates.slot_weights > 0
+        nearest = torch.where(allowed, distance[:, None], torch.inf).amin(-1)
+        chosen = []
+        for slot in range(len(allowed)):
+            own = allowed[slot].expand(len(T_object_wrist), -1)
+            own = torch.where(nearest[:, slot, None] > reach, allowed[nearest.argmin(-1)], own)
+            index = (distance + taken + torch.where(own, 0.0, torch.inf)).argmin(-1, keepdim=True)
+            taken = taken.scatter(-1, index, 1.0)
+            chosen.append(index)
+        return torch.cat(chosen, -1)
+
+    def pivot(self, T_object_wrist: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 3"]:
+        """The point about which the hand turns: its grasp centre [m]."""
+        return self.hand.grasp_centres(T_object_wrist)
+
+    def _contacts(
+        self, poses: Float[Tensor, "n n_links 4 4"], contacts: Int[Tensor, "n c"]
+    ) -> tuple[tuple[Float[Tensor, " n"], ...], Float[Tensor, "n 1"], Float[Tensor, "n n_links 6"]]:
+        """Force closure, distance and alignment of contacts, weighted distance to the place to hold, and wrenches on links."""
+        config, candidates = self.config, self.candidates
+        links = candidates.links[contacts]
+        chosen = poses[torch.arange(len(poses), device=links.device)[:, None], links]
+        points = se3.apply(chosen, candidates.points[contacts])
+        outward = se3.rotate(chosen[..., :3, :3], candidates.normals[contacts])
+        surface = self.field.normals(points)
+        normal, bend = surface.normal, surface.bend
+        closure = energies.force_closure(points - self.centre, normal, self.length)
+        apart = energies.contact_distance(surface.distance, surface.gradient)
+        align = energies.normal_alignment(outward, normal)
+        # The object's normal turns with the contact's position, so its derivative joins that by position through `bend`.
+        by_object_normal = config.force_closure * closure.by_normal + config.alignment * outward
+        by_point = (
+            config.force_closure * closure.by_point + config.distance * apart.by_point
+            + (by_object_normal[..., None, :] @ bend)[..., 0, :]
+        )
+        moment = torch.linalg.cross(points, by_point, dim=-1)
+        moment = moment + torch.linalg.cross(outward, config.alignment * normal, dim=-1)
+        members = self.one_hot[links].transpose(-1, -2)
+        wrenches, pulled = members @ torch.cat([by_point, moment], -1), torch.zeros_like(points[:, :1, 0])
+        if self.touching is not None:
+            pull = self.touching.pull(points)
+            by_point = config.clearance * pull.by_point
+            pulled = config.clearance * pull.value.sum(-1, keepdim=True)
+            wrenches = wrenches + members @ torch.cat([by_point, torch.linalg.cross(points, by_point, dim=-1)], -1)
+        return (closure.value.sum(-1), apart.value.sum(-1), align.sum(-1)), pulled, wrenches
+
+
+@dataclass(frozen=True)
+class NearestPoints:
+    """For n grasps, the point nearest to the object on each of the l links that have surface points."""
+
+    links: Int[Tensor, " l"]
+    index: Int[Tensor, "n l"]
+    """Which of the hand's surface points."""
+    points: Float[Tensor, "n l 3"]
+    """Where they are, in the object's frame [m]."""
+    link_normals: Float[Tensor, "n l 3"]
+    """Outward normals of the links there."""
+    gap: Float[Tensor, "n l"]
+    """Signed distance to the object [m]."""
+    object_normals: Float[Tensor, "n l 3"]
+    """Outward normals of the object there."""
+
+    @staticmethod
+    def of(energy: GraspEnergy, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"]) -> NearestPoints:
+        """Those of grasps on the energy's device."""
+        hand = energy.hand
+        points, normals = hand.points_and_normals(q, T_object_wrist)
+        distance, gradient = energy.field.distances(points)
+        links = hand.link_index.unique()
+        # Points of other links are infinitely far away.
+        index = torch.stack([
+            torch.where(hand.link_index == link, distance, torch.inf).argmin(1) for link in links.tolist()], 1)
+        outward = torch.nn.functional.normalize(_at(gradient, index), dim=-1)
+        return NearestPoints(links, index, _at(points, index), _at(normals, index), distance.gather(1, index), outward)
+
+    def pick(self, values: Float[Tensor, "n p 3"]) -> Float[Tensor, "n l 3"]:
+        """The rows of these points among those of all surface points."""
+        return _at(values, self.index)
+
+
+def _at(values: Float[Tensor, "n p 3"], index: Int[Tensor, "n l"]) -> Float[Tensor, "n l 3"]:
+    return values.gather(1, index[..., None].expand(-1, -1, 3))

@@ -1,0 +1,116 @@
+"""The squeeze of refined grasps: joint targets whose contact forces balance.
+
+A hand that bends every joint by a share of its range pushes the object away where its fingers do not oppose each other. Here
+the forces come first: at the contacts, within friction cones, without a net wrench on the object, shared by the fingers. The
+joint torques that exert them become offsets of the servos' targets, on top of a part of the usual squeeze, which brings
+everything into contact. Differs from the paper, whose controller knows only the object's centre.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from dro_grasp.geometry.contact_forces import friction_cone, nonnegative_least_squares
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.controller import pregrasp_and_squeeze
+from dro_grasp.kinds import Checked
+from dro_grasp.optimize.fingers import finger_joints
+from dro_grasp.optimize.grasp_energy import GraspEnergy, NearestPoints
+
+
+@dataclass(frozen=True)
+class GripConfig(Checked):
+    """Contacts, their forces, and servos (ours)."""
+
+    reach: float = 0.006
+    """Links nearer than this to the object are taken to touch it [m]."""
+    contacts: int = 12
+    """Most links that touch; the nearest ones."""
+    friction: float = 0.4
+    """Coefficient of friction that the forces rely on; less than there will be."""
+    edges: int = 6
+    force: float = 10.0
+    """Sum of the normal forces [N]."""
+    stiffness: float = 3.0
+    """Stiffness of the servos [Nm/rad]; a squeeze is the force over it."""
+    sharing: float = 0.05
+    """Weight of equal shares of the fingers in the force, beside the net wrench."""
+    smoothness: float = 1e-3
+    """Weight of the squared forces themselves."""
+    touching: float = 0.3
+    """Share of the usual squeeze that touching fingers keep."""
+    idle: float = 0.7
+    """The same for fingers that do not touch, and for those that share their joints."""
+    iterations: int = 200
+    batch_size: int = 64
+
+
+@torch.no_grad()
+def gripping(energy: GraspEnergy, grasps: GraspBatch, config: GripConfig | None = None) -> GraspBatch:
+    """The same grasps with pregrasp and squeeze: the usual pregrasp, and a squeeze of balanced forces.
+
+    Their fingers touch, as after refinement; a squeeze that they state is replaced.
+    """
+    config = config or GripConfig()
+    made = [_targets(energy, part, config) for part in grasps.in_parts(config.batch_size)]
+    if not made:
+        return grasps
+    pregrasp, squeeze = (torch.cat(part) for part in zip(*made, strict=True))
+    return grasps.replace(pregrasp_joints=pregrasp, squeeze_joints=squeeze)
+
+
+def _targets(
+    energy: GraspEnergy, grasps: GraspBatch, config: GripConfig
+) -> tuple[Float[Tensor, "n n_dof"], Float[Tensor, "n n_dof"]]:
+    """Pregrasp and squeeze, on the CPU."""
+    hand, tree = energy.hand, energy.hand.tree
+    T, q = grasps.T_object_wrist.to(energy.centre), grasps.joints.to(energy.centre)
+    outer, inner = pregrasp_and_squeeze(hand, T, q, energy.centre)
+    near = NearestPoints.of(energy, T, q)
+    touches = near.gap < config.reach
+    finger = torch.stack([torch.isin(near.links, torch.tensor(f.links, device=q.device)) for f in hand.fingers])
+    involved = (touches[:, None] & finger).any(-1)
+    forces = contact_forces(near, touches, finger, energy.centre, energy.length, config)
+    jacobian = tree.point_jacobian(T[:, None] @ tree.forward(q), near.points, near.links)
+    torque = torch.einsum("nlxd,nlx->nd", jacobian, forces)
+    moved = finger_joints(hand)
+    # A joint that several fingers share goes on bringing those that do not touch yet.
+    active = moved.any(0) & (involved[..., None] | ~moved).all(1)
+    share = torch.where(active, config.touching, config.idle)
+    target = q + share * (inner - q) + torque * hand.movable * tree.joint_unit**2 / config.stiffness
+    lower, upper = torch.minimum(hand.lower, q), torch.maximum(hand.upper, q)
+    return outer.cpu(), target.clamp(lower, upper).cpu()
+
+
+def contact_forces(
+    near: NearestPoints, touches: Bool[Tensor, "n l"], finger: Bool[Tensor, "f l"], centre: Float[Tensor, "3"], length: float,
+    config: GripConfig,
+) -> Float[Tensor, "n l 3"]:
+    """Forces of the links on the object [N]: inside their friction cones, balanced as well as possible.
+
+    They minimise the squared net wrench, with torques about `centre` over `length` [m]; the fingers that touch share the force
+    about equally, and links of no finger, such as the palm, answer with any force. `touches` says which of the contacts touch.
+    """
+    n, count = len(near.gap), min(config.contacts, near.gap.shape[1])
+    kept = torch.where(touches, near.gap, torch.inf).topk(count, largest=False).indices
+    rows = torch.arange(n, device=kept.device)[:, None]
+    inward, arm = -near.object_normals[rows, kept], (near.points[rows, kept] - centre) / length
+    on = touches[rows, kept].to(arm)
+    edges = friction_cone(inward, config.friction, config.edges)
+    wrench = torch.cat([edges, torch.linalg.cross(arm[..., None, :].expand_as(edges), edges)], -1) * on[..., None, None]
+    # Columns of the least squares: net wrench, share of each finger, the forces themselves, and their sum, which is 1.
+    member = finger.to(arm).mT[kept] * on[..., None]
+    fingers = member.amax(1)
+    wanted = fingers / fingers.sum(1, keepdim=True).clamp_min(1)
+    shares = member[:, :, None].expand(-1, -1, config.edges, -1).flatten(1, 2)
+    weight = math.sqrt(config.sharing)
+    columns = torch.cat([wrench.flatten(1, 2), weight * shares, shares.sum(-1, keepdim=True)], -1)
+    target = torch.cat([torch.zeros_like(columns[:, 0, :6]), weight * wanted, torch.ones_like(columns[:, 0, :1])], -1)
+    amounts = nonnegative_least_squares(columns.mT, target, config.smoothness, config.iterations)
+    pressed = (amounts.unflatten(1, (count, config.edges))[..., None] * edges).sum(-2) * on[..., None]
+    return torch.zeros_like(near.points).index_put((rows, kept), config.force * pressed)

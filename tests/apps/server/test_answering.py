@@ -1,0 +1,128 @@
+"""What a grasp server answers, and what it refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+import dro_grasp as dro
+from dro_grasp.errors import OptionError
+from tests.helpers.claw_urdf import claw, written
+from tests.helpers.weights import untrained_weights
+
+pytest.importorskip("pydantic", reason="needs the extra [apps]: pip install '.[apps]'")
+
+from dro_grasp.apps.server.answering import Answerer, ServerConfig
+from dro_grasp.apps.server.client import sent_file
+from dro_grasp.apps.server.messages import GraspAnswer, GraspCall
+
+QUICK: dict[str, Any] = {"source": "network", "candidates": 1, "refine": False}
+TUBE = trimesh.creation.cylinder(0.03, 0.1)
+
+
+@pytest.fixture(scope="module")
+def answerer(tmp_path_factory: pytest.TempPathFactory) -> Answerer:
+    weights = untrained_weights(tmp_path_factory.mktemp("weights"))
+    own = tmp_path_factory.mktemp("own") / "own_tube.stl"
+    TUBE.export(own)
+    return Answerer(ServerConfig(str(weights), hands=("gripper3",), objects=(str(own),)))
+
+
+def ask(answerer: Answerer, obj: Any, **options: Any) -> GraspAnswer:
+    return answerer.answer(GraspCall(hand="gripper3", object=obj, **QUICK | options))
+
+
+def check(answer: GraspAnswer, expected: dro.GraspBatch) -> None:
+    for name in ("wrist_position", "wrist_quaternion_wxyz", "joints", "pregrasp_joints", "squeeze_joints", "score"):
+        found = torch.tensor([getattr(grasp, name) for grasp in answer.grasps])
+        torch.testing.assert_close(found, getattr(expected, name))
+    assert answer.joint_names == list(expected.joint_names)
+
+
+def test_answers_are_the_predictors_grasps(answerer: Answerer) -> None:
+    hand, predictor = dro.load_hand("gripper3"), answerer.predictor
+    above = ask(answerer, "can", num=2, seed=3, direction=(0, 0, -1), protocol="dro")
+    check(above, predictor.predict(hand, dro.load_object("can"), 2, 3, direction=(0.0, 0.0, -1.0), **QUICK))
+    assert above.frame == "object"
+    assert all(isinstance(grasp.success, bool) for grasp in above.grasps)
+    seen = TUBE.sample(300, seed=0) + np.array([0, 0, 0.5])
+    T = trimesh.transformations.rotation_matrix(2.5, [1, 0, 0], [0.3, 0.2, 0.8])
+    scan = ask(answerer, {"points": seen.tolist()}, num=1, camera={"frame": "base", "T_frame_camera": T.tolist()})
+    check(scan, predictor.predict(hand, dro.scanned_object("cloud", seen, T), 1, **QUICK))
+    assert scan.frame == "base"
+    assert scan.grasps[0].success is None
+
+
+def test_a_scene_is_avoided_in_the_frame_of_the_grasps(answerer: Answerer) -> None:
+    wall, T = np.array([[0.06, y, z] for y in np.linspace(-0.2, 0.2, 40) for z in np.linspace(-0.2, 0.2, 40)]), np.eye(4)
+    T[0, 3] = 0.01
+    for camera, points in ((None, wall), ({"frame": "base", "T_frame_camera": T.tolist()}, wall - T[:3, 3])):
+        call = GraspCall(hand="gripper3", object="can", avoid={"points": points.tolist()}, camera=camera)
+        scene = answerer.scene(call.avoid, call.camera)
+        expected = dro.load_scene(points).moved(np.eye(4) if camera is None else T)
+        np.testing.assert_allclose(scene.points, expected.points)
+        assert answerer.scene(call.avoid, call.camera) is scene
+    assert answerer.scene(None, None) is None
+    asked = ask(answerer, "can", num=1, candidates=16, avoid={"points": wall.tolist()}, hold=[[0, 0, 0, 0.3]])
+    avoiding = dro.Constraints(avoid=dro.load_scene(wall), hold=((0.0, 0.0, 0.0, 0.3),))
+    hand, can = dro.load_hand("gripper3"), dro.load_object("can")
+    options = QUICK | {"candidates": 16}
+    check(asked, answerer.predictor.predict(hand, can, 1, constraints=avoiding, **options))
+
+
+def test_what_was_sent_or_named_once_stays_loaded(answerer: Answerer) -> None:
+    stl = TUBE.export(file_type="stl")
+    first = answerer.object(GraspCall(hand="", object=sent_file("tube.stl", stl)).object, None)
+    again = answerer.object(GraspCall(hand="", object=sent_file("tube.stl", stl)).object, None)
+    assert first[1] is again[1]
+    assert first[1].name == "tube"
+    assert first[1].file is None
+    for other in (sent_file("tube.stl", stl) | {"scale": 1.5}, sent_file("other.stl", stl), "own_tube"):
+        assert answerer.object(GraspCall(hand="", object=other).object, None)[1] is not first[1]
+    assert answerer.hand("gripper3") is answerer.hand("gripper3")
+    assert answerer.hand("barrett") is answerer.hand("barrett")
+    assert "own_tube" in answerer.object_names()
+
+
+def test_hands_and_objects_that_could_not_be_told_apart_are_refused(tmp_path: Path) -> None:
+    weights = str(untrained_weights(tmp_path))
+    for folder in ("003", "004"):
+        (tmp_path / folder).mkdir()
+        TUBE.export(tmp_path / folder / "textured.stl")
+        written(tmp_path / folder, claw())
+    first, second = (str(tmp_path / folder / "textured.stl") for folder in ("003", "004"))
+    with pytest.raises(OptionError, match=f"objects '{first}' and '{second}' .* by the name 'textured'; rename one"):
+        Answerer(ServerConfig(weights, objects=(first, second)))
+    with pytest.raises(OptionError, match=r"hands '.*003/claw.urdf' and '.*004/claw.urdf' .* by the name 'claw'; rename one"):
+        Answerer(ServerConfig(weights, hands=tuple(str(tmp_path / folder / "claw.urdf") for folder in ("003", "004"))))
+    once = Answerer(ServerConfig(weights, hands=("gripper3", "gripper3"), objects=(first, str(tmp_path / "003"))))
+    assert [list(once.library.own[kind]) for kind in ("hand", "object")] == [["gripper3"], ["textured"]]
+
+
+GLTF = b'{"asset": {"version": "2.0"}, "buffers": [{"uri": "/etc/passwd", "byteLength": 9}]}'
+SPHERE = trimesh.creation.icosphere(1, 0.03).vertices.tolist()
+AHEAD = [[x, y, z + 0.5] for x, y, z in SPHERE]
+CAMERA = {"frame": "base", "T_frame_camera": np.eye(4).tolist()}
+
+
+@pytest.mark.parametrize(("asked", "told"), [
+    ({"hand": "/etc/passwd"}, "knows no hand '/etc/passwd'"), ({"object": "/etc/passwd"}, "knows no object '/etc/passwd'"),
+    ({"object": sent_file("../../gone.stl", b"hello")}, "^gone.stl "),
+    ({"object": sent_file("a.gltf", GLTF)}, "^a.gltf .*passwd"),
+    ({"num": 0}, "num is 0"), ({"direction": [0, 0, 0]}, "no direction"), ({"seed": -1}, "seed is -1"),
+    ({"num": 1001}, "at most 1000"), ({"object": {"points": [[0, 0, 0.1]] * 40}}, "1 distinct points"),
+    ({"object": {"points": SPHERE}, "protocol": "dro"}, "no trial"), ({"object": {"points": []}}, "distinct points"),
+    ({"avoid": "/etc/passwd"}, "avoid names '/etc/passwd'"), ({"avoid": {"points": []}}, "holds no point"),
+    ({"camera": CAMERA}, "send the cloud"),
+    ({"camera": {"frame": "base", "T_frame_camera": np.zeros((4, 4)).tolist()}, "object": {"points": SPHERE}}, "last row"),
+    ({"camera": {"frame": "a\nb", "T_frame_camera": np.eye(4).tolist()}, "object": {"points": SPHERE}}, "a name on one line"),
+    *(({"camera": CAMERA, "object": {"points": AHEAD, "scale": scale}}, f"scale is {scale}") for scale in (-1.0, 0.0)),
+])
+def test_refusals_say_why_and_nothing_but_what_was_sent_is_read(answerer: Answerer, asked: dict[str, Any], told: str) -> None:
+    with pytest.raises(dro.DroGraspError, match=told):
+        answerer.answer(GraspCall(**{"hand": "gripper3", "object": "can", **QUICK, **asked}))

@@ -1,0 +1,78 @@
+"""The folder of constraints: what its fields ask for, what they show, and what they refuse."""
+
+from __future__ import annotations
+
+import io
+import math
+
+import pytest
+import trimesh
+import viser
+
+from dro_grasp.apps.viewer.constraint_panel import NOTHING
+from dro_grasp.apps.viewer.studio import Studio
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.predict.constraints import Constraints
+from dro_grasp.predict.problem import GraspProblem
+from tests.helpers.served_studio import served_studio
+
+pytestmark = pytest.mark.filterwarnings("default::DeprecationWarning", "default::ResourceWarning")
+
+
+@pytest.fixture(scope="module")
+def studio(tmp_path_factory: pytest.TempPathFactory):
+    with served_studio(tmp_path_factory.mktemp("weights")) as made:
+        yield made
+
+
+def asked(studio: Studio, monkeypatch: pytest.MonkeyPatch) -> Constraints:
+    """What a click on Generate asks of the predictor."""
+    problems: list[GraspProblem] = []
+    monkeypatch.setattr(studio.predictor, "run", lambda problem, *_: problems.append(problem) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        studio._generate()
+    return problems[0].constraints
+
+
+def test_fields_become_constraints_and_are_drawn(studio: Studio, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert asked(studio, monkeypatch) == Constraints(), "empty fields ask for nothing"
+    panel, low = studio.panel, float(load_object("sphere").cloud[:, 2].min())
+    studio._table_under()
+    panel.direction.value, panel.cone.value, panel.opening.value = "-z", "30", "8"
+    panel.hold.value, panel.spare.value = "0 0 0.02 0.05; 0.02, 0, 0, 0.03", "0 0 -0.06 0.02"
+    file = io.BytesIO()
+    trimesh.creation.box(extents=(0.2, 0.2, 0.02), transform=trimesh.transformations.translation_matrix([0.2, 0, 0])).export(
+        file, file_type="stl")
+    upload = viser.UploadedFile(name="shelf.stl", content=file.getvalue())
+    studio._take(upload, "scene", studio.panel.avoid, studio._draw_constraints)
+    drawn: list[str] = []
+    scene = studio.client.scene
+    for kind in ("add_box", "add_icosphere", "add_mesh_simple"):
+        monkeypatch.setattr(scene, kind, lambda name, *_, **__: drawn.append(name))
+    studio._draw_constraints()
+    assert drawn == [f"/constraints/{name}" for name in ("table", "hold0", "hold1", "spare0", "avoid")]
+    found = asked(studio, monkeypatch)
+    assert found.direction == (0.0, 0.0, -1.0)
+    assert found.cone == pytest.approx(math.radians(30))
+    assert found.table == pytest.approx(low, abs=1e-4)
+    assert found.hold == ((0.0, 0.0, 0.02, 0.05), (0.02, 0.0, 0.0, 0.03))
+    assert found.spare == ((0.0, 0.0, -0.06, 0.02),)
+    assert found.opening == pytest.approx(0.008)
+    assert found.avoid is not None
+    assert found.avoid.name == "shelf"
+    panel.avoid.value = NOTHING
+    assert asked(studio, monkeypatch).avoid is None
+
+
+@pytest.mark.parametrize(("field", "text", "message"), [
+    ("table", "high", "something else than numbers"), ("table", "0 1", "give one number"),
+    ("hold", "0 0 0", "give x y z radius"), ("cone", "200", "cone is 3.49"),
+])
+def test_what_no_constraint_can_be_is_told(studio: Studio, field: str, text: str, message: str) -> None:
+    control = getattr(studio.panel, field)
+    before, control.value = control.value, text
+    studio.panel.direction.value = "-z"
+    studio._guarded(studio._draw_constraints)
+    assert studio.status.content.startswith("**Error:**")
+    assert message in studio.status.content
+    control.value = before

@@ -1,0 +1,116 @@
+"""The page that plays plans and attempts: its parts called as the browser calls them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dro_grasp as dro
+from dro_grasp.apps.viewer import lift_page as pages
+from dro_grasp.apps.viewer.lift_page import EVERY, Film, LiftPage, lift_page
+from dro_grasp.arm.animation import Recorder
+from dro_grasp.arm.attempts import Attempt, TabletopConfig
+from dro_grasp.arm.motion import CHOSEN, STAGES, WAITING, PlanNotes, PlanScene, Trajectory
+from dro_grasp.arm.robot_check import robot_shapes, shape_poses
+from dro_grasp.arm.tabletop import write_attempts
+from dro_grasp.cli.main import main
+from dro_grasp.cli.view import is_motion
+from dro_grasp.network.checkpoints import DEFAULT, describe_weights
+from tests.helpers.browser import free_port
+from tests.helpers.weights import untrained_weights
+
+
+@pytest.fixture(scope="module")
+def plan(robot: dro.Robot) -> dro.MotionPlan:
+    """The second joint moves in the last stage only."""
+    k, n = 101, len(robot.hand_joints)
+    time, arm = np.linspace(0, 2, k), np.tile(robot.home, (k, 1))
+    stage = np.repeat(np.arange(len(STAGES)), [21, 20, 20, 20, 20])
+    arm[-20:, 1] -= np.linspace(0, 0.2, 20)
+    still, hand = np.zeros_like(arm), np.tile(robot.hand.canonical_joints().double().numpy(), (k, 1))
+    wrist = np.tile(robot.T_world_wrist(robot.home), (3, 1, 1))
+    notes = PlanNotes(robot.name, "can", robot.arm_joints, robot.hand_joints, "world", 0.0, 3, {"out of reach": 1}, 1, 0, 1.5,
+                      wrist[0].tolist(), 0, {"grasps": 1.0})
+    scene = PlanScene(np.random.default_rng(0).normal((0.5, 0, 0.05), 0.02, (50, 3)), np.zeros((0, 3)), wrist, hand[:3],
+                      np.array([1.5, 1.0, 0.5]), (CHOSEN, "out of reach", WAITING))
+    return dro.MotionPlan(notes, scene, stage, Trajectory(time, arm, still, still),
+                          Trajectory(time, hand, np.zeros((k, n)), np.zeros((k, n))))
+
+
+def test_a_plan_is_played_with_its_object_carried(robot: dro.Robot, plan: dro.MotionPlan, tmp_path: Path) -> None:
+    plan.save(tmp_path / "plan.npz")
+    assert is_motion(tmp_path / "plan.npz")
+    page = lift_page(tmp_path / "plan.npz", port=free_port())
+    try:
+        assert page.film is not None
+        last = len(page.film.arm) - 1
+        page.show_moment(last)
+        expected = shape_poses(robot, plan.arm.position[-1], plan.hand.position[-1])
+        assert len(page._links) == len(robot_shapes(robot))
+        assert np.allclose([handle.position for handle in page._links], expected[:, :3, 3], atol=1e-6)
+        motion = robot.T_world_wrist(plan.arm.position[-1]) @ np.linalg.inv(robot.T_world_wrist(robot.home))
+        assert np.allclose(page._clouds[0].position, motion[:3, 3], atol=1e-6)
+        assert np.linalg.norm(motion[:3, 3]) > 0.05
+        assert set(page.grasps.options) >= {EVERY, CHOSEN, "out of reach", WAITING}
+        page.grasps.value = WAITING
+        page._show_layers()
+        assert page.server.scene.get_handle_by_name("/grasps").points.shape == (1, 2, 3)  # type: ignore[union-attr]
+        assert "3 grasps: 1 out of reach" in page.text.content
+    finally:
+        page.stop()
+
+
+def test_each_attempt_is_played_with_its_own_robot_and_weights(
+    robot: dro.Robot, small_robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other, ran, label = dro.load_robot(small_robot), [], TabletopConfig().label()
+    shipped, own = describe_weights()["sha256"], str(untrained_weights(tmp_path))
+    stored = [Attempt(robot.name, "can", 0, 0, label, True, "done", robot_file="xarm7_leaphand", weights=own),
+              Attempt(other.name, "can", 1, 0, label, True, "done", robot_file=small_robot, weights=DEFAULT,
+                      robot_sha256=other.sha256, weights_sha256=shipped, object_sha256="that of another can")]
+
+    def ended(used: dro.Robot, obj: object, number: int, seed: int, weights: str, _: object, recorder: Recorder) -> Attempt:
+        ran.append((used.name, number, weights))
+        recorder.frames.append((used.home, used.hand.canonical_joints().double().numpy(), np.zeros((0, 4, 4))))
+        return stored[number]
+
+    monkeypatch.setattr(pages, "attempt", ended)
+    monkeypatch.setattr(pages, "GraspPredictor", lambda weights: weights)
+    write_attempts(stored, tmp_path / "results.parquet")
+    page = lift_page(tmp_path / "results.parquet", port=free_port())
+    try:
+        assert "Not as stored" not in page.text.content
+        page.repeat(1)
+        assert ran == [(robot.name, 0, own), (other.name, 1, DEFAULT)]
+        assert page.name.content == f"**{other.name}**"
+        assert len(page._links) == len(robot_shapes(other)) != len(robot_shapes(robot))
+        expected = shape_poses(other, other.home, other.hand.canonical_joints().double().numpy())
+        assert np.allclose([handle.position for handle in page._links], expected[:, :3, 3], atol=1e-6)
+        assert "Not as stored**: with other content than then: object. held" in page.text.content
+    finally:
+        page.stop()
+    lift_page(tmp_path / "results.parquet", 0, small_robot, DEFAULT, port=free_port()).stop()
+    assert ran[2:] == [(other.name, 0, DEFAULT)], "what is given instead is used"
+
+
+def test_an_attempt_that_cannot_be_repeated_is_told(
+    robot: dro.Robot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = TabletopConfig(clutter=2, noise=0.001)
+    assert TabletopConfig.from_label(config.label()) == config
+    old = Attempt(robot.name, "can", 0, 0, config.label().replace("tabletop/", "tabletop/0."))
+    write_attempts([old], tmp_path / "results.parquet")
+    assert is_motion(tmp_path / "results.parquet")
+    assert not is_motion(tmp_path / "none.parquet")
+    assert main(["view", str(tmp_path / "results.parquet"), "--attempt", "1", "--port", str(free_port())]) == 2
+    assert "has attempts 0 to 0; --attempt is 1" in capsys.readouterr().err
+    page = LiftPage(robot, [old], port=free_port())
+    try:
+        page._guarded(lambda: page.repeat(0))
+        assert "another version of dro-grasp (tabletop/0." in page.text.content
+        with pytest.raises(dro.DroGraspError, match="nothing to play"):
+            Film.of_attempt(Recorder())
+    finally:
+        page.stop()

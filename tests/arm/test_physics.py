@@ -1,0 +1,130 @@
+"""Lifts in simulation: servos, what rests on the table, and grasps that let go, told by rehearsals from those that hold."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+
+import dro_grasp as dro
+from dro_grasp.arm.candidates import grasps_in_world
+from dro_grasp.arm.physics import DEVIATIONS, MEMORY, Deviation, LiftScene, Rehearsal
+from dro_grasp.arm.planner import PlanConfig, plan
+from dro_grasp.arm.reachability import Fault, Feasible, Postures
+from dro_grasp.arm.workcell import Workcell
+from dro_grasp.objects.shape import solid_of
+from tests.helpers.claw import claw_xml
+from tests.helpers.clouds import cloud_of
+
+RADIUS = 0.04
+
+
+@pytest.fixture(scope="module")
+def ball() -> dro.ObjectModel:
+    """Stands on a table at z = 0 within reach."""
+    mesh = trimesh.creation.icosphere(4, RADIUS)
+    mesh.apply_translation((0.45, 0.0, RADIUS))
+    return cloud_of(mesh, "ball")
+
+
+def test_an_estimated_object_stands_still_on_the_table(robot: dro.Robot, ball: dro.ObjectModel) -> None:
+    scene = LiftScene(Workcell(robot), [ball])
+    assert scene.model.narena == MEMORY  # MuJoCo's own choice ends in a fatal error where many balls touch the hand
+    scene.place(0, np.eye(4))
+    scene.advance(1.0)
+    assert np.abs(scene.pose(0) - np.eye(4)).max() < 2e-3
+    body = scene.model.body("object0-").id
+    touching = scene.model.geom_bodyid[scene.data.contact.geom].reshape(-1, 2)
+    assert (touching == body).any()
+    assert mujoco.mj_getTotalmass(scene.model) > scene.model.body_mass[body] == pytest.approx(500 * solid_of(ball).volume)
+
+
+@pytest.mark.parametrize("limits", ["-30 30", "10 40"], ids=["at zero", "away from zero"])
+def test_joints_above_the_palm_stay_and_the_others_follow(robot: dro.Robot, tmp_path: Path, limits: str) -> None:
+    """As the two of the wrist of a Shadow hand; those at zero are no joints of the scene."""
+    file = tmp_path / "wrist.xml"
+    forearm = '<body name="forearm"><geom type="box" size="0.03 0.03 0.03" mass="0.3" pos="0 0 -0.1"/><body name="palm">'
+    xml = claw_xml().replace('<body name="palm">', f'{forearm}<joint name="wrist" axis="0 1 0" range="{limits}"/>')
+    file.write_text(xml.replace("</worldbody>", "</body></worldbody>"))
+    hand = dro.load_hand(file)
+    assert hand.movable.tolist() == [False, *8 * [True]]
+    scene, arm = LiftScene(Workcell(replace(robot, hand=hand)), []), robot.home
+    before = scene.joints()[1]
+    wanted = hand.canonical_joints(0.7).double().numpy()
+    scene.command(arm, np.zeros_like(arm), wanted)
+    scene.advance(1.0)
+    np.testing.assert_allclose(scene.joints()[1], wanted, atol=0.03)
+    assert scene.joints()[1][0] == pytest.approx(float(hand.rest[0]), abs=5e-3)
+    assert (np.abs(wanted - before)[1:] > 0.07).all()
+
+
+@pytest.fixture(scope="module")
+def grasps(robot: dro.Robot, ball: dro.ObjectModel) -> dro.GraspBatch:
+    return grasps_in_world(dro.GraspPredictor(), robot.hand, ball, np.eye(4), 12, dro.Constraints(table=0.0))
+
+
+def evenly(robot: dro.Robot, rows: np.ndarray, distance: float) -> np.ndarray:
+    """Configurations along the same line whose wrists are this far apart [m]."""
+    places = robot.T_world_wrist(rows)[:, :3, 3]
+    way = np.linalg.norm(places - places[0], axis=1)
+    wanted = np.linspace(0, way[-1], round(float(way[-1]) / distance) + 1)
+    return np.stack([np.interp(wanted, way, column) for column in rows.T], 1)
+
+
+def test_the_chosen_grasp_holds_and_one_that_never_closes_does_not(
+    robot: dro.Robot, ball: dro.ObjectModel, grasps: dro.GraspBatch
+) -> None:
+    planned = plan(robot, ball, grasps=grasps)
+    rows, closed, hand = planned.part("approach"), planned.part("close"), planned.hand.position
+    chosen = Feasible(planned.notes.chosen, planned.arm.position[rows][:: max(1, (rows.stop - rows.start) // 10)],
+                      planned.arm.position[planned.part("lift")][::10])
+    postures = Postures.of(robot, grasps, chosen.index)
+    assert np.allclose(postures.squeeze, hand[closed.stop - 1], atol=1e-6)
+    cell = Workcell(robot, (), ball)
+    rehearsal = Rehearsal(cell)
+    first = rehearsal.share(chosen, postures)
+    assert first > 0
+    assert rehearsal.share(chosen, replace(postures, grasp=postures.pregrasp, squeeze=postures.pregrasp)) == 0
+    assert rehearsal.share(chosen, postures) == first  # nothing is left from the one before
+    assert planned.notes.seconds["rehearsal"] > 0
+    for distance in (0.005, 0.02):  # between the poses that were solved; nothing depends on it
+        line = replace(chosen, approach=evenly(robot, chosen.approach, distance), lift=evenly(robot, chosen.lift, distance))
+        assert rehearsal.holds(line, postures, DEVIATIONS[0])
+    rehearsal = Rehearsal(cell, few_contacts=12)
+    seen, scene = [], rehearsal.scene
+    honest = scene.advance
+
+    def advance(*arguments: float, **options: float) -> None:
+        seen.append((scene.data.ncon > 12, scene.model.opt.noslip_iterations == 0))
+        honest(*arguments, **options)
+
+    scene.advance = advance
+    rehearsal.holds(chosen, postures, DEVIATIONS[0])
+    assert set(seen) == {(False, False), (True, True)}  # many contacts cost no more than in proportion
+
+
+def test_where_none_holds_the_best_score_is_taken_all_the_same(
+    robot: dro.Robot, ball: dro.ObjectModel, grasps: dro.GraspBatch
+) -> None:
+    heavy = Deviation(weight=100.0)
+    made = plan(robot, ball, config=PlanConfig(deviations=(heavy,)), grasps=grasps)
+    assert made.notes.chosen == plan(robot, ball, config=PlanConfig(rehearsals=0), grasps=grasps).notes.chosen
+    sometimes = PlanConfig(deviations=(Deviation(), heavy, Deviation()))
+    assert Fault.LOSES not in plan(robot, ball, config=sometimes, grasps=grasps).notes.dropped
+
+
+def test_servos_follow_a_trajectory_within_a_degree(robot: dro.Robot) -> None:
+    scene = LiftScene(Workcell(robot), [dro.load_object("can")])
+    hand, worst = scene.joints()[1], 0.0
+    for k in range(100):
+        target, velocity = robot.home.copy(), np.zeros(7)
+        target[0] += 0.3 * (1 - np.cos(np.pi * k / 50))
+        velocity[0] = 0.3 * np.pi * np.sin(np.pi * k / 50)
+        scene.command(target, velocity, hand)
+        scene.advance(0.02)
+        worst = max(worst, float(np.abs(scene.joints()[0] - target).max()))
+    assert worst < np.radians(2)

@@ -1,0 +1,132 @@
+"""What grasps have to respect, in plans: checked on shapes that the planner does not read, and in the world's frame."""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+import dro_grasp as dro
+from dro_grasp.arm.attempts import TabletopConfig
+from dro_grasp.arm.candidates import grasps_in_world
+from dro_grasp.arm.motion import MotionPlan
+from dro_grasp.arm.planner import plan
+from dro_grasp.arm.workcell import Workcell, arm_addresses, robot_spec
+from dro_grasp.errors import OptionError
+from dro_grasp.simulation.hand_part import joint_addresses
+from dro_grasp.simulation.protocols import PROTOCOLS
+
+SHELF = ((0.62, 0.1, 0.5), (0.02, 2.0, 2.0))
+"""Centre and size of a board beside the object, larger than any object that is loaded [m]."""
+
+
+CONE = 0.6
+
+
+@pytest.fixture(scope="module")
+def standing() -> tuple[dro.ObjectModel, np.ndarray]:
+    can, T = dro.load_object("can"), np.eye(4)
+    T[:3, :3] = Rotation.from_euler("z", 2.0).as_matrix()
+    T[:3, 3] = 0.5, 0.1, -float(can.cloud[:, 2].min())
+    return can, T
+
+
+@pytest.fixture(scope="module")
+def wanted(standing: tuple[dro.ObjectModel, np.ndarray]) -> dro.Constraints:
+    (x, y), top = standing[1][:2, 3].tolist(), float(np.ptp(standing[0].cloud[:, 2]))
+    board = trimesh.creation.box(extents=SHELF[1])
+    board.apply_translation(SHELF[0])
+    return dro.Constraints((0.0, 0.0, -1.0), cone=CONE, avoid=dro.load_scene(board), hold=((x, y, top, 0.07),))
+
+
+@pytest.fixture(scope="module")
+def planned(robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray], wanted: dro.Constraints) -> MotionPlan:
+    return plan(robot, *standing, config=dro.PlanConfig(num=8, rehearsals=0, trusted_score=-5, constraints=wanted))
+
+
+def test_the_palm_is_in_the_cone_and_fingers_touch_the_place_alone(
+    planned: MotionPlan, robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray], wanted: dro.Constraints
+) -> None:
+    hand, closed = robot.hand, planned.part("close")
+    assert hand.description is not None
+    wrist = robot.T_world_wrist(planned.arm.position[closed.start])
+    palm = hand.palm_directions(torch.from_numpy(wrist).float()[None])[0]
+    assert math.acos(-float(palm[2])) <= CONE + 1e-3
+    grasp = torch.from_numpy(planned.scene.joints[planned.notes.chosen])
+    links = wrist @ hand.tree.forward(grasp.float()).double().numpy()
+    shapes = np.concatenate([shape.vertices @ links[shape.link, :3, :3].T + links[shape.link, :3, 3]
+                             for shape in hand.description.geometry if shape.collides])
+    (x, y, z, radius), (can, T) = wanted.hold[0], standing
+    apart = KDTree(can.cloud @ T[:3, :3].T + T[:3, 3]).query(shapes)[0]
+    beyond = np.linalg.norm(shapes - (x, y, z), axis=1) - radius
+    assert (apart < 0.01).any()
+    assert apart[beyond > 0.004].min() > 0.001, "where the hand is out of the ball, it is off the object [m]"
+
+
+def test_hand_and_arm_stay_clear_of_the_scene(planned: MotionPlan, robot: dro.Robot) -> None:
+    """The board is one box in MuJoCo; the planner has cells around points of its surface."""
+    spec = robot_spec(robot, PROTOCOLS["dro"], None)
+    for a, b in Workcell(robot).excluded:
+        spec.add_exclude(bodyname1=a, bodyname2=b)
+    spec.worldbody.add_geom(name="board", type=mujoco.mjtGeom.mjGEOM_BOX, pos=SHELF[0], size=np.array(SHELF[1]) / 2)
+    model = spec.compile()
+    data, tree = mujoco.MjData(model), robot.hand.tree
+    fingers, moving = joint_addresses(model, robot.hand)
+    full = planned.hand.position @ tree.coupling.double().numpy().T + tree.offset.double().numpy()
+
+    def hits(arm: np.ndarray, joints: np.ndarray) -> bool:
+        data.qpos[arm_addresses(model, robot)], data.qpos[fingers] = arm, joints[moving]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_collision(model, data)
+        return any("board" in {model.geom(g).name for g in contact.geom} for contact in data.contact if contact.dist < 0)
+
+    assert not any(hits(arm, joints) for arm, joints in zip(planned.arm.position, full, strict=True))
+    draws = np.random.default_rng(0).uniform(-1.5, 1.5, (50, len(robot.home)))
+    assert any(hits(arm, full[0]) for arm in draws), "the check sees an arm that is in the board"
+
+
+def test_a_frame_turns_directions_and_places_and_lifts_the_table() -> None:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_euler("z", 0.7).as_matrix(), (1.0, 2.0, 3.0)
+    ball, direction = (0.1, -0.2, 0.3, 0.04), (0.6, 0.0, -0.8)
+    scene = dro.load_scene(np.random.default_rng(0).uniform(0, 1, (50, 3)))
+    there = dro.Constraints(direction, 0.5, 0.3, scene, (ball,), (ball,), 0.01).moved(T)
+    turn = Rotation.from_euler("z", 0.7)
+    np.testing.assert_allclose(there.direction or (), turn.apply(direction))
+    np.testing.assert_allclose(there.hold[0], [*np.add(turn.apply(ball[:3]), T[:3, 3]), 0.04])
+    assert (there.table, there.cone, there.opening, there.spare) == (3.5, 0.3, 0.01, there.hold)
+    assert there.avoid is not None
+    np.testing.assert_allclose(there.avoid.points, np.add(turn.apply(scene.points), T[:3, 3]))
+    T[:3, :3] = Rotation.from_euler("x", 0.7).as_matrix()
+    with pytest.raises(OptionError, match="the other frame's z axis points elsewhere"):
+        dro.Constraints(table=0.0).moved(T)
+
+
+def test_what_grasps_are_given_is_checked_as_well(
+    robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray]
+) -> None:
+    grasps = grasps_in_world(dro.GraspPredictor(), robot.hand, *standing, 4, dro.Constraints(table=0.0))
+    x, y = standing[1][:2, 3].tolist()
+    config = dro.PlanConfig(constraints=dro.Constraints(spare=((x, y, 0.06, 0.06),)))
+    with pytest.raises(dro.DroGraspError, match=r"4 grasps: 4 in a place to spare, .* relax cone, hold, spare or opening"):
+        plan(robot, *standing, config=config, grasps=grasps)
+
+
+def test_what_says_nothing_or_says_it_twice_is_refused(
+    robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray]
+) -> None:
+    with pytest.raises(OptionError, match="state its height in the robot file"):
+        dro.PlanConfig(constraints=dro.Constraints(table=0.0))
+    with pytest.raises(OptionError, match="both direction and directions 'paper'"):
+        dro.PlanConfig(directions="paper", constraints=dro.Constraints((0, 0, -1)))
+    with pytest.raises(OptionError, match=r"hold is not on the object: .* z = 0.0"):
+        plan(robot, *standing, config=dro.PlanConfig(constraints=dro.Constraints(hold=((0.0, 0.0, 0.0, 0.05),))))
+    with pytest.raises(OptionError, match="objects of attempts come to rest anywhere"):
+        TabletopConfig(plan=dro.PlanConfig(constraints=dro.Constraints(spare=((0.0, 0.0, 0.0, 0.05),))))

@@ -1,0 +1,254 @@
+"""Plans: collision-free at ten times their resolution, within limits, straight where they should be, and refused in words."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import trimesh
+import yaml
+from scipy.spatial.distance import pdist
+
+import dro_grasp as dro
+from dro_grasp.arm.motion import STAGES, MotionPlan
+from dro_grasp.arm.planner import PlanConfig, Task, plan
+from dro_grasp.arm.robot import BUILTIN_ROBOTS
+from dro_grasp.arm.workcell import Workcell, arm_addresses, robot_spec
+from dro_grasp.cli.main import main
+from dro_grasp.errors import OptionError, PlanError, RobotError
+from dro_grasp.extras import EXTRAS
+from dro_grasp.simulation.hand_part import joint_addresses
+from dro_grasp.simulation.protocols import PROTOCOLS
+
+FINER = 10
+
+
+def finer(made: MotionPlan) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Time, stage, arm and hand at ten times the resolution."""
+    time = np.linspace(0, made.seconds, FINER * len(made.arm.time))
+    stage = made.stage[np.searchsorted(made.arm.time, time).clip(max=len(made.stage) - 1)]
+    arm, hand = (np.stack([np.interp(time, made.arm.time, c) for c in t.position.T], 1) for t in (made.arm, made.hand))
+    return time, stage, arm, hand
+
+
+def test_a_plan_touches_nothing_at_ten_times_its_resolution(
+    planned: MotionPlan, robot: dro.Robot, wall: dro.ObjectModel, standing: tuple[dro.ObjectModel, np.ndarray]
+) -> None:
+    """The robot and the table as plain MuJoCo has them; wall and object by signed distances of the hand's surface points."""
+    scene = robot_spec(robot, PROTOCOLS["dro"], robot.table)
+    for a, b in Workcell(robot).excluded:
+        scene.add_exclude(bodyname1=a, bodyname2=b)
+    model = scene.compile()
+    data = mujoco.MjData(model)
+    (fingers, moving), tree = joint_addresses(model, robot.hand), robot.hand.tree
+    _, stage, arm, hand = finer(planned)
+    full = hand @ tree.coupling.double().numpy().T + tree.offset.double().numpy()
+    for q, joints in zip(arm, full[:, moving], strict=True):
+        data.qpos[arm_addresses(model, robot)], data.qpos[fingers] = q, joints
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_collision(model, data)
+        pairs = [sorted(model.body(model.geom_bodyid[g]).name for g in c.geom) for c in data.contact if c.dist < 0]
+        assert all(a.startswith("hand/") and b.startswith("hand/") for a, b in pairs), pairs
+    wrist = torch.from_numpy(robot.T_world_wrist(arm)).float()
+    points = robot.hand.points(torch.from_numpy(hand).float(), wrist)
+    assert float(wall.distance_field.distances(points)[0].min()) > 0
+    obj, T = standing
+    travelling = points[torch.from_numpy(stage <= STAGES.index("shape"))]
+    in_object = travelling @ torch.from_numpy(T[:3, :3]).float() - torch.from_numpy(T[:3, 3]).float()
+    assert float(obj.distance_field.distances(in_object)[0].min()) > 0
+
+
+def test_the_check_above_sees_a_plan_that_goes_through_the_wall(
+    robot: dro.Robot, wall: dro.ObjectModel, standing: tuple[dro.ObjectModel, np.ndarray], planned: MotionPlan
+) -> None:
+    goal = planned.arm.position[planned.part("shape")][0]
+    straight = np.linspace(robot.home, goal, 200)
+    opened = torch.from_numpy(planned.hand.position[0]).float().expand(200, -1)
+    points = robot.hand.points(opened, torch.from_numpy(robot.T_world_wrist(straight)).float())
+    cell = Workcell(robot, [wall], *standing)
+    free = [cell.free(q, planned.hand.position[0], 0.0) for q in straight]
+    inside = wall.distance_field.distances(points)[0].amin(-1) < -0.003
+    assert not any(f and bool(i) for f, i in zip(free, inside, strict=True))
+
+
+def test_limits_hold_by_finite_differences(planned: MotionPlan, robot: dro.Robot) -> None:
+    n = len(planned.notes.hand_joints)
+    limits = [(planned.arm, robot.velocity, robot.acceleration),
+              (planned.hand, np.full(n, robot.hand_velocity), np.full(n, robot.hand_acceleration))]
+    assert (planned.arm.position >= robot.lower).all()
+    assert (planned.arm.position <= robot.upper).all()
+    for part, velocity, acceleration in limits:
+        step = np.diff(part.time)[:, None]
+        assert (step > 0).all()
+        speed = np.diff(part.position, axis=0) / step
+        assert (np.abs(speed) <= velocity * 1.001).all()
+        assert (np.abs(part.velocity) <= velocity * 1.001).all()
+        assert (np.abs(part.acceleration) <= acceleration * 1.001).all()
+        change = np.diff(speed, axis=0) / ((step[1:] + step[:-1]) / 2)
+        assert (np.abs(change) <= acceleration * 1.1).all()
+
+
+def test_approach_and_lift_are_straight_and_stages_follow_each_other(planned: MotionPlan, robot: dro.Robot) -> None:
+    assert sorted(set(planned.stage.tolist())) == list(range(len(STAGES)))
+    assert (np.diff(planned.stage) >= 0).all()
+    assert np.allclose(planned.arm.position[0], robot.home)
+    wrist = robot.T_world_wrist(planned.arm.position)
+    grasp = np.array(planned.notes.T_world_wrist)
+    ahead = robot.hand.palm_directions(torch.from_numpy(grasp)[None].float())[0].double().numpy()
+    for stage, direction, length in (("approach", ahead, 0.1), ("lift", np.array([0, 0, 1.0]), 0.2)):
+        poses = wrist[planned.part(stage)]
+        way = poses[:, :3, 3] - poses[0, :3, 3]
+        assert np.allclose(way[-1], length * direction, atol=2e-3)
+        assert np.abs(way - (way @ direction)[:, None] * direction).max() < 2e-3
+        turned = np.einsum("nij,ij->n", poses[:, :3, :3], grasp[:3, :3])
+        assert (np.arccos(np.clip((turned - 1) / 2, -1, 1)) < 0.01).all()
+    assert np.allclose(wrist[planned.part("close")], grasp, atol=5e-3)
+
+
+def test_what_was_dropped_adds_up(planned: MotionPlan) -> None:
+    notes = planned.notes
+    assert notes.goals >= 1
+    assert sum(notes.dropped.values()) + notes.goals <= notes.grasps == 12
+    assert planned.lines()[0].startswith("12 grasps: ")
+
+
+def test_what_touches_the_robot_at_home_is_named(
+    robot: dro.Robot, wall: dro.ObjectModel, standing: tuple[dro.ObjectModel, np.ndarray]
+) -> None:
+    can, T = standing
+    elbow = trimesh.creation.box((0.2, 0.2, 0.2), trimesh.transformations.translation_matrix((0.0, 0.0, 0.3)))
+    seen = dro.load_scene(trimesh.sample.sample_surface(elbow, 2000, seed=0)[0])
+    config = PlanConfig(constraints=dro.Constraints(avoid=replace(seen, name="cell")))
+    with pytest.raises(PlanError, match=r"obstacle 'cell' collides with arm/link\d .* by .* mm; cut the robot out of"):
+        plan(robot, can, T, [wall], config=config)
+    assert robot.table is not None
+    raised = replace(robot, table=replace(robot.table, height=robot.T_world_wrist(robot.home)[2, 3]))
+    with pytest.raises(RobotError, match=r"(arm|hand)/\w+ and table, by .* mm; correct `table` in the robot file"):
+        plan(raised, can, trimesh.transformations.translation_matrix((0.5, 0.1, 0.6)), [wall])
+
+
+def test_each_batch_of_grasps_is_another_one(
+    robot: dro.Robot, standing: tuple[dro.ObjectModel, np.ndarray]
+) -> None:
+    asked: list[int] = []
+
+    def nowhere(seed: int) -> dro.GraspBatch:
+        asked.append(seed)
+        away, hand = torch.eye(4).repeat(2, 1, 1), robot.hand
+        away[:, 2, 3] = 9.0
+        q = hand.canonical_joints().repeat(2, 1)
+        return dro.GraspBatch.create(hand, standing[0], away, q, score=torch.zeros(2), pregrasp_joints=q, squeeze_joints=q)
+
+    with pytest.raises(PlanError, match="6 grasps: 6 out of reach"):
+        plan(robot, *standing, config=PlanConfig(num=2, batches=3), seed=7, grasps=nowhere)
+    assert asked[0] == 7
+    assert len(set(asked)) == 3
+
+
+def test_what_an_object_in_the_hand_could_meet_is_an_obstacle(robot: dro.Robot) -> None:
+    can = dro.load_object("can")
+    line = np.linspace([0.5, 0, 1.0], [0.5, 0, 4.0], 3000)
+    config = dro.PlanConfig(constraints=dro.Constraints(avoid=dro.load_scene(line)))
+    (thing,) = Task.of(robot, can, np.eye(4), [], config, 0).cell.obstacles
+    within = np.linalg.norm(thing.cloud - robot.T_world_base[:3, 3], axis=1).max()
+    arm = np.random.default_rng(0).uniform(*robot.working_range, (200, len(robot.home)))
+    T = torch.from_numpy(np.linalg.inv(robot.T_world_base) @ robot.T_world_wrist(arm)).float()
+    fingers = robot.hand.points(robot.hand.canonical_joints().expand(len(T), -1), T).norm(dim=-1).max()
+    assert within >= float(fingers) + pdist(np.asarray(can.vertices)[::5]).max()
+    assert within < robot.full_reach + 0.5
+
+
+BAD = {
+    "far away": (["--at", "3", "0"], "farther than the arm and hand are long"),
+    "in the robot": (["--at", "0.0", "0.0"], "while the robot is at home"),
+    "under the table": (["--pose", "low.json"], "below the table"),
+    "no rigid camera": (["--camera", "squashed.json"], "is not a rotation"),
+    "two places": (["--at", "0.5", "0", "--pose", "low.json"], "give one of them"),
+    "no grasps": (["--num", "0"], "num is 0"),
+    "no folder": (["--csv", "nowhere/plan.csv"], "no folder"),
+}
+
+
+def test_a_pose_that_is_none_is_refused_and_not_taken_for_the_table_s_fault(robot: dro.Robot) -> None:
+    lost, mirrored = np.eye(4), np.diag([1.0, 1.0, -1.0, 1.0])
+    far = np.eye(4)
+    lost[0, 3], far[0, 3] = np.nan, 500.0
+    for T, fault in ((lost, "its matrix holds NaN or infinity"), (mirrored, "not a rotation"), (far, "divide millimetres")):
+        with pytest.raises(OptionError, match=f"T_world_object is no pose of 'can'.*{fault}"):
+            plan(robot, dro.load_object("can"), T)
+
+
+@pytest.mark.parametrize(("options", "said"), BAD.values(), ids=BAD)
+def test_bad_input_is_refused_in_words_and_nothing_is_written(
+    options: list[str], said: str, small_robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    low, squashed = np.eye(4), np.diag([1.0, 2.0, 1.0, 1.0])
+    low[:3, 3] = 0.5, 0.0, -1.0
+    Path("low.json").write_text(json.dumps({"frame": "world", "T_frame_object": low.tolist()}))
+    Path("squashed.json").write_text(json.dumps({"frame": "world", "T_frame_camera": squashed.tolist()}))
+    before = sorted(tmp_path.iterdir())
+    assert main(["plan", "--robot", small_robot, "--object", "can", "--output", "plan.npz", *options]) == 2
+    assert said in capsys.readouterr().err
+    assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize(("option", "said"), [("robot.yaml", "link 'link9', which the arm does not have"),
+                                              (None, "nothing stands on the table: 0 points are left")])
+def test_a_robot_and_a_cloud_that_cannot_be_used_leave_nothing_behind(
+    option: str | None, said: str, small_robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = (BUILTIN_ROBOTS / "xarm7_leaphand.yaml").read_text()
+    Path("robot.yaml").write_text(text.replace("link: link7", "link: link9").replace("arm: ", f"arm: {BUILTIN_ROBOTS}/"))
+    x, y = np.meshgrid(np.linspace(0, 0.9, 90), np.linspace(-0.6, 0.6, 120))
+    np.save("table.npy", np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3))
+    before = sorted(tmp_path.iterdir())
+    given = ["--robot", option or small_robot, "--object", "table.npy"]
+    assert main(["plan", *given, "--output", "plan.npz", "--csv", "plan.csv"]) == 2
+    assert said in capsys.readouterr().err
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_without_the_extra_planning_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "ompl", None)
+    assert main(["plan", "--robot", "xarm7_leaphand", "--object", "can"]) == 2
+    assert "ompl; run pip install 'dro-grasp[arm]', or pip install '.[arm]' in the folder of" in capsys.readouterr().err
+
+
+def test_every_other_command_works_without_the_extra(small_robot: str) -> None:
+    blocked = "".join(f"sys.modules[{name!r}] = None; " for name in EXTRAS["arm"])
+    code = (f"import sys; {blocked}import dro_grasp as dro; from dro_grasp.cli.main import main; "
+            f"dro.PlanConfig, dro.MotionPlan.load; sys.exit(main(['robot', 'check', {small_robot!r}]))")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_robot_file_without_a_table_has_the_ground_for_one(
+    small_robot: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An object at `--at` stands on something: the hand must not pass below its foot."""
+    values = yaml.safe_load(Path(small_robot).read_text())
+    del values["table"]
+    (tmp_path / "robot.yaml").write_text(yaml.safe_dump(values))
+    output = tmp_path / "plan.npz"
+    command = ["plan", "--robot", str(tmp_path / "robot.yaml"), "--object", "can", "--output", str(output)]
+    assert main([*command, "--at", "0.5", "0.1", "--num", "8", "--rehearsals", "0"]) == 0
+    said = capsys.readouterr().err
+    assert "states no table: z = 0 is taken for one" in said
+    made, robot = MotionPlan.load(output), dro.load_robot(small_robot)
+    assert made.notes.table == 0.0
+    wrist = torch.from_numpy(robot.T_world_wrist(made.arm.position)).float()
+    assert float(robot.hand.points(torch.from_numpy(made.hand.position).float(), wrist)[..., 2].min()) > 0

@@ -1,0 +1,354 @@
+"""From rendered depth images back to the object: points, normals and frames against the mesh they were rendered from."""
+
+from __future__ import annotations
+
+import io
+import json
+from contextlib import redirect_stdout
+from pathlib import Path
+
+import igl
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from dro_grasp.cli.main import main
+from dro_grasp.errors import ObjectError, OptionError
+from dro_grasp.frames import NamedMotion, read_motion
+from dro_grasp.grasps.batch import GraspBatch
+from dro_grasp.grasps.sources import object_of, with_sources
+from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.perception.partial_views import visible_points
+from dro_grasp.objects.perception.scan import depth_points, load_scan, scanned_object, without_outliers
+from dro_grasp.objects.shape import ObjectModel
+from tests.helpers.loaded_hands import loaded_hand
+from tests.helpers.weights import untrained_weights
+
+INTRINSICS = np.array([[300.0, 0, 79.5], [0, 310.0, 59.5], [0, 0, 1]])
+SHAPE = (120, 160)
+
+
+@pytest.fixture(scope="module")
+def mug() -> ObjectModel:
+    return load_object("mug")
+
+
+@pytest.fixture(scope="module")
+def T_object_camera() -> np.ndarray:
+    """A camera half a metre off that looks at the mug askew."""
+    T = np.eye(4)
+    T[:3, :3] = (Rotation.from_euler("y", 25, degrees=True) * Rotation.from_euler("x", 200, degrees=True)).as_matrix()
+    T[:3, 3] = -0.5 * T[:3, 2]
+    return T
+
+
+@pytest.fixture(scope="module")
+def depth(mug: ObjectModel, T_object_camera: np.ndarray) -> np.ndarray:
+    """Depth along z of the first surface on each pixel's ray, by igl; zero where there is none."""
+    row, column = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    rays = np.stack([(column - 79.5) / 300, (row - 59.5) / 310, np.ones(SHAPE)], -1).reshape(-1, 3)
+    image = np.zeros(len(rays))
+    for i, ray in enumerate(rays @ T_object_camera[:3, :3].T):
+        hits = igl.ray_mesh_intersect(T_object_camera[:3, 3], ray, mug.vertices, mug.faces)
+        if hits:
+            image[i] = min(h[1] for h in hits)  # rays have z = 1, so the parameter is the depth
+    return image.reshape(SHAPE)
+
+
+def off_surface(mug: ObjectModel, points: np.ndarray) -> np.ndarray:
+    return np.abs(igl.signed_distance(points, mug.vertices, mug.faces)[0])
+
+
+def test_points_lie_on_the_mesh(mug: ObjectModel, depth: np.ndarray, T_object_camera: np.ndarray) -> None:
+    points = depth_points(depth, INTRINSICS)
+    assert len(points) == int((depth > 0).sum()) > 500
+    assert off_surface(mug, points @ T_object_camera[:3, :3].T + T_object_camera[:3, 3]).max() < 1e-5
+    mask = np.zeros(SHAPE, bool)
+    mask[:, 80:] = True
+    right = depth_points(depth, INTRINSICS, mask)
+    assert 0 < len(right) < len(points)
+    assert right[:, 0].min() > 0, "x points right"
+
+
+def test_a_scan_is_in_the_frame_asked_for_and_looks_at_the_camera(
+    mug: ObjectModel, depth: np.ndarray, T_object_camera: np.ndarray
+) -> None:
+    noise = np.random.default_rng(0)
+    points = depth_points(depth, INTRINSICS)
+    stray = np.array([[0.0, 0.0, 0.3], [0.1, 0.1, 0.6], [-0.1, 0.05, 0.45]])
+    dirty = np.concatenate([points + noise.normal(0, 5e-4, points.shape), stray, [[np.nan, 0, 0]]])
+    scan = scanned_object("mug seen", dirty, T_object_camera, complete=False)
+    assert scan.is_cloud
+    assert off_surface(mug, scan.cloud.astype(float)).max() < 0.004, "the stray points are gone"
+    towards = T_object_camera[:3, 3] - scan.cloud
+    assert ((scan.cloud_normals * towards).sum(1) > 0).all()
+    kept = scanned_object("mug seen", dirty[:-1], T_object_camera, denoise=False, complete=False)
+    assert off_surface(mug, kept.cloud.astype(float)).max() > 0.02
+    _, face, _, _ = igl.signed_distance(scan.cloud.astype(float), mug.vertices, mug.faces)
+    own = np.cross(*(mug.vertices[mug.faces[face, k]] - mug.vertices[mug.faces[face, 0]] for k in (1, 2)))
+    own /= np.linalg.norm(own, axis=1, keepdims=True)
+    assert np.median((own * scan.cloud_normals).sum(1)) > 0.95
+
+
+def test_a_completed_scan_knows_which_of_its_points_were_seen(
+    mug: ObjectModel, depth: np.ndarray, T_object_camera: np.ndarray
+) -> None:
+    points = depth_points(depth, INTRINSICS)
+    scan = scanned_object("mug seen", points, T_object_camera)
+    assert scan.seen is not None
+    given = KDTree(points @ T_object_camera[:3, :3].T + T_object_camera[:3, 3])
+    assert given.query(scan.seen)[0].max() < 1e-5
+    away = given.query(scan.cloud)[0]
+    assert 0.9 * len(points) < len(scan.seen) <= len(points), "without strays"
+    assert 0.2 < (away > 0.003).mean() < 0.8
+    assert scanned_object("mug seen", points, T_object_camera, complete=False).seen is None
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ("millimetres", "divide millimetres by 1000"), ("mask of another size", "shape"), ("empty mask", "within the mask"),
+        ("nothing", "no pixel"),
+    ],
+)
+def test_images_that_show_nothing_are_refused(depth: np.ndarray, change: str, word: str) -> None:
+    image, mask = depth.copy(), None
+    if change == "millimetres":
+        image *= 1000
+    elif change == "nothing":
+        image[:] = np.nan
+    else:
+        mask = np.zeros(SHAPE if change == "empty mask" else (5, 5), bool)
+    with pytest.raises(ObjectError, match=word):
+        depth_points(image, INTRINSICS, mask)
+
+
+@pytest.mark.parametrize("kind", [bool, np.uint8, int, float, list, torch.as_tensor])
+def test_a_mask_of_any_type_is_true_where_it_is_not_zero(depth: np.ndarray, kind) -> None:
+    """Masks of segmentation networks are bytes, of images 0 and 255."""
+    mask = np.zeros(SHAPE, np.uint8)
+    mask[:, 80:] = 255
+    given = mask.tolist() if kind is list else kind(mask) if kind is torch.as_tensor else mask.astype(kind)
+    expected = np.stack(np.nonzero((depth > 0) & (mask > 0)), 1)
+    points = depth_points(depth, INTRINSICS, given)
+    pixels = points @ INTRINSICS.T / points[:, 2:]
+    np.testing.assert_allclose(pixels[:, [1, 0]], expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", [torch.as_tensor, lambda a: torch.as_tensor(a).requires_grad_(), np.ndarray.tolist])
+def test_lists_and_tensors_are_taken_as_arrays_are(
+    mug: ObjectModel, depth: np.ndarray, T_object_camera: np.ndarray, kind
+) -> None:
+    points = depth_points(depth, INTRINSICS)
+    np.testing.assert_array_equal(depth_points(kind(depth), kind(INTRINSICS)), points)
+    scan = scanned_object("mug", points, T_object_camera)
+    assert scanned_object("mug", kind(points), kind(T_object_camera)).sha256 == scan.sha256
+    towards = np.array([1.0, 0.5, 2.0])
+    seen = [visible_points(mug, x, torch.Generator().manual_seed(0)) for x in (torch.from_numpy(towards), kind(towards))]
+    assert torch.equal(*seen)
+
+
+def test_arrays_of_wrong_shapes_are_refused_in_words(depth: np.ndarray) -> None:
+    for image, intrinsics, word in (
+        (depth[None], INTRINSICS, r"shape \(1, 120, 160\)"), (depth, [300.0, 300.0, 80.0, 60.0], r"\[300.0, 300.0, 80.0"),
+        (depth, np.diag([300.0, 300.0, 0.0]), "principal point"), ([[1.0, 2.0], [3.0]], INTRINSICS, "rows have equal lengths"),
+        ([["a"]], INTRINSICS, "instead of numbers"),
+    ):
+        with pytest.raises(ObjectError, match=word):
+            depth_points(image, intrinsics)
+    for points in (np.ones((40, 4)), np.ones(12), 5.0):
+        with pytest.raises(ObjectError, match=r"expected \(n, 3\) points"):
+            scanned_object("thing", points)
+
+
+def test_points_that_coincide_count_once(depth: np.ndarray, T_object_camera: np.ndarray) -> None:
+    """Neighbours in the same place tell no normal, and hide outliers."""
+    points = depth_points(depth, INTRINSICS)
+    scan = scanned_object("mug", points, T_object_camera)
+    for repeated in (np.tile(points, (20, 1)), np.concatenate([points, np.tile(points[:1], (50_000, 1))])):
+        again = scanned_object("mug", repeated, T_object_camera)
+        assert again.sha256 == scan.sha256
+        np.testing.assert_array_equal(again.cloud_normals, scan.cloud_normals)
+
+
+def test_few_points_are_refused() -> None:
+    with pytest.raises(ObjectError, match="3 points after cleaning"):
+        scanned_object("crumbs", np.random.default_rng(0).normal(size=(3, 3)))
+
+
+@pytest.mark.parametrize("fault", ["transposed", "mirrored", "millimetres"])
+def test_a_pose_that_is_none_is_refused(depth: np.ndarray, T_object_camera: np.ndarray, fault: str) -> None:
+    """It would mirror the object, or leave it where the camera is."""
+    T = {"transposed": T_object_camera.T, "mirrored": np.diag([1.0, 1, -1, 1]), "millimetres": np.eye(4)}[fault].copy()
+    if fault == "millimetres":
+        T[:3, 3] = [400.0, 0, 800.0]
+    with pytest.raises(OptionError, match="T_frame_camera is not the camera's pose"):
+        scanned_object("mug", depth_points(depth, INTRINSICS), T)
+
+
+@pytest.mark.parametrize("scale", [-1.0, 0.0, float("nan")])
+def test_a_scan_of_no_scale_is_refused(depth: np.ndarray, tmp_path: Path, scale: float) -> None:
+    np.save(tmp_path / "scan.npy", depth_points(depth, INTRINSICS))
+    with pytest.raises(ObjectError, match="scale is"):
+        load_scan(tmp_path / "scan.npy", np.eye(4), scale)
+
+
+def test_a_plane_loses_no_points_but_strays() -> None:
+    plane = np.stack([*np.meshgrid(np.linspace(0, 0.1, 20), np.linspace(0, 0.1, 20)), np.zeros((20, 20))], -1).reshape(-1, 3)
+    cleaned = without_outliers(np.concatenate([plane, [[0.05, 0.05, 0.08]]]))
+    assert cleaned[:, 2].max() == 0
+    assert len(cleaned) >= 396
+
+
+@pytest.fixture(scope="module")
+def command(depth: np.ndarray, T_object_camera: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """What grasps a cloud in the frame of a camera file from above, without what makes good grasps."""
+    folder = tmp_path_factory.mktemp("scan")
+    np.save(folder / "scan.npy", depth_points(depth, INTRINSICS))
+    (folder / "camera.json").write_text(json.dumps({"frame": "base", "T_frame_camera": T_object_camera.tolist()}))
+    return ["generate", "--object", str(folder / "scan.npy"), "--camera", str(folder / "camera.json"), "--hand", "gripper3",
+            "--num", "3", "--weights", str(untrained_weights(folder)), "--direction", "0", "0", "-1", "--no-refine",
+            "--source", "network", "--json"]
+
+
+@pytest.fixture(scope="module")
+def made(command: list[str]) -> Path:
+    """The file that it writes."""
+    file, said = Path(command[2]).with_name("g.parquet"), io.StringIO()
+    with redirect_stdout(said):
+        assert main([*command, "--output", str(file)]) == 0
+    assert json.loads(said.getvalue())["frame"] == "base"
+    return file
+
+
+def test_grasps_of_a_cloud_are_in_the_frame_of_the_camera_file(
+    command: list[str], made: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same cloud in two frames gives the same grasps in two frames, and the direction counts in the frame named."""
+    palms = loaded_hand("gripper3").palm_directions(GraspBatch.load(made).T_object_wrist)
+    assert float(palms[:, 2].max()) < -0.8
+    wrists = GraspBatch.load(made).T_object_wrist[:, :3, 3]
+    assert float(wrists.norm(dim=1).max()) < 0.4, "about the object, not about the camera"
+    mesh = [a if not a.endswith("scan.npy") else "mug" for a in command]
+    assert main(mesh) == 2
+    assert "camera cloud" in capsys.readouterr().err
+    assert torch.isfinite(palms).all()
+
+
+def test_a_file_remembers_the_frame_and_where_the_camera_stood(
+    made: Path, depth: np.ndarray, T_object_camera: np.ndarray, tmp_path: Path
+) -> None:
+    """Read again, the object stands where the grasps are; every export names their frame."""
+    points, file, grasps = depth_points(depth, INTRINSICS), made, GraspBatch.load(made)
+    again = object_of(grasps, None, 1.0)
+    assert again.sha256 == grasps.object_sha256[0] == load_scan(
+        made.with_name("scan.npy"), read_motion(made.with_name("camera.json"), "T_frame_camera").T.double().numpy()).sha256
+    seen = points @ T_object_camera[:3, :3].T + T_object_camera[:3, 3]
+    assert np.abs(again.cloud.mean(0) - seen.mean(0)).max() < 0.05
+    for form, ending in (("isaac_grasp", "yaml"), ("moveit", "moveit.yaml"), ("csv", "csv")):
+        target = tmp_path / f"out.{ending}"
+        assert main(["export", str(file), "--format", form, "--output", str(target)]) == 0
+        assert "in frame 'base'" in target.read_text().splitlines()[0]
+    assert main(["export", str(file), "--format", "dexgraspbench", "--output", str(tmp_path / "bench")]) == 0
+    position, wxyz = np.split(np.load(tmp_path / "bench" / "0.npy", allow_pickle=True).item()["obj_pose"], [3])
+    np.testing.assert_allclose(position, T_object_camera[:3, 3], atol=1e-6)
+    turn = Rotation.from_quat(wxyz, scalar_first=True).as_matrix()
+    np.testing.assert_allclose(turn, T_object_camera[:3, :3], atol=1e-6)  # of the file, which is in the camera's frame
+    assert "object_frame_link: base" in (tmp_path / "out.yaml").read_text()
+    assert "frame_id: base" in (tmp_path / "out.moveit.yaml").read_text()
+
+
+def test_what_depth_cameras_leave_behind_is_dropped(
+    mug: ObjectModel, depth: np.ndarray, T_object_camera: np.ndarray, tmp_path: Path
+) -> None:
+    """Pixels without depth as NaN, as organised clouds have them, and a stray far beyond the size of any object."""
+    points = depth_points(depth, INTRINSICS)
+    np.save(tmp_path / "raw.npy", np.concatenate([points, np.full((50, 3), np.nan), [[0.3, 0.2, 1.9]]]))
+    obj = load_scan(tmp_path / "raw.npy", T_object_camera)
+    assert float(np.ptp(obj.cloud, axis=0).max()) < 0.2
+    assert np.quantile(off_surface(mug, obj.cloud.astype(float)), 0.5) < 0.003
+
+
+@pytest.mark.parametrize(("content", "word"), [
+    ({"T_frame_camera": np.eye(4).tolist()}, "no entry 'frame'"),
+    ({"frame": "base"}, "no entry 'T_frame_camera'"),
+    ({"frame": "", "T_frame_camera": np.eye(4).tolist()}, "not a name"),
+    ({"frame": 5, "T_frame_camera": np.eye(4).tolist()}, "not a name"),
+    ({"frame": "base", "T_frame_camera": [[1, 0, 0, 400], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, "millimetres"),
+])
+def test_frames_that_mean_nothing_are_refused(content: dict[str, object], word: str, tmp_path: Path) -> None:
+    (tmp_path / "frame.json").write_text(json.dumps(content))
+    with pytest.raises(OptionError, match=word):
+        read_motion(tmp_path / "frame.json", "T_frame_camera")
+
+
+def on_a_table(seen: np.ndarray, T_object_camera: np.ndarray) -> np.ndarray:
+    """The seen points with a table at the mug's foot, in the camera's frame."""
+    rng = np.random.default_rng(0)
+    foot = load_object("mug").cloud[:, 2].min()
+    table = np.column_stack([rng.uniform(-0.25, 0.25, (4000, 2)), np.full(4000, foot) + rng.normal(0, 0.001, 4000)])
+    return np.concatenate([seen, (table - T_object_camera[:3, 3]) @ T_object_camera[:3, :3]])
+
+
+def test_a_table_in_a_scan_is_cut_off_and_known_in_the_frame_asked_for(
+    mug: ObjectModel, depth: np.ndarray, T_object_camera: np.ndarray
+) -> None:
+    T = T_object_camera if T_object_camera[2, 3] > 0 else np.diag([1.0, 1.0, -1.0, 1.0])
+    assert T is T_object_camera, "the camera is above the mug's foot"
+    points = on_a_table(depth_points(depth, INTRINSICS), T)
+    scan = scanned_object("mug on a table", points, T, complete=False)
+    assert off_surface(mug, scan.cloud.astype(float)).max() < 0.004
+    assert scan.table is not None
+    np.testing.assert_allclose(scan.table, [0, 0, 1, mug.cloud[:, 2].min()], atol=0.02)
+    assert "a table was found in the cloud" in scan.notes[-1]
+    kept = scanned_object("mug on a table", points, T, complete=False, keep_table=True)
+    assert kept.table is None
+    assert len(kept.cloud) > 2 * len(scan.cloud)
+    assert np.ptp(kept.cloud[:, 0]) > 0.4
+
+
+def test_a_cloud_file_loses_its_table(
+    tmp_path: Path, depth: np.ndarray, T_object_camera: np.ndarray, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("dro_grasp.objects.surface_distances.LARGEST_GRID", 50_000)  # how good the grasp is, is not asked
+    points = on_a_table(depth_points(depth, INTRINSICS), T_object_camera)
+    path = tmp_path / "scene.npy"
+    np.save(path, points)
+    cut, whole = load_object(path), load_object(points, keep_table=True)
+    assert np.ptp(cut.cloud, axis=0).max() < 0.2 < np.ptp(whole.cloud, axis=0).max()
+    np.testing.assert_allclose(cut.table[:3], T_object_camera[2, :3], atol=0.02)
+    weights = str(untrained_weights(tmp_path))
+    command = ["generate", "--hand", "gripper3", "--object", str(path), "--num", "1", "--source", "network"]
+    command += ["--weights", weights]
+    assert main([*command, "--table", "0.0"]) == 0
+    told = capsys.readouterr().err
+    assert "a table was found in the cloud" in told
+    assert "but the table in the cloud is where" in told
+    assert main([*command, "--table", "-1.0", "--keep-table"]) == 0
+    assert "counts along the z axis of the cloud" in capsys.readouterr().err
+
+
+def test_a_kept_table_is_there_when_the_grasps_are_read_again(
+    tmp_path: Path, depth: np.ndarray, T_object_camera: np.ndarray
+) -> None:
+    points, path = on_a_table(depth_points(depth, INTRINSICS), T_object_camera), tmp_path / "scene.npy"
+    np.save(path, points * 1000)
+    hand, camera = loaded_hand("gripper3"), NamedMotion("base", torch.from_numpy(T_object_camera).float())
+    for keep_table in (False, True):
+        for obj, pose in (
+            (load_object(path, scale=0.001, keep_table=keep_table), None),
+            (load_scan(path, T_object_camera.astype(np.float32).astype(float), 0.001, keep_table), camera),
+        ):
+            file = tmp_path / "grasps.parquet"
+            bare = GraspBatch.create(hand, [obj], torch.eye(4)[None], hand.canonical_joints()[None])
+            with_sources(bare, "gripper3", str(path), 0.001, pose).save(file)
+            again = object_of(GraspBatch.load(file), None, 1.0)
+            assert (again.sha256, again.notes) == (obj.sha256, obj.notes)
+            assert (again.table is None) == keep_table
+            if pose is None and keep_table:
+                stranger = GraspBatch.load(file).replace(object_sha256=("0" * 64,))
+                unknown = stranger.replace(object_sha256=("",))
+                assert all(object_of(one, None, 1.0).table is not None for one in (stranger, unknown))

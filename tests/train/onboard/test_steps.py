@@ -1,0 +1,252 @@
+"""A hand from its file to weights and a report, taken up where it stopped."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import html
+import json
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dro_grasp.cli.main import main
+from dro_grasp.errors import OutputError
+from dro_grasp.hands.library import BUILTIN_FOLDER
+from dro_grasp.network.checkpoints import describe_weights
+from dro_grasp.optimize.synthesis import SynthesisConfig
+from dro_grasp.train.data.engine.shards import sole_run
+from dro_grasp.train.data.engine.worker import EngineConfig
+from dro_grasp.train.onboard import report, steps
+from tests.helpers.weights import untrained_weights
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("onboarding")
+    shutil.copy(BUILTIN_FOLDER / "gripper3.urdf", folder / "mine.urdf")
+    untrained_weights(folder)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def small_steps(monkeypatch: pytest.MonkeyPatch, quick_statistics: None) -> None:
+    """Small shards, and few grasps in the report."""
+    monkeypatch.setattr(steps, "EngineConfig", functools.partial(
+        EngineConfig, candidates=32, min_candidates=32, synthesis=SynthesisConfig(steps=60, batch_size=32)))
+    monkeypatch.setattr(report, "GRASPS", 3)
+
+
+def command(home: Path, *more: str, hand: str = "mine.urdf") -> list[str]:
+    return ["onboard", str(home / hand), "--output", str(home / "out"), "--objects", "sphere", "--held-out", "can",
+            "--num", "2", "--minutes", "0.01", "--workers", "1", "--weights", str(home / "untrained.safetensors"),
+            "--source", "network", *more]
+
+
+def test_a_file_becomes_weights_and_a_report(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(command(home, "--json")) == 0
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert set(told["seconds"]) == {"check", "before", "data", "training", "after"}
+    assert told["grasps"] > 0
+    assert describe_weights(told["fine_tuned"])["about"]["data"]["hands"] == {"mine": told["grasps"]}
+    page = (home / "out" / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 2, "the hand, and grasps of the one held-out object"
+    assert "http" not in page.replace("http-equiv", ""), "nothing is fetched"
+    assert f"{told['after']['refined']['strict/1']:.0%} after" in page
+    for step in ("before", "after"):
+        share = f"{told[step]['returned']['strict/1']:.0%} {step} ({told['optimised'][step]:.0%} of them made by the optimiser)"
+        assert share in page
+    assert " of 3 made by the optimiser" in page
+    for row in json.loads((home / "out" / steps.STATE).read_text())["steps"]["after"]["rows"]:
+        share, everyone = row["fingers"]["strict/1"]
+        assert f"{100 * share:.0f} ({100 * everyone:.0f})" in page
+    assert told["weights"] == (told["fine_tuned"] if told["gained"] else str(home / "untrained.safetensors"))
+    assert f"--weights {told['weights']}" in page
+    assert told["without_grasps"] == []
+
+
+def test_the_next_steps_are_commands_for_shells(tmp_path: Path) -> None:
+    folder, hand = tmp_path / "my hand", "it's $mine; hand.urdf"
+    done = dataclasses.replace(onboarded(folder, 60, 100), hand=hand)
+    page = html.unescape(report._commands(done)).removeprefix("<pre>").removesuffix("</pre>")
+    words = [shlex.split(line) for line in page.splitlines()]
+    assert words[0][2:8] == ["--hand", hand, "--object", "my_mesh.stl", "--weights", str(folder / steps.WEIGHTS)]
+    assert words[-1] == ["dro-grasp", "dataset", "report", str(folder / steps.DATA), "--output", "data.html"]
+
+
+def test_what_generate_returns_is_of_the_source_that_is_asked_for(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = command(home, "--source", "optimiser", "--json")
+    asked[asked.index("--output") + 1] = str(home / "optimised")
+    assert main(asked) == 0
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert told["optimised"] == {"before": 1.0, "after": 1.0}
+    page = (home / "optimised" / "report.html").read_text()
+    assert "3 of 3 made by the optimiser" in page
+    assert "--source optimiser --output grasps.parquet" in page
+
+
+def test_a_rerun_does_nothing_again(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def working(*_: object, **__: object) -> None:
+        raise AssertionError("done again")
+
+    before = (home / "out" / "weights.safetensors").read_bytes()
+    for name in ("synthesize_dataset", "train", "benchmark", "check_hand"):
+        monkeypatch.setattr(steps, name, working)
+    assert main(command(home)) == 0
+    said = capsys.readouterr()
+    assert said.err.count("finished before") == 5
+    assert "report: " in said.out
+    assert (home / "out" / "weights.safetensors").read_bytes() == before
+
+
+def test_a_run_that_stopped_goes_on(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    state = json.loads((home / "out" / steps.STATE).read_text())
+    kept = {name: state["steps"][name] for name in ("check", "before", "data")}
+    (home / "out" / steps.STATE).write_text(json.dumps(state | {"steps": kept}))
+    monkeypatch.setattr(steps, "synthesize_dataset", None)
+    assert main(command(home)) == 0
+    assert capsys.readouterr().err.count("finished before") == 3
+
+
+def test_a_benchmark_without_what_generate_returns_is_made_again(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As folders of an earlier version have it."""
+    state = json.loads((home / "out" / steps.STATE).read_text())
+    whole = state["steps"]["after"]
+    state["steps"]["after"] = whole | {"rows": [row for row in whole["rows"] if row["stage"] != steps.RETURNED]}
+    (home / "out" / steps.STATE).write_text(json.dumps(state))
+    assert main(command(home)) == 0
+    assert capsys.readouterr().err.count("finished before") == 4
+    rows = json.loads((home / "out" / steps.STATE).read_text())["steps"]["after"]["rows"]
+    assert [row["stage"] for row in rows] == [row["stage"] for row in whole["rows"]]
+
+
+def onboarded(folder: Path, before: int, after: int, asked: int = 200, **steps_made: dict) -> steps.Onboarded:
+    rows = [[{"stage": stage, "asked": asked, "held": {"strict/1": held}, "success": {"strict/1": (held / asked, 0, 1)}}
+             for stage in ("raw", "refined")] for held in (before, after)]
+    return steps.Onboarded("mine", folder, {"before": {"rows": rows[0]}, "after": {"rows": rows[1]}, **steps_made}, "multi")
+
+
+@pytest.mark.parametrize("after", [40, 60, 61, 90])
+def test_what_gained_nothing_says_so_and_keeps_the_weights_from_before(home: Path, after: int) -> None:
+    data = {"counts": {"can": 9, "box": 0}, "failures": {"box": "no contact", "torus": "too thin", "can": "too little time"}}
+    done = onboarded(home, 60, after, data=data)
+    told = " ".join(done.verdict())
+    assert done.without_grasps == ["box", "torus"]
+    assert "No training grasps of box, torus" in told
+    assert done.gained == (after == 90)
+    assert done.weights == (str(home / "weights.safetensors") if done.gained else "multi")
+    said = f"gained nothing beyond chance: 60 of 200 of the refined grasps hold under strict/1 before, {after} of 200 after"
+    assert (said in told) != done.gained
+
+
+@pytest.mark.parametrize(("asked", "rate"), [(40, 0.5), (200, 0.3), (200, 0.6), (200, 0.9), (1000, 0.5)])
+def test_weights_that_are_as_good_are_seldom_taken_for_better(home: Path, asked: int, rate: float) -> None:
+    generator = np.random.default_rng(0)
+    before, after = generator.binomial(asked, rate, (2, 4000)).tolist()
+    gained = [onboarded(home, b, a, asked).gained for b, a in zip(before, after, strict=True)]
+    assert sum(gained) / len(gained) <= 0.05
+
+
+def test_weights_that_are_clearly_better_are_taken(home: Path) -> None:
+    generator = np.random.default_rng(0)
+    before, after = (generator.binomial(200, rate, 1000).tolist() for rate in (0.5, 0.7))
+    assert sum(onboarded(home, b, a).gained for b, a in zip(before, after, strict=True)) >= 900
+
+
+def test_the_folder_of_another_hand_is_refused(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copy(BUILTIN_FOLDER / "barrett.urdf", home / "other.urdf")
+    assert main(command(home, hand="other.urdf")) == 2
+    assert "belongs to hand 'mine'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("more", "word"), [
+    (["--seed", "7"], "with seed"),
+    (["--source", "auto"], "with source network, auto was asked for")])
+def test_a_folder_that_was_begun_otherwise_is_refused(
+    home: Path, more: list[str], word: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its finished steps would be given for those that were asked for. Earlier versions called the source a method."""
+    state = home / "out" / steps.STATE
+    stored = state.read_text()
+    for text in (stored, stored.replace('"source": "network"', '"method": "network"')):
+        state.write_text(text)
+        assert main([*command(home), *more]) == 2
+        assert word in capsys.readouterr().err
+    state.write_text(stored)
+
+
+def test_a_folder_that_was_begun_with_other_weights_is_refused(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*command(home), "--weights", str(untrained_weights(tmp_path))]) == 2
+    assert "was begun with weights" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("more", "word"), [(["--objects", "can"], "can would be trained on"), (["--minutes", "0"], "minutes is 0.0")])
+def test_what_makes_no_sense_is_refused(
+    home: Path, more: list[str], word: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*command(home), *more]) == 2
+    assert word in capsys.readouterr().err
+
+
+def test_a_hand_that_grasps_nothing_is_told(
+    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from dro_grasp.train.data.engine.schedule import DatasetReport
+
+    nothing = DatasetReport(0, 0, 1, 1.0, {("mine", "sphere"): "0 grasps: every candidate penetrates"})
+    monkeypatch.setattr(steps, "synthesize_dataset", lambda *_, **__: nothing)
+    monkeypatch.setattr(steps, "count_collection", lambda _: {})
+    assert main([*command(home), "--output", str(home / "empty")]) == 2
+    assert "every candidate penetrates" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "word"),
+    [("--minutes", "nan", "error: minutes is nan; give a positive number, for example --minutes 30\n"),
+     ("--minutes", "inf", "error: minutes is inf; "), ("--num", "0", "error: num is 0; give at least 1 (--num)\n"),
+     ("--workers", "0", "error: workers is 0; "), ("--held-out", "cann", "no object is called 'cann'"),
+     ("--held-out", "nowhere.stl", "nowhere.stl"), ("--objects", "spher", "no object is called 'spher'"),
+     ("--weights", "nowhere", "no weights at 'nowhere'"), ("hand", "nothand.urdf", "nothand.urdf"),
+     ("hand", "missing.urdf", "missing.urdf")],
+)
+def test_what_is_refused_leaves_no_folder(
+    home: Path, option: str, value: str, word: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (home / "nothand.urdf").write_text("<robot name='a'><link name='b'/></robot>")
+    more = ["--output", str(home / "new")]
+    line = command(home, *more, hand=value) if option == "hand" else command(home, *more, option, value)
+    assert main(line) == 2
+    assert word in capsys.readouterr().err
+    assert not (home / "new").exists()
+
+
+def test_objects_of_one_name_are_refused_before_the_work(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = [home / folder / "cup.stl" for folder in ("a", "b")]
+    for file in files:
+        file.parent.mkdir()
+        file.touch()
+    assert main([*command(home), "--output", str(home / "new"), "--objects", *map(str, files)]) == 2
+    assert f"objects '{files[0]}' and '{files[1]}' are both called 'cup'" in capsys.readouterr().err
+    assert not (home / "new").exists()
+
+
+def test_a_damaged_state_is_set_aside_and_a_second_run_kept_out(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(steps._Onboarding, "run", lambda self: None)
+    for number, content in enumerate(("{", "[]", '{"hand": "mine", "sha256": "x", "steps": 5}', '{"hand": "mine"}'), 1):
+        (tmp_path / steps.STATE).write_text(content)
+        made = steps.onboard(str(home / "mine.urdf"), tmp_path, say=told.append)
+        assert made.steps == {}
+        assert (tmp_path / f"{steps.STATE}.damaged{'' if number == 1 else f'.{number}'}").read_text() == content
+    assert len(told) == 4
+    assert all("is damaged" in line and "made again" in line for line in told)
+    with sole_run(tmp_path), pytest.raises(OutputError, match="another run is filling"):
+        steps.onboard(str(home / "mine.urdf"), tmp_path)
