@@ -193,7 +193,7 @@ def test_weights_remember_every_training_before(path: Path, network: DistanceNet
     stages = [entry["stage"] for entry in history_of(tmp_path / "small.safetensors")]
     assert stages == ["test", "second", "third"]
     assert [entry["stage"] for entry in history_of(locate_weights())][-1] == "training"
-    small = {"predict/score/quality": "ranking", "predict/score/holding": "ranking of settled grasps", "completion/surface": "completion"}
+    small = {"ranking/quality": "ranking", "ranking/holding": "ranking of settled grasps", "completion/surface": "completion"}
     for name, stage in small.items():
         assert {entry["stage"] for entry in history_of(SHIPPED_FOLDER / f"{name}.safetensors")} == {stage}
 
@@ -232,7 +232,7 @@ def test_shipped_weights_are_as_they_were_shipped(monkeypatch: pytest.MonkeyPatc
     harmed[-1] ^= 1
     (folder / "ranking" / "quality.safetensors").write_bytes(harmed)
     with pytest.raises(WeightsError, match="shipped was"):
-        verify_weights("predict/score/quality")
+        verify_weights("ranking/quality")
     (folder / "completion" / "surface.safetensors").unlink()
     with pytest.raises(WeightsError, match="No such file"):
         verify_weights("completion/surface")
