@@ -59,14 +59,15 @@ def bare_arrays(text: str) -> Iterator[str]:
 
 
 def bare_constants(text: str) -> Iterator[str]:
-    body = parsed(text).body
+    body, lines = parsed(text).body, text.splitlines()
     for node, following in zip(body, [*body[1:], None], strict=True):
         targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
         for target in targets:
             if isinstance(target, ast.Tuple) and any(getattr(name, "id", "").isupper() for name in target.elts):
                 yield f"{node.lineno}: several constants in one assignment: give each its own line and docstring"
-            elif isinstance(target, ast.Name) and target.id.isupper() and not _is_docstring(following):
-                yield f"{node.lineno}: {target.id} has no docstring: write its meaning, unit and source under it"
+            elif isinstance(target, ast.Name) and target.id.isupper() and not (
+                _is_docstring(following) or "  # " in lines[(node.end_lineno or node.lineno) - 1]):
+                yield f"{node.lineno}: {target.id} has no docstring: write its meaning, unit and source under it, or behind it"
 
 
 def _is_docstring(node: ast.stmt | None) -> bool:
@@ -92,7 +93,7 @@ BROKEN = {
 KEPT = {
     long_functions: "def f() -> None:\n" + "    pass\n" * (LONGEST_FUNCTION - 1),
     bare_arrays: "class A:\n    x: Float[Tensor, '...']\n    def f(self, x: list[Int[np.ndarray, 'n']]) -> Tensors: ...",
-    bare_constants: "A = 1\n'''Of A.'''\nb = 2",
+    bare_constants: "A = 1\n'''Of A.'''\nb = 2\nC = 3  # Of C",
 }
 
 

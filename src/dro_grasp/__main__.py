@@ -2,8 +2,7 @@
 
 import sys
 
-INTERRUPTED = 130
-"""Exit code after Ctrl-C: 128 plus the number of SIGINT, as shells have it."""
+INTERRUPTED = 130  # Exit code after Ctrl-C: 128 plus the number of SIGINT, as shells have it
 
 
 def run() -> int:

@@ -105,8 +105,7 @@ class _QuickPath(AbstractContextManager[None]):
                 torch.set_float32_matmul_precision(self._before)
 
 
-_QUICK_PATH = _QuickPath()
-"""The only one."""
+_QUICK_PATH = _QuickPath()  # The only one
 
 
 @cache

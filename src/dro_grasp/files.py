@@ -20,10 +20,8 @@ from safetensors import SafetensorError
 
 from dro_grasp.errors import DroGraspError, OptionError, OutputError
 
-TOLD = 200
-"""Characters of a path or a reason that an error repeats (ours)."""
-SAME = {".yaml": ".yml", ".html": ".htm"}
-"""Endings of file names, and others that mean the same."""
+TOLD = 200  # Characters of a path or a reason that an error repeats (ours)
+SAME = {".yaml": ".yml", ".html": ".htm"}  # Endings of file names, and others that mean the same
 FOREIGN = (
     OSError, MemoryError, ValueError, LookupError, ArithmeticError, EOFError, RuntimeError, UnpicklingError, struct.error,
     zlib.error, lzma.LZMAError, BadZipFile, TokenError, SafetensorError)

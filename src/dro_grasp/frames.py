@@ -14,12 +14,9 @@ from torch import Tensor
 from dro_grasp.errors import OptionError
 from dro_grasp.files import given_path
 
-HALF_AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
-"""Names of the half-axes, in the order of the indices of `half_axis`."""
-ROUNDING = 1e-3
-"""Largest deviation of a rotation's product with its transpose from the identity (ours)."""
-LONGEST = 100.0
-"""A longer translation must be in another unit [m] (ours)."""
+HALF_AXES = ("+x", "-x", "+y", "-y", "+z", "-z")  # Names of the half-axes, in the order of the indices of `half_axis`
+ROUNDING = 1e-3  # Largest deviation of a rotation's product with its transpose from the identity (ours)
+LONGEST = 100.0  # A longer translation must be in another unit [m] (ours)
 
 
 def half_axis(directions: Float[Tensor, "n 3"]) -> Int[Tensor, " n"]:

@@ -16,8 +16,7 @@ Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 WORDS = {int: "an integer", float: "a number", bool: "True or False", NoneType: "None"}
 """Kinds that are checked, and their names in errors; what is annotated as something else is not looked at."""
-LONGEST = 80
-"""Characters of a value that an error repeats (ours)."""
+LONGEST = 80  # Characters of a value that an error repeats (ours)
 
 
 class Checked:

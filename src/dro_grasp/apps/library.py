@@ -19,8 +19,7 @@ from dro_grasp.objects.catalogue import load_object, object_names
 from dro_grasp.objects.scenery import Scene, load_scene
 from dro_grasp.objects.shape import ObjectModel
 
-Kind = Literal["hand", "object", "scene"]
-"""What something is used as."""
+Kind = Literal["hand", "object", "scene"]  # What something is used as
 MAX_LOADED: dict[Kind, int] = {"hand": 16, "object": 32, "scene": 8}
 """Most of each kind that stay loaded, those used last (ours); what was added loaded stays besides."""
 

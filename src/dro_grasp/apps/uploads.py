@@ -11,16 +11,11 @@ from dro_grasp.files import reading
 from dro_grasp.hands.description.urdf import find_mesh
 from dro_grasp.hands.description.xml_files import parse_xml
 
-MAX_BYTES = 20_000_000
-"""Largest upload [bytes]."""
-MAX_UNPACKED = 100_000_000
-"""Largest unpacked content of a ZIP file [bytes]."""
-LONGEST_NAME = 200
-"""Longest file name [bytes]; file systems take 255, and some is left for what is made beside a file."""
-MAX_FILES = 1_000
-"""Most files in a ZIP file."""
-DESCRIPTIONS = (".urdf", ".xml", ".mjcf")
-"""Suffixes of hand descriptions."""
+MAX_BYTES = 20_000_000  # Largest upload [bytes]
+MAX_UNPACKED = 100_000_000  # Largest unpacked content of a ZIP file [bytes]
+LONGEST_NAME = 200  # Longest file name [bytes]; file systems take 255, and some is left for what is made beside a file
+MAX_FILES = 1_000  # Most files in a ZIP file
+DESCRIPTIONS = (".urdf", ".xml", ".mjcf")  # Suffixes of hand descriptions
 
 
 def store_upload(name: str, content: bytes, folder: Path) -> Path:

@@ -24,16 +24,11 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.predictor import GraspPredictor
 
-FORMATS = {".gif": "GIF", ".webp": "WEBP"}
-"""Endings of animation files."""
-RATE = 10
-"""Frames per second (ours)."""
-SIZE = (480, 360)
-"""Width and height [pixels]."""
-VIEW = (0.9, -1.25, 0.75)
-"""Direction from the robot towards the camera, in the world."""
-OTHER_COLOUR: Colour = (0.62, 0.68, 0.55)
-"""Green of other objects on the table."""
+FORMATS = {".gif": "GIF", ".webp": "WEBP"}  # Endings of animation files
+RATE = 10  # Frames per second (ours)
+SIZE = (480, 360)  # Width and height [pixels]
+VIEW = (0.9, -1.25, 0.75)  # Direction from the robot towards the camera, in the world
+OTHER_COLOUR: Colour = (0.62, 0.68, 0.55)  # Green of other objects on the table
 
 
 @dataclass

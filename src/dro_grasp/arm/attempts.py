@@ -36,13 +36,10 @@ from dro_grasp.simulation.hand_part import PREFIX
 
 LABEL = "tabletop/3 "
 """Beginning of the settings of stored attempts; the number goes up with every change that can change an outcome."""
-APART = 0.03
-"""Distance between the outlines of objects as they are put down [m] (ours)."""
-STRIDE = 2
-"""Every so many pixels, in both directions, one ray is cast (ours)."""
+APART = 0.03  # Distance between the outlines of objects as they are put down [m] (ours)
+STRIDE = 2  # Every so many pixels, in both directions, one ray is cast (ours)
 
-Region = tuple[float, float, float, float]
-"""Least x and y, greatest x and y, from the arm's base [m]."""
+Region = tuple[float, float, float, float]  # Least x and y, greatest x and y, from the arm's base [m]
 
 
 @dataclass(frozen=True)

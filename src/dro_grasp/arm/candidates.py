@@ -21,10 +21,8 @@ from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.problem import GraspProblem
 
-Directions = Literal["paper", "all"]
-"""Palm directions that are asked for."""
-PAPER_DIRECTIONS = 32
-"""Palm directions of the paper, from above to the right side."""
+Directions = Literal["paper", "all"]  # Palm directions that are asked for
+PAPER_DIRECTIONS = 32  # Palm directions of the paper, from above to the right side
 
 def paper_directions(count: int) -> Float[Tensor, "k 3"]:
     """Unit vectors in the world, at most `count`: from above to the right side, whence the palm looks to the left.

@@ -19,20 +19,15 @@ from dro_grasp.grasps.export.writers import yaml_text
 
 STAGES = ("reach", "shape", "approach", "close", "lift")
 """The arm travels with the hand open; the hand takes the pregrasp; straight to the grasp; the hand closes; straight up."""
-FORMAT = 2
-"""Version of plan files."""
-CHOSEN = "chosen"
-"""Fate of the grasp that the motion carries out."""
-READY = "could be carried out too"
-"""Fate of grasps that were given to the planner beside it."""
-WAITING = "not tried"
-"""Fate of grasps that were not looked at, since better ones sufficed."""
+FORMAT = 2  # Version of plan files
+CHOSEN = "chosen"  # Fate of the grasp that the motion carries out
+READY = "could be carried out too"  # Fate of grasps that were given to the planner beside it
+WAITING = "not tried"  # Fate of grasps that were not looked at, since better ones sufficed
 COLUMNS = ("time", "stage", "arm", "arm_velocity", "arm_acceleration", "hand", "hand_velocity", "hand_acceleration")
 """Arrays of a plan file."""
 SCENE = ("points", "others", "T_world_wrist", "joints", "score")
 """Further arrays of it, what was planned for; their names begin with `scene_`."""
-DIGITS = 6
-"""Decimals of joint values in trajectories: micrometres and microradians (ours)."""
+DIGITS = 6  # Decimals of joint values in trajectories: micrometres and microradians (ours)
 
 
 @dataclass(frozen=True)

@@ -31,20 +31,15 @@ LIFT_PROTOCOL = replace(PROTOCOLS["dro"], name="tabletop", timestep=0.002, force
 """Contacts and servos of the hand: friction 1, density 500 kg/m^3 and the servos' gains as in trials; at most 3 Nm (ours).
 
 Without the solver against slip, held objects creep out of soft contacts; DexGraspBench has two of its iterations."""
-TICK = 0.02
-"""Time between targets of the servos [s] (ours)."""
+TICK = 0.02  # Time between targets of the servos [s] (ours)
 DAMPING_TIME = 0.03
 """Damping of an arm's servo over its stiffness [s] (ours); the wanted velocity is fed forward, so nothing lags behind."""
 MEMORY = 2**28
 """Memory for contacts [bytes]; what is not needed is never touched. Ours: by itself MuJoCo has room for some 300 contacts."""
-SHAPE_GROUP = 4
-"""Group of the geoms that only cameras see: the objects' true meshes."""
-BALL_BIT = 2
-"""Bit of contacts of an estimated object's balls with the hand (ours)."""
-HULL_BIT = 4
-"""Bit of contacts of its convex hull with the table (ours)."""
-FEWEST_LINKS = 2
-"""Links that touch the object at least, once the hand has closed (ours)."""
+SHAPE_GROUP = 4  # Group of the geoms that only cameras see: the objects' true meshes
+BALL_BIT = 2  # Bit of contacts of an estimated object's balls with the hand (ours)
+HULL_BIT = 4  # Bit of contacts of its convex hull with the table (ours)
+FEWEST_LINKS = 2  # Links that touch the object at least, once the hand has closed (ours)
 
 
 @dataclass(frozen=True)

@@ -24,10 +24,8 @@ from dro_grasp.geometry.se3 import apply_to_cloud
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.kinds import Checked
 
-TURNED = 0.12
-"""Farthest that a wrist is turned about the grasp centre from what was asked [rad] (ours)."""
-STEEPEST = 0.2
-"""Sine of the angle above the horizontal up to which a palm may face upwards (ours): the table is below."""
+TURNED = 0.12  # Farthest that a wrist is turned about the grasp centre from what was asked [rad] (ours)
+STEEPEST = 0.2  # Sine of the angle above the horizontal up to which a palm may face upwards (ours): the table is below
 
 
 class Fault(StrEnum):

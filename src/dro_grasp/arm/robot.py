@@ -32,12 +32,9 @@ from dro_grasp.hands.kinematics.tree import PRISMATIC, REVOLUTE, KinematicTree
 from dro_grasp.hands.library import load_hand, locate_hand
 from dro_grasp.kinds import flat
 
-BUILTIN_ROBOTS = Path(__file__).parent / "builtin"
-"""Folder of the built-in robots."""
-POSE_KEYS = {"position", "quaternion_wxyz"}
-"""What a robot file states of a pose."""
-TURN = np.pi
-"""Planned motions stay this near home, so that configurations a whole turn apart count once [rad] (ours)."""
+BUILTIN_ROBOTS = Path(__file__).parent / "builtin"  # Folder of the built-in robots
+POSE_KEYS = {"position", "quaternion_wxyz"}  # What a robot file states of a pose
+TURN = np.pi  # Planned motions stay this near home, so that configurations a whole turn apart count once [rad] (ours)
 
 
 @dataclass(frozen=True)

@@ -19,18 +19,12 @@ from dro_grasp.geometry.rendering.rasterizer import Camera, Colour, Mesh, arrow,
 from dro_grasp.hands.description.loader import Description
 from dro_grasp.simulation.hand_part import PREFIX
 
-SIZE = (900, 660)
-"""Width and height of the picture [pixels]."""
-VIEW = (1.0, -1.3, 0.75)
-"""Direction from the robot towards the camera of pictures, in the world."""
-ARM_COLOUR: Colour = (0.84, 0.85, 0.87)
-"""Light grey of the arm."""
-MOUNT_COLOUR: Colour = (0.35, 0.38, 0.43)
-"""Dark grey of the arm's base."""
-HAND_COLOUR: Colour = (0.25, 0.47, 0.75)
-"""Blue of the hand."""
-TABLE_COLOUR: Colour = (0.90, 0.87, 0.82)
-"""Sand of the table."""
+SIZE = (900, 660)  # Width and height of the picture [pixels]
+VIEW = (1.0, -1.3, 0.75)  # Direction from the robot towards the camera of pictures, in the world
+ARM_COLOUR: Colour = (0.84, 0.85, 0.87)  # Light grey of the arm
+MOUNT_COLOUR: Colour = (0.35, 0.38, 0.43)  # Dark grey of the arm's base
+HAND_COLOUR: Colour = (0.25, 0.47, 0.75)  # Blue of the hand
+TABLE_COLOUR: Colour = (0.90, 0.87, 0.82)  # Sand of the table
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,12 +21,10 @@ from dro_grasp.objects.perception.scan import given_points, given_pose, scanned_
 from dro_grasp.objects.reading import numbers
 from dro_grasp.objects.shape import ObjectModel
 
-THICKNESS = 0.006
-"""Points at most this far from the plane are the table's [m]: four standard deviations of the noise (ours)."""
+THICKNESS = 0.006  # Points at most this far from the plane are the table's [m]: four standard deviations of the noise (ours)
 NEIGHBOUR = 0.012
 """Points nearer to each other than this are of one object [m] (ours): a camera a metre away has points each 3 mm."""
-FEWEST = 60
-"""Fewest points of an object (ours)."""
+FEWEST = 60  # Fewest points of an object (ours)
 
 
 @dataclass(frozen=True)

@@ -18,15 +18,12 @@ from dro_grasp.arm.motion import STAGES, Trajectory
 from dro_grasp.arm.reachability import Feasible, Postures, carried
 from dro_grasp.arm.workcell import Workcell
 
-SPACING = 0.08
-"""Largest change of a joint between the waypoints of a path that is returned [rad or m] (ours)."""
-STEP = 0.01
-"""Longest time between samples of a trajectory [s] (ours); each of its parts has samples at equal distances."""
+SPACING = 0.08  # Largest change of a joint between the waypoints of a path that is returned [rad or m] (ours)
+STEP = 0.01  # Longest time between samples of a trajectory [s] (ours); each of its parts has samples at equal distances
 USED = 0.95
 """Share of each limit that is used: they hold at points of a grid, and a motion that exceeds one between is slowed (ours)."""
 
-Check = Callable[[Float[np.ndarray, " n"]], bool]
-"""Whether a configuration is free."""
+Check = Callable[[Float[np.ndarray, " n"]], bool]  # Whether a configuration is free
 
 
 def find_path(

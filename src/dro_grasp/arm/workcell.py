@@ -25,26 +25,17 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.hand_part import HULL_VERTICES, PREFIX, attach, hand_spec, joint_addresses, let_touch
 from dro_grasp.simulation.protocols import PROTOCOLS, Protocol
 
-ARM = "arm/"
-"""Prefix of the arm's names."""
-WORLD = "world"
-"""MuJoCo's name of the body that the table is of."""
-TABLE = "table"
-"""Name of the table."""
-TARGET = "target"
-"""Name of the object that is grasped."""
-OBSTACLE = "obstacle"
-"""What obstacles are called in contacts."""
-VOXEL = 0.01
-"""Edge of the cells that a cloud of obstacles fills [m] (ours)."""
-CLEARANCE = 0.005
-"""Distance that the robot keeps from everything else while it travels [m] (ours)."""
+ARM = "arm/"  # Prefix of the arm's names
+WORLD = "world"  # MuJoCo's name of the body that the table is of
+TABLE = "table"  # Name of the table
+TARGET = "target"  # Name of the object that is grasped
+OBSTACLE = "obstacle"  # What obstacles are called in contacts
+VOXEL = 0.01  # Edge of the cells that a cloud of obstacles fills [m] (ours)
+CLEARANCE = 0.005  # Distance that the robot keeps from everything else while it travels [m] (ours)
 SINK = 0.002
 """How much deeper than at the start a carried object may be in what it stood on or against [m]; clouds are not exact (ours)."""
-SAMPLES = 100
-"""Random configurations in which links that always collide are looked for (ours)."""
-ALWAYS = 0.95
-"""Share of these in which they collide (ours)."""
+SAMPLES = 100  # Random configurations in which links that always collide are looked for (ours)
+ALWAYS = 0.95  # Share of these in which they collide (ours)
 
 
 class Part(IntEnum):

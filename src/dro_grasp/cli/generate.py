@@ -27,8 +27,7 @@ if TYPE_CHECKING:
     from dro_grasp.predict.predictor import GraspPredictor
     from dro_grasp.predict.problem import GraspProblem
 
-ROWS_SHOWN = 16
-"""Grasps listed in the table."""
+ROWS_SHOWN = 16  # Grasps listed in the table
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,7 @@ from dro_grasp.cli.output import print_json, print_report, print_table, progress
 if TYPE_CHECKING:
     from dro_grasp.train.made_hands.making import MadeHand
 
-LISTING = "hands.csv"
-"""File in the folder that lists its hands."""
+LISTING = "hands.csv"  # File in the folder that lists its hands
 
 COLUMNS = {"name": "name", "family": "family", "fingers": "fingers", "side": "side", "palm": "palm", "joints": "joints",
            "mimic_joints": "mimic", "folds_back": "folds back", "redrawn": "redrawn"}

@@ -17,10 +17,8 @@ if TYPE_CHECKING:
 else:
     ProtocolName = Literal[tuple(PROTOCOLS)]
 
-Ball = tuple[float, float, float, float]
-"""Centre and radius [m]."""
-Flag = tyro.conf.FlagCreatePairsOff[bool]
-"""A switch that is off by default and has no --no- form."""
+Ball = tuple[float, float, float, float]  # Centre and radius [m]
+Flag = tyro.conf.FlagCreatePairsOff[bool]  # A switch that is off by default and has no --no- form
 
 
 def optional(metavar: str, default: str) -> Any:

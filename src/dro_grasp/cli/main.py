@@ -28,17 +28,13 @@ from dro_grasp.cli.view import Picture, View
 from dro_grasp.cli.weights import Weights
 from dro_grasp.errors import DroGraspError, OptionError
 
-DONE = 0
-"""Exit code of a command that succeeded."""
-FAILED = 1
-"""Exit code after a fault of dro-grasp, or when nobody reads the output any more, as in `dro-grasp hands | head -1`."""
-BAD_INPUT = 2
-"""Exit code after invalid input."""
+DONE = 0  # Exit code of a command that succeeded
+FAILED = 1  # Exit code after a fault of dro-grasp, or when nobody reads the output any more, as in `dro-grasp hands | head -1`
+BAD_INPUT = 2  # Exit code after invalid input
 WAIT_POLICY = ("OMP_WAIT_POLICY", "PASSIVE")
 """Environment variable that lets PyTorch's threads sleep while they wait, which they otherwise spend spinning: beside other
 programs at work that takes several times as long. It counts if it is set before PyTorch is loaded."""
-THREADS = "OMP_NUM_THREADS"
-"""Environment variable of the number of threads, for which the same holds."""
+THREADS = "OMP_NUM_THREADS"  # Environment variable of the number of threads, for which the same holds
 
 named = tyro.conf.subcommand
 Command = (

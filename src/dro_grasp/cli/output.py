@@ -17,8 +17,7 @@ stdout = Console(highlight=False, markup=False)
 stderr = Console(stderr=True, highlight=False, markup=False)
 
 
-NOTHING = ("", "-")
-"""Cells without a value."""
+NOTHING = ("", "-")  # Cells without a value
 
 
 def say(text: str) -> None:

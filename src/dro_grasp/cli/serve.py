@@ -9,8 +9,7 @@ from typing import Annotated
 
 from dro_grasp.cli.inputs import optional
 
-TOKEN = "DRO_GRASP_TOKEN"
-"""Environment variable of the token, which others cannot read in a list of processes."""
+TOKEN = "DRO_GRASP_TOKEN"  # Environment variable of the token, which others cannot read in a list of processes
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,8 @@ if TYPE_CHECKING:
     from dro_grasp.grasps.batch import GraspBatch
     from dro_grasp.objects.shape import ObjectModel
 
-MAX_SIDE = 4096
-"""Largest width and height of one picture [pixels]."""
-MAX_PIXELS = 50_000_000
-"""Most pixels of all pictures on a sheet together."""
+MAX_SIDE = 4096  # Largest width and height of one picture [pixels]
+MAX_PIXELS = 50_000_000  # Most pixels of all pictures on a sheet together
 
 
 @dataclass(frozen=True)

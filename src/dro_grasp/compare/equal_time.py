@@ -19,10 +19,8 @@ from dro_grasp.predict.finish import finish
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.stages import ease
 
-Maker = Callable[[int, int], GraspBatch]
-"""Makes a number of grasps with scores from a seed."""
-SMALLEST_ROUND = 0.1
-"""A method goes on if this share of the candidates that it has made still fits into the time (ours)."""
+Maker = Callable[[int, int], GraspBatch]  # Makes a number of grasps with scores from a seed
+SMALLEST_ROUND = 0.1  # A method goes on if this share of the candidates that it has made still fits into the time (ours)
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from dro_grasp.geometry.se3 import roma
 
-NORMAL_95 = 1.959963984540054
-"""Standard deviations of a normal distribution within which 95 % of it lie."""
+NORMAL_95 = 1.959963984540054  # Standard deviations of a normal distribution within which 95 % of it lie
 
 
 def wilson_interval(success: float, total: float) -> tuple[float, float]:

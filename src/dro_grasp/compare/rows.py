@@ -20,8 +20,7 @@ from dro_grasp.simulation.contact_quality import NAMES
 from dro_grasp.simulation.outcome import TrialResult
 from dro_grasp.simulation.protocols import Protocol
 
-ALL = "average"
-"""Name of the row over all hands."""
+ALL = "average"  # Name of the row over all hands
 
 
 @dataclass(frozen=True)

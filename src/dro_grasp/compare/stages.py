@@ -27,33 +27,22 @@ from dro_grasp.simulation.contact_quality import with_contacts
 from dro_grasp.simulation.protocols import Protocol
 from dro_grasp.simulation.trial import simulate
 
-RAW = "raw"
-"""Stage: grasps as they come."""
-RANKED = "ranked"
-"""Stage: the best quarter of them by score."""
-REFINED = "refined"
-"""Stage: refined grasps."""
-BEST = "refined, ranked"
-"""Stage: the best quarter of the refined grasps by score."""
-SETTLED = "settled"
-"""Stage: refined grasps after closing in simulation."""
-SETTLED_BEST = "settled, ranked"
-"""Stage: the best quarter of the settled grasps by score."""
+RAW = "raw"  # Stage: grasps as they come
+RANKED = "ranked"  # Stage: the best quarter of them by score
+REFINED = "refined"  # Stage: refined grasps
+BEST = "refined, ranked"  # Stage: the best quarter of the refined grasps by score
+SETTLED = "settled"  # Stage: refined grasps after closing in simulation
+SETTLED_BEST = "settled, ranked"  # Stage: the best quarter of the settled grasps by score
 TOP = {f"refined, top {count}": count for count in (5, 1)}
 """Stages that keep the few best refined grasps of a pair by score, and how many."""
-AFTER_REFINEMENT = (REFINED, BEST, *TOP)
-"""Stages of refined grasps."""
-AFTER_SETTLING = (SETTLED, SETTLED_BEST)
-"""Stages of settled grasps."""
-STAGES = (RAW, RANKED, *AFTER_REFINEMENT, *AFTER_SETTLING)
-"""Stages of every method."""
+AFTER_REFINEMENT = (REFINED, BEST, *TOP)  # Stages of refined grasps
+AFTER_SETTLING = (SETTLED, SETTLED_BEST)  # Stages of settled grasps
+STAGES = (RAW, RANKED, *AFTER_REFINEMENT, *AFTER_SETTLING)  # Stages of every method
 RETURNED = "returned"
 """Stage: what a method returns to a user; `generate`, with candidates of the network and, where the score asks for them, of
 the optimiser."""
-EQUAL_TIME = "equal-time"
-"""Stage: the best that each method returns with the CPU time of the first method's best quarter."""
-KEPT = 0.25
-"""Share of the grasps of a pair that ranking keeps, before any trial."""
+EQUAL_TIME = "equal-time"  # Stage: the best that each method returns with the CPU time of the first method's best quarter
+KEPT = 0.25  # Share of the grasps of a pair that ranking keeps, before any trial
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from dro_grasp.geometry.point_clouds import point_distances
 
-Ball = tuple[float, float, float, float]
-"""Centre and radius [m]."""
+Ball = tuple[float, float, float, float]  # Centre and radius [m]
 BLUR = (0.25, 0.5, 0.25)
 """Binomial weights that smooth the gradient field along each axis [1] (ours): edges of voxels are not edges of the object."""
 

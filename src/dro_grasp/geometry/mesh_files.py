@@ -10,8 +10,7 @@ from typing import Any
 
 import trimesh
 
-MOST_BYTES = 200_000_000
-"""Largest file, unpacked [bytes] (ours); reading takes some ten times as much memory."""
+MOST_BYTES = 200_000_000  # Largest file, unpacked [bytes] (ours); reading takes some ten times as much memory
 
 
 def open_mesh(path: Path, **options: Any) -> trimesh.Geometry:

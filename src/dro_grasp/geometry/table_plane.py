@@ -10,8 +10,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 THICKNESS = 0.006
 """Points nearer than this to the plane belong to it [m] (ours): about three standard deviations of a depth camera's noise."""
-LEAST_REST = 16
-"""Fewest points above a table (ours)."""
+LEAST_REST = 16  # Fewest points above a table (ours)
 
 
 def table_plane(

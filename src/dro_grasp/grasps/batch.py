@@ -335,8 +335,7 @@ class GraspBatch:
         return html_table(self)
 
 
-PATTERN = "*.parquet"
-"""Names of the files that are read in a folder."""
+PATTERN = "*.parquet"  # Names of the files that are read in a folder
 
 
 def load_grasps(path: Path | str) -> GraspBatch:
@@ -381,10 +380,8 @@ def _told_apart(batches: list[tuple[Path, GraspBatch]]) -> Iterator[GraspBatch]:
         yield batch.replace(object=tuple(map(label, batch.object)), asked_of=asked_of)
 
 
-DUPLICATE_DISTANCE = 0.005
-"""Two posed hands whose surface points lie closer together on average count as one grasp [m] (ours)."""
-HAND_POINTS = 64
-"""Surface points that are compared (ours)."""
+DUPLICATE_DISTANCE = 0.005  # Two posed hands whose surface points lie closer together on average count as one grasp [m] (ours)
+HAND_POINTS = 64  # Surface points that are compared (ours)
 
 
 def distinct(hand: Hand, grasps: GraspBatch, earlier: GraspBatch | None = None) -> Bool[Tensor, " n"]:
@@ -404,10 +401,8 @@ def distinct(hand: Hand, grasps: GraspBatch, earlier: GraspBatch | None = None) 
     return keep[n_earlier:]
 
 
-ROWS = 10
-"""Most grasps in the HTML table (ours)."""
-NAMES = 3
-"""Most objects that are named (ours)."""
+ROWS = 10  # Most grasps in the HTML table (ours)
+NAMES = 3  # Most objects that are named (ours)
 
 
 def percent(confidence: float) -> str | None:

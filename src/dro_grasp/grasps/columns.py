@@ -18,48 +18,29 @@ from dro_grasp.frames import ROUNDING, are_rotations
 
 TRIAL_FLOATS = ("displacement", "rotation", "penetration", "robustness", "fingers_in_contact")
 """Columns of one number per grasp that a trial fills; NaN is unknown."""
-FLOATS = ("score", "energy", *TRIAL_FLOATS)
-"""All columns of one number per grasp."""
-POSTURES = ("pregrasp_joints", "squeeze_joints")
-"""Columns of one number per joint; a row of NaN is not stated."""
-TEXTS = ("object", "object_sha256", "split", "provenance")
-"""Columns of one string per grasp; the empty string is unknown."""
+FLOATS = ("score", "energy", *TRIAL_FLOATS)  # All columns of one number per grasp
+POSTURES = ("pregrasp_joints", "squeeze_joints")  # Columns of one number per joint; a row of NaN is not stated
+TEXTS = ("object", "object_sha256", "split", "provenance")  # Columns of one string per grasp; the empty string is unknown
 COLUMNS = ("T_object_wrist", "joints", "seed", "trial_success", "protocol", *FLOATS, *POSTURES, *TEXTS)
 """Fields of a batch with one entry per grasp."""
 MAY_BE_UNKNOWN = ("score", "energy", *POSTURES)
 """Columns that say nothing about a grasp until somebody fills them; those of its trial are the others."""
-NOT_EVALUATED = ""
-"""Protocol of a grasp without a trial."""
-UNKNOWN_PROTOCOL = "unknown"
-"""Protocol of a grasp whose outcome is known without its protocol."""
-MEASURED = ("trial_success", "protocol", *TRIAL_FLOATS)
-"""Fields of a batch that a trial fills."""
-REASON = "reason"
-"""Further column: why a grasp failed, in words; empty for a success."""
-FAILURE = "failure"
-"""Further column: name of the kind of failure (`Failure`); None for a success."""
-CONTACT_LINKS = "contact_links"
-"""Further column: names of the links that touch the object after closing."""
-FURTHER = (REASON, FAILURE, CONTACT_LINKS)
-"""Further columns that a trial adds."""
-DEPTH = "depth"
-"""Further column of synthesised grasps: deepest penetration of a surface point [m]."""
-RELABELLED = "relabelled"
-"""Further column of stored grasps: whether idle fingers were closed after the grasp was made."""
-HAND_FILE = "hand_file"
-"""Further column: path of the hand's description, if the hand is a user's own."""
-OBJECT_FILE = "object_file"
-"""Further column: path of the object, if it is a user's own."""
-OBJECT_SCALE = "object_scale"
-"""Further column: scale of that file."""
-FRAME = "frame"
-"""Further column of grasps on a camera's cloud: name of the frame of the poses."""
-CAMERA = "T_frame_camera"
-"""Further column of such grasps: pose of the camera in that frame, row by row [m]."""
-ENERGY_TERM = "energy_"
-"""How the names of further columns with the terms of the grasp energy begin."""
-Asked = Mapping[tuple[str, str], int]
-"""How many grasps were asked for, by the name and hash of their object."""
+NOT_EVALUATED = ""  # Protocol of a grasp without a trial
+UNKNOWN_PROTOCOL = "unknown"  # Protocol of a grasp whose outcome is known without its protocol
+MEASURED = ("trial_success", "protocol", *TRIAL_FLOATS)  # Fields of a batch that a trial fills
+REASON = "reason"  # Further column: why a grasp failed, in words; empty for a success
+FAILURE = "failure"  # Further column: name of the kind of failure (`Failure`); None for a success
+CONTACT_LINKS = "contact_links"  # Further column: names of the links that touch the object after closing
+FURTHER = (REASON, FAILURE, CONTACT_LINKS)  # Further columns that a trial adds
+DEPTH = "depth"  # Further column of synthesised grasps: deepest penetration of a surface point [m]
+RELABELLED = "relabelled"  # Further column of stored grasps: whether idle fingers were closed after the grasp was made
+HAND_FILE = "hand_file"  # Further column: path of the hand's description, if the hand is a user's own
+OBJECT_FILE = "object_file"  # Further column: path of the object, if it is a user's own
+OBJECT_SCALE = "object_scale"  # Further column: scale of that file
+FRAME = "frame"  # Further column of grasps on a camera's cloud: name of the frame of the poses
+CAMERA = "T_frame_camera"  # Further column of such grasps: pose of the camera in that frame, row by row [m]
+ENERGY_TERM = "energy_"  # How the names of further columns with the terms of the grasp energy begin
+Asked = Mapping[tuple[str, str], int]  # How many grasps were asked for, by the name and hash of their object
 
 
 def require_fit(batch: Any, n_names: int) -> None:

@@ -23,16 +23,11 @@ from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps import columns
 from dro_grasp.grasps.columns import CAMERA, FRAME, HAND_FILE, OBJECT_FILE, OBJECT_SCALE
 
-HEADER = {"hand": "a name", "hand_sha256": "a hash, or ''", "wrist_link": "a name"}
-"""Texts of the header."""
-JOINTS = "joint_names"
-"""Entry of the header with the names of the joints."""
-ASKED = "asked"
-"""Entry of the header with how many grasps of each object were asked for; files that do not know it lack it."""
-ASKED_OF = ("object", "object_sha256", "num")
-"""What it states of each."""
-NOTES = "notes"
-"""Entry of the header with plain values about the making, or null."""
+HEADER = {"hand": "a name", "hand_sha256": "a hash, or ''", "wrist_link": "a name"}  # Texts of the header
+JOINTS = "joint_names"  # Entry of the header with the names of the joints
+ASKED = "asked"  # Entry of the header with how many grasps of each object were asked for; files that do not know it lack it
+ASKED_OF = ("object", "object_sha256", "num")  # What it states of each
+NOTES = "notes"  # Entry of the header with plain values about the making, or null
 
 
 def _is_text(kind: pa.DataType) -> bool:
@@ -98,12 +93,9 @@ def check_columns(schema: pa.Schema, path: object) -> None:
                              "camera's pose in it; write the file again")
 
 
-FORMAT_VERSION = 1
-"""Version of the grasp file that this code writes and reads."""
-METADATA_KEY = b"dro_grasp"
-"""Key of the JSON header in the schema metadata."""
-EXPECTED = "a Parquet file that dro-grasp wrote, whole; write it again"
-"""A grasp file, for messages (ours)."""
+FORMAT_VERSION = 1  # Version of the grasp file that this code writes and reads
+METADATA_KEY = b"dro_grasp"  # Key of the JSON header in the schema metadata
+EXPECTED = "a Parquet file that dro-grasp wrote, whole; write it again"  # A grasp file, for messages (ours)
 
 
 def table_bytes(columns: dict[str, pa.Array | pa.ChunkedArray], header: dict[str, Any]) -> bytes:
@@ -220,8 +212,7 @@ def _numbers(array: pa.Array) -> Float[np.ndarray, " n"]:
     return np.array(array.cast(pa.float32()).to_numpy(zero_copy_only=False), np.float32)
 
 
-REQUIRED = ("object", "wrist_position", "wrist_quaternion_wxyz", "joints")
-"""Columns without which a file holds no grasps."""
+REQUIRED = ("object", "wrist_position", "wrist_quaternion_wxyz", "joints")  # Columns without which a file holds no grasps
 TEXT_TYPES = {columns.REASON: pa.string(), columns.FAILURE: pa.string(), columns.CONTACT_LINKS: pa.list_(pa.string())}
 """Types of the trial's further columns, which their values do not tell when all are unknown."""
 SYNTHESISED = re.compile(r"\bsynthesis \d+\b")

@@ -21,19 +21,15 @@ JointMask = Bool[Tensor, " n_dof"]
 Point = Float[Tensor, "3"]
 PALM = -1
 """Finger number of links that belong to no finger: the palm, links fixed to it or above it, and links that fingers share."""
-FEWEST_WITH_THUMB = 4
-"""Hands with fewer fingers have no thumb: their fingers all oppose each other (ours)."""
+FEWEST_WITH_THUMB = 4  # Hands with fewer fingers have no thumb: their fingers all oppose each other (ours)
 THUMB_CLOSING = 0.55
 """Share of the way from open to closed at which thumb opposition is measured (ours). From 0.1 to 0.75 it names the thumb of
 every hand with four or five fingers, built in or among the development assets (ten hands)."""
-MOST_FINGERS = 24
-"""Most fingers of a hand (ours): two hands of a humanoid, and its feet."""
+MOST_FINGERS = 24  # Most fingers of a hand (ours): two hands of a humanoid, and its feet
 LONGEST_FINGER = 12
 """Most joints of one finger (ours): to find which way they close, every combination of their directions is tried."""
-AXIS_ALONG_PALM = 0.75
-"""Cosine to the palm direction above which a joint's axis points out of the palm (ours)."""
-PARALLEL = 0.9
-"""Cosine above which two joint axes count as parallel (ours)."""
+AXIS_ALONG_PALM = 0.75  # Cosine to the palm direction above which a joint's axis points out of the palm (ours)
+PARALLEL = 0.9  # Cosine above which two joint axes count as parallel (ours)
 
 
 @dataclass(frozen=True)

@@ -25,20 +25,16 @@ from dro_grasp.hands.opening import ROLLING_UP
 from dro_grasp.hands.palm import EARLY_CLOSINGS, MUCH_BETTER, WELL_ENCLOSED
 from dro_grasp.hands.surface import LinkSurface, sample_links
 
-TIP_OFFSET = 0.03
-"""Distance of the extra target beyond a fingertip [m]. Source: appendix, URDF file preprocessing."""
-LARGEST_HAND = 1.5
-"""Largest extent, from the palm on, that a hand in metres has [m] (ours)."""
-SMALLEST_HAND = 0.02
-"""Smallest extent, from the palm on, that a hand in metres has [m] (ours)."""
+TIP_OFFSET = 0.03  # Distance of the extra target beyond a fingertip [m]. Source: appendix, URDF file preprocessing
+LARGEST_HAND = 1.5  # Largest extent, from the palm on, that a hand in metres has [m] (ours)
+SMALLEST_HAND = 0.02  # Smallest extent, from the palm on, that a hand in metres has [m] (ours)
 LONGEST_REACH = 0.45
 """Longest way from a hand's palm along its links to a fingertip [m] (ours). Of the built-in hands, the development assets and
 thirty published ones, the longest is 0.23; arms begin at 0.5."""
 LONGEST_JAW = 0.2
 """The same where there is a single fingertip [m] (ours): 0.03 to 0.05 for the jaws of SO-100, SO-101, Z1 and
 Talos; the smallest arm that was seen, Koch's, has 0.34."""
-MOST_NAMED = 6
-"""Most hands that an error names (ours)."""
+MOST_NAMED = 6  # Most hands that an error names (ours)
 
 
 def build_hand(description: Description, *, name: str | None = None, seed: int = 0, n_points: int = 512) -> Hand:

@@ -25,17 +25,14 @@ from dro_grasp.hands.library import load_hand_description
 from dro_grasp.hands.opening import FingerMotion, opening_notes
 from dro_grasp.hands.palm import fixed_jaw_of
 
-TILE = (560, 520)
-"""Width and height of one view [pixels]."""
+TILE = (560, 520)  # Width and height of one view [pixels]
 COLOURS = {"contact": (0.93, 0.66, 0.30), "other": (0.62, 0.66, 0.72), "direction": (0.85, 0.15, 0.15),
            "track": (0.15, 0.39, 0.92), "left out": (0.62, 0.30, 0.75)}
 """Of contact links, links that cannot touch anything, the palm direction, the fingertips' tracks and what they leave out."""
 SIDEWAYS = 0.15
 """Cosine below which a thumb is on neither side of the other fingers (ours); hands with a side have 0.34 to 0.96."""
-END = {1: "upper", -1: "lower"}
-"""Limit at which a joint is open, by opening sign."""
-THIN_VOLUME = 1e-9
-"""Volume below which a link's shapes enclose nothing [m^3] (ours)."""
+END = {1: "upper", -1: "lower"}  # Limit at which a joint is open, by opening sign
+THIN_VOLUME = 1e-9  # Volume below which a link's shapes enclose nothing [m^3] (ours)
 
 
 @dataclass(frozen=True)

@@ -23,18 +23,15 @@ from dro_grasp.hands.opening import FingerMotion, Line, main_axis
 from dro_grasp.hands.palm import CLOSINGS, NEARLY_CLOSED, NOTHING_ENCLOSED, FixedJaw, Palm, find_fixed_jaw, find_palm
 from dro_grasp.hands.surface import LinkSurface
 
-REFINEMENTS = 3
-"""Rounds in which opening signs and palm are derived from each other (ours)."""
+REFINEMENTS = 3  # Rounds in which opening signs and palm are derived from each other (ours)
 ROLLED_UP = 0.15
 """Share of its reach at the widest spread below which a finger that opens farther is rolled up (ours). At the limits of their
 ranges, 16 hands keep 0.19 to 1."""
 ALL_ROLLED_UP = 0.5
 """The same for hands all of whose fingers roll up, once joints that move fingers sideways are still (ours). D'Claw, whose
 fingers bend as far back as forth, keeps 0.36 at most; of 15 other hands some finger keeps 0.65 or more."""
-PATH = 65
-"""Postures on the way from closed to open at which a hand is examined (ours)."""
-AT_LIMIT = 0.1
-"""Distance to a limit, as a share of the range, within which a joint is at this limit (ours)."""
+PATH = 65  # Postures on the way from closed to open at which a hand is examined (ours)
+AT_LIMIT = 0.1  # Distance to a limit, as a share of the range, within which a joint is at this limit (ours)
 
 
 @dataclass(frozen=True)

@@ -20,16 +20,11 @@ from dro_grasp.hands.kinematics.tree import KinematicTree
 if TYPE_CHECKING:
     from dro_grasp.hands.description.loader import Description
 
-MIN_FINGER_OFFSET = 0.005
-"""Fingers whose middle is nearer than this to the palm's axis surround it [m] (ours)."""
-MIN_REGISTRATION_POINTS = 4
-"""Fewest points that determine a link's pose, if they are not collinear."""
-POINTS_PER_LINK = 6
-"""Points that each link keeps, if it has them, when a hand is thinned (ours)."""
-STORED_AS = {"opening_signs": "opening", "contact_links": "touching"}
-"""Fields that training bundles hold under another name."""
-DERIVED = {"fingers", "rigid_group", "thumb"}
-"""Fields that follow from the others; training bundles do not hold them."""
+MIN_FINGER_OFFSET = 0.005  # Fingers whose middle is nearer than this to the palm's axis surround it [m] (ours)
+MIN_REGISTRATION_POINTS = 4  # Fewest points that determine a link's pose, if they are not collinear
+POINTS_PER_LINK = 6  # Points that each link keeps, if it has them, when a hand is thinned (ours)
+STORED_AS = {"opening_signs": "opening", "contact_links": "touching"}  # Fields that training bundles hold under another name
+DERIVED = {"fingers", "rigid_group", "thumb"}  # Fields that follow from the others; training bundles do not hold them
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,7 @@ from dro_grasp.hands.description.part import named, split_part
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import checked
 
-BUILTIN_FOLDER = Path(__file__).parent / "builtin"
-"""Folder of the built-in descriptions."""
+BUILTIN_FOLDER = Path(__file__).parent / "builtin"  # Folder of the built-in descriptions
 ASSET_FILES = {
     "barrett": "barrett/bhand_model.urdf",
     "barrett_multidex": "barrett_multidex/model.urdf",
@@ -32,8 +31,7 @@ ASSET_FILES = {
     "ezgripper": "ezgripper/ezgripper.urdf",
 }
 """Main file of each development asset, in the assets' hands folder."""
-ASSET_PREFIX = "assets/"
-"""Prefix that forces a name to be that of a development asset."""
+ASSET_PREFIX = "assets/"  # Prefix that forces a name to be that of a development asset
 
 
 @checked

@@ -14,17 +14,13 @@ from dro_grasp.hands.description.tree_reading import LinkGeometry
 from dro_grasp.hands.kinematics.tree import KinematicTree
 
 Point = Float[np.ndarray, "3"]
-POSTURES = 16
-"""Random postures in which a pin must be where both links have it (ours)."""
+POSTURES = 16  # Random postures in which a pin must be where both links have it (ours)
 LOOSE = 0.03
 """How far a pin may be from its mean place, as a share of its distance from the two links' own joints (ours): couplings state
 some linkages only about. Of five grippers it is 0.014 at most; jaws that turn against each other about near axes have 0.09."""
-TURN = 0.1
-"""Least angle that two links turn about their pin [rad] (ours); with none, any point would do."""
-APART = 3e-3
-"""Least distance of a pin from the axes of the two links' own joints [m] (ours)."""
-OUTSIDE = 5e-3
-"""Largest distance of a pin from the bounding boxes of both links [m] (ours)."""
+TURN = 0.1  # Least angle that two links turn about their pin [rad] (ours); with none, any point would do
+APART = 3e-3  # Least distance of a pin from the axes of the two links' own joints [m] (ours)
+OUTSIDE = 5e-3  # Largest distance of a pin from the bounding boxes of both links [m] (ours)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,31 +19,24 @@ from dro_grasp.hands.description.compiling import Note
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.kinematics.tree import REVOLUTE, KinematicTree
 
-STEPS = 64
-"""Steps in which a joint's range, or the way from closed to open, is searched (ours)."""
-SWEEPS = 24
-"""Most rounds of the search over all joints (ours); hands need 1 to 10."""
-SAME_SPAN = 1e-4
-"""Spans that differ by less are the same [m] (ours)."""
-KNUCKLE = 0.5
-"""Range of a finger's knuckle, as a share of the widest range of its joints (ours); a metacarpal has less."""
+STEPS = 64  # Steps in which a joint's range, or the way from closed to open, is searched (ours)
+SWEEPS = 24  # Most rounds of the search over all joints (ours); hands need 1 to 10
+SAME_SPAN = 1e-4  # Spans that differ by less are the same [m] (ours)
+KNUCKLE = 0.5  # Range of a finger's knuckle, as a share of the widest range of its joints (ours); a metacarpal has less
 BEHIND = 0.9
 """Angle by which an opened finger that folds back points behind the plane of its palm [rad] (ours). At the limits of their
 ranges, 16 hands that open as they should have 0.82 at most, and most of them 0.3."""
 LEAST_REACH = 0.35
 """Share of its widest reach below which a finger that opens farther folds back (ours). At the limits of their ranges, 16 hands
 that open as they should keep 0.44 to 1; a finger that points straight back behind its knuckle keeps 0 or less."""
-ALIKE = 0.9
-"""Cosine between the ways in which two joints move a fingertip from which on they bend the finger alike (ours)."""
-ACROSS = 0.3
-"""Cosine up to which a joint moves a fingertip across such a way (ours)."""
+ALIKE = 0.9  # Cosine between the ways in which two joints move a fingertip from which on they bend the finger alike (ours)
+ACROSS = 0.3  # Cosine up to which a joint moves a fingertip across such a way (ours)
 ROLLING_UP = 8.0
 """Range of all joints of a finger together from which it may roll up [rad] (ours): 1.3 turns; Allegro's have 6.5. Limits that
 say little are often half a turn for each joint."""
 SPREADING = (1.0, 0.75)
 """Openness at which joints that move a finger sideways are looked for (ours): bent farther, they move it to the palm, too."""
-STILL = 5e-3
-"""Slower fingertips do not move with a joint [m/rad or m/m] (ours)."""
+STILL = 5e-3  # Slower fingertips do not move with a joint [m/rad or m/m] (ours)
 
 
 @dataclass(frozen=True)

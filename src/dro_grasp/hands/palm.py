@@ -23,34 +23,25 @@ from dro_grasp.hands.hand import Hand
 Point = Float[np.ndarray, "3"]
 Points = Float[np.ndarray, "n 3"]
 Mask = Bool[np.ndarray, " n"]
-GRID_SPACING = 0.008
-"""Spacing of candidate ball centres [m] (ours)."""
-CLOSINGS = (0.35, 0.5, 0.65)
-"""Shares of the way from open to closed at which the hand is examined (ours)."""
+GRID_SPACING = 0.008  # Spacing of candidate ball centres [m] (ours)
+CLOSINGS = (0.35, 0.5, 0.65)  # Shares of the way from open to closed at which the hand is examined (ours)
 EARLY_CLOSINGS = (0.1, 0.2, *CLOSINGS)
 """Shares of the way from open to closed at which hands whose fingers may roll up are examined as well (ours)."""
-WELL_ENCLOSED = 0.04
-"""Score of a palm above which no earlier closing is looked at [m] (ours)."""
+WELL_ENCLOSED = 0.04  # Score of a palm above which no earlier closing is looked at [m] (ours)
 MUCH_BETTER = 0.01
 """How much better a palm must be for that it is found at an earlier closing [m] (ours). Grippers with such limits gain 0.014 to
 0.02, D'Claw 0.003."""
-FACE_POINTS = 16
-"""Number of palm samples nearest to the grasp centre that make up the palm's inner face (ours)."""
+FACE_POINTS = 16  # Number of palm samples nearest to the grasp centre that make up the palm's inner face (ours)
 NOTHING_ENCLOSED = ("palm and fingers of the half-closed hand enclose no space, so nothing can be grasped; check the origins, "
                     "axes and limits of its joints")
 """Error message."""
-LARGEST_BALL = 0.05
-"""Radius beyond which a larger empty ball is no better [m] (ours)."""
+LARGEST_BALL = 0.05  # Radius beyond which a larger empty ball is no better [m] (ours)
 NEARLY_CLOSED = (0.79, 0.8)
 """Shares of the way from open to closed between which the jaw is looked for (ours). Closed all the way, jaws often overlap."""
-SLIDING = 0.1
-"""Difference in speed along a finger, as a share of its mean, below which it slides rather than turns (ours)."""
-KNUCKLE = 0.25
-"""Share of the finger beside which the jaw has not begun (ours)."""
-LEAST_LENGTH = 0.3
-"""Length of a jaw, as a share of the finger's, below which the palm has none (ours)."""
-LARGEST_WIDTH = 2.5
-"""Width of a jaw, as a multiple of the finger's, above which it is a flat palm (ours)."""
+SLIDING = 0.1  # Difference in speed along a finger, as a share of its mean, below which it slides rather than turns (ours)
+KNUCKLE = 0.25  # Share of the finger beside which the jaw has not begun (ours)
+LEAST_LENGTH = 0.3  # Length of a jaw, as a share of the finger's, below which the palm has none (ours)
+LARGEST_WIDTH = 2.5  # Width of a jaw, as a multiple of the finger's, above which it is a flat palm (ours)
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,10 @@ from torch import Tensor
 
 from dro_grasp.hands.hand import Hand
 
-OPENNESS = (0.9, 0.5, 0.2)
-"""Shares of the way from closed to open at which a hand is measured (ours)."""
-UNIT = 0.1
-"""Unit of length, about the size of a palm [m] (ours)."""
-FINGERS = 5.0
-"""Unit of the number of fingers: those of a human-like hand (ours)."""
-JOINTS = 20.0
-"""Unit of the number of joints, about those of a human-like hand (ours)."""
+OPENNESS = (0.9, 0.5, 0.2)  # Shares of the way from closed to open at which a hand is measured (ours)
+UNIT = 0.1  # Unit of length, about the size of a palm [m] (ours)
+FINGERS = 5.0  # Unit of the number of fingers: those of a human-like hand (ours)
+JOINTS = 20.0  # Unit of the number of joints, about those of a human-like hand (ours)
 
 
 def proportions(hand: Hand, axes: Float[Tensor, "3 3"]) -> Float[Tensor, " f"]:

@@ -18,8 +18,7 @@ from dro_grasp.hands.kinematics.tree import KinematicTree
 
 SAMPLES_PER_LINK = 512
 """Points sampled on each link before farthest point sampling. Source: appendix, robot point cloud sampling."""
-NUDGE = 5e-4
-"""Samples this close to another shape of their link lie where the two shapes meet, not outside [m] (ours)."""
+NUDGE = 5e-4  # Samples this close to another shape of their link lie where the two shapes meet, not outside [m] (ours)
 
 
 @dataclass(frozen=True)

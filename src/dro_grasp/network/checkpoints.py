@@ -22,24 +22,15 @@ from dro_grasp.network.network import DistanceNetwork
 from dro_grasp.network.presets import LAST_WITH_OTHERS, NetworkConfig
 
 Network = TypeVar("Network", bound=nn.Module)
-Tensors = dict[str, Num[Tensor, "..."]]
-"""Tensors of a file by name."""
-SHIPPED_FOLDER = Path(__file__).parent / "weights"
-"""Folder of the shipped weights."""
-KEY = "dro_grasp_weights"
-"""Metadata entry that marks a safetensors file as weights of this package; JSON."""
-FORMAT_VERSION = 1
-"""Version of that entry."""
-PICKLES = (b"PK", b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")
-"""First two bytes of zipped and of bare pickles."""
-CHECKSUMS = "SHA256SUMS"
-"""File beside the shipped weights with their checksums, as `sha256sum` writes it."""
-SMALL = ("completion/surface", "ranking/quality", "ranking/holding")
-"""Networks that ship beside those that predict D(R,O)."""
-DEFAULT = "more_objects"
-"""Name of the default weights."""
-FORMER_WEIGHTS = ("multi", "more_hands")
-"""Names of weights that shipped before."""
+Tensors = dict[str, Num[Tensor, "..."]]  # Tensors of a file by name
+SHIPPED_FOLDER = Path(__file__).parent / "weights"  # Folder of the shipped weights
+KEY = "dro_grasp_weights"  # Metadata entry that marks a safetensors file as weights of this package; JSON
+FORMAT_VERSION = 1  # Version of that entry
+PICKLES = (b"PK", b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")  # First two bytes of zipped and of bare pickles
+CHECKSUMS = "SHA256SUMS"  # File beside the shipped weights with their checksums, as `sha256sum` writes it
+SMALL = ("completion/surface", "ranking/quality", "ranking/holding")  # Networks that ship beside those that predict D(R,O)
+DEFAULT = "more_objects"  # Name of the default weights
+FORMER_WEIGHTS = ("multi", "more_hands")  # Names of weights that shipped before
 
 
 def save_weights(

@@ -10,10 +10,8 @@ from torch import Tensor, nn
 
 from dro_grasp.network.checkpoints import SHIPPED_FOLDER, load_small
 
-SHIPPED = SHIPPED_FOLDER / "completion" / "surface.safetensors"
-"""The shipped network, which completes objects seen in part."""
-LENGTH = 0.01
-"""Unit of the network's corrections [m]. Source: ours."""
+SHIPPED = SHIPPED_FOLDER / "completion" / "surface.safetensors"  # The shipped network, which completes objects seen in part
+LENGTH = 0.01  # Unit of the network's corrections [m]. Source: ours
 
 
 class SurfaceNetwork(nn.Module):

@@ -20,8 +20,7 @@ from torch.nn import functional
 threshold_backward = torch.ops.aten.threshold_backward
 PAIRS_PER_CHUNK = {"cpu": 2048, "cuda": 1 << 19}
 """Pairs of points whose hidden layers exist at a time, by kind of device; others count as cuda. Source: ours, timed."""
-NEAREST = 1e-4
-"""Smaller distances count as this one where the softplus is inverted [m]. Source: ours."""
+NEAREST = 1e-4  # Smaller distances count as this one where the softplus is inverted [m]. Source: ours
 
 
 class DistanceHead(nn.Module):

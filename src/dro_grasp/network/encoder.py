@@ -10,8 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
-SLOPE = 0.2
-"""Negative slope of LeakyReLU. Source: appendix."""
+SLOPE = 0.2  # Negative slope of LeakyReLU. Source: appendix
 
 
 def nearest_neighbours(points: Float[Tensor, "b n 3"], k: int) -> Int[Tensor, "b n k"]:

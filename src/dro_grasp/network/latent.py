@@ -9,10 +9,8 @@ from torch.nn import functional
 
 from dro_grasp.network.encoder import SLOPE, EdgeLayer, PointLayer, nearest_neighbours
 
-MAX_LOG_VARIANCE = 8.0
-"""Log-variances of z are clamped to plus and minus this. Source: ours."""
-CERTAIN = -4.0
-"""Log-variance of the posterior of an untrained motion code. Source: ours."""
+MAX_LOG_VARIANCE = 8.0  # Log-variances of z are clamped to plus and minus this. Source: ours
+CERTAIN = -4.0  # Log-variance of the posterior of an untrained motion code. Source: ours
 
 
 class LatentEncoder(nn.Module):

@@ -15,22 +15,15 @@ from torch.nn import functional
 
 from dro_grasp.devices import side_by_side
 
-MIN_SCALE = 0.003
-"""Smallest standard deviation of a mixture component [m]. Source: ours."""
-LENGTH = 0.1
-"""Unit of length inside the network, about the size of an object [m]. Source: ours."""
-SCALE = 0.03
-"""Unit of the components' standard deviations inside the network [m]. Source: ours."""
+MIN_SCALE = 0.003  # Smallest standard deviation of a mixture component [m]. Source: ours
+LENGTH = 0.1  # Unit of length inside the network, about the size of an object [m]. Source: ours
+SCALE = 0.03  # Unit of the components' standard deviations inside the network [m]. Source: ours
 ROTATIONS_PER_PART = 16
 """Rotations whose hidden layers exist at a time: those of more do not fit a processor's cache. Source: ours, timed."""
-COLDEST = 1e-3
-"""Lower temperatures choose components as this one does: the heaviest. Source: ours."""
-PROPORTIONS = 72
-"""Numbers of a hand's proportions (`dro_grasp.hands.proportions`)."""
-LEAST_SPREAD = 0.05
-"""Smallest spread of a proportion over hands: less tells hands apart by chance. Source: ours."""
-FARTHEST = 3.0
-"""Largest distance of a proportion from the mean hand's, in spreads. Source: ours."""
+COLDEST = 1e-3  # Lower temperatures choose components as this one does: the heaviest. Source: ours
+PROPORTIONS = 72  # Numbers of a hand's proportions (`dro_grasp.hands.proportions`)
+LEAST_SPREAD = 0.05  # Smallest spread of a proportion over hands: less tells hands apart by chance. Source: ours
+FARTHEST = 3.0  # Largest distance of a proportion from the mean hand's, in spreads. Source: ours
 
 
 class Standardised(nn.Module):

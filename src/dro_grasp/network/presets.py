@@ -12,14 +12,10 @@ from torch import Tensor
 
 from dro_grasp.errors import OptionError
 
-WIDEST = 4096
-"""Largest number of points, features or neighbours (ours): memory grows with their products."""
-MOST_LAYERS = 16
-"""Most layers of a part of the network (ours)."""
-LARGEST = 10.0
-"""Largest distance [m] and temperature (ours)."""
-LAST_WITH_OTHERS = "commit e1ba941"
-"""Last state of the package whose networks had other forms, and that shipped other weights."""
+WIDEST = 4096  # Largest number of points, features or neighbours (ours): memory grows with their products
+MOST_LAYERS = 16  # Most layers of a part of the network (ours)
+LARGEST = 10.0  # Largest distance [m] and temperature (ours)
+LAST_WITH_OTHERS = "commit e1ba941"  # Last state of the package whose networks had other forms, and that shipped other weights
 FORMER: dict[str, dict[str, Any]] = {
     "object": {"placed": False, "residual": False, "latent_temperature": 1.0, "latent_form": "kernel", "prior": "standard",
                "placement_hand": "features"},

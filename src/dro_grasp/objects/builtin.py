@@ -13,8 +13,7 @@ from dro_grasp.objects.loading import mesh_object
 from dro_grasp.objects.primitives import Solid, box, frustum, hollow, hull, ring, superquadric, tilted, turned
 from dro_grasp.objects.shape import ObjectModel
 
-Pieces = Sequence[trimesh.Trimesh | Solid]
-"""Convex meshes and solids whose union is the object."""
+Pieces = Sequence[trimesh.Trimesh | Solid]  # Convex meshes and solids whose union is the object
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from jaxtyping import Num
 from dro_grasp.errors import OutputError
 from dro_grasp.files import FOREIGN, given_path, replacing
 
-Arrays = dict[str, Num[np.ndarray, "..."]]
-"""Arrays by name, as in an NPZ file."""
+Arrays = dict[str, Num[np.ndarray, "..."]]  # Arrays by name, as in an NPZ file
 
 
 def cache_folder() -> Path:

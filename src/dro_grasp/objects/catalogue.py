@@ -24,19 +24,15 @@ from dro_grasp.objects.procedural import NAME as PROCEDURAL, procedural_object
 from dro_grasp.objects.reading import ObjectSource, read_geometry
 from dro_grasp.objects.shape import ObjectModel
 
-ASSET_PREFIX = "assets/"
-"""Prefix of a name that forces the asset."""
-MOST_SEEDS = 100_000
-"""Largest such group (ours)."""
+ASSET_PREFIX = "assets/"  # Prefix of a name that forces the asset
+MOST_SEEDS = 100_000  # Largest such group (ours)
 MESH_SUFFIXES = {".obj", ".stl", ".ply", ".glb", ".gltf", ".off", ".dae", ".npy", ".pcd", ".3mf"}
 """Suffixes of the files in a folder that count as objects."""
 MESH = "mesh/simplified.obj"
 """The mesh of an object that MeshProcess prepared for DexGraspBench, in the object's folder; its largest extent is about 2.
 Source: the readme and the example objects of DexGraspBench."""
-PARTS = "urdf/meshes"
-"""Folder of its convex parts."""
-SCALES = (0.06, 0.08, 0.1, 0.12)
-"""Scales of every object in the official grasps."""
+PARTS = "urdf/meshes"  # Folder of its convex parts
+SCALES = (0.06, 0.08, 0.1, 0.12)  # Scales of every object in the official grasps
 
 
 @checked

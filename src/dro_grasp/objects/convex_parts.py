@@ -16,19 +16,13 @@ from dro_grasp.objects.cache import Arrays, cached_arrays, content_hash
 from dro_grasp.objects.repair import OPEN_FILL
 from dro_grasp.objects.surface_distances import signed_distances
 
-THRESHOLD = 0.08
-"""CoACD's concavity threshold [1] (ours)."""
-MAX_PARTS = 24
-"""Most parts of one object (ours)."""
-MAX_VERTICES = 64
-"""Most vertices of one part (ours): collision cost grows with them."""
-COARSE_VERTICES = 48
-"""Most vertices of a coarse part. Ours: the surface of a ball then lies up to 9 % of its radius inside."""
-COARSE_SHARE = 0.5
-"""Share of the parts that is left, rounded up (ours)."""
+THRESHOLD = 0.08  # CoACD's concavity threshold [1] (ours)
+MAX_PARTS = 24  # Most parts of one object (ours)
+MAX_VERTICES = 64  # Most vertices of one part (ours): collision cost grows with them
+COARSE_VERTICES = 48  # Most vertices of a coarse part. Ours: the surface of a ball then lies up to 9 % of its radius inside
+COARSE_SHARE = 0.5  # Share of the parts that is left, rounded up (ours)
 
-Part = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
-"""Vertices [m] and faces of a convex part."""
+Part = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]  # Vertices [m] and faces of a convex part
 
 
 def decompose(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"], key: str) -> tuple[Part, ...]:

@@ -21,16 +21,11 @@ from dro_grasp.objects.reading import ORIGIN, geometry_in_memory, read_geometry
 from dro_grasp.objects.repair import check_surface, mass_properties, repair
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
 
-LARGEST = 1.0
-"""Largest extent of an object that counts as metres [m] (ours)."""
-SMALLEST = 0.005
-"""Smallest such extent [m] (ours)."""
-FARTHEST = 100.0
-"""Largest coordinate [m] (ours): single precision rounds it by 4 micrometres."""
-MIN_CLOUD = 16
-"""Fewest distinct points of a bare cloud (ours)."""
-NEIGHBOURS = 16
-"""Neighbours that estimate the normals of a bare cloud (ours)."""
+LARGEST = 1.0  # Largest extent of an object that counts as metres [m] (ours)
+SMALLEST = 0.005  # Smallest such extent [m] (ours)
+FARTHEST = 100.0  # Largest coordinate [m] (ours): single precision rounds it by 4 micrometres
+MIN_CLOUD = 16  # Fewest distinct points of a bare cloud (ours)
+NEIGHBOURS = 16  # Neighbours that estimate the normals of a bare cloud (ours)
 
 
 def load_file(path: Path, *, scale: float = 1.0, keep_table: bool = False) -> ObjectModel:

@@ -9,8 +9,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-Point = tuple[float, float, float]
-"""Coordinates [m]."""
+Point = tuple[float, float, float]  # Coordinates [m]
 
 
 @dataclass(frozen=True)

@@ -14,16 +14,11 @@ from dro_grasp.objects.builtin import Pieces, assemble
 from dro_grasp.objects.primitives import Point, Solid, box, frustum, hollow, ring, superquadric, turned
 from dro_grasp.objects.shape import ObjectModel
 
-NAME = re.compile(r"procedural_(\d{1,9})")
-"""Name of such an object; the number is its seed."""
-SIZE = (0.05, 0.2)
-"""Range of the largest extent [m] (ours)."""
-STRETCH = (0.75, 1.33)
-"""Range of the factor along each axis, before the size is set (ours)."""
-THINNEST = 0.012
-"""Smallest extent of an object [m] (ours): thinner ones cannot be held from a free pose by most hands."""
-ATTEMPTS = 20
-"""Shapes that are drawn before a seed is given up: some are too thin, and stretching some leaves slivers."""
+NAME = re.compile(r"procedural_(\d{1,9})")  # Name of such an object; the number is its seed
+SIZE = (0.05, 0.2)  # Range of the largest extent [m] (ours)
+STRETCH = (0.75, 1.33)  # Range of the factor along each axis, before the size is set (ours)
+THINNEST = 0.012  # Smallest extent of an object [m] (ours): thinner ones cannot be held from a free pose by most hands
+ATTEMPTS = 20  # Shapes that are drawn before a seed is given up: some are too thin, and stretching some leaves slivers
 
 
 def procedural_object(seed: int, *, scale: float = 1.0) -> ObjectModel:

@@ -17,10 +17,8 @@ from dro_grasp.geometry.mesh_files import check_bytes, open_mesh
 ObjectSource = (str | Path | trimesh.Trimesh | trimesh.PointCloud | trimesh.Scene | tuple[Any, Any] | Num[np.ndarray, "..."]
                 | Num[Tensor, "..."])
 """What an object can be loaded from: its name or file, a mesh, a pair (vertices, faces), or points."""
-ORIGIN = "the given object"
-"""What messages call it."""
-CLOUD_SUFFIXES = {".npy", ".pcd"}
-"""Files that hold a bare cloud."""
+ORIGIN = "the given object"  # What messages call it
+CLOUD_SUFFIXES = {".npy", ".pcd"}  # Files that hold a bare cloud
 
 
 def read_points(path: Path) -> Float[np.ndarray, "n 3"]:

@@ -13,10 +13,8 @@ from dro_grasp.geometry.point_clouds import enclosed_volume
 LEAST_FILL = 1e-3
 """Share of its bounding box that a hull must fill, and share of its hull that a closed mesh must fill (ours); less is a
 sheet."""
-OPEN_FILL = 0.05
-"""Share of its hull that a mesh with holes must fill (ours); a bent sheet appears to fill a little."""
-OVERLAP = 1e-3
-"""Share of the volume by which bodies may overlap without being joined (ours)."""
+OPEN_FILL = 0.05  # Share of its hull that a mesh with holes must fill (ours); a bent sheet appears to fill a little
+OVERLAP = 1e-3  # Share of the volume by which bodies may overlap without being joined (ours)
 
 MassProperties = tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]
 """Volume [m^3], centre of mass [m], and inertia about it at unit density [m^5]."""

@@ -23,14 +23,10 @@ from dro_grasp.objects.reading import ObjectSource, coordinates, geometry_in_mem
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.objects.surface_distances import banded_values, search_tree, signed_distances
 
-SPACING = 0.005
-"""Spacing of the grid of distances to a scene [m] (ours)."""
-LARGEST_GRID = 4_000_000
-"""Most points of such a grid; a larger one gets a wider spacing (ours)."""
-MARGIN = 0.03
-"""Distance around a scene that its grid covers [m] (ours); beyond, distances grow as they do at its border."""
-TOUCH = 0.003
-"""Distance to a scene at which a point of an object's surface lies on it [m] (ours)."""
+SPACING = 0.005  # Spacing of the grid of distances to a scene [m] (ours)
+LARGEST_GRID = 4_000_000  # Most points of such a grid; a larger one gets a wider spacing (ours)
+MARGIN = 0.03  # Distance around a scene that its grid covers [m] (ours); beyond, distances grow as they do at its border
+TOUCH = 0.003  # Distance to a scene at which a point of an object's surface lies on it [m] (ours)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,20 +17,15 @@ from dro_grasp.objects.cache import cached_arrays, content_hash
 from dro_grasp.objects.convex_parts import Part, coarse_parts, decompose, pack
 from dro_grasp.objects.surface_distances import GRID_SPACING, bake_grid, closed_cloud_distances, signed_distances
 
-DENSITY = 500.0
-"""Density of every object in trials [kg/m^3]. Source: the official release."""
-CLOUD_POINTS = 16384
-"""Points of an object's stored cloud (ours)."""
+DENSITY = 500.0  # Density of every object in trials [kg/m^3]. Source: the official release
+CLOUD_POINTS = 16384  # Points of an object's stored cloud (ours)
 BALL_RADII = (0.008, 0.006, 0.004, 0.003, 0.002)
 """Radii of balls [m]; each point gets the largest that stays inside, or else the smallest (ours)."""
 BALL_SPACING = 0.008
 """Distance between the points that are touched [m] (ours): between the largest balls the surface is 1 mm low."""
-MOST_BALLS = 2000
-"""Balls of a solid at most (ours): larger things get larger balls, farther apart. Hands take in a few hundred."""
-BALL_OUTSIDE = 0.0012
-"""How far a ball may reach through the surface elsewhere [m] (ours)."""
-ROUND = 1e-12
-"""Added to the inertia at unit density [m^5], so that a flat cloud has one about every axis (ours)."""
+MOST_BALLS = 2000  # Balls of a solid at most (ours): larger things get larger balls, farther apart. Hands take in a few hundred
+BALL_OUTSIDE = 0.0012  # How far a ball may reach through the surface elsewhere [m] (ours)
+ROUND = 1e-12  # Added to the inertia at unit density [m^5], so that a flat cloud has one about every axis (ours)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,21 +12,15 @@ from scipy.spatial import KDTree
 
 from dro_grasp.objects.cache import Arrays
 
-GRID_SPACING = 0.003
-"""Spacing of a grid of signed distances [m] (ours)."""
-GRID_PADDING = 0.04
-"""Distance that the grid extends beyond the object [m] (ours)."""
-LARGEST_GRID = 8_000_000
-"""Most grid points; a larger object gets a wider spacing (ours)."""
+GRID_SPACING = 0.003  # Spacing of a grid of signed distances [m] (ours)
+GRID_PADDING = 0.04  # Distance that the grid extends beyond the object [m] (ours)
+LARGEST_GRID = 8_000_000  # Most grid points; a larger object gets a wider spacing (ours)
 NEAR = 0.008
 """Distance from a surface up to which a grid that is filled coarsely far away is as exact as one that is not [m] (ours)."""
-STRIDE = 3
-"""Grid points of such a grid, per axis, for each that is computed far away (ours)."""
-DISC_NEIGHBOURS = 7
-"""Points of a bare cloud within the disc around each point, itself included (ours)."""
+STRIDE = 3  # Grid points of such a grid, per axis, for each that is computed far away (ours)
+DISC_NEIGHBOURS = 7  # Points of a bare cloud within the disc around each point, itself included (ours)
 
-Distances = Callable[[Float[np.ndarray, "_ 3"]], Float[np.ndarray, " _"]]
-"""Signed distances of points to one surface [m]."""
+Distances = Callable[[Float[np.ndarray, "_ 3"]], Float[np.ndarray, " _"]]  # Signed distances of points to one surface [m]
 
 
 def bake_grid(surface: Float[np.ndarray, "n 3"], distance: Distances, banded: bool = False) -> Arrays:

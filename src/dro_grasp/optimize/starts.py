@@ -17,18 +17,13 @@ from dro_grasp.kinds import Checked
 from dro_grasp.optimize.grasp_energy import EnergyConfig
 from dro_grasp.optimize.workspace import Surroundings
 
-Direction = tuple[float, float, float]
-"""A vector in the object's frame, of any length but zero."""
-CLEAR = EnergyConfig.clear
-"""Distance from its surroundings at which a hand starts [m]: the one that it keeps later."""
+Direction = tuple[float, float, float]  # A vector in the object's frame, of any length but zero
+CLEAR = EnergyConfig.clear  # Distance from its surroundings at which a hand starts [m]: the one that it keeps later
 LARGEST_TILT = math.radians(60.0)
 """How far palms tilt from the wanted direction towards a plane, where the hand needs room [rad] (ours)."""
-TILT_COST = 0.03
-"""Depth in the surroundings that a tilt of one radian is worth [m/rad] (ours)."""
-APPROACH = 0.10
-"""Length of the straight approach along the palm direction, which a hand has room for [m] (ours)."""
-ROOM_POINTS = 96
-"""Hand points, spread evenly, at which room is measured (ours)."""
+TILT_COST = 0.03  # Depth in the surroundings that a tilt of one radian is worth [m/rad] (ours)
+APPROACH = 0.10  # Length of the straight approach along the palm direction, which a hand has room for [m] (ours)
+ROOM_POINTS = 96  # Hand points, spread evenly, at which room is measured (ours)
 
 
 def lack_of_room(
@@ -104,8 +99,7 @@ def wrist_rotations(
     return (roma.rotvec_to_rotmat(tilt) @ roma.rotvec_to_rotmat(roll[:, None] * wanted) @ align).to(palm)
 
 
-CHOICES = 8
-"""Wrist rotations among which each hand takes the one with most room (ours)."""
+CHOICES = 8  # Wrist rotations among which each hand takes the one with most room (ours)
 
 
 @dataclass(frozen=True)

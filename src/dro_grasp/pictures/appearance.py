@@ -16,26 +16,16 @@ from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 
-PREDICTED_COLOUR: Colour = (0.85, 0.20, 0.55)
-"""Pink of hand points predicted by the network."""
-SOLVED_COLOUR: Colour = (0.15, 0.45, 0.85)
-"""Blue of hand points after the joint solver."""
-CONTACT_COLOUR: Colour = (0.86, 0.10, 0.16)
-"""Red of contact marks."""
-SUCCESS_COLOUR: Colour = (0.16, 0.60, 0.30)
-"""Green of grasps that passed their trial."""
-WAITING_HEIGHT = 0.05
-"""Height of the grasp centre of a waiting hand above the object [m]."""
-CELLS = 28
-"""Cells along each side of the coarse picture that rates a viewpoint."""
-VIEWPOINTS = 96
-"""Viewpoints spread over the sphere."""
-LOWEST_VIEW = -0.5
-"""Smallest height of a camera on the unit sphere, so that none points straight up."""
-LOWEST_OVER_TABLE = 0.3
-"""The same where a table would hide the object from below (ours)."""
-HIGHEST_VIEW = 0.85
-"""Largest height of a camera on the unit sphere, so that none points straight down."""
+PREDICTED_COLOUR: Colour = (0.85, 0.20, 0.55)  # Pink of hand points predicted by the network
+SOLVED_COLOUR: Colour = (0.15, 0.45, 0.85)  # Blue of hand points after the joint solver
+CONTACT_COLOUR: Colour = (0.86, 0.10, 0.16)  # Red of contact marks
+SUCCESS_COLOUR: Colour = (0.16, 0.60, 0.30)  # Green of grasps that passed their trial
+WAITING_HEIGHT = 0.05  # Height of the grasp centre of a waiting hand above the object [m]
+CELLS = 28  # Cells along each side of the coarse picture that rates a viewpoint
+VIEWPOINTS = 96  # Viewpoints spread over the sphere
+LOWEST_VIEW = -0.5  # Smallest height of a camera on the unit sphere, so that none points straight up
+LOWEST_OVER_TABLE = 0.3  # The same where a table would hide the object from below (ours)
+HIGHEST_VIEW = 0.85  # Largest height of a camera on the unit sphere, so that none points straight down
 
 
 def link_colours(hand: Hand) -> list[Colour]:

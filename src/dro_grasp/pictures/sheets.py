@@ -29,26 +29,16 @@ from dro_grasp.pictures.appearance import CONTACT_COLOUR, best_camera, hand_mesh
 from dro_grasp.simulation.closed_poses import held
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 
-TILE = (320, 280)
-"""Width and height of the picture of one grasp [pixels]."""
-PIXELS_AT_ONCE = 2048 * 2048
-"""Pixels that are drawn side by side (ours): bounds the memory."""
-CONTACT_DISTANCE = 0.002
-"""Hand points closer than this to the object's surface count as contacts [m]."""
-CONTACT_RADIUS = 0.0022
-"""Radius of a contact mark [m]."""
-CAPTION = 26
-"""Height of the caption under each picture [pixels]."""
-HEADER = 44
-"""Height of the title of a sheet [pixels]."""
-INK = (40, 44, 52)
-"""Colour of text (red, green, blue, to 255)."""
-FAINT = (120, 126, 136)
-"""Colour of captions of grasps that were not evaluated (red, green, blue, to 255)."""
-HAND_TILE = (300, 280)
-"""Width and height of the picture of one hand [pixels]."""
-OPENNESS = 0.7
-"""Share of the way from closed to open at which hands are drawn (ours)."""
+TILE = (320, 280)  # Width and height of the picture of one grasp [pixels]
+PIXELS_AT_ONCE = 2048 * 2048  # Pixels that are drawn side by side (ours): bounds the memory
+CONTACT_DISTANCE = 0.002  # Hand points closer than this to the object's surface count as contacts [m]
+CONTACT_RADIUS = 0.0022  # Radius of a contact mark [m]
+CAPTION = 26  # Height of the caption under each picture [pixels]
+HEADER = 44  # Height of the title of a sheet [pixels]
+INK = (40, 44, 52)  # Colour of text (red, green, blue, to 255)
+FAINT = (120, 126, 136)  # Colour of captions of grasps that were not evaluated (red, green, blue, to 255)
+HAND_TILE = (300, 280)  # Width and height of the picture of one hand [pixels]
+OPENNESS = 0.7  # Share of the way from closed to open at which hands are drawn (ours)
 
 
 @dataclass(frozen=True)

@@ -19,24 +19,15 @@ from dro_grasp.optimize.starts import APPROACH, angle_to_arc
 from dro_grasp.optimize.workspace import Surroundings
 from dro_grasp.predict.problem import GraspProblem
 
-WAYPOINTS = 9
-"""Places on the approach at which the hand is checked, both ends included (ours)."""
-OPENINGS = 9
-"""Steps in which a pregrasp opens (ours)."""
-PLANE = "in the table"
-"""The hand, or its approach, is below the table."""
-OBSTACLES = "in the scene to avoid"
-"""It meets what stands around the object."""
-SPARED = "in a place to spare"
-"""It meets a ball that is to be left alone."""
-TURNED = "turned away"
-"""The palm points out of the cone."""
-BESIDE = "touching beside the place to hold"
-"""The hand touches the object elsewhere too, or with fewer than two fingers there."""
-NARROW = "too close in pregrasp"
-"""The hand opens less than was asked for."""
-REASONS = {"plane": PLANE, "obstacles": OBSTACLES, "spared": SPARED}
-"""Reason by part of the surroundings."""
+WAYPOINTS = 9  # Places on the approach at which the hand is checked, both ends included (ours)
+OPENINGS = 9  # Steps in which a pregrasp opens (ours)
+PLANE = "in the table"  # The hand, or its approach, is below the table
+OBSTACLES = "in the scene to avoid"  # It meets what stands around the object
+SPARED = "in a place to spare"  # It meets a ball that is to be left alone
+TURNED = "turned away"  # The palm points out of the cone
+BESIDE = "touching beside the place to hold"  # The hand touches the object elsewhere too, or with fewer than two fingers there
+NARROW = "too close in pregrasp"  # The hand opens less than was asked for
+REASONS = {"plane": PLANE, "obstacles": OBSTACLES, "spared": SPARED}  # Reason by part of the surroundings
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,7 @@ from dro_grasp.predict.sources.optimiser import OptimiserConfig
 from dro_grasp.predict.sources.registry import source_or_name
 from dro_grasp.predict.sources.source import AUTO, Source
 
-LARGEST_CALL = 100_000
-"""Most candidates of one call; more do not fit memory."""
+LARGEST_CALL = 100_000  # Most candidates of one call; more do not fit memory
 
 
 @dataclass(frozen=True)

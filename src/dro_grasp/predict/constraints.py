@@ -20,20 +20,13 @@ from dro_grasp.optimize.grasp_energy import Room
 from dro_grasp.optimize.starts import Direction
 from dro_grasp.optimize.workspace import Surroundings
 
-ELSEWHERE = 0.01
-"""A table farther than this from the one in the cloud is another [m] (ours)."""
-UPRIGHT = math.cos(math.radians(5.0))
-"""Least cosine between z and the normal of a table whose height along z is given (ours)."""
-SIDEWAYS = 0.1
-"""Least such cosine of a plane that has a height at all (ours)."""
-TILTED = 1e-6
-"""Largest deviation of a z axis that points upwards (ours)."""
-LARGEST_OPENING = 0.2
-"""Largest opening that is accepted [m] (ours)."""
-MOST_BALLS = 1000
-"""Most balls of a place (ours): each costs time at every step."""
-FEWEST_HELD = 16
-"""Fewest points of an object's cloud that a place to hold must contain (ours)."""
+ELSEWHERE = 0.01  # A table farther than this from the one in the cloud is another [m] (ours)
+UPRIGHT = math.cos(math.radians(5.0))  # Least cosine between z and the normal of a table whose height along z is given (ours)
+SIDEWAYS = 0.1  # Least such cosine of a plane that has a height at all (ours)
+TILTED = 1e-6  # Largest deviation of a z axis that points upwards (ours)
+LARGEST_OPENING = 0.2  # Largest opening that is accepted [m] (ours)
+MOST_BALLS = 1000  # Most balls of a place (ours): each costs time at every step
+FEWEST_HELD = 16  # Fewest points of an object's cloud that a place to hold must contain (ours)
 
 
 @dataclass(frozen=True)

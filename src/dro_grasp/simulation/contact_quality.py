@@ -24,14 +24,10 @@ from dro_grasp.simulation.hand_part import PREFIX
 from dro_grasp.simulation.protocols import PROTOCOLS, Protocol
 from dro_grasp.simulation.scene import TrialScene, scene_of
 
-EDGES = 8
-"""Edges of the pyramid that stands for a friction cone in Q1. Source: DexGraspBench."""
-DISTURBANCE = 0.1
-"""Force to be resisted, of the largest normal force of a contact [1]. Source: DexGraspBench."""
-ALONG_Y = 0.99
-"""Cosine to the y axis from which tangents are taken from the z axis instead [1]. Source: DexGraspBench."""
-HARD = 1e4
-"""Weight of an equation that must hold, beside one of weight 1 (ours): it is off by about its inverse square."""
+EDGES = 8  # Edges of the pyramid that stands for a friction cone in Q1. Source: DexGraspBench
+DISTURBANCE = 0.1  # Force to be resisted, of the largest normal force of a contact [1]. Source: DexGraspBench
+ALONG_Y = 0.99  # Cosine to the y axis from which tangents are taken from the z axis instead [1]. Source: DexGraspBench
+HARD = 1e4  # Weight of an equation that must hold, beside one of weight 1 (ours): it is off by about its inverse square
 
 
 def q1(points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], friction: float) -> float:
@@ -96,16 +92,11 @@ def _grasp_maps(levers: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 
     return maps
 
 
-REACH = 0.01
-"""Largest distance that is measured between a finger and the object [m]. Source: DexGraspBench."""
-TOUCH = 0.002
-"""A link nearer than this to the surface, from outside or inside, touches the object [m]. Source: DexGraspBench."""
-TIP_TOUCH = 0.005
-"""The same for a fingertip, in the measures of force closure [m]. Source: DexGraspBench."""
-CAUTION = 0.5
-"""Share of the friction that the measures of force closure count on [1]. Source: DexGraspBench."""
-NO_CONTACT = 2.0
-"""Wrench error of a grasp that no fingertip touches. Source: DexGraspBench."""
+REACH = 0.01  # Largest distance that is measured between a finger and the object [m]. Source: DexGraspBench
+TOUCH = 0.002  # A link nearer than this to the surface, from outside or inside, touches the object [m]. Source: DexGraspBench
+TIP_TOUCH = 0.005  # The same for a fingertip, in the measures of force closure [m]. Source: DexGraspBench
+CAUTION = 0.5  # Share of the friction that the measures of force closure count on [1]. Source: DexGraspBench
+NO_CONTACT = 2.0  # Wrench error of a grasp that no fingertip touches. Source: DexGraspBench
 
 
 @dataclass(frozen=True)

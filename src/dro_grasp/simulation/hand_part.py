@@ -9,12 +9,9 @@ from jaxtyping import Int
 from dro_grasp.hands.hand import Hand
 from dro_grasp.simulation.protocols import Protocol
 
-HULL_VERTICES = 64
-"""Most vertices of a colliding hull; more only cost time. Ours."""
-EQUALITY_TIME = 0.01
-"""Time constant of joint couplings [s]: the smallest that MuJoCo allows at a time step of 5 ms."""
-PREFIX = "hand/"
-"""Prefix of the hand's names in a scene."""
+HULL_VERTICES = 64  # Most vertices of a colliding hull; more only cost time. Ours
+EQUALITY_TIME = 0.01  # Time constant of joint couplings [s]: the smallest that MuJoCo allows at a time step of 5 ms
+PREFIX = "hand/"  # Prefix of the hand's names in a scene
 
 
 def hand_spec(hand: Hand, protocol: Protocol) -> mujoco.MjSpec:

@@ -23,28 +23,17 @@ from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
 from dro_grasp.simulation.rollout import Rollout, quiet, rollouts
 from dro_grasp.simulation.scene import scene_of
 
-CONTACTS = 16
-"""Most contacts of a grasp that are weighed, those that press hardest (ours)."""
-PUSH = 5.0
-"""Acceleration of the object that the contacts are asked to answer, along each axis and against it [m/s^2] (ours)."""
-FRICTION_SHARE = 0.5
-"""Share of the friction that the answer may use (ours)."""
-LEVER = 0.05
-"""Lever that makes a torque comparable with a force [m] (ours)."""
-CHANGE = 0.3
-"""Cost of doubling or dropping the force of a contact, beside an unanswered push of UNIT (ours)."""
-UNIT = 10.0
-"""Acceleration of the object by which pushes and the forces of contacts are measured [m/s^2] (ours)."""
-BEARS = 0.05
-"""Normal force of a contact above which its slip counts [N] (ours)."""
-EDGES = 6
-"""Edges of a friction cone (ours)."""
-RIDGE = 1e-4
-"""Weight of the squared forces in the solver (ours)."""
-STEPS = 80
-"""Steps of the solver (ours)."""
-NO_ANSWER = 3.0
-"""Largest value of `unanswered`; its value without contacts, and that of `slip` without any that bears (ours)."""
+CONTACTS = 16  # Most contacts of a grasp that are weighed, those that press hardest (ours)
+PUSH = 5.0  # Acceleration of the object that the contacts are asked to answer, along each axis and against it [m/s^2] (ours)
+FRICTION_SHARE = 0.5  # Share of the friction that the answer may use (ours)
+LEVER = 0.05  # Lever that makes a torque comparable with a force [m] (ours)
+CHANGE = 0.3  # Cost of doubling or dropping the force of a contact, beside an unanswered push of UNIT (ours)
+UNIT = 10.0  # Acceleration of the object by which pushes and the forces of contacts are measured [m/s^2] (ours)
+BEARS = 0.05  # Normal force of a contact above which its slip counts [N] (ours)
+EDGES = 6  # Edges of a friction cone (ours)
+RIDGE = 1e-4  # Weight of the squared forces in the solver (ours)
+STEPS = 80  # Steps of the solver (ours)
+NO_ANSWER = 3.0  # Largest value of `unanswered`; its value without contacts, and that of `slip` without any that bears (ours)
 
 
 @dataclass(frozen=True)

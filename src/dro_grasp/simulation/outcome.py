@@ -19,12 +19,9 @@ from dro_grasp.grasps.columns import FAILURE
 from dro_grasp.simulation.contacts import Penetration
 from dro_grasp.simulation.protocols import Protocol
 
-FORCES = np.concatenate([np.eye(3), -np.eye(3)])
-"""Directions of the forces, in the object's frame."""
-DIRECTIONS = ("+x", "+y", "+z", "-x", "-y", "-z")
-"""Their names, in the same order."""
-GIVE_UP = 0.1
-"""An object that moves this far counts as lost [m]. Ours."""
+FORCES = np.concatenate([np.eye(3), -np.eye(3)])  # Directions of the forces, in the object's frame
+DIRECTIONS = ("+x", "+y", "+z", "-x", "-y", "-z")  # Their names, in the same order
+GIVE_UP = 0.1  # An object that moves this far counts as lost [m]. Ours
 
 
 class Failure(Enum):
@@ -134,8 +131,7 @@ def verdict(trials: TrialResult, count: int, needed: int) -> TrialResult:
     return replace(result, robustness=total / count, shown=shown, reason=reason)
 
 
-TEXTS = ("contact_links", "failure", "reason")
-"""Fields of a TrialResult with one entry a grasp that are no tensors."""
+TEXTS = ("contact_links", "failure", "reason")  # Fields of a TrialResult with one entry a grasp that are no tensors
 NUMBERS = tuple(n for n in TrialResult.__dataclass_fields__ if n not in {*TEXTS, "protocol", "asked"})
 """Fields of a TrialResult that are tensors."""
 
@@ -198,8 +194,7 @@ class Measurements:
         return Failure.SLIPPED, f" by {moved * 1e3:.0f} mm"
 
 
-FEW = 0.5
-"""Share of successes below which a user is told what to do next (ours)."""
+FEW = 0.5  # Share of successes below which a user is told what to do next (ours)
 MORE = "propose more candidates for each grasp (--candidates 16), or take them from the optimiser (--method optimise)"
 """What helps against most failures: choosing from more grasps."""
 REMEDIES = {

@@ -12,8 +12,7 @@ from dro_grasp.errors import OptionError
 from dro_grasp.grasps.controller_config import ControllerConfig
 from dro_grasp.kinds import Checked
 
-NAME = re.compile(r"[\w.-]+")
-"""Names of protocols: nothing that stands between the parts of a label."""
+NAME = re.compile(r"[\w.-]+")  # Names of protocols: nothing that stands between the parts of a label
 
 
 @dataclass(frozen=True)
@@ -174,8 +173,7 @@ PROTOCOLS = {
 
 Sources: the paper for `dro`, ours for `strict`, `robust` and `dro_static`, the settings of DexGraspBench.
 """
-DEFAULT_PROTOCOL = "strict"
-"""Name of the protocol of trials for which none is named: the paper's is lenient (ours)."""
+DEFAULT_PROTOCOL = "strict"  # Name of the protocol of trials for which none is named: the paper's is lenient (ours)
 
 
 def protocol(name: str | Protocol) -> Protocol:

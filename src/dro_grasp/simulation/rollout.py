@@ -25,11 +25,9 @@ from dro_grasp.simulation.outcome import FORCES, GIVE_UP
 from dro_grasp.simulation.protocols import Perturbations
 from dro_grasp.simulation.scene import TrialScene, object_mass
 
-FACTORS = ("friction", "mass", "gain")
-"""Conditions that are factors, as in Perturbations."""
+FACTORS = ("friction", "mass", "gain")  # Conditions that are factors, as in Perturbations
 
-RESOLUTION = 1e-4
-"""Grasps that agree to this have the same draws [m or rad]. Ours: another machine rounds otherwise."""
+RESOLUTION = 1e-4  # Grasps that agree to this have the same draws [m or rad]. Ours: another machine rounds otherwise
 
 
 @dataclass(frozen=True)
@@ -82,12 +80,9 @@ def _draw(config: Perturbations, k: int, generator: np.random.Generator) -> dict
     return drawn
 
 
-RAMP = 10
-"""Number of stages in which a gradual protocol moves the servos' targets from one posture to the next. Ours."""
-CHUNK = 64
-"""Grasps simulated together. Ours: bounds memory; the result does not depend on it."""
-STATE = ("qpos", "qvel", "qacc_warmstart")
-"""Quantities that a trial needs to continue from an earlier moment."""
+RAMP = 10  # Number of stages in which a gradual protocol moves the servos' targets from one posture to the next. Ours
+CHUNK = 64  # Grasps simulated together. Ours: bounds memory; the result does not depend on it
+STATE = ("qpos", "qvel", "qacc_warmstart")  # Quantities that a trial needs to continue from an earlier moment
 
 
 @dataclass(frozen=True)
@@ -271,8 +266,7 @@ class _Quiet:
                 mujoco.set_mju_user_warning(self._before)
 
 
-_QUIET = _Quiet()
-"""The only one."""
+_QUIET = _Quiet()  # The only one
 
 
 def quiet() -> _Quiet:

@@ -28,10 +28,8 @@ from dro_grasp.simulation.protocols import Protocol, protocol as find_protocol
 
 SOLVER_ITERATIONS = 20
 """Most iterations of the contact solver. Ours: trials usually need two, and a hundred give the same verdicts."""
-FAR_AWAY = (0.0, 0.0, 5.0)
-"""Place of the object until a grasp is written [m]. Ours."""
-CACHED_SCENES = 8
-"""Scenes that `cached_scene` keeps. Ours: a viewer or a benchmark returns to a few pairs and protocols."""
+FAR_AWAY = (0.0, 0.0, 5.0)  # Place of the object until a grasp is written [m]. Ours
+CACHED_SCENES = 8  # Scenes that `cached_scene` keeps. Ours: a viewer or a benchmark returns to a few pairs and protocols
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,7 @@ from torch.nn import functional
 from dro_grasp.network.encoder import StaticGraphEncoder
 from dro_grasp.train.samples import SampleSource
 
-SAMPLES = 32
-"""Grasping hands that ranks are averaged over."""
+SAMPLES = 32  # Grasping hands that ranks are averaged over
 
 
 def matching_rank(

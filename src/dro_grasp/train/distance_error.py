@@ -17,10 +17,8 @@ from dro_grasp.train.data.bundle.training_file import Bundle
 from dro_grasp.train.losses import divergence
 from dro_grasp.train.samples import SampleSource
 
-SAMPLES = 400
-"""Placements of each hand."""
-AT_ONCE = 50
-"""Placements that pass through the network together."""
+SAMPLES = 400  # Placements of each hand
+AT_ONCE = 50  # Placements that pass through the network together
 
 
 @dataclass(frozen=True)

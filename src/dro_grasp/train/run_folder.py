@@ -22,12 +22,9 @@ from dro_grasp.network.network import DistanceNetwork
 from dro_grasp.network.presets import NetworkConfig
 from dro_grasp.train.data.bundle.training_file import Bundle
 
-CHECKPOINT = "checkpoint.pt"
-"""File with everything that a run needs to resume."""
-LOG = "log.jsonl"
-"""File with one JSON object a line: step, seconds, learning rate and mean losses."""
-ENTRIES = ("step", "seconds", "model", "average", "optimiser", "plan")
-"""Entries of a checkpoint."""
+CHECKPOINT = "checkpoint.pt"  # File with everything that a run needs to resume
+LOG = "log.jsonl"  # File with one JSON object a line: step, seconds, learning rate and mean losses
+ENTRIES = ("step", "seconds", "model", "average", "optimiser", "plan")  # Entries of a checkpoint
 
 
 @dataclass(frozen=True)

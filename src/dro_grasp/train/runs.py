@@ -24,8 +24,7 @@ from dro_grasp.train.config import ScheduleConfig
 from dro_grasp.train.processes import Processes, join, process_count
 from dro_grasp.train.run_folder import RunFolder
 
-SECONDS_BETWEEN_LINES = 10.0
-"""Least time between two lines on the console [s]. Source: ours."""
+SECONDS_BETWEEN_LINES = 10.0  # Least time between two lines on the console [s]. Source: ours
 
 
 @dataclass(frozen=True)
@@ -37,8 +36,7 @@ class RunProgress:
     share: float
 
 
-Report = Callable[[RunProgress, dict[str, float]], None]
-"""Called with a run's progress and the mean losses since the last call."""
+Report = Callable[[RunProgress, dict[str, float]], None]  # Called with a run's progress and the mean losses since the last call
 
 
 def console_report(title: str) -> Report:
@@ -74,8 +72,7 @@ def tensorboard_report(folder: Path) -> Report:
     return report
 
 
-Losses = dict[str, Float[Tensor, ""]]
-"""Losses of a batch by name; `total` is minimised."""
+Losses = dict[str, Float[Tensor, ""]]  # Losses of a batch by name; `total` is minimised
 
 
 class TrainingRun:

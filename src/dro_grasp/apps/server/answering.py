@@ -40,10 +40,8 @@ from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.source import Progress
 from dro_grasp.predict.stages import evaluate
 
-MAX_PROBLEMS = 8
-"""Most pairs of hand and object, with constraints, of which all that was derived stays (ours)."""
-MAX_CANDIDATES = 1_000
-"""Most candidates of one request (ours): a server answers robots, `generate` fills files."""
+MAX_PROBLEMS = 8  # Most pairs of hand and object, with constraints, of which all that was derived stays (ours)
+MAX_CANDIDATES = 1_000  # Most candidates of one request (ours): a server answers robots, `generate` fills files
 
 
 @dataclass(frozen=True)

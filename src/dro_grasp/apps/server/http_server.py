@@ -25,12 +25,9 @@ from dro_grasp.apps.server.messages import GraspAnswer, GraspCall, Refusal
 from dro_grasp.apps.server.request_queue import Reply, RequestQueue, refused
 from dro_grasp.errors import OptionError, ServerError
 
-BODY_TIMEOUT = 30.0
-"""Time within which the whole of a request must arrive [s] (ours)."""
-SHUTDOWN_TIMEOUT = 10.0
-"""Time that requests under way get to end when the server is stopped [s] (ours)."""
-MAX_CONNECTIONS = 128
-"""Most open connections (ours)."""
+BODY_TIMEOUT = 30.0  # Time within which the whole of a request must arrive [s] (ours)
+SHUTDOWN_TIMEOUT = 10.0  # Time that requests under way get to end when the server is stopped [s] (ours)
+MAX_CONNECTIONS = 128  # Most open connections (ours)
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, create_model, field_validator
 from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.constraints import Constraints
 
-MAX_POINTS = 200_000
-"""Most points of a cloud that is sent as numbers (ours); files may hold more."""
+MAX_POINTS = 200_000  # Most points of a cloud that is sent as numbers (ours); files may hold more
 Point = tuple[float, float, float]
 Row = tuple[float, float, float, float]
 Settings = TypeVar("Settings")

@@ -38,8 +38,7 @@ def refused(status: HTTPStatus, why: str) -> Reply:
     return Reply(status, json.dumps({"error": why}).encode())
 
 
-CANCELLED = refused(HTTPStatus.CONFLICT, "the request was cancelled")
-"""The reply to a request that is no longer wanted."""
+CANCELLED = refused(HTTPStatus.CONFLICT, "the request was cancelled")  # The reply to a request that is no longer wanted
 
 
 class Ready(NamedTuple):

@@ -16,20 +16,13 @@ from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.constraints import Constraints
 
-ANY: str = "any"
-"""The choice of every palm direction."""
-NOTHING: str = "nothing"
-"""The choice of no scene."""
-OBJECT_FILES = ".stl,.obj,.ply,.glb,.off,.npy,.pcd"
-"""Files of objects and scenes that a browser offers to upload."""
-TABLE_SIZE = 0.5
-"""Edge of the table that is drawn [m] (ours)."""
-AVOIDED = (0.75, 0.35, 0.3)
-"""Colour of what the hand stays clear of (ours)."""
-HELD = (0.3, 0.65, 0.4)
-"""Colour of the place to hold (ours)."""
-TABLE = (0.82, 0.80, 0.76)
-"""Colour of the table (ours)."""
+ANY: str = "any"  # The choice of every palm direction
+NOTHING: str = "nothing"  # The choice of no scene
+OBJECT_FILES = ".stl,.obj,.ply,.glb,.off,.npy,.pcd"  # Files of objects and scenes that a browser offers to upload
+TABLE_SIZE = 0.5  # Edge of the table that is drawn [m] (ours)
+AVOIDED = (0.75, 0.35, 0.3)  # Colour of what the hand stays clear of (ours)
+HELD = (0.3, 0.65, 0.4)  # Colour of the place to hold (ours)
+TABLE = (0.82, 0.80, 0.76)  # Colour of the table (ours)
 
 
 class ConstraintPanel:

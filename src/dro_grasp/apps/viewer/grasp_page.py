@@ -27,14 +27,11 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pictures.sheets import after_closing, contact_points, outcome, protocol_name, shows_held
 from dro_grasp.simulation.trial import record
 
-FRAME_TIME = 0.04
-"""Time between two pictures of a trial [s] (ours)."""
+FRAME_TIME = 0.04  # Time between two pictures of a trial [s] (ours)
 Posture = Literal["held", "open", "pregrasp", "grasp", "squeeze"]
 """Stages of closing the hand; the first is that after closing in a trial."""
-GRASP_FILE = "grasp file (Parquet)"
-"""Choice of the grasp file itself among the formats that can be downloaded."""
-EXPORTS = (GRASP_FILE, *(form.title for form in FORMATS.values() if not form.file_per_grasp))
-"""What can be downloaded."""
+GRASP_FILE = "grasp file (Parquet)"  # Choice of the grasp file itself among the formats that can be downloaded
+EXPORTS = (GRASP_FILE, *(form.title for form in FORMATS.values() if not form.file_per_grasp))  # What can be downloaded
 
 
 @dataclass(frozen=True)

@@ -26,16 +26,11 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pictures.appearance import SOLVED_COLOUR, SUCCESS_COLOUR
 from dro_grasp.predict.predictor import GraspPredictor
 
-RATE = 25.0
-"""Pictures a second (ours)."""
-DROPPED_COLOUR: Colour = (0.62, 0.62, 0.62)
-"""Grey of grasps that were dropped."""
-WAITING_COLOUR: Colour = (0.93, 0.80, 0.35)
-"""Yellow of grasps that were not tried."""
-NONE = "none"
-"""Choice of no grasps."""
-EVERY = "all"
-"""Choice of every grasp."""
+RATE = 25.0  # Pictures a second (ours)
+DROPPED_COLOUR: Colour = (0.62, 0.62, 0.62)  # Grey of grasps that were dropped
+WAITING_COLOUR: Colour = (0.93, 0.80, 0.35)  # Yellow of grasps that were not tried
+NONE = "none"  # Choice of no grasps
+EVERY = "all"  # Choice of every grasp
 
 
 @dataclass(frozen=True, eq=False)

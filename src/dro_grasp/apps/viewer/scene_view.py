@@ -31,27 +31,17 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.pictures import appearance
 
-MAX_CONNECTIONS = 64
-"""Most open connections to one page (ours)."""
-HOST = "127.0.0.1"
-"""Default address: only this machine can connect."""
-POINT_SIZE = 0.0022
-"""Size of a drawn point [m]."""
-CAMERA_DISTANCE = 1.15
-"""Initial camera distance, as a multiple of that of a picture."""
-ASPECT = 4 / 3
-"""Width over height of a window from which on nothing is cut off."""
-NARROW = 1.0
-"""Width over height of a window below which the panel covers its lower half, as on a phone."""
-RAISED = 0.27
-"""Share of its height by which hand and object then stand above the middle (ours)."""
-GRID_DEPTH = 0.12
-"""Distance from the object's lowest point down to the grid [m]."""
+MAX_CONNECTIONS = 64  # Most open connections to one page (ours)
+HOST = "127.0.0.1"  # Default address: only this machine can connect
+POINT_SIZE = 0.0022  # Size of a drawn point [m]
+CAMERA_DISTANCE = 1.15  # Initial camera distance, as a multiple of that of a picture
+ASPECT = 4 / 3  # Width over height of a window from which on nothing is cut off
+NARROW = 1.0  # Width over height of a window below which the panel covers its lower half, as on a phone
+RAISED = 0.27  # Share of its height by which hand and object then stand above the middle (ours)
+GRID_DEPTH = 0.12  # Distance from the object's lowest point down to the grid [m]
 
-Point = tuple[float, float, float]
-"""A place [m]."""
-Client = viser.ViserServer | viser.ClientHandle
-"""Whose page it is: that of all browsers, or of one."""
+Point = tuple[float, float, float]  # A place [m]
+Client = viser.ViserServer | viser.ClientHandle  # Whose page it is: that of all browsers, or of one
 
 
 class SceneView:

@@ -34,16 +34,12 @@ from dro_grasp.predict.stages import evaluate
 from dro_grasp.simulation.outcome import diagnose
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 
-MAX_GRASPS = 64
-"""Most grasps of one click (ours)."""
-MAX_CANDIDATES = 8
-"""Most candidates for each of them (ours)."""
-TURN_POLL = 0.5
-"""Time after which a page that waits for another looks whether it is still open [s] (ours)."""
+MAX_GRASPS = 64  # Most grasps of one click (ours)
+MAX_CANDIDATES = 8  # Most candidates for each of them (ours)
+TURN_POLL = 0.5  # Time after which a page that waits for another looks whether it is still open [s] (ours)
 UPLOAD_TIMEOUT = 10.0
 """Time that an upload waits to be picked while the page does other work, such as loading its first pair [s] (ours)."""
-CLOSE_TIMEOUT = 5.0
-"""Time that a closed page has to end what it does before its uploads are deleted [s] (ours)."""
+CLOSE_TIMEOUT = 5.0  # Time that a closed page has to end what it does before its uploads are deleted [s] (ours)
 
 
 class Studio(GraspPage):

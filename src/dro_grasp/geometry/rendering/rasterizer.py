@@ -10,16 +10,11 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int, Num, UInt8
 
-Colour = tuple[float, float, float]
-"""Red, green, blue between 0 and 1."""
-OBJECT_COLOUR: Colour = (0.95, 0.62, 0.28)
-"""Orange of objects that are grasped."""
-NEAR = 1e-3
-"""Triangles closer to the camera than this are not drawn [m] (ours)."""
-ROWS_AT_ONCE = 200_000
-"""Rows of pixels, of all triangles, that are drawn together (ours): bounds the memory."""
-SAMPLES_AT_ONCE = 500_000
-"""Samples that are shaded together (ours); likewise."""
+Colour = tuple[float, float, float]  # Red, green, blue between 0 and 1
+OBJECT_COLOUR: Colour = (0.95, 0.62, 0.28)  # Orange of objects that are grasped
+NEAR = 1e-3  # Triangles closer to the camera than this are not drawn [m] (ours)
+ROWS_AT_ONCE = 200_000  # Rows of pixels, of all triangles, that are drawn together (ours): bounds the memory
+SAMPLES_AT_ONCE = 500_000  # Samples that are shaded together (ours); likewise
 
 
 @dataclass(frozen=True)

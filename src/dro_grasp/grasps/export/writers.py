@@ -24,8 +24,7 @@ from dro_grasp.grasps.export.formats import ExportJob
 from dro_grasp.grasps.sources import camera_pose, frame_of
 from dro_grasp.hands.hand import Hand
 
-OBJECT = "object"
-"""Name of the frame that grasps are stored in: that of the object's mesh or cloud."""
+OBJECT = "object"  # Name of the frame that grasps are stored in: that of the object's mesh or cloud
 
 
 @dataclass(frozen=True)
@@ -148,12 +147,9 @@ def isaac_grasp(grasps: GraspBatch, frame: Frame) -> str:
     return comment(grasps, frame) + (note if unknown else "") + yaml_text(content)
 
 
-APPROACH = 0.10
-"""Wished path of the hand along its palm direction before the grasp [m] (ours)."""
-RETREAT = 0.10
-"""Wished path away from the grasp [m] (ours)."""
-SHORTEST = 0.02
-"""Least path of either [m] (ours)."""
+APPROACH = 0.10  # Wished path of the hand along its palm direction before the grasp [m] (ours)
+RETREAT = 0.10  # Wished path away from the grasp [m] (ours)
+SHORTEST = 0.02  # Least path of either [m] (ours)
 
 
 def moveit_grasps(grasps: GraspBatch, hand: Hand, frame: Frame) -> str:

@@ -21,22 +21,15 @@ from scipy.optimize import least_squares
 from dro_grasp.hands.description.compiling import Note, compile_hand
 
 Joints = Float[np.ndarray, " n"]  # a value of each joint
-CLOSED = 1e-3
-"""Largest gap of a loop that counts as closed [m or rad] (ours)."""
-STEPS = 32
-"""Steps from one end of a leader's range to the other (ours)."""
-SPRING = 1e-2
-"""Weight of the strongest spring beside a gap, which counts in units of `CLOSED` (ours)."""
-STAY = 1e-3
-"""Weight of staying where a joint was a step before, which decides where nothing else does (ours)."""
+CLOSED = 1e-3  # Largest gap of a loop that counts as closed [m or rad] (ours)
+STEPS = 32  # Steps from one end of a leader's range to the other (ours)
+SPRING = 1e-2  # Weight of the strongest spring beside a gap, which counts in units of `CLOSED` (ours)
+STAY = 1e-3  # Weight of staying where a joint was a step before, which decides where nothing else does (ours)
 OFF_CENTRE = 0.1
 """Share of the way to the middle of the ranges at which freedoms are counted: at their start, some are singular (ours)."""
-STRAIGHT = 0.05
-"""Largest distance from a linear rule that is no reason for a warning [rad or m] (ours)."""
-STILL = 1e-3
-"""Motion over a leader's whole range below which a joint is held [rad or m] (ours)."""
-MINOR = 0.1
-"""Share of a joint's motion that other leaders may make without a warning (ours)."""
+STRAIGHT = 0.05  # Largest distance from a linear rule that is no reason for a warning [rad or m] (ours)
+STILL = 1e-3  # Motion over a leader's whole range below which a joint is held [rad or m] (ours)
+MINOR = 0.1  # Share of a joint's motion that other leaders may make without a warning (ours)
 
 
 def driven_joints(spec: mujoco.MjSpec) -> set[str]:

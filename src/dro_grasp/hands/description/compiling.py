@@ -17,23 +17,17 @@ from jaxtyping import Float
 
 from dro_grasp.errors import HandError
 
-LEAST_MASS = 1e-4
-"""Mass of moving links that state none, or a negative one [kg] (ours)."""
-LEAST_INERTIA = 1e-8
-"""Inertia of moving links that state none [kg m^2] (ours)."""
-MOST_JOINTS = 100
-"""Most joints that move (ours); a humanoid with two hands has some 80."""
-LONGEST = 10.0
-"""Largest coordinate, size or travel of a slide [m] (ours)."""
+LEAST_MASS = 1e-4  # Mass of moving links that state none, or a negative one [kg] (ours)
+LEAST_INERTIA = 1e-8  # Inertia of moving links that state none [kg m^2] (ours)
+MOST_JOINTS = 100  # Most joints that move (ours); a humanoid with two hands has some 80
+LONGEST = 10.0  # Largest coordinate, size or travel of a slide [m] (ours)
 MOST_TURN = 25.0
 """Largest limit of a joint that turns [rad] (ours): four turns; no finger, wrist or arm makes more than two either way. In
 degrees, the limits of a finger are beyond it."""
 LEAST_TURN = 0.1
 """Range of a hand's widest turning joint below which its limits look like radians that were read as degrees [rad] (ours)."""
-TURNS = 1e4
-"""Largest reference angle [rad], and largest ratio or offset of a coupling (ours)."""
-HEAVIEST = 1e4
-"""Largest mass [kg] and inertia [kg m^2] (ours)."""
+TURNS = 1e4  # Largest reference angle [rad], and largest ratio or offset of a coupling (ours)
+HEAVIEST = 1e4  # Largest mass [kg] and inertia [kg m^2] (ours)
 NUMBERS = (
     ("link", "body_pos", "origin", LONGEST), ("link", "body_quat", "rotation", 2.0),
     ("shape", "geom_pos", "origin", LONGEST), ("shape", "geom_quat", "rotation", 2.0), ("shape", "geom_size", "size", LONGEST),

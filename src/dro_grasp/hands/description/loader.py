@@ -28,8 +28,7 @@ from dro_grasp.hands.description.urdf import as_obj, prepare_urdf
 from dro_grasp.hands.description.xml_files import included_files, parse_xml
 from dro_grasp.hands.kinematics.tree import KinematicTree
 
-OPEN = "open"
-"""Name of the state or keyframe (ours; MoveIt's own examples use it)."""
+OPEN = "open"  # Name of the state or keyframe (ours; MoveIt's own examples use it)
 
 
 def load_description(path: Path | str, link: str | None = None, *, arm: bool = False) -> Description:

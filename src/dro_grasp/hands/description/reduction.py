@@ -11,12 +11,9 @@ from dro_grasp.errors import HandError
 from dro_grasp.hands.description.closed_loops import couple_closed_loops, driven_joints, is_linear
 from dro_grasp.hands.description.compiling import MOST_JOINTS, Note
 
-NO_LIMITS = "states no limits"
-"""Beginning of the note of a joint whose limits had to be assumed."""
-CONTINUOUS_LIMIT = math.pi
-"""Limits of hinges that state none, both ways from zero [rad] (ours)."""
-SLIDE_LIMIT = 0.05
-"""Limits of slides that state none, both ways from zero [m] (ours)."""
+NO_LIMITS = "states no limits"  # Beginning of the note of a joint whose limits had to be assumed
+CONTINUOUS_LIMIT = math.pi  # Limits of hinges that state none, both ways from zero [rad] (ours)
+SLIDE_LIMIT = 0.05  # Limits of slides that state none, both ways from zero [m] (ours)
 
 
 def keep_hand_only(spec: mujoco.MjSpec, path: Path, *, fixed_base: bool = False) -> tuple[Note, ...]:

@@ -20,8 +20,7 @@ from dro_grasp.hands.kinematics.tree import FIXED, PRISMATIC, REVOLUTE, Kinemati
 if TYPE_CHECKING:
     import trimesh
 
-BEYOND = 0.02
-"""Least motion beyond a follower's own limits that is told [rad or m] (ours)."""
+BEYOND = 0.02  # Least motion beyond a follower's own limits that is told [rad or m] (ours)
 NARROWEST = 0.2
 """Share of a leading joint's range that its followers' limits must leave; narrower limits count as mistakes (ours)."""
 

@@ -17,8 +17,7 @@ from dro_grasp.geometry.mesh_files import open_mesh
 from dro_grasp.hands.description.compiling import LEAST_INERTIA, LEAST_MASS, Note
 from dro_grasp.hands.description.xml_files import DEEPEST
 
-MOVING = {"revolute", "continuous", "prismatic"}
-"""URDF joint types with one degree of freedom."""
+MOVING = {"revolute", "continuous", "prismatic"}  # URDF joint types with one degree of freedom
 
 
 def prepare_urdf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[str, list[Path], dict[str, Path]]:

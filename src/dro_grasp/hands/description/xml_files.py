@@ -12,18 +12,12 @@ import defusedxml.ElementTree
 from dro_grasp.errors import HandError
 from dro_grasp.files import command
 
-DEEPEST = 100
-"""Most elements within each other, and most links one below the other (ours); the deepest hand known to us has 30."""
-MOST_ELEMENTS = 50_000
-"""Most elements of one file (ours)."""
-MOST_LINKS = 1_000
-"""Most links, after repetitions (ours); a tactile hand with a frame for every taxel has some 500."""
-MOST_BYTES = 20_000_000
-"""Largest description [bytes] (ours)."""
-MOST_PIXELS = 10_000
-"""Most pixels of a generated texture along each side (ours)."""
-MOST_DIVISIONS = 200.0
-"""Most divisions of a generated mesh in each direction (ours); 10,000 would take a minute and 7 GB."""
+DEEPEST = 100  # Most elements within each other, and most links one below the other (ours); the deepest hand known to us has 30
+MOST_ELEMENTS = 50_000  # Most elements of one file (ours)
+MOST_LINKS = 1_000  # Most links, after repetitions (ours); a tactile hand with a frame for every taxel has some 500
+MOST_BYTES = 20_000_000  # Largest description [bytes] (ours)
+MOST_PIXELS = 10_000  # Most pixels of a generated texture along each side (ours)
+MOST_DIVISIONS = 200.0  # Most divisions of a generated mesh in each direction (ours); 10,000 would take a minute and 7 GB
 UNUSED = {"composite", "flexcomp", "flex", "hfield", "skin", "plugin"}
 """Elements of MJCF that no rigid hand has, and that can grow without limit (ours)."""
 

@@ -15,10 +15,8 @@ from torch import Tensor
 from dro_grasp.geometry.se3 import invert, rotate
 from dro_grasp.hands.kinematics.tree import FIXED, REVOLUTE, KinematicTree
 
-ROUNDS = 8
-"""Sweeps of coordinate descent where several joints lie between two known links (ours)."""
-RIDGE = 1e-6
-"""Pull towards the given values, for joints that no pose determines [1] (ours)."""
+ROUNDS = 8  # Sweeps of coordinate descent where several joints lie between two known links (ours)
+RIDGE = 1e-6  # Pull towards the given values, for joints that no pose determines [1] (ours)
 
 
 @torch.no_grad()

@@ -16,14 +16,10 @@ from torch import Tensor
 from dro_grasp.devices import cached_tensor
 from dro_grasp.geometry.se3 import apply, rotate
 
-FIXED = 0
-"""Kind of a link that does not move against its parent (ours)."""
-REVOLUTE = 1
-"""Kind of a link that turns about its joint's axis (ours)."""
-PRISMATIC = 2
-"""Kind of a link that slides along its joint's axis (ours)."""
-SLIDING_UNIT = 0.03
-"""Travel of a prismatic joint that moves a hand about as much as 1 rad of a revolute one [m] (ours)."""
+FIXED = 0  # Kind of a link that does not move against its parent (ours)
+REVOLUTE = 1  # Kind of a link that turns about its joint's axis (ours)
+PRISMATIC = 2  # Kind of a link that slides along its joint's axis (ours)
+SLIDING_UNIT = 0.03  # Travel of a prismatic joint that moves a hand about as much as 1 rad of a revolute one [m] (ours)
 
 
 @dataclass(frozen=True)

@@ -20,22 +20,14 @@ from dro_grasp.network.completion_network import SurfaceNetwork, shipped_surface
 from dro_grasp.objects.perception.symmetry import Guess, VisibleSide, project
 from dro_grasp.objects.surface_distances import cloud_distances
 
-GUESSES = 5
-"""Symmetries that the network chooses between (ours)."""
-VISIBLE_POINTS = 2048
-"""Most visible points that guesses are made of (ours)."""
-THINNEST = 1e-4
-"""Width in the image below which nothing can be said of the other side [m] (ours)."""
-CELLS = 20_000
-"""Approximate number of grid cells for the surface (ours): edges of 5 mm for a large can, 1 mm for a die."""
-MARGIN = 0.01
-"""Distance that the grid extends beyond all guesses [m] (ours)."""
-SPREAD = 40_000
-"""Points that are moved onto the surface (ours)."""
-SMALL = 0.01
-"""Distance that the network receives as about 1/2 [m] (ours)."""
-LENGTH = 0.05
-"""Length that the network receives as 1 [m] (ours)."""
+GUESSES = 5  # Symmetries that the network chooses between (ours)
+VISIBLE_POINTS = 2048  # Most visible points that guesses are made of (ours)
+THINNEST = 1e-4  # Width in the image below which nothing can be said of the other side [m] (ours)
+CELLS = 20_000  # Approximate number of grid cells for the surface (ours): edges of 5 mm for a large can, 1 mm for a die
+MARGIN = 0.01  # Distance that the grid extends beyond all guesses [m] (ours)
+SPREAD = 40_000  # Points that are moved onto the surface (ours)
+SMALL = 0.01  # Distance that the network receives as about 1/2 [m] (ours)
+LENGTH = 0.05  # Length that the network receives as 1 [m] (ours)
 
 
 class CompletedCloud(NamedTuple):

@@ -22,8 +22,7 @@ from dro_grasp.objects.shape import ObjectModel
 
 View = Literal["whole", "cloud", "half", "depth"]
 """The mesh; all surface points without the mesh; half of them; the points of a depth image."""
-POINTS = 1024
-"""Points of the paper's half of a cloud (twice the network's 512 points)."""
+POINTS = 1024  # Points of the paper's half of a cloud (twice the network's 512 points)
 
 
 def partial_view(obj: ObjectModel, view: View, seed: int, camera: DepthCamera | None = None) -> ObjectModel:

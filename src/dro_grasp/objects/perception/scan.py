@@ -21,8 +21,7 @@ from dro_grasp.objects.perception.completion import complete_cloud
 from dro_grasp.objects.reading import numbers, read_points
 from dro_grasp.objects.shape import CLOUD_POINTS, ObjectModel
 
-NEIGHBOURS = 12
-"""Neighbours that decide whether a point is an outlier (ours)."""
+NEIGHBOURS = 12  # Neighbours that decide whether a point is an outlier (ours)
 
 
 def depth_points(depth: ArrayLike, intrinsics: ArrayLike, mask: ArrayLike | None = None) -> Float[np.ndarray, "n 3"]:

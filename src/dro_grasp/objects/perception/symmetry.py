@@ -19,22 +19,14 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-SAMPLE = 300
-"""Visible points that judge a symmetry (ours)."""
-DEPTHS = (-0.1, -0.05, 0.0, 0.05, 0.1, 0.2, 0.3, 0.5)
-"""Depths of the centre c behind the rim [widths] (ours)."""
-TILTS = (0.3, 0.6, 0.9)
-"""Angles between mirror planes and the image [rad] (ours)."""
-TURNS = 8
-"""Directions of the tilt, and axes of half turns in the image (ours)."""
-STRAIGHT_DOWN = 0.999
-"""Cosine between view and vertical above which a camera counts as looking straight down (ours)."""
-TOLERANCE = 0.003
-"""Deviation from the visible side that counts as noise [m] (ours)."""
-STRAY = 0.02
-"""Share of points that may lie below the end of the visible side, and above its top (ours)."""
-RIM_RADIUS = 0.12
-"""With a camera: radius of the neighbourhood that tells rim points [widths] (ours)."""
+SAMPLE = 300  # Visible points that judge a symmetry (ours)
+DEPTHS = (-0.1, -0.05, 0.0, 0.05, 0.1, 0.2, 0.3, 0.5)  # Depths of the centre c behind the rim [widths] (ours)
+TILTS = (0.3, 0.6, 0.9)  # Angles between mirror planes and the image [rad] (ours)
+TURNS = 8  # Directions of the tilt, and axes of half turns in the image (ours)
+STRAIGHT_DOWN = 0.999  # Cosine between view and vertical above which a camera counts as looking straight down (ours)
+TOLERANCE = 0.003  # Deviation from the visible side that counts as noise [m] (ours)
+STRAY = 0.02  # Share of points that may lie below the end of the visible side, and above its top (ours)
+RIM_RADIUS = 0.12  # With a camera: radius of the neighbourhood that tells rim points [widths] (ours)
 TURNS_AWAY = 0.35
 """Cosine between normal and ray below which the surface at the rim turns away; above, it ends at an edge (ours)."""
 

@@ -20,14 +20,10 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.controller import completed
 from dro_grasp.optimize.grasp_energy import TERMS, GraspEnergy, NearestPoints
 
-NEAR = 0.005
-"""Distance from the surface at which a link's nearness is 1/e [m] (ours)."""
-LENGTH = 0.05
-"""Positions and sizes are given to the network in this unit [m] (ours)."""
-MOTION = 0.01
-"""Gaps and motions are given to the network in this unit [m] (ours)."""
-FARTHEST = 0.05
-"""Links farther away than this look alike [m] (ours)."""
+NEAR = 0.005  # Distance from the surface at which a link's nearness is 1/e [m] (ours)
+LENGTH = 0.05  # Positions and sizes are given to the network in this unit [m] (ours)
+MOTION = 0.01  # Gaps and motions are given to the network in this unit [m] (ours)
+FARTHEST = 0.05  # Links farther away than this look alike [m] (ours)
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,9 @@ from dro_grasp.network.checkpoints import SHIPPED_FOLDER, load_small
 if TYPE_CHECKING:
     from dro_grasp.simulation.holding import Holding
 
-SHIPPED = SHIPPED_FOLDER / "ranking" / "holding.safetensors"
-"""The model that ships."""
-FEATURES = 11
-"""Numbers of each grasp that the network sees; see `holding_features`."""
-LEAST_MOTION = 1e-4
-"""Motions below this look alike [m, rad, m/s, rad/s] (ours)."""
+SHIPPED = SHIPPED_FOLDER / "ranking" / "holding.safetensors"  # The model that ships
+FEATURES = 11  # Numbers of each grasp that the network sees; see `holding_features`
+LEAST_MOTION = 1e-4  # Motions below this look alike [m, rad, m/s, rad/s] (ours)
 
 
 class HoldingScore(nn.Module):

@@ -22,8 +22,7 @@ from dro_grasp.network.checkpoints import SHIPPED_FOLDER, history_of, load_small
 from dro_grasp.optimize.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.predict.score.features import GRASP_FEATURES, LINK_FEATURES, feature_names, grasp_features
 
-SHIPPED = SHIPPED_FOLDER / "ranking" / "quality.safetensors"
-"""The network that ships."""
+SHIPPED = SHIPPED_FOLDER / "ranking" / "quality.safetensors"  # The network that ships
 FEATURES_KEY = "features"
 """What a weights file records about the network's inputs: the list of features that it was trained with."""
 

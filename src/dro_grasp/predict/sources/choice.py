@@ -20,11 +20,9 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
 from dro_grasp.optimize.grasp_energy import Room
 
-CROWDING_POINTS = 64
-"""Hand points, spread evenly, between which the distance of fingers is measured (ours)."""
+CROWDING_POINTS = 64  # Hand points, spread evenly, between which the distance of fingers is measured (ours)
 
-LEAST_PART = 1e-6
-"""Sum of the fingers' parts below which they count as not near at all (ours)."""
+LEAST_PART = 1e-6  # Sum of the fingers' parts below which they count as not near at all (ours)
 
 
 @dataclass(frozen=True)

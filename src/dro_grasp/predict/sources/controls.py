@@ -18,8 +18,7 @@ from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.choice import ChoiceConfig, choice_scores
 from dro_grasp.predict.sources.source import Progress, Source
 
-CHOICE_POINTS = 160
-"""Hand points by which a rotation of the mean grasp is chosen; as many as the shipped weights see (ours)."""
+CHOICE_POINTS = 160  # Hand points by which a rotation of the mean grasp is chosen; as many as the shipped weights see (ours)
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,7 @@ from dro_grasp.predict.sources.choice import ChoiceConfig, choice_scores
 from dro_grasp.predict.sources.source import Candidates, Progress, Source
 from dro_grasp.predict.stopwatch import Stopwatch
 
-HIGHEST_TEMPERATURE = 2.0
-"""Highest temperature that is accepted; 1 is what the weights were trained for (ours)."""
+HIGHEST_TEMPERATURE = 2.0  # Highest temperature that is accepted; 1 is what the weights were trained for (ours)
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from dro_grasp.predict.admission import facing
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.source import POINTS, Candidates, Progress, Source
 
-DESCENT_STEPS = 1200
-"""Steps of a descent that is not settled: ten times those of the data engine (ours)."""
+DESCENT_STEPS = 1200  # Steps of a descent that is not settled: ten times those of the data engine (ours)
 
 
 @dataclass(frozen=True)

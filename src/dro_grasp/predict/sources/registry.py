@@ -17,12 +17,9 @@ from dro_grasp.predict.sources.source import AUTO, Source
 
 SOURCES: dict[str, Callable[[], Any]] = {"dfc": DescentSource, "start": StartSource}
 """What makes each source that needs nothing; `register_source` adds yours. A predictor has `network` and `optimiser` too."""
-OF_THE_PREDICTOR = ("network", "optimiser")
-"""Sources that a predictor makes, with its weights and configuration."""
-FORMER_NAMES = {"optimise": "optimiser", "synthesise": "optimiser", "dro": AUTO}
-"""Names of before, which are still taken."""
-WITH_DATA = ("mean-grasp", "mean-grasp-chosen")
-"""Controls that need the mean of training grasps."""
+OF_THE_PREDICTOR = ("network", "optimiser")  # Sources that a predictor makes, with its weights and configuration
+FORMER_NAMES = {"optimise": "optimiser", "synthesise": "optimiser", "dro": AUTO}  # Names of before, which are still taken
+WITH_DATA = ("mean-grasp", "mean-grasp-chosen")  # Controls that need the mean of training grasps
 
 
 def register_source(name: str, factory: Callable[[], Any]) -> None:

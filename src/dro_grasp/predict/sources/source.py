@@ -16,12 +16,9 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.stopwatch import Stopwatch
 
-Progress = Callable[[int, int], None]
-"""Called with (candidates made so far, candidates wanted)."""
-AUTO = "auto"
-"""The rule: the network proposes, and the optimiser adds rivals for the grasps that the score does not trust."""
-POINTS = 160
-"""Hand points that are kept beside a candidate whose source states none, as many as the shipped weights see (ours)."""
+Progress = Callable[[int, int], None]  # Called with (candidates made so far, candidates wanted)
+AUTO = "auto"  # The rule: the network proposes, and the optimiser adds rivals for the grasps that the score does not trust
+POINTS = 160  # Hand points that are kept beside a candidate whose source states none, as many as the shipped weights see (ours)
 
 
 @dataclass(frozen=True)

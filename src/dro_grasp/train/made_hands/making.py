@@ -24,20 +24,13 @@ from dro_grasp.kinds import checked
 from dro_grasp.train.made_hands.plan import HandPlan, write_urdf
 from dro_grasp.train.made_hands.sampling import sample_plan
 
-MOST_DRAWS = 200
-"""Draws after which a seed is given up (ours; the first one or two are usually kept)."""
-PALM_COSINE = 0.8
-"""Least cosine between the derived palm direction and the planned one (ours)."""
-TOUCHING = 5e-4
-"""Deepest penetration of the open hand's links [m] (ours)."""
-MEETING = 0.03
-"""Largest distance to which each fingertip comes to one that closes against it, from middle to middle [m] (ours)."""
-FEWEST_WITH_SPARE = 4
-"""From this number of fingers on, one of them may meet no other, as little fingers do (ours)."""
-POSTURES = 1024
-"""Random postures in which fingertips are looked for near each other (ours)."""
-SWEEP = (0.25, 0.75)
-"""Shares of the way from closed to open at which fingertips must be in front of the palm (ours)."""
+MOST_DRAWS = 200  # Draws after which a seed is given up (ours; the first one or two are usually kept)
+PALM_COSINE = 0.8  # Least cosine between the derived palm direction and the planned one (ours)
+TOUCHING = 5e-4  # Deepest penetration of the open hand's links [m] (ours)
+MEETING = 0.03  # Largest distance to which each fingertip comes to one that closes against it, from middle to middle [m] (ours)
+FEWEST_WITH_SPARE = 4  # From this number of fingers on, one of them may meet no other, as little fingers do (ours)
+POSTURES = 1024  # Random postures in which fingertips are looked for near each other (ours)
+SWEEP = (0.25, 0.75)  # Shares of the way from closed to open at which fingertips must be in front of the palm (ours)
 
 
 @dataclass(frozen=True)

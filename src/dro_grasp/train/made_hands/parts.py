@@ -14,12 +14,9 @@ from dro_grasp.train.made_hands.plan import Coupling, FingerPlan, FingerShape, P
 Point = Float[np.ndarray, "3"]
 SHARES = {1: (1.0,), 2: (0.56, 0.44), 3: (0.45, 0.30, 0.25)}
 """Shares of a finger's length, from the palm outwards, by its number of phalanges (ours; human fingers are close)."""
-TAPER = 0.93
-"""Width of each phalanx as a share of the one before (ours)."""
-STRAIGHT = -0.35
-"""Angle beyond which an open finger bends no farther backwards, although it may [rad] (ours)."""
-KNUCKLE = 1.25
-"""Distance from a finger's first axis to its second one [half a finger's width] (ours)."""
+TAPER = 0.93  # Width of each phalanx as a share of the one before (ours)
+STRAIGHT = -0.35  # Angle beyond which an open finger bends no farther backwards, although it may [rad] (ours)
+KNUCKLE = 1.25  # Distance from a finger's first axis to its second one [half a finger's width] (ours)
 
 
 @dataclass(frozen=True)

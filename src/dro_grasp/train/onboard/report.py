@@ -18,10 +18,8 @@ from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.stages import evaluate
 from dro_grasp.train.onboard.steps import DATA, PICTURE, REPORT, STRICT, Onboarded
 
-GRASPS = 8
-"""Grasps drawn on each object."""
-OBJECTS = 3
-"""Held-out objects drawn."""
+GRASPS = 8  # Grasps drawn on each object
+OBJECTS = 3  # Held-out objects drawn
 STAGES = {RAW: "network alone", REFINED: "network, refined", BEST: "network, refined, best quarter", RETURNED: "generate"}
 """What the grasps of each stage are called."""
 

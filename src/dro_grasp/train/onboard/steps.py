@@ -36,24 +36,15 @@ from dro_grasp.train.data.engine.shards import sole_run
 from dro_grasp.train.data.engine.worker import EngineConfig
 from dro_grasp.train.loop import train
 
-STATE = "onboarding.json"
-"""File of finished steps in the hand's folder."""
-WEIGHTS = "weights.safetensors"
-"""File of the fine-tuned weights."""
-REPORT = "report.html"
-"""File of the report."""
-DATA = "data"
-"""Folder of synthesised grasps."""
-PICTURE = "hand.png"
-"""File of the hand's picture."""
-DATA_SHARE = 0.45
-"""Share of the time for synthesis (ours); what the shares leave is for the benchmarks before and after."""
-TRAINING_SHARE = 0.40
-"""Share of the time for fine-tuning (ours)."""
-STRICT = PROTOCOLS["strict"].label
-"""Protocol by which fine-tuning is judged."""
-MOST_GRASPS = 400
-"""Grasps of an object beyond which time is better spent on training (ours)."""
+STATE = "onboarding.json"  # File of finished steps in the hand's folder
+WEIGHTS = "weights.safetensors"  # File of the fine-tuned weights
+REPORT = "report.html"  # File of the report
+DATA = "data"  # Folder of synthesised grasps
+PICTURE = "hand.png"  # File of the hand's picture
+DATA_SHARE = 0.45  # Share of the time for synthesis (ours); what the shares leave is for the benchmarks before and after
+TRAINING_SHARE = 0.40  # Share of the time for fine-tuning (ours)
+STRICT = PROTOCOLS["strict"].label  # Protocol by which fine-tuning is judged
+MOST_GRASPS = 400  # Grasps of an object beyond which time is better spent on training (ours)
 
 
 @dataclass(frozen=True)

@@ -28,20 +28,15 @@ from dro_grasp.geometry.se3 import compose, roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 
-Tensors = dict[str, Shaped[Tensor, "..."]]
-"""The tensors of a file by key."""
-FORMAT_VERSION = 1
-"""Version of the bundle file that this code writes and reads."""
-HEADER = "dro_grasp_bundle"
-"""Key of the file's metadata that describes its content."""
-MAX_BYTES = 25_000_000
-"""Largest bundle [bytes]. Ours: a repository takes it as it is."""
+Tensors = dict[str, Shaped[Tensor, "..."]]  # The tensors of a file by key
+FORMAT_VERSION = 1  # Version of the bundle file that this code writes and reads
+HEADER = "dro_grasp_bundle"  # Key of the file's metadata that describes its content
+MAX_BYTES = 25_000_000  # Largest bundle [bytes]. Ours: a repository takes it as it is
 HELD_OUT_HANDS = frozenset(f"assets/{name}" for name in ("inspire", "ability", "dclaw", "orca", "ezgripper"))
 """Hands that no shipped weights were trained on, for zero-shot and few-shot results. Ours."""
 FEW_SHOT = "few_shot"
 """Split of a held-out hand's grasps on training objects: for fine-tuning studies, never for shipped weights."""
-TRAINING = frozenset({"train", ""})
-"""Splits of a training bundle; the empty one stands for an object of the user's own."""
+TRAINING = frozenset({"train", ""})  # Splits of a training bundle; the empty one stands for an object of the user's own
 SPLITS = {"train": TRAINING, "few_shot": frozenset({FEW_SHOT}), "validate": frozenset({"validate"})}
 """Splits that a bundle may hold, by the bundle's own split."""
 

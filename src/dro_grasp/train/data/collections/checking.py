@@ -19,8 +19,7 @@ from dro_grasp.simulation.trial import simulate
 from dro_grasp.train.data.collections.collection import PairGrasps, Sources
 from dro_grasp.train.data.engine.worker import closed_where_it_holds
 
-Progress = Callable[[int, int], None]
-"""Called with (grasps evaluated, grasps in all)."""
+Progress = Callable[[int, int], None]  # Called with (grasps evaluated, grasps in all)
 
 
 @dataclass(frozen=True)

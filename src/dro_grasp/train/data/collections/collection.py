@@ -19,8 +19,7 @@ from dro_grasp.kinds import checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.train.data.engine.shards import Yield, find_shards, read_yield
 
-YIELDS = "yields"
-"""Entry of a file's notes with the yield of each of its objects."""
+YIELDS = "yields"  # Entry of a file's notes with the yield of each of its objects
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.train.data.collections.collection import PairGrasps
 from dro_grasp.train.data.engine.shards import Yield
 
-ROLL_BINS = 8
-"""Sectors of 45 degrees that wrist rolls are counted in."""
+ROLL_BINS = 8  # Sectors of 45 degrees that wrist rolls are counted in
 
 
 @dataclass(frozen=True)

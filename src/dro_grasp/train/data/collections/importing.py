@@ -32,8 +32,7 @@ from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.catalogue import load_object
 
 Format = Literal["cmap", "dexgraspnet", "dexgraspbench"]
-WRIST = ("WRJTx", "WRJTy", "WRJTz", "WRJRx", "WRJRy", "WRJRz")
-"""Names of the wrist's six coordinates. Source: DexGraspNet."""
+WRIST = ("WRJTx", "WRJTy", "WRJTz", "WRJRx", "WRJRy", "WRJRz")  # Names of the wrist's six coordinates. Source: DexGraspNet
 HARMLESS = {
     ("numpy.core.multiarray", "_reconstruct"), ("numpy._core.multiarray", "_reconstruct"), ("numpy", "ndarray"),
     ("numpy", "dtype"), ("numpy.core.multiarray", "scalar"), ("numpy._core.multiarray", "scalar"),
@@ -48,8 +47,7 @@ EXPECTED = {
 """Entries of each format, for messages."""
 
 
-Joints = dict[str, float] | Float[np.ndarray, " n_joints"]
-"""Values by name, or in the order of the hand's moving joints."""
+Joints = dict[str, float] | Float[np.ndarray, " n_joints"]  # Values by name, or in the order of the hand's moving joints
 
 
 @dataclass(frozen=True)

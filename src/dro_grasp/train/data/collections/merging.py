@@ -24,20 +24,14 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.train.data.collections.collection import read_collection, yield_notes
 from dro_grasp.train.data.engine.shards import Yield
 
-POSITION_STEP = 2.0**-16
-"""Grid of positions in merged files [m]. Ours: 0.015 mm."""
-ANGLE_STEP = 2.0**-13
-"""Grid of joints, pregrasps and squeezes in merged files [rad or m]. Ours: 0.12 mrad."""
-UNIT_STEP = 2.0**-15
-"""Grid of quaternions in merged files. Ours: 0.03 mrad."""
+POSITION_STEP = 2.0**-16  # Grid of positions in merged files [m]. Ours: 0.015 mm
+ANGLE_STEP = 2.0**-13  # Grid of joints, pregrasps and squeezes in merged files [rad or m]. Ours: 0.12 mrad
+UNIT_STEP = 2.0**-15  # Grid of quaternions in merged files. Ours: 0.03 mrad
 MANTISSA = 10
 """Bits of the mantissa of scores, energies, distances and angles of trials, and further columns. Ours: three digits."""
-FILE_BYTES = 100_000_000
-"""Size of a merged file from which on the next object goes into another [bytes] (ours)."""
-PLAIN_COLUMNS = (REASON, FAILURE)
-"""Columns that are empty for successes."""
-EXACT = (OBJECT_SCALE, CAMERA)
-"""Further columns without which the object is not found again."""
+FILE_BYTES = 100_000_000  # Size of a merged file from which on the next object goes into another [bytes] (ours)
+PLAIN_COLUMNS = (REASON, FAILURE)  # Columns that are empty for successes
+EXACT = (OBJECT_SCALE, CAMERA)  # Further columns without which the object is not found again
 
 
 @dataclass(frozen=True)

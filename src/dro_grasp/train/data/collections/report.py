@@ -21,10 +21,8 @@ from dro_grasp.pictures.sheets import caption, contact_sheet, draw_grasp
 from dro_grasp.pictures.web_page import ShadedCount, image, table, write_page
 from dro_grasp.train.data.collections.coverage import ROLL_BINS, HandCoverage, PairCoverage, grasp_sizes, wrist_rolls
 
-MAX_PICTURES = 8
-"""Grasps drawn for each hand, each on another object."""
-LABEL = 14
-"""Most characters of a joint's label in a chart (ours)."""
+MAX_PICTURES = 8  # Grasps drawn for each hand, each on another object
+LABEL = 14  # Most characters of a joint's label in a chart (ours)
 COLOUR = "#2a788e"
 """Blue of the data in charts."""
 ACCENT = "#d1713b"

@@ -148,8 +148,7 @@ def _replaced(pool: ProcessPool) -> ProcessPool:
     return _one_process()
 
 
-CONNECT_TIME = 5.0
-"""Longest wait for a cluster's head to accept a connection [s]. Ours."""
+CONNECT_TIME = 5.0  # Longest wait for a cluster's head to accept a connection [s]. Ours
 GPU_SHARE = 0.25
 """Share of a GPU for a shard whose energies are computed there. Ours: trials, on the CPU, take most of its time."""
 RETRIES = 3

@@ -29,10 +29,8 @@ from dro_grasp.train.data.engine.pools import Failed, LocalPool, Outcome, Pool
 from dro_grasp.train.data.engine.shards import Shard, Yield, find_shards, read_yield, remove_leftovers, sole_run
 from dro_grasp.train.data.engine.worker import EngineConfig, Job, Task
 
-REPORT_EVERY = 10.0
-"""Time between lines of progress [s]. Ours."""
-CANDIDATE_STEP = 64
-"""Shards have a multiple of this many candidates. Ours."""
+REPORT_EVERY = 10.0  # Time between lines of progress [s]. Ours
+CANDIDATE_STEP = 64  # Shards have a multiple of this many candidates. Ours
 Pair = tuple[str, str]
 Content = TypeVar("Content")
 
@@ -283,8 +281,7 @@ class Production:
                 f"{seconds:.0f} s")
 
 
-SETTINGS = "settings.json"
-"""File of the settings in a data set's folder."""
+SETTINGS = "settings.json"  # File of the settings in a data set's folder
 FREE = frozenset({
     "seconds", "candidates", "min_candidates", "max_candidates", "max_barren_rounds", "candidate_budget", "max_crashes",
     "shard", "shard_seconds", "synthesis.device"})

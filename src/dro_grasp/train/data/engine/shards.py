@@ -29,10 +29,8 @@ LOCK = ".lock"
 """File in a data set's folder that a run locks while it fills the folder; one for each part of a run that is divided."""
 HOLDER = ".process"
 """File with the number of the process that holds the lock; other systems than Linux let nobody read a locked file."""
-MOST = 1e18
-"""More than any count or time of a yield (ours)."""
-STALE = 3600.0
-"""Age from which a temporary file counts as left behind by a killed process [s]. Ours."""
+MOST = 1e18  # More than any count or time of a yield (ours)
+STALE = 3600.0  # Age from which a temporary file counts as left behind by a killed process [s]. Ours
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,7 @@ from dro_grasp.simulation.trial import simulate
 from dro_grasp.train.data.bundle.training_file import split_of
 from dro_grasp.train.data.engine.shards import Shard, Yield, notes_of
 
-LOOSE = "held by too few links"
-"""Reason that counts grasps which pass the trial without enough contact."""
+LOOSE = "held by too few links"  # Reason that counts grasps which pass the trial without enough contact
 
 
 @dataclass(frozen=True)
