@@ -27,11 +27,11 @@ from dro_grasp.network.network import DistanceNetwork
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.holding_score import SHIPPED, HoldingScore, holding_features
-from dro_grasp.predict.settling import settled
+from dro_grasp.predict.settling import settle_grasps
 from dro_grasp.predict.sources.network import propose
 from dro_grasp.predict.sources.optimiser import OptimiserSource
 from dro_grasp.predict.stages import refine, scored
-from dro_grasp.simulation.holding import Holding
+from dro_grasp.simulation.grasp_state import GraspState
 from dro_grasp.simulation.trial import simulate
 
 TRIALS = ("strict", "dexgraspbench", "robust")
@@ -56,13 +56,13 @@ def collect(network: DistanceNetwork, name: str, objects: int, num: int, seed: i
         for maker, grasps in found.items():
             grasps = scored(problem, refine(problem, grasps))
             better = grasps[grasps.score.topk(max(1, len(grasps) // 2)).indices]
-            found = settled(problem, better)
-            grasps = found.grasps[found.held]
+            found = settle_grasps(problem, better)
+            grasps = found.grasps[found.stable]
             if not len(grasps):
                 continue
             outcomes = torch.stack([simulate(hand, obj, grasps, rules).success for rules in TRIALS], 1)
             yield {"hand": hand.name, "object": label, "maker": maker, "score": scored(problem, grasps).score,
-                   "outcomes": outcomes.float(), **{f.name: getattr(found.holding, f.name) for f in fields(Holding)}}
+                   "outcomes": outcomes.float(), **{f.name: getattr(found.state, f.name) for f in fields(GraspState)}}
 
 
 def fit(parts: list[dict[str, Any]], seed: int) -> HoldingScore:
@@ -128,7 +128,7 @@ def main() -> None:
         return
     parts = [part for path in sorted(options.folder.glob("*.pt")) for part in torch.load(path, weights_only=True)]
     for part in parts:
-        part["features"] = holding_features(part["score"], Holding(**{f.name: part[f.name] for f in fields(Holding)}))
+        part["features"] = holding_features(part["score"], GraspState(**{f.name: part[f.name] for f in fields(GraspState)}))
     found, grasps = judged(parts, options.seed), sum(len(part["score"]) for part in parts)
     print(f"{grasps} grasps; hands left out of a fit: {found}")
     about = {

@@ -36,7 +36,7 @@ from dro_grasp.optimize.grasp_energy import GraspEnergy
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.features import feature_names, grasp_features
 from dro_grasp.predict.score.score import SHIPPED, ScoreConfig, ScoreNetwork, load_score_network, save_score_network
-from dro_grasp.predict.settling import settled
+from dro_grasp.predict.settling import settle_grasps
 from dro_grasp.predict.sources.network import ProposalConfig, propose
 from dro_grasp.predict.sources.optimiser import OptimiserSource
 from dro_grasp.predict.stages import complete, refine
@@ -82,7 +82,7 @@ def shaken(hand: Hand, grasps: GraspBatch, generator: torch.Generator) -> GraspB
     T[:, :3, :3] = roma.rotvec_to_rotmat(turn) @ T[:, :3, :3]
     T[:, :3, 3] += hand.grasp_centres(grasps.T_object_wrist) - hand.grasp_centres(T) + move
     q = (grasps.joints + bend * hand.tree.joint_unit * hand.movable).clamp(hand.tree.lower, hand.tree.upper)
-    return grasps.moved_to(T, q)
+    return grasps.with_poses(T, q)
 
 
 def away(grasps: GraspBatch, generator: torch.Generator) -> GraspBatch:
@@ -90,7 +90,7 @@ def away(grasps: GraspBatch, generator: torch.Generator) -> GraspBatch:
     T = grasps.T_object_wrist.clone()
     direction = functional.normalize(torch.randn(len(T), 3, generator=generator), dim=-1)
     T[:, :3, 3] += direction * (0.05 + 0.35 * torch.rand(len(T), 1, generator=generator))
-    return grasps.moved_to(T, grasps.joints)
+    return grasps.with_poses(T, grasps.joints)
 
 
 @torch.no_grad()
@@ -120,14 +120,14 @@ def collect(
         best = refine(problem, OptimiserSource().propose(problem, num, rng.randrange(10**6)).grasps)
         # Closing is simulated with the whole object, as `generate` does; on a bare cloud it is left out.
         whole = GraspProblem(hand, obj)
-        closed = {kind: settled(whole, grasps) for kind, grasps in (("settled", refined), ("optimised, settled", best))}
+        closed = {kind: settle_grasps(whole, grasps) for kind, grasps in (("settled", refined), ("optimised, settled", best))}
         some = refined[slice(0, num // 8)]
         opened = hand.canonical_joints(1.0).expand_as(some.joints)
         groups = {
             "raw": raw[slice(0, num // 8)], "refined": refined[slice(0, num // 2)], "optimised": best[slice(0, num // 2)],
-            **{kind: found.grasps[found.held] for kind, found in closed.items()},
+            **{kind: found.grasps[found.stable] for kind, found in closed.items()},
             "shaken": shaken(hand, refined[slice(0, num // 4)], generator),
-            "opened": some.moved_to(some.T_object_wrist, opened), "away": away(some, generator),
+            "opened": some.with_poses(some.T_object_wrist, opened), "away": away(some, generator),
         }
         parts += [{"hand": hand.name, "object": label, "kind": kind, "view": view, **evaluated(hand, obj, grasps, known)}
                   for kind, grasps in groups.items() if len(grasps)]  # all optimised ones may have lost the object

@@ -20,7 +20,7 @@ from safetensors import SafetensorError
 
 from dro_grasp.errors import DroGraspError, OptionError, OutputError
 
-TOLD = 200  # Characters of a path or a reason that an error repeats (ours)
+MAX_QUOTED_CHARS = 200  # Characters of a path or a reason that an error repeats (ours)
 SAME = {".yaml": ".yml", ".html": ".htm"}  # Endings of file names, and others that mean the same
 FOREIGN = (
     OSError, MemoryError, ValueError, LookupError, ArithmeticError, EOFError, RuntimeError, UnpicklingError, struct.error,
@@ -46,7 +46,7 @@ def given_path(name: Path | str) -> Path:
             os.stat(path)
     except (OSError, ValueError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise OptionError(f"{str(name)[:TOLD]!r} is no path of a file ({reason}); check its spelling") from error
+        raise OptionError(f"{str(name)[:MAX_QUOTED_CHARS]!r} is no path of a file ({reason}); check its spelling") from error
     return path
 
 
@@ -75,7 +75,8 @@ def reading(path: object, refuse: type[DroGraspError], expected: str, *others: t
 
 def reason_of(error: Exception) -> str:
     """Why something failed, in one short line."""
-    return (getattr(error, "strerror", None) or next(iter(str(error).splitlines()), "") or type(error).__name__)[:TOLD]
+    reason = getattr(error, "strerror", None) or next(iter(str(error).splitlines()), "") or type(error).__name__
+    return reason[:MAX_QUOTED_CHARS]
 
 
 def is_unread(error: BaseException | None) -> bool:

@@ -16,7 +16,7 @@ from dro_grasp.files import given_path
 
 HALF_AXES = ("+x", "-x", "+y", "-y", "+z", "-z")  # Names of the half-axes, in the order of the indices of `half_axis`
 ROUNDING = 1e-3  # Largest deviation of a rotation's product with its transpose from the identity (ours)
-LONGEST = 100.0  # A longer translation must be in another unit [m] (ours)
+LONGEST_TRANSLATION = 100.0  # A longer translation must be in another unit [m] (ours)
 
 
 def half_axis(directions: Float[Tensor, "n 3"]) -> Int[Tensor, " n"]:
@@ -79,6 +79,6 @@ def motion_fault(T: Float[Tensor, "*any"]) -> str | None:
         return f"its matrix has shape {tuple(T.shape)} or a last row other than 0 0 0 1"
     if not bool(are_rotations(T[:3, :3])):
         return "the upper left 3x3 of its matrix is not a rotation (scaled, or mirrored)"
-    if float(T[:3, 3].norm()) > LONGEST:
+    if float(T[:3, 3].norm()) > LONGEST_TRANSLATION:
         return f"its translation is {float(T[:3, 3].norm()):g} m long; divide millimetres by 1000"
     return None

@@ -16,7 +16,7 @@ Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 WORDS = {int: "an integer", float: "a number", bool: "True or False", NoneType: "None"}
 """Kinds that are checked, and their names in errors; what is annotated as something else is not looked at."""
-LONGEST = 80  # Characters of a value that an error repeats (ours)
+MAX_QUOTED_CHARS = 80  # Characters of a value that an error repeats (ours)
 
 
 class Checked:
@@ -56,7 +56,7 @@ def plain(name: str, given: Any, kind: Any) -> Any:
         except (TypeError, ValueError, RuntimeError):  # NumPy's and PyTorch's conversions raise these
             continue
     options = [each for each in _members(kind) if get_origin(each) is Literal]
-    told = " ".join((given if options and isinstance(given, str) else repr(given)).split())[:LONGEST]
+    told = " ".join((given if options and isinstance(given, str) else repr(given)).split())[:MAX_QUOTED_CHARS]
     if options:
         raise OptionError(f"{name} is '{told}'; choose {', '.join(map(str, get_args(options[0])))}")
     raise OptionError(f"{name} is {told}; give {' or '.join(_words(each) for each in _members(kind))}")

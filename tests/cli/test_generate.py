@@ -14,7 +14,7 @@ from dro_grasp.compare.metrics import wilson_interval
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
-from dro_grasp.predict.admission import permitted
+from dro_grasp.predict.admission import feasible
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.controls import palm_facing_starts
@@ -164,7 +164,7 @@ def test_table_keeps_hands_above_it(generate, tmp_path: Path) -> None:
     assert report["candidates"] >= report["num"] == report["asked"] == 3
     assert report["shortage"] is None
     problem = GraspProblem(loaded_hand("gripper3"), load_object("sphere"), constraints=Constraints(table=-0.15))
-    assert permitted(problem, GraspBatch.load(path)).all()
+    assert feasible(problem, GraspBatch.load(path)).all()
 
 
 def test_impossible_table_says_so(weights: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -179,7 +179,7 @@ def stored(folder: Path, holding: bool) -> Path:
     if holding:
         found = refine(GraspProblem(hand, sphere), synthesize(hand, sphere, 24, 1, SynthesisConfig(batch_size=24, steps=20)))
         # As `generate` gets them without refinement: the controller makes pregrasp and squeeze.
-        two = found.bare().without("pregrasp_joints", "squeeze_joints")
+        two = found.poses_only().without("pregrasp_joints", "squeeze_joints")
         two = two[simulate(hand, sphere, two, "strict").success][:2]
     else:
         two = palm_facing_starts(hand, sphere, 2, 0)

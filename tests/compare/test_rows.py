@@ -73,7 +73,8 @@ def predictor(tmp_path_factory: pytest.TempPathFactory) -> GraspPredictor:
 @pytest.fixture(scope="module")
 def good() -> GraspBatch:
     """Grasps that hold."""
-    grasps = refine(GraspProblem(HAND, CAN), synthesize(HAND, CAN, 24, 1, SynthesisConfig(batch_size=24, steps=20))).bare()
+    made = synthesize(HAND, CAN, 24, 1, SynthesisConfig(batch_size=24, steps=20))
+    grasps = refine(GraspProblem(HAND, CAN), made).poses_only()
     return grasps[simulate(HAND, CAN, grasps, "strict").success]
 
 

@@ -34,8 +34,8 @@ def test_a_batch_knows_what_it_was_asked_for_only_when_it_is_told() -> None:
 
 
 @pytest.mark.parametrize("change", [
-    lambda g: g.sorted_by_score(), lambda g: g.sorted_by_energy(), lambda g: g.bare(), lambda g: g.without_trial(),
-    lambda g: g.replace(seed=g.seed + 1), lambda g: g.moved_to(g.T_object_wrist, g.joints), lambda g: g.without("score"),
+    lambda g: g.sorted_by_score(), lambda g: g.sorted_by_energy(), lambda g: g.poses_only(), lambda g: g.without_trial(),
+    lambda g: g.replace(seed=g.seed + 1), lambda g: g.with_poses(g.T_object_wrist, g.joints), lambda g: g.without("score"),
 ])
 def test_what_leaves_all_grasps_there_keeps_it(change) -> None:
     assert change(evaluated(3).with_asked(16)).asked == 16

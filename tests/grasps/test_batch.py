@@ -155,7 +155,7 @@ def test_moved_grasps_keep_nothing_of_the_poses_before():
     outcome = evaluated(4, score=numbers, energy=numbers, pregrasp_joints=joints, squeeze_joints=joints)
     before = outcome.replace(extra=outcome.extra | {
         "depth": torch.rand(4), "energy_contact": torch.rand(4), "object_file": ("ball.stl",) * 4})
-    moved = before.moved_to(before.T_object_wrist.flip(0), before.joints + 1)
+    moved = before.with_poses(before.T_object_wrist.flip(0), before.joints + 1)
     assert torch.equal(moved.joints, before.joints + 1)
     assert torch.equal(moved.T_object_wrist, before.T_object_wrist.flip(0))
     for name in ("score", "energy", "pregrasp_joints", "squeeze_joints", "displacement", "rotation", "penetration"):

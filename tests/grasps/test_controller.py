@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.controller import ControllerConfig, completed, distance_slope, pregrasp_and_squeeze
+from dro_grasp.grasps.controller import ControllerConfig, complete, distance_slope, pregrasp_and_squeeze
 from dro_grasp.hands.hand import Hand
 from tests.helpers.claw import claw, wrist_below
 from tests.helpers.toy_hand import toy_hand
@@ -113,7 +113,7 @@ def test_only_what_is_not_stated_is_completed(hand):
     grasps = GraspBatch.create(owner, thing, T, joints).replace(
         T_object_wrist=T, joints=joints, pregrasp_joints=torch.where(some, hints, nothing),
         squeeze_joints=torch.where(other, hints, nothing))
-    whole = completed(hand, grasps, centre)
+    whole = complete(hand, grasps, centre)
     torch.testing.assert_close(whole.pregrasp_joints, torch.where(some, hints, before))
     torch.testing.assert_close(whole.squeeze_joints, torch.where(other, hints, after))
-    assert completed(hand, whole, centre) is whole
+    assert complete(hand, whole, centre) is whole

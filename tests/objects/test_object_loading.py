@@ -230,7 +230,7 @@ def test_meshes_and_clouds_far_from_their_origin_are_refused(tmp_path: Path) -> 
 def test_an_archive_that_unpacks_to_much_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with zipfile.ZipFile(tmp_path / "bomb.3mf", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("3D/3dmodel.model", b" " * 3_000_000)
-    monkeypatch.setattr(mesh_files, "MOST_BYTES", 2_000_000)
+    monkeypatch.setattr(mesh_files, "MAX_BYTES", 2_000_000)
     with pytest.raises(ObjectError, match=r"it holds 3 MB, the limit is 2"):
         load_file(tmp_path / "bomb.3mf")
 

@@ -322,7 +322,7 @@ def test_a_cup_stays_hollow() -> None:
 def test_a_large_thing_has_larger_balls_and_not_more_of_them(sphere: ObjectModel, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a thing of 30 cm is for the usual number of balls, a small one is for fewer."""
     usual = len(balls_of(sphere)[1])
-    monkeypatch.setattr("dro_grasp.objects.shape.MOST_BALLS", usual // 4)
+    monkeypatch.setattr("dro_grasp.objects.shape.MAX_BALLS", usual // 4)
     centres, radii = balls_of(sphere)
     assert usual // 8 < len(radii) <= usual // 4
     assert radii.max() > 1.5 * BALL_RADII[0]

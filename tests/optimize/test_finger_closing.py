@@ -43,7 +43,7 @@ def test_an_idle_finger_stops_where_it_first_meets_the_object() -> None:
     for part in torch.linspace(0, 0.98, 60):  # nothing was met on the way
         q = before.joints.clone()
         q[0, :2] = start + part * (end - start)
-        assert float(gaps(before.moved_to(before.T_object_wrist, q))[0, 0]) > CONFIG.contact - 7e-4
+        assert float(gaps(before.with_poses(before.T_object_wrist, q))[0, 0]) > CONFIG.contact - 7e-4
 
 
 def test_a_finger_that_is_bent_too_far_comes_from_its_open_posture() -> None:
@@ -64,7 +64,7 @@ def test_a_finger_that_reaches_nothing_rests_as_bent_as_the_one_that_holds() -> 
     before = grasp(-0.2, -0.1, -0.3, 0.2, -0.3, 0.2)
     T = before.T_object_wrist.clone()
     T[0, 0, 3] += 0.06  # only finger 0 reaches the ball, across the palm
-    before = before.moved_to(T, before.joints)
+    before = before.with_poses(T, before.joints)
     after = close_idle_fingers(ENERGY, before)
     holds, beside, last = after.joints[0].reshape(3, 2)
     assert float(gaps(after)[0, 0]) == pytest.approx(CONFIG.contact, abs=7e-4)
@@ -83,7 +83,7 @@ def test_a_finger_that_is_bent_more_than_those_that_hold_stays() -> None:
     before = grasp(-0.2, -0.1, 0.3, 0.6, -0.3, 0.2)
     T = before.T_object_wrist.clone()
     T[0, 0, 3] += 0.06
-    before = before.moved_to(T, before.joints)
+    before = before.with_poses(T, before.joints)
     after = close_idle_fingers(ENERGY, before)
     assert float(gaps(after)[0, 0]) == pytest.approx(CONFIG.contact, abs=7e-4)
     assert torch.equal(after.joints[0, 2:4], before.joints[0, 2:4])
@@ -108,7 +108,7 @@ def test_an_outer_link_that_meets_nothing_bends_as_the_fingers_that_hold() -> No
     before = grasp(0.4, -0.3, 0.6, 0.3, 0.6, 0.3, height=0.04)
     T = before.T_object_wrist.clone()
     T[0, 0, 3] -= 0.07  # the back of finger 0 touches the ball
-    before = before.moved_to(T, before.joints)
+    before = before.with_poses(T, before.joints)
     assert float(gaps(before)[0, 0]) < CONFIG.idle
     after = close_idle_fingers(ENERGY, before)
     assert float(after.joints[0, 1]) == pytest.approx((0.4 - 0.3) / 2, abs=1e-5)

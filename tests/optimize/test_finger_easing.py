@@ -9,7 +9,7 @@ import torch
 
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.optimize import fingers
-from dro_grasp.optimize.fingers import EasingConfig, ease_fingers, lacking_room
+from dro_grasp.optimize.fingers import EasingConfig, ease_fingers, missing_clearance
 from dro_grasp.optimize.grasp_energy import EnergyConfig, GraspEnergy
 from tests.helpers.claw import ball, grasps_of, wrist_below
 from tests.helpers.toy_hand import coupled_hand, toy_hand
@@ -81,12 +81,12 @@ def test_the_lacking_room_is_that_of_every_point_of_the_opened_hand(part: str) -
             guess = 0.0 if seen is None else float((seen - point).norm(dim=-1).min()) - max(distance, 0.0)
             wanted.append(min(max(guess, CONFIG.clearance), CONFIG.unseen) - distance)
         expected.append(max(0.0, *wanted))
-    found = lacking_room(ENERGY, both, given)
+    found = missing_clearance(ENERGY, both, given)
     assert found.tolist() == pytest.approx(expected, abs=7e-4)
     assert expected[0] > 0.002
     assert expected[2] == 0
-    assert torch.equal(lacking_room(ENERGY, both, given, replace(CONFIG, batch_size=1)), found)
-    assert len(lacking_room(ENERGY, both[:0], given)) == 0
+    assert torch.equal(missing_clearance(ENERGY, both, given, replace(CONFIG, batch_size=1)), found)
+    assert len(missing_clearance(ENERGY, both[:0], given)) == 0
 
 
 def test_a_finger_that_is_clear_stays_while_others_open() -> None:

@@ -107,7 +107,7 @@ def test_a_joint_that_fingers_share_brings_those_that_do_not_touch_yet() -> None
 
 
 def power_like(far: GraspBatch) -> GraspBatch:
-    return far.moved_to(wrist_below(0.05, 1), far.joints)
+    return far.with_poses(wrist_below(0.05, 1), far.joints)
 
 
 def test_a_lopsided_grasp_moves_the_object_less(tmp_path: Path) -> None:

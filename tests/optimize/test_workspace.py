@@ -11,7 +11,7 @@ from torch import Tensor
 from dro_grasp.geometry.distance_field import Balls
 from dro_grasp.geometry.se3 import turned_about
 from dro_grasp.grasps.controller_config import ControllerConfig
-from dro_grasp.optimize.grasp_energy import EnergyConfig, GraspEnergy, Room
+from dro_grasp.optimize.grasp_energy import EnergyConfig, GraspEnergy, Workspace
 from dro_grasp.optimize.workspace import Surroundings
 from tests.helpers.energy_samples import near_kinks, precise, rounded_box
 from tests.helpers.toy_hand import toy_hand
@@ -23,14 +23,15 @@ ASIDE = dataclasses.replace(rounded_box(), origin=torch.tensor([-0.02, -0.08, -0
 SPARED = Balls(torch.tensor([[0.05, 0.0, 0.02], [-0.04, 0.03, 0.0]]).double(), torch.tensor([0.05, 0.04]).double())
 HELD = Balls(torch.tensor([[0.03, 0.0, 0.0], [0.0, 0.02, 0.02]]).double(), torch.tensor([0.02, 0.015]).double())
 KINDS = {
-    "plane": Room(Surroundings(PLANE)), "obstacle": Room(Surroundings(obstacles=ASIDE)),
-    "spared": Room(Surroundings(spared=SPARED)), "all": Room(Surroundings(PLANE, ASIDE, SPARED)), "hold": Room(hold=HELD)}
+    "plane": Workspace(Surroundings(PLANE)), "obstacle": Workspace(Surroundings(obstacles=ASIDE)),
+    "keep_out": Workspace(Surroundings(keep_out=SPARED)), "all": Workspace(Surroundings(PLANE, ASIDE, SPARED)),
+    "contact_region": Workspace(contact_region=HELD)}
 ONLY = EnergyConfig(
     force_closure=0, distance=0, penetration=0, self_penetration=0, alignment=0, joints=0, clearance=100, clearance_points=64)
 
 
 def energy_in(kind: str) -> GraspEnergy:
-    return GraspEnergy(HAND, rounded_box(), torch.zeros(3).double(), 0.03, ONLY, room=KINDS[kind])
+    return GraspEnergy(HAND, rounded_box(), torch.zeros(3).double(), 0.03, ONLY, workspace=KINDS[kind])
 
 
 @pytest.mark.parametrize("kind", KINDS)

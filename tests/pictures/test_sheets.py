@@ -16,7 +16,7 @@ from dro_grasp.cli.main import main
 from dro_grasp.errors import OutputError
 from dro_grasp.geometry.rendering.rasterizer import Camera, render
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.controller import completed
+from dro_grasp.grasps.controller import complete
 from dro_grasp.hands.check import picture
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.catalogue import load_object
@@ -133,7 +133,7 @@ def test_clouds_and_hands_without_description_are_drawn_as_points(hand, obj, gra
 
 def test_hands_are_drawn_closed_on_a_cloud_too(hand: Hand, obj: ObjectModel, grasps: GraspBatch, tmp_path: Path) -> None:
     cloud = partial_view(obj, "cloud", 0)
-    some = completed(hand, grasps[:1], torch.zeros(3))
+    some = complete(hand, grasps[:1], torch.zeros(3))
     closed = pictures.after_closing(hand, cloud, some)
     assert float((closed.joints - some.joints).abs().amax()) > 0.02
     sheets = []

@@ -30,8 +30,8 @@ from dro_grasp.predict.admission import (
     TURNED,
     AdmissionConfig,
     clear,
-    permitted,
-    reasons_against,
+    count_violations,
+    feasible,
     shortage_in_words,
 )
 from dro_grasp.predict.constraints import Constraints
@@ -137,22 +137,22 @@ def free() -> GraspBatch:
 def test_grasps_that_are_permitted_respect_the_constraint(case: str, free: GraspBatch) -> None:
     problem = GraspProblem(HAND, MUG, constraints=CASES[case])
     found = refine(problem, OptimiserSource().propose(problem, 4, seed=0).grasps)
-    kept = found[permitted(problem, found)]
+    kept = found[feasible(problem, found)]
     assert len(kept) >= 1
     worst = max(shortfall(case, kept, row) for row in range(len(kept)))
     assert worst < 0.002, "surface points are sparse, but not that sparse"
     violating = [shortfall(case, free, row) > 0.002 for row in range(len(free))]
     assert sum(violating) >= 1, "the case asks for nothing"
-    respected = permitted(problem, free)
+    respected = feasible(problem, free)
     assert not (respected & torch.tensor(violating)).any()
-    assert reasons_against(problem, free) == {REASONS[case]: int((~respected).sum())}
+    assert count_violations(problem, free) == {REASONS[case]: int((~respected).sum())}
 
 
 def test_reasons_are_counted_once_each(free: GraspBatch) -> None:
     both = Constraints(direction=(1.0, 0.0, 0.0), cone=0.01, spare=(LOWER,))
     problem = GraspProblem(HAND, MUG, constraints=both)
-    counted = reasons_against(problem, free)
-    assert sum(counted.values()) == int((~permitted(problem, free)).sum()) == len(free)
+    counted = count_violations(problem, free)
+    assert sum(counted.values()) == int((~feasible(problem, free)).sum()) == len(free)
     assert set(counted) <= {SPARED, TURNED}
 
 
@@ -239,13 +239,13 @@ def test_how_much_a_grasp_may_miss_is_configured(free: GraspBatch) -> None:
     """With more room to keep fewer are let pass, and with less room more; a place is held with as many fingers as are asked."""
     problem = GraspProblem(HAND, MUG, constraints=CASES["spare"])
     assert problem.surroundings is not None
-    passed = [int(permitted(problem, free, AdmissionConfig(least_clearance=least)).sum()) for least in (-1.0, 0.002, 1.0)]
+    passed = [int(feasible(problem, free, AdmissionConfig(least_clearance=least)).sum()) for least in (-1.0, 0.002, 1.0)]
     assert passed == [len(free), int(clear(problem, free, problem.surroundings).sum()), 0]
     around = GraspProblem(HAND, MUG, constraints=Constraints(hold=((0.0, 0.0, 0.0, 1.0),)))
-    enough = [permitted(around, free, AdmissionConfig(fewest_fingers=count)) for count in (0, 1, 2, 3)]
+    enough = [feasible(around, free, AdmissionConfig(fewest_fingers=count)) for count in (0, 1, 2, 3)]
     assert bool(enough[0].all())
     assert all(bool((more <= fewer).all()) for fewer, more in pairwise(enough))
-    assert not permitted(around, free, AdmissionConfig(reach=-1.0)).any(), "no finger is as near as that"
+    assert not feasible(around, free, AdmissionConfig(reach=-1.0)).any(), "no finger is as near as that"
 
 
 @pytest.mark.parametrize(

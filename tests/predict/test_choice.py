@@ -14,7 +14,7 @@ from dro_grasp.hands.anatomy import PALM
 from dro_grasp.network.network import DistanceNetwork, Moves
 from dro_grasp.network.presets import NetworkConfig
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.optimize.grasp_energy import Room
+from dro_grasp.optimize.grasp_energy import Workspace
 from dro_grasp.optimize.workspace import Surroundings
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.choice import CROWDING_POINTS, ChoiceConfig, ChoicePenalties, choice_scores
@@ -81,7 +81,7 @@ def test_a_hand_at_the_surface_is_preferred_to_one_inside_and_to_one_far_away() 
 def test_a_hand_under_a_plane_is_worse_by_its_depth(clouds: torch.Tensor) -> None:
     free = choice_scores(HAND, SPHERE.distance_field, clouds, CONFIG)
     plane = Surroundings(torch.tensor([0.0, 0.0, 1.0, -0.09]))
-    above = choice_scores(HAND, SPHERE.distance_field, clouds, CONFIG, Room(plane))
+    above = choice_scores(HAND, SPHERE.distance_field, clouds, CONFIG, Workspace(plane))
     depth = (CONFIG.margin - (clouds[..., 2].amin(-1) + 0.09)).clamp_min(0)
     torch.testing.assert_close(free - above, CONFIG.clearance * depth)
     assert 0 < int((depth > 0).sum()) < depth.numel()
@@ -94,7 +94,7 @@ def test_fingers_at_the_place_to_hold_are_preferred() -> None:
     tip = at[HAND.finger_of_link[HAND.link_index] == 0].mean(0).tolist()
     away = [-x for x in tip]
     there, elsewhere = (
-        choice_scores(HAND, SPHERE.distance_field, at, CONFIG, Room(hold=Balls.of(((*place, 0.03),))))  # type: ignore[arg-type]
+        choice_scores(HAND, SPHERE.distance_field, at, CONFIG, Workspace(contact_region=Balls.of(((*place, 0.03),))))  # type: ignore[arg-type]
         for place in (tip, away))
     assert float(there) > float(elsewhere)
 

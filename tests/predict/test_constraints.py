@@ -16,7 +16,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimize.starts import LARGEST_TILT, angle_to_arc
-from dro_grasp.predict.admission import permitted
+from dro_grasp.predict.admission import feasible
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.optimiser import OptimiserSource
@@ -48,7 +48,7 @@ def test_a_low_object_on_a_table_is_grasped(name: str, direction: tuple[float, f
     hand = loaded_hand(name)
     problem = GraspProblem(hand, SOAP, constraints=Constraints(direction, TABLE))
     found = refine(problem, OptimiserSource().propose(problem, 8, seed=0).grasps)
-    kept = found[permitted(problem, found)]
+    kept = found[feasible(problem, found)]
     assert len(kept) >= 3
     off = angle_to_arc(hand.palm_directions(kept.T_object_wrist), torch.tensor(direction), torch.tensor([0.0, 0.0, 1.0]))
     assert float(torch.rad2deg(off).median()) < 30, "near the direction, or tilted from there to the table"
@@ -57,7 +57,7 @@ def test_a_low_object_on_a_table_is_grasped(name: str, direction: tuple[float, f
         assert lowest > TABLE - 0.002, "surface points are sparse, but not that sparse [m]"
     free = GraspProblem(hand, SOAP, constraints=Constraints(direction))
     below = refine(free, OptimiserSource().propose(free, 8, seed=0).grasps)
-    assert float(permitted(problem, below).float().mean()) < 0.2
+    assert float(feasible(problem, below).float().mean()) < 0.2
 
 
 def test_palms_tilt_only_towards_the_plane() -> None:

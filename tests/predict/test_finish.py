@@ -14,12 +14,12 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.perception.partial_views import partial_view
 from dro_grasp.optimize.fingers import EasingConfig
 from dro_grasp.optimize.refinement import RefineConfig
-from dro_grasp.predict.admission import TURNED, AdmissionConfig, permitted, reasons_against
+from dro_grasp.predict.admission import TURNED, AdmissionConfig, count_violations, feasible
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.finish import FinishConfig, finish
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.holding_score import holding_score
-from dro_grasp.predict.settling import SettleConfig, settled
+from dro_grasp.predict.settling import SettleConfig, settle_grasps
 from dro_grasp.predict.sources.controls import palm_facing_starts
 from dro_grasp.predict.sources.source import Candidates
 from dro_grasp.predict.stages import complete, ease, refine, scored
@@ -48,18 +48,18 @@ def naive(problem: GraspProblem, made: Candidates, keep: int) -> tuple[GraspBatc
     """The same grasps from single stages, one candidate after the other where a stage allows it; and their rows, and how many
     the constraints let pass."""
     refined = refine(problem, made.grasps)
-    passed = [row for row in range(len(made)) if bool(permitted(problem, refined[row : row + 1]))]
+    passed = [row for row in range(len(made)) if bool(feasible(problem, refined[row : row + 1]))]
     known = scored(problem, refined[torch.tensor(passed, dtype=torch.long)])
     ranked = sorted(range(len(passed)), key=lambda row: -float(known.score[row]))
     better = sorted(ranked[: max(round(0.5 * len(passed)), min(keep, len(passed)))])
     before = known[torch.tensor(better, dtype=torch.long)]
-    closed, held, state = settled(problem, before)
-    good = held & permitted(problem, closed)
+    closed, stable, state = settle_grasps(problem, before)
+    good = stable & feasible(problem, closed)
     poses = [(closed if bool(good[i]) else before)[i : i + 1] for i in range(len(better))]
     done = GraspBatch.concatenate([pose.without("score") for pose in poses])
     values = scored(problem, done).score
     after = values.clone()
-    after[held] = holding_score(values[held], state)
+    after[stable] = holding_score(values[stable], state)
     score = torch.tensor([float(after[i]) if bool(good[i]) else min(float(after[i]), -4.0) for i in range(len(better))])
     best = sorted(range(len(better)), key=lambda row: -float(score[row]))[:keep]
     chosen = done.replace(score=score)[torch.tensor(best, dtype=torch.long)]
@@ -79,7 +79,7 @@ def test_the_chain_is_its_stages_one_after_the_other(problem: GraspProblem) -> N
     assert len(done.refined) == passed
     assert sum(done.dropped.values()) == done.made - passed
     assert (passed < 16) == (problem is ON_TABLE)
-    assert done.dropped == Counter({TURNED: 2}) + reasons_against(problem, refine(problem, made.grasps))
+    assert done.dropped == Counter({TURNED: 2}) + count_violations(problem, refine(problem, made.grasps))
 
 
 def test_stages_that_are_none_are_left_out() -> None:

@@ -14,13 +14,13 @@ from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.perception.partial_views import partial_view
-from dro_grasp.optimize.fingers import lacking_room
+from dro_grasp.optimize.fingers import missing_clearance
 from dro_grasp.optimize.grasp_energy import EnergyConfig
 from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
-from dro_grasp.predict.admission import permitted
+from dro_grasp.predict.admission import feasible
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem
-from dro_grasp.predict.settling import SettleConfig, Settled, can_settle, settle_best, settled
+from dro_grasp.predict.settling import SettleConfig, Settled, can_settle, settle_best, settle_grasps
 from dro_grasp.predict.stages import evaluate, refine, scored
 from dro_grasp.simulation.closed_poses import hand_shift, settle
 from dro_grasp.simulation.contacts import deepest_penetration
@@ -44,7 +44,7 @@ def many() -> GraspBatch:
 
 @pytest.fixture(scope="module")
 def outcome(many: GraspBatch) -> Settled:
-    return settled(PROBLEM, many)
+    return settle_grasps(PROBLEM, many)
 
 
 def shifted(grasps: GraspBatch, distances: list[float]) -> GraspBatch:
@@ -60,18 +60,18 @@ def test_what_closing_does_to_the_object_decides_what_becomes_of_a_grasp(many: G
     still, lost = moved < 0.004, moved > 0.06
     pushed = (moved > 0.0055) & (moved < 0.03)
     assert min(int(rows.sum()) for rows in (still, pushed, lost)) > 0
-    found, held, state = outcome
-    assert bool(held[still].all()), "with this can they are not deep either"
+    found, stable, state = outcome
+    assert bool(stable[still].all()), "with this can they are not deep either"
     torch.testing.assert_close(found.T_object_wrist[still], closed.T_object_wrist[still])
     torch.testing.assert_close(found.joints[still], closed.joints[still])
     assert (found.squeeze_joints[still] - many.squeeze_joints[still]).abs().amax(1).min() > 1e-4, "it squeezes anew"
-    assert bool(held[pushed].any())
-    again = refine(PROBLEM, closed[pushed & held])
+    assert bool(stable[pushed].any())
+    again = refine(PROBLEM, closed[pushed & stable])
     for name in ("T_object_wrist", "joints", "pregrasp_joints", "squeeze_joints"):
-        torch.testing.assert_close(getattr(found, name)[pushed & held], getattr(again, name))
-        assert torch.equal(getattr(found, name)[~held], getattr(many, name)[~held]), "as it was"
-    assert not held[lost].any()
-    assert len(state.shift) == int(held.sum())
+        torch.testing.assert_close(getattr(found, name)[pushed & stable], getattr(again, name))
+        assert torch.equal(getattr(found, name)[~stable], getattr(many, name)[~stable]), "as it was"
+    assert not stable[lost].any()
+    assert len(state.shift) == int(stable.sum())
     assert float(state.shift.max()) < 0.02
 
 
@@ -79,29 +79,30 @@ def test_what_closing_does_to_the_object_decides_what_becomes_of_a_grasp(many: G
 def test_what_moves_turns_or_penetrates_more_than_the_limit_stays_as_it_was(
     many: GraspBatch, outcome: Settled, quantity: str
 ) -> None:
-    found, held, state = outcome
-    rows = held.nonzero()[:, 0]
-    values = deepest_penetration(HAND, CAN, found[held]) if quantity == "depth" else getattr(state, quantity)
+    found, stable, state = outcome
+    rows = stable.nonzero()[:, 0]
+    values = deepest_penetration(HAND, CAN, found[stable]) if quantity == "depth" else getattr(state, quantity)
     limit = float(values.sort().values[[0, -1]].mean())
     field = {"shift": "farthest", "turn": "largest_turn", "depth": "deepest"}[quantity]
-    fewer = settled(PROBLEM, many, SettleConfig(**{field: limit}))
+    fewer = settle_grasps(PROBLEM, many, SettleConfig(**{field: limit}))
     passed = rows[values < limit]
     assert 0 < len(passed) < len(rows)
-    assert fewer.held.nonzero()[:, 0].tolist() == passed.tolist()
+    assert fewer.stable.nonzero()[:, 0].tolist() == passed.tolist()
     dropped = rows[values >= limit]
     assert torch.equal(fewer.grasps.T_object_wrist[dropped], many.T_object_wrist[dropped])
-    torch.testing.assert_close(fewer.holding.shift, state.shift[values < limit])
+    torch.testing.assert_close(fewer.state.shift, state.shift[values < limit])
 
 
 def test_limits_say_what_is_still_and_what_is_lost(many: GraspBatch) -> None:
     moved = hand_shift(HAND, many, settle(HAND, CAN, many))
-    none = settled(PROBLEM, many, SettleConfig(lost=0.0))
-    assert not none.held.any()
+    none = settle_grasps(PROBLEM, many, SettleConfig(lost=0.0))
+    assert not none.stable.any()
     assert torch.equal(none.grasps.T_object_wrist, many.T_object_wrist)
-    refined = settled(PROBLEM, many, SettleConfig(still=0.0))
-    quiet = (moved < 0.005) & refined.held
+    refined = settle_grasps(PROBLEM, many, SettleConfig(still=0.0))
+    quiet = (moved < 0.005) & refined.stable
     assert bool(quiet.any())
-    assert not torch.allclose(refined.grasps.joints[quiet], settled(PROBLEM, many).grasps.joints[quiet]), "refined as well"
+    usual = settle_grasps(PROBLEM, many)
+    assert not torch.allclose(refined.grasps.joints[quiet], usual.grasps.joints[quiet]), "refined as well"
 
 
 def test_a_hand_has_moved_as_far_as_its_grasp_centre(grasps: GraspBatch) -> None:
@@ -111,8 +112,8 @@ def test_a_hand_has_moved_as_far_as_its_grasp_centre(grasps: GraspBatch) -> None
 
 
 def test_settled_grasps_hardly_push_the_object_away(many: GraspBatch, outcome: Settled) -> None:
-    found, held, _ = outcome
-    before, after = (simulate(HAND, CAN, g, "strict") for g in (many, found[held]))
+    found, stable, _ = outcome
+    before, after = (simulate(HAND, CAN, g, "strict") for g in (many, found[stable]))
     assert before.failure.count(Failure.PUSHED_AWAY) > 2
     assert after.failure.count(Failure.PUSHED_AWAY) <= 1
 
@@ -134,15 +135,15 @@ def test_what_ends_where_constraints_forbid_stays_as_it_was_and_scores_low(many:
     """A ball to spare where one of the wrists is."""
     known = scored(PROBLEM, many)
     _, free = settle_best(PROBLEM, known, 24)
-    ball = (*many.T_object_wrist[outcome.held][0, :3, 3].tolist(), 0.01)
+    ball = (*many.T_object_wrist[outcome.stable][0, :3, 3].tolist(), 0.01)
     forbidden = GraspProblem(HAND, CAN, constraints=Constraints(spare=(ball,)))
     rows, found = settle_best(forbidden, known, 24)
     assert rows.tolist() == list(range(24))
-    barred = ~permitted(forbidden, settled(forbidden, known).grasps)
-    assert bool((barred & outcome.held).any())
+    barred = ~feasible(forbidden, settle_grasps(forbidden, known).grasps)
+    assert bool((barred & outcome.stable).any())
     assert float(found.score[barred].max()) <= SettleConfig().unstable_score
     assert torch.equal(found.T_object_wrist[barred], many.T_object_wrist[barred])
-    assert float(free.score[barred & outcome.held].max()) > SettleConfig().unstable_score
+    assert float(free.score[barred & outcome.stable].max()) > SettleConfig().unstable_score
 
 
 def test_a_grasp_scores_lower_for_room_that_it_lacks_beside_what_was_not_seen(grasps: GraspBatch) -> None:
@@ -153,7 +154,7 @@ def test_a_grasp_scores_lower_for_room_that_it_lacks_beside_what_was_not_seen(gr
         settle_best(p, scored(p, grasps), 5, stays) for p in (GraspProblem(HAND, o) for o in (cloud, half)))
     torch.testing.assert_close(whole.joints, guessed.joints)
     problem = GraspProblem(HAND, half)
-    lacking = lacking_room(problem.energy(EnergyConfig()), guessed, half.seen)
+    lacking = missing_clearance(problem.energy(EnergyConfig()), guessed, half.seen)
     assert float(lacking.max()) > 0.002
     torch.testing.assert_close(whole.score - guessed.score, stays.room_worth * lacking)
     _, dear = settle_best(problem, scored(problem, grasps), 5, replace(stays, room_worth=200.0))
@@ -170,8 +171,8 @@ def test_on_a_bare_cloud_grasps_settle_where_they_do_on_the_mesh_and_get_no_tria
     sphere = load_object("sphere")
     whole, bare = GraspProblem(HAND, sphere), GraspProblem(HAND, partial_view(sphere, "cloud", 0))
     some = refine(whole, synthesize(HAND, sphere, 6, 2, SynthesisConfig(batch_size=6, steps=20)))
-    on_mesh, on_balls = settled(whole, some), settled(bare, some)
-    both = on_mesh.held & on_balls.held
+    on_mesh, on_balls = settle_grasps(whole, some), settle_grasps(bare, some)
+    both = on_mesh.stable & on_balls.stable
     assert both.sum() > 3
     assert hand_shift(HAND, on_mesh.grasps[both], on_balls.grasps[both]).median() < 0.002
     turned = [made.grasps.T_object_wrist[both, :3, :3] for made in (on_mesh, on_balls)]

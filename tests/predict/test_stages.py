@@ -14,7 +14,7 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.objects.perception.partial_views import partial_view
 from dro_grasp.optimize.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize, synthesize_with
-from dro_grasp.predict.admission import AdmissionConfig, permitted
+from dro_grasp.predict.admission import AdmissionConfig, feasible
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.optimiser import OptimiserConfig, OptimiserSource
@@ -73,7 +73,7 @@ def test_fingers_leave_room_on_a_bare_cloud_where_the_constraints_let_them(grasp
     assert float((clear[1] - clear[0]).max()) > 0.002
     assert float((clear[1] - clear[0]).min()) > -1e-4
     below = GraspProblem(HAND, cloud.obj, constraints=Constraints(cone=0.01, direction=(0.0, 0.0, 1.0)))
-    assert torch.equal(ease(below, given).joints, given.joints), "none of these grasps is permitted"
+    assert torch.equal(ease(below, given).joints, given.joints), "none of these grasps is feasible"
 
 
 def test_where_the_wider_room_is_forbidden_fingers_leave_that_of_a_surface_that_was_seen(grasps: GraspBatch) -> None:
@@ -91,8 +91,8 @@ def test_where_the_wider_room_is_forbidden_fingers_leave_that_of_a_surface_that_
     assert float(gaps[1][row] - gaps[0][row]) > 0.001
     near = AdmissionConfig(fewest_fingers=3, reach=float(gaps[0][row] + gaps[1][row]) / 2)
     one = slice(row, row + 1)
-    assert permitted(half, narrow[one], near).all()
-    assert not permitted(half, wide[one], near).any()
+    assert feasible(half, narrow[one], near).all()
+    assert not feasible(half, wide[one], near).any()
     torch.testing.assert_close(ease(half, given[one], None, near).joints, narrow.joints[one])
     nowhere = replace(near, reach=-1.0)
     assert torch.equal(ease(half, given[one], None, nowhere).joints, given.joints[one])

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from dro_grasp.errors import OptionError
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.controller import completed
+from dro_grasp.grasps.controller import complete
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
 from dro_grasp.objects.shape import ObjectModel
@@ -97,7 +97,7 @@ def test_conditions_in_a_shared_scene_are_those_of_a_scene_compiled_with_them(ha
     alone = simulate(hand, obj, grasps, compiled)
     assert not torch.equal(alone.displacement, simulate(hand, obj, grasps, "strict").displacement)
     scene = cached_scene(hand, obj, rules)
-    closing = completed(hand, grasps, torch.zeros(3), rules.controller)
+    closing = complete(hand, grasps, torch.zeros(3), rules.controller)
     conditions = draw(rules.perturbations, grasps).rows(slice(3 * len(grasps), 4 * len(grasps)))
     shared = trials._run(Rollout(scene, closing, 1, conditions=conditions), measure_penetration(scene, grasps))
     torch.testing.assert_close(shared.displacement, alone.displacement, atol=1e-8, rtol=1e-5, equal_nan=True)

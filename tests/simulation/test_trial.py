@@ -16,9 +16,9 @@ from dro_grasp.grasps.controller import ControllerConfig
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation import rollout as rollouts
-from dro_grasp.simulation.closed_poses import held, settle
-from dro_grasp.simulation.holding import holding
-from dro_grasp.simulation.outcome import GIVE_UP, Failure
+from dro_grasp.simulation.closed_poses import after_closing, settle
+from dro_grasp.simulation.grasp_state import grasp_state
+from dro_grasp.simulation.outcome import LOST_DISTANCE, Failure
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, protocol
 from dro_grasp.simulation.trial import TrialResult, record, simulate
 from tests.helpers.claw import ball, claw, grasps_of, power_grasp, wrist_below
@@ -71,14 +71,14 @@ def test_outcomes_do_not_depend_on_where_the_objects_frame_is(hand, obj):
     assert near.success.tolist() == away.success.tolist()
     torch.testing.assert_close(near.displacement, away.displacement, atol=5e-5, rtol=0, equal_nan=True)
     torch.testing.assert_close(near.rotation, away.rotation, atol=2e-3, rtol=0, equal_nan=True)
-    close, remote = (holding(hand, o, grasps_of(hand, o, pose, grasps.joints)) for o, pose in ((obj, T), (far, T_far)))
+    close, remote = (grasp_state(hand, o, grasps_of(hand, o, pose, grasps.joints)) for o, pose in ((obj, T), (far, T_far)))
     torch.testing.assert_close(close.speed, remote.speed, atol=5e-4, rtol=0)
 
 
 def test_held_grasps_are_where_the_recorded_trial_has_them_after_closing(hand, obj):
     grasps = power_grasp(hand, obj, 2)
     grasps = grasps.with_trial(simulate(hand, obj, grasps))
-    closed, rules = held(hand, obj, grasps), protocol(DEFAULT_PROTOCOL)
+    closed, rules = after_closing(hand, obj, grasps), protocol(DEFAULT_PROTOCOL)
     assert closed.success.tolist() == grasps.success.tolist()
     assert closed.protocol == grasps.protocol
     assert (closed.joints - grasps.joints).abs().max() > 0.01
@@ -88,14 +88,14 @@ def test_held_grasps_are_where_the_recorded_trial_has_them_after_closing(hand, o
         poses, joints = record(hand, obj, grasps, i, stride=stride)
         torch.testing.assert_close(closed.joints[i], joints[end], atol=1e-5, rtol=0)
         torch.testing.assert_close(closed.T_object_wrist[i], torch.linalg.inv(poses[end]), atol=1e-5, rtol=0)
-    assert len(held(hand, obj, grasps[:0])) == 0
+    assert len(after_closing(hand, obj, grasps[:0])) == 0
 
 
 def test_a_grasp_that_throws_the_object_away_is_not_drawn_without_it(hand, obj):
     wild = replace(protocol("dro"), name="wild", stiffness=3e4, damping=0.0, force_limit=1e4)
     grasps = power_grasp(hand, obj, 2)
-    assert simulate(hand, obj, grasps, wild).closing_shift.nan_to_num(math.inf).min() > GIVE_UP
-    assert torch.equal(held(hand, obj, grasps, wild).joints, grasps.joints)
+    assert simulate(hand, obj, grasps, wild).closing_shift.nan_to_num(math.inf).min() > LOST_DISTANCE
+    assert torch.equal(after_closing(hand, obj, grasps, wild).joints, grasps.joints)
 
 
 def test_hand_30_cm_away_scores_nothing(hand, obj):

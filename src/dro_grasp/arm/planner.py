@@ -31,7 +31,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.kinds import Checked, checked
 from dro_grasp.objects.scenery import load_scene
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.predict.admission import BESIDE, NARROW, SPARED, TURNED, faults
+from dro_grasp.predict.admission import BESIDE, NARROW, SPARED, TURNED, violations
 from dro_grasp.predict.config import AUTO, GraspRequest
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.predictor import GraspPredictor
@@ -286,7 +286,7 @@ def add(task: Task, tries: Tries, grasps: GraspBatch) -> None:
             T = np.linalg.inv(task.T)
             problem = GraspProblem(task.robot.hand, task.obj, constraints=task.constraints.moved(T))
             there = grasps.replace(T_object_wrist=torch.from_numpy(T).float() @ grasps.T_object_wrist)
-            for reason, wrong in faults(problem, there).items():
+            for reason, wrong in violations(problem, there).items():
                 for row in wrong.nonzero()[:, 0].tolist():
                     tries.dropped.setdefault(first + row, reason)
         for row, reason in task.reach.hopeless(grasps).items():

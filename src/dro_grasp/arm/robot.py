@@ -22,7 +22,7 @@ from dro_grasp.files import given_path
 from dro_grasp.frames import motion_fault
 from dro_grasp.geometry.rendering.rasterizer import Camera
 from dro_grasp.geometry.se3 import roma
-from dro_grasp.hands.description.compiling import MOST_TURN
+from dro_grasp.hands.description.compiling import MAX_TURN
 from dro_grasp.hands.description.loader import Description, load_description
 from dro_grasp.hands.description.part import named, split_part
 from dro_grasp.hands.description.reduction import NO_LIMITS
@@ -392,7 +392,7 @@ class _Fit:
                     raise self.error(f"limits: position of joint '{name}' is {ends!r}; expected [lower, upper], numbers in rad "
                                      "or m")
                 lower[i], upper[i] = ends
-                if np.abs(ends).max() > MOST_TURN:
+                if np.abs(ends).max() > MAX_TURN:
                     raise self.error(f"limits: position of joint '{name}' is {ends}, which looks like degrees: expected rad")
             elif name in unlimited:
                 raise self.error(f"joint '{name}' of the arm has no position limits; state them in the arm's file, or here: "

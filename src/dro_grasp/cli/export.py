@@ -86,7 +86,7 @@ class Export:
         """One object's grasps, each with pregrasp and squeeze; hand and object are loaded where they are needed."""
         import torch
 
-        from dro_grasp.grasps.controller import completed
+        from dro_grasp.grasps.controller import complete
         from dro_grasp.grasps.sources import hand_of, object_of, object_source
 
         stated = bool(grasps.states_closing.all())
@@ -96,7 +96,7 @@ class Export:
             grasps.require_hand(hand)
         if hand is not None and not stated:
             centre = torch.as_tensor(object_of(grasps, self.object, 1.0).centre_of_mass, dtype=grasps.joints.dtype)
-            grasps = completed(hand, grasps, centre)
+            grasps = complete(hand, grasps, centre)
         return ExportJob(grasps, frame, hand, *object_source(grasps))
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import trimesh
 
-MOST_BYTES = 200_000_000  # Largest file, unpacked [bytes] (ours); reading takes some ten times as much memory
+MAX_BYTES = 200_000_000  # Largest file, unpacked [bytes] (ours); reading takes some ten times as much memory
 
 
 def open_mesh(path: Path, **options: Any) -> trimesh.Geometry:
@@ -28,8 +28,8 @@ def check_bytes(path: Path) -> None:
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
             size = max(size, sum(entry.file_size for entry in archive.infolist()))
-    if size > MOST_BYTES:
-        raise ValueError(f"it holds {size / 1e6:.0f} MB, the limit is {MOST_BYTES / 1e6:.0f}: simplify the mesh or thin out "
+    if size > MAX_BYTES:
+        raise ValueError(f"it holds {size / 1e6:.0f} MB, the limit is {MAX_BYTES / 1e6:.0f}: simplify the mesh or thin out "
                          "the cloud")
 
 

@@ -62,7 +62,7 @@ class GraspBatch:
     provenance: tuple[str, ...]
     """How each grasp was made, with model and version."""
     pregrasp_joints: Float[Tensor, "n n_dof"]
-    """Opened joints from which the hand closes; a row of NaN is not stated, and `controller.completed` makes it."""
+    """Opened joints from which the hand closes; a row of NaN is not stated, and `controller.complete` makes it."""
     squeeze_joints: Float[Tensor, "n n_dof"]
     """Joint targets that press on the object; likewise."""
     score: Float[Tensor, " n"]
@@ -262,11 +262,11 @@ class GraspBatch:
     def _sorted(self, cost: Float[Tensor, " n"]) -> GraspBatch:
         return self._take(cost.nan_to_num(nan=torch.inf).argsort(stable=True)).replace(asked_of=self.asked_of)
 
-    def bare(self) -> GraspBatch:
+    def poses_only(self) -> GraspBatch:
         """Poses, joints, objects and their making alone, without outcomes and further columns."""
         return self.replace(extra={}).without(*columns.MAY_BE_UNKNOWN).without_trial()
 
-    def moved_to(self, T_object_wrist: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"]) -> GraspBatch:
+    def with_poses(self, T_object_wrist: Float[Tensor, "n 4 4"], joints: Float[Tensor, "n n_dof"]) -> GraspBatch:
         """The batch at other poses and joints; everything that belongs to the poses before is unknown or gone."""
         stale = [name for name in self.extra if name == columns.DEPTH or name.startswith(columns.ENERGY_TERM)]
         rest = self.without(*columns.MAY_BE_UNKNOWN, *stale).without_trial()
@@ -387,7 +387,7 @@ HAND_POINTS = 64  # Surface points that are compared (ours)
 def distinct(hand: Hand, grasps: GraspBatch, earlier: GraspBatch | None = None) -> Bool[Tensor, " n"]:
     """Grasps that are not near-duplicates of an earlier grasp of the same object, be it in this batch or in `earlier`."""
     n_earlier = 0 if earlier is None else len(earlier)
-    joined = grasps if earlier is None else GraspBatch.concatenate([earlier.bare(), grasps.bare()])
+    joined = grasps if earlier is None else GraspBatch.concatenate([earlier.poses_only(), grasps.poses_only()])
     thin = hand.with_points(min(HAND_POINTS, hand.n_points))
     points = thin.points(joined.joints, joined.T_object_wrist)
     keep = torch.ones(len(joined), dtype=torch.bool)

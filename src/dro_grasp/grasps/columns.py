@@ -13,7 +13,7 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from dro_grasp.errors import OptionError
-from dro_grasp.files import TOLD
+from dro_grasp.files import MAX_QUOTED_CHARS
 from dro_grasp.frames import ROUNDING, are_rotations
 
 TRIAL_FLOATS = ("displacement", "rotation", "penetration", "robustness", "fingers_in_contact")
@@ -96,8 +96,8 @@ def rows_at(index: Any, n: int) -> Int[Tensor, " k"]:
         return torch.empty(0, dtype=torch.long)
     mask = chosen is not None and chosen.dtype == torch.bool
     if chosen is None or chosen.is_floating_point() or chosen.is_complex() or (mask and chosen.ndim != 1):
-        raise OptionError(f"{str(index)[:TOLD]} chooses no grasps; give an index, a slice, a list of indices, or a mask with "
-                          "one truth value a grasp")
+        raise OptionError(f"{str(index)[:MAX_QUOTED_CHARS]} chooses no grasps; give an index, a slice, a list of indices, or a "
+                          "mask with one truth value a grasp")
     if (not mask and bool(((chosen < -n) | (chosen >= n)).any())) or (mask and len(chosen) != n):
         raise IndexError(f"mask of {len(chosen)} for a batch of {n}" if mask else f"grasp {index} of a batch of {n}")
     return torch.arange(n)[chosen].reshape(-1)
@@ -181,7 +181,7 @@ def filled(joints: Float[Tensor, "n n_dof"], known: Mapping[str, Any], given: Ma
         fields["provenance"] = (fields["provenance"],) * n
     for name in (*TEXTS, "protocol"):
         if not isinstance(texts := fields[name], list | tuple) or not all(isinstance(text, str) for text in texts):
-            raise OptionError(f"{name} is {str(texts)[:TOLD]!r}; give one text for each of the {n} grasps")
+            raise OptionError(f"{name} is {str(texts)[:MAX_QUOTED_CHARS]!r}; give one text for each of the {n} grasps")
         if len(texts) != n:
             raise OptionError(f"{name} has {len(texts)} texts; give one for each of the {n} grasps")
         fields[name] = tuple(texts)

@@ -15,7 +15,7 @@ from dro_grasp.grasps.controller_config import ControllerConfig
 from dro_grasp.hands.hand import Hand
 
 
-def completed(hand: Hand, grasps: GraspBatch, centre: Float[Tensor, "3"], config: ControllerConfig | None = None) -> GraspBatch:
+def complete(hand: Hand, grasps: GraspBatch, centre: Float[Tensor, "3"], config: ControllerConfig | None = None) -> GraspBatch:
     """The same grasps of one object, each with pregrasp and squeeze; rows that are stated stay. `centre` as below."""
     open_rows = ~grasps.states_closing
     if not bool(open_rows.any()):

@@ -25,7 +25,7 @@ FEWEST_WITH_THUMB = 4  # Hands with fewer fingers have no thumb: their fingers a
 THUMB_CLOSING = 0.55
 """Share of the way from open to closed at which thumb opposition is measured (ours). From 0.1 to 0.75 it names the thumb of
 every hand with four or five fingers, built in or among the development assets (ten hands)."""
-MOST_FINGERS = 24  # Most fingers of a hand (ours): two hands of a humanoid, and its feet
+MAX_FINGERS = 24  # Most fingers of a hand (ours): two hands of a humanoid, and its feet
 LONGEST_FINGER = 12
 """Most joints of one finger (ours): to find which way they close, every combination of their directions is tried."""
 AXIS_ALONG_PALM = 0.75  # Cosine to the palm direction above which a joint's axis points out of the palm (ours)
@@ -79,8 +79,8 @@ def find_tips(tree: KinematicTree, shaped: Collection[int]) -> tuple[int, ...]:
     if not tips:
         raise HandError("no moving joint of this description carries a shape, so it has no fingertip; give its moving links a "
                         "visual or collision shape")
-    if len(tips) > MOST_FINGERS:
-        raise HandError(f"this description has {len(tips)} fingertips; expected at most {MOST_FINGERS}, fix the joints that "
+    if len(tips) > MAX_FINGERS:
+        raise HandError(f"this description has {len(tips)} fingertips; expected at most {MAX_FINGERS}, fix the joints that "
                         "are not the hand's")
     return tuple(tips)
 

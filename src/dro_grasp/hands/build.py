@@ -34,7 +34,7 @@ thirty published ones, the longest is 0.23; arms begin at 0.5."""
 LONGEST_JAW = 0.2
 """The same where there is a single fingertip [m] (ours): 0.03 to 0.05 for the jaws of SO-100, SO-101, Z1 and
 Talos; the smallest arm that was seen, Koch's, has 0.34."""
-MOST_NAMED = 6  # Most hands that an error names (ours)
+MAX_NAMED = 6  # Most hands that an error names (ours)
 
 
 def build_hand(description: Description, *, name: str | None = None, seed: int = 0, n_points: int = 512) -> Hand:
@@ -226,14 +226,14 @@ def require_one_hand(tree: KinematicTree, tips: Sequence[int], palm: int, file: 
     """
     hands = find_hands(tree, tips)
     if hands and not bool(tree.descends[list(tips), hands[0]].all()):
-        more = ", ..." if len(hands) > MOST_NAMED else ""
-        given = ", ".join(named(file, tree.link_names[hand]) for hand in hands[:MOST_NAMED])
+        more = ", ..." if len(hands) > MAX_NAMED else ""
+        given = ", ".join(named(file, tree.link_names[hand]) for hand in hands[:MAX_NAMED])
         raise HandError(f"this is a whole robot; give the hand that you want: {given}{more}")
     longest = LONGEST_REACH if len(tips) > 1 else LONGEST_JAW
     far = [tip for tip in tips if reach(tree, palm, tip) > longest]
     if far and not hands:
         carriers = [tree.parent[max(link for link in path_to(tree, tip) if tree.kind[link] != FIXED)] for tip in far]
-        given = " or ".join(named(file, tree.link_names[carrier]) for carrier in dict.fromkeys(carriers[:MOST_NAMED]))
+        given = " or ".join(named(file, tree.link_names[carrier]) for carrier in dict.fromkeys(carriers[:MAX_NAMED]))
         what = "this is an arm" if len(tips) == 1 else "these are arms or legs"
         raise HandError(f"its fingertip '{tree.link_names[far[0]]}' is {reach(tree, palm, far[0]):.2g} m of links away from "
                         f"'{tree.link_names[palm]}', so {what}; if a hand is part of it, name the link at which it begins, "

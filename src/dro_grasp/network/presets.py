@@ -13,7 +13,7 @@ from torch import Tensor
 from dro_grasp.errors import OptionError
 
 WIDEST = 4096  # Largest number of points, features or neighbours (ours): memory grows with their products
-MOST_LAYERS = 16  # Most layers of a part of the network (ours)
+MAX_LAYERS = 16  # Most layers of a part of the network (ours)
 LARGEST = 10.0  # Largest distance [m] and temperature (ours)
 LAST_WITH_OTHERS = "commit e1ba941"  # Last state of the package whose networks had other forms, and that shipped other weights
 FORMER: dict[str, dict[str, Any]] = {
@@ -135,7 +135,7 @@ def _fits(value: Any, kind: Any) -> bool:
     if kind is int:
         return type(value) is int and 0 < value <= WIDEST
     each = get_args(kind)
-    length = isinstance(value, tuple) and 0 < len(value) <= MOST_LAYERS and (Ellipsis in each or len(value) == len(each))
+    length = isinstance(value, tuple) and 0 < len(value) <= MAX_LAYERS and (Ellipsis in each or len(value) == len(each))
     return length and all(_fits(x, int) for x in value)
 
 

@@ -25,7 +25,7 @@ from dro_grasp.objects.reading import ObjectSource, read_geometry
 from dro_grasp.objects.shape import ObjectModel
 
 ASSET_PREFIX = "assets/"  # Prefix of a name that forces the asset
-MOST_SEEDS = 100_000  # Largest such group (ours)
+MAX_SEEDS = 100_000  # Largest such group (ours)
 MESH_SUFFIXES = {".obj", ".stl", ".ply", ".glb", ".gltf", ".off", ".dae", ".npy", ".pcd", ".3mf"}
 """Suffixes of the files in a folder that count as objects."""
 MESH = "mesh/simplified.obj"
@@ -130,8 +130,8 @@ def _procedural(first: int, last: int) -> list[str]:
     """Names of the objects of a range of seeds, both ends included."""
     if last < first:
         raise ObjectError(f"no object is in 'procedural:{first}-{last}'; give the smaller seed first")
-    if last - first >= MOST_SEEDS:
-        raise ObjectError(f"'procedural:{first}-{last}' stands for {last - first + 1:,} objects; give at most {MOST_SEEDS:,}")
+    if last - first >= MAX_SEEDS:
+        raise ObjectError(f"'procedural:{first}-{last}' stands for {last - first + 1:,} objects; give at most {MAX_SEEDS:,}")
     return [f"procedural_{seed}" for seed in range(first, last + 1)]
 
 

@@ -23,7 +23,7 @@ BALL_RADII = (0.008, 0.006, 0.004, 0.003, 0.002)
 """Radii of balls [m]; each point gets the largest that stays inside, or else the smallest (ours)."""
 BALL_SPACING = 0.008
 """Distance between the points that are touched [m] (ours): between the largest balls the surface is 1 mm low."""
-MOST_BALLS = 2000  # Balls of a solid at most (ours): larger things get larger balls, farther apart. Hands take in a few hundred
+MAX_BALLS = 2000  # Balls of a solid at most (ours): larger things get larger balls, farther apart. Hands take in a few hundred
 BALL_OUTSIDE = 0.0012  # How far a ball may reach through the surface elsewhere [m] (ours)
 ROUND = 1e-12  # Added to the inertia at unit density [m^5], so that a flat cloud has one about every axis (ours)
 
@@ -178,7 +178,7 @@ def _spread(cloud: Float[np.ndarray, "m 3"], spacing: float) -> Int[np.ndarray, 
 def _balls(obj: ObjectModel) -> Balls:
     """Balls that touch a cloud with normals from inside."""
     cloud, radii, spacing = obj.cloud.astype(float), np.array(BALL_RADII), BALL_SPACING
-    while len(rows := _spread(cloud, spacing)) > MOST_BALLS:
+    while len(rows := _spread(cloud, spacing)) > MAX_BALLS:
         spacing *= 1.25  # (ours)
         radii = np.array([BALL_RADII[0] * spacing / BALL_SPACING, *BALL_RADII])
     centres = cloud[rows] - radii[:, None, None] * obj.cloud_normals[rows]

@@ -62,7 +62,7 @@ def close_idle_fingers(energy: GraspEnergy, grasps: GraspBatch, config: ClosingC
     parts = zip(grasps.T_object_wrist.split(config.batch_size), grasps.joints.split(config.batch_size), strict=True)
     bends = bending(energy.hand)
     ends = [_Closer(energy, bends, T.to(device), config).close(q.to(device)) for T, q in parts]
-    return grasps.moved_to(grasps.T_object_wrist, torch.cat(ends).cpu())
+    return grasps.with_poses(grasps.T_object_wrist, torch.cat(ends).cpu())
 
 
 @dataclass(frozen=True)
@@ -85,12 +85,12 @@ class _Closer:
         idle = least_by_finger(self.energy, self.distances(q)) > config.idle
         for start, moving in ((q, bend), (opened, bend), (opened, first)):
             q, idle = self.contact(q, start, moving, idle)
-        holding = ~idle
+        active = ~idle
         outer = self.outer(q, bend)
-        hanging = holding & outer.any(-1) & (self.gaps(q, self.moved(outer)) > config.idle)
+        hanging = active & outer.any(-1) & (self.gaps(q, self.moved(outer)) > config.idle)
         q, hanging = self.contact(q, q, outer, hanging)
         moving = torch.where(idle[..., None], bend, outer)
-        return self.rest(q, moving, idle | hanging, holding)
+        return self.rest(q, moving, idle | hanging, active)
 
     def contact(
         self, q: Float[Tensor, "n n_dof"], start: Float[Tensor, "n n_dof"], moving: Bool[Tensor, "n n_tips n_dof"],
@@ -112,15 +112,15 @@ class _Closer:
 
     def rest(
         self, q: Float[Tensor, "n n_dof"], moving: Bool[Tensor, "n n_tips n_dof"], waiting: Bool[Tensor, "n n_tips"],
-        holding: Bool[Tensor, "n n_tips"],
+        active: Bool[Tensor, "n n_tips"],
     ) -> Float[Tensor, "n n_dof"]:
         """Joints with what reaches nothing bent as far as the fingers that hold, or less where there is no room."""
         hand, config, bends = self.energy.hand, self.config, self.bends
         opened = torch.where(bends.any(0), hand.canonical_joints(1.0), q)
-        holding = holding & bends.any(1)
+        active = active & bends.any(1)
         if hand.thumb is not None:
-            holding[:, hand.thumb] = False  # it bends otherwise than the fingers that it opposes
-        wanted = (self.bent(q, bends) * holding).sum(1) / holding.sum(1).clamp_min(1)
+            active[:, hand.thumb] = False  # it bends otherwise than the fingers that it opposes
+        wanted = (self.bent(q, bends) * active).sum(1) / active.sum(1).clamp_min(1)
         shares, counted = self.bent(q, moving), self.moved(moving)
         waiting = waiting & moving.any(-1) & (wanted[:, None] > shares)
         for finger in waiting.any(0).nonzero()[:, 0].tolist():
@@ -253,14 +253,14 @@ def ease_fingers(
 
 
 @torch.no_grad()
-def lacking_room(
+def missing_clearance(
     energy: GraspEnergy, grasps: GraspBatch, seen: Float[np.ndarray, "m 3"] | None = None, config: EasingConfig | None = None
 ) -> Float[Tensor, " n"]:
     """How much less room the opened hands leave than fingers should, where it is least, palm included [m]; 0 for none."""
     config, device = config or EasingConfig(), energy.centre.device
     lacking, tree = [torch.zeros(0)], None if seen is None else KDTree(seen)
     for part in grasps.in_parts(config.batch_size):
-        _, spare = _room(energy, part.T_object_wrist.to(device), part.pregrasp_joints.to(device), tree, config)
+        _, spare = _clearance(energy, part.T_object_wrist.to(device), part.pregrasp_joints.to(device), tree, config)
         lacking.append((-spare).amax(-1).clamp_min(0).cpu())
     return torch.cat(lacking)
 
@@ -274,7 +274,7 @@ def _eased(energy: GraspEnergy, grasps: GraspBatch, seen: KDTree | None, config:
     shares = torch.linspace(0, 1, config.steps, device=device)
     gaps, spares = [], []
     for share in shares:
-        distance, spare = _room(energy, T, torch.where(bends, q + share * (opened - q), q), seen, config)
+        distance, spare = _clearance(energy, T, torch.where(bends, q + share * (opened - q), q), seen, config)
         gaps.append(least_by_finger(energy, distance.masked_fill(stays, torch.inf)))
         spares.append(least_by_finger(energy, spare.masked_fill(stays, torch.inf)))
     gap, spare = torch.stack(gaps), torch.stack(spares)
@@ -286,7 +286,7 @@ def _eased(energy: GraspEnergy, grasps: GraspBatch, seen: KDTree | None, config:
     return torch.where(bends, q + share * (opened - q), q).cpu()
 
 
-def _room(
+def _clearance(
     energy: GraspEnergy, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], seen: KDTree | None, config: EasingConfig
 ) -> tuple[Float[Tensor, "n p"], Float[Tensor, "n p"]]:
     """Distance of each of the hand's surface points to the object, and how much more room it leaves than it should [m]."""

@@ -18,7 +18,7 @@ from dro_grasp.kinds import Checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize import terms as energies
 from dro_grasp.optimize.contacts import ContactCandidates, ContactConfig, LinkPoints, contact_candidates, link_spheres
-from dro_grasp.optimize.workspace import Clearance, Surroundings, Touching
+from dro_grasp.optimize.workspace import Clearance, ContactRegionTerm, Surroundings
 
 TERMS = ("force_closure", "distance", "penetration", "self_penetration", "alignment", "joints")
 """Names of the terms, in the order of every array of terms."""
@@ -65,7 +65,7 @@ class Evaluation(Rows):
     terms: Float[Tensor, "n 6"]
     """Weighted terms in the order of TERMS."""
     clearance: Float[Tensor, "n 1"]
-    """Weighted penetration into the surroundings, and touch beside the place to hold. It says nothing about the grasp itself,
+    """Weighted penetration into the surroundings, and touch beside the contact region. It says nothing about the grasp itself,
     so it is not among the terms."""
     by_pose: Float[Tensor, "n 6"]
     """Derivative by the hand's translation [1/m] and rotation about its grasp centre [1/rad]."""
@@ -78,18 +78,18 @@ class Evaluation(Rows):
 
 
 @dataclass(frozen=True, eq=False)
-class Room:
+class Workspace:
     """Where a hand may be, and where it may touch the object; anywhere by default."""
 
     surroundings: Surroundings | None = None
     """What it stays clear of."""
-    hold: Balls | None = None
+    contact_region: Balls | None = None
     """The only place where it touches the object."""
 
-    def to(self, device: torch.device | str) -> Room:
+    def to(self, device: torch.device | str) -> Workspace:
         """The same on another device."""
         around = None if self.surroundings is None else self.surroundings.to(device)
-        return Room(around, None if self.hold is None else on_device(self.hold, device))
+        return Workspace(around, None if self.contact_region is None else on_device(self.contact_region, device))
 
 
 class GraspEnergy:
@@ -97,7 +97,7 @@ class GraspEnergy:
 
     def __init__(
         self, hand: Hand, field: DistanceField, centre: Float[Tensor, "3"], length: float, config: EnergyConfig | None = None,
-        contacts: ContactConfig | None = None, device: torch.device | str = "cpu", room: Room | None = None,
+        contacts: ContactConfig | None = None, device: torch.device | str = "cpu", workspace: Workspace | None = None,
     ) -> None:
         """Prepare everything that stays the same from step to step.
 
@@ -107,8 +107,8 @@ class GraspEnergy:
             length: Typical distance of its surface from there [m].
             device: Device of the evaluations; all that is given is on the CPU.
         """
-        self.length, room = length, room or Room()
-        self.room = room.to(device)
+        self.length, workspace = length, workspace or Workspace()
+        self.workspace = workspace.to(device)
         self.candidates: ContactCandidates = on_device(contact_candidates(hand, contacts), device)
         self.spheres = on_device(link_spheres(hand), device)
         self.source, hand = hand, hand.to(device)
@@ -121,13 +121,13 @@ class GraspEnergy:
     @staticmethod
     def of_object(
         hand: Hand, obj: ObjectModel, config: EnergyConfig | None = None, contacts: ContactConfig | None = None,
-        device: torch.device | str = "cpu", room: Room | None = None,
+        device: torch.device | str = "cpu", workspace: Workspace | None = None,
     ) -> GraspEnergy:
         """The energy on the object's grid of signed distances."""
         surface = torch.as_tensor(obj.cloud, dtype=torch.float32)
         centre = torch.as_tensor(obj.centre_of_mass, dtype=torch.float32)
         length = float((surface - centre).norm(dim=-1).mean())
-        return GraspEnergy(hand, obj.distance_field, centre, length, config, contacts, device, room)
+        return GraspEnergy(hand, obj.distance_field, centre, length, config, contacts, device, workspace)
 
     def weighted(self, config: EnergyConfig) -> GraspEnergy:
         """This energy under other weights; it shares contacts, link spheres and distance field."""
@@ -140,16 +140,17 @@ class GraspEnergy:
         hand = self.hand
         thin = self.source.with_points(min(config.hand_points, hand.n_points)).to(hand.link_points.device)
         self.config, self.body = config, LinkPoints.of(thin.link_points, thin.link_index, hand.tree.n_links)
-        room = config.closing_room * (hand.upper - hand.lower) * ~hand.abduction
+        margin = config.closing_room * (hand.upper - hand.lower) * ~hand.abduction
         self.clearance = None
-        if self.room.surroundings is not None:
+        if self.workspace.surroundings is not None:
             few = self.source.with_points(min(config.clearance_points, hand.n_points)).to(hand.link_points.device)
             body = LinkPoints.of(few.link_points, few.link_index, hand.tree.n_links)
             self.clearance = Clearance(
-                hand, self.room.surroundings, body, self.ball, self.spheres.radii, config.clear, config.clearance)
-        self.touching = None if self.room.hold is None else Touching(self.room.hold, config.clear)
-        self.lower = torch.where(hand.opening_signs > 0, hand.lower + room, hand.lower)
-        self.upper = torch.where(hand.opening_signs > 0, hand.upper, hand.upper - room)
+                hand, self.workspace.surroundings, body, self.ball, self.spheres.radii, config.clear, config.clearance)
+        place = self.workspace.contact_region
+        self.region_term = None if place is None else ContactRegionTerm(place, config.clear)
+        self.lower = torch.where(hand.opening_signs > 0, hand.lower + margin, hand.lower)
+        self.upper = torch.where(hand.opening_signs > 0, hand.upper, hand.upper - margin)
 
     def __call__(
         self, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], contacts: Int[Tensor, "n c"] | None = None
@@ -164,8 +165,8 @@ class GraspEnergy:
         distance, gradient = self.field.distances(body)
         inside = energies.penetration(distance - config.margin, gradient)
         beside, by_point = torch.zeros_like(T_object_wrist[:, :1, 0]), config.penetration * inside.by_point
-        if self.touching is not None:
-            off = self.touching.push(body, distance, gradient)
+        if self.region_term is not None:
+            off = self.region_term.push(body, distance, gradient)
             beside, by_point = config.clearance * off.value.sum(-1, keepdim=True), by_point + config.clearance * off.by_point
             beside = beside + pulled
         wrenches = wrenches + energies.link_wrenches(body, by_point, self.body.members)
@@ -205,8 +206,8 @@ class GraspEnergy:
         poses = T_object_wrist[:, None] @ self.hand.tree.forward(q)
         points = self.contact_points.place(poses)
         distance = self.field.distances(points)[0].abs()
-        if self.touching is not None:
-            distance = distance + self.touching.pull(points).value
+        if self.region_term is not None:
+            distance = distance + self.region_term.pull(points).value
         taken = torch.zeros_like(distance)
         allowed = candidates.slot_weights > 0
         nearest = torch.where(allowed, distance[:, None], torch.inf).amin(-1)
@@ -226,7 +227,7 @@ class GraspEnergy:
     def _contacts(
         self, poses: Float[Tensor, "n n_links 4 4"], contacts: Int[Tensor, "n c"]
     ) -> tuple[tuple[Float[Tensor, " n"], ...], Float[Tensor, "n 1"], Float[Tensor, "n n_links 6"]]:
-        """Force closure, distance and alignment of contacts, weighted distance to the place to hold, and wrenches on links."""
+        """Force closure, distance and alignment of contacts, weighted distance to the contact region, and wrenches on links."""
         config, candidates = self.config, self.candidates
         links = candidates.links[contacts]
         chosen = poses[torch.arange(len(poses), device=links.device)[:, None], links]
@@ -247,8 +248,8 @@ class GraspEnergy:
         moment = moment + torch.linalg.cross(outward, config.alignment * normal, dim=-1)
         members = self.one_hot[links].transpose(-1, -2)
         wrenches, pulled = members @ torch.cat([by_point, moment], -1), torch.zeros_like(points[:, :1, 0])
-        if self.touching is not None:
-            pull = self.touching.pull(points)
+        if self.region_term is not None:
+            pull = self.region_term.pull(points)
             by_point = config.clearance * pull.by_point
             pulled = config.clearance * pull.value.sum(-1, keepdim=True)
             wrenches = wrenches + members @ torch.cat([by_point, torch.linalg.cross(points, by_point, dim=-1)], -1)

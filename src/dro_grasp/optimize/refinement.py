@@ -67,7 +67,7 @@ def refine_grasps(energy: GraspEnergy, grasps: GraspBatch, config: RefineConfig 
     with torch.no_grad():
         ends = side_by_side(lambda T, q: _descend(energy, T, q, config), *parts)
     T, q = (torch.cat(part).cpu() for part in zip(*ends, strict=True))
-    return grasps.moved_to(T, q)
+    return grasps.with_poses(T, q)
 
 
 def _descend(

@@ -26,7 +26,7 @@ APPROACH = 0.10  # Length of the straight approach along the palm direction, whi
 ROOM_POINTS = 96  # Hand points, spread evenly, at which room is measured (ours)
 
 
-def lack_of_room(
+def approach_cost(
     hand: Hand, T: Float[Tensor, "*b 4 4"], points: Float[Tensor, "*n p 3"], direction: Direction | None,
     surroundings: Surroundings,
 ) -> Float[Tensor, "*b"]:
@@ -159,7 +159,7 @@ def starts(
         middle = wanted.mean(0)
     pick = torch.randint(len(wanted), (n,), generator=generator)
     aim = middle + config.aim * torch.rand(n, 1, generator=generator) * (wanted[pick] - middle)
-    rotation = roomy_rotations(hand, points, aim, config, generator, surroundings)
+    rotation = clearest_rotations(hand, points, aim, config, generator, surroundings)
     direction = rotation @ hand.palm_direction_wrist
     offset = aim - rotation @ hand.grasp_centre_wrist
     reach = float((surface - centre).norm(dim=-1).max())
@@ -177,7 +177,7 @@ def starts(
     return compose(rotation, offset), q
 
 
-def roomy_rotations(
+def clearest_rotations(
     hand: Hand, points: Float[Tensor, "n p 3"], aim: Float[Tensor, "n 3"], config: StartConfig, generator: torch.Generator,
     surroundings: Surroundings | None,
 ) -> Float[Tensor, "n 3 3"]:
@@ -189,5 +189,5 @@ def roomy_rotations(
     rotations = wrist_rotations(hand, n * CHOICES, config.direction, spread, generator, up)
     rotations = rotations.unflatten(0, (n, CHOICES))
     placed = compose(rotations, aim[:, None] - rotations @ hand.grasp_centre_wrist)
-    lack = lack_of_room(hand, placed, points[:, None], None if config.cone else config.direction, surroundings)
+    lack = approach_cost(hand, placed, points[:, None], None if config.cone else config.direction, surroundings)
     return rotations[torch.arange(n), lack.argmin(1)]

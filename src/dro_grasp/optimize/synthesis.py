@@ -100,7 +100,7 @@ def synthesize_with(
     """
     hand, generator = energy.source, torch.Generator().manual_seed(seed)
     surface, centre = torch.as_tensor(obj.cloud, dtype=torch.float32), energy.centre.cpu()
-    surroundings = energy.room.to("cpu").surroundings
+    surroundings = energy.workspace.to("cpu").surroundings
     parts = []
     for begin in range(0, num, config.batch_size):
         size = min(config.batch_size, num - begin)

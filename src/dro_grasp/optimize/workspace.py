@@ -1,4 +1,4 @@
-"""Where a hand may be and where it may touch: its surroundings, a place to hold, and the energy of leaving them."""
+"""Where a hand may be and where it may touch: its surroundings, a contact region, and the energy of leaving them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Surroundings:
     """Upward unit normal of a plane, and its height along the normal [m]."""
     obstacles: DistanceField | None = None
     """Signed distances of other things."""
-    spared: Balls | None = None
+    keep_out: Balls | None = None
     """Places where the hand is not wanted."""
 
     @property
@@ -36,8 +36,8 @@ class Surroundings:
 
     @property
     def parts(self) -> dict[str, Surroundings]:
-        """The same one by one: plane, obstacles, spared."""
-        return {name: Surroundings(**{name: part}) for name in ("plane", "obstacles", "spared")
+        """The same one by one: plane, obstacles, keep-out."""
+        return {name: Surroundings(**{name: part}) for name in ("plane", "obstacles", "keep_out")
                 if (part := getattr(self, name)) is not None}
 
     def distances(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
@@ -45,7 +45,7 @@ class Surroundings:
         distance, gradient = torch.full_like(points[..., 0], torch.inf), torch.zeros_like(points)
         if self.plane is not None:
             distance, gradient = points @ self.plane[:3] - self.plane[3], self.plane[:3].expand_as(points)
-        for part in (self.obstacles, self.spared):
+        for part in (self.obstacles, self.keep_out):
             if part is not None:
                 other, slope = part.distances(points)
                 nearer = other < distance
@@ -64,12 +64,12 @@ class Surroundings:
         """The same on another device."""
         plane = None if self.plane is None else self.plane.to(device)
         obstacles = None if self.obstacles is None else on_device(self.obstacles, device)
-        return Surroundings(plane, obstacles, None if self.spared is None else on_device(self.spared, device))
+        return Surroundings(plane, obstacles, None if self.keep_out is None else on_device(self.keep_out, device))
 
 
 @dataclass(frozen=True)
-class Touching:
-    """A place on an object, as balls, in which all contacts are to be."""
+class ContactRegionTerm:
+    """The energy of touching an object outside its contact region, a place as balls."""
 
     place: Balls
     clear: float
@@ -118,7 +118,7 @@ class Clearance:
         """
         self.hand, self.surroundings, self.weight, self.clear = hand, surroundings, weight, clear
         # Of a plane, the spheres know nothing that surface points do not know; other things may be thin or small.
-        filled = surroundings.obstacles is not None or surroundings.spared is not None
+        filled = surroundings.obstacles is not None or surroundings.keep_out is not None
         self.parts = ((body, torch.zeros_like(body.layout[0])), (ball, radii))[: 1 + filled]
         config, moving = ControllerConfig(), hand.movable & ~hand.abduction
         self.postures = [

@@ -19,15 +19,15 @@ from dro_grasp.optimize.starts import APPROACH, angle_to_arc
 from dro_grasp.optimize.workspace import Surroundings
 from dro_grasp.predict.problem import GraspProblem
 
-WAYPOINTS = 9  # Places on the approach at which the hand is checked, both ends included (ours)
-OPENINGS = 9  # Steps in which a pregrasp opens (ours)
+APPROACH_CHECKS = 9  # Places on the approach at which the hand is checked, both ends included (ours)
+OPENING_STEPS = 9  # Steps in which a pregrasp opens (ours)
 PLANE = "in the table"  # The hand, or its approach, is below the table
 OBSTACLES = "in the scene to avoid"  # It meets what stands around the object
 SPARED = "in a place to spare"  # It meets a ball that is to be left alone
 TURNED = "turned away"  # The palm points out of the cone
 BESIDE = "touching beside the place to hold"  # The hand touches the object elsewhere too, or with fewer than two fingers there
 NARROW = "too close in pregrasp"  # The hand opens less than was asked for
-REASONS = {"plane": PLANE, "obstacles": OBSTACLES, "spared": SPARED}  # Reason by part of the surroundings
+REASONS = {"plane": PLANE, "obstacles": OBSTACLES, "keep_out": SPARED}  # Reason by part of the surroundings
 
 
 @dataclass(frozen=True)
@@ -44,17 +44,17 @@ class AdmissionConfig(Checked):
     """Distance up to which they count as touching [m]: as where forces are balanced."""
 
 
-def permitted(problem: GraspProblem, grasps: GraspBatch, config: AdmissionConfig | None = None) -> Bool[Tensor, " n"]:
+def feasible(problem: GraspProblem, grasps: GraspBatch, config: AdmissionConfig | None = None) -> Bool[Tensor, " n"]:
     """Which complete grasps respect the problem's constraints."""
     kept = torch.ones(len(grasps), dtype=torch.bool)
     if not len(grasps):
         return kept
-    for wrong in faults(problem, grasps, config, apart=False).values():
+    for wrong in violations(problem, grasps, config, apart=False).values():
         kept &= ~wrong
     return kept
 
 
-def reasons_against(
+def count_violations(
     problem: GraspProblem, grasps: GraspBatch, config: AdmissionConfig | None = None
 ) -> Counter[str]:
     """How many complete grasps do not respect the constraints, by the first reason."""
@@ -62,13 +62,13 @@ def reasons_against(
     left = torch.ones(len(grasps), dtype=torch.bool)
     if not len(grasps):
         return counted
-    for reason, wrong in faults(problem, grasps, config).items():
+    for reason, wrong in violations(problem, grasps, config).items():
         counted[reason] += int((wrong & left).sum())
         left &= ~wrong
     return +counted
 
 
-def faults(
+def violations(
     problem: GraspProblem, grasps: GraspBatch, config: AdmissionConfig | None = None, apart: bool = True
 ) -> dict[str, Bool[Tensor, " n"]]:
     """Which complete grasps do not respect the constraints, by reason; with `apart`, table, scene and spared places apart."""
@@ -115,7 +115,7 @@ def clear(
     back[:, :3, 3] = -APPROACH * hand.palm_directions(T)
     opened = hand.canonical_joints(1.0).expand_as(grasps.joints)
     postures = [(T, grasps.joints), (T, grasps.squeeze_joints), (T + back, opened)]
-    postures += [(T + share * back, grasps.pregrasp_joints) for share in torch.linspace(0, 1, WAYPOINTS).tolist()]
+    postures += [(T + share * back, grasps.pregrasp_joints) for share in torch.linspace(0, 1, APPROACH_CHECKS).tolist()]
     closest = torch.full((len(T),), torch.inf)
     for pose, q in postures:
         distance = near.distance(pose.to(problem.device), q.to(problem.device), surroundings)
@@ -125,7 +125,7 @@ def clear(
 
 def holds_in_place(problem: GraspProblem, grasps: GraspBatch, config: AdmissionConfig) -> Bool[Tensor, " n"]:
     """Which grasps touch the object in the place to hold alone, with two fingers at least."""
-    place, hand = problem.room.hold, problem.hand.to(problem.device)
+    place, hand = problem.workspace.contact_region, problem.hand.to(problem.device)
     assert place is not None
     points = hand.points(grasps.joints.to(problem.device), grasps.T_object_wrist.to(problem.device))
     distance, beside = problem.field.distances(points)[0], place.distances(points)[0] > 0
@@ -152,7 +152,7 @@ def opened_wide(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
         return grasps
     q = grasps.pregrasp_joints
     end = torch.where(hand.movable & ~hand.abduction, hand.open_ends, q)
-    for share in torch.linspace(0, 1, OPENINGS).tolist():
+    for share in torch.linspace(0, 1, OPENING_STEPS).tolist():
         tight = finger_gap(problem, grasps.T_object_wrist, q) < opening
         if not bool(tight.any()):
             break

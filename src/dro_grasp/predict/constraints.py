@@ -11,22 +11,23 @@ import torch
 from jaxtyping import Float
 
 from dro_grasp.errors import OptionError
-from dro_grasp.files import TOLD
+from dro_grasp.files import MAX_QUOTED_CHARS
 from dro_grasp.geometry.distance_field import Ball, Balls
 from dro_grasp.kinds import Checked, plain
 from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimize.grasp_energy import Room
+from dro_grasp.optimize.grasp_energy import Workspace
 from dro_grasp.optimize.starts import Direction
 from dro_grasp.optimize.workspace import Surroundings
 
-ELSEWHERE = 0.01  # A table farther than this from the one in the cloud is another [m] (ours)
-UPRIGHT = math.cos(math.radians(5.0))  # Least cosine between z and the normal of a table whose height along z is given (ours)
-SIDEWAYS = 0.1  # Least such cosine of a plane that has a height at all (ours)
-TILTED = 1e-6  # Largest deviation of a z axis that points upwards (ours)
-LARGEST_OPENING = 0.2  # Largest opening that is accepted [m] (ours)
-MOST_BALLS = 1000  # Most balls of a place (ours): each costs time at every step
-FEWEST_HELD = 16  # Fewest points of an object's cloud that a place to hold must contain (ours)
+SAME_TABLE_WITHIN = 0.01  # A table farther than this from the one in the cloud is another [m] (ours)
+MIN_UPRIGHT_COSINE = math.cos(math.radians(5.0))
+"""Least cosine between z and the normal of a table whose height along z is given (ours)."""
+MIN_PLANE_COSINE = 0.1  # Least such cosine of a plane that has a height at all (ours)
+Z_AXIS_TOLERANCE = 1e-6  # Largest deviation of a z axis that points upwards (ours)
+MAX_PREGRASP_CLEARANCE = 0.2  # Largest opening that is accepted [m] (ours)
+MAX_BALLS = 1000  # Most balls of a place (ours): each costs time at every step
+MIN_REGION_POINTS = 16  # Fewest points of an object's cloud that a place to hold must contain (ours)
 
 
 @dataclass(frozen=True)
@@ -81,8 +82,8 @@ class Constraints(Checked):
         if self.cone is not None and self.direction is None:
             raise OptionError("cone is an angle from direction, which is absent; give both, for example --direction 0 0 -1 "
                               "--cone 0.5")
-        if self.opening is not None and not 0 < self.opening <= LARGEST_OPENING:
-            raise OptionError(f"opening is {self.opening}; give metres, above 0 and at most {LARGEST_OPENING:g}: 0.01 for 1 cm")
+        if self.opening is not None and not 0 < self.opening <= MAX_PREGRASP_CLEARANCE:
+            raise OptionError(f"opening is {self.opening}; give metres, above 0 and at most {MAX_PREGRASP_CLEARANCE:g}: 0.01 for 1 cm")
 
     def moved(self, T: Float[np.ndarray, "4 4"]) -> Constraints:
         """The same in another frame, of which T is the motion from this one's coordinates to its own [m].
@@ -91,7 +92,7 @@ class Constraints(Checked):
             OptionError: There is a table, and the other frame's z axis points elsewhere.
         """
         R, t = T[:3, :3], T[:3, 3]
-        if self.table is not None and abs(T[2, 2] - 1) > TILTED:
+        if self.table is not None and abs(T[2, 2] - 1) > Z_AXIS_TOLERANCE:
             raise OptionError("table is a height along z, and the other frame's z axis points elsewhere; leave out table, or "
                               "turn the frame")
         hold, spare = (tuple((*(R @ ball[:3] + t).tolist(), ball[3]) for ball in balls) for balls in (self.hold, self.spare))
@@ -117,12 +118,12 @@ class Constraints(Checked):
         free = torch.ones(len(cloud), dtype=torch.bool)
         if (place := Balls.of(self.hold)) is not None:
             free = place.distances(cloud)[0] <= 0
-            if int(free.sum()) < FEWEST_HELD:
+            if int(free.sum()) < MIN_REGION_POINTS:
                 raise OptionError(f"hold is not on the object: {int(free.sum())} of {len(cloud)} points of its surface are "
                                   f"within the balls, and it spans {spans} m. Move the balls, or give a larger radius")
         if (place := Balls.of(self.spare)) is not None:
             free &= place.distances(cloud)[0] > 0
-            if int(free.sum()) < FEWEST_HELD:
+            if int(free.sum()) < MIN_REGION_POINTS:
                 raise OptionError(f"spare leaves nothing{' of hold' if self.hold else ''} to touch on the object, which "
                                   f"spans {spans} m; give a smaller radius")
         if self.avoid is not None:
@@ -133,14 +134,14 @@ class Constraints(Checked):
         if self.table is None or obj.table is None:
             return None
         found, centre = torch.tensor(obj.table), torch.tensor(obj.centre_of_mass)
-        height = float((found[3] - found[:2] @ centre[:2]) / found[2]) if abs(float(found[2])) > SIDEWAYS else math.inf
-        if abs(height - self.table) < ELSEWHERE and float(found[2]) > UPRIGHT:
+        height = float((found[3] - found[:2] @ centre[:2]) / found[2]) if abs(float(found[2])) > MIN_PLANE_COSINE else math.inf
+        if abs(height - self.table) < SAME_TABLE_WITHIN and float(found[2]) > MIN_UPRIGHT_COSINE:
             return None
         x, y, z, distance = (f"{float(value):.3g}" for value in obj.table)
         return (f"table is z = {self.table:g} m, but the table in the cloud is where {x} x + {y} y + {z} z = {distance} "
                 "m. Leave out table, which takes the one in the cloud; or, if the cloud is a camera's, give the camera's pose")
 
-    def room(self, obj: ObjectModel, reach: float) -> Room:
+    def workspace(self, obj: ObjectModel, reach: float) -> Workspace:
         """Where a hand may be around an object, and where it may touch it.
 
         Args:
@@ -154,7 +155,7 @@ class Constraints(Checked):
         surroundings = None
         if plane is not None or obstacles is not None or spared is not None:
             surroundings = Surroundings(None if plane is None else torch.tensor(plane, dtype=torch.float32), obstacles, spared)
-        return Room(surroundings, Balls.of(self.hold))
+        return Workspace(surroundings, Balls.of(self.hold))
 
 
 def _vector(given: Any) -> Direction:
@@ -182,8 +183,8 @@ def _balls(name: str, given: Any) -> tuple[Ball, ...]:
         rows = [_numbers(ball) for ball in given]
     except (TypeError, ValueError, RuntimeError, OptionError) as error:
         raise OptionError(f"{name} is {_shortly(given)}; give a list of balls, each of {example}") from error
-    if len(rows) > MOST_BALLS:
-        raise OptionError(f"{name} has {len(rows)} balls; give at most {MOST_BALLS}, with a larger radius")
+    if len(rows) > MAX_BALLS:
+        raise OptionError(f"{name} has {len(rows)} balls; give at most {MAX_BALLS}, with a larger radius")
     balls: list[Ball] = []
     for row in rows:
         if len(row) != 4 or not all(map(math.isfinite, row)) or not row[3] > 0:
@@ -199,4 +200,4 @@ def _numbers(given: Any) -> tuple[float, ...]:
 
 def _shortly(given: Any) -> str:
     """What was given, in one line."""
-    return " ".join(str(given).split())[:TOLD]
+    return " ".join(str(given).split())[:MAX_QUOTED_CHARS]

@@ -16,7 +16,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.kinds import Checked
 from dro_grasp.optimize.fingers import EasingConfig
 from dro_grasp.optimize.refinement import RefineConfig
-from dro_grasp.predict.admission import TURNED, AdmissionConfig, permitted, reasons_against
+from dro_grasp.predict.admission import TURNED, AdmissionConfig, count_violations, feasible
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.score import ScoreConfig
 from dro_grasp.predict.settling import SettleConfig, can_settle, settle_best
@@ -105,8 +105,8 @@ def finish(
     with watch("refine"):
         whole = complete(problem, candidates.grasps) if config.refine is None else refine(
             problem, candidates.grasps, config.refine)
-    allowed = permitted(problem, whole, config.admission)
-    dropped = Counter({TURNED: candidates.turned}) + reasons_against(problem, whole[~allowed], config.admission)
+    allowed = feasible(problem, whole, config.admission)
+    dropped = Counter({TURNED: candidates.turned}) + count_violations(problem, whole[~allowed], config.admission)
     candidates, made = candidates[allowed], len(candidates) + candidates.turned
     with watch("rank"):
         refined = pool = scored(problem, whole[allowed], config.score)

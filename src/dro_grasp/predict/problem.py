@@ -14,7 +14,7 @@ from dro_grasp.geometry.distance_field import Balls, DistanceField
 from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel, solid_of
-from dro_grasp.optimize.grasp_energy import EnergyConfig, GraspEnergy, Room
+from dro_grasp.optimize.grasp_energy import EnergyConfig, GraspEnergy, Workspace
 from dro_grasp.optimize.starts import APPROACH
 from dro_grasp.optimize.workspace import Clearance, Surroundings
 from dro_grasp.predict.constraints import Constraints
@@ -63,7 +63,7 @@ class GraspProblem:
         return APPROACH + float((points - self.hand.grasp_centre_wrist).norm(dim=-1).max())
 
     @cached_property
-    def held(self) -> Float[Tensor, "k 3"] | None:
+    def contact_points(self) -> Float[Tensor, "k 3"] | None:
         """Points of the object's cloud in the place to hold, on the CPU [m]; None where all of it may be touched."""
         if (place := Balls.of(self.constraints.hold)) is None:
             return None
@@ -86,14 +86,14 @@ class GraspProblem:
         return self._default_energy.field
 
     @property
-    def room(self) -> Room:
+    def workspace(self) -> Workspace:
         """Where the hand may be, and where it may touch the object, on the device."""
-        return self._default_energy.room
+        return self._default_energy.workspace
 
     @property
     def surroundings(self) -> Surroundings | None:
         """What the hand stays clear of, on the device; None for nothing."""
-        return self.room.surroundings
+        return self.workspace.surroundings
 
     @property
     def clearance(self) -> Clearance | None:
@@ -109,7 +109,7 @@ class GraspProblem:
     @cached_property
     def _default_energy(self) -> GraspEnergy:
         return GraspEnergy.of_object(
-            self.hand, self.obj, device=self.device, room=self.constraints.room(self.obj, self.hand_reach))
+            self.hand, self.obj, device=self.device, workspace=self.constraints.workspace(self.obj, self.hand_reach))
 
     def thinned(self, count: int) -> Hand:
         """The hand with `count` surface points, on the device.
@@ -123,6 +123,6 @@ class GraspProblem:
 
     def cloud(self, count: int, generator: torch.Generator) -> Float[Tensor, "count 3"]:
         """Random surface points of the object, or of the place to hold, on the device [m]."""
-        if self.held is None:
+        if self.contact_points is None:
             return self.obj.sample_points(count, generator).to(self.device)
-        return self.held[torch.randint(len(self.held), (count,), generator=generator)].to(self.device)
+        return self.contact_points[torch.randint(len(self.contact_points), (count,), generator=generator)].to(self.device)

@@ -16,17 +16,17 @@ from torch import Tensor
 
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.kinds import Checked
-from dro_grasp.optimize.fingers import lacking_room
+from dro_grasp.optimize.fingers import missing_clearance
 from dro_grasp.optimize.grasp_energy import EnergyConfig
 from dro_grasp.optimize.refinement import RefineConfig
-from dro_grasp.predict.admission import AdmissionConfig, permitted
+from dro_grasp.predict.admission import AdmissionConfig, feasible
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.holding_score import holding_score
 from dro_grasp.predict.score.score import ScoreConfig
 from dro_grasp.predict.stages import complete, grip, refine, scored
 from dro_grasp.simulation.closed_poses import hand_shift, settle
 from dro_grasp.simulation.contacts import deepest_penetration
-from dro_grasp.simulation.holding import Holding, holding
+from dro_grasp.simulation.grasp_state import GraspState, grasp_state
 
 
 @dataclass(frozen=True)
@@ -58,9 +58,9 @@ class Settled(NamedTuple):
 
     grasps: GraspBatch
     """All of them, in their order."""
-    held: Bool[Tensor, " n"]
+    stable: Bool[Tensor, " n"]
     """Which ones hold still, with no link too deep in the object or in another."""
-    holding: Holding
+    state: GraspState
     """How these m hold the object."""
 
 
@@ -90,18 +90,18 @@ def settle_best(
     config = config or SettleConfig()
     count = max(round(config.share * len(grasps)), min(len(grasps), least))
     best = grasps.score.topk(count).indices.sort().values
-    closed, held, state = settled(problem, grasps[best], config)
-    wrong = ~permitted(problem, closed, admission)
+    closed, stable, state = settle_grasps(problem, grasps[best], config)
+    wrong = ~feasible(problem, closed, admission)
     closed = replaced(closed, wrong, grasps[best[wrong]])
     found = scored(problem, closed, score).score
-    found[held] = holding_score(found[held], state)
-    found = torch.where(held & ~wrong, found, found.clamp_max(config.unstable_score))
+    found[stable] = holding_score(found[stable], state)
+    found = torch.where(stable & ~wrong, found, found.clamp_max(config.unstable_score))
     if problem.obj.seen is not None:
-        found = found - config.room_worth * lacking_room(problem.energy(EnergyConfig()), closed, problem.obj.seen)
+        found = found - config.room_worth * missing_clearance(problem.energy(EnergyConfig()), closed, problem.obj.seen)
     return best, closed.replace(score=found)
 
 
-def settled(problem: GraspProblem, grasps: GraspBatch, config: SettleConfig | None = None) -> Settled:
+def settle_grasps(problem: GraspProblem, grasps: GraspBatch, config: SettleConfig | None = None) -> Settled:
     """Grasps where closing leaves them, and which of them hold still.
 
     Each hand closes twice. Where the object hardly moves the first time, the grasp that comes out squeezes with balanced
@@ -124,10 +124,10 @@ def settled(problem: GraspProblem, grasps: GraspBatch, config: SettleConfig | No
     again, rows = near & ~still, near.nonzero()[:, 0]
     better = replaced(closed, still, grip(problem, closed[still], config.refinement))
     better = replaced(better, again, refine(problem, closed[again], config.refinement))[rows]
-    state, depth = holding(hand, obj, better), deepest_penetration(hand, obj, better)
+    state, depth = grasp_state(hand, obj, better), deepest_penetration(hand, obj, better)
     holds = (state.shift < config.farthest) & (state.turn < config.largest_turn) & (depth < config.deepest)
-    held = torch.zeros_like(still).index_fill(0, rows[holds], True)
-    return Settled(replaced(grasps, held, better[holds]), held, state.rows(holds))
+    stable = torch.zeros_like(still).index_fill(0, rows[holds], True)
+    return Settled(replaced(grasps, stable, better[holds]), stable, state.rows(holds))
 
 
 def replaced(grasps: GraspBatch, rows: Bool[Tensor, " n"], others: GraspBatch) -> GraspBatch:
@@ -136,4 +136,4 @@ def replaced(grasps: GraspBatch, rows: Bool[Tensor, " n"], others: GraspBatch) -
     for name in ("T_object_wrist", "joints", "pregrasp_joints", "squeeze_joints"):
         values[name] = getattr(grasps, name).clone()
         values[name][rows] = getattr(others, name)
-    return grasps.bare().replace(**values)
+    return grasps.poses_only().replace(**values)

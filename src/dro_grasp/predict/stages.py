@@ -8,14 +8,14 @@ from dataclasses import replace
 import torch
 
 from dro_grasp.devices import one_thread
+from dro_grasp.grasps import controller
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.controller import completed
 from dro_grasp.kinds import checked
 from dro_grasp.optimize.fingers import EasingConfig, close_idle_fingers, ease_fingers
 from dro_grasp.optimize.grasp_energy import EnergyConfig
 from dro_grasp.optimize.refinement import RefineConfig, refine_grasps
 from dro_grasp.optimize.squeeze import gripping
-from dro_grasp.predict.admission import AdmissionConfig, opened_wide, permitted
+from dro_grasp.predict.admission import AdmissionConfig, feasible, opened_wide
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.score import ScoreConfig, score_grasps
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
@@ -33,7 +33,7 @@ def complete(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
         GraspFileError: The grasps are of another hand.
     """
     grasps.require_hand(problem.hand)
-    return opened_wide(problem, completed(problem.hand, grasps, problem.centre))
+    return opened_wide(problem, controller.complete(problem.hand, grasps, problem.centre))
 
 
 def refine(problem: GraspProblem, grasps: GraspBatch, config: RefineConfig | None = None) -> GraspBatch:
@@ -76,7 +76,7 @@ def ease(
     for known in (None,) if seen is None else (seen, None):
         with one_thread():
             apart = ease_fingers(energy, grasps[rows], known, config)
-        allowed = permitted(problem, apart, admission)
+        allowed = feasible(problem, apart, admission)
         joints[rows[allowed]] = apart.joints[allowed]
         rows = rows[~allowed]
     return grasps.replace(joints=joints)

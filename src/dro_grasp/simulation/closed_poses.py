@@ -10,7 +10,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.contacts import contact_mask, find_contact_links
-from dro_grasp.simulation.outcome import GIVE_UP
+from dro_grasp.simulation.outcome import LOST_DISTANCE
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
 from dro_grasp.simulation.rollout import Rollout, rollouts
 from dro_grasp.simulation.scene import scene_of
@@ -31,8 +31,8 @@ def settle(
     for part, rollout in rollouts(scene, hand, grasps, workers):
         reached, T_object_wrist = _reached(part, rollout, hand, torch.from_numpy(rollout.close().stable))
         touching = contact_mask(hand, find_contact_links(scene, rollout.qpos))
-        holding = touching.float() @ hand.tree.moves.float() > 0  # joints that move a contact link
-        joints.append(torch.where(holding, reached, part.joints))
+        moves_contact = touching.float() @ hand.tree.moves.float() > 0  # joints that move a contact link
+        joints.append(torch.where(moves_contact, reached, part.joints))
         poses.append(T_object_wrist)
     unsettled = grasps.without("pregrasp_joints", "squeeze_joints", "score").without_trial()
     return unsettled.replace(T_object_wrist=torch.cat(poses), joints=torch.cat(joints))
@@ -43,18 +43,18 @@ def hand_shift(hand: Hand, before: GraspBatch, after: GraspBatch) -> Float[Tenso
     return (hand.grasp_centres(after.T_object_wrist) - hand.grasp_centres(before.T_object_wrist)).norm(dim=-1)
 
 
-def held(
+def after_closing(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *, workers: int | None = None
 ) -> GraspBatch:
     """The same grasps, outcomes included, in the poses of hand and object after closing, from where a trial goes on.
 
-    A grasp whose simulation is unstable, or that pushes the object farther than GIVE_UP, stays as it is. Errors are those of
-    `simulate`.
+    A grasp whose simulation is unstable, or that pushes the object farther than LOST_DISTANCE, stays as it is. Errors are
+    those of `simulate`.
     """
     scene, parts = scene_of(hand, obj, grasps, protocol), [(grasps.joints[:0], grasps.T_object_wrist[:0])]
     for part, rollout in rollouts(scene, hand, grasps, workers):
         closed = rollout.close()
-        sound = torch.from_numpy(closed.stable & (closed.shift(rollout.start) < GIVE_UP))
+        sound = torch.from_numpy(closed.stable & (closed.shift(rollout.start) < LOST_DISTANCE))
         parts.append(_reached(part, rollout, hand, sound))
     joints, poses = (torch.cat(column) for column in zip(*parts, strict=True))
     return grasps.replace(joints=joints, T_object_wrist=poses)

@@ -21,7 +21,7 @@ from dro_grasp.simulation.protocols import Protocol
 
 FORCES = np.concatenate([np.eye(3), -np.eye(3)])  # Directions of the forces, in the object's frame
 DIRECTIONS = ("+x", "+y", "+z", "-x", "-y", "-z")  # Their names, in the same order
-GIVE_UP = 0.1  # An object that moves this far counts as lost [m]. Ours
+LOST_DISTANCE = 0.1  # An object that moves this far counts as lost [m]. Ours
 
 
 class Failure(Enum):
@@ -177,7 +177,7 @@ class Measurements:
             return Failure.SELF_PENETRATION, f" by {self.penetration.own[i] * 1e3:.0f} mm"
         if not self.stable[i]:
             return Failure.UNSTABLE, ""
-        if self.shift[i] > min(rules.max_closing_shift, GIVE_UP) or self.turn[i] > rules.max_closing_rotation:
+        if self.shift[i] > min(rules.max_closing_shift, LOST_DISTANCE) or self.turn[i] > rules.max_closing_rotation:
             return Failure.PUSHED_AWAY, ""
         # With a reset every force counts, otherwise the last one alone.
         counted = slice(None) if rules.reset else slice(-1, None)
@@ -186,7 +186,7 @@ class Measurements:
             return None, ""
         if not self.contacts[i]:
             return Failure.NO_CONTACT, ""
-        lost = np.flatnonzero(self.displacement[i] >= GIVE_UP)
+        lost = np.flatnonzero(self.displacement[i] >= LOST_DISTANCE)
         if len(lost):
             return Failure.LOST, f" under force {DIRECTIONS[lost[0]]}"
         if moved < rules.max_displacement:

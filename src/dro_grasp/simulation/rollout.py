@@ -19,9 +19,9 @@ from dro_grasp.devices import Rows, cores
 from dro_grasp.geometry import se3
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.controller import completed
+from dro_grasp.grasps.controller import complete
 from dro_grasp.hands.hand import Hand
-from dro_grasp.simulation.outcome import FORCES, GIVE_UP
+from dro_grasp.simulation.outcome import FORCES, LOST_DISTANCE
 from dro_grasp.simulation.protocols import Perturbations
 from dro_grasp.simulation.scene import TrialScene, object_mass
 
@@ -181,7 +181,7 @@ class Rollout:
             displacement[rows, k:] = now.shift(origin.rows(rows))[:, None]
             rotation[rows, k:] = now.turn(origin.rows(rows))[:, None]
             stable[rows] = now.stable
-            alive[rows] = now.stable & (displacement[rows, k] < GIVE_UP)
+            alive[rows] = now.stable & (displacement[rows, k] < LOST_DISTANCE)
         return displacement, rotation, stable
 
     def observe(self, rows: Int[np.ndarray, " k"] | None = None) -> ObjectState:
@@ -242,7 +242,7 @@ def rollouts(
     centre = torch.as_tensor(scene.obj.centre_of_mass)
     for part in grasps.in_parts(CHUNK):
         if scene.protocol.closing:
-            part = completed(hand, part, centre, scene.protocol.controller)
+            part = complete(hand, part, centre, scene.protocol.controller)
         yield part, Rollout(scene, part, workers or cores(), stride)
 
 

@@ -19,7 +19,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.contacts import Penetration, count_fingers, find_contact_links, measure_penetration
-from dro_grasp.simulation.outcome import DIRECTIONS, GIVE_UP, Failure, Measurements, TrialResult, verdict
+from dro_grasp.simulation.outcome import DIRECTIONS, LOST_DISTANCE, Failure, Measurements, TrialResult, verdict
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
 from dro_grasp.simulation.rollout import Rollout, draw, rollouts
 from dro_grasp.simulation.scene import TrialScene, cached_scene, scene_of
@@ -96,7 +96,7 @@ def _run(rollout: Rollout, penetration: Penetration) -> TrialResult:
     contacts = find_contact_links(scene, rollout.qpos)
     shift, turn = closed.shift(rollout.start), closed.turn(rollout.start)
     # A trial that has failed already needs no forces.
-    failed = ((shift > min(rules.max_closing_shift, GIVE_UP)) | (turn > rules.max_closing_rotation)
+    failed = ((shift > min(rules.max_closing_shift, LOST_DISTANCE)) | (turn > rules.max_closing_rotation)
               | (penetration.object > rules.max_penetration) | (penetration.own > rules.max_self_penetration))
     displacement, rotation, stable = rollout.push(closed, ~failed)
     fingers = count_fingers(scene.hand, contacts)

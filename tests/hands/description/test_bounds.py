@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from dro_grasp.errors import HandError
-from dro_grasp.hands.anatomy import LONGEST_FINGER, MOST_FINGERS
+from dro_grasp.hands.anatomy import LONGEST_FINGER, MAX_FINGERS
 from dro_grasp.hands.description.compiling import NUMBERS
 from dro_grasp.hands.description.loader import load_description
 from dro_grasp.hands.library import load_hand
@@ -97,7 +97,7 @@ def test_long_chains_and_many_joints_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("count", "branches", "message"), [
-    (MOST_FINGERS + 1, True, "25 fingertips; expected at most 24"),
+    (MAX_FINGERS + 1, True, "25 fingertips; expected at most 24"),
     (LONGEST_FINGER + 1, False, "has 13 joints; expected at most 12")])
 def test_too_many_fingers_and_too_long_ones_are_refused(tmp_path: Path, count: int, branches: bool, message: str) -> None:
     text = claw(links="".join(link(f"l{i}") for i in range(count)), joints="".join(

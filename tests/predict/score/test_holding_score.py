@@ -14,9 +14,9 @@ from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimize.synthesis import synthesize
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.holding_score import FEATURES, SHIPPED, holding_features, holding_score, load_holding_score
-from dro_grasp.predict.settling import settled
+from dro_grasp.predict.settling import settle_grasps
 from dro_grasp.predict.stages import refine, scored
-from dro_grasp.simulation.holding import Holding
+from dro_grasp.simulation.grasp_state import GraspState
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.loaded_hands import loaded_hand
 
@@ -24,10 +24,10 @@ FIRM = {"shift": 0.001, "turn": 0.02, "speed": 1e-4, "spin": 1e-3, "contacts": 9
 """A grasp that holds."""
 
 
-def held(**changes: float) -> Holding:
+def held(**changes: float) -> GraspState:
     values = FIRM | changes
     worst = values.pop("worst", 0.4)
-    return Holding(**{k: torch.tensor([v]) for k, v in values.items()}, unanswered=torch.tensor([[worst, 0.8 * worst]]))
+    return GraspState(**{k: torch.tensor([v]) for k, v in values.items()}, unanswered=torch.tensor([[worst, 0.8 * worst]]))
 
 
 @pytest.mark.parametrize("worse", [
@@ -69,7 +69,7 @@ def test_a_file_with_a_number_that_is_none_is_refused(tmp_path: Path) -> None:
 def test_it_tells_better_than_geometry_alone_which_settled_grasps_hold() -> None:
     hand, obj = loaded_hand("gripper3"), load_object("hammer")
     problem = GraspProblem(hand, obj)
-    grasps, rows, state = settled(problem, refine(problem, synthesize(hand, obj, 256, 5)))
+    grasps, rows, state = settle_grasps(problem, refine(problem, synthesize(hand, obj, 256, 5)))
     grasps = scored(problem, grasps[rows])
     holds = simulate(hand, obj, grasps, "dexgraspbench").success
     assert 30 < int(holds.sum()) < len(holds) - 30

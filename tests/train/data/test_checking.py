@@ -93,7 +93,7 @@ def lazy(stored: Path) -> list[PairGrasps]:
     bends = hand.tree.moves[list(hand.fingers[0].links)].any(0) & ~hand.abduction
     joints[:, bends] = hand.open_ends[bends]
     joints = torch.where(grasps.success[:, None], joints, grasps.joints)
-    opened = grasps.moved_to(grasps.T_object_wrist, joints)
+    opened = grasps.with_poses(grasps.T_object_wrist, joints)
     opened.save(stored.with_name("lazy.parquet"))
     return list(read_collection(stored.with_name("lazy.parquet"), only_successful=False))
 

@@ -18,7 +18,7 @@ from dro_grasp.errors import OptionError
 from dro_grasp.frames import HALF_AXES, half_axis
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import CONTACT_LINKS, REASON
-from dro_grasp.grasps.controller import completed
+from dro_grasp.grasps.controller import complete
 from dro_grasp.grasps.export.formats import FORMATS, ExportJob
 from dro_grasp.grasps.export.writers import Frame
 from dro_grasp.hands.hand import Hand
@@ -211,7 +211,7 @@ class GraspPage(Page):
         if kind == GRASP_FILE:
             return f"{stem}.parquet", grasps.to_bytes()
         centre = torch.as_tensor(self.made.obj.centre_of_mass, dtype=grasps.joints.dtype)
-        grasps = completed(self.made.hand, grasps, centre)
+        grasps = complete(self.made.hand, grasps, centre)
         name, form = next((name, form) for name, form in FORMATS.items() if form.title == kind)
         content = form.content(ExportJob(grasps, Frame(), self.made.hand))
         return f"{stem}_{name}{form.suffix}", cast(bytes, content)
@@ -300,7 +300,7 @@ def describe(grasps: GraspBatch, index: int) -> str:
 def postures_of(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> dict[str, Float[Tensor, "n n_dof"]]:
     """Joints of every posture; the controller completes those that the grasps lack."""
     joints = grasps.joints.float()
-    grasps = completed(hand, grasps, torch.as_tensor(obj.centre_of_mass, dtype=torch.float32))
+    grasps = complete(hand, grasps, torch.as_tensor(obj.centre_of_mass, dtype=torch.float32))
     opened = hand.canonical_joints().expand_as(joints)
     return {"open": opened, "pregrasp": grasps.pregrasp_joints.float(), "grasp": joints,
             "squeeze": grasps.squeeze_joints.float()}

@@ -19,9 +19,9 @@ from dro_grasp.errors import HandError
 
 LEAST_MASS = 1e-4  # Mass of moving links that state none, or a negative one [kg] (ours)
 LEAST_INERTIA = 1e-8  # Inertia of moving links that state none [kg m^2] (ours)
-MOST_JOINTS = 100  # Most joints that move (ours); a humanoid with two hands has some 80
-LONGEST = 10.0  # Largest coordinate, size or travel of a slide [m] (ours)
-MOST_TURN = 25.0
+MAX_JOINTS = 100  # Most joints that move (ours); a humanoid with two hands has some 80
+MAX_LENGTH = 10.0  # Largest coordinate, size or travel of a slide [m] (ours)
+MAX_TURN = 25.0
 """Largest limit of a joint that turns [rad] (ours): four turns; no finger, wrist or arm makes more than two either way. In
 degrees, the limits of a finger are beyond it."""
 LEAST_TURN = 0.1
@@ -29,12 +29,13 @@ LEAST_TURN = 0.1
 TURNS = 1e4  # Largest reference angle [rad], and largest ratio or offset of a coupling (ours)
 HEAVIEST = 1e4  # Largest mass [kg] and inertia [kg m^2] (ours)
 NUMBERS = (
-    ("link", "body_pos", "origin", LONGEST), ("link", "body_quat", "rotation", 2.0),
-    ("shape", "geom_pos", "origin", LONGEST), ("shape", "geom_quat", "rotation", 2.0), ("shape", "geom_size", "size", LONGEST),
-    ("vertex", "mesh_vert", "vertex", LONGEST), ("joint", "jnt_pos", "anchor", LONGEST),
-    ("link", "body_ipos", "centre of mass", LONGEST), ("link", "body_mass", "mass", HEAVIEST),
+    ("link", "body_pos", "origin", MAX_LENGTH), ("link", "body_quat", "rotation", 2.0),
+    ("shape", "geom_pos", "origin", MAX_LENGTH), ("shape", "geom_quat", "rotation", 2.0),
+    ("shape", "geom_size", "size", MAX_LENGTH),
+    ("vertex", "mesh_vert", "vertex", MAX_LENGTH), ("joint", "jnt_pos", "anchor", MAX_LENGTH),
+    ("link", "body_ipos", "centre of mass", MAX_LENGTH), ("link", "body_mass", "mass", HEAVIEST),
     ("link", "body_inertia", "inertia", HEAVIEST), ("joint", "jnt_axis", "axis", 2.0),
-    ("joint", "jnt_range", "limits", MOST_TURN), ("joint", "qpos0", "reference", TURNS),
+    ("joint", "jnt_range", "limits", MAX_TURN), ("joint", "qpos0", "reference", TURNS),
     ("joint", "qpos_spring", "spring's reference", TURNS), ("joint", "jnt_stiffness", "stiffness", 1e9),
     ("coupling", "eq_data", "coefficients", TURNS),
 )
@@ -124,9 +125,9 @@ def _repair(spec: mujoco.MjSpec, message: str, notes: list[Note]) -> bool:
 def _check_numbers(model: mujoco.MjModel, path: Path) -> None:
     """Refuse numbers of a compiled hand that are not finite, or beyond all that a hand has; name their owner."""
     for j in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE):
-        if np.abs(model.jnt_range[j]).max() > LONGEST:
+        if np.abs(model.jnt_range[j]).max() > MAX_LENGTH:
             raise HandError(f"{path}: the limits of joint '{model.joint(j).name}' are {_told(model.jnt_range[j])} m; expected "
-                            f"at most {LONGEST:g} m; this looks like millimetres: scale the file by 0.001")
+                            f"at most {MAX_LENGTH:g} m; this looks like millimetres: scale the file by 0.001")
     for kind, array, what, largest in NUMBERS:
         values = np.asarray(getattr(model, array), float)
         values = values[:, None] if values.ndim == 1 else values[:, :4]
@@ -164,7 +165,7 @@ def _hint(what: str, values: Float[np.ndarray, " n"], largest: float) -> str:
         return "; if the file does not state it, its shapes are in another unit than metres: scale the file"
     if what == "limits":
         return "; this looks like degrees: write radians, or leave the limits out where a joint has none"
-    return "; this looks like millimetres: scale the file by 0.001" if largest == LONGEST else ""
+    return "; this looks like millimetres: scale the file by 0.001" if largest == MAX_LENGTH else ""
 
 
 def _owner(model: mujoco.MjModel, kind: str, index: int) -> str:

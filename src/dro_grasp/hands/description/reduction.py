@@ -9,7 +9,7 @@ import mujoco
 
 from dro_grasp.errors import HandError
 from dro_grasp.hands.description.closed_loops import couple_closed_loops, driven_joints, is_linear
-from dro_grasp.hands.description.compiling import MOST_JOINTS, Note
+from dro_grasp.hands.description.compiling import MAX_JOINTS, Note
 
 NO_LIMITS = "states no limits"  # Beginning of the note of a joint whose limits had to be assumed
 CONTINUOUS_LIMIT = math.pi  # Limits of hinges that state none, both ways from zero [rad] (ours)
@@ -146,8 +146,8 @@ def _keep_joint_equalities(spec: mujoco.MjSpec, notes: list[Note]) -> None:
 
 def _check_joints(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> None:
     """Give unlimited joints limits; refuse ball joints, inner free joints, and more joints than any hand has."""
-    if (count := len(list(spec.joints))) > MOST_JOINTS:
-        raise HandError(f"{path} has {count} joints; expected at most {MOST_JOINTS}, fix those that are not the hand's")
+    if (count := len(list(spec.joints))) > MAX_JOINTS:
+        raise HandError(f"{path} has {count} joints; expected at most {MAX_JOINTS}, fix those that are not the hand's")
     for joint in spec.joints:
         if joint.type in {mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_FREE}:
             kind = "ball" if joint.type == mujoco.mjtJoint.mjJNT_BALL else "free"

@@ -13,11 +13,11 @@ from dro_grasp.errors import HandError
 from dro_grasp.files import command
 
 DEEPEST = 100  # Most elements within each other, and most links one below the other (ours); the deepest hand known to us has 30
-MOST_ELEMENTS = 50_000  # Most elements of one file (ours)
-MOST_LINKS = 1_000  # Most links, after repetitions (ours); a tactile hand with a frame for every taxel has some 500
-MOST_BYTES = 20_000_000  # Largest description [bytes] (ours)
-MOST_PIXELS = 10_000  # Most pixels of a generated texture along each side (ours)
-MOST_DIVISIONS = 200.0  # Most divisions of a generated mesh in each direction (ours); 10,000 would take a minute and 7 GB
+MAX_ELEMENTS = 50_000  # Most elements of one file (ours)
+MAX_LINKS = 1_000  # Most links, after repetitions (ours); a tactile hand with a frame for every taxel has some 500
+MAX_BYTES = 20_000_000  # Largest description [bytes] (ours)
+MAX_PIXELS = 10_000  # Most pixels of a generated texture along each side (ours)
+MAX_DIVISIONS = 200.0  # Most divisions of a generated mesh in each direction (ours); 10,000 would take a minute and 7 GB
 UNUSED = {"composite", "flexcomp", "flex", "hfield", "skin", "plugin"}
 """Elements of MJCF that no rigid hand has, and that can grow without limit (ours)."""
 
@@ -33,9 +33,9 @@ def parse_xml(path: Path) -> ET.Element:
     if not path.is_file():
         raise HandError(f"no hand description at {path}; give an existing .urdf or .xml file, or a name that "
                         "`dro-grasp hands` lists")
-    if path.stat().st_size > MOST_BYTES:
+    if path.stat().st_size > MAX_BYTES:
         raise HandError(f"{path} has {path.stat().st_size / 1e6:.0f} MB; expected a robot hand of at most "
-                        f"{MOST_BYTES / 1e6:.0f}")
+                        f"{MAX_BYTES / 1e6:.0f}")
     try:
         root = defusedxml.ElementTree.parse(path, forbid_dtd=False).getroot()
     except defusedxml.DefusedXmlException as error:
@@ -85,16 +85,16 @@ def _check_elements(root: ET.Element, path: Path) -> None:
         element, depth, times = waiting.pop()
         elements += 1
         links += times * (element.tag in {"body", "link"})
-        if depth > DEEPEST or elements > MOST_ELEMENTS or links > MOST_LINKS:
-            raise HandError(f"{path} has more than {DEEPEST} elements within each other, {MOST_LINKS} links, or "
-                            f"{MOST_ELEMENTS} elements; expected a robot hand, leave out what is not part of it")
+        if depth > DEEPEST or elements > MAX_ELEMENTS or links > MAX_LINKS:
+            raise HandError(f"{path} has more than {DEEPEST} elements within each other, {MAX_LINKS} links, or "
+                            f"{MAX_ELEMENTS} elements; expected a robot hand, leave out what is not part of it")
         if element.tag in UNUSED and root.tag == "mujoco":  # in a URDF these belong to simulators, and nobody here reads them
             raise HandError(f"{path} has <{element.tag}>, which is no part of a rigid hand; remove it")
-        if element.tag == "texture" and max(_largest(element, "width"), _largest(element, "height")) > MOST_PIXELS:
-            raise HandError(f"{path} has a <texture> wider or higher than {MOST_PIXELS} pixels; remove it")
-        if element.tag == "mesh" and "builtin" in element.attrib and not _largest(element, "params") <= MOST_DIVISIONS:
+        if element.tag == "texture" and max(_largest(element, "width"), _largest(element, "height")) > MAX_PIXELS:
+            raise HandError(f"{path} has a <texture> wider or higher than {MAX_PIXELS} pixels; remove it")
+        if element.tag == "mesh" and "builtin" in element.attrib and not _largest(element, "params") <= MAX_DIVISIONS:
             raise HandError(f"{path} has a built-in <mesh> of params=\"{element.get('params', '')[:40]}\"; expected numbers "
-                            f"of at most {MOST_DIVISIONS:g}; divide it less, or give a file")
+                            f"of at most {MAX_DIVISIONS:g}; divide it less, or give a file")
         times *= max(1.0, _largest(element, "count")) if element.tag == "replicate" else 1
         waiting.extend((child, depth + 1, times) for child in element)
 

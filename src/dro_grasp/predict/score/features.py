@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.grasps.controller import completed
+from dro_grasp.grasps.controller import complete
 from dro_grasp.optimize.grasp_energy import TERMS, GraspEnergy, NearestPoints
 
 NEAR = 0.005  # Distance from the surface at which a link's nearness is 1/e [m] (ours)
@@ -121,7 +121,7 @@ def grasp_features(energy: GraspEnergy, grasps: GraspBatch, terms: Float[Tensor,
 def grasp_state(energy: GraspEnergy, grasps: GraspBatch, terms: Float[Tensor, "n terms"]) -> GraspState:
     """Grasps as their features see them; arguments as for `grasp_features`."""
     hand, device = energy.hand, energy.centre.device
-    grasps = completed(energy.source, grasps, energy.centre.cpu())
+    grasps = complete(energy.source, grasps, energy.centre.cpu())
     T, q, pregrasp, squeeze = (
         x.to(device) for x in (grasps.T_object_wrist, grasps.joints, grasps.pregrasp_joints, grasps.squeeze_joints))
     near = NearestPoints.of(energy, T, q)

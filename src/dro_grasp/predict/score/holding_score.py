@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from dro_grasp.network.checkpoints import SHIPPED_FOLDER, load_small
 
 if TYPE_CHECKING:
-    from dro_grasp.simulation.holding import Holding
+    from dro_grasp.simulation.grasp_state import GraspState
 
 SHIPPED = SHIPPED_FOLDER / "ranking" / "holding.safetensors"  # The model that ships
 FEATURES = 11  # Numbers of each grasp that the network sees; see `holding_features`
@@ -41,17 +41,17 @@ class HoldingScore(nn.Module):
         return self.layers((features - self.mean) / self.deviation)
 
 
-def holding_features(score: Float[Tensor, " n"], holding: Holding) -> Float[Tensor, "n features"]:
+def holding_features(score: Float[Tensor, " n"], state: GraspState) -> Float[Tensor, "n features"]:
     """The network's inputs, from what the ranking network says of grasps [log-odds] and how they hold the object."""
-    motion = torch.stack([holding.shift, holding.turn, holding.speed, holding.spin], 1).clamp_min(LEAST_MOTION).log()
-    amounts = torch.stack([holding.contacts, holding.links, holding.pressure], 1).log1p()
-    return torch.cat([score[:, None], motion, amounts, holding.slip[:, None].clamp_max(2), holding.unanswered], 1)
+    motion = torch.stack([state.shift, state.turn, state.speed, state.spin], 1).clamp_min(LEAST_MOTION).log()
+    amounts = torch.stack([state.contacts, state.links, state.pressure], 1).log1p()
+    return torch.cat([score[:, None], motion, amounts, state.slip[:, None].clamp_max(2), state.unanswered], 1)
 
 
 @torch.no_grad()
-def holding_score(score: Float[Tensor, " n"], holding: Holding) -> Float[Tensor, " n"]:
+def holding_score(score: Float[Tensor, " n"], state: GraspState) -> Float[Tensor, " n"]:
     """Mean log-odds of success in trials; higher is better, comparable among hands and objects. Arguments as above."""
-    return shipped_holding_score()(holding_features(score, holding)).mean(1)
+    return shipped_holding_score()(holding_features(score, state)).mean(1)
 
 
 def load_holding_score(path: Path) -> HoldingScore:

@@ -18,7 +18,7 @@ from dro_grasp.geometry.distance_field import DistanceField
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
-from dro_grasp.optimize.grasp_energy import Room
+from dro_grasp.optimize.grasp_energy import Workspace
 
 CROWDING_POINTS = 64  # Hand points, spread evenly, between which the distance of fingers is measured (ours)
 
@@ -81,7 +81,7 @@ class ChoiceConfig(Checked):
 
 def choice_scores(
     hand: Hand, field: DistanceField, points: Float[Tensor, "*b n_points 3"], penalties: ChoicePenalties,
-    room: Room | None = None,
+    workspace: Workspace | None = None,
 ) -> Float[Tensor, "*b"]:
     """How well hands suit the object; higher is better, comparable among hands of one kind.
 
@@ -90,11 +90,12 @@ def choice_scores(
         field: Signed distances of the object, from its mesh or from its cloud and normals.
         points: Its surface points then, in the object's frame [m].
         penalties: What speaks against a hand.
-        room: Where the hand may be, and where it may touch the object.
+        workspace: Where the hand may be, and where it may touch the object.
     """
-    room = room or Room()
+    workspace = workspace or Workspace()
     distance, normal = field.distances(points)
-    wanted = distance if room.hold is None else distance.clamp_min(0) + room.hold.distances(points)[0].clamp_min(0)
+    place = workspace.contact_region
+    wanted = distance if place is None else distance.clamp_min(0) + place.distances(points)[0].clamp_min(0)
     finger = hand.finger_of_link[hand.link_index]
 
     def nearest(part: int, distance: Float[Tensor, "*b n_points"] = distance) -> Float[Tensor, "*b"]:
@@ -109,8 +110,8 @@ def choice_scores(
     score = score - penalties.imbalance * mean_normal.norm(dim=-1)
     if bool((finger == PALM).any()):
         score = score - penalties.palm_penetration * (penalties.margin - nearest(PALM)).clamp_min(0)
-    if room.surroundings is not None:
-        closest = room.surroundings.distances(points)[0].amin(-1)
+    if workspace.surroundings is not None:
+        closest = workspace.surroundings.distances(points)[0].amin(-1)
         score = score - penalties.clearance * (penalties.margin - closest).clamp_min(0)
     some = hand.spread_rank < CROWDING_POINTS
     owner = finger[some]

@@ -25,7 +25,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.proportions import proportions
 from dro_grasp.kinds import Checked
 from dro_grasp.network.network import DistanceNetwork, Moves
-from dro_grasp.optimize.starts import CHOICES, CLEAR, Spread, lack_of_room, wrist_rotations
+from dro_grasp.optimize.starts import CHOICES, CLEAR, Spread, approach_cost, wrist_rotations
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.choice import ChoiceConfig, choice_scores
 from dro_grasp.predict.sources.source import Candidates, Progress, Source
@@ -167,7 +167,7 @@ def _placements(
     offset = cloud.mean(0) + rotate(rotation, position - hand.grasp_centre_wrist @ axes)
     placed = compose(rotation @ axes.mT, offset)
     if surroundings is not None:
-        lack = lack_of_room(hand, placed, opened, None if cone else direction, surroundings)
+        lack = approach_cost(hand, placed, opened, None if cone else direction, surroundings)
         best = lack.argsort(stable=True)[:wanted]
         rotation, offset = rotation[best] @ axes.mT, offset[best]
         placed = compose(rotation, offset + surroundings.lift(apply_to_cloud(placed[best], opened), CLEAR))
@@ -197,7 +197,7 @@ def _distances(
 
     def choose(moves: Moves, axes: Float[Tensor, "c 3 3"]) -> Moves:
         points = moves.points @ axes[:, None].mT + centre
-        suits = choice_scores(hand, field, points, config.choice.penalties, problem.room)
+        suits = choice_scores(hand, field, points, config.choice.penalties, problem.workspace)
         best = suits.reshape(-1, rivals * draws).argmax(-1)
         return moves.pick(torch.arange(len(best), device=best.device) * rivals + best // draws, best % draws)
 

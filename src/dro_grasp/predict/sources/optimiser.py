@@ -51,7 +51,7 @@ class OptimiserSource(Source):
         count = config.starts_per_candidate * num
         grasps = synthesize_with(problem.energy(synthesis.energy), problem.obj, count, seed, synthesis, progress)
         kept = facing(problem, grasps, config.farthest_direction)
-        found = Candidates.of(problem, grasps[kept][:num].bare(), self.n_points)
+        found = Candidates.of(problem, grasps[kept][:num].poses_only(), self.n_points)
         return replace(found, turned=min(int((~kept).sum()), num - len(found)))
 
 
@@ -71,4 +71,4 @@ class DescentSource(Source):
     def propose(self, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None) -> GraspBatch:
         """All that the descents end at, in no particular order of quality."""
         energy = problem.energy(self.config.energy)
-        return synthesize_with(energy, problem.obj, num, seed, self.config, progress).bare()
+        return synthesize_with(energy, problem.obj, num, seed, self.config, progress).poses_only()

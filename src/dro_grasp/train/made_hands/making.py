@@ -24,7 +24,7 @@ from dro_grasp.kinds import checked
 from dro_grasp.train.made_hands.plan import HandPlan, write_urdf
 from dro_grasp.train.made_hands.sampling import sample_plan
 
-MOST_DRAWS = 200  # Draws after which a seed is given up (ours; the first one or two are usually kept)
+MAX_DRAWS = 200  # Draws after which a seed is given up (ours; the first one or two are usually kept)
 PALM_COSINE = 0.8  # Least cosine between the derived palm direction and the planned one (ours)
 TOUCHING = 5e-4  # Deepest penetration of the open hand's links [m] (ours)
 MEETING = 0.03  # Largest distance to which each fingertip comes to one that closes against it, from middle to middle [m] (ours)
@@ -82,7 +82,7 @@ def make_hand(seed: int) -> MadeHand:
     name, generator, redrawn = hand_name(seed), np.random.default_rng(seed), []
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"{name}.urdf"
-        for _ in range(MOST_DRAWS):
+        for _ in range(MAX_DRAWS):
             plan = sample_plan(generator)
             text = write_urdf(plan, name)
             file.write_text(text)
@@ -93,7 +93,7 @@ def make_hand(seed: int) -> MadeHand:
             if not reason:
                 return MadeHand(name, seed, plan, text, tuple(redrawn))
             redrawn.append(reason)
-    raise HandError(f"none of {MOST_DRAWS} plans drawn from seed {seed} can grasp (last: {redrawn[-1]}); give another seed")
+    raise HandError(f"none of {MAX_DRAWS} plans drawn from seed {seed} can grasp (last: {redrawn[-1]}); give another seed")
 
 
 def why_unfit(plan: HandPlan, report: HandReport) -> str:

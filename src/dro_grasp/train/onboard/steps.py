@@ -44,7 +44,7 @@ PICTURE = "hand.png"  # File of the hand's picture
 DATA_SHARE = 0.45  # Share of the time for synthesis (ours); what the shares leave is for the benchmarks before and after
 TRAINING_SHARE = 0.40  # Share of the time for fine-tuning (ours)
 STRICT = PROTOCOLS["strict"].label  # Protocol by which fine-tuning is judged
-MOST_GRASPS = 400  # Grasps of an object beyond which time is better spent on training (ours)
+MAX_GRASPS = 400  # Grasps of an object beyond which time is better spent on training (ours)
 
 
 @dataclass(frozen=True)
@@ -273,7 +273,7 @@ class _Onboarding:
 
     def _data(self) -> dict[str, Any]:
         report = synthesize_dataset(
-            [self.name], self.objects, MOST_GRASPS, self.folder / DATA, workers=self.config.workers, seed=self.config.seed,
+            [self.name], self.objects, MAX_GRASPS, self.folder / DATA, workers=self.config.workers, seed=self.config.seed,
             config=EngineConfig(seconds=60 * self.config.minutes * DATA_SHARE,
                                 synthesis=SynthesisConfig(device=self.config.device)), progress=self.say)
         counts = next(iter(count_collection(self.folder / DATA).values()), {})

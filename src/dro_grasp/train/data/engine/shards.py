@@ -29,7 +29,7 @@ LOCK = ".lock"
 """File in a data set's folder that a run locks while it fills the folder; one for each part of a run that is divided."""
 HOLDER = ".process"
 """File with the number of the process that holds the lock; other systems than Linux let nobody read a locked file."""
-MOST = 1e18  # More than any count or time of a yield (ours)
+MAX_YIELD = 1e18  # More than any count or time of a yield (ours)
 STALE = 3600.0  # Age from which a temporary file counts as left behind by a killed process [s]. Ours
 
 
@@ -96,7 +96,7 @@ class Yield:
         failures = own.get("failures", {})
         counts = [value for name, value in own.items() if name != "failures"]
         counts += failures.values() if isinstance(failures, dict) else [failures]
-        if wrong := [x for x in counts if not isinstance(x, int | float) or not 0 <= x < MOST]:
+        if wrong := [x for x in counts if not isinstance(x, int | float) or not 0 <= x < MAX_YIELD]:
             raise GraspFileError(f"the yields in a grasp file's notes hold {str(wrong[0])[:60]}; expected counts and seconds: "
                                  "write the file again")
         return Yield(**own)

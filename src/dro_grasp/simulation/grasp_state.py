@@ -37,7 +37,7 @@ NO_ANSWER = 3.0  # Largest value of `unanswered`; its value without contacts, an
 
 
 @dataclass(frozen=True)
-class Holding(Rows):
+class GraspState(Rows):
     """How the object is held in n closed grasps."""
 
     shift: Float[Tensor, " n"]
@@ -76,22 +76,23 @@ class ContactForces:
 
     @property
     def slip(self) -> float:
-        """As in `Holding`."""
+        """As in `GraspState`."""
         bears = self.pressure > BEARS
         return float((self.tangential[bears] / self.pressure[bears]).max()) if bears.any() else NO_ANSWER
 
 
-def holding(
+def grasp_state(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *, workers: int | None = None
-) -> Holding:
+) -> GraspState:
     """Close hands as a trial does, and look at what holds the object then; arguments and errors are those of `simulate`."""
     scene = scene_of(hand, obj, grasps, protocol)
-    parts = [Holding(**{f.name: torch.zeros(0, 2) if f.name == "unanswered" else torch.zeros(0) for f in fields(Holding)})]
+    none = {f.name: torch.zeros(0, 2) if f.name == "unanswered" else torch.zeros(0) for f in fields(GraspState)}
+    parts = [GraspState(**none)]
     parts += [_observed(rollout) for _, rollout in rollouts(scene, hand, grasps, workers)]
-    return Holding(**{f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Holding)})
+    return GraspState(**{f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(GraspState)})
 
 
-def _observed(rollout: Rollout) -> Holding:
+def _observed(rollout: Rollout) -> GraspState:
     """Close the hands of a rollout."""
     scene, closed = rollout.scene, rollout.close()
     first = int(scene.model.body_dofadr[scene.object_body])
@@ -106,7 +107,7 @@ def _observed(rollout: Rollout) -> Holding:
     }
     friction = FRICTION_SHARE * scene.protocol.friction
     values = {name: torch.as_tensor(np.array(column), dtype=torch.float32) for name, column in columns.items()}
-    return Holding(**values, unanswered=unanswered(found, torch.as_tensor(rollout.mass, dtype=torch.float32), friction))
+    return GraspState(**values, unanswered=unanswered(found, torch.as_tensor(rollout.mass, dtype=torch.float32), friction))
 
 
 def _contacts(rollout: Rollout) -> list[ContactForces]:

@@ -9,11 +9,11 @@ import pytest
 import torch
 from scipy.optimize import nnls
 
-from dro_grasp.grasps.controller import completed
+from dro_grasp.grasps.controller import complete
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.simulation import holding as module
-from dro_grasp.simulation.holding import CHANGE, LEVER, NO_ANSWER, PUSH, ContactForces, holding, unanswered
+from dro_grasp.simulation import grasp_state as module
+from dro_grasp.simulation.grasp_state import CHANGE, LEVER, NO_ANSWER, PUSH, ContactForces, grasp_state, unanswered
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.claw import ball, claw, power_grasp
 
@@ -76,7 +76,7 @@ def test_motion_and_contacts_are_those_of_a_trial(hand: Hand, obj: ObjectModel) 
     T = grasps.T_object_wrist.clone()
     T[1, 2, 3] -= 0.01
     grasps = grasps.replace(T_object_wrist=T)
-    found, trial = holding(hand, obj, grasps), simulate(hand, obj, grasps, "strict")
+    found, trial = grasp_state(hand, obj, grasps), simulate(hand, obj, grasps, "strict")
     torch.testing.assert_close(found.shift, trial.closing_shift)
     torch.testing.assert_close(found.turn, trial.closing_rotation)
     assert found.links.tolist() == [len(links) for links in trial.contact_links]
@@ -89,19 +89,20 @@ def test_an_open_hand_holds_nothing(hand: Hand, obj: ObjectModel) -> None:
     opened = torch.zeros_like(grasps.joints)
     far = grasps.T_object_wrist.clone()
     far[:, 2, 3] -= 0.5
-    found = holding(hand, obj, grasps.replace(T_object_wrist=far, joints=opened, pregrasp_joints=opened, squeeze_joints=opened))
+    away = grasps.replace(T_object_wrist=far, joints=opened, pregrasp_joints=opened, squeeze_joints=opened)
+    found = grasp_state(hand, obj, away)
     assert found.contacts.tolist() == found.links.tolist() == found.pressure.tolist() == [0.0]
     assert found.unanswered.tolist() == [[NO_ANSWER, NO_ANSWER]]
     assert float(found.shift) == float(found.speed) == 0.0
 
 
 def test_a_firmer_squeeze_presses_harder(hand: Hand, obj: ObjectModel) -> None:
-    grasps = completed(hand, power_grasp(hand, obj, 1), torch.as_tensor(obj.centre_of_mass))
+    grasps = complete(hand, power_grasp(hand, obj, 1), torch.as_tensor(obj.centre_of_mass))
     firmer = grasps.replace(squeeze_joints=2 * grasps.squeeze_joints - grasps.joints)
-    assert 1.5 * holding(hand, obj, grasps).pressure < holding(hand, obj, firmer).pressure
+    assert 1.5 * grasp_state(hand, obj, grasps).pressure < grasp_state(hand, obj, firmer).pressure
 
 
 def test_no_grasps_hold_nothing(hand: Hand, obj: ObjectModel) -> None:
-    found = holding(hand, obj, power_grasp(hand, obj, 1)[:0])
+    found = grasp_state(hand, obj, power_grasp(hand, obj, 1)[:0])
     assert found.shift.shape == (0,)
     assert found.unanswered.shape == (0, 2)
