@@ -20,7 +20,7 @@ import torch
 
 import dro_grasp as dro
 from dro_grasp.errors import OptionError
-from dro_grasp.kinds import Checked, checked, plain
+from dro_grasp.kinds import FORMER_CONSTRAINTS, Checked, checked, plain, renamed
 from dro_grasp.network.presets import NetworkConfig
 
 
@@ -78,12 +78,12 @@ def requests_and_constraints() -> None:
     request = dro.GraspRequest(num=np.int64(3), seed=np.uint8(7), candidates=torch.tensor(2))
     assert (type(request.num), type(request.seed), type(request.candidates)) == (int, int, int)
     asked = dro.Constraints(
-        direction=np.array([0, 0, -1.0]), table=np.float32(0), cone=np.float64(0.5), opening=torch.tensor(0.01))
-    assert [type(v) for v in (asked.table, asked.cone, asked.opening)] == [float] * 3
+        direction=np.array([0, 0, -1.0]), table=np.float32(0), max_tilt=np.float64(0.5), pregrasp_clearance=torch.tensor(0.01))
+    assert [type(v) for v in (asked.table, asked.max_tilt, asked.pregrasp_clearance)] == [float] * 3
     for wrong in ({"candidates": 1.5}, {"num": "4"}, {"refine": "no"}, {"seed": None}, {"temperature": "1"}):
         with pytest.raises(OptionError, match=f"^{next(iter(wrong))} is .*; give"):
             dro.GraspRequest(**wrong)
-    for wrong in ({"table": "0"}, {"cone": "0.5", "direction": (0, 0, -1)}, {"opening": "0.01"}):
+    for wrong in ({"table": "0"}, {"max_tilt": "0.5", "direction": (0, 0, -1)}, {"pregrasp_clearance": "0.01"}):
         with pytest.raises(OptionError, match=f"^{next(iter(wrong))} is '.*'; give a number"):
             dro.Constraints(**wrong)
 
@@ -130,3 +130,41 @@ def test_functions_take_them_too() -> None:
     with pytest.raises(TypeError):
         draw("a", wrong=1)
     assert list(inspect.signature(draw).parameters) == ["where", "count", "scale"]
+
+
+FORMER = {"hold": ((0.0, 0.0, 0.0, 0.1),), "spare": ((0.0, 0.0, 0.5, 0.1),), "opening": 0.01, "cone": 0.5}
+
+
+def test_fields_of_before_are_taken_and_told() -> None:
+    """Constraints by their former names are the same, in construction, in `replace`, and when they are read."""
+    up = (0.0, 0.0, -1.0)
+    now = dro.Constraints(up, contact_region=FORMER["hold"], keep_out=FORMER["spare"], pregrasp_clearance=0.01, max_tilt=0.5)
+    with pytest.warns(FutureWarning, match="hold is called contact_region now") as told:
+        before = dro.Constraints(up, **FORMER)
+    assert before == now
+    assert {str(w.message).split()[0] for w in told} == set(FORMER)
+    assert all(w.filename == __file__ for w in told), "the caller's line is the one to change"
+    with pytest.warns(FutureWarning, match="cone is called max_tilt now"):
+        assert dataclasses.replace(now, cone=0.2) == dataclasses.replace(now, max_tilt=0.2)
+    for name, value in FORMER.items():
+        with pytest.warns(FutureWarning, match=f"{name} is called"):
+            assert getattr(now, name) == value
+    with pytest.warns(FutureWarning, match="doubt is called warning now"):
+        assert now.doubt(dro.load_object("can")) is None  # type: ignore[attr-defined]
+    with pytest.raises(TypeError, match="held"):
+        dro.Constraints(held=())  # type: ignore[call-arg]
+
+
+def test_arguments_of_before_are_taken_and_told() -> None:
+    """A function takes them by both names, and refuses what was never one."""
+    @renamed(hold="contact_region")
+    def asked(num: int, contact_region: int = 0) -> tuple[int, int]:
+        return num, contact_region
+
+    assert asked(1, contact_region=2) == (1, 2)
+    with pytest.warns(FutureWarning, match="hold is called contact_region now"):
+        assert asked(1, hold=2) == (1, 2)  # type: ignore[call-arg]
+    with pytest.raises(TypeError, match="held"):
+        asked(1, held=2)  # type: ignore[call-arg]
+    taken = inspect.signature(dro.GraspPredictor.predict).parameters
+    assert set(FORMER_CONSTRAINTS.values()) <= set(taken) and not set(FORMER_CONSTRAINTS) & set(taken)

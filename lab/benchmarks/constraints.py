@@ -110,10 +110,12 @@ def cases_of(obj: ObjectModel) -> dict[str, Case]:
     scene = load_scene(wall)
     return {
         "nothing": Case(Constraints()), "direction": Case(Constraints(ABOVE)),
-        "cone": Case(Constraints(ABOVE, cone=CONE), to_cone), "avoid": Case(Constraints(avoid=scene), to_wall),
-        "hold": Case(Constraints(hold=(held,)), fingers), "spare": Case(Constraints(spare=(spared,)), to_ball),
-        "opening": Case(Constraints(opening=OPENING), opened),
-        "cone, avoid, opening": Case(Constraints(ABOVE, cone=CONE, avoid=scene, opening=OPENING), to_wall),
+        "max_tilt": Case(Constraints(ABOVE, max_tilt=CONE), to_cone), "obstacles": Case(Constraints(obstacles=scene), to_wall),
+        "contact_region": Case(Constraints(contact_region=(held,)), fingers),
+        "keep_out": Case(Constraints(keep_out=(spared,)), to_ball),
+        "pregrasp_clearance": Case(Constraints(pregrasp_clearance=OPENING), opened),
+        "max_tilt, obstacles, pregrasp_clearance": Case(
+            Constraints(ABOVE, max_tilt=CONE, obstacles=scene, pregrasp_clearance=OPENING), to_wall),
     }
 
 

@@ -1,4 +1,4 @@
-"""Numbers and truth values as users give them: NumPy's and PyTorch's become Python's, and anything else is refused by name."""
+"""What users give: numbers and truth values, made Python's or refused by name, and names of before, still taken."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import dataclasses
 import functools
 import inspect
 import operator
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Mapping
 from types import NoneType, UnionType
 from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -130,3 +131,56 @@ def flat(record: Any, prefix: str = "") -> dict[str, Any]:
         name = f"{prefix}{field.name}"
         values |= flat(value, f"{name}.") if dataclasses.is_dataclass(value) else {name: value}
     return values
+
+
+FORMER_CONSTRAINTS = {
+    "hold": "contact_region", "spare": "keep_out", "avoid": "obstacles", "opening": "pregrasp_clearance", "cone": "max_tilt"}
+"""What the constraints of grasps were called in 0.1, and are called now: in Python, on the command line, and in JSON."""
+FORMER_SOURCES = {"optimise": "optimiser", "synthesise": "optimiser", "dro": "auto"}  # The same of sources of grasps
+Named = TypeVar("Named", bound=Callable[..., Any])
+
+
+def renamed(**former: str) -> Callable[[Named], Named]:
+    """Let a function or class answer to names of before as well, with a FutureWarning: for one release after they changed.
+
+    Args:
+        former: The present name by each former one: of a function's argument, or of a class's field, property or method.
+    """
+    def decorate(owner: Named) -> Named:
+        if not isinstance(owner, type):
+            return _taking_former(owner, former)  # type: ignore[return-value]
+        taken = inspect.signature(owner).parameters
+        given = {old: new for old, new in former.items() if new in taken}
+        if given:
+            owner.__init__ = _taking_former(owner.__init__, given)  # type: ignore[misc]
+        for old, new in former.items():
+            setattr(owner, old, _former_attribute(old, new))
+        return owner
+
+    return decorate
+
+
+def present(name: str, former: Mapping[str, str], what: str = "") -> str:
+    """The name of today for a name that may be of before, which is told by a FutureWarning."""
+    if name not in former:
+        return name
+    warnings.warn(f"{what}{name} is called {former[name]} now", FutureWarning, stacklevel=3)
+    return former[name]
+
+
+def _taking_former(call: Callable[..., Any], former: Mapping[str, str]) -> Callable[..., Any]:
+    """A function that takes its arguments by former names too.
+
+    Both names are given where `dataclasses.replace` fills in the fields that it was not asked to change: the former one counts.
+    """
+    @functools.wraps(call)
+    def taking(*args: Any, **kwargs: Any) -> Any:
+        for old in [name for name in kwargs if name in former]:
+            kwargs[present(old, former)] = kwargs.pop(old)
+        return call(*args, **kwargs)
+
+    return taking
+
+
+def _former_attribute(old: str, new: str) -> property:
+    return property(lambda owner: getattr(owner, present(old, {old: new})), doc=f"Former name of `{new}`.")

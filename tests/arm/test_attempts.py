@@ -131,7 +131,8 @@ def test_clutter_stands_on_the_table_around_the_object(robot: dro.Robot) -> None
 
 def test_settings_go_through_labels_and_back() -> None:
     assert TabletopConfig.from_label(TabletopConfig().label()) == TabletopConfig()
-    config = TabletopConfig(plan=dro.PlanConfig(constraints=dro.Constraints((0.0, 0.0, -1.0), cone=0.5, opening=0.01)))
+    wanted = dro.Constraints((0.0, 0.0, -1.0), max_tilt=0.5, pregrasp_clearance=0.01)
+    config = TabletopConfig(plan=dro.PlanConfig(constraints=wanted))
     assert TabletopConfig.from_label(config.label()) == config
     assert config.label() != TabletopConfig().label()
     heavier = TabletopConfig(plan=dro.PlanConfig(deviations=(Deviation((0.01, 0.0), 0.5, 2.0),)))

@@ -42,7 +42,8 @@ def wanted(standing: tuple[dro.ObjectModel, np.ndarray]) -> dro.Constraints:
     (x, y), top = standing[1][:2, 3].tolist(), float(np.ptp(standing[0].cloud[:, 2]))
     board = trimesh.creation.box(extents=SHELF[1])
     board.apply_translation(SHELF[0])
-    return dro.Constraints((0.0, 0.0, -1.0), cone=CONE, avoid=dro.load_scene(board), hold=((x, y, top, 0.07),))
+    region = ((x, y, top, 0.07),)
+    return dro.Constraints((0.0, 0.0, -1.0), max_tilt=CONE, obstacles=dro.load_scene(board), contact_region=region)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,7 @@ def test_the_palm_is_in_the_cone_and_fingers_touch_the_place_alone(
     links = wrist @ hand.tree.forward(grasp.float()).double().numpy()
     shapes = np.concatenate([shape.vertices @ links[shape.link, :3, :3].T + links[shape.link, :3, 3]
                              for shape in hand.description.geometry if shape.collides])
-    (x, y, z, radius), (can, T) = wanted.hold[0], standing
+    (x, y, z, radius), (can, T) = wanted.contact_region[0], standing
     apart = KDTree(can.cloud @ T[:3, :3].T + T[:3, 3]).query(shapes)[0]
     beyond = np.linalg.norm(shapes - (x, y, z), axis=1) - radius
     assert (apart < 0.01).any()
@@ -100,10 +101,10 @@ def test_a_frame_turns_directions_and_places_and_lifts_the_table() -> None:
     there = dro.Constraints(direction, 0.5, 0.3, scene, (ball,), (ball,), 0.01).moved(T)
     turn = Rotation.from_euler("z", 0.7)
     np.testing.assert_allclose(there.direction or (), turn.apply(direction))
-    np.testing.assert_allclose(there.hold[0], [*np.add(turn.apply(ball[:3]), T[:3, 3]), 0.04])
-    assert (there.table, there.cone, there.opening, there.spare) == (3.5, 0.3, 0.01, there.hold)
-    assert there.avoid is not None
-    np.testing.assert_allclose(there.avoid.points, np.add(turn.apply(scene.points), T[:3, 3]))
+    np.testing.assert_allclose(there.contact_region[0], [*np.add(turn.apply(ball[:3]), T[:3, 3]), 0.04])
+    assert (there.table, there.max_tilt, there.pregrasp_clearance, there.keep_out) == (3.5, 0.3, 0.01, there.contact_region)
+    assert there.obstacles is not None
+    np.testing.assert_allclose(there.obstacles.points, np.add(turn.apply(scene.points), T[:3, 3]))
     T[:3, :3] = Rotation.from_euler("x", 0.7).as_matrix()
     with pytest.raises(OptionError, match="the other frame's z axis points elsewhere"):
         dro.Constraints(table=0.0).moved(T)
@@ -114,8 +115,8 @@ def test_what_grasps_are_given_is_checked_as_well(
 ) -> None:
     grasps = grasps_in_world(dro.GraspPredictor(), robot.hand, *standing, 4, dro.Constraints(table=0.0))
     x, y = standing[1][:2, 3].tolist()
-    config = dro.PlanConfig(constraints=dro.Constraints(spare=((x, y, 0.06, 0.06),)))
-    with pytest.raises(dro.DroGraspError, match=r"4 grasps: 4 in a place to spare, .* relax cone, hold, spare or opening"):
+    config = dro.PlanConfig(constraints=dro.Constraints(keep_out=((x, y, 0.06, 0.06),)))
+    with pytest.raises(dro.DroGraspError, match=r"4 grasps: 4 in a place to spare, .* keep_out or pregrasp_clearance"):
         plan(robot, *standing, config=config, grasps=grasps)
 
 
@@ -126,7 +127,7 @@ def test_what_says_nothing_or_says_it_twice_is_refused(
         dro.PlanConfig(constraints=dro.Constraints(table=0.0))
     with pytest.raises(OptionError, match="both direction and directions 'paper'"):
         dro.PlanConfig(directions="paper", constraints=dro.Constraints((0, 0, -1)))
-    with pytest.raises(OptionError, match=r"hold is not on the object: .* z = 0.0"):
-        plan(robot, *standing, config=dro.PlanConfig(constraints=dro.Constraints(hold=((0.0, 0.0, 0.0, 0.05),))))
+    with pytest.raises(OptionError, match=r"contact_region is not on the object: .* z = 0.0"):
+        plan(robot, *standing, config=dro.PlanConfig(constraints=dro.Constraints(contact_region=((0.0, 0.0, 0.0, 0.05),))))
     with pytest.raises(OptionError, match="objects of attempts come to rest anywhere"):
-        TabletopConfig(plan=dro.PlanConfig(constraints=dro.Constraints(spare=((0.0, 0.0, 0.0, 0.05),))))
+        TabletopConfig(plan=dro.PlanConfig(constraints=dro.Constraints(keep_out=((0.0, 0.0, 0.0, 0.05),))))

@@ -126,7 +126,7 @@ def test_what_touches_the_robot_at_home_is_named(
     can, T = standing
     elbow = trimesh.creation.box((0.2, 0.2, 0.2), trimesh.transformations.translation_matrix((0.0, 0.0, 0.3)))
     seen = dro.load_scene(trimesh.sample.sample_surface(elbow, 2000, seed=0)[0])
-    config = PlanConfig(constraints=dro.Constraints(avoid=replace(seen, name="cell")))
+    config = PlanConfig(constraints=dro.Constraints(obstacles=replace(seen, name="cell")))
     with pytest.raises(PlanError, match=r"obstacle 'cell' collides with arm/link\d .* by .* mm; cut the robot out of"):
         plan(robot, can, T, [wall], config=config)
     assert robot.table is not None
@@ -156,7 +156,7 @@ def test_each_batch_of_grasps_is_another_one(
 def test_what_an_object_in_the_hand_could_meet_is_an_obstacle(robot: dro.Robot) -> None:
     can = dro.load_object("can")
     line = np.linspace([0.5, 0, 1.0], [0.5, 0, 4.0], 3000)
-    config = dro.PlanConfig(constraints=dro.Constraints(avoid=dro.load_scene(line)))
+    config = dro.PlanConfig(constraints=dro.Constraints(obstacles=dro.load_scene(line)))
     (thing,) = Task.of(robot, can, np.eye(4), [], config, 0).cell.obstacles
     within = np.linalg.norm(thing.cloud - robot.T_world_base[:3, 3], axis=1).max()
     arm = np.random.default_rng(0).uniform(*robot.working_range, (200, len(robot.home)))

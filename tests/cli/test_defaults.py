@@ -28,7 +28,8 @@ from dro_grasp.train.data.engine.worker import EngineConfig
 from tests.helpers.served_studio import served_studio
 
 REQUESTS = {"num": 16, "seed": 0, "candidates": 4, "refine": True, "temperature": None, "source": "auto"}
-CONSTRAINTS = {"direction": None, "table": None, "cone": None, "avoid": None, "hold": (), "spare": (), "opening": None}
+CONSTRAINTS = {"direction": None, "table": None, "max_tilt": None, "obstacles": None, "contact_region": (), "keep_out": (),
+               "pregrasp_clearance": None}
 
 
 def default(function: Callable[..., Any], name: str) -> Any:

@@ -49,8 +49,8 @@ def planned(robot: str, *options: str) -> int:
 def test_every_option_reaches_the_planner_and_every_file_is_written(
     asked: dict[str, Any], small_robot: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    palm = ["--direction", "0", "0", "-1", "--cone", "0.6", "--opening", "0.012"]
-    places = ["--hold", "0.5", "0.1", "0.2", "0.03", "--spare", "0", "0", "1", "0.1", "0", "0", "2", "0.2"]
+    palm = ["--direction", "0", "0", "-1", "--max-tilt", "0.6", "--pregrasp-clearance", "0.012"]
+    places = ["--contact-region", "0.5", "0.1", "0.2", "0.03", "--keep-out", "0", "0", "1", "0.1", "0", "0", "2", "0.2"]
     numbers = ["--num", "9", "--top", "2", "--rehearsals", "4", "--planner-seconds", "2.5", "--seed", "7", "--weights", "mine"]
     files = ["--output", "plan.npz", "--trajectory", "plan.yaml", "--csv", "plan.csv"]
     where = ["--at", "0.5", "0.1", "--obstacles", "cube"]
@@ -88,7 +88,7 @@ def test_the_pose_in_a_file_is_the_objects_and_people_are_told_in_words(
 
 @pytest.mark.parametrize(("options", "said"), [
     (["--seed", "-1"], "seed is -1; give an integer from 0"),
-    (["--cone", "0.5"], "give both, for example --direction 0 0 -1"),
+    (["--max-tilt", "0.5"], "give both, for example --direction 0 0 -1"),
     (["--output", "nowhere/plan.npz"], "create it first"),
     (["--at", "nan", "0.1"], "error: --at is nan 0.1; give x and y in metres"),
     (["--at", "0.5", "inf"], "error: --at is 0.5 inf; give x and y in metres"),

@@ -44,10 +44,11 @@ def lifted(*options: str) -> int:
 def test_every_option_reaches_the_attempts_and_the_counts_are_printed(
     done: list[Attempt], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert lifted("--see", "mesh", "--order", "random", "--direction", "0", "0", "-1", "--cone", "0.6", "--opening", "0.012",
+    assert lifted("--see", "mesh", "--order", "random", "--direction", "0", "0", "-1", "--max-tilt", "0.6",
+                  "--pregrasp-clearance", "0.012",
                   "--num", "9", "--rehearsals", "4", "--clutter", "2", "--segment", "mask", "--noise", "0.003", "--seed", "5",
                   "--json") == 0
-    constraints = dro.Constraints((0, 0, -1), cone=0.6, opening=0.012)
+    constraints = dro.Constraints((0, 0, -1), max_tilt=0.6, pregrasp_clearance=0.012)
     config = TabletopConfig("mesh", 0.003, clutter=2, segment="mask", plan=dro.PlanConfig(
         9, order="random", rehearsals=4, constraints=constraints))
     assert [TabletopConfig.from_label(a.settings) for a in done] == [config] * 4

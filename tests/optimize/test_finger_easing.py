@@ -104,7 +104,7 @@ def test_a_finger_that_finds_no_room_beside_a_guess_comes_no_nearer_to_the_surfa
     spares = iter(torch.linspace(-0.02, -0.01, CONFIG.steps).tolist())
     before = complete(TOUCHING, OPENED)
     ones = torch.ones(1, len(ENERGY.body.members))
-    monkeypatch.setattr(fingers, "_room", lambda *_: (next(gaps) * ones, next(spares) * ones))
+    monkeypatch.setattr(fingers, "_clearance", lambda *_: (next(gaps) * ones, next(spares) * ones))
     assert torch.equal(ease_fingers(ENERGY, before, BALL.cloud).joints, TOUCHING[None])
 
 

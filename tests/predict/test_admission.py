@@ -55,16 +55,17 @@ SCENE = trimesh.util.concatenate([
 DOTS = trimesh.sample.sample_surface(SCENE, 20_000, seed=0)[0]
 BESIDE_HANDLE, LOWER = (0.055, 0.0, 0.0, 0.03), (0.0, 0.0, -0.045, 0.03)
 CASES = {
-    "mesh": Constraints(avoid=load_scene(SCENE)),
-    "cloud": Constraints(avoid=load_scene(DOTS)),
-    "cone": Constraints(direction=(0.0, 0.6, -0.8), cone=0.3),
-    "hold": Constraints(hold=((*RIM, 0.055),)),
-    "spare": Constraints(spare=(BESIDE_HANDLE, LOWER)),
-    "opening": Constraints(opening=0.01),
+    "mesh": Constraints(obstacles=load_scene(SCENE)),
+    "cloud": Constraints(obstacles=load_scene(DOTS)),
+    "max_tilt": Constraints(direction=(0.0, 0.6, -0.8), max_tilt=0.3),
+    "contact_region": Constraints(contact_region=((*RIM, 0.055),)),
+    "keep_out": Constraints(keep_out=(BESIDE_HANDLE, LOWER)),
+    "pregrasp_clearance": Constraints(pregrasp_clearance=0.01),
     "table": Constraints(direction=(1.0, 0.0, 0.0), table=FLOOR),
 }
 REASONS = {
-    "mesh": OBSTACLES, "cloud": OBSTACLES, "cone": TURNED, "hold": BESIDE, "spare": SPARED, "opening": NARROW, "table": PLANE}
+    "mesh": OBSTACLES, "cloud": OBSTACLES, "max_tilt": TURNED, "contact_region": BESIDE, "keep_out": SPARED,
+    "pregrasp_clearance": NARROW, "table": PLANE}
 
 
 @cache
@@ -115,12 +116,12 @@ def shortfall(case: str, grasps: GraspBatch, row: int) -> float:
         return -min(map(box_distance, every))
     if case == "table":
         return FLOOR - min(points[:, 2].min() for points in every)
-    if case == "spare":
+    if case == "keep_out":
         return -min(float((np.linalg.norm(p - ball[:3], axis=1) - ball[3]).min())
                     for p in every for ball in (BESIDE_HANDLE, LOWER))
-    if case == "cone":
+    if case == "max_tilt":
         return math.acos(float(HAND.palm_directions(T) @ torch.tensor([0.0, 0.6, -0.8]))) - 0.3
-    if case == "opening":
+    if case == "pregrasp_clearance":
         return 0.01 - float(mesh_distance(shapes(T, grasps.pregrasp_joints[row], closing_only=True)).min())
     points = shapes(T, grasps.joints[row])
     touching = points[mesh_distance(points) < 0.0015]
@@ -149,7 +150,7 @@ def test_grasps_that_are_permitted_respect_the_constraint(case: str, free: Grasp
 
 
 def test_reasons_are_counted_once_each(free: GraspBatch) -> None:
-    both = Constraints(direction=(1.0, 0.0, 0.0), cone=0.01, spare=(LOWER,))
+    both = Constraints(direction=(1.0, 0.0, 0.0), max_tilt=0.01, keep_out=(LOWER,))
     problem = GraspProblem(HAND, MUG, constraints=both)
     counted = count_violations(problem, free)
     assert sum(counted.values()) == int((~feasible(problem, free)).sum()) == len(free)
@@ -157,15 +158,15 @@ def test_reasons_are_counted_once_each(free: GraspBatch) -> None:
 
 
 @pytest.mark.parametrize(("given", "message"), [
-    ({"cone": 0.5}, "an angle from direction, which is absent"),
-    ({"direction": (0.0, 0.0, -1.0), "cone": 0.0}, "cone is 0.0; give the largest angle in radians, above 0"),
-    ({"direction": (0.0, 0.0, -1.0), "cone": 30.0}, "30 degrees are 0.524"),
-    ({"direction": (0.0, 0.0, -1.0), "cone": 200.0}, "at most 3.14$"),
-    ({"hold": ((0.0, 0.0, 0.0, 0.0),)}, "radius above 0 in metres"),
-    ({"spare": ((0.0, 0.0, math.nan, 0.1),)}, "spare has the ball"),
-    ({"hold": ((0.0, 0.0, 0.0, 0.1),) * 1001}, "at most 1000"),
-    ({"opening": 0.0}, "opening is 0.0; give metres"),
-    ({"opening": math.inf}, "opening is inf"),
+    ({"max_tilt": 0.5}, "an angle from direction, which is absent"),
+    ({"direction": (0.0, 0.0, -1.0), "max_tilt": 0.0}, "max_tilt is 0.0; give the largest angle in radians, above 0"),
+    ({"direction": (0.0, 0.0, -1.0), "max_tilt": 30.0}, "30 degrees are 0.524"),
+    ({"direction": (0.0, 0.0, -1.0), "max_tilt": 200.0}, "at most 3.14$"),
+    ({"contact_region": ((0.0, 0.0, 0.0, 0.0),)}, "radius above 0 in metres"),
+    ({"keep_out": ((0.0, 0.0, math.nan, 0.1),)}, "keep_out has the ball"),
+    ({"contact_region": ((0.0, 0.0, 0.0, 0.1),) * 1001}, "at most 1000"),
+    ({"pregrasp_clearance": 0.0}, "pregrasp_clearance is 0.0; give metres"),
+    ({"pregrasp_clearance": math.inf}, "pregrasp_clearance is inf"),
 ])
 def test_what_is_no_constraint_is_refused(given: dict[str, object], message: str) -> None:
     with pytest.raises(OptionError, match=message):
@@ -174,9 +175,10 @@ def test_what_is_no_constraint_is_refused(given: dict[str, object], message: str
 
 def test_what_leaves_nothing_of_the_object_is_refused() -> None:
     for constraints, message in (
-        (Constraints(hold=((0.0, 0.0, 0.5, 0.05),)), "hold is not on the object: 0 of"),
-        (Constraints(spare=((0.0, 0.0, 0.0, 0.5),)), "spare leaves nothing to touch"),
-        (Constraints(hold=((*RIM, 0.05),), spare=((*RIM, 0.06),)), "spare leaves nothing of hold to touch"),
+        (Constraints(contact_region=((0.0, 0.0, 0.5, 0.05),)), "contact_region is not on the object: 0 of"),
+        (Constraints(keep_out=((0.0, 0.0, 0.0, 0.5),)), "keep_out leaves nothing to touch"),
+        (Constraints(contact_region=((*RIM, 0.05),), keep_out=((*RIM, 0.06),)),
+         "keep_out leaves nothing of contact_region to touch"),
     ):
         with pytest.raises(OptionError, match=message):
             GraspProblem(HAND, MUG, constraints=constraints)
@@ -185,14 +187,14 @@ def test_what_leaves_nothing_of_the_object_is_refused() -> None:
     for source in ((MUG.vertices, MUG.faces), MUG.cloud, MUG.cloud[MUG.cloud_normals[:, 0] > 0]):
         own = load_scene(source)
         with pytest.raises(ObjectError, match="contains object 'mug'"):
-            GraspProblem(HAND, MUG, constraints=Constraints(avoid=own))
+            GraspProblem(HAND, MUG, constraints=Constraints(obstacles=own))
 
 
 def test_an_object_may_stand_on_the_scene() -> None:
     board = trimesh.creation.box(extents=(0.4, 0.4, 0.02))
     board.apply_translation([0, 0, FLOOR - 0.01])
     for scene in (load_scene(board), load_scene(board.sample(40_000, seed=0))):
-        GraspProblem(HAND, MUG, constraints=Constraints(avoid=scene))
+        GraspProblem(HAND, MUG, constraints=Constraints(obstacles=scene))
 
 
 def test_a_scene_has_the_distances_of_its_boxes() -> None:
@@ -237,11 +239,11 @@ def test_scenes_that_are_none_are_refused(tmp_path) -> None:
 
 def test_how_much_a_grasp_may_miss_is_configured(free: GraspBatch) -> None:
     """With more room to keep fewer are let pass, and with less room more; a place is held with as many fingers as are asked."""
-    problem = GraspProblem(HAND, MUG, constraints=CASES["spare"])
+    problem = GraspProblem(HAND, MUG, constraints=CASES["keep_out"])
     assert problem.surroundings is not None
     passed = [int(feasible(problem, free, AdmissionConfig(least_clearance=least)).sum()) for least in (-1.0, 0.002, 1.0)]
     assert passed == [len(free), int(clear(problem, free, problem.surroundings).sum()), 0]
-    around = GraspProblem(HAND, MUG, constraints=Constraints(hold=((0.0, 0.0, 0.0, 1.0),)))
+    around = GraspProblem(HAND, MUG, constraints=Constraints(contact_region=((0.0, 0.0, 0.0, 1.0),)))
     enough = [feasible(around, free, AdmissionConfig(fewest_fingers=count)) for count in (0, 1, 2, 3)]
     assert bool(enough[0].all())
     assert all(bool((more <= fewer).all()) for fewer, more in pairwise(enough))

@@ -90,10 +90,11 @@ def given(**values: object) -> Constraints:
 
 
 def test_vectors_of_any_kind_become_plain_numbers() -> None:
-    plain = Constraints((0.0, 0.0, -1.0), hold=((0.0, 0.0, 0.1, 0.03),), spare=((0.1, 0.0, 0.0, 0.02),))
+    plain = Constraints((0.0, 0.0, -1.0), contact_region=((0.0, 0.0, 0.1, 0.03),), keep_out=((0.1, 0.0, 0.0, 0.02),))
     for make in (np.array, torch.tensor, list):
-        made = given(direction=make([0, 0, -1]), hold=make([[0.0, 0.0, 0.1, 0.03]]), spare=make([[0.1, 0.0, 0.0, 0.02]]))
-        numbers = [*made.direction, *(number for ball in (*made.hold, *made.spare) for number in ball)]
+        made = given(direction=make([0, 0, -1]), contact_region=make([[0.0, 0.0, 0.1, 0.03]]),
+                     keep_out=make([[0.1, 0.0, 0.0, 0.02]]))
+        numbers = [*made.direction, *(number for ball in (*made.contact_region, *made.keep_out) for number in ball)]
         assert all(type(number) is float for number in numbers)
         if make is not torch.tensor:  # which rounds to single precision
             assert repr(made) == repr(plain)
@@ -101,7 +102,7 @@ def test_vectors_of_any_kind_become_plain_numbers() -> None:
         assert made != Constraints()
         assert len({made, Constraints()}) == 2
     for nothing in ([], np.zeros((0, 4))):
-        assert given(hold=nothing, spare=nothing) == Constraints()
+        assert given(contact_region=nothing, keep_out=nothing) == Constraints()
 
 
 @pytest.mark.parametrize("direction", [
@@ -117,7 +118,7 @@ def test_a_vector_without_a_direction_is_refused(direction: object) -> None:
         given(direction=direction)
 
 
-@pytest.mark.parametrize("name", ["hold", "spare"])
+@pytest.mark.parametrize("name", ["contact_region", "keep_out"])
 @pytest.mark.parametrize("balls", [
     (0, 0, 0.1, 0.03), 1.0, np.zeros(4), [(0, 0, "x", 1)], ["ball"], ["0123"],
     [("0", "0", "0", "1")], [(0, 0, 0.1)], [(0, 0, math.nan, 1)], [(0, 0, 0, 0)]])

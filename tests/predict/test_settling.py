@@ -136,7 +136,7 @@ def test_what_ends_where_constraints_forbid_stays_as_it_was_and_scores_low(many:
     known = scored(PROBLEM, many)
     _, free = settle_best(PROBLEM, known, 24)
     ball = (*many.T_object_wrist[outcome.stable][0, :3, 3].tolist(), 0.01)
-    forbidden = GraspProblem(HAND, CAN, constraints=Constraints(spare=(ball,)))
+    forbidden = GraspProblem(HAND, CAN, constraints=Constraints(keep_out=(ball,)))
     rows, found = settle_best(forbidden, known, 24)
     assert rows.tolist() == list(range(24))
     barred = ~feasible(forbidden, settle_grasps(forbidden, known).grasps)

@@ -72,7 +72,7 @@ def test_fingers_leave_room_on_a_bare_cloud_where_the_constraints_let_them(grasp
     clear = [CAN.distance_field.distances(HAND.points(g.joints, g.T_object_wrist))[0].amin(-1) for g in (given, apart)]
     assert float((clear[1] - clear[0]).max()) > 0.002
     assert float((clear[1] - clear[0]).min()) > -1e-4
-    below = GraspProblem(HAND, cloud.obj, constraints=Constraints(cone=0.01, direction=(0.0, 0.0, 1.0)))
+    below = GraspProblem(HAND, cloud.obj, constraints=Constraints(max_tilt=0.01, direction=(0.0, 0.0, 1.0)))
     assert torch.equal(ease(below, given).joints, given.joints), "none of these grasps is feasible"
 
 
@@ -81,7 +81,7 @@ def test_where_the_wider_room_is_forbidden_fingers_leave_that_of_a_surface_that_
     wide one."""
     whole = partial_view(PROBLEM.obj, "cloud", 0)
     seen = replace(whole, seen=whole.cloud[whole.cloud[:, 0] > 0])
-    everywhere = Constraints(hold=((0.0, 0.0, 0.0, 1.0),))
+    everywhere = Constraints(contact_region=((0.0, 0.0, 0.0, 1.0),))
     plain, half = (GraspProblem(HAND, o, constraints=everywhere) for o in (whole, seen))
     given = complete(plain, grasps)
     free = AdmissionConfig(fewest_fingers=0)

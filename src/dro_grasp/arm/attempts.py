@@ -72,9 +72,9 @@ class TabletopConfig(Checked):
         """
         super().__post_init__()
         wanted = self.plan.constraints
-        if wanted.avoid is not None or wanted.hold or wanted.spare:
-            raise OptionError("objects of attempts come to rest anywhere, so that avoid, hold and spare say nothing there; "
-                              "leave them out, or use dro_grasp.plan for one object in its place")
+        if wanted.obstacles is not None or wanted.contact_region or wanted.keep_out:
+            raise OptionError("objects of attempts come to rest anywhere, so that obstacles, contact_region and keep_out say "
+                              "nothing there; leave them out, or use dro_grasp.plan for one object in its place")
         if not 0 <= self.noise < math.inf:
             raise OptionError(f"noise is {self.noise}; give a standard deviation in metres from 0 on, for example 0.0015")
         x, y, far_x, far_y = self.region

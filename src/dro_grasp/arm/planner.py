@@ -51,7 +51,7 @@ class PlanConfig(Checked):
     directions: Directions = "all"
     """Palm directions: `paper`, from above to the right side, or `all` that a table leaves room for."""
     constraints: Constraints = field(default_factory=Constraints)
-    """What grasps have to respect, in the world's frame; the scene to avoid, the arm too. The table is the robot's."""
+    """What grasps have to respect, in the world's frame; of obstacles, the arm stays clear too. The table is the robot's."""
     order: Literal["score", "random"] = "score"
     """Which reachable grasps are taken: the best by score, or any, as a control."""
     rounds: int = 3
@@ -155,7 +155,7 @@ class Task:
     """Where it stands in the world [m]."""
     config: PlanConfig
     constraints: Constraints
-    """Without the scene to avoid, which the cell has."""
+    """Without obstacles, which the cell has."""
     seed: int
 
     @staticmethod
@@ -165,10 +165,10 @@ class Task:
     ) -> Task:
         """The object, upright, in a workcell with all that is in the way; arguments are those of `plan`."""
         obj, T = upright(obj, T_world_object)
-        if (avoid := config.constraints.avoid) is not None:
+        if (scene := config.constraints.obstacles) is not None:
             reach = robot.full_reach + float(np.linalg.norm(np.ptp(obj.cloud, axis=0)))
-            obstacles = [*obstacles, *scene_solid(avoid, robot.T_world_base[:3, 3], reach)]
-        return Task(Workcell(robot, obstacles, obj, T), obj, T, config, replace(config.constraints, avoid=None), seed)
+            obstacles = [*obstacles, *scene_solid(scene, robot.T_world_base[:3, 3], reach)]
+        return Task(Workcell(robot, obstacles, obj, T), obj, T, config, replace(config.constraints, obstacles=None), seed)
 
     @property
     def robot(self) -> Robot:
@@ -214,7 +214,8 @@ class Task:
         """What to change, by the reason for which most grasps were dropped."""
         reason = max(dropped, key=lambda r: dropped[r], default="")
         if reason in (TURNED, SPARED, BESIDE, NARROW):
-            return f"most grasps are {reason}; relax cone, hold, spare or opening, or ask for more grasps (--num)"
+            return (f"most grasps are {reason}; relax max_tilt, contact_region, keep_out or pregrasp_clearance, or ask for "
+                    "more grasps (--num)")
         return (f"the object stands {self.distance:.2f} m from the base, and most grasps are {reason}; move the object, ask "
                 "for more grasps (--num), or for other palm directions (--directions)")
 
@@ -271,7 +272,7 @@ def _predicted(task: Task, predictor: GraspPredictor) -> Callable[[int], GraspBa
         directions = reachable_directions(task.robot, middle, task.seed)
     clouds = [thing.cloud for thing in task.cell.obstacles]
     wanted = replace(
-        task.constraints, table=task.height, avoid=load_scene(np.concatenate(clouds), OBSTACLE) if clouds else None)
+        task.constraints, table=task.height, obstacles=load_scene(np.concatenate(clouds), OBSTACLE) if clouds else None)
     return lambda seed: grasps_in_world(
         predictor, task.robot.hand, task.obj, task.T,
         GraspRequest(task.config.num, seed, task.config.candidates, source=task.config.source), wanted, directions)

@@ -66,7 +66,7 @@ class Benchmark:
     """A first look: what the methods return, four grasps of each hand on the first two objects, under dro and strict."""
     view: Literal["whole", "cloud", "half", "depth"] = "whole"
     """What methods, refinement and ranking see: the mesh, its points, the paper's half of them, or a depth image."""
-    views: Annotated[int, tyro.conf.arg(aliases=["--looks"])] = 1
+    views: int = 1
     """Views of each object for each hand, with --num grasps each."""
     seed: int = 0
     """The same seed gives the same grasps and views."""

@@ -8,8 +8,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import tyro
-
 from dro_grasp.cli.inputs import ConstraintOptions, Flag, ProtocolName, optional
 from dro_grasp.cli.output import print_json, print_table, progress_bar, say, say_aside
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
@@ -51,13 +49,13 @@ class Generate:
     """In the object's frame, or in the one that --camera names."""
     table: Annotated[float | None, optional("Z", "no table")] = None
     """Height [m] of a table in the object's frame; the whole hand stays above it."""
-    avoid: Annotated[Path | None, optional("MESH|CLOUD", "nothing")] = None
+    obstacles: Annotated[Path | None, optional("MESH|CLOUD", "nothing")] = None
     """Mesh or cloud of what stands around the object, in its frame and unit and without it. The hand stays clear of it: open,
     10 cm back; straight from there in pregrasp; in grasp and squeeze."""
     camera: Annotated[Path | None, optional("JSON", "the object's own frame")] = None
     """File with {"frame": "base", "T_frame_camera": 4x4}: the object is a cloud in that camera's frame; it is cleaned. Grasps,
     direction and table are in the named frame."""
-    source: Annotated[str, tyro.conf.arg(aliases=["--method"])] = "auto"
+    source: str = "auto"
     """What proposes candidates: network; optimiser, which also makes training data (any hand, nothing learned); auto, the
     network, and the optimiser for the grasps with which the score does not trust it; module:Class, a source of yours; or a
     grasp file."""
@@ -108,9 +106,9 @@ class Generate:
         outputs = paths_per_object(self.output, names, several, ".parquet")
         pictures = paths_per_object(self.picture, names, several, ".png")
         camera = None if self.camera is None else read_motion(self.camera, "T_frame_camera")
-        if self.avoid is not None:
-            scene = load_scene(self.avoid, scale=self.scale)
-            constraints = replace(constraints, avoid=scene if camera is None else scene.moved(camera.T.double().numpy()))
+        if self.obstacles is not None:
+            scene = load_scene(self.obstacles, scale=self.scale)
+            constraints = replace(constraints, obstacles=scene if camera is None else scene.moved(camera.T.double().numpy()))
         start = time.perf_counter() - begin
         hand, predictor = load_hand(self.hand), GraspPredictor(self.weights, self.device)
         seconds = {"start": start, "load": time.perf_counter() - begin - start}
@@ -149,8 +147,8 @@ class Generate:
                               "--protocol, which needs a mesh, or leave out --only-successful")
         for note in obj.notes:
             say_aside(f"{obj.name}: {note}")
-        if (doubt := self._doubt(job, obj)) is not None:
-            say_aside(f"warning: {obj.name}: {doubt}")
+        if (warning := self._warning(job, obj)) is not None:
+            say_aside(f"warning: {obj.name}: {warning}")
         problem = GraspProblem(job.hand, obj, self.device, job.constraints)
         with progress_bar("predicting", self.json) as progress:
             made = job.predictor.run(problem, job.request, progress)
@@ -208,12 +206,12 @@ class Generate:
             return load_object(name, scale=self.scale, keep_table=self.keep_table)
         return load_scan(given_path(name), camera.T.double().numpy(), self.scale, self.keep_table)
 
-    def _doubt(self, job: Job, obj: ObjectModel) -> str | None:
+    def _warning(self, job: Job, obj: ObjectModel) -> str | None:
         """What is odd about the table, in words; None for nothing."""
         if obj.is_cloud and obj.table is None and self.table is not None and job.camera is None:
             return (f"--table {self.table:g} counts along the z axis of the cloud. If that is a camera's, which points "
                     "forward, give the camera's pose with --camera")
-        return job.constraints.doubt(obj)
+        return job.constraints.warning(obj)
 
     def _protocol(self, obj: ObjectModel) -> str:
         return self.protocol or ("none" if obj.is_cloud else DEFAULT_PROTOCOL)

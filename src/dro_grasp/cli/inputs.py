@@ -32,12 +32,12 @@ class PalmOptions:
 
     direction: Annotated[tuple[float, float, float] | None, optional("X Y Z", "any direction")] = None
     """Palm direction: 0 0 -1 grasps from above. Over a table, palms tilt towards it as far as the hand needs room."""
-    cone: Annotated[float | None, optional("RAD", "roughly along the direction")] = None
+    max_tilt: Annotated[float | None, optional("RAD", "roughly along the direction")] = None
     """Largest angle [rad] between palm direction and --direction; palms are spread evenly within it."""
-    opening: Annotated[float | None, optional("M", "a quarter of what is left")] = None
+    pregrasp_clearance: Annotated[float | None, optional("M", "a quarter of what is left")] = None
     """Least distance [m] between the object and every link that closes, in pregrasp."""
 
-    def constraints(self, table: float | None = None, avoid: Scene | None = None) -> Constraints:
+    def constraints(self, table: float | None = None, obstacles: Scene | None = None) -> Constraints:
         """These options, with a table's height [m] and what stands around.
 
         Raises:
@@ -45,14 +45,14 @@ class PalmOptions:
         """
         from dro_grasp.predict.constraints import Constraints
 
-        return Constraints(table=table, avoid=avoid, **asdict(self))
+        return Constraints(table=table, obstacles=obstacles, **asdict(self))
 
 
 @dataclass(frozen=True)
 class ConstraintOptions(PalmOptions):
     """Where palms point, how far hands open, and where they touch."""
 
-    hold: Annotated[tuple[Ball, ...], optional("X Y Z RADIUS", "anywhere")] = ()
+    contact_region: Annotated[tuple[Ball, ...], optional("X Y Z RADIUS", "anywhere")] = ()
     """Balls [m]: in the grasp, the hand touches the object nowhere else. Four numbers for each ball."""
-    spare: Annotated[tuple[Ball, ...], optional("X Y Z RADIUS", "nothing")] = ()
+    keep_out: Annotated[tuple[Ball, ...], optional("X Y Z RADIUS", "nothing")] = ()
     """Balls [m] that the hand stays out of."""

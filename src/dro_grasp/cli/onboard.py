@@ -33,7 +33,7 @@ class Onboard:
     """Grasps of the network to evaluate on each held-out object, and a quarter as many that `generate` returns."""
     weights: Annotated[str | None, optional("NAME|PATH", "the shipped weights")] = None
     """Weights to fine-tune."""
-    source: Annotated[str, tyro.conf.arg(aliases=["--method"])] = "auto"
+    source: str = "auto"
     """Source of the grasps that `generate` returns in benchmarks and report: as `generate --source`."""
     device: str = "cpu"
     """Device for the network, its training and the energies: cpu, cuda or cuda:1. Trials always run on the CPU."""

@@ -45,7 +45,7 @@ class Plan:
     of the others."""
     obstacles: tuple[str, ...] = ()
     """Clouds and meshes of things, in the world frame, that nothing may touch."""
-    avoid: Annotated[Path | None, optional("MESH|CLOUD", "nothing")] = None
+    scene: Annotated[Path | None, optional("MESH|CLOUD", "nothing")] = None
     """Mesh or cloud of what stands around, of any size, in the world frame and without object and robot: hand and arm stay
     clear of it."""
     constraints: ConstraintOptions = field(default_factory=ConstraintOptions)
@@ -88,8 +88,8 @@ class Plan:
         require_extra("arm")
         if not 0 <= self.seed < 2**31:
             raise OptionError(f"seed is {self.seed}; give an integer from 0 to 2^31 - 1")
-        avoid = None if self.avoid is None else load_scene(self.avoid)
-        constraints = self.constraints.constraints(avoid=avoid)
+        scene = None if self.scene is None else load_scene(self.scene)
+        constraints = self.constraints.constraints(obstacles=scene)
         config = PlanConfig(
             self.num, self.top, self.directions, constraints, rehearsals=self.rehearsals, planner_seconds=self.planner_seconds)
         for option, place in (("--at", self.at), ("--near", self.near)):

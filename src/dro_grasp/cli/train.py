@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -18,24 +17,6 @@ if TYPE_CHECKING:
     from dro_grasp.train.config import ScheduleConfig
 
 
-FORMER_OPTIONS = ("--method", "--latent", "--latent-form", "--prior", "--placement-hand", "--divergence-warmup", "--free-bits",
-                  "--drawn")
-"""Options of training that are no longer a choice; they are still read, so that commands of before get more of an answer than
-that they are unknown."""
-
-
-def former_options(arguments: Sequence[str]) -> tuple[list[str], dict[str, str]]:
-    """The arguments without options that are no longer a choice, and these with their values."""
-    rest, former, words = [], {}, iter(arguments)
-    for word in words:
-        option, given, value = word.partition("=")
-        if option in FORMER_OPTIONS:
-            former[option] = value if given else next(words, "")
-        else:
-            rest.append(word)
-    return rest, former
-
-
 @dataclass(frozen=True, kw_only=True)
 class Stage:
     """Options of both stages of training."""
@@ -48,7 +29,7 @@ class Stage:
     """Weights file to write."""
     preset: Annotated[
         Literal["slim", "paper", "paper-slim", "multi"] | None,
-        tyro.conf.arg(aliases=["--size"], metavar="{slim,paper,paper-slim,multi}", help_behavior_hint="(default: multi)"),
+        tyro.conf.arg(metavar="{slim,paper,paper-slim,multi}", help_behavior_hint="(default: multi)"),
     ] = None
     """Network: multi, or slim (that of the default weights: narrow, told the placement), paper, or paper-slim (the paper's,
     as narrow)."""
@@ -69,7 +50,7 @@ class Stage:
     json: Flag = False
     """Print one JSON object at the end."""
     former: tyro.conf.Suppress[dict[str, str]] = field(default_factory=dict)
-    """Options of `FORMER_OPTIONS` that were given."""
+    """Options that are no longer a choice, and the values that were given."""
 
     def network(self, initial: DistanceNetwork | None) -> NetworkConfig:
         """The configuration of the preset, else of the initial weights, else of `multi`.

@@ -13,7 +13,7 @@ from torch import Tensor
 from dro_grasp.geometry.distance_field import Ball, Balls, DistanceField
 from dro_grasp.geometry.se3 import apply_to_cloud, compose, random_rotations, roma, rotate, rotation_between
 from dro_grasp.hands.hand import Hand
-from dro_grasp.kinds import Checked
+from dro_grasp.kinds import Checked, renamed
 from dro_grasp.optimize.grasp_energy import EnergyConfig
 from dro_grasp.optimize.workspace import Surroundings
 
@@ -69,8 +69,8 @@ class Spread(NamedTuple):
 
     deviation: float
     """Standard deviation [rad]."""
-    cone: float | None = None
-    """Evenly within a cone of this half angle instead [rad]."""
+    max_tilt: float | None = None
+    """Evenly within this angle instead [rad]."""
 
 
 def wrist_rotations(
@@ -79,7 +79,7 @@ def wrist_rotations(
 ) -> Float[Tensor, "count 3 3"]:
     """Random wrist rotations: uniform, or with the palm near a direction in the object's frame and any roll.
 
-    `up` is the normal of a plane towards which palms also tilt, by up to LARGEST_TILT; not in a cone.
+    `up` is the normal of a plane towards which palms also tilt, by up to LARGEST_TILT; not where `spread` has a `max_tilt`.
     """
     palm = hand.palm_direction_wrist
     if direction is None:
@@ -90,8 +90,8 @@ def wrist_rotations(
     tilt = torch.randn(count, 3, generator=generator) * spread.deviation
     tilt = tilt - (tilt @ wanted)[:, None] * wanted
     align = rotation_between(palm.cpu(), wanted)
-    if spread.cone is not None:
-        height = 1 - torch.rand(count, 1, generator=generator) * (1 - math.cos(spread.cone))
+    if spread.max_tilt is not None:
+        height = 1 - torch.rand(count, 1, generator=generator) * (1 - math.cos(spread.max_tilt))
         tilt = torch.nn.functional.normalize(tilt, dim=-1) * torch.acos(height)
     elif up is not None:
         axis, most = _tilt(wanted, up.cpu())
@@ -102,6 +102,7 @@ def wrist_rotations(
 CHOICES = 8  # Wrist rotations among which each hand takes the one with most room (ours)
 
 
+@renamed(hold="contact_region", cone="max_tilt")
 @dataclass(frozen=True)
 class StartConfig(Checked):
     """Distribution of the starts. Source of the scheme: DexGraspNet; the numbers are ours."""
@@ -117,9 +118,9 @@ class StartConfig(Checked):
     """Palm direction in the object's frame; any by default."""
     direction_spread: float = math.radians(5.0)
     """Standard deviation of the palm direction around the given one [rad]."""
-    cone: float | None = None
+    max_tilt: float | None = None
     """Palm directions are spread evenly within this angle of the given one instead [rad]."""
-    hold: tuple[Ball, ...] = ()
+    contact_region: tuple[Ball, ...] = ()
     """Places at which palms aim, where there are any; at all of the object by default."""
     gap: tuple[float, float] = (0.0, 0.01)
     """Range of the distance between hand and object [m]."""
@@ -154,7 +155,7 @@ def starts(
     q = start_joints(hand, n, config, generator)
     points = hand.points(q)
     wanted, middle = surface, centre
-    if (place := Balls.of(config.hold)) is not None:
+    if (place := Balls.of(config.contact_region)) is not None:
         wanted = surface[place.distances(surface)[0] <= 0]
         middle = wanted.mean(0)
     pick = torch.randint(len(wanted), (n,), generator=generator)
@@ -183,11 +184,11 @@ def clearest_rotations(
 ) -> Float[Tensor, "n 3 3"]:
     """Wrist rotations of hands that aim at points; of several for each, the one that has most room in the surroundings."""
     n, up = len(aim), None if surroundings is None else surroundings.up
-    spread = Spread(config.direction_spread, config.cone)
+    spread = Spread(config.direction_spread, config.max_tilt)
     if surroundings is None:
         return wrist_rotations(hand, n, config.direction, spread, generator)
     rotations = wrist_rotations(hand, n * CHOICES, config.direction, spread, generator, up)
     rotations = rotations.unflatten(0, (n, CHOICES))
     placed = compose(rotations, aim[:, None] - rotations @ hand.grasp_centre_wrist)
-    lack = approach_cost(hand, placed, points[:, None], None if config.cone else config.direction, surroundings)
+    lack = approach_cost(hand, placed, points[:, None], None if config.max_tilt else config.direction, surroundings)
     return rotations[torch.arange(n), lack.argmin(1)]

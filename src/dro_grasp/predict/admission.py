@@ -21,10 +21,11 @@ from dro_grasp.predict.problem import GraspProblem
 
 APPROACH_CHECKS = 9  # Places on the approach at which the hand is checked, both ends included (ours)
 OPENING_STEPS = 9  # Steps in which a pregrasp opens (ours)
+# The texts of reasons are stored in plans and told in JSON, so they stay when a word of ours changes.
 PLANE = "in the table"  # The hand, or its approach, is below the table
 OBSTACLES = "in the scene to avoid"  # It meets what stands around the object
-SPARED = "in a place to spare"  # It meets a ball that is to be left alone
-TURNED = "turned away"  # The palm points out of the cone
+SPARED = "in a place to spare"  # It meets a keep-out ball
+TURNED = "turned away"  # The palm tilts farther than `max_tilt` from the wanted direction
 BESIDE = "touching beside the place to hold"  # The hand touches the object elsewhere too, or with fewer than two fingers there
 NARROW = "too close in pregrasp"  # The hand opens less than was asked for
 REASONS = {"plane": PLANE, "obstacles": OBSTACLES, "keep_out": SPARED}  # Reason by part of the surroundings
@@ -39,7 +40,7 @@ class AdmissionConfig(Checked):
     touch: float = 0.003
     """Distance at which a hand touches the object [m]: refined grasps keep 1 mm off it."""
     fewest_fingers: int = 2
-    """Fingers that touch the place to hold, at least."""
+    """Fingers that touch the contact region, at least."""
     reach: float = GripConfig.reach
     """Distance up to which they count as touching [m]: as where forces are balanced."""
 
@@ -71,32 +72,32 @@ def count_violations(
 def violations(
     problem: GraspProblem, grasps: GraspBatch, config: AdmissionConfig | None = None, apart: bool = True
 ) -> dict[str, Bool[Tensor, " n"]]:
-    """Which complete grasps do not respect the constraints, by reason; with `apart`, table, scene and spared places apart."""
+    """Which complete grasps do not respect the constraints, by reason; with `apart`, table, obstacles and keep-outs apart."""
     found, constraints, config = {}, problem.constraints, config or AdmissionConfig()
     if problem.surroundings is not None:
         parts = problem.surroundings.parts if apart else {"obstacles": problem.surroundings}
         found = {REASONS[name]: ~clear(problem, grasps, part, config.least_clearance) for name, part in parts.items()}
-    if constraints.cone is not None:
+    if constraints.max_tilt is not None:
         found[TURNED] = ~facing(problem, grasps)
-    if constraints.hold:
+    if constraints.contact_region:
         found[BESIDE] = ~holds_in_place(problem, grasps, config)
-    if constraints.opening is not None:
-        found[NARROW] = finger_gap(problem, grasps.T_object_wrist, grasps.pregrasp_joints) < constraints.opening
+    if constraints.pregrasp_clearance is not None:
+        found[NARROW] = finger_gap(problem, grasps.T_object_wrist, grasps.pregrasp_joints) < constraints.pregrasp_clearance
     return found
 
 
 def facing(problem: GraspProblem, grasps: GraspBatch, farthest: float = math.inf) -> Bool[Tensor, " n"]:
-    """Which grasps have palms in the cone, or within an angle of the wanted direction [rad].
+    """Which grasps have palms that tilt no farther than allowed, or within an angle of the wanted direction [rad].
 
     Over a plane, those count too that tilt towards it.
     """
-    direction, cone, surroundings = problem.constraints.direction, problem.constraints.cone, problem.surroundings
+    direction, max_tilt, surroundings = problem.constraints.direction, problem.constraints.max_tilt, problem.surroundings
     if direction is None:
         return torch.ones(len(grasps), dtype=torch.bool)
     palm = problem.hand.palm_directions(grasps.T_object_wrist)
     wanted = torch.nn.functional.normalize(torch.tensor(direction, dtype=palm.dtype), dim=0)
-    if cone is not None:
-        return angle_to_arc(palm, wanted, None) <= cone
+    if max_tilt is not None:
+        return angle_to_arc(palm, wanted, None) <= max_tilt
     up = None if surroundings is None else surroundings.up
     return angle_to_arc(palm, wanted, None if up is None else up.to(palm)) < farthest
 
@@ -124,7 +125,7 @@ def clear(
 
 
 def holds_in_place(problem: GraspProblem, grasps: GraspBatch, config: AdmissionConfig) -> Bool[Tensor, " n"]:
-    """Which grasps touch the object in the place to hold alone, with two fingers at least."""
+    """Which grasps touch the object in the contact region alone, with two fingers at least."""
     place, hand = problem.workspace.contact_region, problem.hand.to(problem.device)
     assert place is not None
     points = hand.points(grasps.joints.to(problem.device), grasps.T_object_wrist.to(problem.device))
@@ -147,13 +148,13 @@ def finger_gap(problem: GraspProblem, T: Float[Tensor, "n 4 4"], q: Float[Tensor
 
 def opened_wide(problem: GraspProblem, grasps: GraspBatch) -> GraspBatch:
     """Complete grasps whose pregrasp opens as far as the constraints ask, or as far as the hand does."""
-    opening, hand = problem.constraints.opening, problem.hand
-    if opening is None or not len(grasps):
+    clearance, hand = problem.constraints.pregrasp_clearance, problem.hand
+    if clearance is None or not len(grasps):
         return grasps
     q = grasps.pregrasp_joints
     end = torch.where(hand.movable & ~hand.abduction, hand.open_ends, q)
     for share in torch.linspace(0, 1, OPENING_STEPS).tolist():
-        tight = finger_gap(problem, grasps.T_object_wrist, q) < opening
+        tight = finger_gap(problem, grasps.T_object_wrist, q) < clearance
         if not bool(tight.any()):
             break
         q = torch.where(tight[:, None], grasps.pregrasp_joints + share * (end - grasps.pregrasp_joints), q)
@@ -176,12 +177,12 @@ def shortage_in_words(
     constraints, low, high = problem.constraints, *problem.height_range
     advice = {
         "table": f"lower table (now {constraints.table} m; the object spans z = {low:.3f} to {high:.3f} m)",
-        "cone": f"widen cone (now {constraints.cone} rad)",
+        "max_tilt": f"widen max_tilt (now {constraints.max_tilt} rad)",
         "direction": "leave out direction, or give another one",
-        "avoid": "check that the scene to avoid is in the object's frame, and leave out what may be touched",
-        "hold": "enlarge the balls of hold",
-        "spare": "make the balls of spare smaller",
-        "opening": f"ask for less opening (now {constraints.opening} m)",
+        "obstacles": "check that obstacles is in the object's frame, and leave out what may be touched",
+        "contact_region": "enlarge the balls of contact_region",
+        "keep_out": "make the balls of keep_out smaller",
+        "pregrasp_clearance": f"ask for less pregrasp_clearance (now {constraints.pregrasp_clearance} m)",
     }
     given = [words for name, words in advice.items() if getattr(constraints, name) not in (None, ())]
     if constraints.table is None and dropped.get(PLANE):

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from dro_grasp.errors import OptionError
 from dro_grasp.files import MAX_QUOTED_CHARS
 from dro_grasp.geometry.distance_field import Ball, Balls
-from dro_grasp.kinds import Checked, plain
+from dro_grasp.kinds import FORMER_CONSTRAINTS, Checked, plain, renamed
 from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize.grasp_energy import Workspace
@@ -25,17 +25,18 @@ MIN_UPRIGHT_COSINE = math.cos(math.radians(5.0))
 """Least cosine between z and the normal of a table whose height along z is given (ours)."""
 MIN_PLANE_COSINE = 0.1  # Least such cosine of a plane that has a height at all (ours)
 Z_AXIS_TOLERANCE = 1e-6  # Largest deviation of a z axis that points upwards (ours)
-MAX_PREGRASP_CLEARANCE = 0.2  # Largest opening that is accepted [m] (ours)
-MAX_BALLS = 1000  # Most balls of a place (ours): each costs time at every step
-MIN_REGION_POINTS = 16  # Fewest points of an object's cloud that a place to hold must contain (ours)
+MAX_PREGRASP_CLEARANCE = 0.2  # Largest pregrasp clearance that is accepted [m] (ours)
+MAX_BALLS = 1000  # Most balls of a contact region or keep-out (ours): each costs time at every step
+MIN_REGION_POINTS = 16  # Fewest points of an object's cloud that a contact region must contain (ours)
 
 
+@renamed(**FORMER_CONSTRAINTS, doubt="warning", room="workspace")
 @dataclass(frozen=True)
 class Constraints(Checked):
     """What grasps have to respect; nothing by default. All in the object's frame.
 
     Examples:
-        >>> above = Constraints(direction=(0, 0, -1), cone=0.5, table=0.0, avoid=load_scene("shelf.ply"))
+        >>> above = Constraints(direction=(0, 0, -1), max_tilt=0.5, table=0.0, obstacles=load_scene("shelf.ply"))
         >>> grasps = GraspPredictor().predict(hand, obj, constraints=above)
     """
 
@@ -43,16 +44,17 @@ class Constraints(Checked):
     """Palm direction; any by default. Over a table, palms tilt towards it as far as the hand needs room."""
     table: float | None = None
     """Height of a plane [m]; the hand stays above it. By default the table that was found in a cloud, if any."""
-    cone: float | None = None
+    max_tilt: float | None = None
     """Largest angle between the palm direction and `direction` [rad]; palms are spread evenly within it and tilt no farther.
     By default palms point roughly along the direction."""
-    avoid: Scene | None = None
+    obstacles: Scene | None = None
     """What else the hand stays clear of: see `load_scene`."""
-    hold: tuple[Ball, ...] = ()
-    """Places, as balls (x, y, z, radius) [m]: in the grasp, the hand touches the object nowhere else. Anywhere by default."""
-    spare: tuple[Ball, ...] = ()
-    """Places, as balls (x, y, z, radius) [m], that the hand stays out of."""
-    opening: float | None = None
+    contact_region: tuple[Ball, ...] = ()
+    """Contact region, as balls (x, y, z, radius) [m]: in the grasp, the hand touches the object nowhere else. By default it may
+    touch all of it."""
+    keep_out: tuple[Ball, ...] = ()
+    """Keep-out, as balls (x, y, z, radius) [m] that the hand stays out of."""
+    pregrasp_clearance: float | None = None
     """Least distance between the object and every link that closes, in pregrasp [m]: by so much may hand and object be off
     their places. The pregrasp opens as far as that takes. By default it opens by a quarter of what is left."""
 
@@ -64,11 +66,11 @@ class Constraints(Checked):
         """Refuse what cannot be done, before any work.
 
         Raises:
-            OptionError: A number is out of range, the direction is no vector or zero, or a cone has no direction.
+            OptionError: A number is out of range, the direction is no vector or zero, or `max_tilt` has no direction.
         """
         if self.direction is not None:
             object.__setattr__(self, "direction", _vector(self.direction))
-        for name, balls in (("hold", self.hold), ("spare", self.spare)):
+        for name, balls in (("contact_region", self.contact_region), ("keep_out", self.keep_out)):
             object.__setattr__(self, name, _balls(name, balls))
         super().__post_init__()  # after these, whose errors say more
         if self.direction is not None and not 1e-9 <= math.hypot(*self.direction) < math.inf:
@@ -76,14 +78,16 @@ class Constraints(Checked):
                               "for example --direction 0 0 -1 to grasp from above")
         if self.table is not None and not math.isfinite(self.table):
             raise OptionError(f"table is {self.table}; give the height in metres, for example --table 0")
-        if self.cone is not None and not 0 < self.cone <= math.pi:
-            degrees = f"; {self.cone:g} degrees are {math.radians(self.cone):.3g}" if 0 < self.cone <= 180 else ""
-            raise OptionError(f"cone is {self.cone}; give the largest angle in radians, above 0 and at most 3.14{degrees}")
-        if self.cone is not None and self.direction is None:
-            raise OptionError("cone is an angle from direction, which is absent; give both, for example --direction 0 0 -1 "
-                              "--cone 0.5")
-        if self.opening is not None and not 0 < self.opening <= MAX_PREGRASP_CLEARANCE:
-            raise OptionError(f"opening is {self.opening}; give metres, above 0 and at most {MAX_PREGRASP_CLEARANCE:g}: 0.01 for 1 cm")
+        if self.max_tilt is not None and not 0 < self.max_tilt <= math.pi:
+            degrees = f"; {self.max_tilt:g} degrees are {math.radians(self.max_tilt):.3g}" if 0 < self.max_tilt <= 180 else ""
+            raise OptionError(f"max_tilt is {self.max_tilt}; give the largest angle in radians, above 0 and at most "
+                              f"3.14{degrees}")
+        if self.max_tilt is not None and self.direction is None:
+            raise OptionError("max_tilt is an angle from direction, which is absent; give both, for example --direction 0 0 -1 "
+                              "--max-tilt 0.5")
+        if self.pregrasp_clearance is not None and not 0 < self.pregrasp_clearance <= MAX_PREGRASP_CLEARANCE:
+            raise OptionError(f"pregrasp_clearance is {self.pregrasp_clearance}; give metres, above 0 and at most "
+                              f"{MAX_PREGRASP_CLEARANCE:g}: 0.01 for 1 cm")
 
     def moved(self, T: Float[np.ndarray, "4 4"]) -> Constraints:
         """The same in another frame, of which T is the motion from this one's coordinates to its own [m].
@@ -95,17 +99,18 @@ class Constraints(Checked):
         if self.table is not None and abs(T[2, 2] - 1) > Z_AXIS_TOLERANCE:
             raise OptionError("table is a height along z, and the other frame's z axis points elsewhere; leave out table, or "
                               "turn the frame")
-        hold, spare = (tuple((*(R @ ball[:3] + t).tolist(), ball[3]) for ball in balls) for balls in (self.hold, self.spare))
+        region, keep_out = (tuple((*(R @ ball[:3] + t).tolist(), ball[3]) for ball in balls)
+                            for balls in (self.contact_region, self.keep_out))
         return replace(
             self, direction=None if self.direction is None else tuple((R @ self.direction).tolist()),
             table=None if self.table is None else self.table + float(t[2]),
-            avoid=None if self.avoid is None else self.avoid.moved(T), hold=hold, spare=spare)
+            obstacles=None if self.obstacles is None else self.obstacles.moved(T), contact_region=region, keep_out=keep_out)
 
     def require_fit(self, obj: ObjectModel) -> None:
         """Refuse what leaves nothing of this object to grasp.
 
         Raises:
-            OptionError: The table is above it, or a place to hold is not on it, or everything is spared.
+            OptionError: The table is above it, or the contact region is not on it, or the keep-out is all of it.
             ObjectError: The scene contains it.
         """
         cloud = torch.from_numpy(obj.cloud)
@@ -116,20 +121,20 @@ class Constraints(Checked):
         spans = ", ".join(f"{axis} = {a:.3f} to {b:.3f}" for axis, a, b in zip("xyz", obj.cloud.min(0), obj.cloud.max(0),
                                                                               strict=True))
         free = torch.ones(len(cloud), dtype=torch.bool)
-        if (place := Balls.of(self.hold)) is not None:
+        if (place := Balls.of(self.contact_region)) is not None:
             free = place.distances(cloud)[0] <= 0
             if int(free.sum()) < MIN_REGION_POINTS:
-                raise OptionError(f"hold is not on the object: {int(free.sum())} of {len(cloud)} points of its surface are "
-                                  f"within the balls, and it spans {spans} m. Move the balls, or give a larger radius")
-        if (place := Balls.of(self.spare)) is not None:
+                raise OptionError(f"contact_region is not on the object: {int(free.sum())} of {len(cloud)} points of its "
+                                  f"surface are within the balls, and it spans {spans} m. Move the balls, or give a larger radius")
+        if (place := Balls.of(self.keep_out)) is not None:
             free &= place.distances(cloud)[0] > 0
             if int(free.sum()) < MIN_REGION_POINTS:
-                raise OptionError(f"spare leaves nothing{' of hold' if self.hold else ''} to touch on the object, which "
-                                  f"spans {spans} m; give a smaller radius")
-        if self.avoid is not None:
-            self.avoid.require_apart(obj)
+                raise OptionError(f"keep_out leaves nothing{' of contact_region' if self.contact_region else ''} to "
+                                  f"touch on the object, which spans {spans} m; give a smaller radius")
+        if self.obstacles is not None:
+            self.obstacles.require_apart(obj)
 
-    def doubt(self, obj: ObjectModel) -> str | None:
+    def warning(self, obj: ObjectModel) -> str | None:
         """What is odd about the table, in words; None for nothing."""
         if self.table is None or obj.table is None:
             return None
@@ -149,13 +154,14 @@ class Constraints(Checked):
             reach: How far the hand gets from it [m]; nothing farther away matters.
         """
         plane = obj.table if self.table is None else (0.0, 0.0, 1.0, self.table)
-        obstacles, spared = None, Balls.of(self.spare)
-        if self.avoid is not None:
-            obstacles = self.avoid.near(obj.cloud.min(0) - reach, obj.cloud.max(0) + reach)
+        obstacles, keep_out = None, Balls.of(self.keep_out)
+        if self.obstacles is not None:
+            obstacles = self.obstacles.near(obj.cloud.min(0) - reach, obj.cloud.max(0) + reach)
         surroundings = None
-        if plane is not None or obstacles is not None or spared is not None:
-            surroundings = Surroundings(None if plane is None else torch.tensor(plane, dtype=torch.float32), obstacles, spared)
-        return Workspace(surroundings, Balls.of(self.hold))
+        if plane is not None or obstacles is not None or keep_out is not None:
+            below = None if plane is None else torch.tensor(plane, dtype=torch.float32)
+            surroundings = Surroundings(below, obstacles, keep_out)
+        return Workspace(surroundings, Balls.of(self.contact_region))
 
 
 def _vector(given: Any) -> Direction:
@@ -178,7 +184,7 @@ def _balls(name: str, given: Any) -> tuple[Ball, ...]:
     Raises:
         OptionError: One has no four numbers, or no radius; or there are too many.
     """
-    example = f"x, y, z and a radius above 0 in metres, for example --{name} 0 0 0.1 0.03"
+    example = f"x, y, z and a radius above 0 in metres, for example --{name.replace('_', '-')} 0 0 0.1 0.03"
     try:
         rows = [_numbers(ball) for ball in given]
     except (TypeError, ValueError, RuntimeError, OptionError) as error:

@@ -17,6 +17,7 @@ from dro_grasp.geometry.distance_field import Ball
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.sources import with_own_files
 from dro_grasp.hands.hand import Hand
+from dro_grasp.kinds import FORMER_CONSTRAINTS, renamed
 from dro_grasp.network.checkpoints import load_weights
 from dro_grasp.network.network import DistanceNetwork
 from dro_grasp.objects.scenery import Scene
@@ -95,10 +96,12 @@ class GraspPredictor:
         """Name of the weights."""
         return self.network.name
 
+    @renamed(**FORMER_CONSTRAINTS)
     def predict(
         self, hand: Hand, obj: ObjectModel, num: int = 16, seed: int = 0, constraints: Constraints | None = None, *,
-        direction: Direction | None = None, cone: float | None = None, table: float | None = None, avoid: Scene | None = None,
-        hold: tuple[Ball, ...] = (), spare: tuple[Ball, ...] = (), opening: float | None = None,
+        direction: Direction | None = None, max_tilt: float | None = None, table: float | None = None,
+        obstacles: Scene | None = None, contact_region: tuple[Ball, ...] = (), keep_out: tuple[Ball, ...] = (),
+        pregrasp_clearance: float | None = None,
         candidates: int = 4, refine: bool = True, temperature: float | None = None, source: str | Source = AUTO,
     ) -> GraspBatch:
         """Grasps with pregrasp, squeeze and score, the best score first; fewer, with a warning, if no more can be found.
@@ -109,29 +112,29 @@ class GraspPredictor:
             num: Grasps to return.
             seed: The same seed gives the same grasps.
             constraints: What grasps have to respect; the fields of `Constraints` that are given by name replace its own.
-            direction: See `Constraints`, as `cone`, `table`, `avoid`, `hold`, `spare` and `opening`.
-            cone: Likewise.
+            direction: See `Constraints`, as `max_tilt` and all up to `pregrasp_clearance`.
+            max_tilt: Likewise.
             table: Likewise.
-            avoid: Likewise.
-            hold: Likewise.
-            spare: Likewise.
-            opening: Likewise.
+            obstacles: Likewise.
+            contact_region: Likewise.
+            keep_out: Likewise.
+            pregrasp_clearance: Likewise.
             candidates: See `GraspRequest`, as `refine`, `temperature` and `source`.
             refine: Likewise.
             temperature: Likewise.
             source: Likewise.
 
         Raises:
-            ObjectError: The scene to avoid contains the object.
+            ObjectError: The obstacles contain the object.
             NoGraspError: No grasp was found.
             OptionError: An argument is out of range, or the table is above the object.
         """
-        given = {"direction": direction, "cone": cone, "table": table, "avoid": avoid, "hold": hold, "spare": spare,
-                 "opening": opening}
+        given = {"direction": direction, "max_tilt": max_tilt, "table": table, "obstacles": obstacles,
+                 "contact_region": contact_region, "keep_out": keep_out, "pregrasp_clearance": pregrasp_clearance}
         wanted = replace(constraints or Constraints(), **{name: x for name, x in given.items() if x is not None and x != ()})
         problem = GraspProblem(hand, obj, self.device, wanted)
-        if (doubt := problem.constraints.doubt(obj)) is not None:
-            warnings.warn(doubt, stacklevel=2)
+        if (warning := problem.constraints.warning(obj)) is not None:
+            warnings.warn(warning, stacklevel=2)
         made = self.run(problem, GraspRequest(num, seed, candidates, refine, temperature, source))
         if made.shortage is not None:
             warnings.warn(made.shortage, stacklevel=2)

@@ -45,7 +45,7 @@ class GraspProblem:
 
         Raises:
             OptionError: Something else was given, this machine has no such device, or nothing is left of the object.
-            ObjectError: The scene to avoid contains the object.
+            ObjectError: The obstacles contain the object.
         """
         require_pair(self.hand, self.obj)
         require_device(str(self.device))
@@ -64,8 +64,8 @@ class GraspProblem:
 
     @cached_property
     def contact_points(self) -> Float[Tensor, "k 3"] | None:
-        """Points of the object's cloud in the place to hold, on the CPU [m]; None where all of it may be touched."""
-        if (place := Balls.of(self.constraints.hold)) is None:
+        """Points of the object's cloud in the contact region, on the CPU [m]; None where all of it may be touched."""
+        if (place := Balls.of(self.constraints.contact_region)) is None:
             return None
         cloud = torch.from_numpy(self.obj.cloud)
         return cloud[place.distances(cloud)[0] <= 0]
@@ -122,7 +122,7 @@ class GraspProblem:
         return self._thinned[count]
 
     def cloud(self, count: int, generator: torch.Generator) -> Float[Tensor, "count 3"]:
-        """Random surface points of the object, or of the place to hold, on the device [m]."""
+        """Random surface points of the object, or of the contact region, on the device [m]."""
         if self.contact_points is None:
             return self.obj.sample_points(count, generator).to(self.device)
         return self.contact_points[torch.randint(len(self.contact_points), (count,), generator=generator)].to(self.device)

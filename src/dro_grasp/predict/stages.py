@@ -44,11 +44,11 @@ def refine(problem: GraspProblem, grasps: GraspBatch, config: RefineConfig | Non
         grasps: Any grasps of the two; outcomes, scores, energies and what they state of pregrasp and squeeze are dropped.
         config: Steps, bounds and forces.
     """
-    config, cone = config or RefineConfig(), problem.constraints.cone
+    config, max_tilt = config or RefineConfig(), problem.constraints.max_tilt
     grasps.require_hand(problem.hand)
     energy = problem.energy(config.energy)
-    if cone is not None:
-        config = replace(config, largest_turn=min(config.largest_turn, cone))
+    if max_tilt is not None:
+        config = replace(config, largest_turn=min(config.largest_turn, max_tilt))
     with one_thread():
         closed = close_idle_fingers(energy, grasps, config.closing)
     refined = refine_grasps(energy, closed, config)

@@ -195,7 +195,7 @@ class Measurements:
 
 
 FEW = 0.5  # Share of successes below which a user is told what to do next (ours)
-MORE = "propose more candidates for each grasp (--candidates 16), or take them from the optimiser (--method optimise)"
+MORE = "propose more candidates for each grasp (--candidates 16), or take them from the optimiser (--source optimiser)"
 """What helps against most failures: choosing from more grasps."""
 REMEDIES = {
     Failure.PENETRATION: MORE,

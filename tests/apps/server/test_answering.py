@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -62,14 +64,14 @@ def test_a_scene_is_avoided_in_the_frame_of_the_grasps(answerer: Answerer) -> No
     wall, T = np.array([[0.06, y, z] for y in np.linspace(-0.2, 0.2, 40) for z in np.linspace(-0.2, 0.2, 40)]), np.eye(4)
     T[0, 3] = 0.01
     for camera, points in ((None, wall), ({"frame": "base", "T_frame_camera": T.tolist()}, wall - T[:3, 3])):
-        call = GraspCall(hand="gripper3", object="can", avoid={"points": points.tolist()}, camera=camera)
-        scene = answerer.scene(call.avoid, call.camera)
+        call = GraspCall(hand="gripper3", object="can", obstacles={"points": points.tolist()}, camera=camera)
+        scene = answerer.scene(call.obstacles, call.camera)
         expected = dro.load_scene(points).moved(np.eye(4) if camera is None else T)
         np.testing.assert_allclose(scene.points, expected.points)
-        assert answerer.scene(call.avoid, call.camera) is scene
+        assert answerer.scene(call.obstacles, call.camera) is scene
     assert answerer.scene(None, None) is None
-    asked = ask(answerer, "can", num=1, candidates=16, avoid={"points": wall.tolist()}, hold=[[0, 0, 0, 0.3]])
-    avoiding = dro.Constraints(avoid=dro.load_scene(wall), hold=((0.0, 0.0, 0.0, 0.3),))
+    asked = ask(answerer, "can", num=1, candidates=16, obstacles={"points": wall.tolist()}, contact_region=[[0, 0, 0, 0.3]])
+    avoiding = dro.Constraints(obstacles=dro.load_scene(wall), contact_region=((0.0, 0.0, 0.0, 0.3),))
     hand, can = dro.load_hand("gripper3"), dro.load_object("can")
     options = QUICK | {"candidates": 16}
     check(asked, answerer.predictor.predict(hand, can, 1, constraints=avoiding, **options))
@@ -117,7 +119,7 @@ CAMERA = {"frame": "base", "T_frame_camera": np.eye(4).tolist()}
     ({"num": 0}, "num is 0"), ({"direction": [0, 0, 0]}, "no direction"), ({"seed": -1}, "seed is -1"),
     ({"num": 1001}, "at most 1000"), ({"object": {"points": [[0, 0, 0.1]] * 40}}, "1 distinct points"),
     ({"object": {"points": SPHERE}, "protocol": "dro"}, "no trial"), ({"object": {"points": []}}, "distinct points"),
-    ({"avoid": "/etc/passwd"}, "avoid names '/etc/passwd'"), ({"avoid": {"points": []}}, "holds no point"),
+    ({"obstacles": "/etc/passwd"}, "obstacles names '/etc/passwd'"), ({"obstacles": {"points": []}}, "holds no point"),
     ({"camera": CAMERA}, "send the cloud"),
     ({"camera": {"frame": "base", "T_frame_camera": np.zeros((4, 4)).tolist()}, "object": {"points": SPHERE}}, "last row"),
     ({"camera": {"frame": "a\nb", "T_frame_camera": np.eye(4).tolist()}, "object": {"points": SPHERE}}, "a name on one line"),
@@ -126,3 +128,16 @@ CAMERA = {"frame": "base", "T_frame_camera": np.eye(4).tolist()}
 def test_refusals_say_why_and_nothing_but_what_was_sent_is_read(answerer: Answerer, asked: dict[str, Any], told: str) -> None:
     with pytest.raises(dro.DroGraspError, match=told):
         answerer.answer(GraspCall(**{"hand": "gripper3", "object": "can", **QUICK, **asked}))
+
+
+def test_fields_of_before_are_taken_and_told(answerer: Answerer) -> None:
+    """A robot that asks in the words of before is answered, and told the words of today; both at once are refused."""
+    asked = {"hand": "gripper3", "object": "can", "hold": [[0, 0, 0, 0.3]], "opening": 0.01, "method": "optimise"}
+    call = GraspCall.model_validate_json(json.dumps(asked))
+    assert (call.contact_region, call.pregrasp_clearance, call.source) == (((0, 0, 0, 0.3),), 0.01, "optimiser")
+    assert call.told.split(", ")[0] == "hold is called contact_region now"
+    assert GraspCall(hand="gripper3", object="can").told is None
+    assert pickle.loads(pickle.dumps(call)).told == call.told, "it travels to the process that answers"
+    with pytest.raises(ValueError, match="hold is called contact_region now, and both are given"):
+        GraspCall(**asked, contact_region=[])
+    assert "hold is called contact_region now" in ask(answerer, "can", num=1, hold=[[0, 0, 0, 0.3]]).notes[-1]

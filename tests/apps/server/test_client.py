@@ -38,19 +38,19 @@ def sent(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 @pytest.mark.parametrize("array", [np.array, torch.tensor])
 def test_numbers_may_be_arrays_and_tensors(sent: list[Any], array: Any) -> None:
     dro.GraspClient().predict(
-        "gripper3", array(CLOUD), 2, direction=array([0, 0, -1]), hold=array([[0, 0, 0.5, 0.25]]),
+        "gripper3", array(CLOUD), 2, direction=array([0, 0, -1]), contact_region=array([[0, 0, 0.5, 0.25]]),
         table=array(-0.5), keep_table=np.bool_(True), camera={"frame": "base", "T_frame_camera": array(POSE)},
-        avoid=array(CLOUD) + 1, spare=[array([0, 1, 0, 0.25])])
+        obstacles=array(CLOUD) + 1, keep_out=[array([0, 1, 0, 0.25])])
     (call,) = sent
-    assert (call.direction, call.hold, call.table) == ((0, 0, -1), ((0, 0, 0.5, 0.25),), -0.5)
-    assert (call.spare, call.object.keep_table) == (((0, 1, 0, 0.25),), True)
+    assert (call.direction, call.contact_region, call.table) == ((0, 0, -1), ((0, 0, 0.5, 0.25),), -0.5)
+    assert (call.keep_out, call.object.keep_table) == (((0, 1, 0, 0.25),), True)
     assert call.camera.T_frame_camera == POSE
-    for part, points in ((call.object, CLOUD), (call.avoid, CLOUD + 1)):
+    for part, points in ((call.object, CLOUD), (call.obstacles, CLOUD + 1)):
         np.testing.assert_array_equal(np.load(io.BytesIO(part.file.content)), points)
 
 
 def test_none_is_as_if_it_were_left_out(sent: list[Any]) -> None:
-    nothing = dict.fromkeys(("avoid", "camera", "direction", "table", "cone", "protocol"))
+    nothing = dict.fromkeys(("obstacles", "camera", "direction", "table", "max_tilt", "protocol"))
     for options in (nothing, {}):
         dro.GraspClient().predict("gripper3", "can", id="one", **options)
     assert sent[0] == sent[1]
@@ -59,7 +59,8 @@ def test_none_is_as_if_it_were_left_out(sent: list[Any]) -> None:
 @pytest.mark.parametrize(("obj", "options", "told"), [
     ("can", {"constraints": dro.Constraints()}, "a Constraints cannot be sent to a grasp server; give .* arrays"),
     (["can"], {}, r"a list that holds no array of numbers .* points \(n, 3\)"),
-    ([[0.0, 0.0], [0.0]], {}, "a list that holds no array of numbers"), ("can", {"hold": {0.1}}, "a set cannot be sent"),
+    ([[0.0, 0.0], [0.0]], {}, "a list that holds no array of numbers"),
+    ("can", {"contact_region": {0.1}}, "a set cannot be sent"),
 ])
 def test_what_cannot_be_sent_is_named(sent: list[Any], obj: Any, options: dict[str, Any], told: str) -> None:
     with pytest.raises(OptionError, match=told):

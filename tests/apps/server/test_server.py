@@ -50,7 +50,7 @@ def test_the_client_asks_by_name_by_file_and_with_points(client: dro.GraspClient
     assert [answer["object"] for answer in answers] == ["can", "tube", "tube", "cloud"]
     assert answers[1]["grasps"] == answers[2]["grasps"] != answers[0]["grasps"]
     wall = mesh.sample(300, seed=0) + np.array([0.3, 0, 0])
-    assert client.predict("gripper3", "can", 1, avoid=wall, **OPTIONS)["grasps"]
+    assert client.predict("gripper3", "can", 1, obstacles=wall, **OPTIONS)["grasps"]
     larger = client.predict("gripper3", file, 1, scale=1.5, **OPTIONS)
     assert larger["grasps"] != answers[1]["grasps"]
     with pytest.raises(dro.DroGraspError, match=r"knows no object 'tube\.obj'"):

@@ -38,35 +38,36 @@ def test_fields_become_constraints_and_are_drawn(studio: Studio, monkeypatch: py
     assert asked(studio, monkeypatch) == Constraints(), "empty fields ask for nothing"
     panel, low = studio.panel, float(load_object("sphere").cloud[:, 2].min())
     studio._table_under()
-    panel.direction.value, panel.cone.value, panel.opening.value = "-z", "30", "8"
-    panel.hold.value, panel.spare.value = "0 0 0.02 0.05; 0.02, 0, 0, 0.03", "0 0 -0.06 0.02"
+    panel.direction.value, panel.max_tilt.value, panel.pregrasp_clearance.value = "-z", "30", "8"
+    panel.contact_region.value, panel.keep_out.value = "0 0 0.02 0.05; 0.02, 0, 0, 0.03", "0 0 -0.06 0.02"
     file = io.BytesIO()
     trimesh.creation.box(extents=(0.2, 0.2, 0.02), transform=trimesh.transformations.translation_matrix([0.2, 0, 0])).export(
         file, file_type="stl")
     upload = viser.UploadedFile(name="shelf.stl", content=file.getvalue())
-    studio._take(upload, "scene", studio.panel.avoid, studio._draw_constraints)
+    studio._take(upload, "scene", studio.panel.obstacles, studio._draw_constraints)
     drawn: list[str] = []
     scene = studio.client.scene
     for kind in ("add_box", "add_icosphere", "add_mesh_simple"):
         monkeypatch.setattr(scene, kind, lambda name, *_, **__: drawn.append(name))
     studio._draw_constraints()
-    assert drawn == [f"/constraints/{name}" for name in ("table", "hold0", "hold1", "spare0", "avoid")]
+    names = ("table", "contact_region0", "contact_region1", "keep_out0", "obstacles")
+    assert drawn == [f"/constraints/{name}" for name in names]
     found = asked(studio, monkeypatch)
     assert found.direction == (0.0, 0.0, -1.0)
-    assert found.cone == pytest.approx(math.radians(30))
+    assert found.max_tilt == pytest.approx(math.radians(30))
     assert found.table == pytest.approx(low, abs=1e-4)
-    assert found.hold == ((0.0, 0.0, 0.02, 0.05), (0.02, 0.0, 0.0, 0.03))
-    assert found.spare == ((0.0, 0.0, -0.06, 0.02),)
-    assert found.opening == pytest.approx(0.008)
-    assert found.avoid is not None
-    assert found.avoid.name == "shelf"
-    panel.avoid.value = NOTHING
+    assert found.contact_region == ((0.0, 0.0, 0.02, 0.05), (0.02, 0.0, 0.0, 0.03))
+    assert found.keep_out == ((0.0, 0.0, -0.06, 0.02),)
+    assert found.pregrasp_clearance == pytest.approx(0.008)
+    assert found.obstacles is not None
+    assert found.obstacles.name == "shelf"
+    panel.obstacles.value = NOTHING
     assert asked(studio, monkeypatch).avoid is None
 
 
 @pytest.mark.parametrize(("field", "text", "message"), [
     ("table", "high", "something else than numbers"), ("table", "0 1", "give one number"),
-    ("hold", "0 0 0", "give x y z radius"), ("cone", "200", "cone is 3.49"),
+    ("contact_region", "0 0 0", "give x y z radius"), ("max_tilt", "200", "max_tilt is 3.49"),
 ])
 def test_what_no_constraint_can_be_is_told(studio: Studio, field: str, text: str, message: str) -> None:
     control = getattr(studio.panel, field)

@@ -99,7 +99,7 @@ class Answerer:
         """
         begin = time.perf_counter()
         request = settings_in(call, GraspRequest)
-        constraints = settings_in(call, Constraints, avoid=self.scene(call.avoid, call.camera))
+        constraints = settings_in(call, Constraints, obstacles=self.scene(call.obstacles, call.camera))
         if request.num * request.candidates > MAX_CANDIDATES:
             raise OptionError(f"{request.num} grasps of {request.candidates} candidates each are asked for; a server makes at "
                               f"most {MAX_CANDIDATES} candidates at once, `dro-grasp generate` more")
@@ -113,13 +113,13 @@ class Answerer:
         made = self.predictor.run(problem, request, progress)
         middle = time.perf_counter()
         grasps = made.grasps if call.protocol is None else evaluate(problem, made.grasps, call.protocol, progress)
-        doubt = constraints.doubt(obj)
+        warning = constraints.warning(obj)
         seconds = {"load": loaded, **made.seconds, "trial": time.perf_counter() - middle, "whole": time.perf_counter() - begin}
         return GraspAnswer(
             id=call.id, hand=hand.name, object=obj.name, frame="object" if call.camera is None else call.camera.frame,
             wrist_link=grasps.wrist_link, joint_names=list(grasps.joint_names), grasps=sent_grasps(grasps, made),
             candidates=made.candidates, weights=self.predictor.weights_name, protocol=call.protocol,
-            notes=[*obj.notes, *filter(None, [doubt])], shortage=made.shortage,
+            notes=[*obj.notes, *filter(None, [call.told, warning])], shortage=made.shortage,
             seconds={name: round(value, 4) for name, value in seconds.items()})
 
     def hand_names(self) -> list[str]:
@@ -157,11 +157,11 @@ class Answerer:
         return key, self.library.loaded("object", key, lambda: self._load(sent, camera))
 
     def scene(self, sent: SentObject | None, camera: SentCamera | None) -> Scene | None:
-        """What the hand is to avoid, in the frame of the grasps: what was sent, or an object of the server's own."""
+        """Obstacles, in the frame of the grasps: what was sent, or an object of the server's own."""
         if sent is None:
             return None
         if sent.name is not None and sent.name not in self.library.own["object"]:
-            raise ObjectError(f"avoid names '{sent.name}', which the server was not started with; send the mesh or cloud")
+            raise ObjectError(f"obstacles names '{sent.name}', which the server was not started with; send the mesh or cloud")
 
         def load() -> Scene:
             with unpacked(sent, self.library.own["object"]) as source:

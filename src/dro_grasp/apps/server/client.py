@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from dro_grasp.errors import OptionError, ServerError
 from dro_grasp.files import given_path
-from dro_grasp.kinds import checked
+from dro_grasp.kinds import FORMER_CONSTRAINTS, checked, present
 
 
 class GraspClient:
@@ -42,15 +42,16 @@ class GraspClient:
                 (n, 3), as an array, tensor or nested lists [m].
             num: Grasps to return.
             options: What else a request holds, such as direction, table, camera, protocol; scale and keep_table are the
-                object's, and avoid is a path or points, as the object is. Numbers may be arrays or tensors.
+                object's, and obstacles is a path or points, as the object is. Numbers may be arrays or tensors.
 
         Raises:
             OptionError: A value cannot be sent.
             ServerError: The server refuses, fails or is not there.
         """
         of_object = {name: options.pop(name) for name in ("scale", "keep_table") if name in options}
-        if options.get("avoid") is not None:
-            options["avoid"] = sent_object(options["avoid"])
+        options = {present(name, FORMER_CONSTRAINTS): value for name, value in options.items()}
+        if options.get("obstacles") is not None:
+            options["obstacles"] = sent_object(options["obstacles"])
         return self.ask("POST", "/grasps", {"hand": hand, "object": sent_object(obj) | of_object, "num": num, **options})
 
     def cancel(self, name: str) -> None:

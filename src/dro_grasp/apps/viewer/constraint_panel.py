@@ -21,7 +21,7 @@ NOTHING: str = "nothing"  # The choice of no scene
 OBJECT_FILES = ".stl,.obj,.ply,.glb,.off,.npy,.pcd"  # Files of objects and scenes that a browser offers to upload
 TABLE_SIZE = 0.5  # Edge of the table that is drawn [m] (ours)
 AVOIDED = (0.75, 0.35, 0.3)  # Colour of what the hand stays clear of (ours)
-HELD = (0.3, 0.65, 0.4)  # Colour of the place to hold (ours)
+TOUCHED = (0.3, 0.65, 0.4)  # Colour of the contact region (ours)
 TABLE = (0.82, 0.80, 0.76)  # Colour of the table (ours)
 
 
@@ -34,15 +34,20 @@ class ConstraintPanel:
         with gui.add_folder("Constraints", expand_by_default=False):
             self.direction = gui.add_dropdown(
                 "Palm direction", (ANY, *HALF_AXES), initial_value=ANY, hint="-z grasps from above.")
-            self.cone = gui.add_text("Cone [deg]", "", hint="Largest angle from the palm direction; empty: roughly along it.")
+            self.max_tilt = gui.add_text(
+                "Largest tilt [deg]", "", hint="Largest angle from the palm direction; empty: roughly along it.")
             self.table = gui.add_text("Table z [m]", "", hint="The hand stays above this height; empty: no table.")
             self.under = gui.add_button("Table under the object")
-            self.hold = gui.add_text("Hold", "", hint="x y z radius [m], more after a semicolon: the only places to touch.")
-            self.spare = gui.add_text("Spare", "", hint="x y z radius [m], more after a semicolon: places to stay out of.")
-            self.opening = gui.add_text("Opening [mm]", "", hint="Least distance from closing fingers to the object, before.")
-            self.avoid = gui.add_dropdown("Avoid", tuple([NOTHING]), initial_value=NOTHING, hint="A scene without the object.")
-            self.upload = gui.add_upload_button("Upload a scene to avoid", mime_type=OBJECT_FILES)
-        for control in (self.table, self.hold, self.spare, self.avoid):
+            self.contact_region = gui.add_text(
+                "Contact region", "", hint="x y z radius [m], more after a semicolon: the only places to touch.")
+            self.keep_out = gui.add_text(
+                "Keep-out", "", hint="x y z radius [m], more after a semicolon: places to stay out of.")
+            self.pregrasp_clearance = gui.add_text(
+                "Pregrasp clearance [mm]", "", hint="Least distance from closing fingers to the object, before.")
+            self.obstacles = gui.add_dropdown(
+                "Obstacles", tuple([NOTHING]), initial_value=NOTHING, hint="A scene without the object.")
+            self.upload = gui.add_upload_button("Upload a scene of obstacles", mime_type=OBJECT_FILES)
+        for control in (self.table, self.contact_region, self.keep_out, self.obstacles):
             control.on_update(lambda event: None if event.client is None else changed())
 
     def constraints(self, scene: Callable[[str], Scene]) -> Constraints:
@@ -51,11 +56,12 @@ class ConstraintPanel:
         Raises:
             OptionError: A field holds something else than numbers, or they are out of range.
         """
-        cone, table, opening = (_number(field) for field in (self.cone, self.table, self.opening))
+        tilt, table, clearance = (_number(field) for field in (self.max_tilt, self.table, self.pregrasp_clearance))
         return Constraints(
             None if self.direction.value == ANY else half_axis_direction(self.direction.value), table,
-            None if cone is None else math.radians(cone), None if self.avoid.value == NOTHING else scene(self.avoid.value),
-            _balls(self.hold), _balls(self.spare), None if opening is None else opening / 1000)
+            None if tilt is None else math.radians(tilt),
+            None if self.obstacles.value == NOTHING else scene(self.obstacles.value),
+            _balls(self.contact_region), _balls(self.keep_out), None if clearance is None else clearance / 1000)
 
     def draw(self, constraints: Constraints, obj: ObjectModel) -> None:
         """Show table, places and scene beside the object."""
@@ -65,14 +71,14 @@ class ConstraintPanel:
             x, y, _ = obj.cloud.mean(0).tolist()
             scene.add_box("/constraints/table", rgb(TABLE), (TABLE_SIZE, TABLE_SIZE, 0.004),
                           position=(x, y, constraints.table - 0.002))
-        for name, balls, colour in (("hold", constraints.hold, HELD), ("spare", constraints.spare, AVOIDED)):
-            for i, (x, y, z, radius) in enumerate(balls):
+        for name, colour in (("contact_region", TOUCHED), ("keep_out", AVOIDED)):
+            for i, (x, y, z, radius) in enumerate(getattr(constraints, name)):
                 scene.add_icosphere(f"/constraints/{name}{i}", radius, rgb(colour), opacity=0.4, position=(x, y, z))
-        if (avoid := constraints.avoid) is not None and avoid.faces is not None:
+        if (around := constraints.obstacles) is not None and around.faces is not None:
             scene.add_mesh_simple(
-                "/constraints/avoid", avoid.points, avoid.faces, color=rgb(AVOIDED), opacity=0.6, side="double")
-        elif avoid is not None:
-            scene.add_point_cloud("/constraints/avoid", avoid.points.astype(np.float32), rgb(AVOIDED), point_size=0.004)
+                "/constraints/obstacles", around.points, around.faces, color=rgb(AVOIDED), opacity=0.6, side="double")
+        elif around is not None:
+            scene.add_point_cloud("/constraints/obstacles", around.points.astype(np.float32), rgb(AVOIDED), point_size=0.004)
 
 
 def _number(field: viser.GuiTextHandle) -> float | None:

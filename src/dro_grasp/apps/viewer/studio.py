@@ -162,7 +162,7 @@ class Studio(GraspPage):
         self.panel = panel = ConstraintPanel(self.client, lambda: self._guarded(self._draw_constraints))
         hand_file.on_upload(lambda _: self._take(hand_file.value, "hand", self.hand, self._preview))
         object_file.on_upload(lambda _: self._take(object_file.value, "object", self.object, self._preview))
-        panel.upload.on_upload(lambda _: self._take(panel.upload.value, "scene", panel.avoid, self._draw_constraints))
+        panel.upload.on_upload(lambda _: self._take(panel.upload.value, "scene", panel.obstacles, self._draw_constraints))
         panel.under.on_click(lambda _: self._guarded(self._table_under))
         self.button.on_click(lambda _: self._guarded(self._generate))
         for choice in (self.hand, self.object):

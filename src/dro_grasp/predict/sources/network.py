@@ -155,8 +155,8 @@ def _placements(
     are taken; among those with all the room that they need it is the prior that chooses.
     """
     axes, surroundings = network.config.axes(hand.palm_axes_wrist), problem.surroundings
-    direction, cone = problem.constraints.direction, problem.constraints.cone
-    spread, up = Spread(config.direction_spread, cone), None if surroundings is None else surroundings.up
+    direction, max_tilt = problem.constraints.direction, problem.constraints.max_tilt
+    spread, up = Spread(config.direction_spread, max_tilt), None if surroundings is None else surroundings.up
     wanted = num * rivals
     offered = wanted if surroundings is None else max(wanted, CHOICES * num)
     count = wanted * (config.rotations_per_grasp if direction is None else config.rolls_per_grasp)
@@ -167,7 +167,7 @@ def _placements(
     offset = cloud.mean(0) + rotate(rotation, position - hand.grasp_centre_wrist @ axes)
     placed = compose(rotation @ axes.mT, offset)
     if surroundings is not None:
-        lack = approach_cost(hand, placed, opened, None if cone else direction, surroundings)
+        lack = approach_cost(hand, placed, opened, None if max_tilt else direction, surroundings)
         best = lack.argsort(stable=True)[:wanted]
         rotation, offset = rotation[best] @ axes.mT, offset[best]
         placed = compose(rotation, offset + surroundings.lift(apply_to_cloud(placed[best], opened), CLEAR))

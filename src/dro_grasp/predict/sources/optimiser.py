@@ -46,7 +46,8 @@ class OptimiserSource(Source):
     def propose(self, problem: GraspProblem, num: int, seed: int, progress: Progress | None = None) -> Candidates:
         """Of several descents for each candidate, those of lowest energy."""
         wanted, config = problem.constraints, self.config
-        starts = replace(config.synthesis.starts, direction=wanted.direction, cone=wanted.cone, hold=wanted.hold)
+        starts = replace(config.synthesis.starts, direction=wanted.direction, max_tilt=wanted.max_tilt,
+                         contact_region=wanted.contact_region)
         synthesis = replace(config.synthesis, starts=starts)
         count = config.starts_per_candidate * num
         grasps = synthesize_with(problem.energy(synthesis.energy), problem.obj, count, seed, synthesis, progress)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import importlib
 import sys
-import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from dro_grasp.errors import OptionError
+from dro_grasp.kinds import FORMER_SOURCES, present
 from dro_grasp.predict.sources.controls import MeanGrasp, MeanGraspSource, StartSource
 from dro_grasp.predict.sources.optimiser import DescentSource
 from dro_grasp.predict.sources.own import FileSource, OwnSource
@@ -18,7 +18,6 @@ from dro_grasp.predict.sources.source import AUTO, Source
 SOURCES: dict[str, Callable[[], Any]] = {"dfc": DescentSource, "start": StartSource}
 """What makes each source that needs nothing; `register_source` adds yours. A predictor has `network` and `optimiser` too."""
 OF_THE_PREDICTOR = ("network", "optimiser")  # Sources that a predictor makes, with its weights and configuration
-FORMER_NAMES = {"optimise": "optimiser", "synthesise": "optimiser", "dro": AUTO}  # Names of before, which are still taken
 WITH_DATA = ("mean-grasp", "mean-grasp-chosen")  # Controls that need the mean of training grasps
 
 
@@ -33,7 +32,7 @@ def register_source(name: str, factory: Callable[[], Any]) -> None:
     Raises:
         OptionError: The name is taken, or could be mistaken for a file or a class.
     """
-    if name in source_names() or name in (AUTO, *FORMER_NAMES, *WITH_DATA):
+    if name in source_names() or name in (AUTO, *FORMER_SOURCES, *WITH_DATA):
         raise OptionError(f"there is a source '{name}' already; choose another name")
     if not name or set(name) & set(":@/\\") or name.endswith(".parquet"):
         raise OptionError(f"'{name}' is no name of a source; give one without : @ / and without .parquet")
@@ -45,14 +44,6 @@ def source_names() -> tuple[str, ...]:
     return (*OF_THE_PREDICTOR, *SOURCES)
 
 
-def present_name(name: str) -> str:
-    """The name of a source today; a former one is told."""
-    if name not in FORMER_NAMES:
-        return name
-    warnings.warn(f"source '{name}' is called '{FORMER_NAMES[name]}' now", FutureWarning, stacklevel=2)
-    return FORMER_NAMES[name]
-
-
 def source_or_name(name: str) -> str | Source:
     """A source that needs no predictor; of the others, and of the rule `auto`, the name.
 
@@ -60,7 +51,7 @@ def source_or_name(name: str) -> str | Source:
         OptionError: See `make_source`.
         GraspFileError: Likewise.
     """
-    name = present_name(name)
+    name = present(name, FORMER_SOURCES, "source ")
     return name if name in (AUTO, *OF_THE_PREDICTOR) else make_source(name)
 
 
@@ -75,7 +66,7 @@ def make_source(name: str, means: Mapping[str, MeanGrasp] | None = None) -> Sour
         OptionError: There is no such source, or it lacks what it needs.
         GraspFileError: The grasp file cannot be read.
     """
-    name = present_name(name)
+    name = present(name, FORMER_SOURCES, "source ")
     if name in (AUTO, *OF_THE_PREDICTOR):
         raise OptionError(f"source '{name}' needs a network and a configuration; GraspPredictor().source('{name}') makes it")
     if name in SOURCES:

@@ -19,13 +19,13 @@ from dro_grasp.errors import BundleError, OptionError
 from dro_grasp.files import check_folder, make_folder, replacing, set_aside
 from dro_grasp.hands.check import check_hand, picture
 from dro_grasp.hands.library import load_hand
-from dro_grasp.kinds import Checked
+from dro_grasp.kinds import FORMER_SOURCES, Checked
 from dro_grasp.network.checkpoints import DEFAULT, history_of, load_weights, locate_weights, save_weights
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.optimize.synthesis import SynthesisConfig
 from dro_grasp.predict.config import AUTO
 from dro_grasp.predict.predictor import GraspPredictor
-from dro_grasp.predict.sources.registry import FORMER_NAMES, source_or_name
+from dro_grasp.predict.sources.registry import source_or_name
 from dro_grasp.simulation.protocols import PROTOCOLS, protocol
 from dro_grasp.train.config import ScheduleConfig, TrainConfig
 from dro_grasp.train.data.bundle.training_file import load_bundle, split_of
@@ -216,7 +216,7 @@ class _Onboarding:
             known = json.loads(state.read_text())
             asked = dict(known["asked"]) if "asked" in known else {}
             if "method" in asked:  # of earlier versions
-                asked["source"] = FORMER_NAMES.get(asked["method"], asked["method"])
+                asked["source"] = FORMER_SOURCES.get(asked["method"], asked["method"])
             return {"hand": str(known["hand"]), "sha256": str(known["sha256"]), "steps": dict(known["steps"]),
                     "asked": asked}
         except (ValueError, LookupError, TypeError) as error:
@@ -228,7 +228,7 @@ class _Onboarding:
         """What decides on the results, beside the hand and the time."""
         config = self.config
         return {"weights": config.weights or DEFAULT, "objects": self.objects, "held_out": self.held_out, "num": config.num,
-                "source": FORMER_NAMES.get(config.source, config.source), "learning_rate": config.learning_rate,
+                "source": FORMER_SOURCES.get(config.source, config.source), "learning_rate": config.learning_rate,
                 "seed": config.seed}
 
     def run(self) -> None:
