@@ -149,10 +149,14 @@ def renamed(**former: str) -> Callable[[Named], Named]:
     def decorate(owner: Named) -> Named:
         if not isinstance(owner, type):
             return _taking_former(owner, former)  # type: ignore[return-value]
-        taken = inspect.signature(owner).parameters
-        given = {old: new for old, new in former.items() if new in taken}
+        signature = inspect.signature(owner.__init__)  # type: ignore[misc]
+        given = {old: new for old, new in former.items() if new in signature.parameters}
         if given:
-            owner.__init__ = _taking_former(owner.__init__, given)  # type: ignore[misc]
+            made = _taking_former(owner.__init__, given)  # type: ignore[misc]
+            # What checks calls by their signature, as jaxtyping does, must not refuse the former names.
+            more = inspect.Parameter("former", inspect.Parameter.VAR_KEYWORD, annotation=Any)
+            made.__signature__ = signature.replace(parameters=[*signature.parameters.values(), more])  # type: ignore[attr-defined]
+            owner.__init__ = made  # type: ignore[misc]
         for old, new in former.items():
             setattr(owner, old, _former_attribute(old, new))
         return owner

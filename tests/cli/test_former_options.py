@@ -9,12 +9,13 @@ from dro_grasp.cli.robots import Plan
 
 WHAT = ["--hand", "gripper3", "--object", "mug"]
 ROBOT = ["--robot", "xarm7_leaphand", "--object", "mug"]
+ABOVE = ["--direction", "0", "0", "-1"]
 BALL = ["0", "0", "0.1", "0.03"]
 
 
 @pytest.mark.parametrize(("before", "now"), [
-    (["generate", *WHAT, "--direction", "0", "0", "-1", "--cone", "0.5", "--opening=0.01", "--avoid", "a.stl"],
-     ["generate", *WHAT, "--direction", "0", "0", "-1", "--max-tilt", "0.5", "--pregrasp-clearance=0.01", "--obstacles", "a.stl"]),
+    (["generate", *WHAT, *ABOVE, "--cone", "0.5", "--opening=0.01", "--avoid", "a.stl"],
+     ["generate", *WHAT, *ABOVE, "--max-tilt", "0.5", "--pregrasp-clearance=0.01", "--obstacles", "a.stl"]),
     (["generate", *WHAT, "--hold", *BALL, "--spare", *BALL, "--method", "optimise"],
      ["generate", *WHAT, "--contact-region", *BALL, "--keep-out", *BALL, "--source", "optimiser"]),
     (["plan", *ROBOT, "--avoid", "a.stl", "--hold", *BALL], ["plan", *ROBOT, "--scene", "a.stl", "--contact-region", *BALL]),

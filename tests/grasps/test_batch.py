@@ -291,3 +291,14 @@ def test_poses_and_joints_that_are_none_are_refused(change, told):
     given = made_up_grasps(toy_hand(), count=3)
     with pytest.raises(OptionError, match=told):
         GraspBatch.create(toy_hand(), ball(), *change(given.T_object_wrist, given.joints))
+
+
+def test_methods_of_before_are_taken_and_told() -> None:
+    """`bare` and `moved_to` are `poses_only` and `with_poses`, for one release."""
+    batch = evaluated(3, score=torch.rand(3))
+    with pytest.warns(FutureWarning, match="bare is called poses_only now"):
+        before = batch.bare()
+    assert not before.evaluated.any()
+    assert torch.equal(before.joints, batch.joints)
+    with pytest.warns(FutureWarning, match="moved_to is called with_poses now"):
+        assert torch.equal(batch.moved_to(batch.T_object_wrist, batch.joints + 1).joints, batch.joints + 1)

@@ -123,5 +123,6 @@ def test_a_vector_without_a_direction_is_refused(direction: object) -> None:
     (0, 0, 0.1, 0.03), 1.0, np.zeros(4), [(0, 0, "x", 1)], ["ball"], ["0123"],
     [("0", "0", "0", "1")], [(0, 0, 0.1)], [(0, 0, math.nan, 1)], [(0, 0, 0, 0)]])
 def test_balls_that_are_none_are_refused(name: str, balls: object) -> None:
-    with pytest.raises(OptionError, match=f"{name} .*; give .*x, y, z and a radius above 0 in metres, .*--{name} 0 0 0.1"):
+    option = "--" + name.replace("_", "-")
+    with pytest.raises(OptionError, match=f"{name} .*; give .*x, y, z and a radius above 0 in metres, .*{option} 0 0 0.1"):
         given(**{name: balls})

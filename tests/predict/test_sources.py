@@ -92,7 +92,7 @@ def test_weights_of_a_method_stand_behind_its_name(weights: str) -> None:
 
 @pytest.mark.parametrize(("former", "name"), [("dro", "auto"), ("synthesise", "optimiser"), ("optimise", "optimiser")])
 def test_former_names_are_taken_with_a_warning(weights: str, former: str, name: str) -> None:
-    with pytest.warns(FutureWarning, match=f"source '{former}' is called '{name}' now"):
+    with pytest.warns(FutureWarning, match=f"source {former} is called {name} now"):
         assert make_method(former, MethodOptions(weights)).name == name
 
 

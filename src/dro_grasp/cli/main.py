@@ -64,9 +64,11 @@ Command = (
 
 GONE = None  # What an option is called that is no longer a choice; `former` of its command has it
 CONSTRAINTS = {f"--{old}": f"--{new.replace('_', '-')}" for old, new in FORMER_CONSTRAINTS.items()}
+"""What options of constraints were called, and are."""
 TRAINING: dict[str, str | None] = {"--size": "--preset"} | dict.fromkeys((
     "--method", "--latent", "--latent-form", "--prior", "--placement-hand", "--divergence-warmup", "--free-bits",
     "--drawn"), GONE)
+"""The same of training."""
 FORMER_OPTIONS: dict[str, Mapping[str, str | None]] = {
     "generate": CONSTRAINTS | {"--method": "--source"},
     # --obstacles are things of an object's size there

@@ -10,13 +10,13 @@ import torch
 from dro_grasp.geometry.se3 import apply
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
-from dro_grasp.kinds import Checked
+from dro_grasp.kinds import FORMER_SOURCES, Checked, present
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.config import GraspRequest, PredictorConfig
 from dro_grasp.predict.predictor import GraspPredictor, Prediction
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.controls import MeanGrasp
-from dro_grasp.predict.sources.registry import WITH_DATA, make_source, present_name
+from dro_grasp.predict.sources.registry import WITH_DATA, make_source
 from dro_grasp.predict.sources.source import AUTO, Candidates, Source, ask
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ class Method:
         Raises:
             OptionError: There is no such source.
         """
-        source = present_name(source) if isinstance(source, str) else source
+        source = present(source, FORMER_SOURCES, "source ") if isinstance(source, str) else source
         self.predictor, self.source, self.candidates = predictor, predictor.source(source), candidates
         self.asks = AUTO if source == AUTO else self.source
         self.name = name or (AUTO if source == AUTO else self.source.name)
@@ -103,7 +103,7 @@ def make_method(name: str, options: MethodOptions | None = None) -> Method:
     """
     options = options or MethodOptions()
     plain, at, weights = name.partition("@")
-    plain = present_name(plain)
+    plain = present(plain, FORMER_SOURCES, "source ")
     own = bool(at) and plain in (AUTO, "network")
     config = PredictorConfig()
     if options.temperature is not None:

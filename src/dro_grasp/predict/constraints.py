@@ -125,7 +125,8 @@ class Constraints(Checked):
             free = place.distances(cloud)[0] <= 0
             if int(free.sum()) < MIN_REGION_POINTS:
                 raise OptionError(f"contact_region is not on the object: {int(free.sum())} of {len(cloud)} points of its "
-                                  f"surface are within the balls, and it spans {spans} m. Move the balls, or give a larger radius")
+                                  f"surface are within the balls, and it spans {spans} m. Move the "
+                                  "balls, or give a larger radius")
         if (place := Balls.of(self.keep_out)) is not None:
             free &= place.distances(cloud)[0] > 0
             if int(free.sum()) < MIN_REGION_POINTS:

@@ -140,4 +140,4 @@ def test_fields_of_before_are_taken_and_told(answerer: Answerer) -> None:
     assert pickle.loads(pickle.dumps(call)).told == call.told, "it travels to the process that answers"
     with pytest.raises(ValueError, match="hold is called contact_region now, and both are given"):
         GraspCall(**asked, contact_region=[])
-    assert "hold is called contact_region now" in ask(answerer, "can", num=1, hold=[[0, 0, 0, 0.3]]).notes[-1]
+    assert "avoid is called obstacles now" in ask(answerer, "can", num=1, avoid={"points": [[9.0, 0, 0]]}).notes[-1]

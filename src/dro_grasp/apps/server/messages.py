@@ -7,6 +7,7 @@ import base64
 import inspect
 import textwrap
 import uuid
+from collections.abc import Callable
 from dataclasses import MISSING, fields
 from itertools import pairwise
 from typing import Any, Literal, TypeVar, get_type_hints
@@ -15,7 +16,6 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
-    ModelWrapValidatorHandler,
     PrivateAttr,
     create_model,
     field_validator,
@@ -110,7 +110,7 @@ class _Call(Message):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _present(cls, given: Any, handler: ModelWrapValidatorHandler[Any]) -> Any:
+    def _present(cls, given: Any, handler: Callable[[Any], Any]) -> Any:
         """Take names of before too: robots in the field are updated later than their server."""
         former = tuple(name for name in given if name in FORMER_FIELDS) if isinstance(given, dict) else ()
         for name in former:
