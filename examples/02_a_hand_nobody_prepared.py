@@ -1,4 +1,4 @@
-"""A URDF that was written a moment ago: check it, then synthesise its first grasps from geometry alone."""
+"""A URDF that was written a moment ago: check it, then synthesize its first grasps from geometry alone."""
 
 from collections import Counter
 from pathlib import Path
@@ -35,5 +35,5 @@ hand = dro.load_hand(path)
 obj = dro.load_object("can")
 grasps = dro.synthesize(hand, obj, num=64)[:16]
 result = dro.simulate(hand, obj, grasps, "strict")
-print(f"{int(result.success.sum())} of the best {len(grasps)} synthesised grasps hold; the others fail as follows:")
+print(f"{int(result.success.sum())} of the best {len(grasps)} synthesized grasps hold; the others fail as follows:")
 print(dict(Counter(failure.value for failure in result.failure if failure)))

@@ -1,4 +1,4 @@
-"""From nothing to weights of your own: synthesise, bundle, pretrain, train, predict. Minutes here, hours in earnest."""
+"""From nothing to weights of your own: synthesize, bundle, pretrain, train, predict. Minutes here, hours in earnest."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory

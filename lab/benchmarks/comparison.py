@@ -53,7 +53,7 @@ PAPER = {
 }
 """Success [%], diversity [rad] and seconds on Barrett, Allegro and Shadow hand. Source: paper, table of the overall comparison,
 in Isaac Gym; DFC took more than the seconds stated."""
-METHODS = ("dro:raw=4", "dro:1=4", "dro", "synthesise:1=4", "synthesise=4", "dfc=4", "gendexgrasp=2",
+METHODS = ("dro:raw=4", "dro:1=4", "dro", "optimiser:1=4", "optimiser=4", "dfc=4", "gendexgrasp=2",
            "gendexgrasp-gamma1=1", "manifm=4", "start=4")
 """Rows by default."""
 

@@ -1,6 +1,6 @@
 """Strict-valid grasps per CPU-hour, by synthesis, settling and trial together.
 
-The work is the data engine's own: every shard is synthesised, closed, evaluated under protocol `strict`, and its
+The work is the data engine's own: every shard is synthesized, closed, evaluated under protocol `strict`, and its
 near-duplicates are counted once. CPU time is that of the process, including model compilation; loading a hand
 and an object is counted separately, with grid and convex parts from the cache.
 
@@ -31,7 +31,7 @@ HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand")
 SAMPLE = 8
 """Training objects that are drawn, unless all 48 are taken."""
 CANDIDATES = 128
-"""Grasps synthesised for each pair."""
+"""Grasps synthesized for each pair."""
 PUBLISHED = (
     ("DexGraspNet", "under 3", "one A100"), ("BODex", "30 to 50", "one A100"), ("Lightning Grasp", "300 to 1000", "one A100"),
 )

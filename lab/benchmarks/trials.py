@@ -1,6 +1,6 @@
 """Trials per second under protocol `dro`, by wall clock on all cores, and the slowest objects.
 
-The grasps are synthesised, so most trials run to their end; a trial that fails early is cheaper. The time is that of
+The grasps are synthesized, so most trials run to their end; a trial that fails early is cheaper. The time is that of
 `simulate`, including penetration and scene building (64 grasps per pair with `--full`, otherwise 16), but not the loading of
 hands and objects.
 
@@ -100,7 +100,7 @@ def main() -> None:
     everything = [r for of_hand in runs.values() for r in of_hand]
     cpu = sum(r.cpu_seconds for r in everything) / sum(len(r.result.success) for r in everything)
     emit(
-        f"Trials with protocol {options.protocol}: {FULL if options.full else SAMPLE} synthesised grasps (seed "
+        f"Trials with protocol {options.protocol}: {FULL if options.full else SAMPLE} synthesized grasps (seed "
         f"{options.seed}) of each of the paper's 10 validation objects, {options.workers} threads",
         [row(hand, of_hand) for hand, of_hand in runs.items()],
         ["hand", "trials", "trials/s", "CPU [ms]", "slowest object", "there", "success [%]", "failures"],

@@ -38,7 +38,7 @@ class BundleDraws:
         """
         names = [name for name, grasps in bundle.grasps.items() if len(grasps.joints)]
         if not names:
-            raise BundleError("the bundle holds no grasps; synthesise some first")
+            raise BundleError("the bundle holds no grasps; synthesize some first")
         self.hands = [bundle.hands[n].with_points(min(hand_points, bundle.hands[n].n_points)).to(device) for n in names]
         self.grasps = [bundle.grasps[n].to(device) for n in names]
         self.points = torch.stack([cloud.points for cloud in bundle.objects.values()]).to(device)

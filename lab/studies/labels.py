@@ -44,7 +44,7 @@ def choices(candidates: int) -> dict[str, EngineConfig]:
         "idle fingers stay": EngineConfig(candidates=candidates, close_fingers=False),
         "a finger is idle with 0.3": EngineConfig(
             candidates=candidates, synthesis=SynthesisConfig(contacts=ContactConfig(idle=0.3))),
-        "labels as synthesised": EngineConfig(candidates=candidates, settle=False),
+        "labels as synthesized": EngineConfig(candidates=candidates, settle=False),
         "400 steps, best third evaluated": EngineConfig(
             candidates=candidates, trial_share=0.34, synthesis=SynthesisConfig(steps=400)),
         "every finger holds": EngineConfig(candidates=candidates, synthesis=SynthesisConfig(contacts=all_hold)),
@@ -77,7 +77,7 @@ def measure(hand_name: str, objects: list[str], config: EngineConfig) -> list[ob
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--candidates", type=int, default=128, help="grasps synthesised for each pair")
+    parser.add_argument("--candidates", type=int, default=128, help="grasps synthesized for each pair")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     torch.set_num_threads(1)

@@ -190,12 +190,12 @@ def test_what_generate_returns_and_what_controls_return_in_the_networks_time() -
     assert returned.success["strict/1"][0] == float(simulate(hand, obj, made.grasps, "strict").success.float().mean())
     assert returned.candidates == made.candidates
     assert returned.optimised == made.origin.count("optimiser") / 2
-    start, synthesised = (find(rows, name, EQUAL_TIME, "gripper3") for name in (START, OPTIMISER))
+    start, synthesized = (find(rows, name, EQUAL_TIME, "gripper3") for name in (START, OPTIMISER))
     assert start.candidates >= start.asked  # how many depends on the clock; a fake one counts them in test_equal_time
     assert (start.asked, start.optimised) == (2, 0)
-    assert synthesised.asked == 2
-    assert synthesised.optimised == 1
-    assert {name for row in (alone, start, synthesised) for name in row.seconds} == {"CPU"}
+    assert synthesized.asked == 2
+    assert synthesized.optimised == 1
+    assert {name for row in (alone, start, synthesized) for name in row.seconds} == {"CPU"}
     assert 0.25 < start.seconds["CPU"] / alone.seconds["CPU"] < 4
 
 

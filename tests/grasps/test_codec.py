@@ -27,8 +27,8 @@ def test_columns_say_what_a_stranger_would_compute() -> None:
     assert columns["success"].null_count == len(grasps) - int(grasps.evaluated.sum())
 
 
-def test_files_without_energies_hold_them_as_scores_of_synthesised_grasps() -> None:
-    """What earlier versions wrote: the score of a synthesised grasp is minus its energy; predicted ones have log-odds."""
+def test_files_without_energies_hold_them_as_scores_of_synthesized_grasps() -> None:
+    """What earlier versions wrote: the score of a synthesized grasp is minus its energy; predicted ones have log-odds."""
     terms = torch.tensor([1.0, 2.0, torch.nan, 1.0])
     grasps = made_up_grasps(toy_hand(), count=4, score=torch.tensor([-7.0, -9.0, 2.0, -3.0]), extra={"energy_distance": terms})
     made = ("dro-grasp 0.1.0, synthesis 2", "dro-grasp 0.1.0, synthesis 2, 200 to 400 steps", "network multi", "network multi")

@@ -103,7 +103,7 @@ def test_a_single_finger_and_what_it_closes_on_have_a_slot_each(tmp_path: Path) 
     assert torch.allclose((drawn[:, 2:] == PALM).float().mean(0), torch.full((2,), 0.5), atol=0.1)
 
 
-def test_synthesised_grasps_hold_between_the_jaws(tmp_path: Path) -> None:
+def test_synthesized_grasps_hold_between_the_jaws(tmp_path: Path) -> None:
     hand, rod = jaws(tmp_path), load_object("rod")
     trial = simulate(hand, rod, synthesize(hand, rod, 32), "strict")
     assert int(trial.success.sum()) >= 12  # 17; 6 where the palm faces the fixed jaw and contacts are drawn as for other hands

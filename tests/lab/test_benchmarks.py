@@ -91,9 +91,9 @@ def test_the_papers_form_is_trained_and_measured_once(
 
 def test_a_row_of_the_comparison_says_candidates_and_number() -> None:
     source, options = comparison.Source, Namespace(bundle=None, num=7)
-    rows = [source.of(name, options) for name in ("start:raw=3", "synthesise:16=2", "synthesise", "start")]
+    rows = [source.of(name, options) for name in ("start:raw=3", "optimiser:16=2", "optimiser", "start")]
     assert [(row.name, row.raw, row.num) for row in rows] == [
-        ("start:raw", True, 3), ("synthesise:16", False, 2), ("synthesise", False, 7), ("start", False, 7)]
+        ("start:raw", True, 3), ("optimiser:16", False, 2), ("optimiser", False, 7), ("start", False, 7)]
     assert [row.method.candidates for row in rows[1:3]] == [16, CANDIDATES]
 
 

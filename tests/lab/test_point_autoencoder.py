@@ -94,7 +94,7 @@ def test_the_loss_falls_and_the_averaged_weights_are_returned_with_statistics_of
 
 def test_an_empty_bundle_and_a_loss_that_is_no_number_are_refused(bundle, tmp_path: Path) -> None:
     empty = dataclasses.replace(bundle, grasps={})
-    with pytest.raises(BundleError, match="synthesise some first"):
+    with pytest.raises(BundleError, match="synthesize some first"):
         trained(empty, tmp_path / "empty", [])
     assert not (tmp_path / "empty").exists()
     short = dataclasses.replace(CONFIG, schedule=dataclasses.replace(SCHEDULE, steps=1))

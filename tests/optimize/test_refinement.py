@@ -30,7 +30,7 @@ def obj(request: pytest.FixtureRequest) -> ObjectModel:
 
 @pytest.fixture(scope="module")
 def disturbed() -> GraspBatch:
-    """Synthesised grasps pushed into the object and bent, as a network's predictions are."""
+    """Synthesized grasps pushed into the object and bent, as a network's predictions are."""
     made = synthesize(HAND, load_object("can"), 48, 0, SynthesisConfig(batch_size=48))[slice(0, 16)]
     generator = torch.Generator().manual_seed(0)
     T, q = made.T_object_wrist.clone(), made.joints.clone()

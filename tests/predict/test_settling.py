@@ -156,8 +156,8 @@ def test_a_grasp_scores_lower_for_room_that_it_lacks_beside_what_was_not_seen(gr
     problem = GraspProblem(HAND, half)
     lacking = missing_clearance(problem.energy(EnergyConfig()), guessed, half.seen)
     assert float(lacking.max()) > 0.002
-    torch.testing.assert_close(whole.score - guessed.score, stays.room_worth * lacking)
-    _, dear = settle_best(problem, scored(problem, grasps), 5, replace(stays, room_worth=200.0))
+    torch.testing.assert_close(whole.score - guessed.score, stays.clearance_worth * lacking)
+    _, dear = settle_best(problem, scored(problem, grasps), 5, replace(stays, clearance_worth=200.0))
     torch.testing.assert_close(whole.score - dear.score, 200.0 * lacking)
 
 

@@ -312,7 +312,7 @@ def test_a_cloud_cannot_be_simulated(hand, obj):
 
 @pytest.mark.assets
 @pytest.mark.parametrize("name", ["barrett_multidex", "allegro_left", "shadowhand"])
-def test_synthesised_grasps_of_the_paper_hands_hold(name: str, assets_folder: Path):
+def test_synthesized_grasps_of_the_paper_hands_hold(name: str, assets_folder: Path):
     from dro_grasp.objects.catalogue import load_object
     from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 

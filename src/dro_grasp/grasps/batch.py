@@ -1,4 +1,4 @@
-"""GraspBatch: grasps of one hand, predicted or synthesised, evaluated or not."""
+"""GraspBatch: grasps of one hand, predicted or synthesized, evaluated or not."""
 
 from __future__ import annotations
 

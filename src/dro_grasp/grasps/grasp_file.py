@@ -215,8 +215,8 @@ def _numbers(array: pa.Array) -> Float[np.ndarray, " n"]:
 REQUIRED = ("object", "wrist_position", "wrist_quaternion_wxyz", "joints")  # Columns without which a file holds no grasps
 TEXT_TYPES = {columns.REASON: pa.string(), columns.FAILURE: pa.string(), columns.CONTACT_LINKS: pa.list_(pa.string())}
 """Types of the trial's further columns, which their values do not tell when all are unknown."""
-SYNTHESISED = re.compile(r"\bsynthesis \d+\b")
-"""Provenance of synthesised grasps, whose `score` is minus the energy in files without a column `energy`."""
+SYNTHESIZED = re.compile(r"\bsynthesis \d+\b")
+"""Provenance of synthesized grasps, whose `score` is minus the energy in files without a column `energy`."""
 
 
 def encode(batch: Any) -> tuple[dict[str, pa.Array], dict[str, Any]]:
@@ -311,12 +311,12 @@ def _poses(position: Float[Tensor, "n 3"], quaternion: Float[Tensor, "n 4"]) -> 
 
 
 def _energy_apart(score: Float[Tensor, " n"], provenance: tuple[str, ...], table: pa.Table) -> dict[str, Float[Tensor, " n"]]:
-    """Energy and score in a file without a column `energy`: the score of its synthesised grasps is minus the energy."""
+    """Energy and score in a file without a column `energy`: the score of its synthesized grasps is minus the energy."""
     terms = [name for name in table.column_names if name.startswith(columns.ENERGY_TERM)]
     has_terms = ~torch.from_numpy(np.array(table[terms[0]].is_null())) if terms else torch.zeros(len(score), dtype=torch.bool)
-    synthesised = has_terms & torch.tensor([SYNTHESISED.search(p) is not None for p in provenance], dtype=torch.bool)
+    synthesized = has_terms & torch.tensor([SYNTHESIZED.search(p) is not None for p in provenance], dtype=torch.bool)
     nothing = torch.full_like(score, torch.nan)
-    return {"energy": torch.where(synthesised, -score, nothing), "score": torch.where(synthesised, nothing, score)}
+    return {"energy": torch.where(synthesized, -score, nothing), "score": torch.where(synthesized, nothing, score)}
 
 
 def _decode_further(column: pa.ChunkedArray) -> Any:

@@ -155,7 +155,7 @@ def require_same(grasps: GraspBatch, hand: Hand, obj: ObjectModel) -> None:
     ):
         if stored and stored != found:
             raise GraspFileError(f"the grasps were made for another version of {kind} '{name}' (hash {stored[:12]}, found "
-                                 f"{found[:12]}); bring that version back, or synthesise again")
+                                 f"{found[:12]}); bring that version back, or synthesize again")
 
 
 def _recorded(grasps: GraspBatch, column: str) -> str | None:

@@ -79,7 +79,7 @@ class Scene:
             return
         flat = float(np.linalg.norm(obj.cloud_normals[on].mean(0)))
         if flat < 0.85 or on.mean() > 0.5:  # (ours) otherwise it is the flat side on which the object stands
-            raise ObjectError(f"the scene to avoid, '{self.name}', contains object '{obj.name}': {100 * on.mean():.0f} % of "
+            raise ObjectError(f"the scene of obstacles, '{self.name}', contains object '{obj.name}': {100 * on.mean():.0f} % of "
                               "the object's surface lies on it or inside. Cut the object out of the scene, or check that "
                               "both are in one frame and in metres")
 
@@ -101,7 +101,7 @@ def load_scene(source: ObjectSource, name: str | None = None, scale: float = 1.0
     if isinstance(source, str | Path):
         path = given_path(source)
         if not path.is_file():
-            raise ObjectError(f"no file at {path}; give the mesh or cloud of the scene to avoid (STL, OBJ, PLY, NPY, PCD)")
+            raise ObjectError(f"no file at {path}; give the mesh or cloud of the obstacles (STL, OBJ, PLY, NPY, PCD)")
         (geometry, unit), label, origin = read_geometry(path), name or path.stem, str(path)
     else:
         (geometry, unit), label, origin = geometry_in_memory(source), name or "scene", "the given scene"

@@ -105,7 +105,7 @@ class _Closer:
         share, meets = some.first_contact(start, moving)
         for finger in (meets & still).any(0).nonzero()[:, 0].tolist():
             new = torch.where(self.bends[finger], self.along(start, moving[:, finger], share[:, finger, None]), now)
-            kept = (meets & still)[:, finger] & some.roomy(new, now)
+            kept = (meets & still)[:, finger] & some.keeps_apart(new, now)
             now = torch.where(kept[:, None], new, now)
             still[:, finger] &= ~kept
         return q.index_put((rows,), now), waiting.index_put((rows,), still)
@@ -129,7 +129,7 @@ class _Closer:
                     break
                 share = torch.lerp(shares[:, finger], wanted, part)
                 new = torch.where(moving[:, finger], self.along(opened, moving[:, finger], share[:, None]), q)
-                kept = waiting[:, finger] & (self.gaps(new, counted)[:, finger] > config.contact) & self.roomy(new, q)
+                kept = waiting[:, finger] & (self.gaps(new, counted)[:, finger] > config.contact) & self.keeps_apart(new, q)
                 q = torch.where(kept[:, None], new, q)
                 waiting[:, finger] &= ~kept
         return q
@@ -184,7 +184,7 @@ class _Closer:
         """Signed distance of the hand's surface points to the object [m]."""
         return self.energy.field.distances(body_points(self.energy, self.T, q))[0]
 
-    def roomy(self, new: Float[Tensor, "n n_dof"], q: Float[Tensor, "n n_dof"]) -> Bool[Tensor, " n"]:
+    def keeps_apart(self, new: Float[Tensor, "n n_dof"], q: Float[Tensor, "n n_dof"]) -> Bool[Tensor, " n"]:
         """Whether self-penetration grows no more than it may from `q` to `new`."""
         return self.overlap(new) < self.overlap(q) + self.config.overlap
 

@@ -23,7 +23,7 @@ from dro_grasp.optimize.grasp_energy import TERMS, EnergyConfig, Evaluation, Gra
 from dro_grasp.optimize.starts import StartConfig, starts
 
 PROVENANCE = f"dro-grasp {__version__}, synthesis 2"
-"""Provenance of synthesised grasps; the number counts up when the method changes."""
+"""Provenance of synthesized grasps; the number counts up when the method changes."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class State(Rows):
 
 @checked
 def synthesize(hand: Hand, obj: ObjectModel, num: int, seed: int = 0, config: SynthesisConfig | None = None) -> GraspBatch:
-    """Synthesise grasps of an object by a hand, lowest energy first, not evaluated.
+    """Synthesize grasps of an object by a hand, lowest energy first, not evaluated.
 
     The same seed gives the same grasps.
 

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from dro_grasp.grasps.batch import GraspBatch
-from dro_grasp.kinds import Checked
+from dro_grasp.kinds import Checked, renamed
 from dro_grasp.optimize.fingers import missing_clearance
 from dro_grasp.optimize.grasp_energy import EnergyConfig
 from dro_grasp.optimize.refinement import RefineConfig
@@ -29,14 +29,15 @@ from dro_grasp.simulation.contacts import deepest_penetration
 from dro_grasp.simulation.grasp_state import GraspState, grasp_state
 
 
+@renamed(room_worth="clearance_worth")
 @dataclass(frozen=True)
 class SettleConfig(Checked):
     """Which grasps settle, what counts as holding still while the hand closes, and what that means for the score (ours)."""
 
     share: float = 0.5
     """Share of scored candidates that are settled, the best ones; the others are left out."""
-    room_worth: float = 80.0
-    """What the score of a grasp on an object seen in part loses for room that the opened hand lacks [log-odds per m]."""
+    clearance_worth: float = 80.0
+    """What the score of a grasp on an object seen in part loses for clearance that the opened hand lacks [log-odds per m]."""
     unstable_score: float = -4.0
     """Highest score of a grasp that does not hold still when its closing is simulated [log-odds of holding]."""
     still: float = 0.005
@@ -75,7 +76,7 @@ def settle_best(
 ) -> tuple[Int[Tensor, " k"], GraspBatch]:
     """The better share of scored grasps, settled and scored again, in their order; which rows they are comes first.
 
-    The score counts how the object is held then, and on an object seen in part the room that the opened hand leaves. A grasp
+    The score counts how the object is held then, and on an object seen in part the clearance that the opened hand leaves. A grasp
     that does not hold still, or ends where the problem's constraints forbid, stays as it was and scores at most
     `unstable_score`.
 
@@ -97,7 +98,7 @@ def settle_best(
     found[stable] = holding_score(found[stable], state)
     found = torch.where(stable & ~wrong, found, found.clamp_max(config.unstable_score))
     if problem.obj.seen is not None:
-        found = found - config.room_worth * missing_clearance(problem.energy(EnergyConfig()), closed, problem.obj.seen)
+        found = found - config.clearance_worth * missing_clearance(problem.energy(EnergyConfig()), closed, problem.obj.seen)
     return best, closed.replace(score=found)
 
 

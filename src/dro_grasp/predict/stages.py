@@ -64,10 +64,10 @@ def grip(problem: GraspProblem, grasps: GraspBatch, config: RefineConfig) -> Gra
 def ease(
     problem: GraspProblem, grasps: GraspBatch, config: EasingConfig | None = None, admission: AdmissionConfig | None = None
 ) -> GraspBatch:
-    """Complete grasps as they are given away: on a bare cloud, fingers leave room; those on a mesh stay.
+    """Complete grasps as they are given away: on a bare cloud, fingers open until they are clear of it; those on a mesh stay.
 
-    It comes last. Score and energy judge grasps whose fingers touch, and are kept. Where the constraints forbid the room, as a
-    table does, fingers leave as much as on a surface that was seen, or none.
+    It comes last. Score and energy judge grasps whose fingers touch, and are kept. Where the constraints forbid that, as a
+    table does, fingers open as on a surface that was seen, or not at all.
     """
     if not problem.obj.is_cloud or not len(grasps):
         return grasps

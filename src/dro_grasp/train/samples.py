@@ -50,7 +50,7 @@ class SampleSource:
     ) -> None:
         self.network, self.augmentation = network, augmentation
         if bundle.n_grasps == 0:
-            raise BundleError("the bundle holds no grasps; synthesise some first")
+            raise BundleError("the bundle holds no grasps; synthesize some first")
         self.hands = {name: hand.with_points(network.n_hand).to(device) for name, hand in bundle.hands.items()}
         self.grasps = {name: grasps.to(device) for name, grasps in bundle.grasps.items()}
         self.names = [name for name, grasps in bundle.grasps.items() if len(grasps.joints)]

@@ -123,10 +123,10 @@ def test_moveit(grasps: GraspBatch, one: Path, camera: Path, tmp_path: Path, in_
 
 
 def test_only_a_score_makes_a_confidence(grasps: GraspBatch, tmp_path: Path) -> None:
-    """Synthesised grasps have an energy: no format calls them hopeless, or certain, for it."""
+    """Synthesized grasps have an energy: no format calls them hopeless, or certain, for it."""
     energies = torch.tensor([300.0, 0.1])
-    synthesised = grasps[[0, 1]].without("score").replace(energy=energies)
-    GraspBatch.concatenate([synthesised, grasps[[3]]]).save(tmp_path / "mug.parquet")
+    synthesized = grasps[[0, 1]].without("score").replace(energy=energies)
+    GraspBatch.concatenate([synthesized, grasps[[3]]]).save(tmp_path / "mug.parquet")
     for format, name in (("isaac_grasp", "isaac.yaml"), ("moveit", "moveit.yaml"), ("csv", "table.csv")):
         assert export(tmp_path / "mug.parquet", "--format", format, "--output", tmp_path / name) == 0
     isaac = (tmp_path / "isaac.yaml").read_text()

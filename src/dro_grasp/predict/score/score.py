@@ -1,4 +1,4 @@
-"""Scores of grasps, predicted or synthesised: the log-odds that they hold.
+"""Scores of grasps, predicted or synthesized: the log-odds that they hold.
 
 Source: the paper's appendix ranks predictions by DexGraspNet's energy and reports the best; the release does not rank.
 """
@@ -78,7 +78,7 @@ class ScoreConfig(Checked):
     """How grasps are scored."""
 
     energy: EnergyConfig = field(default_factory=lambda: EnergyConfig(penetration=30.0))
-    """Weights of the energy terms, as in the network's training. Predictions penetrate more than synthesised grasps, which
+    """Weights of the energy terms, as in the network's training. Predictions penetrate more than synthesized grasps, which
     closing partly repairs."""
     batch_size: int = 64
     """Grasps scored at once."""

@@ -1,4 +1,4 @@
-"""Onboarding of a new hand: check, benchmark, synthesise, fine-tune, benchmark again; a rerun resumes where it stopped."""
+"""Onboarding of a new hand: check, benchmark, synthesize, fine-tune, benchmark again; a rerun resumes where it stopped."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from dro_grasp.train.loop import train
 STATE = "onboarding.json"  # File of finished steps in the hand's folder
 WEIGHTS = "weights.safetensors"  # File of the fine-tuned weights
 REPORT = "report.html"  # File of the report
-DATA = "data"  # Folder of synthesised grasps
+DATA = "data"  # Folder of synthesized grasps
 PICTURE = "hand.png"  # File of the hand's picture
 DATA_SHARE = 0.45  # Share of the time for synthesis (ours); what the shares leave is for the benchmarks before and after
 TRAINING_SHARE = 0.40  # Share of the time for fine-tuning (ours)
@@ -54,7 +54,7 @@ class OnboardingConfig(Checked):
     minutes: float = 30.0
     """Time for data, training and trials together [min]."""
     objects: tuple[str, ...] = ("builtin:train",)
-    """Objects to synthesise grasps of."""
+    """Objects to synthesize grasps of."""
     held_out: tuple[str, ...] = ("builtin:test",)
     """Objects of the benchmarks before and after; never trained on."""
     num: int = 20

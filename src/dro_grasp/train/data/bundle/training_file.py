@@ -126,7 +126,7 @@ def write_bundle(
         raise BundleError(f"grasps of {', '.join(sorted(strangers))} were given without these hands, or for other versions of "
                           "them; pass the hands they were made for")
     if not grasps:
-        raise BundleError("no grasps were given; synthesise some on objects for training first")
+        raise BundleError("no grasps were given; synthesize some on objects for training first")
     called = Counter(hand.name for hand in (*hands, *without_grasps))
     if double := sorted(name for name, count in called.items() if count > 1):
         raise BundleError(f"{', '.join(double[:5])} is the name of more than one hand; rename them, or leave out those that "
@@ -232,7 +232,7 @@ def _pack_hand(key: str, hand: Hand, tensors: Tensors) -> dict[str, Any]:
 
 def _pack_grasps(key: str, hand: Hand, batches: list[GraspBatch], names: list[str], splits: Set[str]) -> Tensors:
     if not batches:
-        raise BundleError(f"no grasps of hand '{hand.name}'; synthesise some or leave the hand out")
+        raise BundleError(f"no grasps of hand '{hand.name}'; synthesize some or leave the hand out")
     known = {name: i for i, name in enumerate(names)}
     for batch in batches:
         refused = {o for o, s in zip(batch.object, batch.split, strict=True) if s not in splits}

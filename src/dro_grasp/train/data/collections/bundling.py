@@ -92,7 +92,7 @@ def sources(batches: list[GraspBatch]) -> tuple[list[Hand], dict[str, ObjectClou
     for kind, names in (("hand", [hand.name for hand in found.values()]), ("object", [name for name, _ in named])):
         double = sorted({name for name in names if names.count(name) > 1})
         if double:
-            raise BundleError(f"different {kind}s are called {', '.join(double)}; rename them and synthesise again")
+            raise BundleError(f"different {kind}s are called {', '.join(double)}; rename them and synthesize again")
     clouds = {
         name: ObjectCloud(torch.from_numpy(obj.cloud[:CLOUD_POINTS]), torch.from_numpy(obj.cloud_normals[:CLOUD_POINTS]))
         for (name, _), obj in named.items()}

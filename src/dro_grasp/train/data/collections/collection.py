@@ -121,5 +121,5 @@ def _pairs_of_shards(folder: Path) -> Iterator[PairGrasps]:
         if len(hands) > 1 or len({sha for batch in batches for sha in batch.object_sha256}) > 1:
             what = f"hand '{hand}'" if len(hands) > 1 else f"object '{obj}'"
             raise GraspFileError(f"the shards of {hand} on {obj} were made with different versions of {what}, whose file has "
-                                 "changed; synthesise the pair again into another folder")
+                                 "changed; synthesize the pair again into another folder")
         yield PairGrasps(hand, obj, GraspBatch.concatenate(batches), sum((read_yield(folder, s) for s in own), Yield()))

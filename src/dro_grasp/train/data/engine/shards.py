@@ -41,7 +41,7 @@ class Yield:
     """
 
     candidates: int = 0
-    """Grasps synthesised."""
+    """Grasps synthesized."""
     ranked_out: int = 0
     """Without a trial because their energy was too high."""
     deep: int = 0

@@ -1,4 +1,4 @@
-"""The work of one shard: synthesise candidates, close the hand on the object, keep those that pass the trial."""
+"""The work of one shard: synthesize candidates, close the hand on the object, keep those that pass the trial."""
 
 from __future__ import annotations
 
