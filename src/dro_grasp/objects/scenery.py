@@ -79,7 +79,7 @@ class Scene:
             return
         flat = float(np.linalg.norm(obj.cloud_normals[on].mean(0)))
         if flat < 0.85 or on.mean() > 0.5:  # (ours) otherwise it is the flat side on which the object stands
-            raise ObjectError(f"the scene of obstacles, '{self.name}', contains object '{obj.name}': {100 * on.mean():.0f} % of "
+            raise ObjectError(f"the scene '{self.name}' contains object '{obj.name}': {100 * on.mean():.0f} % of "
                               "the object's surface lies on it or inside. Cut the object out of the scene, or check that "
                               "both are in one frame and in metres")
 

@@ -76,8 +76,8 @@ def settle_best(
 ) -> tuple[Int[Tensor, " k"], GraspBatch]:
     """The better share of scored grasps, settled and scored again, in their order; which rows they are comes first.
 
-    The score counts how the object is held then, and on an object seen in part the clearance that the opened hand leaves. A grasp
-    that does not hold still, or ends where the problem's constraints forbid, stays as it was and scores at most
+    The score counts how the object is held then, and on an object seen in part the clearance that the opened hand leaves. A
+    grasp that does not hold still, or ends where the problem's constraints forbid, stays as it was and scores at most
     `unstable_score`.
 
     Args:
