@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from dro_grasp.apps.viewer.studio import Studio
 from dro_grasp.cli.evaluate import Evaluate
 from dro_grasp.cli.generate import Generate
 from dro_grasp.cli.inputs import ConstraintOptions
@@ -44,8 +43,8 @@ def test_a_request_has_the_same_defaults_everywhere() -> None:
         option = default(ConstraintOptions if name in fields else Generate, name)
         assert getattr(Constraints(), name) == option == value, name
     assert {default(GraspPredictor.predict, name) == REQUESTS[name] for name in ("num", "seed")} == {True}
-    for name in ("num", "candidates", "temperature", "source"):
-        assert default(Studio.generate, name) == REQUESTS[name], name
+    for name in ("candidates", "temperature", "source", "refine"):
+        assert default(GraspPredictor.predict, name) == REQUESTS[name], name
 
 
 def test_data_are_made_alike() -> None:
@@ -65,7 +64,7 @@ def test_the_viewer_asks_for_what_the_command_asks(tmp_path, monkeypatch: pytest
         assert studio.protocol.value == DEFAULT_PROTOCOL
 
 
-@pytest.mark.parametrize("function", [simulate, settle, record, evaluate, Evaluate, Studio.generate])
+@pytest.mark.parametrize("function", [simulate, settle, record, evaluate, Evaluate])
 def test_trials_are_strict_unless_another_protocol_is_named(function: Callable[..., Any]) -> None:
     assert default(function, "protocol") == DEFAULT_PROTOCOL == "strict"
 
