@@ -105,7 +105,8 @@ class Source:
         """A method by its name in the table, such as `dro`, `dro:raw`, `dro:16` or `dfc=4`."""
         name, _, num = name.partition("=")
         plain, _, count = name.rpartition(":") if name.endswith(RAW) or name.rpartition(":")[2].isdigit() else (name, "", "")
-        method = make_method(plain, MethodOptions(bundle=options.bundle, candidates=int(count or GraspRequest.candidates)))
+        candidates = int(count) if count.isdigit() else GraspRequest.candidates
+        method = make_method(plain, MethodOptions(bundle=options.bundle, candidates=candidates))
         return Source(name, method, name.endswith(RAW), int(num or options.num))
 
 

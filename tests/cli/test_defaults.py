@@ -44,6 +44,8 @@ def test_a_request_has_the_same_defaults_everywhere() -> None:
         option = default(ConstraintOptions if name in fields else Generate, name)
         assert getattr(Constraints(), name) == option == value, name
     assert {default(GraspPredictor.predict, name) == REQUESTS[name] for name in ("num", "seed")} == {True}
+    for name in ("candidates", "temperature", "source", "refine"):
+        assert default(GraspPredictor.predict, name) == REQUESTS[name], name
 
 
 def test_data_are_made_alike() -> None:

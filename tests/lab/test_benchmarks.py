@@ -16,6 +16,7 @@ from scipy.stats import ttest_rel
 
 from dro_grasp.network.presets import PRESETS
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.predict.config import GraspRequest
 from dro_grasp.train import loop, pretraining
 from dro_grasp.train.data.bundle.training_file import write_bundle
 from dro_grasp.train.data.collections.importing import read_foreign
@@ -94,7 +95,7 @@ def test_a_row_of_the_comparison_says_candidates_and_number() -> None:
     rows = [source.of(name, options) for name in ("start:raw=3", "optimiser:16=2", "optimiser", "start")]
     assert [(row.name, row.raw, row.num) for row in rows] == [
         ("start:raw", True, 3), ("optimiser:16", False, 2), ("optimiser", False, 7), ("start", False, 7)]
-    assert [row.method.candidates for row in rows[1:3]] == [16, CANDIDATES]
+    assert [row.method.candidates for row in rows[1:3]] == [16, GraspRequest.candidates]
 
 
 def test_grasps_go_to_dexgraspbench_as_its_own_come_from_it(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from dro_grasp.compare.methods import make_method
 from dro_grasp.errors import WeightsError
 from dro_grasp.network.checkpoints import save_weights
 from dro_grasp.objects.catalogue import load_object
+from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.train.config import ScheduleConfig
 from lab.methods import train
 from lab.methods.bundle_draws import BundleDraws
@@ -163,10 +164,10 @@ def test_training_makes_a_method_that_the_benchmark_takes(bundle, home: Path, tm
     assert weights.stat().st_size < 3_000_000
     assert make_method("lab.methods.gendexgrasp:GenDexGraspGamma1").name == "gendexgrasp-gamma1"
     method = map_method.GenDexGrasp(weights)
-    grasps = method.predict(toy_hand(), load_object("sphere"), 2, 3)
+    grasps = method.propose(GraspProblem(toy_hand(), load_object("sphere")), 2, 3)
     assert len(grasps) == 2
     assert bool(grasps.energy.isfinite().all())
-    assert torch.equal(grasps.joints, method.predict(toy_hand(), load_object("sphere"), 2, 3).joints)
+    assert torch.equal(grasps.joints, method.propose(GraspProblem(toy_hand(), load_object("sphere")), 2, 3).joints)
 
 
 def test_foreign_weights_are_refused(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from dro_grasp.errors import WeightsError
 from dro_grasp.network.checkpoints import save_weights
 from dro_grasp.objects.loading import object_in_memory
 from dro_grasp.objects.shape import ObjectModel
+from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.train.runs import recalibrate
 from lab.methods.gendexgrasp.map_fitting import FittingConfig
 from lab.methods.gendexgrasp.map_method import ContactMapMethod
@@ -49,7 +50,7 @@ def quick(weights: Path, steps: int = 2, particles: int = 3) -> ContactMapMethod
 
 def test_grasps_are_of_the_hand_on_the_object_and_the_seed_repeats_them(weights: Path, obj: ObjectModel) -> None:
     hand, method = toy_hand(), quick(weights)
-    grasps, again, other = (method.predict(hand, obj, 5, seed) for seed in (3, 3, 4))
+    grasps, again, other = (method.propose(GraspProblem(hand, obj), 5, seed) for seed in (3, 3, 4))
     assert (len(grasps), grasps.hand, set(grasps.object), grasps.joint_names) == (5, "toy", {obj.name}, hand.tree.joint_names)
     assert set(grasps.provenance) == {"GenDexGrasp mine"}
     assert set(grasps.seed.tolist()) == {3}
@@ -67,7 +68,7 @@ def test_grasps_are_of_the_hand_on_the_object_and_the_seed_repeats_them(weights:
 def test_an_object_elsewhere_has_the_same_grasps_there(weights: Path, obj: ObjectModel) -> None:
     """The network sees objects about their centres: no grasp depends on where an object's frame is."""
     hand, method = toy_hand(), quick(weights)
-    here, there = method.predict(hand, obj, 2, 0), method.predict(hand, box(SHIFT), 2, 0)
+    here, there = method.propose(GraspProblem(hand, obj), 2, 0), method.propose(GraspProblem(hand, box(SHIFT)), 2, 0)
     torch.testing.assert_close(there.energy, here.energy, atol=1e-4, rtol=1e-3)
     torch.testing.assert_close(there.joints, here.joints, atol=2e-3, rtol=0)
     moved = here.T_object_wrist[:, :3, 3] + torch.from_numpy(SHIFT).float()
@@ -75,7 +76,7 @@ def test_an_object_elsewhere_has_the_same_grasps_there(weights: Path, obj: Objec
 
 
 def test_descents_lower_the_energy_that_is_told(weights: Path, obj: ObjectModel) -> None:
-    start, end = (quick(weights, steps, 1).predict(toy_hand(), obj, 2, 0).energy for steps in (0, 12))
+    start, end = (quick(weights, steps, 1).propose(GraspProblem(toy_hand(), obj), 2, 0).energy for steps in (0, 12))
     assert bool((end < 0.95 * start).all())
 
 

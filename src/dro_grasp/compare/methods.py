@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 
@@ -19,8 +20,20 @@ from dro_grasp.predict.sources.controls import MeanGrasp
 from dro_grasp.predict.sources.registry import WITH_DATA, make_source
 from dro_grasp.predict.sources.source import AUTO, Candidates, Source, ask
 
-if TYPE_CHECKING:
-    from dro_grasp.train.data.bundle.training_file import Bundle
+
+@runtime_checkable
+class TrainingGrasps(Protocol):
+    """What the mean grasps need of a training bundle, which this wing does not know."""
+
+    @property
+    def objects(self) -> Mapping[str, Any]:
+        """Cloud of each object, with its `points` [m]."""
+        ...
+
+    @property
+    def grasps(self) -> Mapping[str, Any]:
+        """Grasps of each hand: `joints`, `T_object_wrist` and `object_index`."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -33,7 +46,7 @@ class MethodOptions(Checked):
     """Where networks run."""
     temperature: float | None = None
     """Spread of z of the D(R,O) network."""
-    bundle: Bundle | None = None
+    bundle: TrainingGrasps | None = None
     """Training grasps, for the mean grasp."""
     candidates: int = GraspRequest.candidates
     """Candidates for each grasp that a method returns."""
@@ -116,7 +129,7 @@ def make_method(name: str, options: MethodOptions | None = None) -> Method:
     return Method(source, predictor, label, options.candidates)
 
 
-def mean_grasps_of(bundle: Bundle) -> dict[str, MeanGrasp]:
+def mean_grasps_of(bundle: TrainingGrasps) -> dict[str, MeanGrasp]:
     """The mean grasp of each hand in a training bundle that has grasps."""
     clouds = torch.stack([cloud.points.mean(0) for cloud in bundle.objects.values()])
     means = {}

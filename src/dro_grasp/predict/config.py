@@ -40,6 +40,7 @@ class GraspRequest(Checked):
             OptionError: `num` or `candidates` is not positive, another value is out of range, or there is no such source.
             GraspFileError: The source is a grasp file that cannot be read.
         """
+        super().__post_init__()
         if self.num < 1:
             raise OptionError(f"num is {self.num}; ask for at least one grasp (--num 16)")
         if self.candidates < 1:

@@ -115,6 +115,7 @@ class Protocol(Checked):
 
     def __post_init__(self) -> None:
         """Refuse a name that labels could not be told apart with: OptionError."""
+        super().__post_init__()
         if not NAME.fullmatch(self.name):
             raise OptionError(f"'{self.name}' is no name of a protocol; use letters, digits, '_', '-' and '.'")
 

@@ -71,7 +71,7 @@ def test_requests_have_every_field_of_what_is_asked_with_default_and_description
 
 
 def test_the_documents_request_is_one() -> None:
-    document = (Path(__file__).parents[2] / "docs" / "serve.md").read_text()
+    document = (Path(__file__).parents[3] / "docs" / "serve.md").read_text()
     (text,) = re.findall(r"^```json\n(.*?)^```", document, re.MULTILINE | re.DOTALL)
     call = GraspCall(**json.loads(text))
     assert (call.object.file.content, call.object.scale, call.table) == (b"solid", 0.001, 0.0)

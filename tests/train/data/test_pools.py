@@ -22,7 +22,7 @@ from dro_grasp.train.data.engine.worker import EngineConfig, FinishedShard, Job,
 from tests.helpers import engine_work
 from tests.helpers.engine_work import GRASPS
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 PARENT = """
 import signal, sys
 from dro_grasp.train.data.engine.schedule import synthesize_dataset

@@ -16,7 +16,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.train.data.engine.shards import find_shards
 from dro_grasp.train.data.engine.worker import Job
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 CLUSTER = """
 import json, sys
 from ray.cluster_utils import Cluster

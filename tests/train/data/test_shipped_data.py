@@ -19,7 +19,7 @@ from dro_grasp.train.data.collections.collection import YIELDS, read_collection
 from dro_grasp.train.data.collections.merging import file_name
 from tests.helpers.loaded_hands import loaded_hand
 
-FOLDER = Path(__file__).parents[2] / "data" / "grasps"
+FOLDER = Path(__file__).parents[3] / "data" / "grasps"
 FILES = sorted(FOLDER.glob("*.parquet"))
 PAPER_HANDS = ("assets/barrett_multidex", "assets/allegro_left", "assets/shadowhand")
 VALIDATE = {

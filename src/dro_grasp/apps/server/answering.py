@@ -27,6 +27,7 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.grasps.columns import REASON
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
+from dro_grasp.kinds import Checked
 from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.objects.loading import check_scale
 from dro_grasp.objects.perception.scan import scanned_object
@@ -45,7 +46,7 @@ MAX_CANDIDATES = 1_000  # Most candidates of one request (ours): a server answer
 
 
 @dataclass(frozen=True)
-class ServerConfig:
+class ServerConfig(Checked):
     """What a server computes with."""
 
     weights: str | None = None
