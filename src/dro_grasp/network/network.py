@@ -86,8 +86,7 @@ class Moves:
 
     hand_features: Float[Tensor, "b n width"]
     object_features: Float[Tensor, "b m width"]
-    obj: Float[Tensor, "b m 3"]
-    """In the network's frame [m]."""
+    obj: Float[Tensor, "b m 3"]  # in the network's frame [m]
     z: Float[Tensor, "b k latent"]
     points: Float[Tensor, "b k n 3"]
     """The hand that each z moves, in the network's frame [m]; where z moves nothing, the open hand."""
@@ -102,15 +101,11 @@ class Moves:
 class NetworkOutput:
     """Result of one forward pass in training."""
 
-    distances: Float[Tensor, "b n columns"]
-    """D(R,O) [m]."""
-    mean: Float[Tensor, "b latent"]
-    """Of the posterior of z, as its log-variance."""
+    distances: Float[Tensor, "b n columns"]  # D(R,O) [m]
+    mean: Float[Tensor, "b latent"]  # of the posterior of z, as its log-variance
     log_variance: Float[Tensor, "b latent"]
-    flow_error: Float[Tensor, " b"]
-    """Squared velocity error of the flow to z; zero in the paper's form."""
-    moved: Float[Tensor, "b n 3"]
-    """The placed hand, moved by z if z moves it [m]."""
+    flow_error: Float[Tensor, " b"]  # squared velocity error of the flow to z; zero in the paper's form
+    moved: Float[Tensor, "b n 3"]  # the placed hand, moved by z if z moves it [m]
 
 
 class DistanceNetwork(nn.Module):

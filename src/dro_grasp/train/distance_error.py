@@ -26,12 +26,9 @@ class DistanceError:
     """Distance error of one hand."""
 
     hand: str
-    posterior: float
-    """Mean absolute error of D(R,O) with z from the true grasp [m]."""
-    prior: float
-    """The same with z drawn as at inference [m]."""
-    divergence: float
-    """KL divergence of the posterior from the prior, a standard normal or a learned Gaussian [nat]."""
+    posterior: float  # mean absolute error of D(R,O) with z from the true grasp [m]
+    prior: float  # the same with z drawn as at inference [m]
+    divergence: float  # KL divergence of the posterior from the prior, a standard normal or a learned Gaussian [nat]
 
 
 @torch.no_grad()

@@ -9,7 +9,7 @@ from typing import Any
 from dro_grasp.compare.stages import BEST, RAW, REFINED, RETURNED
 from dro_grasp.files import command
 from dro_grasp.hands.library import load_hand, locate_hand
-from dro_grasp.objects.catalogue import load_object
+from dro_grasp.objects.catalogue import load_object, resolve_objects
 from dro_grasp.pictures.sheets import draw_grasps
 from dro_grasp.pictures.web_page import image, table, write_page
 from dro_grasp.predict.config import AUTO, GraspRequest
@@ -18,22 +18,16 @@ from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.stages import evaluate
 from dro_grasp.train.onboard.steps import DATA, PICTURE, REPORT, STRICT, Onboarded
 
-GRASPS = 8  # Grasps drawn on each object
-OBJECTS = 3  # Held-out objects drawn
 STAGES = {RAW: "network alone", REFINED: "network, refined", BEST: "network, refined, best quarter", RETURNED: "generate"}
 """What the grasps of each stage are called."""
 
 
-def write_report(done: Onboarded, held_out: list[str]) -> Path:
-    """Write the page into the folder of the hand, and return its path; grasps on some held-out objects are drawn.
-
-    Raises:
-        OutputError: The page cannot be written.
-    """
+def write_report(done: Onboarded) -> Path:
+    """Write the page into the folder of the hand, and return its path; grasps on some held-out objects are drawn."""
     path, name = done.folder / REPORT, html.escape(locate_hand(done.hand).name)
     parts = [
         f"<h1>{name}</h1>", _summary(done), _rates(done),
-        "<h2>What generate returns with the better weights</h2>", _drawn(done, held_out),
+        "<h2>What generate returns with the better weights</h2>", _drawn(done),
         f"<h2>The description</h2><p class=note>{html.escape(done.hand)}</p>",
         image((done.folder / PICTURE).read_bytes(), f"{name}, open and closed"),
         f"<pre>{html.escape(chr(10).join(done.steps['check']['lines']))}</pre>", "<h2>Training grasps</h2>",
@@ -74,18 +68,19 @@ def _rates(done: Onboarded) -> str:
         "is. <i>generate --source network</i> does without.</p>")
 
 
-def _drawn(done: Onboarded, held_out: list[str]) -> str:
-    hand, predictor = load_hand(done.hand), GraspPredictor(done.weights)
+def _drawn(done: Onboarded) -> str:
+    config, asked = done.config, done.config.grasps_drawn
+    hand, predictor = load_hand(done.hand), GraspPredictor(done.weights, config.device, config.predictor)
     parts = []
-    for name in held_out[:OBJECTS]:
+    for name in resolve_objects(list(config.held_out))[: config.objects_drawn]:
         obj = load_object(name)
         path = done.folder / f"{Path(name).stem}.png"
         problem = GraspProblem(hand, obj)
-        made = predictor.run(problem, GraspRequest(GRASPS, source=done.source))
+        made = predictor.run(problem, GraspRequest(asked, source=config.source))
         draw_grasps(hand, obj, evaluate(problem, made.grasps, "strict"), path)
         by_optimiser, short = made.origin.count("optimiser"), ""
-        if len(made.grasps) < GRASPS:
-            short = f"; {len(made.grasps)} of the {GRASPS} asked for were found"
+        if len(made.grasps) < asked:
+            short = f"; {len(made.grasps)} of the {asked} asked for were found"
         parts.append(image(path.read_bytes(), f"grasps of {name}")
                      + f"<p class=note>{html.escape(name)}: {by_optimiser} of {len(made.grasps)} made by the optimiser{short}"
                        "</p>")
@@ -100,7 +95,7 @@ def _data(step: dict[str, Any]) -> str:
 
 def _commands(done: Onboarded) -> str:
     weights = () if done.weights is None else ("--weights", done.weights)
-    source = () if done.source == AUTO else ("--source", done.source)
+    source = () if done.config.source == AUTO else ("--source", done.config.source)
     lines = [
         command("dro-grasp", "generate", "--hand", done.hand, "--object", "my_mesh.stl", *weights, *source)
         + " --output grasps.parquet",

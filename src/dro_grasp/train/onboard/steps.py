@@ -6,7 +6,7 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +19,10 @@ from dro_grasp.errors import BundleError, OptionError
 from dro_grasp.files import check_folder, make_folder, replacing, set_aside
 from dro_grasp.hands.check import check_hand, picture
 from dro_grasp.hands.library import load_hand
-from dro_grasp.kinds import Checked
+from dro_grasp.kinds import Checked, flat
 from dro_grasp.network.checkpoints import DEFAULT, history_of, load_weights, locate_weights, save_weights
 from dro_grasp.objects.catalogue import load_object, resolve_objects
-from dro_grasp.optimize.synthesis import SynthesisConfig
-from dro_grasp.predict.config import AUTO
+from dro_grasp.predict.config import AUTO, PredictorConfig
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.sources.registry import FORMER_NAMES, source_or_name
 from dro_grasp.simulation.protocols import PROTOCOLS, protocol
@@ -31,46 +30,47 @@ from dro_grasp.train.config import ScheduleConfig, TrainConfig
 from dro_grasp.train.data.bundle.training_file import load_bundle, split_of
 from dro_grasp.train.data.collections.bundling import make_bundle
 from dro_grasp.train.data.collections.collection import count_collection
-from dro_grasp.train.data.engine.schedule import require_distinct, require_known, synthesize_dataset
+from dro_grasp.train.data.engine.schedule import FREE, require_distinct, require_known, synthesize_dataset
 from dro_grasp.train.data.engine.shards import sole_run
 from dro_grasp.train.data.engine.worker import EngineConfig
 from dro_grasp.train.loop import train
+from dro_grasp.train.run_folder import BOOKKEEPING
 
 STATE = "onboarding.json"  # File of finished steps in the hand's folder
 WEIGHTS = "weights.safetensors"  # File of the fine-tuned weights
 REPORT = "report.html"  # File of the report
 DATA = "data"  # Folder of synthesised grasps
 PICTURE = "hand.png"  # File of the hand's picture
-DATA_SHARE = 0.45  # Share of the time for synthesis (ours); what the shares leave is for the benchmarks before and after
-TRAINING_SHARE = 0.40  # Share of the time for fine-tuning (ours)
 STRICT = PROTOCOLS["strict"].label  # Protocol by which fine-tuning is judged
-MOST_GRASPS = 400  # Grasps of an object beyond which time is better spent on training (ours)
 
 
 @dataclass(frozen=True)
 class OnboardingConfig(Checked):
     """How long onboarding takes, and on which objects."""
 
-    minutes: float = 30.0
-    """Time for data, training and trials together [min]."""
-    objects: tuple[str, ...] = ("builtin:train",)
-    """Objects to synthesise grasps of."""
-    held_out: tuple[str, ...] = ("builtin:test",)
-    """Objects of the benchmarks before and after; never trained on."""
+    minutes: float = 30.0  # time for data, training and trials together [min]
+    objects: tuple[str, ...] = ("builtin:train",)  # objects to synthesise grasps of
+    held_out: tuple[str, ...] = ("builtin:test",)  # objects of the benchmarks before and after; never trained on
     num: int = 20
     """Grasps that the network makes of each held-out object in each benchmark; `generate` returns a quarter as many."""
-    weights: str | None = None
-    """Weights to fine-tune; the shipped ones by default."""
-    workers: int = 2
-    """Processes of the synthesis."""
-    source: str = AUTO
-    """Where the grasps that `generate` returns come from, in benchmarks and report."""
-    learning_rate: float = 3e-4
-    """Peak rate of fine-tuning; the rate of training from scratch overwrites the initial weights (ours)."""
-    seed: int = 0
-    """Of synthesis, benchmark and training."""
-    device: str = "cpu"
-    """Device of the network, its training and the energies; trials run on the CPU."""
+    weights: str | None = None  # weights to fine-tune; the shipped ones by default
+    workers: int = 2  # processes of the synthesis
+    source: str = AUTO  # where the grasps that `generate` returns come from, in benchmarks and report
+    seed: int = 0  # of synthesis, benchmark and training
+    device: str = "cpu"  # device of the network, its training and the energies; trials run on the CPU
+    data_share: float = 0.45
+    """Share of the time for synthesis (ours); what the shares leave is for the benchmarks before and after."""
+    training_share: float = 0.40  # share of the time for fine-tuning (ours)
+    most_grasps: int = 400  # grasps of an object beyond which time is better spent on training (ours)
+    grasps_drawn: int = 8  # grasps in the report on each object
+    objects_drawn: int = 3  # held-out objects in the report
+    engine: EngineConfig = field(default_factory=EngineConfig)
+    """The synthesis; its time and device follow from those above."""
+    predictor: PredictorConfig = field(default_factory=PredictorConfig)  # what `generate` does, in benchmarks and report
+    training: TrainConfig = field(default_factory=lambda: TrainConfig(
+        ScheduleConfig(steps=10**6, learning_rate=3e-4), hands_per_step=1, samples_per_hand=16))
+    """The fine-tuning; its time, seed and device follow from those above. The rate of training from scratch would overwrite the
+    initial weights (ours)."""
 
     def __post_init__(self) -> None:
         """Refuse numbers out of range, and a source that does not exist."""
@@ -90,12 +90,8 @@ class Onboarded:
 
     hand: str
     folder: Path
-    steps: dict[str, dict[str, Any]]
-    """Result of each step by name, with its seconds: check, before, data, training, after."""
-    initial: str | None = None
-    """Weights that were fine-tuned; None for the shipped ones."""
-    source: str = AUTO
-    """Where the grasps that `generate` returned came from."""
+    steps: dict[str, dict[str, Any]]  # result of each step by name, with its seconds: check, before, data, training, after
+    config: OnboardingConfig
 
     @property
     def gained(self) -> bool:
@@ -108,7 +104,7 @@ class Onboarded:
     @property
     def weights(self) -> str | None:
         """Weights to use from now on: the fine-tuned ones if they gained anything, else those from before."""
-        return str(self.folder / WEIGHTS) if self.gained else self.initial
+        return str(self.folder / WEIGHTS) if self.gained else self.config.weights
 
     @property
     def without_grasps(self) -> list[str]:
@@ -181,7 +177,7 @@ def onboard(
     onboarding = _Onboarding(hand, path, config, objects, held_out, say)
     with sole_run(make_folder(path)):
         onboarding.run()
-    return Onboarded(hand, path, onboarding.steps, config.weights, config.source)
+    return Onboarded(hand, path, onboarding.steps, config)
 
 
 class _Onboarding:
@@ -202,23 +198,17 @@ class _Onboarding:
                 raise OptionError(f"{folder} belongs to hand '{known['hand']}', whose description differs; name another "
                                   "folder, or restore that description")
             for name, asked in self._asked().items():
-                if known["asked"].get(name, asked) != asked:  # earlier versions stored none
+                if known["asked"].get(name, asked) != asked:
                     raise OptionError(f"{folder} was begun with {name} {known['asked'][name]}, {asked} was asked for; use the "
                                       "same to resume, or name another folder")
-            # A benchmark of an earlier version, which tells less than what the report needs, is made again.
-            self.steps = {
-                name: step for name, step in known["steps"].items() if "rows" not in step
-                or any(row["stage"] == RETURNED and {"fingers", "asked"} <= row.keys() for row in step["rows"])}
+            self.steps = known["steps"]
 
     def _known(self, state: Path) -> dict[str, Any] | None:
         """What a run before has stored; a damaged file is set aside, and its steps are made again."""
         try:
             known = json.loads(state.read_text())
-            asked = dict(known["asked"]) if "asked" in known else {}
-            if "method" in asked:  # of earlier versions
-                asked["source"] = FORMER_NAMES.get(asked["method"], asked["method"])
             return {"hand": str(known["hand"]), "sha256": str(known["sha256"]), "steps": dict(known["steps"]),
-                    "asked": asked}
+                    "asked": dict(known["asked"])}
         except (ValueError, LookupError, TypeError) as error:
             aside = set_aside(state)
             self.say(f"{state} is damaged ({type(error).__name__}) and set aside as {aside.name}; its steps are made again")
@@ -227,9 +217,13 @@ class _Onboarding:
     def _asked(self) -> dict[str, Any]:
         """What decides on the results, beside the hand and the time."""
         config = self.config
-        return {"weights": config.weights or DEFAULT, "objects": self.objects, "held_out": self.held_out, "num": config.num,
-                "source": FORMER_NAMES.get(config.source, config.source), "learning_rate": config.learning_rate,
-                "seed": config.seed}
+        settings = flat(config.engine, "engine.") | flat(config.predictor, "predictor.") | flat(config.training, "training.")
+        lasting = {name: value for name, value in settings.items()
+                   if name.split(".", 1)[1].removeprefix("schedule.") not in FREE | BOOKKEEPING}
+        asked = {"weights": config.weights or DEFAULT, "objects": self.objects, "held_out": self.held_out, "num": config.num,
+                 "most_grasps": config.most_grasps, "source": FORMER_NAMES.get(config.source, config.source),
+                 "seed": config.seed, **lasting}
+        return json.loads(json.dumps(asked, default=str))
 
     def run(self) -> None:
         """Run every step that is not finished."""
@@ -261,7 +255,7 @@ class _Onboarding:
 
     def _benchmark(self, weights: str | None) -> dict[str, Any]:
         """Success rates on held-out objects: of the network, and of the grasps that `generate` returns."""
-        predictor = GraspPredictor(weights, self.config.device)
+        predictor = GraspPredictor(weights, self.config.device, self.config.predictor)
         rules = tuple(protocol(name) for name in ("dro", "strict"))
         config = BenchmarkConfig(self.config.num, (RAW, REFINED, BEST, RETURNED), rules, seed=self.config.seed,
                                  device=self.config.device)
@@ -272,10 +266,11 @@ class _Onboarding:
         return {"rows": [row.to_dict() for row in rows], "said": f"{predictor.weights_name}, {told}, {share}"}
 
     def _data(self) -> dict[str, Any]:
-        report = synthesize_dataset(
-            [self.name], self.objects, MOST_GRASPS, self.folder / DATA, workers=self.config.workers, seed=self.config.seed,
-            config=EngineConfig(seconds=60 * self.config.minutes * DATA_SHARE,
-                                synthesis=SynthesisConfig(device=self.config.device)), progress=self.say)
+        config = self.config
+        engine = replace(config.engine, seconds=60 * config.minutes * config.data_share,
+                         synthesis=replace(config.engine.synthesis, device=config.device))
+        report = synthesize_dataset([self.name], self.objects, config.most_grasps, self.folder / DATA, config.workers,
+                                    config.seed, engine, self.say)
         counts = next(iter(count_collection(self.folder / DATA).values()), {})
         failures = {obj: why for (_, obj), why in report.failures.items()}
         if not sum(counts.values()):
@@ -289,10 +284,10 @@ class _Onboarding:
         path = self.folder / "bundle.safetensors"
         make_bundle([self.folder / DATA], path, split_of(self.hand.name, "train"))
         bundle, initial = load_bundle(path), load_weights(self.config.weights)
-        schedule = ScheduleConfig(
-            steps=10**6, minutes=self.config.minutes * TRAINING_SHARE, learning_rate=self.config.learning_rate,
-            seed=self.config.seed, device=self.config.device)
-        config = TrainConfig(schedule, hands_per_step=1, samples_per_hand=16)
+        schedule = replace(
+            self.config.training.schedule, minutes=self.config.minutes * self.config.training_share, seed=self.config.seed,
+            device=self.config.device)
+        config = replace(self.config.training, schedule=schedule)
         run = self.folder / "run" / bundle.fingerprint  # data that are made again make another run
         model = train(bundle, initial.config, config, run, name=self.folder.name, initial=initial,
                       report=lambda run, means: self.say(f"step {run.step}: distance {1e3 * means['distance']:.1f} mm"))

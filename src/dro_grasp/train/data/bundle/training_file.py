@@ -59,10 +59,8 @@ class HandGrasps:
     """All grasps of one hand."""
 
     T_object_wrist: Float[Tensor, "n 4 4"]
-    joints: Float[Tensor, "n n_dof"]
-    """Independent joints [rad or m]."""
-    object_index: Int[Tensor, " n"]
-    """Index into the bundle's objects."""
+    joints: Float[Tensor, "n n_dof"]  # independent joints [rad or m]
+    object_index: Int[Tensor, " n"]  # index into the bundle's objects
 
     def to(self, device: torch.device | str) -> HandGrasps:
         """The same grasps on another device."""
@@ -75,8 +73,7 @@ class Bundle:
 
     hands: dict[str, Hand]
     objects: dict[str, ObjectCloud]
-    grasps: dict[str, HandGrasps]
-    """By hand name. A hand may have none: pretraining needs its kinematics alone."""
+    grasps: dict[str, HandGrasps]  # by hand name. A hand may have none: pretraining needs its kinematics alone.
 
     @property
     def object_names(self) -> tuple[str, ...]:

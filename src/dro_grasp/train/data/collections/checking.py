@@ -26,16 +26,12 @@ Progress = Callable[[int, int], None]  # Called with (grasps evaluated, grasps i
 class Agreement:
     """Stored verdicts against those of new trials, for some grasps."""
 
-    protocol: str
-    """Of the new trials."""
+    protocol: str  # of the new trials
     evaluated: int = 0
-    agreed: int = 0
-    """Of the trials, those with the stored verdict."""
+    agreed: int = 0  # of the trials, those with the stored verdict
     succeeded: int = 0
-    reasons: Counter[str] = field(default_factory=Counter)
-    """Why stored successes fail now, counted."""
-    hands: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """Trials and successes by hand."""
+    reasons: Counter[str] = field(default_factory=Counter)  # why stored successes fail now, counted
+    hands: dict[str, tuple[int, int]] = field(default_factory=dict)  # trials and successes by hand
 
     @property
     def share(self) -> float:

@@ -54,18 +54,14 @@ Joints = dict[str, float] | Float[np.ndarray, " n_joints"]  # Values by name, or
 class ForeignGrasp:
     """One grasp in a file's own terms."""
 
-    hand: str
-    """Empty if the format names none; so is `object`."""
+    hand: str  # empty if the format names none; so is `object`
     object: str
-    scale: float
-    """Of the object."""
+    scale: float  # of the object
     T_object_wrist: Float[np.ndarray, "4 4"]
-    joints: Joints
-    """[rad or m]"""
+    joints: Joints  # [rad or m]
     pregrasp: Joints | None = None
     """Joints from which the hand closes, if the format has them, in this wrist pose too [rad or m]."""
-    squeeze: Joints | None = None
-    """Joint targets that press on the object, likewise."""
+    squeeze: Joints | None = None  # joint targets that press on the object, likewise
 
 
 def read_foreign(path: Path, kind: Format) -> list[ForeignGrasp]:

@@ -39,17 +39,12 @@ class Merged:
     """Grasps of one hand out of several data sets, for one file."""
 
     hand: str
-    table: pa.Table
-    """The grasps as columns of their file, which take a fifth of the memory."""
+    table: pa.Table  # the grasps as columns of their file, which take a fifth of the memory
     header: dict[str, Any]
-    yields: dict[str, Yield]
-    """By object."""
-    duplicates: int
-    """Near-duplicates that were dropped."""
-    surplus: int
-    """Grasps above the number asked for, dropped."""
-    number: int = 1
-    """Of the file, where the hand's grasps fill several."""
+    yields: dict[str, Yield]  # by object
+    duplicates: int  # near-duplicates that were dropped
+    surplus: int  # grasps above the number asked for, dropped
+    number: int = 1  # of the file, where the hand's grasps fill several
 
     def __len__(self) -> int:
         return self.table.num_rows

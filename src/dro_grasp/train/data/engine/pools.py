@@ -34,10 +34,8 @@ Work = Callable[[Job, Task], FinishedShard]
 class Failed:
     """A shard that could not be made."""
 
-    reason: str
-    """In one line."""
-    died: bool = False
-    """The worker died or was stopped: a new attempt may succeed."""
+    reason: str  # in one line
+    died: bool = False  # the worker died or was stopped: a new attempt may succeed
 
 
 Outcome = tuple[Task, FinishedShard | Failed]

@@ -40,14 +40,10 @@ class PairState:
     """Progress of one (hand, object) pair."""
 
     total: Yield = field(default_factory=Yield)
-    done: set[int] = field(default_factory=set)
-    """Finished rounds; damaged shards leave gaps."""
-    barren: int = 0
-    """Rounds without a grasp since the last one with a grasp."""
-    crashes: int = 0
-    """Deaths of workers on it since its last shard."""
-    error: str = ""
-    """The error that ended it, empty without one."""
+    done: set[int] = field(default_factory=set)  # finished rounds; damaged shards leave gaps
+    barren: int = 0  # rounds without a grasp since the last one with a grasp
+    crashes: int = 0  # deaths of workers on it since its last shard
+    error: str = ""  # the error that ended it, empty without one
 
     @property
     def grasps(self) -> int:
@@ -83,16 +79,11 @@ class PairState:
 class DatasetReport:
     """Result of one run."""
 
-    grasps: int
-    """In the folder, for the pairs asked for."""
-    added: int
-    """Of them in this run."""
-    shards: int
-    """Made in this run."""
-    seconds: float
-    """Wall time [s]."""
-    failures: dict[Pair, str]
-    """Pairs that were given up, and why."""
+    grasps: int  # in the folder, for the pairs asked for
+    added: int  # of them in this run
+    shards: int  # made in this run
+    seconds: float  # wall time [s]
+    failures: dict[Pair, str]  # pairs that were given up, and why
 
 
 @checked
@@ -222,11 +213,9 @@ class Production:
     goal: int
     config: EngineConfig
     say: Callable[[str], None]
-    end: float = math.inf
-    """Deadline (`time.perf_counter`) after which no new shard starts."""
+    end: float = math.inf  # deadline (`time.perf_counter`) after which no new shard starts
     busy: set[Pair] = field(default_factory=set)
-    shards: int = 0
-    """Finished so far."""
+    shards: int = 0  # finished so far
 
     def finish(self) -> int:
         """Keep the pool busy until every pair is finished or given up; returns the number of shards made."""

@@ -40,22 +40,14 @@ class Yield:
     Each is in exactly one of `ranked_out`, `deep`, `moved`, `failures`, `duplicates` and `valid`.
     """
 
-    candidates: int = 0
-    """Grasps synthesised."""
-    ranked_out: int = 0
-    """Without a trial because their energy was too high."""
-    deep: int = 0
-    """Without a trial because they penetrate the object too far."""
-    moved: int = 0
-    """Without a trial because closing moved the object too far."""
-    failures: dict[str, int] = field(default_factory=dict)
-    """Failed trials by reason."""
-    duplicates: int = 0
-    """Passed, but near-duplicates of an earlier grasp."""
-    valid: int = 0
-    """Passed and stored."""
-    cpu_seconds: float = 0.0
-    """CPU time without loading hand and object [s]."""
+    candidates: int = 0  # grasps synthesised
+    ranked_out: int = 0  # without a trial because their energy was too high
+    deep: int = 0  # without a trial because they penetrate the object too far
+    moved: int = 0  # without a trial because closing moved the object too far
+    failures: dict[str, int] = field(default_factory=dict)  # failed trials by reason
+    duplicates: int = 0  # passed, but near-duplicates of an earlier grasp
+    valid: int = 0  # passed and stored
+    cpu_seconds: float = 0.0  # CPU time without loading hand and object [s]
     preparation_seconds: float = 0.0
     """CPU time of loading hand and object, with convex parts and grid where they are not cached [s]."""
 
@@ -108,8 +100,7 @@ class Shard:
 
     hand: str
     object: str
-    round: int
-    """Counts up from 0 for each pair."""
+    round: int  # counts up from 0 for each pair
 
     def path(self, folder: Path) -> Path:
         """Where the shard's file lies in a data set's folder."""
