@@ -112,11 +112,6 @@ def write_bundle(
         grasps: At least one grasp of each of these hands.
         splits: Splits that the grasps may be of.
         without_grasps: Further hands, for pretraining.
-
-    Raises:
-        BundleError: A grasp is of another split, its hand or object is missing, two hands share a name, or the file grows
-            too large.
-        OutputError: The file cannot be written.
     """
     strangers = {b.hand for b in grasps if b.hand_sha256 not in {h.sha256 for h in hands}}
     if strangers:

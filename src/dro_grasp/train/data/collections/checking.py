@@ -53,12 +53,7 @@ class Agreement:
 def check(
     pairs: Iterable[PairGrasps], sample: int, rules: Protocol, seed: int = 0, progress: Progress | None = None
 ) -> Agreement:
-    """Evaluate a random sample of stored grasps again, all of them if there are fewer, and compare verdicts.
-
-    Raises:
-        OptionError: `sample` is not positive.
-        GraspFileError: The data set is empty, or a hand or an object is not the one the grasps were made for.
-    """
+    """Evaluate a random sample of stored grasps again, all of them if there are fewer, and compare verdicts."""
     if sample < 1:
         raise OptionError(f"sample is {sample}; check at least one grasp")
     parts = [pair.grasps for pair in pairs if len(pair.grasps)]

@@ -73,12 +73,7 @@ class HandCoverage:
 
 
 def measure_coverage(pairs: Iterable[PairGrasps]) -> list[HandCoverage]:
-    """Coverage of each hand of a data set.
-
-    Raises:
-        GraspFileError: Two hands share a name, or a hand has changed between its grasps.
-        HandError: A hand cannot be loaded.
-    """
+    """Coverage of each hand of a data set."""
     by_hand: dict[str, list[PairGrasps]] = {}
     for pair in of_one_version((None, pair) for pair in pairs):
         by_hand.setdefault(pair.grasps.hand, []).append(pair)
@@ -86,14 +81,7 @@ def measure_coverage(pairs: Iterable[PairGrasps]) -> list[HandCoverage]:
 
 
 def of_one_version(pairs: Iterable[tuple[Path | None, PairGrasps]]) -> Iterator[PairGrasps]:
-    """The pairs as they come; each name must stand for one hand in all of them.
-
-    Args:
-        pairs: Each with the data set that it is from, for messages; None for grasps in memory.
-
-    Raises:
-        GraspFileError: Two hands share a name, or a hand has changed between its grasps.
-    """
+    """The pairs as they come, each with its data set, for messages; each name must stand for one hand in all of them."""
     known: dict[str, tuple[Path | None, PairGrasps]] = {}
     for path, pair in pairs:
         new, old = pair.grasps, known.setdefault(pair.grasps.hand, (path, pair))

@@ -65,11 +65,7 @@ class ForeignGrasp:
 
 
 def read_foreign(path: Path, kind: Format) -> list[ForeignGrasp]:
-    """All grasps of a project's file: `cmap_dataset.pt`, or an npy file.
-
-    Raises:
-        GraspFileError: The file is missing, holds something else, or could run code.
-    """
+    """All grasps of a project's file: `cmap_dataset.pt`, or an npy file."""
     readers = {"cmap": _cmap, "dexgraspnet": _dexgraspnet, "dexgraspbench": _dexgraspbench}
     path = given_path(path)
     if path.is_dir():
@@ -185,11 +181,7 @@ def read_npy(path: Path) -> Shaped[np.ndarray, "..."]:
 
 
 def in_order(joints: Joints, moving: Sequence[str], independent: Sequence[str]) -> list[float]:
-    """Values of the independent joints, of the names of these and of all that move, followers included.
-
-    Raises:
-        GraspFileError: The grasp has other joints.
-    """
+    """Values of the independent joints, of the names of these and of all that move, followers included."""
     give = "give the description that the data was made with (--hands)"
     if isinstance(joints, dict):
         # Names of MuJoCo's Shadow hand begin with the robot's.
@@ -214,11 +206,6 @@ def import_grasps(
     Args:
         hands: Our names or paths of hands, by the names in the files; the entry '' stands for all others.
         obj: Object of all grasps, for files that name it otherwise or not at all.
-
-    Raises:
-        OptionError: No file is given, or neither a file nor the arguments name its hand or object.
-        HandError: A hand cannot be loaded.
-        GraspFileError: A file cannot be read, or its grasps are of other joints.
     """
     if not paths:
         raise OptionError(f"no file to import was given; name at least one {kind} file")

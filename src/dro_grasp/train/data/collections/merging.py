@@ -78,12 +78,6 @@ def merge(
         aside: Folder in which the grasps wait meanwhile, as much again as the data sets; by default the system's for
             temporary files.
         file_bytes: Size of a file from which on the next object goes into another, about.
-
-    Raises:
-        OptionError: `per_pair` is less than 1.
-        GraspFileError: A path holds no grasps, or a hand or object is not the same in all data sets.
-        HandError: A hand cannot be loaded.
-        OutputError: There is no space for the grasps that wait.
     """
     require_choice(per_pair)
     with tempfile.TemporaryDirectory(dir=aside, prefix=".merge-") as name:

@@ -48,19 +48,15 @@ class Pool(Protocol):
     @property
     def free(self) -> int:
         """Number of shards that it would start at once."""
-        ...
 
     def submit(self, task: Task) -> None:
         """Start a shard."""
-        ...
 
     def wait(self, timeout: float) -> list[Outcome]:
         """Shards that ended, as soon as there is one; none after `timeout` [s]."""
-        ...
 
     def close(self) -> None:
         """Stop everything; shards in flight are dropped."""
-        ...
 
 
 def failure_of(error: BaseException) -> Failed:
@@ -159,12 +155,8 @@ class RayPool:
     def __init__(self, job: Job, workers: int, limit: float, address: str | None = None, work: Work = make_shard) -> None:
         """Join a cluster, or start one of so many workers here; a shard that takes longer than the limit [s] is stopped.
 
-        Args:
-            address: Address `host:port` of the cluster's head, or `auto` for the one that runs here; None takes
-                RAY_ADDRESS, and without it starts a cluster on this machine.
-
-        Raises:
-            OptionError: Ray is not installed, or there is no cluster at the address.
+        `address` is that of the cluster's head, `host:port`, or `auto` for the one that runs here; without it RAY_ADDRESS
+        counts, and without both a cluster starts on this machine.
         """
         require_extra("ray")
         import ray

@@ -191,10 +191,8 @@ def _readable(
 
 
 def next_pair(states: dict[Pair, PairState], busy: set[Pair], goal: int, config: EngineConfig) -> Pair | None:
-    """The unfinished, idle pair with the fewest rounds, or None.
-
-    New objects are spread over the workers, as preparing one can take minutes; pairs on which a worker died come last.
-    """
+    """The unfinished, idle pair with the fewest rounds, or None; pairs on which a worker died come last."""
+    # New objects are spread over the workers, as preparing one can take minutes.
     open_pairs = [pair for pair, s in states.items()
                   if pair not in busy and s.grasps < goal and not s.why_given_up(goal, config)]
     prepared_now = {obj for hand, obj in busy if not states[hand, obj].total.candidates}

@@ -17,11 +17,11 @@ from dro_grasp.errors import BundleError, OptionError, OutputError
 from dro_grasp.hands.library import BUILTIN_FOLDER
 from dro_grasp.network.checkpoints import describe_weights
 from dro_grasp.predict.config import PredictorConfig, RescueConfig
+from dro_grasp.train import onboarding
 from dro_grasp.train.config import TrainConfig
 from dro_grasp.train.data.engine.shards import sole_run
 from dro_grasp.train.data.engine.worker import EngineConfig
-from dro_grasp.train.onboard import report, steps
-from dro_grasp.train.onboard.steps import OnboardingConfig, onboard
+from dro_grasp.train.onboarding import Onboarded, OnboardingConfig, onboard, write_report
 from tests.helpers.weights import untrained_weights
 
 
@@ -42,7 +42,7 @@ def small(home: Path, **more: object) -> OnboardingConfig:
 
 
 @pytest.fixture(scope="module")
-def made(home: Path) -> steps.Onboarded:
+def made(home: Path) -> Onboarded:
     return onboard(str(home / "mine.urdf"), home / "out", small(home))
 
 
@@ -52,12 +52,12 @@ def command(home: Path, *more: str, hand: str = "mine.urdf") -> list[str]:
             "--source", "network", *more]
 
 
-def test_a_file_becomes_weights_and_a_report(home: Path, made: steps.Onboarded) -> None:
+def test_a_file_becomes_weights_and_a_report(home: Path, made: Onboarded) -> None:
     grasps = made.steps["training"]["grasps"]
     assert set(made.steps) == {"check", "before", "data", "training", "after"}
     assert grasps > 0
-    assert describe_weights(home / "out" / steps.WEIGHTS)["about"]["data"]["hands"] == {"mine": grasps}
-    page = report.write_report(made).read_text()
+    assert describe_weights(home / "out" / onboarding.WEIGHTS)["about"]["data"]["hands"] == {"mine": grasps}
+    page = write_report(made).read_text()
     assert page.count("data:image/png;base64,") == 2, "the hand, and grasps of the one held-out object"
     assert "http" not in page.replace("http-equiv", ""), "nothing is fetched"
     assert f"{made.rate('after', 'refined', 'strict/1'):.0%} after" in page
@@ -65,21 +65,21 @@ def test_a_file_becomes_weights_and_a_report(home: Path, made: steps.Onboarded) 
         returned = f"{made.rate(step, 'returned', 'strict/1'):.0%} {step}"
         assert f"{returned} ({made.optimised(step):.0%} of them made by the optimiser)" in page
     assert " of 3 made by the optimiser" in page
-    for row in json.loads((home / "out" / steps.STATE).read_text())["steps"]["after"]["rows"]:
+    for row in json.loads((home / "out" / onboarding.STATE).read_text())["steps"]["after"]["rows"]:
         share, everyone = row["fingers"]["strict/1"]
         assert f"{100 * share:.0f} ({100 * everyone:.0f})" in page
     assert f"--weights {made.weights}" in page
 
 
-def test_a_rerun_does_nothing_again(home: Path, made: steps.Onboarded, capsys: pytest.CaptureFixture[str]) -> None:
-    before = {name: (home / "out" / name).read_bytes() for name in (steps.STATE, steps.WEIGHTS)}
+def test_a_rerun_does_nothing_again(home: Path, made: Onboarded, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {name: (home / "out" / name).read_bytes() for name in (onboarding.STATE, onboarding.WEIGHTS)}
     assert main(command(home, "--json")) == 0
     told, said = capsys.readouterr()
     told = json.loads(told.splitlines()[-1])
     assert said.count("finished before") == 5
     assert {name: (home / "out" / name).read_bytes() for name in before} == before, "the time of each step among it"
     assert told["grasps"] == made.steps["training"]["grasps"]
-    assert told["fine_tuned"] == str(home / "out" / steps.WEIGHTS)
+    assert told["fine_tuned"] == str(home / "out" / onboarding.WEIGHTS)
     assert told["weights"] == (told["fine_tuned"] if told["gained"] else str(home / "untrained.safetensors"))
     assert told["without_grasps"] == []
     assert told["report"] == str(home / "out" / "report.html")
@@ -91,35 +91,35 @@ def test_a_rerun_does_nothing_again(home: Path, made: steps.Onboarded, capsys: p
 def test_the_next_steps_are_commands_for_shells(tmp_path: Path) -> None:
     folder, hand = tmp_path / "my hand", "it's $mine; hand.urdf"
     done = replace(onboarded(folder, 60, 100), hand=hand)
-    page = html.unescape(report._commands(done)).removeprefix("<pre>").removesuffix("</pre>")
+    page = html.unescape(onboarding._commands(done)).removeprefix("<pre>").removesuffix("</pre>")
     words = [shlex.split(line) for line in page.splitlines()]
-    assert words[0][2:8] == ["--hand", hand, "--object", "my_mesh.stl", "--weights", str(folder / steps.WEIGHTS)]
-    assert words[-1] == ["dro-grasp", "dataset", "report", str(folder / steps.DATA), "--output", "data.html"]
+    assert words[0][2:8] == ["--hand", hand, "--object", "my_mesh.stl", "--weights", str(folder / onboarding.WEIGHTS)]
+    assert words[-1] == ["dro-grasp", "dataset", "report", str(folder / onboarding.DATA), "--output", "data.html"]
 
 
 def test_what_generate_returns_is_of_the_source_that_is_asked_for(home: Path) -> None:
     done = onboard(str(home / "mine.urdf"), home / "optimised", small(home, source="optimiser"))
     assert [done.optimised(step) for step in ("before", "after")] == [1.0, 1.0]
-    page = report.write_report(done).read_text()
+    page = write_report(done).read_text()
     assert "3 of 3 made by the optimiser" in page
     assert "--source optimiser --output grasps.parquet" in page
 
 
 @pytest.mark.usefixtures("made")
 def test_a_run_that_stopped_goes_on(home: Path) -> None:
-    state = json.loads((home / "out" / steps.STATE).read_text())
+    state = json.loads((home / "out" / onboarding.STATE).read_text())
     kept = {name: state["steps"][name] for name in ("check", "before", "data")}
-    (home / "out" / steps.STATE).write_text(json.dumps(state | {"steps": kept}))
+    (home / "out" / onboarding.STATE).write_text(json.dumps(state | {"steps": kept}))
     told: list[str] = []
     again = onboard(str(home / "mine.urdf"), home / "out", small(home), told.append)
     assert sum("finished before" in line for line in told) == 3
     assert {name: again.steps[name] for name in kept} == kept
 
 
-def onboarded(folder: Path, before: int, after: int, asked: int = 200, **steps_made: dict) -> steps.Onboarded:
+def onboarded(folder: Path, before: int, after: int, asked: int = 200, **steps_made: dict) -> Onboarded:
     rows = [[{"stage": stage, "asked": asked, "held": {"strict/1": held}, "success": {"strict/1": (held / asked, 0, 1)}}
              for stage in ("raw", "refined")] for held in (before, after)]
-    return steps.Onboarded("mine", folder, {"before": {"rows": rows[0]}, "after": {"rows": rows[1]}, **steps_made},
+    return Onboarded("mine", folder, {"before": {"rows": rows[0]}, "after": {"rows": rows[1]}, **steps_made},
                            OnboardingConfig(weights="multi"))
 
 
@@ -236,10 +236,10 @@ def test_a_damaged_state_is_set_aside_and_a_second_run_kept_out(
 ) -> None:
     told: list[str] = []
     for number, content in enumerate(("{", "[]", '{"hand": "mine", "sha256": "x", "steps": 5}', '{"hand": "mine"}'), 1):
-        (tmp_path / steps.STATE).write_text(content)
-        assert steps._Onboarding(str(home / "mine.urdf"), tmp_path, small(home), [], [], told.append).steps == {}
-        assert (tmp_path / f"{steps.STATE}.damaged{'' if number == 1 else f'.{number}'}").read_text() == content
+        (tmp_path / onboarding.STATE).write_text(content)
+        assert onboarding._Onboarding(str(home / "mine.urdf"), tmp_path, small(home), [], [], told.append).steps == {}
+        assert (tmp_path / f"{onboarding.STATE}.damaged{'' if number == 1 else f'.{number}'}").read_text() == content
     assert len(told) == 4
     assert all("is damaged" in line and "made again" in line for line in told)
     with sole_run(tmp_path), pytest.raises(OutputError, match="another run is filling"):
-        steps.onboard(str(home / "mine.urdf"), tmp_path)
+        onboard(str(home / "mine.urdf"), tmp_path)
