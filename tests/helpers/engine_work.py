@@ -11,7 +11,7 @@ from pathlib import Path
 from dro_grasp.errors import HandError, ObjectError
 from dro_grasp.train.data.engine.shards import Yield, notes_of
 from dro_grasp.train.data.engine.worker import FinishedShard, Job, Task
-from tests.datasets.test_shards import grasps
+from tests.train.data.test_shards import grasps
 
 GRASPS = 5
 """Grasps of a shard."""

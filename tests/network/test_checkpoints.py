@@ -137,7 +137,7 @@ def change(path: Path, how: str) -> None:
         ("impossible sizes", "expected weights of this version"), ("unknown setting", "unknown settings magic"),
         ("hand not placed", "unknown settings placed"),
         ("contradiction", "latent_form is no longer a choice; in frame 'object' it is kernel now, and motion in the file"),
-        ("wrist", "frame is wrist, which no network has"),
+        ("wrist", "expected weights of this version of the network"),
         ("gaussian", "prior is no longer a choice; in frame 'palm' it is flow now, and learned in the file"),
         ("features", "placement_hand is no longer a choice; in frame 'palm' it is proportions now, and features in the file"),
         ("another version", "version 99, expected 1"), ("zipped pickle", "can run code"), ("bare pickle", "can run code"),

@@ -48,15 +48,19 @@ class Pool(Protocol):
     @property
     def free(self) -> int:
         """Number of shards that it would start at once."""
+        ...
 
     def submit(self, task: Task) -> None:
         """Start a shard."""
+        ...
 
     def wait(self, timeout: float) -> list[Outcome]:
         """Shards that ended, as soon as there is one; none after `timeout` [s]."""
+        ...
 
     def close(self) -> None:
         """Stop everything; shards in flight are dropped."""
+        ...
 
 
 def failure_of(error: BaseException) -> Failed:
