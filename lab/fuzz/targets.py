@@ -35,7 +35,7 @@ from dro_grasp.objects.perception.scan import load_scan
 from dro_grasp.train.data.bundle.training_file import ObjectCloud, load_bundle, write_bundle
 from dro_grasp.train.data.collections.collection import count_collection, read_collection
 from dro_grasp.train.data.collections.importing import read_foreign
-from dro_grasp.train.run_folder import CHECKPOINT, LOG, RunFolder
+from dro_grasp.train.runs import CHECKPOINT, LOG, RunFolder
 from lab.fuzz import mutations as damage
 
 Rng = random.Random

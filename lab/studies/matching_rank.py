@@ -25,7 +25,7 @@ from dro_grasp.network.checkpoints import load_weights
 from dro_grasp.network.encoder import StaticGraphEncoder
 from dro_grasp.pictures.sheets import contact_sheet
 from dro_grasp.train.config import AugmentationConfig
-from dro_grasp.train.correspondence import matching_rank, mean_rank
+from dro_grasp.train.measures import matching_rank, mean_rank
 from dro_grasp.train.samples import SampleSource
 from lab.benchmarks.distance_error import validation_bundle
 from lab.benchmarks.report import emit

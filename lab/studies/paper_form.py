@@ -35,10 +35,10 @@ from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.simulation.protocols import protocol
 from dro_grasp.train.config import LOSSES, LossConfig, PretrainConfig, ScheduleConfig, TrainConfig
 from dro_grasp.train.data.bundle.training_file import Bundle, load_bundle
-from dro_grasp.train.distance_error import distance_errors
 from dro_grasp.train.loop import train
+from dro_grasp.train.measures import distance_errors
 from dro_grasp.train.pretraining import pretrain
-from dro_grasp.train.run_folder import last_logged
+from dro_grasp.train.runs import last_logged
 from lab.benchmarks.report import emit
 from lab.benchmarks.synthesis import HANDS
 

@@ -12,8 +12,7 @@ from dro_grasp.train.config import PretrainConfig, ScheduleConfig, TrainConfig
 from dro_grasp.train.data.bundle.training_file import Bundle
 from dro_grasp.train.loop import train
 from dro_grasp.train.pretraining import pretrain
-from dro_grasp.train.run_folder import LOG
-from dro_grasp.train.runs import Report, RunProgress
+from dro_grasp.train.runs import LOG, Report, RunProgress
 from tests.helpers.tiny_bundle import TINY
 
 SCHEDULE = ScheduleConfig(

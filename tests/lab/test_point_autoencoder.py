@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from dro_grasp.errors import BundleError, TrainingError
 from dro_grasp.train.config import ScheduleConfig
 from dro_grasp.train.data.bundle.training_file import Bundle
-from dro_grasp.train.run_folder import RunFolder
+from dro_grasp.train.runs import RunFolder
 from lab.methods.bundle_draws import BundleDraws
 from lab.methods.point_autoencoder import AutoencoderConfig, divergence, each, layer, train_autoencoder
 

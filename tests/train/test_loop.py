@@ -14,9 +14,9 @@ from dro_grasp.errors import TrainingError
 from dro_grasp.network.network import DistanceNetwork
 from dro_grasp.train import loop
 from dro_grasp.train.config import AugmentationConfig, LossConfig, MotionConfig, PretrainConfig, TrainConfig
-from dro_grasp.train.correspondence import matching_rank
 from dro_grasp.train.data.bundle.training_file import Bundle
 from dro_grasp.train.loop import measure_hands, train
+from dro_grasp.train.measures import matching_rank
 from dro_grasp.train.pretraining import contrastive_step, pretrain_motion
 from dro_grasp.train.runs import recalibrate
 from dro_grasp.train.samples import SampleSource

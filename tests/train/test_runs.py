@@ -25,8 +25,17 @@ from dro_grasp.network.network import DistanceNetwork, untrained_network
 from dro_grasp.train import loop, losses, pretraining
 from dro_grasp.train.config import AugmentationConfig, LossConfig, ScheduleConfig, TrainConfig
 from dro_grasp.train.data.bundle.training_file import Bundle
-from dro_grasp.train.run_folder import CHECKPOINT, LOG, RunFolder, run_plan
-from dro_grasp.train.runs import RunProgress, TrainingRun, check_schedule, console_report, learning_rate_share
+from dro_grasp.train.runs import (
+    CHECKPOINT,
+    LOG,
+    RunFolder,
+    RunProgress,
+    TrainingRun,
+    check_schedule,
+    console_report,
+    learning_rate_share,
+    run_plan,
+)
 from tests.helpers.tiny_bundle import TINY
 from tests.helpers.training_stages import SCHEDULE, SHARDED, STAGES, curve, quiet, run_stage
 

@@ -46,15 +46,13 @@ class Onboard:
 
     def run(self) -> int:
         """Run all steps, then write the report."""
-        from dro_grasp.objects.catalogue import resolve_objects
-        from dro_grasp.train.onboard.report import write_report
-        from dro_grasp.train.onboard.steps import WEIGHTS, OnboardingConfig, onboard
+        from dro_grasp.train.onboarding import WEIGHTS, OnboardingConfig, onboard, write_report
 
         config = OnboardingConfig(
             self.minutes, self.objects, self.held_out, self.num, self.weights, self.workers, self.source, seed=self.seed,
             device=self.device)
         done = onboard(self.hand, self.output, config, say_aside)
-        report = write_report(done, resolve_objects(list(self.held_out)))
+        report = write_report(done)
         rates = {step: {row["stage"]: {k: v[0] for k, v in row["success"].items()} for row in done.steps[step]["rows"]}
                  for step in ("before", "after")}
         if self.json:

@@ -111,10 +111,10 @@ class Pretrain(Stage):
         from dro_grasp.files import check_output
         from dro_grasp.network.checkpoints import history_of, load_weights, locate_weights, save_weights
         from dro_grasp.train.config import AugmentationConfig, MotionConfig, PretrainConfig
-        from dro_grasp.train.correspondence import matching_rank
         from dro_grasp.train.data.bundle.training_file import load_bundle
+        from dro_grasp.train.measures import matching_rank
         from dro_grasp.train.pretraining import pretrain, pretrain_motion
-        from dro_grasp.train.processes import is_first
+        from dro_grasp.train.runs import is_first
         from dro_grasp.train.samples import SampleSource
 
         check_output(self.output, ".safetensors")
@@ -190,9 +190,9 @@ class Train(Stage):
         from dro_grasp.network.checkpoints import history_of, load_weights, locate_weights, save_weights
         from dro_grasp.train.config import LOSSES, AugmentationConfig, PlacementConfig, TrainConfig
         from dro_grasp.train.data.bundle.training_file import load_bundle
-        from dro_grasp.train.distance_error import distance_errors
         from dro_grasp.train.loop import train, train_placement
-        from dro_grasp.train.processes import is_first
+        from dro_grasp.train.measures import distance_errors
+        from dro_grasp.train.runs import is_first
 
         check_output(self.output, ".safetensors")
         if self.part == "placement" and (self.initial is None or self.pretrained is not None):
@@ -239,7 +239,7 @@ class Train(Stage):
 
 def how_long(run_folder: Path) -> dict[str, int]:
     """Steps and seconds that a run took."""
-    from dro_grasp.train.run_folder import last_logged
+    from dro_grasp.train.runs import last_logged
 
     last = last_logged(run_folder)
     return {"steps": int(last["step"]), "seconds": round(last["seconds"])}

@@ -102,10 +102,7 @@ def load_into(network: Network, path: Path) -> Network:
 def load_small(path: Path, make: Callable[[Tensors], Network], expected: str) -> Network:
     """A small network that ships beside those that predict D(R,O), in evaluation mode; its gradients are switched off.
 
-    Args:
-        path: The file.
-        make: Makes the network of the size that the file's tensors have.
-        expected: What the file should be, and a remedy, in words.
+    `make` makes the network of the size that the file's tensors have; `expected` is what the file should be, and a remedy.
     """
     tensors = _read(path)[1]
     with reading(path, WeightsError, expected):

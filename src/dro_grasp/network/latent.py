@@ -42,8 +42,7 @@ class LatentEncoder(nn.Module):
 class Condition(nn.Module):
     """Input of the flow to z: the object relative to the placed open hand, and the hand's features."""
 
-    SCALE = 0.1
-    """Unit of length inside the network, about the size of a cloud [m]. Source: ours."""
+    SCALE = 0.1  # Unit of length inside the network, about the size of a cloud [m]. Source: ours
 
     def __init__(self, features: int, width: int) -> None:
         super().__init__()
@@ -69,10 +68,8 @@ class FlowPrior(nn.Module):
     object, instead of forcing a distribution on z. Source: flow matching, Lipman et al. 2023, Liu et al. 2023.
     """
 
-    STEPS = 10
-    """Midpoint steps of the integration from noise to z. Source: ours."""
-    DRAWS = 8
-    """Pairs of time and noise for each z in a training step; they are cheap beside the encoders. Source: ours."""
+    STEPS = 10  # Midpoint steps of the integration from noise to z. Source: ours
+    DRAWS = 8  # Pairs of time and noise for each z in a training step; they are cheap beside the encoders. Source: ours
 
     def __init__(self, latent: int, width: int) -> None:
         super().__init__()
@@ -121,8 +118,7 @@ class HandMotion(nn.Module):
     finger to open and another to close.
     """
 
-    SCALE = 0.05
-    """Unit of length inside the network, about the size of a shift [m]. Source: ours."""
+    SCALE = 0.05  # Unit of length inside the network, about the size of a shift [m]. Source: ours
 
     def __init__(self, features: int, latent: int, width: int) -> None:
         super().__init__()

@@ -32,9 +32,7 @@ class Attention(nn.Module):
     def forward(self, x: Float[Tensor, "b n c"], memory: Float[Tensor, "b m c"]) -> Float[Tensor, "b n c"]:
         """Attended values."""
         query = self.query(x).unflatten(-1, (self.heads, -1)).transpose(1, 2)
-        key, value = (
-            part.unflatten(-1, (self.heads, -1)).transpose(1, 2) for part in self.memory(memory).chunk(2, -1)
-        )
+        key, value = (part.unflatten(-1, (self.heads, -1)).transpose(1, 2) for part in self.memory(memory).chunk(2, -1))
         if query.is_cuda or not torch.is_grad_enabled():
             mixed = functional.scaled_dot_product_attention(query, key, value)
         else:
@@ -86,8 +84,7 @@ class Moves:
 
     hand_features: Float[Tensor, "b n width"]
     object_features: Float[Tensor, "b m width"]
-    obj: Float[Tensor, "b m 3"]
-    """In the network's frame [m]."""
+    obj: Float[Tensor, "b m 3"]  # in the network's frame [m]
     z: Float[Tensor, "b k latent"]
     points: Float[Tensor, "b k n 3"]
     """The hand that each z moves, in the network's frame [m]; where z moves nothing, the open hand."""
@@ -102,15 +99,11 @@ class Moves:
 class NetworkOutput:
     """Result of one forward pass in training."""
 
-    distances: Float[Tensor, "b n columns"]
-    """D(R,O) [m]."""
-    mean: Float[Tensor, "b latent"]
-    """Of the posterior of z, as its log-variance."""
+    distances: Float[Tensor, "b n columns"]  # D(R,O) [m]
+    mean: Float[Tensor, "b latent"]  # of the posterior of z, as its log-variance
     log_variance: Float[Tensor, "b latent"]
-    flow_error: Float[Tensor, " b"]
-    """Squared velocity error of the flow to z; zero in the paper's form."""
-    moved: Float[Tensor, "b n 3"]
-    """The placed hand, moved by z if z moves it [m]."""
+    flow_error: Float[Tensor, " b"]  # squared velocity error of the flow to z; zero in the paper's form
+    moved: Float[Tensor, "b n 3"]  # the placed hand, moved by z if z moves it [m]
 
 
 class DistanceNetwork(nn.Module):
@@ -162,12 +155,10 @@ class DistanceNetwork(nn.Module):
         self, hand: Float[Tensor, "b n 3"], obj: Float[Tensor, "b m 3"], grasp: Float[Tensor, "b n 3"],
         generator: torch.Generator, columns: int | None = None,
     ) -> NetworkOutput:
-        """One training pass: z comes from the true grasp.
+        """One training pass: z comes from the true grasp. All clouds are in the frame of the configuration [m].
 
         Args:
-            hand: The open hand [m], in the frame of the configuration.
-            obj: The object in the same frame [m].
-            grasp: The hand in the grasp pose, in the same frame [m].
+            hand: The open hand.
             generator: Source of the draws of z, on the clouds' device.
             columns: Compute distances to this many leading object points only; the order must be random.
         """
@@ -259,13 +250,12 @@ class DistanceNetwork(nn.Module):
     ) -> tuple[Float[Tensor, "num 3 3"], Float[Tensor, "num 3"]]:
         """Rotations of the hand's axes, and positions of the grasp centre in them about the object's centre [m].
 
-        A network that knows the placement chooses the rotations by its prior. The paper's takes the first, centred on the
-        object: it has no prior, and does not see the position.
+        A network that knows the placement chooses by its prior among `rotations` of the hand's axes (`NetworkConfig.axes`),
+        which are in random order. The paper's takes the first, centred on the object: it has no prior, and does not see the
+        position.
 
         Args:
             obj: The object's cloud in its own frame [m].
-            rotations: Candidate rotations of the hand's axes (`NetworkConfig.axes`), in random order.
-            num: How many.
             generator: Source of randomness, on the CPU.
             proportions: Of the hand in these axes.
         """
@@ -283,11 +273,7 @@ def untrained_network(config: NetworkConfig, seed: int, name: str = "untrained")
 
 
 def take_initial(model: DistanceNetwork, initial: DistanceNetwork) -> None:
-    """Copy all weights of a network of the same configuration.
-
-    Raises:
-        WeightsError: The configurations differ.
-    """
+    """Copy all weights of a network of the same configuration."""
     # Settings such as the frame change what the weights mean, but no shape.
     if other := model.config.differences(initial.config):
         told = ", ".join(f"{name} {mine} instead of {theirs}" for name, (mine, theirs) in other.items())
@@ -297,11 +283,7 @@ def take_initial(model: DistanceNetwork, initial: DistanceNetwork) -> None:
 
 
 def take_weights(model: nn.Module, given: nn.Module, name: str) -> None:
-    """Copy the weights of a part of another network; `name` is that network's.
-
-    Raises:
-        WeightsError: The two differ in a tensor's name or shape.
-    """
+    """Copy the weights of a part of another network; `name` is that network's."""
     try:
         model.load_state_dict(given.state_dict())
     except RuntimeError as error:
@@ -311,11 +293,7 @@ def take_weights(model: nn.Module, given: nn.Module, name: str) -> None:
 
 
 def take_pretrained(model: DistanceNetwork, pretrained: DistanceNetwork) -> None:
-    """Copy the hand encoder, and the motion where z moves the hand.
-
-    Raises:
-        WeightsError: They do not fit, or there is a pretrained motion and z does not move the hand.
-    """
+    """Copy the hand encoder, and the motion where z moves the hand."""
     if pretrained.config.neighbours != model.config.neighbours:
         raise WeightsError(f"the hand encoder of '{pretrained.name}' sees {pretrained.config.neighbours} neighbours of each "
                            f"point, this network at {model.config.neighbours}; pretrain with the network that is trained")

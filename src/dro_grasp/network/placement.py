@@ -89,13 +89,11 @@ class PlacementPrior(nn.Module):
         self, obj: Float[Tensor, "m 3"], hand: Float[Tensor, " f"], rotations: Float[Tensor, "r 3 3"], num: int,
         generator: torch.Generator, temperature: float,
     ) -> tuple[Float[Tensor, "num 3 3"], Float[Tensor, "num 3"]]:
-        """Choose rotations by their scores and draw a position of the grasp centre for each.
+        """Choose rotations by their scores, none twice, and draw a position of the grasp centre for each.
 
         Args:
             obj: Object points about the object's centre, in the object's axes [m].
-            hand: As in `forward`.
             rotations: Candidate rotations of the hand's axes in the object's.
-            num: How many to choose, without repetition.
             temperature: Scales the spread of the drawn positions.
 
         Returns:

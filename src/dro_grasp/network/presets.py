@@ -16,13 +16,11 @@ WIDEST = 4096  # Largest number of points, features or neighbours (ours): memory
 MAX_LAYERS = 16  # Most layers of a part of the network (ours)
 LARGEST = 10.0  # Largest distance [m] and temperature (ours)
 LAST_WITH_OTHERS = "commit e1ba941"  # Last state of the package whose networks had other forms, and that shipped other weights
-FORMER: dict[str, dict[str, Any]] = {
-    "object": {"placed": False, "residual": False, "latent_temperature": 1.0, "latent_form": "kernel", "prior": "standard",
-               "placement_hand": "features"},
-    "palm": {"placed": True, "residual": True, "latent_temperature": 1.0, "latent_form": "motion", "prior": "flow",
-             "placement_hand": "proportions"},
+FORMER: dict[str, dict[str, str]] = {
+    "object": {"latent_form": "kernel", "prior": "standard", "placement_hand": "features"},
+    "palm": {"latent_form": "motion", "prior": "flow", "placement_hand": "proportions"},
 }
-"""Settings of older files that the frame decides now, with what it decides."""
+"""Settings in files that the frame decides now, with what it decides."""
 
 
 @dataclass(frozen=True)
@@ -104,17 +102,9 @@ class NetworkConfig:
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> NetworkConfig:
-        """From plain values, as a weights file stores them; lists become tuples.
-
-        Raises:
-            ValueError: A setting is unknown or impossible, or one that is no longer a choice has another value than it has now.
-        """
+        """From plain values, as a weights file stores them; lists become tuples."""
         plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
         form = str(plain.get("frame", "object"))
-        if form == "wrist":
-            raise ValueError(f"frame 'wrist' is no longer a choice; networks of {LAST_WITH_OTHERS} had it")
-        if "latent_form" in plain:  # the oldest of these files do not name what was then the only choice
-            plain.setdefault("placement_hand", "features")
         for name, fixed in FORMER.get(form, {}).items():
             if (found := plain.pop(name, fixed)) != fixed:
                 raise ValueError(f"{name} is no longer a choice; in frame '{form}' it is {fixed} now, and {found} in the file, "

@@ -20,8 +20,7 @@ from dro_grasp.network.presets import NetworkConfig
 from dro_grasp.train import losses
 from dro_grasp.train.config import PlacementConfig, TrainConfig
 from dro_grasp.train.data.bundle.training_file import Bundle
-from dro_grasp.train.run_folder import run_plan
-from dro_grasp.train.runs import Losses, Report, TrainingRun, begin, console_report, recalibrate
+from dro_grasp.train.runs import Losses, Report, TrainingRun, begin, console_report, recalibrate, run_plan
 from dro_grasp.train.samples import HandSamples, SampleSource
 
 
@@ -117,11 +116,7 @@ def train_placement(
     bundle: Bundle, network: NetworkConfig, config: PlacementConfig, folder: Path, initial: DistanceNetwork,
     report: Report | None = None, name: str = "trained",
 ) -> DistanceNetwork:
-    """Train the placement prior of given weights, and nothing else; arguments, result and errors as those of `train`.
-
-    Raises:
-        TrainingError: The network has no placement prior.
-    """
+    """Train the placement prior of given weights, and nothing else; arguments, result and errors as those of `train`."""
     processes, device = begin(config.schedule)
     model = untrained_network(network, config.schedule.seed, name)
     take_initial(model, initial)

@@ -16,8 +16,7 @@ from dro_grasp.network.presets import NetworkConfig
 from dro_grasp.train.config import AugmentationConfig, MotionConfig, PretrainConfig
 from dro_grasp.train.data.bundle.training_file import Bundle
 from dro_grasp.train.losses import contrastive_loss, divergence
-from dro_grasp.train.run_folder import run_plan
-from dro_grasp.train.runs import Losses, Report, TrainingRun, begin, console_report, recalibrate
+from dro_grasp.train.runs import Losses, Report, TrainingRun, begin, console_report, recalibrate, run_plan
 from dro_grasp.train.samples import SampleSource, random_turns
 
 

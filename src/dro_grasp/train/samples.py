@@ -22,23 +22,16 @@ from dro_grasp.train.data.bundle.training_file import Bundle
 class HandSamples:
     """Samples of one hand. Everything is in the network's frame: about the object's centre."""
 
-    hand: Hand
-    """Thinned to the network's number of points."""
+    hand: Hand  # thinned to the network's number of points
     placed: Float[Tensor, "b n 3"]
     """The open hand near the grasp [m]; centred on the object where the network does not know the placement."""
-    grasp: Float[Tensor, "b n 3"]
-    """The hand in the grasp [m]."""
-    obj: Float[Tensor, "b m 3"]
-    """The object [m], in random order."""
+    grasp: Float[Tensor, "b n 3"]  # the hand in the grasp [m]
+    obj: Float[Tensor, "b m 3"]  # the object [m], in random order
     normals: Float[Tensor, "b m 3"]
-    T_frame_link: Float[Tensor, "b l 4 4"]
-    """True poses of all links in the grasp."""
-    obj_hand: Float[Tensor, "b m 3"]
-    """The object in the axes of the true hand [m], for the placement prior."""
-    obj_random: Float[Tensor, "b m 3"]
-    """The same in the axes of a random hand."""
-    position: Float[Tensor, "b 3"]
-    """True position of the grasp centre in the hand's axes [m]."""
+    T_frame_link: Float[Tensor, "b l 4 4"]  # true poses of all links in the grasp
+    obj_hand: Float[Tensor, "b m 3"]  # the object in the axes of the true hand [m], for the placement prior
+    obj_random: Float[Tensor, "b m 3"]  # the same in the axes of a random hand
+    position: Float[Tensor, "b 3"]  # true position of the grasp centre in the hand's axes [m]
     proportions: Float[Tensor, " f"]
 
 

@@ -17,14 +17,6 @@ Side = Literal["left", "right", "none"]  # none for hands without a thumb, or wh
 Thumb = Literal["opposed", "lateral", "none"]  # mounted before the palm, beside it, or nowhere
 Family = Literal["row", "ring", "facing"]  # fingers in a row with a thumb, around a disc, or in two rows that face each other
 PalmShape = Literal["box", "disc", "rounded", "two-part"]  # a disc is a cylinder; `rounded` has cylinders at its sides
-FingerShape = Literal["capsule", "box"]  # a cylinder with spheres at its ends, or a box with cylinders across its ends
-Coupling = Literal["free", "tip", "all"]  # joints that follow the one before: none, the last one, or all but the first
-
-
-def rpy_of(rotation: Float[np.ndarray, "3 3"]) -> Vector:
-    """Roll, pitch and yaw of a rotation [rad]."""
-    roll, pitch, yaw = Rotation.from_matrix(rotation).as_euler("xyz").tolist()
-    return roll, pitch, yaw
 
 
 @dataclass(frozen=True)

@@ -59,10 +59,8 @@ class HandGrasps:
     """All grasps of one hand."""
 
     T_object_wrist: Float[Tensor, "n 4 4"]
-    joints: Float[Tensor, "n n_dof"]
-    """Independent joints [rad or m]."""
-    object_index: Int[Tensor, " n"]
-    """Index into the bundle's objects."""
+    joints: Float[Tensor, "n n_dof"]  # independent joints [rad or m]
+    object_index: Int[Tensor, " n"]  # index into the bundle's objects
 
     def to(self, device: torch.device | str) -> HandGrasps:
         """The same grasps on another device."""
@@ -75,8 +73,7 @@ class Bundle:
 
     hands: dict[str, Hand]
     objects: dict[str, ObjectCloud]
-    grasps: dict[str, HandGrasps]
-    """By hand name. A hand may have none: pretraining needs its kinematics alone."""
+    grasps: dict[str, HandGrasps]  # by hand name. A hand may have none: pretraining needs its kinematics alone.
 
     @property
     def object_names(self) -> tuple[str, ...]:
@@ -115,11 +112,6 @@ def write_bundle(
         grasps: At least one grasp of each of these hands.
         splits: Splits that the grasps may be of.
         without_grasps: Further hands, for pretraining.
-
-    Raises:
-        BundleError: A grasp is of another split, its hand or object is missing, two hands share a name, or the file grows
-            too large.
-        OutputError: The file cannot be written.
     """
     strangers = {b.hand for b in grasps if b.hand_sha256 not in {h.sha256 for h in hands}}
     if strangers:

@@ -77,12 +77,7 @@ def _why_none(split: str, seen: Counter[str], hands: Sequence[str], hands_seen: 
 
 
 def sources(batches: list[GraspBatch]) -> tuple[list[Hand], dict[str, ObjectCloud], list[GraspBatch]]:
-    """The hands and object clouds of batches of one hand and one object, each once, and the batches with the hashes of these.
-
-    Raises:
-        BundleError: Different files have one name.
-        GraspFileError: A hand or an object has changed since.
-    """
+    """Hands and object clouds of batches of one hand and one object, each once, and the batches with the hashes of these."""
     loaded, stated = Sources(), []
     for grasps in batches:
         hand, obj = loaded.of(grasps)

@@ -26,16 +26,12 @@ Progress = Callable[[int, int], None]  # Called with (grasps evaluated, grasps i
 class Agreement:
     """Stored verdicts against those of new trials, for some grasps."""
 
-    protocol: str
-    """Of the new trials."""
+    protocol: str  # of the new trials
     evaluated: int = 0
-    agreed: int = 0
-    """Of the trials, those with the stored verdict."""
+    agreed: int = 0  # of the trials, those with the stored verdict
     succeeded: int = 0
-    reasons: Counter[str] = field(default_factory=Counter)
-    """Why stored successes fail now, counted."""
-    hands: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """Trials and successes by hand."""
+    reasons: Counter[str] = field(default_factory=Counter)  # why stored successes fail now, counted
+    hands: dict[str, tuple[int, int]] = field(default_factory=dict)  # trials and successes by hand
 
     @property
     def share(self) -> float:
@@ -57,12 +53,7 @@ class Agreement:
 def check(
     pairs: Iterable[PairGrasps], sample: int, rules: Protocol, seed: int = 0, progress: Progress | None = None
 ) -> Agreement:
-    """Evaluate a random sample of stored grasps again, all of them if there are fewer, and compare verdicts.
-
-    Raises:
-        OptionError: `sample` is not positive.
-        GraspFileError: The data set is empty, or a hand or an object is not the one the grasps were made for.
-    """
+    """Evaluate a random sample of stored grasps again, all of them if there are fewer, and compare verdicts."""
     if sample < 1:
         raise OptionError(f"sample is {sample}; check at least one grasp")
     parts = [pair.grasps for pair in pairs if len(pair.grasps)]

@@ -26,12 +26,9 @@ YIELDS = "yields"  # Entry of a file's notes with the yield of each of its objec
 class PairGrasps:
     """The grasps of one hand on one object."""
 
-    hand: str
-    """Name of the hand, or the path under which it was requested."""
-    object: str
-    """Likewise; numbered where a file has several objects of the name (see `GraspBatch.by_object`)."""
-    grasps: GraspBatch
-    """May be empty."""
+    hand: str  # name of the hand, or the path under which it was requested
+    object: str  # likewise; numbered where a file has several objects of the name (see `GraspBatch.by_object`)
+    grasps: GraspBatch  # may be empty
     made: Yield
     """Yield of their production. A merged file may hold a choice of the valid grasps; for grasps from elsewhere only
     `valid` is known."""

@@ -31,18 +31,12 @@ class PairCoverage:
     """One hand on one object."""
 
     object: str
-    grasps: int
-    """In the data set."""
-    yields: Yield
-    """What became of the candidates in synthesis; the data set may hold only some of the valid grasps."""
-    half_axes: tuple[int, ...]
-    """Grasps by the half-axis nearest to their palm direction, in the order of HALF_AXES."""
-    rolls: int
-    """How many of the ROLL_BINS sectors of wrist roll have a grasp."""
-    size: tuple[float, float]
-    """Smallest and largest grasp size [m]; NaN without grasps."""
-    contact_links: tuple[int, int]
-    """Fewest and most links in contact after closing; zero if not recorded."""
+    grasps: int  # in the data set
+    yields: Yield  # what became of the candidates in synthesis; the data set may hold only some of the valid grasps
+    half_axes: tuple[int, ...]  # grasps by the half-axis nearest to their palm direction, in the order of HALF_AXES
+    rolls: int  # how many of the ROLL_BINS sectors of wrist roll have a grasp
+    size: tuple[float, float]  # smallest and largest grasp size [m]; NaN without grasps
+    contact_links: tuple[int, int]  # fewest and most links in contact after closing; zero if not recorded
 
     @property
     def reason(self) -> str:
@@ -57,8 +51,7 @@ class HandCoverage:
     hand: Hand
     grasps: GraspBatch
     pairs: tuple[PairCoverage, ...]
-    diversity: dict[str, float]
-    """Diversity over all objects together: all, wrist, joints."""
+    diversity: dict[str, float]  # diversity over all objects together: all, wrist, joints
 
     @property
     def yields(self) -> Yield:
@@ -80,12 +73,7 @@ class HandCoverage:
 
 
 def measure_coverage(pairs: Iterable[PairGrasps]) -> list[HandCoverage]:
-    """Coverage of each hand of a data set.
-
-    Raises:
-        GraspFileError: Two hands share a name, or a hand has changed between its grasps.
-        HandError: A hand cannot be loaded.
-    """
+    """Coverage of each hand of a data set."""
     by_hand: dict[str, list[PairGrasps]] = {}
     for pair in of_one_version((None, pair) for pair in pairs):
         by_hand.setdefault(pair.grasps.hand, []).append(pair)
@@ -93,14 +81,7 @@ def measure_coverage(pairs: Iterable[PairGrasps]) -> list[HandCoverage]:
 
 
 def of_one_version(pairs: Iterable[tuple[Path | None, PairGrasps]]) -> Iterator[PairGrasps]:
-    """The pairs as they come; each name must stand for one hand in all of them.
-
-    Args:
-        pairs: Each with the data set that it is from, for messages; None for grasps in memory.
-
-    Raises:
-        GraspFileError: Two hands share a name, or a hand has changed between its grasps.
-    """
+    """The pairs as they come, each with its data set, for messages; each name must stand for one hand in all of them."""
     known: dict[str, tuple[Path | None, PairGrasps]] = {}
     for path, pair in pairs:
         new, old = pair.grasps, known.setdefault(pair.grasps.hand, (path, pair))

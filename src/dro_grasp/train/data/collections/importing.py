@@ -54,26 +54,18 @@ Joints = dict[str, float] | Float[np.ndarray, " n_joints"]  # Values by name, or
 class ForeignGrasp:
     """One grasp in a file's own terms."""
 
-    hand: str
-    """Empty if the format names none; so is `object`."""
+    hand: str  # empty if the format names none; so is `object`
     object: str
-    scale: float
-    """Of the object."""
+    scale: float  # of the object
     T_object_wrist: Float[np.ndarray, "4 4"]
-    joints: Joints
-    """[rad or m]"""
+    joints: Joints  # [rad or m]
     pregrasp: Joints | None = None
     """Joints from which the hand closes, if the format has them, in this wrist pose too [rad or m]."""
-    squeeze: Joints | None = None
-    """Joint targets that press on the object, likewise."""
+    squeeze: Joints | None = None  # joint targets that press on the object, likewise
 
 
 def read_foreign(path: Path, kind: Format) -> list[ForeignGrasp]:
-    """All grasps of a project's file: `cmap_dataset.pt`, or an npy file.
-
-    Raises:
-        GraspFileError: The file is missing, holds something else, or could run code.
-    """
+    """All grasps of a project's file: `cmap_dataset.pt`, or an npy file."""
     readers = {"cmap": _cmap, "dexgraspnet": _dexgraspnet, "dexgraspbench": _dexgraspbench}
     path = given_path(path)
     if path.is_dir():
@@ -189,11 +181,7 @@ def read_npy(path: Path) -> Shaped[np.ndarray, "..."]:
 
 
 def in_order(joints: Joints, moving: Sequence[str], independent: Sequence[str]) -> list[float]:
-    """Values of the independent joints, of the names of these and of all that move, followers included.
-
-    Raises:
-        GraspFileError: The grasp has other joints.
-    """
+    """Values of the independent joints, of the names of these and of all that move, followers included."""
     give = "give the description that the data was made with (--hands)"
     if isinstance(joints, dict):
         # Names of MuJoCo's Shadow hand begin with the robot's.
@@ -218,11 +206,6 @@ def import_grasps(
     Args:
         hands: Our names or paths of hands, by the names in the files; the entry '' stands for all others.
         obj: Object of all grasps, for files that name it otherwise or not at all.
-
-    Raises:
-        OptionError: No file is given, or neither a file nor the arguments name its hand or object.
-        HandError: A hand cannot be loaded.
-        GraspFileError: A file cannot be read, or its grasps are of other joints.
     """
     if not paths:
         raise OptionError(f"no file to import was given; name at least one {kind} file")

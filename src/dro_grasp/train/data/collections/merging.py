@@ -39,17 +39,12 @@ class Merged:
     """Grasps of one hand out of several data sets, for one file."""
 
     hand: str
-    table: pa.Table
-    """The grasps as columns of their file, which take a fifth of the memory."""
+    table: pa.Table  # the grasps as columns of their file, which take a fifth of the memory
     header: dict[str, Any]
-    yields: dict[str, Yield]
-    """By object."""
-    duplicates: int
-    """Near-duplicates that were dropped."""
-    surplus: int
-    """Grasps above the number asked for, dropped."""
-    number: int = 1
-    """Of the file, where the hand's grasps fill several."""
+    yields: dict[str, Yield]  # by object
+    duplicates: int  # near-duplicates that were dropped
+    surplus: int  # grasps above the number asked for, dropped
+    number: int = 1  # of the file, where the hand's grasps fill several
 
     def __len__(self) -> int:
         return self.table.num_rows
@@ -83,12 +78,6 @@ def merge(
         aside: Folder in which the grasps wait meanwhile, as much again as the data sets; by default the system's for
             temporary files.
         file_bytes: Size of a file from which on the next object goes into another, about.
-
-    Raises:
-        OptionError: `per_pair` is less than 1.
-        GraspFileError: A path holds no grasps, or a hand or object is not the same in all data sets.
-        HandError: A hand cannot be loaded.
-        OutputError: There is no space for the grasps that wait.
     """
     require_choice(per_pair)
     with tempfile.TemporaryDirectory(dir=aside, prefix=".merge-") as name:

@@ -30,11 +30,7 @@ ACCENT = "#d1713b"
 
 
 def write_report(hands: Sequence[HandCoverage], path: Path, progress: Callable[[int, int], None] | None = None) -> None:
-    """Write the page; `progress` is called with (hands done, all hands).
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write the page; `progress` is called with (hands done, all hands)."""
     path = check_output(path)
     sections = []
     for i, hand in enumerate(hands):

@@ -34,10 +34,8 @@ Work = Callable[[Job, Task], FinishedShard]
 class Failed:
     """A shard that could not be made."""
 
-    reason: str
-    """In one line."""
-    died: bool = False
-    """The worker died or was stopped: a new attempt may succeed."""
+    reason: str  # in one line
+    died: bool = False  # the worker died or was stopped: a new attempt may succeed
 
 
 Outcome = tuple[Task, FinishedShard | Failed]
@@ -161,12 +159,8 @@ class RayPool:
     def __init__(self, job: Job, workers: int, limit: float, address: str | None = None, work: Work = make_shard) -> None:
         """Join a cluster, or start one of so many workers here; a shard that takes longer than the limit [s] is stopped.
 
-        Args:
-            address: Address `host:port` of the cluster's head, or `auto` for the one that runs here; None takes
-                RAY_ADDRESS, and without it starts a cluster on this machine.
-
-        Raises:
-            OptionError: Ray is not installed, or there is no cluster at the address.
+        `address` is that of the cluster's head, `host:port`, or `auto` for the one that runs here; without it RAY_ADDRESS
+        counts, and without both a cluster starts on this machine.
         """
         require_extra("ray")
         import ray

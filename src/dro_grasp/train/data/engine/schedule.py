@@ -40,14 +40,10 @@ class PairState:
     """Progress of one (hand, object) pair."""
 
     total: Yield = field(default_factory=Yield)
-    done: set[int] = field(default_factory=set)
-    """Finished rounds; damaged shards leave gaps."""
-    barren: int = 0
-    """Rounds without a grasp since the last one with a grasp."""
-    crashes: int = 0
-    """Deaths of workers on it since its last shard."""
-    error: str = ""
-    """The error that ended it, empty without one."""
+    done: set[int] = field(default_factory=set)  # finished rounds; damaged shards leave gaps
+    barren: int = 0  # rounds without a grasp since the last one with a grasp
+    crashes: int = 0  # deaths of workers on it since its last shard
+    error: str = ""  # the error that ended it, empty without one
 
     @property
     def grasps(self) -> int:
@@ -83,16 +79,11 @@ class PairState:
 class DatasetReport:
     """Result of one run."""
 
-    grasps: int
-    """In the folder, for the pairs asked for."""
-    added: int
-    """Of them in this run."""
-    shards: int
-    """Made in this run."""
-    seconds: float
-    """Wall time [s]."""
-    failures: dict[Pair, str]
-    """Pairs that were given up, and why."""
+    grasps: int  # in the folder, for the pairs asked for
+    added: int  # of them in this run
+    shards: int  # made in this run
+    seconds: float  # wall time [s]
+    failures: dict[Pair, str]  # pairs that were given up, and why
 
 
 @checked
@@ -200,10 +191,8 @@ def _readable(
 
 
 def next_pair(states: dict[Pair, PairState], busy: set[Pair], goal: int, config: EngineConfig) -> Pair | None:
-    """The unfinished, idle pair with the fewest rounds, or None.
-
-    New objects are spread over the workers, as preparing one can take minutes; pairs on which a worker died come last.
-    """
+    """The unfinished, idle pair with the fewest rounds, or None; pairs on which a worker died come last."""
+    # New objects are spread over the workers, as preparing one can take minutes.
     open_pairs = [pair for pair, s in states.items()
                   if pair not in busy and s.grasps < goal and not s.why_given_up(goal, config)]
     prepared_now = {obj for hand, obj in busy if not states[hand, obj].total.candidates}
@@ -222,11 +211,9 @@ class Production:
     goal: int
     config: EngineConfig
     say: Callable[[str], None]
-    end: float = math.inf
-    """Deadline (`time.perf_counter`) after which no new shard starts."""
+    end: float = math.inf  # deadline (`time.perf_counter`) after which no new shard starts
     busy: set[Pair] = field(default_factory=set)
-    shards: int = 0
-    """Finished so far."""
+    shards: int = 0  # finished so far
 
     def finish(self) -> int:
         """Keep the pool busy until every pair is finished or given up; returns the number of shards made."""

@@ -22,7 +22,7 @@ from filelock import FileLock, Timeout
 
 from dro_grasp._version import __version__
 from dro_grasp.errors import GraspFileError, OutputError
-from dro_grasp.files import replacing
+from dro_grasp.files import make_folder, replacing
 from dro_grasp.grasps.grasp_file import read_footer
 
 LOCK = ".lock"
@@ -40,22 +40,14 @@ class Yield:
     Each is in exactly one of `ranked_out`, `deep`, `moved`, `failures`, `duplicates` and `valid`.
     """
 
-    candidates: int = 0
-    """Grasps synthesized."""
-    ranked_out: int = 0
-    """Without a trial because their energy was too high."""
-    deep: int = 0
-    """Without a trial because they penetrate the object too far."""
-    moved: int = 0
-    """Without a trial because closing moved the object too far."""
-    failures: dict[str, int] = field(default_factory=dict)
-    """Failed trials by reason."""
-    duplicates: int = 0
-    """Passed, but near-duplicates of an earlier grasp."""
-    valid: int = 0
-    """Passed and stored."""
-    cpu_seconds: float = 0.0
-    """CPU time without loading hand and object [s]."""
+    candidates: int = 0  # grasps synthesized
+    ranked_out: int = 0  # without a trial because their energy was too high
+    deep: int = 0  # without a trial because they penetrate the object too far
+    moved: int = 0  # without a trial because closing moved the object too far
+    failures: dict[str, int] = field(default_factory=dict)  # failed trials by reason
+    duplicates: int = 0  # passed, but near-duplicates of an earlier grasp
+    valid: int = 0  # passed and stored
+    cpu_seconds: float = 0.0  # CPU time without loading hand and object [s]
     preparation_seconds: float = 0.0
     """CPU time of loading hand and object, with convex parts and grid where they are not cached [s]."""
 
@@ -108,8 +100,7 @@ class Shard:
 
     hand: str
     object: str
-    round: int
-    """Counts up from 0 for each pair."""
+    round: int  # counts up from 0 for each pair
 
     def path(self, folder: Path) -> Path:
         """Where the shard's file lies in a data set's folder."""
@@ -117,14 +108,9 @@ class Shard:
 
     def save(self, payload: bytes, folder: Path) -> None:
         """Write the shard's file; it appears whole or not at all."""
-        path = self.path(folder)
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"cannot make {path.parent}: {error.strerror}; free some space or choose another "
-                              "folder") from error
-        try:
-            with replacing(path) as temporary:
+            make_folder(self.path(folder).parent)
+            with replacing(self.path(folder)) as temporary:
                 temporary.write_bytes(payload)
         except OutputError as error:
             raise OutputError(f"{error}. The shards that are there are whole; in the same folder, the same command goes on "
@@ -137,11 +123,7 @@ def notes_of(result: Yield) -> dict[str, Any]:
 
 
 def find_shards(folder: Path | str) -> list[Shard]:
-    """All finished shards of a data set's folder, sorted.
-
-    Raises:
-        GraspFileError: There is no such folder, or something in it disappeared meanwhile.
-    """
+    """All finished shards of a data set's folder, sorted."""
     folder = Path(folder)
     if not folder.is_dir():
         raise GraspFileError(f"no folder {folder}; give the folder that `dro-grasp synthesize` wrote")
@@ -163,13 +145,7 @@ def read_yield(folder: Path, shard: Shard) -> Yield:
 
 @contextmanager
 def sole_run(folder: Path, part: tuple[int, int] = (1, 1)) -> Iterator[None]:
-    """Keep a second run of the same part out of a folder while the block lasts, and runs that divide the work otherwise.
-
-    The lock goes with the process.
-
-    Raises:
-        OutputError: Another run is filling the folder.
-    """
+    """Keep a second run of the same part out of a folder while the block lasts, and runs that divide the work otherwise."""
     suffix = "" if part[1] == 1 else f"-{part[0]}-of-{part[1]}"
     lock = FileLock(folder / f"{LOCK}{suffix}", timeout=0, fallback_to_soft=False)
     fellows = {f"{LOCK}-{i}-of-{part[1]}" for i in range(1, part[1] + 1)} - {LOCK + suffix}

@@ -95,8 +95,7 @@ class Task:
 
     shard: Shard
     candidates: int
-    earlier: tuple[bytes, ...] = ()
-    """The pair's shards so far, as files; a grasp close to one of theirs is a duplicate."""
+    earlier: tuple[bytes, ...] = ()  # the pair's shards so far, as files; a grasp close to one of theirs is a duplicate
 
 
 @dataclass(frozen=True)
@@ -104,8 +103,7 @@ class FinishedShard:
     """The outcome of one task."""
 
     shard: Shard
-    payload: bytes
-    """The shard's file."""
+    payload: bytes  # the shard's file
     result: Yield
 
 

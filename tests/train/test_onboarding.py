@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-import dataclasses
-import functools
 import html
 import json
 import shlex
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from dro_grasp.cli.main import main
-from dro_grasp.errors import OutputError
+from dro_grasp.errors import BundleError, OptionError, OutputError
 from dro_grasp.hands.library import BUILTIN_FOLDER
 from dro_grasp.network.checkpoints import describe_weights
-from dro_grasp.optimize.synthesis import SynthesisConfig
+from dro_grasp.predict.config import PredictorConfig, RescueConfig
+from dro_grasp.train import onboarding
+from dro_grasp.train.config import TrainConfig
 from dro_grasp.train.data.engine.shards import sole_run
 from dro_grasp.train.data.engine.worker import EngineConfig
-from dro_grasp.train.onboard import report, steps
+from dro_grasp.train.onboarding import Onboarded, OnboardingConfig, onboard, write_report
 from tests.helpers.weights import untrained_weights
 
 
@@ -32,12 +33,17 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(autouse=True)
-def small_steps(monkeypatch: pytest.MonkeyPatch, quick_statistics: None) -> None:
+def small(home: Path, **more: object) -> OnboardingConfig:
     """Small shards, and few grasps in the report."""
-    monkeypatch.setattr(steps, "EngineConfig", functools.partial(
-        EngineConfig, candidates=32, min_candidates=32, synthesis=SynthesisConfig(steps=60, batch_size=32)))
-    monkeypatch.setattr(report, "GRASPS", 3)
+    given = OnboardingConfig(
+        0.01, ("sphere",), ("can",), 2, str(home / "untrained.safetensors"), 1, "network", grasps_drawn=3,
+        engine=EngineConfig(candidates=32, min_candidates=32))
+    return replace(given, **more)
+
+
+@pytest.fixture(scope="module")
+def made(home: Path) -> Onboarded:
+    return onboard(str(home / "mine.urdf"), home / "out", small(home))
 
 
 def command(home: Path, *more: str, hand: str = "mine.urdf") -> list[str]:
@@ -46,87 +52,75 @@ def command(home: Path, *more: str, hand: str = "mine.urdf") -> list[str]:
             "--source", "network", *more]
 
 
-def test_a_file_becomes_weights_and_a_report(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(command(home, "--json")) == 0
-    told = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert set(told["seconds"]) == {"check", "before", "data", "training", "after"}
-    assert told["grasps"] > 0
-    assert describe_weights(told["fine_tuned"])["about"]["data"]["hands"] == {"mine": told["grasps"]}
-    page = (home / "out" / "report.html").read_text()
+def test_a_file_becomes_weights_and_a_report(home: Path, made: Onboarded) -> None:
+    grasps = made.steps["training"]["grasps"]
+    assert set(made.steps) == {"check", "before", "data", "training", "after"}
+    assert grasps > 0
+    assert describe_weights(home / "out" / onboarding.WEIGHTS)["about"]["data"]["hands"] == {"mine": grasps}
+    page = write_report(made).read_text()
     assert page.count("data:image/png;base64,") == 2, "the hand, and grasps of the one held-out object"
     assert "http" not in page.replace("http-equiv", ""), "nothing is fetched"
-    assert f"{told['after']['refined']['strict/1']:.0%} after" in page
+    assert f"{made.rate('after', 'refined', 'strict/1'):.0%} after" in page
     for step in ("before", "after"):
-        share = f"{told[step]['returned']['strict/1']:.0%} {step} ({told['optimised'][step]:.0%} of them made by the optimiser)"
-        assert share in page
+        returned = f"{made.rate(step, 'returned', 'strict/1'):.0%} {step}"
+        assert f"{returned} ({made.optimised(step):.0%} of them made by the optimiser)" in page
     assert " of 3 made by the optimiser" in page
-    for row in json.loads((home / "out" / steps.STATE).read_text())["steps"]["after"]["rows"]:
+    for row in json.loads((home / "out" / onboarding.STATE).read_text())["steps"]["after"]["rows"]:
         share, everyone = row["fingers"]["strict/1"]
         assert f"{100 * share:.0f} ({100 * everyone:.0f})" in page
+    assert f"--weights {made.weights}" in page
+
+
+def test_a_rerun_does_nothing_again(home: Path, made: Onboarded, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {name: (home / "out" / name).read_bytes() for name in (onboarding.STATE, onboarding.WEIGHTS)}
+    assert main(command(home, "--json")) == 0
+    told, said = capsys.readouterr()
+    told = json.loads(told.splitlines()[-1])
+    assert said.count("finished before") == 5
+    assert {name: (home / "out" / name).read_bytes() for name in before} == before, "the time of each step among it"
+    assert told["grasps"] == made.steps["training"]["grasps"]
+    assert told["fine_tuned"] == str(home / "out" / onboarding.WEIGHTS)
     assert told["weights"] == (told["fine_tuned"] if told["gained"] else str(home / "untrained.safetensors"))
-    assert f"--weights {told['weights']}" in page
     assert told["without_grasps"] == []
+    assert told["report"] == str(home / "out" / "report.html")
+    for step in ("before", "after"):
+        assert told[step]["returned"]["strict/1"] == made.rate(step, "returned", "strict/1")
+        assert told["optimised"][step] == made.optimised(step)
 
 
 def test_the_next_steps_are_commands_for_shells(tmp_path: Path) -> None:
     folder, hand = tmp_path / "my hand", "it's $mine; hand.urdf"
-    done = dataclasses.replace(onboarded(folder, 60, 100), hand=hand)
-    page = html.unescape(report._commands(done)).removeprefix("<pre>").removesuffix("</pre>")
+    done = replace(onboarded(folder, 60, 100), hand=hand)
+    page = html.unescape(onboarding._commands(done)).removeprefix("<pre>").removesuffix("</pre>")
     words = [shlex.split(line) for line in page.splitlines()]
-    assert words[0][2:8] == ["--hand", hand, "--object", "my_mesh.stl", "--weights", str(folder / steps.WEIGHTS)]
-    assert words[-1] == ["dro-grasp", "dataset", "report", str(folder / steps.DATA), "--output", "data.html"]
+    assert words[0][2:8] == ["--hand", hand, "--object", "my_mesh.stl", "--weights", str(folder / onboarding.WEIGHTS)]
+    assert words[-1] == ["dro-grasp", "dataset", "report", str(folder / onboarding.DATA), "--output", "data.html"]
 
 
-def test_what_generate_returns_is_of_the_source_that_is_asked_for(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    asked = command(home, "--source", "optimiser", "--json")
-    asked[asked.index("--output") + 1] = str(home / "optimised")
-    assert main(asked) == 0
-    told = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert told["optimised"] == {"before": 1.0, "after": 1.0}
-    page = (home / "optimised" / "report.html").read_text()
+def test_what_generate_returns_is_of_the_source_that_is_asked_for(home: Path) -> None:
+    done = onboard(str(home / "mine.urdf"), home / "optimised", small(home, source="optimiser"))
+    assert [done.optimised(step) for step in ("before", "after")] == [1.0, 1.0]
+    page = write_report(done).read_text()
     assert "3 of 3 made by the optimiser" in page
     assert "--source optimiser --output grasps.parquet" in page
 
 
-def test_a_rerun_does_nothing_again(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def working(*_: object, **__: object) -> None:
-        raise AssertionError("done again")
-
-    before = (home / "out" / "weights.safetensors").read_bytes()
-    for name in ("synthesize_dataset", "train", "benchmark", "check_hand"):
-        monkeypatch.setattr(steps, name, working)
-    assert main(command(home)) == 0
-    said = capsys.readouterr()
-    assert said.err.count("finished before") == 5
-    assert "report: " in said.out
-    assert (home / "out" / "weights.safetensors").read_bytes() == before
-
-
-def test_a_run_that_stopped_goes_on(home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    state = json.loads((home / "out" / steps.STATE).read_text())
+@pytest.mark.usefixtures("made")
+def test_a_run_that_stopped_goes_on(home: Path) -> None:
+    state = json.loads((home / "out" / onboarding.STATE).read_text())
     kept = {name: state["steps"][name] for name in ("check", "before", "data")}
-    (home / "out" / steps.STATE).write_text(json.dumps(state | {"steps": kept}))
-    monkeypatch.setattr(steps, "synthesize_dataset", None)
-    assert main(command(home)) == 0
-    assert capsys.readouterr().err.count("finished before") == 3
+    (home / "out" / onboarding.STATE).write_text(json.dumps(state | {"steps": kept}))
+    told: list[str] = []
+    again = onboard(str(home / "mine.urdf"), home / "out", small(home), told.append)
+    assert sum("finished before" in line for line in told) == 3
+    assert {name: again.steps[name] for name in kept} == kept
 
 
-def test_a_benchmark_without_what_generate_returns_is_made_again(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """As folders of an earlier version have it."""
-    state = json.loads((home / "out" / steps.STATE).read_text())
-    whole = state["steps"]["after"]
-    state["steps"]["after"] = whole | {"rows": [row for row in whole["rows"] if row["stage"] != steps.RETURNED]}
-    (home / "out" / steps.STATE).write_text(json.dumps(state))
-    assert main(command(home)) == 0
-    assert capsys.readouterr().err.count("finished before") == 4
-    rows = json.loads((home / "out" / steps.STATE).read_text())["steps"]["after"]["rows"]
-    assert [row["stage"] for row in rows] == [row["stage"] for row in whole["rows"]]
-
-
-def onboarded(folder: Path, before: int, after: int, asked: int = 200, **steps_made: dict) -> steps.Onboarded:
+def onboarded(folder: Path, before: int, after: int, asked: int = 200, **steps_made: dict) -> Onboarded:
     rows = [[{"stage": stage, "asked": asked, "held": {"strict/1": held}, "success": {"strict/1": (held / asked, 0, 1)}}
              for stage in ("raw", "refined")] for held in (before, after)]
-    return steps.Onboarded("mine", folder, {"before": {"rows": rows[0]}, "after": {"rows": rows[1]}, **steps_made}, "multi")
+    return Onboarded("mine", folder, {"before": {"rows": rows[0]}, "after": {"rows": rows[1]}, **steps_made},
+                           OnboardingConfig(weights="multi"))
 
 
 @pytest.mark.parametrize("after", [40, 60, 61, 90])
@@ -156,28 +150,35 @@ def test_weights_that_are_clearly_better_are_taken(home: Path) -> None:
     assert sum(onboarded(home, b, a).gained for b, a in zip(before, after, strict=True)) >= 900
 
 
+@pytest.mark.usefixtures("made")
 def test_the_folder_of_another_hand_is_refused(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copy(BUILTIN_FOLDER / "barrett.urdf", home / "other.urdf")
     assert main(command(home, hand="other.urdf")) == 2
     assert "belongs to hand 'mine'" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("made")
 @pytest.mark.parametrize(("more", "word"), [
     (["--seed", "7"], "with seed"),
     (["--source", "auto"], "with source network, auto was asked for")])
 def test_a_folder_that_was_begun_otherwise_is_refused(
     home: Path, more: list[str], word: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its finished steps would be given for those that were asked for. Earlier versions called the source a method."""
-    state = home / "out" / steps.STATE
-    stored = state.read_text()
-    for text in (stored, stored.replace('"source": "network"', '"method": "network"')):
-        state.write_text(text)
-        assert main([*command(home), *more]) == 2
-        assert word in capsys.readouterr().err
-    state.write_text(stored)
+    """Its finished steps would be given for those that were asked for."""
+    assert main([*command(home), *more]) == 2
+    assert word in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("made")
+def test_a_folder_that_was_begun_with_another_configuration_is_refused(home: Path) -> None:
+    for more, word in (({"engine": EngineConfig(max_shift=0.02)}, "engine.max_shift 0.03, 0.02 was asked for"),
+                       ({"predictor": PredictorConfig(rescue=RescueConfig(per_grasp=2))}, "predictor.rescue.per_grasp 8, 2"),
+                       ({"training": TrainConfig()}, "training.schedule.steps 1000000, 10000")):
+        with pytest.raises(OptionError, match=f"was begun with {word}"):
+            onboard(str(home / "mine.urdf"), home / "out", small(home, **more))
+
+
+@pytest.mark.usefixtures("made")
 def test_a_folder_that_was_begun_with_other_weights_is_refused(
     home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -194,16 +195,10 @@ def test_what_makes_no_sense_is_refused(
     assert word in capsys.readouterr().err
 
 
-def test_a_hand_that_grasps_nothing_is_told(
-    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from dro_grasp.train.data.engine.schedule import DatasetReport
-
-    nothing = DatasetReport(0, 0, 1, 1.0, {("mine", "sphere"): "0 grasps: every candidate penetrates"})
-    monkeypatch.setattr(steps, "synthesize_dataset", lambda *_, **__: nothing)
-    monkeypatch.setattr(steps, "count_collection", lambda _: {})
-    assert main([*command(home), "--output", str(home / "empty")]) == 2
-    assert "every candidate penetrates" in capsys.readouterr().err
+def test_a_hand_that_grasps_nothing_is_told(home: Path) -> None:
+    nothing = EngineConfig(candidates=32, max_penetration=-1.0, max_barren_rounds=1)
+    with pytest.raises(BundleError, match=r"no grasp of .* look at .*: 0 grasps, none in .*: hand too deep in the object"):
+        onboard(str(home / "mine.urdf"), home / "empty", small(home, engine=nothing))
 
 
 @pytest.mark.parametrize(
@@ -237,16 +232,14 @@ def test_objects_of_one_name_are_refused_before_the_work(home: Path, capsys: pyt
 
 
 def test_a_damaged_state_is_set_aside_and_a_second_run_kept_out(
-    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    home: Path, tmp_path: Path
 ) -> None:
     told: list[str] = []
-    monkeypatch.setattr(steps._Onboarding, "run", lambda self: None)
     for number, content in enumerate(("{", "[]", '{"hand": "mine", "sha256": "x", "steps": 5}', '{"hand": "mine"}'), 1):
-        (tmp_path / steps.STATE).write_text(content)
-        made = steps.onboard(str(home / "mine.urdf"), tmp_path, say=told.append)
-        assert made.steps == {}
-        assert (tmp_path / f"{steps.STATE}.damaged{'' if number == 1 else f'.{number}'}").read_text() == content
+        (tmp_path / onboarding.STATE).write_text(content)
+        assert onboarding._Onboarding(str(home / "mine.urdf"), tmp_path, small(home), [], [], told.append).steps == {}
+        assert (tmp_path / f"{onboarding.STATE}.damaged{'' if number == 1 else f'.{number}'}").read_text() == content
     assert len(told) == 4
     assert all("is damaged" in line and "made again" in line for line in told)
     with sole_run(tmp_path), pytest.raises(OutputError, match="another run is filling"):
-        steps.onboard(str(home / "mine.urdf"), tmp_path)
+        onboard(str(home / "mine.urdf"), tmp_path)

@@ -1,1 +1,0 @@
-"""A hand that nobody prepared: from its description to weights that grasp with it, and a report."""
