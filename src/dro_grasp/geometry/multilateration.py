@@ -19,20 +19,14 @@ from dro_grasp.kinds import Checked
 class MultilaterationConfig(Checked):
     """Settings of the closed form and of the refinement. Values are ours."""
 
-    ridge: float = 1e-8
-    """Added to the anchors' covariance, so that flat clouds stay solvable [m^2]."""
-    thin: float = 5e-3
-    """A cloud is thin, and is refined, if the standard deviation along its thinnest axis is below this [m]."""
-    steps: int = 4
-    """Gauss-Newton steps of the refinement."""
-    damping: float = 1e-4
-    """Added to the Gauss-Newton matrix, per anchor [1]."""
-    max_step: float = 0.05
-    """Longest Gauss-Newton step [m]."""
+    ridge: float = 1e-8  # added to the anchors' covariance, so that flat clouds stay solvable [m^2]
+    thin: float = 5e-3  # a cloud is thin, and is refined, if the standard deviation along its thinnest axis is below this [m]
+    steps: int = 4  # Gauss-Newton steps of the refinement
+    damping: float = 1e-4  # added to the Gauss-Newton matrix, per anchor [1]
+    max_step: float = 0.05  # longest Gauss-Newton step [m]
     approach_anchors: int = 128
     """All steps but the last two use about so many anchors, evenly from the list: they only approach the minimum."""
-    chunk: int = 4
-    """Clouds that are refined at once: more do not fit into the processor's cache."""
+    chunk: int = 4  # clouds that are refined at once: more do not fit into the processor's cache
 
 
 @dataclass(frozen=True)
@@ -41,10 +35,8 @@ class _Cloud:
 
     centre: Float[Tensor, "*b 1 3"]
     points: Float[Tensor, "*b m 3"]
-    axes: Float[Tensor, "*b 3 3"]
-    """Principal axes as columns, the thinnest first."""
-    variance: Float[Tensor, "*b 3"]
-    """Variance along each axis [m^2], ascending."""
+    axes: Float[Tensor, "*b 3 3"]  # principal axes as columns, the thinnest first
+    variance: Float[Tensor, "*b 3"]  # variance along each axis [m^2], ascending
 
 
 def multilaterate(
@@ -187,12 +179,10 @@ def _distances(points: Float[Tensor, "*b n 3"], anchors: Float[Tensor, "*b m 3"]
 class SideConfig(Checked):
     """Settings of the choice. Values are ours."""
 
-    rounds: int = 4
-    """Rounds in which each point picks its nearer candidate and the body is registered again."""
+    rounds: int = 4  # rounds in which each point picks its nearer candidate and the body is registered again
     reference_margin: float = 0.8
     """Factor on the error of a solution on the reference body's side, so that it wins if both sides fit alike."""
-    ridge: float = 1e-6
-    """Regularises the fit of the heights [1]; lengths are in units of the body's size there."""
+    ridge: float = 1e-6  # regularises the fit of the heights [1]; lengths are in units of the body's size there
 
 
 @torch.no_grad()

@@ -38,8 +38,7 @@ class Finger:
 
     chain: tuple[int, ...]
     """Links from the palm (excluded) to the tip (included); a link that several fingers share is in each of their chains."""
-    links: tuple[int, ...]
-    """Links of this finger alone: those of the chain and their side links, such as a pad."""
+    links: tuple[int, ...]  # links of this finger alone: those of the chain and their side links, such as a pad
     joints_to_tip: tuple[int, ...]
     """For each of `links`, the number of moving joints between it and the tip; 0 for links beside the chain."""
 

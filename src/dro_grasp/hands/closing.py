@@ -51,8 +51,7 @@ class ClosingFinder:
     tree: KinematicTree
     rest: Joints  # as in `Hand`
     movable: JointMask  # as in `Hand`
-    stated: Joints
-    """The open posture that the hand's file states [rad or m]; NaN for joints of which it says nothing."""
+    stated: Joints  # the open posture that the hand's file states [rad or m]; NaN for joints of which it says nothing
     fingers: tuple[Finger, ...]
     coarse: LinkSurface  # some samples of every link from the palm on
     on_palm: Bool[np.ndarray, " n"]  # the samples on the palm

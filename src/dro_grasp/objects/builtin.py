@@ -21,8 +21,7 @@ class BuiltinObject:
     """How a built-in object is made."""
 
     make: Callable[[], Pieces]
-    split: str
-    """`train` or `test`."""
+    split: str  # `train` or `test`
 
 
 def _teapot() -> Pieces:

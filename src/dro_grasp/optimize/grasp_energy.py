@@ -28,47 +28,34 @@ TERMS = ("force_closure", "distance", "penetration", "self_penetration", "alignm
 class EnergyConfig(Checked):
     """Weights and geometry of the energy. Source: DexGraspNet, unless stated otherwise."""
 
-    force_closure: float = 1.0
-    """Weight of the squared net wrench."""
-    distance: float = 100.0
-    """Weight of the contacts' distance to the surface [1/m]."""
-    penetration: float = 100.0
-    """Weight of the hand points' penetration into the object [1/m]."""
+    force_closure: float = 1.0  # weight of the squared net wrench
+    distance: float = 100.0  # weight of the contacts' distance to the surface [1/m]
+    penetration: float = 100.0  # weight of the hand points' penetration into the object [1/m]
     filled: bool = False
     """Whether penetration is also measured at the spheres that fill the links, with the same weight (ours): a thin object
     finds its way between the hand points."""
-    self_penetration: float = 50.0
-    """Weight of self-penetration [1/m] (DexGraspNet: 10; its spheres are finer)."""
-    alignment: float = 1.0
-    """Weight of the angle between hand and object normals (ours)."""
-    joints: float = 1.0
-    """Weight of joints closer to their closed end than `closing_room` [1/rad or 1/m]."""
-    closing_room: float = 0.1
-    """Share of a joint's range that is kept for the squeeze (ours)."""
-    hand_points: int = 200
-    """Number of hand points at which penetration is measured."""
-    margin: float = 0.001
-    """Clearance that hand points keep from the object before they count as penetrating [m] (ours)."""
+    self_penetration: float = 50.0  # weight of self-penetration [1/m] (DexGraspNet: 10; its spheres are finer)
+    alignment: float = 1.0  # weight of the angle between hand and object normals (ours)
+    joints: float = 1.0  # weight of joints closer to their closed end than `closing_room` [1/rad or 1/m]
+    closing_room: float = 0.1  # share of a joint's range that is kept for the squeeze (ours)
+    hand_points: int = 200  # number of hand points at which penetration is measured
+    margin: float = 0.001  # clearance that hand points keep from the object before they count as penetrating [m] (ours)
     clearance: float = 100.0
     """Weight of the hand's penetration into its surroundings, in pregrasp, grasp and squeeze, and of the distance of contacts
     and other hand points from where they may be [1/m] (ours)."""
-    clearance_points: int = 120
-    """Number of hand points at which that is measured (ours)."""
-    clear: float = 0.005
-    """Distance that the hand keeps from its surroundings [m] (ours)."""
+    clearance_points: int = 120  # number of hand points at which that is measured (ours)
+    clear: float = 0.005  # distance that the hand keeps from its surroundings [m] (ours)
 
 
 @dataclass(frozen=True)
 class Evaluation(Rows):
     """Energy and gradient of n grasps."""
 
-    terms: Float[Tensor, "n 6"]
-    """Weighted terms in the order of TERMS."""
+    terms: Float[Tensor, "n 6"]  # weighted terms in the order of TERMS
     clearance: Float[Tensor, "n 1"]
     """Weighted penetration into the surroundings, and touch beside the place to hold. It says nothing about the grasp itself,
     so it is not among the terms."""
-    by_pose: Float[Tensor, "n 6"]
-    """Derivative by the hand's translation [1/m] and rotation about its grasp centre [1/rad]."""
+    by_pose: Float[Tensor, "n 6"]  # derivative by the hand's translation [1/m] and rotation about its grasp centre [1/rad]
     by_joint: Float[Tensor, "n n_dof"]
 
     @property
@@ -81,10 +68,8 @@ class Evaluation(Rows):
 class Room:
     """Where a hand may be, and where it may touch the object; anywhere by default."""
 
-    surroundings: Surroundings | None = None
-    """What it stays clear of."""
-    hold: Balls | None = None
-    """The only place where it touches the object."""
+    surroundings: Surroundings | None = None  # what it stays clear of
+    hold: Balls | None = None  # the only place where it touches the object
 
     def to(self, device: torch.device | str) -> Room:
         """The same on another device."""
@@ -260,16 +245,11 @@ class NearestPoints:
     """For n grasps, the point nearest to the object on each of the l links that have surface points."""
 
     links: Int[Tensor, " l"]
-    index: Int[Tensor, "n l"]
-    """Which of the hand's surface points."""
-    points: Float[Tensor, "n l 3"]
-    """Where they are, in the object's frame [m]."""
-    link_normals: Float[Tensor, "n l 3"]
-    """Outward normals of the links there."""
-    gap: Float[Tensor, "n l"]
-    """Signed distance to the object [m]."""
-    object_normals: Float[Tensor, "n l 3"]
-    """Outward normals of the object there."""
+    index: Int[Tensor, "n l"]  # which of the hand's surface points
+    points: Float[Tensor, "n l 3"]  # where they are, in the object's frame [m]
+    link_normals: Float[Tensor, "n l 3"]  # outward normals of the links there
+    gap: Float[Tensor, "n l"]  # signed distance to the object [m]
+    object_normals: Float[Tensor, "n l 3"]  # outward normals of the object there
 
     @staticmethod
     def of(energy: GraspEnergy, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"]) -> NearestPoints:

@@ -22,12 +22,9 @@ from dro_grasp.optimize.terms import PointTerm
 class Surroundings:
     """Signed distances to whatever is nearest, negative inside."""
 
-    plane: Float[Tensor, "4"] | None = None
-    """Upward unit normal of a plane, and its height along the normal [m]."""
-    obstacles: DistanceField | None = None
-    """Signed distances of other things."""
-    spared: Balls | None = None
-    """Places where the hand is not wanted."""
+    plane: Float[Tensor, "4"] | None = None  # upward unit normal of a plane, and its height along the normal [m]
+    obstacles: DistanceField | None = None  # signed distances of other things
+    spared: Balls | None = None  # places where the hand is not wanted
 
     @property
     def up(self) -> Float[Tensor, "3"] | None:
@@ -72,8 +69,7 @@ class Touching:
     """A place on an object, as balls, in which all contacts are to be."""
 
     place: Balls
-    clear: float
-    """Distance that the hand keeps from the object elsewhere [m]."""
+    clear: float  # distance that the hand keeps from the object elsewhere [m]
 
     def beside(self, points: Float[Tensor, "*b p 3"]) -> Bool[Tensor, "*b p"]:
         """Which points are outside the place."""

@@ -25,10 +25,8 @@ from dro_grasp.simulation.scene import TrialScene, scene_of
 class Penetration(Rows):
     """Penetration in n grasps."""
 
-    object: Float[np.ndarray, " n"]
-    """Deepest contact of hand and object [m]; zero without contact."""
-    own: Float[np.ndarray, " n"]
-    """Summed over pairs of hand links, the deepest contact of each pair [m]."""
+    object: Float[np.ndarray, " n"]  # deepest contact of hand and object [m]; zero without contact
+    own: Float[np.ndarray, " n"]  # summed over pairs of hand links, the deepest contact of each pair [m]
 
 
 def measure_penetration(scene: TrialScene, grasps: GraspBatch) -> Penetration:
@@ -87,11 +85,9 @@ class Contacts:
     """k contacts of one configuration."""
 
     bodies: Int[np.ndarray, "k 2"]
-    distance: Float[np.ndarray, " k"]
-    """Negative inside [m]."""
+    distance: Float[np.ndarray, " k"]  # negative inside [m]
     position: Float[np.ndarray, "k 3"]
-    normal: Float[np.ndarray, "k 3"]
-    """From the first body to the second."""
+    normal: Float[np.ndarray, "k 3"]  # from the first body to the second
 
 
 def find_contacts(model: mujoco.MjModel, qpos: Float[np.ndarray, "n nq"]) -> Iterator[Contacts]:

@@ -34,10 +34,8 @@ RESOLUTION = 1e-4  # Grasps that agree to this have the same draws [m or rad]. O
 class Conditions(Rows):
     """What differs from the protocol in n trials; the factors are those of Perturbations."""
 
-    shift: Float[np.ndarray, "n 3"]
-    """Displacement of the object, in its own frame [m]."""
-    turn: Float[np.ndarray, "n 3"]
-    """Rotation vector of the object about its centre of mass, in its own frame [rad]."""
+    shift: Float[np.ndarray, "n 3"]  # displacement of the object, in its own frame [m]
+    turn: Float[np.ndarray, "n 3"]  # rotation vector of the object about its centre of mass, in its own frame [rad]
     friction: Float[np.ndarray, " n"]
     mass: Float[np.ndarray, " n"]
     gain: Float[np.ndarray, " n"]
@@ -89,11 +87,9 @@ STATE = ("qpos", "qvel", "qacc_warmstart")  # Quantities that a trial needs to c
 class ObjectState(Rows):
     """The object in n trials, in the wrist frame."""
 
-    position: Float[np.ndarray, "n 3"]
-    """Centre of mass [m]."""
+    position: Float[np.ndarray, "n 3"]  # centre of mass [m]
     rotation: Float[np.ndarray, "n 3 3"]
-    stable: Bool[np.ndarray, " n"]
-    """Whether the simulation is sound so far."""
+    stable: Bool[np.ndarray, " n"]  # whether the simulation is sound so far
 
     def shift(self, other: ObjectState) -> Float[np.ndarray, " n"]:
         """Distance to another state [m]."""

@@ -32,11 +32,9 @@ from dro_grasp.kinds import Checked
 class Targets:
     """World positions for points that are fixed to links."""
 
-    positions: Float[Tensor, "*b t 3"]
-    """Where each point should be [m]."""
+    positions: Float[Tensor, "*b t 3"]  # where each point should be [m]
     links: Int[Tensor, " t"]
-    local: Float[Tensor, "t 3"]
-    """Each point in the frame of its link [m]."""
+    local: Float[Tensor, "t 3"]  # each point in the frame of its link [m]
 
 
 @dataclass(frozen=True)
@@ -46,25 +44,19 @@ class JointSolverConfig(Checked):
     max_iterations: int = 32
     step_limit: float = 0.5
     """Largest change of a joint or of a wrist coordinate per iteration [rad or m]. Source: section III-D."""
-    tolerance: float = 2e-5
-    """A grasp is done when no coordinate changes by more than this [rad or m]."""
+    tolerance: float = 2e-5  # a grasp is done when no coordinate changes by more than this [rad or m]
     objective_tolerance: float = 5e-4
     """A grasp is also done when a step lowers the objective by less than this share, or when two steps in a row fail
     to lower it."""
-    damping: float = 1e-2
-    """Initial damping, in units of the mean IRLS weight times `damping_length` squared."""
-    damping_range: tuple[float, float] = (1e-6, 1e8)
-    """Smallest and largest damping, in the same unit."""
+    damping: float = 1e-2  # initial damping, in units of the mean IRLS weight times `damping_length` squared
+    damping_range: tuple[float, float] = (1e-6, 1e8)  # smallest and largest damping, in the same unit
     damping_length: float = 0.01
     """Lever arm that gives the damping its scale [m]: it makes 1 rad of a joint comparable to so many metres."""
-    damping_decrease: float = 8.0
-    """Divides the damping after a step that lowers the objective (Levenberg-Marquardt)."""
+    damping_decrease: float = 8.0  # divides the damping after a step that lowers the objective (Levenberg-Marquardt)
     damping_increase: float = 16.0
     """Multiplies the damping after a step that does not; larger than the decrease, so that failures do not alternate."""
-    sharpness: float = 0.8
-    """Once steps are small: share of Newton's curvature in place of IRLS's; see joint_step."""
-    sharpen_below: float = 0.1
-    """Steps whose largest coordinate is below this count as small [rad or m]."""
+    sharpness: float = 0.8  # once steps are small: share of Newton's curvature in place of IRLS's; see joint_step
+    sharpen_below: float = 0.1  # steps whose largest coordinate is below this count as small [rad or m]
     step: StepConfig = field(default_factory=StepConfig)
 
 
@@ -73,12 +65,9 @@ class JointSolution:
     """Result of the solver, per grasp."""
 
     T_world_wrist: Float[Tensor, "*b 4 4"]
-    joints: Float[Tensor, "*b n_dof"]
-    """Independent joints, inside their limits [rad or m]."""
-    residual: Float[Tensor, "*b"]
-    """Mean distance of the points from their targets [m]."""
-    converged: Bool[Tensor, "*b"]
-    """Whether steps or gains fell below their tolerances."""
+    joints: Float[Tensor, "*b n_dof"]  # independent joints, inside their limits [rad or m]
+    residual: Float[Tensor, "*b"]  # mean distance of the points from their targets [m]
+    converged: Bool[Tensor, "*b"]  # whether steps or gains fell below their tolerances
     iterations: Int[Tensor, "*b"]
 
 
@@ -92,8 +81,7 @@ class _Problem:
     drive: Float[Tensor, "pairs k"]
     """Change of a pair's joint per unit of its dof where that joint moves the target, else zero; coordinate-major."""
     pair_link: Int[Tensor, " pairs"]
-    pair_dof: Float[Tensor, "n_dof pairs"] | None
-    """Sums pairs into dofs; None if pair i is dof i."""
+    pair_dof: Float[Tensor, "n_dof pairs"] | None  # sums pairs into dofs; None if pair i is dof i
     positions: Float[Tensor, "b t 3"]
     lower: Float[Tensor, "b n_dof"]
     upper: Float[Tensor, "b n_dof"]
@@ -109,11 +97,9 @@ class _State(Rows):
 
     T: Float[Tensor, "b 4 4"]
     q: Float[Tensor, "b n_dof"]
-    residual: Float[Tensor, "b k"]
-    """Points minus targets in the wrist frame, coordinate-major [m]."""
+    residual: Float[Tensor, "b k"]  # points minus targets in the wrist frame, coordinate-major [m]
     jacobian: Float[Tensor, "b p k"]
-    cost: Float[Tensor, " b"]
-    """Sum of smoothed norms [m]."""
+    cost: Float[Tensor, " b"]  # sum of smoothed norms [m]
     damping: Float[Tensor, " b"]
     sharpness: Float[Tensor, " b"]
     stalled: Int[Tensor, " b"]

@@ -28,8 +28,7 @@ from dro_grasp.kinds import Checked
 class StepConfig(Checked):
     """How precisely one step is solved. Values are ours."""
 
-    active_set_passes: int = 3
-    """Most solves with a corrected active set; they end when the set no longer changes."""
+    active_set_passes: int = 3  # most solves with a corrected active set; they end when the set no longer changes
     norm_floor: float = 3e-4
     """Below this, norms are replaced by parabolas [m]: the weights stay finite and the optimum moves by less than this."""
 

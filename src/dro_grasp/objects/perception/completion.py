@@ -34,17 +34,14 @@ class CompletedCloud(NamedTuple):
     """Both sides of an object."""
 
     points: Float[np.ndarray, "k 3"]
-    normals: Float[np.ndarray, "k 3"]
-    """Outward, of length 1."""
-    added: Bool[np.ndarray, " k"]
-    """Which points are completed, not seen; they come last."""
+    normals: Float[np.ndarray, "k 3"]  # outward, of length 1
+    added: Bool[np.ndarray, " k"]  # which points are completed, not seen; they come last
 
 
 class SurfaceFeatures(NamedTuple):
     """Input of the network at n places."""
 
-    guessed: Float[Tensor, "n 5"]
-    """Signed distances to the guesses [m]."""
+    guessed: Float[Tensor, "n 5"]  # signed distances to the guesses [m]
     features: Float[Tensor, "n 20"]
     """The same distances, squeezed by asinh. Squeezed likewise: distance to the nearest visible point, height over its tangent
     plane, distance from the image, height over the surface there, heights above the end and the top of the visible side.

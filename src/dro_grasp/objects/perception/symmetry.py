@@ -42,8 +42,7 @@ class Guess:
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
-    cost: float
-    """Disagreement with the visible side; 0 is best."""
+    cost: float  # disagreement with the visible side; 0 is best
 
 
 @dataclass(frozen=True)
@@ -52,22 +51,15 @@ class VisibleSide:
 
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
-    camera_distance: float | None
-    """Distance of the camera along z, if there is one [m]."""
-    sample: Int[np.ndarray, " sample"]
-    """Indices of the points that judge symmetries."""
-    rim: Int[np.ndarray, " rim"]
-    """Indices of the points where the visible side ends."""
-    expected_gap: Float[np.ndarray, " rim"]
-    """Expected gap between both sides at each rim point [m]: the hidden thickness there."""
+    camera_distance: float | None  # distance of the camera along z, if there is one [m]
+    sample: Int[np.ndarray, " sample"]  # indices of the points that judge symmetries
+    rim: Int[np.ndarray, " rim"]  # indices of the points where the visible side ends
+    expected_gap: Float[np.ndarray, " rim"]  # expected gap between both sides at each rim point [m]: the hidden thickness there
     smoothness: Float[np.ndarray, " rim"]
     """Weight of a kink at each rim point: confidence that the surface continues without an edge."""
-    width: float
-    """Smallest extent in the image [m]."""
-    end: float
-    """Height below which nothing is visible [m]."""
-    top: float
-    """Height above which nothing is visible [m]."""
+    width: float  # smallest extent in the image [m]
+    end: float  # height below which nothing is visible [m]
+    top: float  # height above which nothing is visible [m]
 
     @classmethod
     def of(
