@@ -16,11 +16,10 @@ from dro_grasp.grasps.controller import ControllerConfig
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation import rollout as rollouts
-from dro_grasp.simulation.closed_poses import held, settle
 from dro_grasp.simulation.holding import holding
 from dro_grasp.simulation.outcome import GIVE_UP, Failure
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, protocol
-from dro_grasp.simulation.trial import TrialResult, record, simulate
+from dro_grasp.simulation.trial import TrialResult, held, record, settle, simulate
 from tests.helpers.claw import ball, claw, grasps_of, power_grasp, wrist_below
 from tests.helpers.loaded_hands import loaded_hand
 

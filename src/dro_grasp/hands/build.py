@@ -14,15 +14,21 @@ from torch import Tensor
 
 from dro_grasp.errors import HandError, OptionError
 from dro_grasp.geometry.point_clouds import farthest_points
-from dro_grasp.hands.anatomy import Finger, find_fingers, find_palm_link, find_tips, fixed_below, path_to, rigid_groups
-from dro_grasp.hands.closing import Closing, ClosingFinder
-from dro_grasp.hands.description.loader import Description
-from dro_grasp.hands.description.part import named
+from dro_grasp.hands.anatomy import (
+    Finger,
+    find_fingers,
+    find_palm_link,
+    find_rods,
+    find_tips,
+    fixed_below,
+    path_to,
+    rigid_groups,
+)
+from dro_grasp.hands.closing import EARLY_CLOSINGS, MUCH_BETTER, WELL_ENCLOSED, Closing, ClosingFinder
+from dro_grasp.hands.description.loader import Description, named
 from dro_grasp.hands.hand import POINTS_PER_LINK, Hand
 from dro_grasp.hands.kinematics.tree import FIXED, KinematicTree
-from dro_grasp.hands.linkages import find_rods
 from dro_grasp.hands.opening import ROLLING_UP
-from dro_grasp.hands.palm import EARLY_CLOSINGS, MUCH_BETTER, WELL_ENCLOSED
 from dro_grasp.hands.surface import LinkSurface, sample_links
 
 TIP_OFFSET = 0.03  # Distance of the extra target beyond a fingertip [m]. Source: appendix, URDF file preprocessing

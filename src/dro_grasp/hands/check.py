@@ -16,14 +16,13 @@ from dro_grasp.geometry.point_clouds import enclosed_volume
 from dro_grasp.geometry.rendering.rasterizer import Camera, Mesh, arrow, render
 from dro_grasp.hands.anatomy import Finger
 from dro_grasp.hands.build import LONGEST_REACH, build_hand, reach
+from dro_grasp.hands.closing import fixed_jaw_of
 from dro_grasp.hands.description.compiling import Note
-from dro_grasp.hands.description.loader import Description
-from dro_grasp.hands.description.part import named
+from dro_grasp.hands.description.loader import Description, named
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.kinematics.tree import KinematicTree
 from dro_grasp.hands.library import load_hand_description
 from dro_grasp.hands.opening import FingerMotion, opening_notes
-from dro_grasp.hands.palm import fixed_jaw_of
 
 TILE = (560, 520)  # Width and height of one view [pixels]
 COLOURS = {"contact": (0.93, 0.66, 0.30), "other": (0.62, 0.66, 0.72), "direction": (0.85, 0.15, 0.15),

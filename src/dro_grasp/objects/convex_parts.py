@@ -13,12 +13,12 @@ from scipy.spatial import ConvexHull
 from dro_grasp.errors import ObjectError
 from dro_grasp.geometry.point_clouds import even_directions
 from dro_grasp.objects.cache import Arrays, cached_arrays, content_hash
-from dro_grasp.objects.repair import OPEN_FILL
 from dro_grasp.objects.surface_distances import signed_distances
 
 THRESHOLD = 0.08  # CoACD's concavity threshold [1] (ours)
 MAX_PARTS = 24  # Most parts of one object (ours)
 MAX_VERTICES = 64  # Most vertices of one part (ours): collision cost grows with them
+OPEN_FILL = 0.05  # Share of its hull that a mesh with holes must fill (ours); a bent sheet appears to fill a little
 COARSE_VERTICES = 48  # Most vertices of a coarse part. Ours: the surface of a ball then lies up to 9 % of its radius inside
 COARSE_SHARE = 0.5  # Share of the parts that is left, rounded up (ours)
 

@@ -10,8 +10,7 @@ import trimesh
 from numpy.random import Generator
 
 from dro_grasp.errors import ObjectError
-from dro_grasp.objects.builtin import Pieces, assemble
-from dro_grasp.objects.primitives import Point, Solid, box, frustum, hollow, ring, superquadric, turned
+from dro_grasp.objects.builtin import Pieces, Point, Solid, assemble, box, frustum, hollow, ring, superquadric, turned
 from dro_grasp.objects.shape import ObjectModel
 
 NAME = re.compile(r"procedural_(\d{1,9})")  # Name of such an object; the number is its seed

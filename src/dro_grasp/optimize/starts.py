@@ -14,8 +14,7 @@ from dro_grasp.geometry.distance_field import Ball, Balls, DistanceField
 from dro_grasp.geometry.se3 import apply_to_cloud, compose, random_rotations, roma, rotate, rotation_between
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
-from dro_grasp.optimize.grasp_energy import EnergyConfig
-from dro_grasp.optimize.workspace import Surroundings
+from dro_grasp.optimize.grasp_energy import EnergyConfig, Surroundings
 
 Direction = tuple[float, float, float]  # A vector in the object's frame, of any length but zero
 CLEAR = EnergyConfig.clear  # Distance from its surroundings at which a hand starts [m]: the one that it keeps later

@@ -26,8 +26,8 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked, checked
 from dro_grasp.objects.shape import ObjectModel, solid_of
 from dro_grasp.pictures.appearance import CONTACT_COLOUR, best_camera, hand_meshes, object_meshes, success_colour
-from dro_grasp.simulation.closed_poses import held
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
+from dro_grasp.simulation.trial import held
 
 TILE = (320, 280)  # Width and height of the picture of one grasp [pixels]
 PIXELS_AT_ONCE = 2048 * 2048  # Pixels that are drawn side by side (ours): bounds the memory

@@ -16,9 +16,8 @@ from dro_grasp.geometry.distance_field import Ball, Balls
 from dro_grasp.kinds import Checked, plain
 from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimize.grasp_energy import Room
+from dro_grasp.optimize.grasp_energy import Room, Surroundings
 from dro_grasp.optimize.starts import Direction
-from dro_grasp.optimize.workspace import Surroundings
 
 ELSEWHERE = 0.01  # A table farther than this from the one in the cloud is another [m] (ours)
 UPRIGHT = math.cos(math.radians(5.0))  # Least cosine between z and the normal of a table whose height along z is given (ours)
