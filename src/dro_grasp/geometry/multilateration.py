@@ -84,11 +84,9 @@ def _spread(anchors: Float[Tensor, "*b m 3"]) -> _Cloud:
 
 
 def _closed_form(distances: Float[Tensor, "*b n m"], cloud: _Cloud, config: MultilaterationConfig) -> Float[Tensor, "*b n 3"]:
-    """Linear least squares about the anchors' mean: one 3x3 inverse per cloud, one product for all rows.
-
-    With anchors q of zero mean, |p|^2 - 2 q.p = d^2 - |q|^2. Its mean over the anchors removes |p|^2 and leaves
-    2 q.p = (|q|^2 - d^2) - mean, whose normal matrix is the anchors' covariance.
-    """
+    """Linear least squares about the anchors' mean: one 3x3 inverse per cloud, one product for all rows."""
+    # With anchors q of zero mean, |p|^2 - 2 q.p = d^2 - |q|^2. Its mean over the anchors removes |p|^2 and leaves 2 q.p =
+    # (|q|^2 - d^2) - mean, whose normal matrix is the anchors' covariance.
     q = cloud.points
     count = q.shape[-2]
     inverse = cloud.axes @ ((1 / (cloud.variance + config.ridge))[..., None] * cloud.axes.mT)
@@ -123,10 +121,8 @@ def _refine(
     start: Float[Tensor, "*b n 3"], distances: Float[Tensor, "*b n m"], anchors: Float[Tensor, "*b m 3"],
     config: MultilaterationConfig,
 ) -> Float[Tensor, "*b n 3"]:
-    """Gauss-Newton steps; autograd sees the last one alone.
-
-    At the minimum, its derivative by the distances is that of the minimum itself (up to second-order terms).
-    """
+    """Gauss-Newton steps; autograd sees the last one alone."""
+    # At the minimum, its derivative by the distances is that of the minimum itself (up to second-order terms).
     stride = max(1, anchors.shape[-2] // config.approach_anchors)
     with torch.no_grad():
         points = start
@@ -166,10 +162,8 @@ def _outer_products(
 
 
 def _distances(points: Float[Tensor, "*b n 3"], anchors: Float[Tensor, "*b m 3"]) -> Float[Tensor, "*b n m"]:
-    """Distances by one matrix product, for points about the anchors' mean.
-
-    Cancellation then costs less than a micrometre beyond 5 mm of distance, and the time is a tenth of cdist's.
-    """
+    """Distances by one matrix product, for points about the anchors' mean."""
+    # Cancellation then costs less than a micrometre beyond 5 mm of distance, and the time is a tenth of cdist's.
     inner = points @ anchors.mT
     squared = points.square().sum(-1)[..., None] + anchors.square().sum(-1)[..., None, :] - 2 * inner
     return squared.clamp(min=1e-10).sqrt()
@@ -220,12 +214,10 @@ def choose_sides(
 def _cut(
     local: Float[Tensor, "l p 3"], weight: Float[Tensor, "l p"], height: Float[Tensor, "b l p"], config: SideConfig
 ) -> Bool[Tensor, "b l p"]:
-    """Side of the plane for each point of each body, up to exchanging the sides.
-
-    A point's height over the plane is linear in its own coordinates, h = a . (x, 1), and the distances give |h|. So
-    h^2 = (x, 1)^T (a a^T) (x, 1) is linear in the ten entries of the symmetric matrix a a^T: a least-squares fit gives
-    them, and a is the leading eigenvector.
-    """
+    """Side of the plane for each point of each body, up to exchanging the sides."""
+    # A point's height over the plane is linear in its own coordinates, h = a . (x, 1), and the distances give |h|. So h^2 = (x,
+    # 1)^T (a a^T) (x, 1) is linear in the ten entries of the symmetric matrix a a^T: a least-squares fit gives them, and a is
+    # the leading eigenvector.
     count = weight.sum(-1)[:, None, None]
     centred = local - (local * weight[..., None]).sum(1, keepdim=True) / count
     size = ((centred.square() * weight[..., None]).sum((1, 2), keepdim=True) / count).sqrt().clamp(min=1e-6)

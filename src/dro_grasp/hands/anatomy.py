@@ -68,11 +68,7 @@ def rigid_groups(tree: KinematicTree) -> tuple[int, ...]:
 
 
 def find_tips(tree: KinematicTree, shaped: Collection[int]) -> tuple[int, ...]:
-    """Fingertips: below each last moving joint, the deepest link with a (visual or collision) shape.
-
-    Raises:
-        HandError: No moving joint carries a shape, or too many end in one.
-    """
+    """The deepest link with a shape below each last moving joint; HandError: there is none, or there are too many."""
     paths = [path_to(tree, link) for link in range(tree.n_links)]
     last_moving = {link: max((i for i in paths[link] if tree.kind[i] != FIXED), default=None) for link in shaped}
     tips = []
@@ -115,13 +111,8 @@ def find_fingers(
     """The finger of each tip.
 
     A link that carries one tip, or a rod of its finger, belongs to that finger; a link that carries none belongs to the finger
-    of its parent. A link fixed to the palm belongs to no finger, even if it carries one, because it does not move.
-
-    Args:
-        rods: As `find_rods` gives them.
-
-    Raises:
-        HandError: A finger has more joints than any has.
+    of its parent. A link fixed to the palm belongs to no finger, even if it carries one, because it does not move. `rods` are as
+    `find_rods` gives them. HandError: a finger has more joints than any has.
     """
     still, below = set(fixed_below(tree, palm)), tree.descends[:, palm].tolist()
     chains = [tuple(i for i in path_to(tree, tip) if below[i] and i not in still) for tip in tips]

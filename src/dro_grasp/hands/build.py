@@ -44,16 +44,10 @@ MOST_NAMED = 6  # Most hands that an error names (ours)
 
 
 def build_hand(description: Description, *, name: str | None = None, seed: int = 0, n_points: int = 512) -> Hand:
-    """Derive everything the method needs from a description.
+    """Derive everything the method needs from a description; the file's stem is the hand's name by default.
 
-    Args:
-        name: Name of the hand in files and tables; the file's stem by default.
-        seed: Seed of the point sampling.
-        n_points: Surface points to keep: enough for the fingertips, and no more than are sampled (SAMPLES_PER_LINK on a link).
-
-    Raises:
-        HandError: The description has no finger, no link with a surface, or a size that no hand has.
-        OptionError: So many points cannot be kept.
+    Of the surface points, `n_points` are kept: enough for the fingertips, and no more than are sampled (SAMPLES_PER_LINK on a
+    link), else OptionError. HandError: the description has no finger, no link with a surface, or a size that no hand has.
     """
     try:
         hand = HandBuilder(description, seed).build(name or description.name)
@@ -225,11 +219,7 @@ def find_hands(tree: KinematicTree, tips: Sequence[int]) -> list[int]:
 
 
 def require_one_hand(tree: KinematicTree, tips: Sequence[int], palm: int, file: str) -> None:
-    """Refuse a whole robot, of which nobody could say what its hand is.
-
-    Raises:
-        HandError: It has several hands, or one beside other moving ends, or arms alone; the message says how to ask for one.
-    """
+    """Refuse a robot with several hands, one beside other moving ends, or arms alone; the HandError says how to ask for one."""
     hands = find_hands(tree, tips)
     if hands and not bool(tree.descends[list(tips), hands[0]].all()):
         more = ", ..." if len(hands) > MOST_NAMED else ""

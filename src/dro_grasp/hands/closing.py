@@ -65,11 +65,7 @@ class Palm:
 
 
 def find_palm(palm_points: Points, palm_normals: Points, fingers: list[Float[np.ndarray, "_ 3"]]) -> Palm:
-    """The palm in front of which palm and fingers, given by surface points [m] and outward normals, enclose a ball best.
-
-    Raises:
-        HandError: They enclose nothing.
-    """
+    """The palm before which surface points [m] of palm and fingers enclose a ball best; HandError: they enclose nothing."""
     everything = np.concatenate([palm_points, *fingers])
     try:
         hull = ConvexHull(everything)

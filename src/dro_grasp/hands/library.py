@@ -75,11 +75,7 @@ class HandFile(NamedTuple):
 
 
 def locate_hand(name: str | Path) -> HandFile:
-    """The file of a hand, and its part; the file need not exist.
-
-    Raises:
-        HandError: No hand has this name.
-    """
+    """The file of a hand, and its part; the file need not exist. HandError: no hand has this name."""
     text, link = split_part(str(name))
     path, label = _locate(text)
     return HandFile(path, named(label, link), link)

@@ -46,11 +46,7 @@ class LinkSurface:
 
 
 def sample_links(description: Description, links: list[int], seed: int) -> LinkSurface:
-    """Dense samples on the collision shapes as MuJoCo uses them, or on the visual shapes of links without any.
-
-    Raises:
-        HandError: The shapes of a link have no area.
-    """
+    """Samples of links' collision shapes as MuJoCo uses them, or else of visual ones; HandError: a link's have no area."""
     generator = torch.Generator().manual_seed(seed)
     points, normals, index = [], [], []
     for link in links:

@@ -99,10 +99,8 @@ def unpack(stored: Arrays) -> tuple[Part, ...]:
 
 
 def coarse_parts(parts: Sequence[Part]) -> tuple[Part, ...]:
-    """Half as many parts: those whose common hull adds the least volume are joined, pair by pair; each is then simplified.
-
-    A part keeps the vertices that are outermost in evenly spread directions, so thin parts stay solid. Cached.
-    """
+    """Half as many parts: those whose common hull adds the least volume are joined, pair by pair; each is then simplified."""
+    # A part keeps the vertices that are outermost in evenly spread directions, so thin parts stay solid. Cached.
     key = content_hash(*(array for part in parts for array in part))
     settings = f"{COARSE_VERTICES}-{COARSE_SHARE * 100:.0f}"
     stored = cached_arrays(f"coarse-{key[:24]}-{settings}", lambda: pack(_joined(parts)))

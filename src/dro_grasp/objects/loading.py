@@ -187,10 +187,8 @@ def check_scale(scale: float) -> None:
 
 
 def check_extent(points: Float[np.ndarray, "n 3"], origin: str, scale: float = 1.0) -> None:
-    """Refuse sizes and places that are implausible in metres, by an ObjectError that suggests a scale.
-
-    Most files state no unit, and a wrong guess would grasp air.
-    """
+    """Refuse sizes and places that are implausible in metres, by an ObjectError that suggests a scale."""
+    # Most files state no unit, and a wrong guess would grasp air.
     largest, farthest = float(np.ptp(points, axis=0).max()), float(np.abs(points).max())
     if SMALLEST <= largest <= LARGEST and farthest > FARTHEST:
         raise ObjectError(f"{origin} has coordinates of up to {farthest:.3g} m, too large for single precision; move it to "
@@ -239,10 +237,8 @@ def repair(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
 
 
 def mass_properties(mesh: trimesh.Trimesh, origin: str, notes: list[str]) -> MassProperties:
-    """Volume, centre of mass and inertia; an ObjectError if not even the convex hull encloses a volume.
-
-    A mesh with holes is measured by the points inside by their winding number, a sheet by its convex hull.
-    """
+    """Volume, centre of mass and inertia; an ObjectError if not even the convex hull encloses a volume."""
+    # A mesh with holes is measured by the points inside by their winding number, a sheet by its convex hull.
     hull = _hull(mesh)
     box = float(np.prod(mesh.extents))
     if hull is None or hull.volume < max(LEAST_FILL * box, 1e-9):  # [m^3] (ours)

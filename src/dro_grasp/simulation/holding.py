@@ -124,11 +124,9 @@ def _contacts(rollout: Rollout) -> list[ContactForces]:
 
 
 def unanswered(contacts: list[ContactForces], mass: Float[Tensor, " n"], friction: float) -> Float[Tensor, "n 2"]:
-    """What is missing for the contacts to answer pushes: for the worst of six directions, and on average.
-
-    Each contact may change its force within its friction cone; a change relative to its present pressure costs as much as a
-    share of the push that stays unanswered.
-    """
+    """What is missing for the contacts to answer pushes: for the worst of six directions, and on average."""
+    # Each contact may change its force within its friction cone; a change relative to its present pressure costs as much as a
+    # share of the push that stays unanswered.
     n = len(contacts)
     normal, arm = torch.zeros(n, CONTACTS, 3), torch.zeros(n, CONTACTS, 3)
     normal[..., 2], pressure = 1.0, torch.zeros(n, CONTACTS)

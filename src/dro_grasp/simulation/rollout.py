@@ -50,10 +50,8 @@ class Conditions(Rows):
 
 
 def draw(config: Perturbations, grasps: GraspBatch) -> Conditions:
-    """Conditions of all trials but the first: the second trial of every grasp, then the third, and so on.
-
-    A grasp's position and joints are the seed of its draws, so they depend neither on its company nor on a file between.
-    """
+    """Conditions of all trials but the first: the second trial of every grasp, then the third, and so on."""
+    # A grasp's position and joints are the seed of its draws, so they depend neither on its company nor on a file between.
     k = config.trials - 1
     drawn = [_draw(config, k, _generator(p, q)) for p, q in zip(grasps.T_object_wrist[:, :3, 3], grasps.joints, strict=True)]
     columns = {name: np.stack([d[name] for d in drawn], 1) for name in ("shift", "turn", *FACTORS)}

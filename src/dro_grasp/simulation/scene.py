@@ -53,11 +53,9 @@ def hand_spec(hand: Hand, protocol: Protocol) -> mujoco.MjSpec:
 
 
 def let_touch(geom: mujoco.MjsGeom) -> None:
-    """Let a geom of a robot touch objects as all do, whatever its file says of its contacts; one that is only drawn stays so.
-
-    Of two geoms of the same priority, a contact takes the larger dimension: four with an object, the normal between links.
-    With friction there, the Newton solver of MuJoCo 4.0.0 diverges at times, and 1 % of the trials explode.
-    """
+    """Let a geom of a robot touch objects as all do, whatever its file says of its contacts; one that is only drawn stays so."""
+    # Of two geoms of the same priority, a contact takes the larger dimension: four with an object, the normal between links.
+    # With friction there, the Newton solver of MuJoCo 4.0.0 diverges at times, and 1 % of the trials explode.
     geom.condim, geom.margin, geom.gap, geom.priority = 1, 0.0, 0.0, 0
     if (geom.contype or geom.conaffinity) and not (geom.contype | geom.conaffinity) & 1:
         geom.contype |= 1  # the bit of objects
@@ -74,10 +72,8 @@ def attach(scene: mujoco.MjSpec, part: mujoco.MjSpec, frame: mujoco.MjsFrame, pr
 
 
 def add_servos(scene: mujoco.MjSpec, hand: Hand, protocol: Protocol) -> None:
-    """Position servos on the independent joints, all hands alike.
-
-    They are added to the scene, not to the hand, whose description may set defaults for actuators.
-    """
+    """Position servos on the independent joints, all hands alike."""
+    # They are added to the scene, not to the hand, whose description may set defaults for actuators.
     for joint in scene.joints:
         if joint.name.removeprefix(PREFIX) not in hand.tree.joint_names:
             continue
@@ -214,12 +210,7 @@ def scene_of(hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | P
 
 
 def require_simulable(hand: Hand, obj: ObjectModel) -> None:
-    """Refuse a hand or an object that no trial can have.
-
-    Raises:
-        ObjectError: The object is a bare point cloud, without balls that stand for it.
-        HandError: The hand came without its description.
-    """
+    """Refuse a cloud without balls that stand for it (ObjectError), and a hand without its description (HandError)."""
     if obj.is_cloud and obj.balls is None:
         raise ObjectError(f"object '{obj.name}' is a bare point cloud; a trial needs a mesh (--object); or use --protocol none")
     if hand.description is None:
@@ -252,10 +243,9 @@ def _empty_scene(protocol: Protocol) -> mujoco.MjSpec:
 
 
 def add_object(scene: mujoco.MjSpec, obj: ObjectModel, protocol: Protocol, name: str = "object") -> mujoco.MjsBody:
-    """The object as its convex parts, or as its balls, with its mass and inertia; body and free joint have the name.
-
-    The body's frame is at the centre of mass: MuJoCo integrates its origin, which errs where a body turns about another point.
-    """
+    """The object as its convex parts, or as its balls, with its mass and inertia; body and free joint have the name."""
+    # The body's frame is at the centre of mass: MuJoCo integrates its origin, which errs where a body turns about another
+    # point.
     body = scene.worldbody.add_body(name=name, pos=FAR_AWAY)
     middle = obj.centre_of_mass
     body.add_freejoint(name=name)
@@ -283,10 +273,8 @@ def object_mass(obj: ObjectModel, protocol: Protocol) -> float:
 
 
 def _exclude_resting_contacts(scene: mujoco.MjSpec, hand: Hand) -> None:
-    """Exclude contacts of links that touch in the open hand, fingers side by side, and of each link with its parent.
-
-    Fingers that cross must collide. MuJoCo's own parent-child filter ignores static parents.
-    """
+    """Exclude contacts of links that touch in the open hand, fingers side by side, and of each link with its parent."""
+    # Fingers that cross must collide. MuJoCo's own parent-child filter ignores static parents.
     model = scene.compile()
     data = mujoco.MjData(model)
     addresses, moving = joint_addresses(model, hand)

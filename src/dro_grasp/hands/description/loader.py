@@ -32,16 +32,12 @@ OPEN = "open"  # Name of the state or keyframe (ours; MoveIt's own examples use 
 
 
 def load_description(path: Path | str, link: str | None = None, *, arm: bool = False) -> Description:
-    """Read a URDF or MJCF file, or the part of it that begins at a link.
+    """Read a URDF or MJCF file, or the part of it that begins at a link; HandError: it cannot be used, or has no such link.
 
     Args:
-        path: The file.
         link: The link at which the hand begins; by default the file is the hand's, or the arm's.
         arm: Read the arm instead of the hand, up to this link. Its root stands still; a hand is free, so joints that move all
             of it are left out.
-
-    Raises:
-        HandError: The file cannot be used, or has no such link; the message gives the reason and a remedy.
     """
     path = given_path(path)
     root = parse_xml(path)
@@ -155,11 +151,7 @@ def _digest(path: Path, files: tuple[Path, ...], link: str | None) -> str:
 
 
 def open_state(srdf: Path) -> dict[str, float]:
-    """Joint values of every `<group_state name="open">` of an SRDF file [rad or m]; empty if it has none.
-
-    Raises:
-        HandError: The file is not valid XML, or a value is not a number.
-    """
+    """Joints in every `<group_state name="open">` of an SRDF [rad or m]; HandError: it is no XML, or a value is no number."""
     stated = {}
     for state in parse_xml(srdf).iter("group_state"):
         for joint in state.iter("joint") if state.get("name") == OPEN else ():

@@ -30,9 +30,7 @@ def keep_hand_only(spec: mujoco.MjSpec, path: Path, *, fixed_base: bool = False)
     """Reduce a file, in place, to its largest articulated body tree, with its root at identity.
 
     Everything else that is not the hand is deleted, and unless the base is fixed the joints that move all of the hand, too.
-
-    Raises:
-        HandError: Nothing moves, or a joint is neither a hinge nor a slide.
+    HandError: nothing moves, or a joint is neither a hinge nor a slide.
     """
     notes: list[Note] = []
     hand = _largest_tree(spec, path)

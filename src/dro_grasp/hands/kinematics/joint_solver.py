@@ -91,11 +91,9 @@ def _update(
 def _joint_value(
     tree: KinematicTree, motion: Float[Tensor, "*b s 4 4"], moving: Int[Tensor, " s"], near: Float[Tensor, "*b s"]
 ) -> Float[Tensor, "*b s"]:
-    """Angle about, or shift along, each joint's axis a that comes closest to a motion (R, t).
-
-    The rotation about a closest to R in the Frobenius norm maximises trace(R(x)^T R), which is
-    sin(x) (a . v) + cos(x) (trace R - a^T R a) + a^T R a, with v the axial vector of R - R^T.
-    """
+    """Angle about, or shift along, each joint's axis a that comes closest to a motion (R, t)."""
+    # The rotation about a closest to R in the Frobenius norm maximises trace(R(x)^T R), which is sin(x) (a . v) + cos(x) (trace
+    # R - a^T R a) + a^T R a, with v the axial vector of R - R^T.
     axis = tree.axis[moving]
     rotation = motion[..., :3, :3]
     turned = torch.stack([
@@ -173,11 +171,9 @@ def best_step(
 def _model(
     jacobian: Float[Tensor, "b p k"], residual: Float[Tensor, "b k"], sharpness: Float[Tensor, " b"] | None, config: StepConfig
 ) -> tuple[Float[Tensor, "b p p"], Float[Tensor, "b p"]]:
-    """Curvature H and slope g of the sum of norms.
-
-    With weights w_i = 1 / |r_i|, IRLS has H = sum w_i J_i^T J_i. The correction -s w_i (J_i^T u_i)(J_i^T u_i)^T is of rank
-    one per target, so it joins the same matrix product as one more column per target.
-    """
+    """Curvature H and slope g of the sum of norms."""
+    # With weights w_i = 1 / |r_i|, IRLS has H = sum w_i J_i^T J_i. The correction -s w_i (J_i^T u_i)(J_i^T u_i)^T is of rank
+    # one per target, so it joins the same matrix product as one more column per target.
     norms = point_norms(residual)
     floored = norms.clamp(min=config.norm_floor)
     scale = floored.reciprocal()
@@ -206,12 +202,10 @@ def smoothed_norms(residual: Float[Tensor, "*b k"], floor: float) -> Float[Tenso
 
 
 def _minimum_in_box(quadratic: _Quadratic, passes: int) -> Float[Tensor, "b p"]:
-    """Minimum of the quadratic in its box, by a primal-dual active set.
-
-    Each unknown is free, held at its lower bound or held at its upper bound. A pass minimises over the free unknowns. Then
-    a free unknown beyond a bound is held there, and a held unknown is released if the slope pulls it back inside. Most
-    sets settle in two or three passes; passes after the first one see only the rows whose set has changed.
-    """
+    """Minimum of the quadratic in its box, by a primal-dual active set."""
+    # Each unknown is free, held at its lower bound or held at its upper bound. A pass minimises over the free unknowns. Then a
+    # free unknown beyond a bound is held there, and a held unknown is released if the slope pulls it back inside. Most sets
+    # settle in two or three passes; passes after the first one see only the rows whose set has changed.
     lower, upper, gradient = quadratic.lower, quadratic.upper, quadratic.gradient
     # Joints that cannot move have equal bounds: they stay at the lower one whatever the slope.
     frozen = lower >= upper
@@ -242,10 +236,8 @@ def _pass(
 
 
 def _solve_free(quadratic: _Quadratic, at_lower: Bool[Tensor, "b p"], at_upper: Bool[Tensor, "b p"]) -> Float[Tensor, "b p"]:
-    """Minimum over the free unknowns, with the others at their bounds.
-
-    Rows and columns of held unknowns become those of the identity, so that all problems of the batch keep one size.
-    """
+    """Minimum over the free unknowns, with the others at their bounds."""
+    # Rows and columns of held unknowns become those of the identity, so that all problems of the batch keep one size.
     fixed = at_lower | at_upper
     value = torch.where(at_lower, quadratic.lower, torch.where(at_upper, quadratic.upper, 0.0))
     free = (~fixed).to(value.dtype)
@@ -452,11 +444,9 @@ def _state(problem: _Problem, T: Float[Tensor, "b 4 4"], q: Float[Tensor, "b n_d
 def _jacobian(
     problem: _Problem, poses: Float[Tensor, "b n_links 4 4"], points: Float[Tensor, "b t 3"]
 ) -> Float[Tensor, "b p k"]:
-    """Transposed derivative of the points with respect to wrist shift, wrist rotation and joints.
-
-    A twist (v, w) moves a point p by v + w x p. `twist` holds this map, six rows over all coordinates; it is the wrist's
-    part of the Jacobian, and a joint's row is its own twist times these six rows.
-    """
+    """Transposed derivative of the points with respect to wrist shift, wrist rotation and joints."""
+    # A twist (v, w) moves a point p by v + w x p. `twist` holds this map, six rows over all coordinates; it is the wrist's part
+    # of the Jacobian, and a joint's row is its own twist times these six rows.
     zero, one = torch.zeros_like(points[..., 0]), torch.ones_like(points[..., 0])
     x, y, z = points.unbind(-1)
     # Entry 3 i + c: coordinate c of a point's velocity per unit of twist coordinate i.

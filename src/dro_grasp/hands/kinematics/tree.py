@@ -106,11 +106,9 @@ class KinematicTree:
 
     @cached_tensor
     def _local_basis(self) -> Float[Tensor, "4 n_links 4 4"]:
-        """Four constant matrices B_k per link: T_parent_link = B_0 + sin(x) B_1 + (1 - cos(x)) B_2 + x B_3.
-
-        For an axis a through the anchor c, Rodrigues' formula is R = I + sin(x) K + (1 - cos(x)) K^2, K = [a]_x, and the
-        motion is p -> R (p - c) + c: K c and K^2 c move into the translation. A slide is x a.
-        """
+        """Four constant matrices B_k per link: T_parent_link = B_0 + sin(x) B_1 + (1 - cos(x)) B_2 + x B_3."""
+        # For an axis a through the anchor c, Rodrigues' formula is R = I + sin(x) K + (1 - cos(x)) K^2, K = [a]_x, and the
+        # motion is p -> R (p - c) + c: K c and K^2 c move into the translation. A slide is x a.
         turns = self._revolute[:, None]
         slides = torch.tensor(self.kind, device=self.axis.device)[:, None] == PRISMATIC
         k = _skew(self.axis * turns)

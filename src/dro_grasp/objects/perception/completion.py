@@ -73,11 +73,9 @@ class VisibleSide:
     def of(
         cls, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], camera_distance: float | None
     ) -> VisibleSide:
-        """Find the rim, and predict how the surface continues there.
-
-        In an image, a point belongs to the rim if its neighbours lie to one side of it. A cloud cut by a plane has its rim
-        along the cut, at its lowest points.
-        """
+        """Find the rim, and predict how the surface continues there."""
+        # In an image, a point belongs to the rim if its neighbours lie to one side of it. A cloud cut by a plane has its rim
+        # along the cut, at its lowest points.
         image, height = project(points, camera_distance), points[:, 2]
         angles = np.linspace(0, np.pi, 16, endpoint=False)
         width = float(np.ptp(image @ np.stack([np.cos(angles), np.sin(angles)]), axis=0).min())
@@ -148,11 +146,9 @@ class VisibleSide:
         return [(M, np.array([*middle, start - depth * self.width])) for depth in DEPTHS for M in linear]
 
     def cost(self, linear: Float[np.ndarray, "3 3"], centre: Float[np.ndarray, "3"]) -> float:
-        """Disagreement of a symmetry with the visible side; 0 is best.
-
-        The sum of three means: the distance of moved points from where they would be hidden, the deviation of the gap at
-        the rim from the expected one, and the kink 1 - n_moved . n_rim between the normals that meet there.
-        """
+        """Disagreement of a symmetry with the visible side; 0 is best."""
+        # The sum of three means: the distance of moved points from where they would be hidden, the deviation of the gap at the
+        # rim from the expected one, and the kink 1 - n_moved . n_rim between the normals that meet there.
         wrong = self._exposure((self.points[self.sample] - centre) @ linear.T + centre)
         # The guess is the image of the visible side. As the motion is its own inverse, the distance of a rim point from the
         # guess equals the distance of the moved rim point from the visible side, so one search tree serves all motions.
