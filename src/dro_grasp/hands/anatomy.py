@@ -111,8 +111,8 @@ def find_fingers(
     """The finger of each tip.
 
     A link that carries one tip, or a rod of its finger, belongs to that finger; a link that carries none belongs to the finger
-    of its parent. A link fixed to the palm belongs to no finger, even if it carries one, because it does not move. `rods` are as
-    `find_rods` gives them. HandError: a finger has more joints than any has.
+    of its parent. A link fixed to the palm belongs to no finger, even if it carries one, because it does not move. `rods` are
+    as `find_rods` gives them. HandError: a finger has more joints than any has.
     """
     still, below = set(fixed_below(tree, palm)), tree.descends[:, palm].tolist()
     chains = [tuple(i for i in path_to(tree, tip) if below[i] and i not in still) for tip in tips]
@@ -139,11 +139,7 @@ def measure_opposition(
     tree: KinematicTree, q: Joints, rate: Joints, tips: Sequence[int],
     tip_offsets: Float[Tensor, "n_tips 3"],
 ) -> Float[Tensor, " n_tips"]:
-    """How much each fingertip moves against the others at joints `q`, while all joints close at `rate`.
-
-    Returns:
-        Minus the mean cosine to the other tips' directions: -1 if all move alike, 1 if the others all move the opposite way.
-    """
+    """Minus the mean cosine of each fingertip's motion to the others', at joints that close at `rate`: -1 if all move alike."""
     poses, links = tree.forward(q), torch.tensor(tips, device=q.device)
     points = se3.apply(poses[links], tip_offsets)
     velocity = tree.point_jacobian(poses, points, links) @ rate
@@ -218,13 +214,10 @@ class _End:
 
 
 def find_rods(tree: KinematicTree, tips: Sequence[int], geometry: Sequence[LinkGeometry]) -> dict[int, int]:
-    """The rods among the last links of a hand.
+    """For each rod among the last links the tip of the finger that it is pinned to.
 
     Two last links that turn about one point in all postures are pinned together. The rod is the one that reaches less far
     from the link where their chains part.
-
-    Returns:
-        For each rod, which is the end of a chain as `find_tips` gives it, the tip of the finger that it is pinned to.
     """
     if tree.n_dof == len(tree.moving_names):
         return {}  # a linkage has joints that follow

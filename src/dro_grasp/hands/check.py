@@ -182,15 +182,7 @@ def _words(value: Any) -> list[str]:
 
 
 def picture(hand: Hand, path: Path | str) -> None:
-    """Draw the hand open and closed, with its contact links, its palm direction and the path of each fingertip.
-
-    Args:
-        hand: From `load_hand` or a report; it needs its description.
-        path: PNG to write.
-
-    Raises:
-        OutputError: It cannot be written.
-    """
+    """Draw the hand, which needs its description, open and closed; OutputError: the PNG cannot be written."""
     from PIL import Image, ImageDraw, ImageFont
 
     path = check_output(path)

@@ -116,11 +116,7 @@ class FixedJaw:
 def find_fixed_jaw(before: Points, points: Points, on_palm: Mask, on_finger: Mask) -> FixedJaw | None:
     """The jaw that a nearly closed finger approaches; None if the palm has no such part, as a flat palm or a block alone.
 
-    Along the finger, the jaw begins where the part of the palm ends that the closing finger has passed.
-
-    Args:
-        before: Surface points of the hand a little before [m].
-        points: The same points when it is nearly closed [m].
+    Surface points are those when it is nearly closed and those a little before [m].
     """
     if not on_palm.any() or (on_palm & on_finger).any():
         return None
@@ -293,11 +289,7 @@ class ClosingFinder:
     def signs_at_limits(self, signs: Joints, abduction: JointMask, spreads: JointMask, centre: Point) -> Joints:
         """Opening signs by what each joint does from limit to limit, with the others at rest or, by these signs, half closed.
 
-        Args:
-            signs: Opening signs so far.
-            abduction: The joints that are at rest when the hand is half closed.
-            spreads: Joints that do not close anything.
-            centre: The grasp centre [m].
+        Abduction joints are at rest when the hand is half closed, `spreads` close nothing; `centre` is the grasp centre [m].
         """
         bases = (self.rest, self.posture(self.opened(signs), signs, abduction, 0.5))
         tips, targets = (self.motion.links, self.motion.tip_points), (centre, self.palm_middle)

@@ -85,9 +85,7 @@ def turned(profile: list[tuple[float, float]]) -> list[trimesh.Trimesh]:
 def hollow(profile: list[tuple[float, float]], wall: float, floor: float, corners: int = 16) -> Solid:
     """A vessel of revolution, open at the top [m].
 
-    Args:
-        profile: (radius, height) pairs of the outside, bottom to top; the floor lies below the second.
-        wall: Thickness of the wall, measured level.
+    The profile has (radius, height) pairs of the outside, bottom to top; the floor lies below the second, `wall` is level.
     """
     (low, bottom), (wide, above) = profile[:2]
     level = bottom + floor

@@ -56,12 +56,9 @@ def mesh_object(
     name: str, mesh: trimesh.Trimesh, *, origin: str, scale: float = 1.0, split: str | None = None,
     parts: tuple[Part, ...] | None = None,
 ) -> ObjectModel:
-    """Check and repair a mesh, and derive mass properties and the stored cloud.
+    """Check and repair a mesh, and derive mass properties and the stored cloud; the parts are scaled as well.
 
-    Args:
-        origin: Source of the mesh, for messages.
-        scale: Multiplies all coordinates, including those of the parts.
-        split: `train`, `validate`, `test`, or None for a user's object.
+    Messages name the `origin`; `split` is `train`, `validate`, `test`, or None for a user's object.
     """
     notes: list[str] = []
     vertices, faces = np.asarray(mesh.vertices, np.float64) * scale, np.asarray(mesh.faces, np.int64)
@@ -95,10 +92,7 @@ def cloud_object(
 ) -> ObjectModel:
     """An object from a bare point cloud (n 3), or a cloud with normals (n 6); only the points are scaled.
 
-    Args:
-        origin: Source of the cloud, for messages.
-        keep_table: Take every point for the object's, also those of a table.
-        seen: What was seen of it, where the rest of the cloud is a guess [m].
+    `keep_table` takes every point for the object's; `seen` is what was seen of it, where the rest of the cloud is a guess [m].
     """
     if points.ndim != 2 or points.shape[1] not in (3, 6):
         raise ObjectError(f"{origin} holds an array of shape {points.shape}; expected (n, 3) points or (n, 6) points "

@@ -109,14 +109,7 @@ class Clearance:
         self, hand: Hand, surroundings: Surroundings, body: LinkPoints, ball: LinkPoints, radii: Float[Tensor, " s"],
         clear: float, weight: float,
     ) -> None:
-        """All on the device of the evaluations.
-
-        Args:
-            body: Surface points.
-            ball: Centres of the spheres, whose radii follow [m].
-            clear: Distance to keep [m].
-            weight: Of the summed penetration [1/m].
-        """
+        """Surface points, centres and radii of spheres [m], distance to keep [m], weight of the summed penetration [1/m]."""
         self.hand, self.surroundings, self.weight, self.clear = hand, surroundings, weight, clear
         # Of a plane, the spheres know nothing that surface points do not know; other things may be thin or small.
         filled = surroundings.obstacles is not None or surroundings.spared is not None
@@ -224,11 +217,8 @@ class GraspEnergy:
     ) -> None:
         """Prepare everything that stays the same from step to step.
 
-        Args:
-            field: Signed distances of the object.
-            centre: The object's centre of mass [m].
-            length: Typical distance of its surface from there [m].
-            device: Device of the evaluations; all that is given is on the CPU.
+        `centre` is the object's centre of mass, `length` a typical distance of its surface from there [m]. The device is that
+        of the evaluations; all that is given is on the CPU.
         """
         self.length, room = length, room or Room()
         self.room = room.to(device)

@@ -111,11 +111,8 @@ class Rollout:
     ) -> None:
         """Place hands and objects.
 
-        Args:
-            grasps: At least one; each states its pregrasp and squeeze if the protocol closes the hand.
-            workers: Threads.
-            stride: Record a frame every so many time steps; None records nothing.
-            conditions: What differs from the protocol; None if nothing does.
+        Grasps, one at least, state pregrasp and squeeze if the protocol closes the hand. A frame is recorded every `stride`
+        time steps, none by default; `workers` are threads, and `conditions` differ from the protocol.
         """
         rules = scene.protocol
         start, target = grasps.joints, grasps.joints
@@ -153,9 +150,7 @@ class Rollout:
     ) -> tuple[Float[np.ndarray, "n 6"], Float[np.ndarray, "n 6"], Bool[np.ndarray, " n"]]:
         """Apply all forces in turn to the trials that are alive; a lost object is left alone.
 
-        Returns:
-            Displacement [m] and rotation [rad] after each force, NaN where none was applied; whether the simulation
-            stayed sound.
+        Displacement [m] and rotation [rad] after each force, NaN where none was applied; whether the simulation stayed sound.
         """
         displacement, rotation = np.full((self.size, 6), np.nan), np.full((self.size, 6), np.nan)
         stable, alive = closed.stable.copy(), alive & closed.stable

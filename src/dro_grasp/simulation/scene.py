@@ -53,9 +53,9 @@ def hand_spec(hand: Hand, protocol: Protocol) -> mujoco.MjSpec:
 
 
 def let_touch(geom: mujoco.MjsGeom) -> None:
-    """Let a geom of a robot touch objects as all do, whatever its file says of its contacts; one that is only drawn stays so."""
-    # Of two geoms of the same priority, a contact takes the larger dimension: four with an object, the normal between links.
-    # With friction there, the Newton solver of MuJoCo 4.0.0 diverges at times, and 1 % of the trials explode.
+    """Let a geom of a robot touch objects as all do, whatever its file says; one that is only drawn stays so."""
+    # Of two geoms of the same priority, a contact takes the larger dimension: four with an object, the normal between
+    # links. With friction there, the Newton solver of MuJoCo 4.0.0 diverges at times, and 1 % of the trials explode.
     geom.condim, geom.margin, geom.gap, geom.priority = 1, 0.0, 0.0, 0
     if (geom.contype or geom.conaffinity) and not (geom.contype | geom.conaffinity) & 1:
         geom.contype |= 1  # the bit of objects

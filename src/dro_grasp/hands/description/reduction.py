@@ -204,12 +204,7 @@ def driven_joints(spec: mujoco.MjSpec) -> set[str]:
 
 
 def couple_closed_loops(spec: mujoco.MjSpec, driven: Collection[str], path: Path, notes: list[Note]) -> None:
-    """Replace, in place, the ties of closed loops by joint equalities; ties that cannot be closed stay.
-
-    Args:
-        spec: The hand alone, whose joints have limits.
-        driven: Names of the joints that actuators move: they lead.
-    """
+    """Replace, in place, ties of closed loops by joint equalities that driven joints lead; ties that cannot be closed stay."""
     if not any(e.active and not is_linear(e) for e in spec.equalities):
         return
     linkage, ties = Linkage(spec, path), [e for e in spec.equalities if e.active]

@@ -154,13 +154,8 @@ def best_step(
 ) -> Float[Tensor, "b p"]:
     """The step that brings all points closest to their targets, to first order.
 
-    Args:
-        jacobian: Transposed derivative of the k coordinates with respect to p unknowns.
-        residual: Coordinates minus targets [m].
-        lower: Smallest allowed step, at most 0 [rad or m].
-        upper: Largest allowed step, at least 0 [rad or m].
-        damping: Multiple of the identity that is added to the normal equations [1/m].
-        sharpness: Between IRLS (0, the default) and Newton's method (1).
+    The step is between `lower`, at most 0, and `upper`, at least 0 [rad or m]. `damping` times the identity is added to the
+    normal equations [1/m]; `sharpness` is between IRLS (0, the default) and Newton's method (1).
     """
     config = config or StepConfig()
     matrix, gradient = _model(jacobian, residual, sharpness, config)
@@ -331,18 +326,11 @@ def solve_joints(
     tree: KinematicTree, targets: Targets, T_world_wrist: Float[Tensor, "*b 4 4"], q: Float[Tensor, "*b n_dof"],
     movable: Bool[Tensor, " n_dof"] | None = None, config: JointSolverConfig | None = None,
 ) -> JointSolution:
-    """Wrist pose and joints that bring points on links closest to target positions.
+    """Wrist pose and joints, from initial ones, that bring points on links closest to targets; OptionError: there is none.
 
-    Minimises the sum of un-squared distances within the joint limits; couplings hold exactly. Each grasp stops on its own
-    criterion, and its result does not depend on the other grasps in the batch.
-
-    Args:
-        T_world_wrist: Initial pose of the root link.
-        q: Initial independent joints; clamped to the limits [rad or m].
-        movable: False for joints that keep their initial value, inside the limits or not; all move by default.
-
-    Raises:
-        OptionError: There is no target.
+    Minimises the sum of un-squared distances within the joint limits [rad or m]; couplings hold exactly. Each grasp stops on
+    its own criterion, and its result does not depend on the other grasps in the batch. Joints that are not `movable` keep their
+    initial value, inside the limits or not; all move by default.
     """
     config = config or JointSolverConfig()
     if len(targets.links) == 0:
