@@ -156,7 +156,6 @@ def _finger_notes(hand: Hand) -> list[Note]:
 
 
 def _shape_notes(hand: Hand, description: Description) -> list[Note]:
-    """Links that cannot touch anything, whose shapes enclose nothing, or that have too few points."""
     notes = []
     for link, name in enumerate(hand.tree.link_names):
         if not bool(hand.tree.descends[link, hand.palm]):
@@ -215,7 +214,6 @@ def _camera(hand: Hand) -> Camera:
 
 
 def _meshes(hand: Hand, openness: float) -> list[Mesh]:
-    """The posed hand, the palm direction, and the fingertips' tracks."""
     poses = hand.tree.forward(hand.canonical_joints(openness)).numpy()
     meshes = [
         Mesh(g.vertices @ poses[g.link, :3, :3].T + poses[g.link, :3, 3], g.faces,

@@ -16,6 +16,7 @@ import dataclasses
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -28,7 +29,9 @@ from dro_grasp.hands.anatomy import PALM, Finger, JointMask, Joints, Point, axes
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.kinematics.tree import KinematicTree
 from dro_grasp.hands.opening import FingerMotion, Line, main_axis
-from dro_grasp.hands.surface import LinkSurface
+
+if TYPE_CHECKING:
+    from dro_grasp.hands.build import LinkSurface
 
 Place = Float[np.ndarray, "3"]
 Points = Float[np.ndarray, "n 3"]

@@ -53,7 +53,6 @@ def banded_values(
 
 
 def _places(low: Float[np.ndarray, "3"], counts: Int[np.ndarray, "3"], spacing: float) -> Float[np.ndarray, "n 3"]:
-    """Points of a grid [m]."""
     return low + spacing * np.indices(tuple(counts)).reshape(3, -1).T
 
 

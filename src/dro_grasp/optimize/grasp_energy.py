@@ -249,7 +249,6 @@ class GraspEnergy:
         return other
 
     def _weigh(self, config: EnergyConfig) -> None:
-        """Set the weights and everything that depends on them."""
         hand = self.hand
         thin = self.source.with_points(min(config.hand_points, hand.n_points)).to(hand.link_points.device)
         self.config, self.body = config, LinkPoints.of(thin.link_points, thin.link_index, hand.tree.n_links)

@@ -80,7 +80,6 @@ def holding(
 
 
 def _observed(rollout: Rollout) -> Holding:
-    """Close the hands of a rollout."""
     scene, closed = rollout.scene, rollout.close()
     first = int(scene.model.body_dofadr[scene.object_body])
     velocity = np.nan_to_num(np.array(rollout.batch.bind("qvel"))[:, first:first + 6])

@@ -90,7 +90,6 @@ def record(
 
 
 def _run(rollout: Rollout, penetration: Penetration) -> TrialResult:
-    """Take a rollout through the whole protocol; the labelled grasps' penetration is known."""
     scene, rules = rollout.scene, rollout.scene.protocol
     closed = rollout.close()
     contacts = find_contact_links(scene, rollout.qpos)

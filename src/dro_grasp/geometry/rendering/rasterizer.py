@@ -209,7 +209,6 @@ def render(
 
 
 def _gather(meshes: Sequence[Mesh], camera: Camera, canvas: _Canvas, style: Style) -> _Triangles:
-    """The triangles of all meshes, as the camera sees them."""
     axes = camera.axes()
     corners, normals, colours = [np.zeros((0, 3, 3))], [np.zeros((0, 3, 3))], [np.zeros((0, 3))]
     for mesh in meshes:
@@ -262,7 +261,6 @@ def _draw(rows: Int[np.ndarray, "rows 2"], triangles: _Triangles, canvas: _Canva
 
 
 def _shaded(triangles: _Triangles, canvas: _Canvas, background: Colour, style: Style) -> Float[np.ndarray, "samples 3"]:
-    """The colour of every sample."""
     colours = np.broadcast_to(np.asarray(background, np.float32), (len(canvas.face), 3)).copy()
     shares = triangles.shares
     corners, normals_of, colours_of = (

@@ -76,7 +76,6 @@ def _free_wrist(spec: mujoco.MjSpec, hand: mujoco.MjsBody, notes: list[Note]) ->
 
 
 def _largest_tree(spec: mujoco.MjSpec, path: Path) -> mujoco.MjsBody:
-    """The top-level body with the most moving joints below it."""
     roots = list(spec.worldbody.bodies)
     if not roots:
         raise HandError(f"{path} has no body; expected a hand with moving joints")

@@ -232,7 +232,6 @@ def as_obj(file: Path) -> bytes:
 
 
 def _collide_with_visuals(link: ET.Element, notes: list[Note]) -> None:
-    """Let a link whose collision meshes are all missing collide with its visual shapes."""
     visuals = link.findall("visual")
     for visual in visuals:
         shape = copy.deepcopy(visual)

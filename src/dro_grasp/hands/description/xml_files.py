@@ -71,7 +71,6 @@ def included_files(root: ET.Element, path: Path) -> tuple[Path, ...]:
 
 
 def _check_elements(root: ET.Element, path: Path) -> None:
-    """Refuse a file of too many elements or links, too deep ones, or elements that can grow without limit."""
     waiting, elements, links = [(root, 1, 1.0)], 0, 0.0
     while waiting:
         element, depth, times = waiting.pop()

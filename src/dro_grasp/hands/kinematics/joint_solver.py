@@ -396,7 +396,6 @@ def _advance(problem: _Problem, state: _State, config: JointSolverConfig) -> tup
 
 
 def _move(state: _State, step: Float[Tensor, "b p"]) -> tuple[Float[Tensor, "b 4 4"], Float[Tensor, "b n_dof"]]:
-    """Apply a step: the wrist moves in its own frame."""
     local = compose(roma.rotvec_to_rotmat(step[:, 3:6]), step[:, :3])
     return state.T @ local, state.q + step[:, 6:]
 
