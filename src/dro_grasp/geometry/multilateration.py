@@ -189,14 +189,10 @@ def choose_sides(
     Distances to a flat cloud leave two positions for each point, mirrored in its plane. The body's known shape resolves the
     ambiguity, because a rigid motion cannot mirror it. Each body is registered from four starts: all points on one side, all on
     the other, and the two ways in which the plane may cut it. From each start, points pick their nearer candidates and the body
-    is registered again; the smallest error wins.
+    is registered again; the smallest error wins, on the `reference` body's side if both sides fit alike.
 
-    Args:
-        local: Points of l bodies in their own frames [m], padded.
-        weight: 0 for padding.
-        candidates: The two positions of each point [m].
-        misfit: Mean squared error of the distances at each candidate [m^2].
-        reference: The body whose side the others take if both sides fit alike.
+    Points of l bodies are in their own frames [m], with weight 0 for padding; misfits at their candidates [m^2] are mean
+    squares.
     """
     config = config or SideConfig()
     cut = _cut(local, weight, (candidates[:, 0] - candidates[:, 1]).norm(dim=-1) / 2, config)

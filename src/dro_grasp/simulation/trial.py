@@ -19,12 +19,10 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.contacts import Penetration, contact_mask, count_fingers, find_contact_links, measure_penetration
-from dro_grasp.simulation.outcome import DIRECTIONS, GIVE_UP, Failure, Measurements, TrialResult, verdict
+from dro_grasp.simulation.outcome import GIVE_UP, Failure, Measurements, TrialResult, verdict
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
 from dro_grasp.simulation.rollout import Rollout, draw, rollouts
 from dro_grasp.simulation.scene import TrialScene, cached_scene, scene_of
-
-__all__ = ["DIRECTIONS", "Failure", "TrialResult", "record", "simulate"]
 
 
 @checked
@@ -66,16 +64,10 @@ def record(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, index: int, protocol: str | Protocol = DEFAULT_PROTOCOL, *,
     stride: int = 10,
 ) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames n_dof"]]:
-    """Frames of one grasp's trial, as `simulate` runs it: it ends where the trial ends; arguments and errors are the same.
+    """Frames of one grasp's trial: object poses in the wrist frame [m], and joints [rad or m]; errors as of `simulate`.
 
-    Of several trials under a protocol that perturbs, it is the one that `simulate` measures.
-
-    Args:
-        index: Which grasp.
-        stride: Time steps between two frames; the end of closing and of each force gets a frame in any case.
-
-    Returns:
-        Object poses in the wrist frame [m], and joints [rad or m].
+    It runs and ends as `simulate` does; of several trials under a protocol that perturbs, it is the one that `simulate`
+    measures. There are `stride` time steps between two frames; the end of closing and of each force gets a frame in any case.
     """
     scene = scene_of(hand, obj, grasps, protocol)
     (grasp, rollout), = rollouts(scene, hand, grasps[index], workers=1, stride=stride)

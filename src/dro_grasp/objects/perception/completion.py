@@ -215,14 +215,10 @@ def complete_cloud(
 ) -> CompletedCloud:
     """Complete the unseen side. Both sides get about the same density, for which visible points are thinned.
 
-    If all points lie on one viewing ray, the cloud is returned unchanged.
-
-    Args:
-        points: Points of the visible side [m].
-        normals: Their outward unit normals.
-        camera: Its position [m]; without it, the points are all on one side of a plane, whose normal is the mean of theirs.
-        up: Up direction, if known; symmetries that preserve it are preferred.
-        network: Chooses between symmetries; the shipped one by default.
+    Points of the visible side [m] have outward unit normals; if all lie on one viewing ray, they are returned unchanged.
+    Without the position of the `camera` [m], they are all on one side of a plane, whose normal is the mean of theirs.
+    Symmetries that preserve the `up` direction, if it is known, are preferred; the shipped network chooses between them by
+    default.
     """
     side, axes, middle = to_view_axes(points, normals, camera)
     if side.width < THINNEST:

@@ -26,13 +26,11 @@ POINTS = 1024  # Points of the paper's half of a cloud (twice the network's 512 
 
 
 def partial_view(obj: ObjectModel, view: View, seed: int, camera: DepthCamera | None = None) -> ObjectModel:
-    """The object in a view: itself, or a bare cloud in its frame with the unseen side completed.
+    """An object with a mesh in a view: itself, or a bare cloud in its frame with the unseen side completed.
 
-    Args:
-        obj: An object with a mesh.
-        view: `whole` is the object itself. `cloud` keeps all points and normals and completes nothing. `half` keeps the
-            half of the points farthest along a random direction, as in the paper's appendix, without a camera. `depth` is
-            one noisy depth image from a random direction.
+    `whole` is the object itself. `cloud` keeps all points and normals and completes nothing. `half` keeps the half of the
+    points farthest along a random direction, as in the paper's appendix, without a camera. `depth` is one noisy depth image
+    from a random direction.
     """
     if view == "whole":
         return obj
