@@ -22,8 +22,8 @@ from scipy.spatial import KDTree
 from dro_grasp.arm.motion import STAGES, MotionPlan
 from dro_grasp.arm.robot import Robot, load_robot
 from dro_grasp.arm.workcell import Workcell, arm_addresses, robot_spec
-from dro_grasp.simulation.hand_part import joint_addresses
 from dro_grasp.simulation.protocols import PROTOCOLS
+from dro_grasp.simulation.scene import joint_addresses
 from lab.benchmarks.report import emit
 
 FINER = 10

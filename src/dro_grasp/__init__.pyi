@@ -60,7 +60,7 @@ from .predict.sources.optimiser import OptimiserConfig as OptimiserConfig
 from .predict.sources.registry import make_source as make_source, register_source as register_source
 from .predict.sources.source import Candidates as Candidates, Source as Source
 from .predict.stages import complete as complete, evaluate as evaluate, rank as rank, refine as refine
-from .simulation.contact_quality import ContactQuality as ContactQuality, measure_contacts as measure_contacts
+from .simulation.contacts import ContactQuality as ContactQuality, measure_contacts as measure_contacts
 from .simulation.outcome import Failure as Failure, TrialResult as TrialResult
 from .simulation.protocols import Perturbations as Perturbations, Protocol as Protocol
 from .simulation.trial import simulate as simulate

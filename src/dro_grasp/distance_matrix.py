@@ -16,8 +16,7 @@ from dro_grasp.geometry.multilateration import MultilaterationConfig, SideConfig
 from dro_grasp.geometry.point_clouds import point_distances
 from dro_grasp.geometry.se3 import apply, apply_to_cloud, register
 from dro_grasp.hands.hand import Hand
-from dro_grasp.hands.kinematics.joint_reading import read_joints
-from dro_grasp.hands.kinematics.joint_solver import JointSolution, JointSolverConfig, Targets, solve_joints
+from dro_grasp.hands.kinematics.joint_solver import JointSolution, JointSolverConfig, Targets, read_joints, solve_joints
 from dro_grasp.kinds import Checked
 
 

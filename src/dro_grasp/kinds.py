@@ -159,7 +159,7 @@ def renamed(**former: str) -> Callable[[Named], Named]:
             owner.__init__ = made  # type: ignore[misc]
         for old, new in former.items():
             setattr(owner, old, _former_attribute(old, new))
-        return owner
+        return owner  # type: ignore[return-value]
 
     return decorate
 

@@ -19,8 +19,8 @@ from dro_grasp.arm.motion import MotionPlan
 from dro_grasp.arm.planner import plan
 from dro_grasp.arm.workcell import Workcell, arm_addresses, robot_spec
 from dro_grasp.errors import OptionError
-from dro_grasp.simulation.hand_part import joint_addresses
 from dro_grasp.simulation.protocols import PROTOCOLS
+from dro_grasp.simulation.scene import joint_addresses
 
 SHELF = ((0.62, 0.1, 0.5), (0.02, 2.0, 2.0))
 """Centre and size of a board beside the object, larger than any object that is loaded [m]."""

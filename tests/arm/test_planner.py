@@ -24,8 +24,8 @@ from dro_grasp.arm.workcell import Workcell, arm_addresses, robot_spec
 from dro_grasp.cli.main import main
 from dro_grasp.errors import OptionError, PlanError, RobotError
 from dro_grasp.extras import EXTRAS
-from dro_grasp.simulation.hand_part import joint_addresses
 from dro_grasp.simulation.protocols import PROTOCOLS
+from dro_grasp.simulation.scene import joint_addresses
 
 FINER = 10
 

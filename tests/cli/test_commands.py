@@ -21,7 +21,7 @@ from dro_grasp.cli import main as cli
 from dro_grasp.cli.main import main
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.simulation.contact_quality import measure_contacts
+from dro_grasp.simulation.contacts import measure_contacts
 from dro_grasp.simulation.protocols import protocol
 from tests.helpers.loaded_hands import loaded_hand
 

@@ -20,9 +20,8 @@ from dro_grasp.predict.config import GraspRequest
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.predictor import GraspPredictor
 from dro_grasp.predict.stages import evaluate
-from dro_grasp.simulation.closed_poses import settle
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL
-from dro_grasp.simulation.trial import record, simulate
+from dro_grasp.simulation.trial import record, settle, simulate
 from dro_grasp.train.data.engine.worker import EngineConfig
 from tests.helpers.served_studio import served_studio
 

@@ -42,7 +42,7 @@ from dro_grasp.predict.sources.network import NetworkSource
 from dro_grasp.predict.sources.optimiser import OptimiserConfig
 from dro_grasp.predict.sources.source import Candidates, Progress
 from dro_grasp.predict.stages import refine, scored
-from dro_grasp.simulation.contact_quality import measure_contacts
+from dro_grasp.simulation.contacts import measure_contacts
 from dro_grasp.simulation.protocols import Perturbations, protocol
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.bench_clone import clone_of_bars

@@ -10,9 +10,9 @@ import torch
 
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.hands.check import check_hand
+from dro_grasp.hands.closing import find_fixed_jaw, fixed_jaw_of
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import load_hand
-from dro_grasp.hands.palm import find_fixed_jaw, fixed_jaw_of
 from dro_grasp.objects.catalogue import load_object
 from dro_grasp.optimize.contacts import contact_candidates
 from dro_grasp.optimize.synthesis import synthesize

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from dro_grasp.hands.anatomy import find_tips
+from dro_grasp.hands.anatomy import find_rods, find_tips
 from dro_grasp.hands.build import build_hand
 from dro_grasp.hands.description.loader import load_description
-from dro_grasp.hands.linkages import find_rods
 from tests.helpers.linkage_gripper import write_linkage
 from tests.helpers.loaded_hands import loaded_hand
 

@@ -12,10 +12,9 @@ import dro_grasp as dro
 from dro_grasp.errors import HandError
 from dro_grasp.grasps.controller import pregrasp_and_squeeze
 from dro_grasp.hands.check import check_hand, picture
-from dro_grasp.hands.closing import Closing, ClosingFinder
+from dro_grasp.hands.closing import EARLY_CLOSINGS, Closing, ClosingFinder
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import hand_names
-from dro_grasp.hands.palm import EARLY_CLOSINGS
 from dro_grasp.optimize.starts import StartConfig, start_joints
 from tests.helpers.bracket_hand import bracket_urdf
 from tests.helpers.claw_urdf import LIMIT, claw, joint, link, written

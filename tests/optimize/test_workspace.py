@@ -11,8 +11,7 @@ from torch import Tensor
 from dro_grasp.geometry.distance_field import Balls
 from dro_grasp.geometry.se3 import turned_about
 from dro_grasp.grasps.controller_config import ControllerConfig
-from dro_grasp.optimize.grasp_energy import EnergyConfig, GraspEnergy, Workspace
-from dro_grasp.optimize.workspace import Surroundings
+from dro_grasp.optimize.grasp_energy import EnergyConfig, GraspEnergy, Surroundings, Workspace
 from tests.helpers.energy_samples import near_kinks, precise, rounded_box
 from tests.helpers.toy_hand import toy_hand
 

@@ -14,8 +14,7 @@ from dro_grasp.hands.anatomy import PALM
 from dro_grasp.network.network import DistanceNetwork, Moves
 from dro_grasp.network.presets import NetworkConfig
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.optimize.grasp_energy import Workspace
-from dro_grasp.optimize.workspace import Surroundings
+from dro_grasp.optimize.grasp_energy import Surroundings, Workspace
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.sources.choice import CROWDING_POINTS, ChoiceConfig, ChoicePenalties, choice_scores
 from dro_grasp.predict.sources.network import ProposalConfig, propose

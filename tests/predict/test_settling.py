@@ -22,10 +22,9 @@ from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.settling import SettleConfig, Settled, can_settle, settle_best, settle_grasps
 from dro_grasp.predict.stages import evaluate, refine, scored
-from dro_grasp.simulation.closed_poses import hand_shift, settle
 from dro_grasp.simulation.contacts import deepest_penetration
 from dro_grasp.simulation.outcome import Failure
-from dro_grasp.simulation.trial import simulate
+from dro_grasp.simulation.trial import hand_shift, settle, simulate
 from tests.helpers.loaded_hands import loaded_hand
 
 HAND, CAN = loaded_hand("gripper3"), load_object("can")

@@ -7,7 +7,7 @@ import torch
 from dro_grasp.errors import ObjectError
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.simulation.contact_quality import NAMES, NO_CONTACT, REACH, measure_contacts, with_contacts
+from dro_grasp.simulation.contacts import NAMES, NO_CONTACT, REACH, measure_contacts, with_contacts
 from dro_grasp.simulation.trial import simulate
 from tests.helpers.claw import ball, claw, grasps_of, power_grasp, wrist_below
 

@@ -6,7 +6,7 @@ import pytest
 from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
-from dro_grasp.simulation.contact_quality import q1, wrench_error
+from dro_grasp.simulation.contacts import q1, wrench_error
 
 
 def contacts(n, seed):

@@ -16,9 +16,8 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.library import ASSET_FILES, load_hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation.contacts import measure_penetration
-from dro_grasp.simulation.hand_part import attach
 from dro_grasp.simulation.protocols import protocol
-from dro_grasp.simulation.scene import CACHED_SCENES, TrialScene, build_scene, cached_scene
+from dro_grasp.simulation.scene import CACHED_SCENES, TrialScene, attach, build_scene, cached_scene
 from tests.helpers.claw import ball, claw, grasps_of, wrist_below
 from tests.helpers.claw_urdf import LIMIT, claw as claw_text, joint, written
 from tests.helpers.loaded_hands import loaded_hand

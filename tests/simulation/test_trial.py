@@ -16,11 +16,10 @@ from dro_grasp.grasps.controller import ControllerConfig
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.simulation import rollout as rollouts
-from dro_grasp.simulation.closed_poses import after_closing, settle
 from dro_grasp.simulation.grasp_state import grasp_state
 from dro_grasp.simulation.outcome import LOST_DISTANCE, Failure
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, protocol
-from dro_grasp.simulation.trial import TrialResult, record, simulate
+from dro_grasp.simulation.trial import TrialResult, record, settle, simulate
 from tests.helpers.claw import ball, claw, grasps_of, power_grasp, wrist_below
 from tests.helpers.loaded_hands import loaded_hand
 

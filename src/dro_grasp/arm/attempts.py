@@ -32,7 +32,7 @@ from dro_grasp.objects.perception.scan import depth_points
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.predict.constraints import Constraints
 from dro_grasp.predict.predictor import GraspPredictor
-from dro_grasp.simulation.hand_part import PREFIX
+from dro_grasp.simulation.scene import PREFIX
 
 LABEL = "tabletop/3 "
 """Beginning of the settings of stored attempts; the number goes up with every change that can change an outcome."""

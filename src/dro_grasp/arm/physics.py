@@ -22,10 +22,9 @@ from dro_grasp.arm.robot import Robot
 from dro_grasp.arm.workcell import ARM, TABLE, RobotJoints, Workcell, moved, robot_spec, wxyz
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.objects.shape import ObjectModel, solid_of
-from dro_grasp.simulation.hand_part import HULL_VERTICES, PREFIX, add_servos, servo_joints
 from dro_grasp.simulation.protocols import PROTOCOLS
 from dro_grasp.simulation.rollout import quiet
-from dro_grasp.simulation.scene import add_object
+from dro_grasp.simulation.scene import HULL_VERTICES, PREFIX, add_object, add_servos, servo_joints
 
 LIFT_PROTOCOL = replace(PROTOCOLS["dro"], name="tabletop", timestep=0.002, force_limit=3.0, noslip=3)
 """Contacts and servos of the hand: friction 1, density 500 kg/m^3 and the servos' gains as in trials; at most 3 Nm (ours).

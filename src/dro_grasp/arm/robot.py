@@ -23,8 +23,7 @@ from dro_grasp.frames import motion_fault
 from dro_grasp.geometry.rendering.rasterizer import Camera
 from dro_grasp.geometry.se3 import roma
 from dro_grasp.hands.description.compiling import MAX_TURN
-from dro_grasp.hands.description.loader import Description, load_description
-from dro_grasp.hands.description.part import named, split_part
+from dro_grasp.hands.description.loader import Description, load_description, named, split_part
 from dro_grasp.hands.description.reduction import NO_LIMITS
 from dro_grasp.hands.description.xml_files import parse_xml
 from dro_grasp.hands.hand import Hand

@@ -17,7 +17,7 @@ from dro_grasp.arm.workcell import CLEARANCE, TABLE, WORLD, Workcell
 from dro_grasp.files import check_output, replacing
 from dro_grasp.geometry.rendering.rasterizer import Camera, Colour, Mesh, arrow, render
 from dro_grasp.hands.description.loader import Description
-from dro_grasp.simulation.hand_part import PREFIX
+from dro_grasp.simulation.scene import PREFIX
 
 SIZE = (900, 660)  # Width and height of the picture [pixels]
 VIEW = (1.0, -1.3, 0.75)  # Direction from the robot towards the camera of pictures, in the world

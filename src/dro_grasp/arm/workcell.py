@@ -22,8 +22,8 @@ from dro_grasp.hands.description.compiling import collide
 from dro_grasp.objects.cache import content_hash
 from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.simulation.hand_part import HULL_VERTICES, PREFIX, attach, hand_spec, joint_addresses, let_touch
 from dro_grasp.simulation.protocols import PROTOCOLS, Protocol
+from dro_grasp.simulation.scene import HULL_VERTICES, PREFIX, attach, hand_spec, joint_addresses, let_touch
 
 ARM = "arm/"  # Prefix of the arm's names
 WORLD = "world"  # MuJoCo's name of the body that the table is of

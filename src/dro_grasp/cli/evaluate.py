@@ -57,7 +57,7 @@ class Evaluate:
         from dro_grasp.grasps.batch import GraspBatch, load_grasps
         from dro_grasp.grasps.sources import hand_of, require_one_object
         from dro_grasp.predict.stages import evaluate
-        from dro_grasp.simulation.contact_quality import with_contacts
+        from dro_grasp.simulation.contacts import with_contacts
         from dro_grasp.simulation.protocols import changed
 
         rules = changed(self.protocol, friction=self.friction)
@@ -120,7 +120,7 @@ class Evaluate:
         """Print the rates of each object and of all; of what is `lost`, grasps were asked for, and none was found."""
         from dro_grasp.compare.metrics import mean_share, success_rate
         from dro_grasp.grasps.batch import GraspBatch
-        from dro_grasp.simulation.contact_quality import NAMES
+        from dro_grasp.simulation.contacts import NAMES
         from dro_grasp.simulation.outcome import count_failures, diagnose, next_steps
 
         rows = []

@@ -16,7 +16,7 @@ import torch
 from dro_grasp.compare.metrics import diversity, finger_contact, mean_of_rates, mean_share, roc_area, success_rate
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.optimize.synthesis import PROVENANCE
-from dro_grasp.simulation.contact_quality import NAMES
+from dro_grasp.simulation.contacts import NAMES
 from dro_grasp.simulation.outcome import TrialResult
 from dro_grasp.simulation.protocols import Protocol
 

@@ -23,7 +23,7 @@ from dro_grasp.predict.finish import finish
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.settling import can_settle
 from dro_grasp.predict.stages import ease, scored
-from dro_grasp.simulation.contact_quality import with_contacts
+from dro_grasp.simulation.contacts import with_contacts
 from dro_grasp.simulation.protocols import Protocol
 from dro_grasp.simulation.trial import simulate
 

@@ -22,14 +22,10 @@ BLUR = (0.25, 0.5, 0.25)
 class SurfaceModel(NamedTuple):
     """Second-order model of a surface at some points."""
 
-    distance: Float[Tensor, "*b"]
-    """Signed distance [m]."""
-    gradient: Float[Tensor, "*b 3"]
-    """Gradient of the distance, about a unit vector."""
-    normal: Float[Tensor, "*b 3"]
-    """Outward unit normal: the direction of the gradient."""
-    bend: Float[Tensor, "*b 3 3"]
-    """Derivative of the normal by position [1/m]."""
+    distance: Float[Tensor, "*b"]  # signed distance [m]
+    gradient: Float[Tensor, "*b 3"]  # gradient of the distance, about a unit vector
+    normal: Float[Tensor, "*b 3"]  # outward unit normal: the direction of the gradient
+    bend: Float[Tensor, "*b 3 3"]  # derivative of the normal by position [1/m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,14 +35,10 @@ class DistanceField:
     Voxels lie in one row, the last axis fastest, so that a point costs one look-up.
     """
 
-    slopes: Float[Tensor, "voxels 4"]
-    """Per voxel: distance [m] and unit gradient."""
-    shape: tuple[int, int, int]
-    """Voxels per axis."""
-    origin: Float[Tensor, "3"]
-    """Position of the first voxel [m]."""
-    spacing: float
-    """Edge of a voxel [m]."""
+    slopes: Float[Tensor, "voxels 4"]  # per voxel: distance [m] and unit gradient
+    shape: tuple[int, int, int]  # voxels per axis
+    origin: Float[Tensor, "3"]  # position of the first voxel [m]
+    spacing: float  # edge of a voxel [m]
 
     @staticmethod
     def from_values(values: Float[Tensor, "nx ny nz"], origin: Float[Tensor, "3"], spacing: float) -> DistanceField:
@@ -102,10 +94,8 @@ class DistanceField:
 class Balls:
     """The union of balls, with signed distances as of a `DistanceField`."""
 
-    centres: Float[Tensor, "k 3"]
-    """[m]"""
-    radii: Float[Tensor, " k"]
-    """[m]"""
+    centres: Float[Tensor, "k 3"]  # [m]
+    radii: Float[Tensor, " k"]  # [m]
 
     @staticmethod
     def of(balls: Sequence[Ball]) -> Balls | None:

@@ -19,20 +19,14 @@ from dro_grasp.kinds import Checked
 class MultilaterationConfig(Checked):
     """Settings of the closed form and of the refinement. Values are ours."""
 
-    ridge: float = 1e-8
-    """Added to the anchors' covariance, so that flat clouds stay solvable [m^2]."""
-    thin: float = 5e-3
-    """A cloud is thin, and is refined, if the standard deviation along its thinnest axis is below this [m]."""
-    steps: int = 4
-    """Gauss-Newton steps of the refinement."""
-    damping: float = 1e-4
-    """Added to the Gauss-Newton matrix, per anchor [1]."""
-    max_step: float = 0.05
-    """Longest Gauss-Newton step [m]."""
+    ridge: float = 1e-8  # added to the anchors' covariance, so that flat clouds stay solvable [m^2]
+    thin: float = 5e-3  # a cloud is thin, and is refined, if the standard deviation along its thinnest axis is below this [m]
+    steps: int = 4  # Gauss-Newton steps of the refinement
+    damping: float = 1e-4  # added to the Gauss-Newton matrix, per anchor [1]
+    max_step: float = 0.05  # longest Gauss-Newton step [m]
     approach_anchors: int = 128
     """All steps but the last two use about so many anchors, evenly from the list: they only approach the minimum."""
-    chunk: int = 4
-    """Clouds that are refined at once: more do not fit into the processor's cache."""
+    chunk: int = 4  # clouds that are refined at once: more do not fit into the processor's cache
 
 
 @dataclass(frozen=True)
@@ -41,10 +35,8 @@ class _Cloud:
 
     centre: Float[Tensor, "*b 1 3"]
     points: Float[Tensor, "*b m 3"]
-    axes: Float[Tensor, "*b 3 3"]
-    """Principal axes as columns, the thinnest first."""
-    variance: Float[Tensor, "*b 3"]
-    """Variance along each axis [m^2], ascending."""
+    axes: Float[Tensor, "*b 3 3"]  # principal axes as columns, the thinnest first
+    variance: Float[Tensor, "*b 3"]  # variance along each axis [m^2], ascending
 
 
 def multilaterate(
@@ -92,11 +84,9 @@ def _spread(anchors: Float[Tensor, "*b m 3"]) -> _Cloud:
 
 
 def _closed_form(distances: Float[Tensor, "*b n m"], cloud: _Cloud, config: MultilaterationConfig) -> Float[Tensor, "*b n 3"]:
-    """Linear least squares about the anchors' mean: one 3x3 inverse per cloud, one product for all rows.
-
-    With anchors q of zero mean, |p|^2 - 2 q.p = d^2 - |q|^2. Its mean over the anchors removes |p|^2 and leaves
-    2 q.p = (|q|^2 - d^2) - mean, whose normal matrix is the anchors' covariance.
-    """
+    """Linear least squares about the anchors' mean: one 3x3 inverse per cloud, one product for all rows."""
+    # With anchors q of zero mean, |p|^2 - 2 q.p = d^2 - |q|^2. Its mean over the anchors removes |p|^2 and leaves 2 q.p =
+    # (|q|^2 - d^2) - mean, whose normal matrix is the anchors' covariance.
     q = cloud.points
     count = q.shape[-2]
     inverse = cloud.axes @ ((1 / (cloud.variance + config.ridge))[..., None] * cloud.axes.mT)
@@ -131,10 +121,8 @@ def _refine(
     start: Float[Tensor, "*b n 3"], distances: Float[Tensor, "*b n m"], anchors: Float[Tensor, "*b m 3"],
     config: MultilaterationConfig,
 ) -> Float[Tensor, "*b n 3"]:
-    """Gauss-Newton steps; autograd sees the last one alone.
-
-    At the minimum, its derivative by the distances is that of the minimum itself (up to second-order terms).
-    """
+    """Gauss-Newton steps; autograd sees the last one alone."""
+    # At the minimum, its derivative by the distances is that of the minimum itself (up to second-order terms).
     stride = max(1, anchors.shape[-2] // config.approach_anchors)
     with torch.no_grad():
         points = start
@@ -174,10 +162,8 @@ def _outer_products(
 
 
 def _distances(points: Float[Tensor, "*b n 3"], anchors: Float[Tensor, "*b m 3"]) -> Float[Tensor, "*b n m"]:
-    """Distances by one matrix product, for points about the anchors' mean.
-
-    Cancellation then costs less than a micrometre beyond 5 mm of distance, and the time is a tenth of cdist's.
-    """
+    """Distances by one matrix product, for points about the anchors' mean."""
+    # Cancellation then costs less than a micrometre beyond 5 mm of distance, and the time is a tenth of cdist's.
     inner = points @ anchors.mT
     squared = points.square().sum(-1)[..., None] + anchors.square().sum(-1)[..., None, :] - 2 * inner
     return squared.clamp(min=1e-10).sqrt()
@@ -187,12 +173,10 @@ def _distances(points: Float[Tensor, "*b n 3"], anchors: Float[Tensor, "*b m 3"]
 class SideConfig(Checked):
     """Settings of the choice. Values are ours."""
 
-    rounds: int = 4
-    """Rounds in which each point picks its nearer candidate and the body is registered again."""
+    rounds: int = 4  # rounds in which each point picks its nearer candidate and the body is registered again
     reference_margin: float = 0.8
     """Factor on the error of a solution on the reference body's side, so that it wins if both sides fit alike."""
-    ridge: float = 1e-6
-    """Regularises the fit of the heights [1]; lengths are in units of the body's size there."""
+    ridge: float = 1e-6  # regularises the fit of the heights [1]; lengths are in units of the body's size there
 
 
 @torch.no_grad()
@@ -205,14 +189,10 @@ def choose_sides(
     Distances to a flat cloud leave two positions for each point, mirrored in its plane. The body's known shape resolves the
     ambiguity, because a rigid motion cannot mirror it. Each body is registered from four starts: all points on one side, all on
     the other, and the two ways in which the plane may cut it. From each start, points pick their nearer candidates and the body
-    is registered again; the smallest error wins.
+    is registered again; the smallest error wins, on the `reference` body's side if both sides fit alike.
 
-    Args:
-        local: Points of l bodies in their own frames [m], padded.
-        weight: 0 for padding.
-        candidates: The two positions of each point [m].
-        misfit: Mean squared error of the distances at each candidate [m^2].
-        reference: The body whose side the others take if both sides fit alike.
+    Points of l bodies are in their own frames [m], with weight 0 for padding; misfits at their candidates [m^2] are mean
+    squares.
     """
     config = config or SideConfig()
     cut = _cut(local, weight, (candidates[:, 0] - candidates[:, 1]).norm(dim=-1) / 2, config)
@@ -230,12 +210,10 @@ def choose_sides(
 def _cut(
     local: Float[Tensor, "l p 3"], weight: Float[Tensor, "l p"], height: Float[Tensor, "b l p"], config: SideConfig
 ) -> Bool[Tensor, "b l p"]:
-    """Side of the plane for each point of each body, up to exchanging the sides.
-
-    A point's height over the plane is linear in its own coordinates, h = a . (x, 1), and the distances give |h|. So
-    h^2 = (x, 1)^T (a a^T) (x, 1) is linear in the ten entries of the symmetric matrix a a^T: a least-squares fit gives
-    them, and a is the leading eigenvector.
-    """
+    """Side of the plane for each point of each body, up to exchanging the sides."""
+    # A point's height over the plane is linear in its own coordinates, h = a . (x, 1), and the distances give |h|. So h^2 = (x,
+    # 1)^T (a a^T) (x, 1) is linear in the ten entries of the symmetric matrix a a^T: a least-squares fit gives them, and a is
+    # the leading eigenvector.
     count = weight.sum(-1)[:, None, None]
     centred = local - (local * weight[..., None]).sum(1, keepdim=True) / count
     size = ((centred.square() * weight[..., None]).sum((1, 2), keepdim=True) / count).sqrt().clamp(min=1e-6)

@@ -15,10 +15,8 @@ until each cell has one point never end on points that coincide."""
 
 
 def point_distances(a: Float[Tensor, "*#b n 3"], b: Float[Tensor, "*#b m 3"]) -> Float[Tensor, "*#b n m"]:
-    """Distance of each point of one cloud to each of another [m], as their coordinates give it.
-
-    PyTorch's form by a matrix product loses half of the digits, and its gradient is not finite where points meet.
-    """
+    """Distance of each point of one cloud to each of another [m], as their coordinates give it."""
+    # PyTorch's form by a matrix product loses half of the digits, and its gradient is not finite where points meet.
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
 
 
@@ -81,10 +79,8 @@ def one_per_cell(points: Float[np.ndarray, "n 3"], edge: float) -> Int[np.ndarra
 
 
 def random_half(points: Float[Tensor, "n 3"], count: int, generator: torch.Generator) -> Int[Tensor, " count"]:
-    """Indices of random points in the half of a cloud that lies along a random direction. Source: appendix, partial clouds.
-
-    Twice as many points as wanted are drawn, and those with the smaller product of position and direction removed.
-    """
+    """Indices of random points in the half of a cloud that lies along a random direction. Source: appendix, partial clouds."""
+    # Twice as many points as wanted are drawn, and those with the smaller product of position and direction removed.
     if len(points) < 2 * count:
         raise ValueError(f"a random half of {count} points needs a cloud of {2 * count} points, got {len(points)}")
     drawn = torch.randperm(len(points), generator=generator)[: 2 * count]

@@ -48,15 +48,10 @@ def moved_plane(plane: Float[np.ndarray, "4"], T: Float[np.ndarray, "4 4"]) -> F
 def largest_plane(
     points: Float[np.ndarray, "n 3"], near: float, steepest: float = math.pi / 2, fits: int = 1
 ) -> Float[np.ndarray, "4"] | None:
-    """Unit normal of the plane with most points near it, and its height along the normal [m]; None if there is none.
+    """Upward unit normal of the plane with most points near it, and its height along the normal [m]; None if there is none.
 
-    The normal points upwards. Source of the scheme: RANSAC, Fischler and Bolles 1981, then least squares.
-
-    Args:
-        points: The cloud [m].
-        near: Points at most this far from a plane are counted [m].
-        steepest: Largest angle between its normal and the z axis [rad].
-        fits: Least-squares fits to the points near the best plane drawn, each with the points near the one before.
+    Points at most `near` from a plane are counted [m], and `steepest` is the largest angle of its normal to the z axis [rad].
+    Each of some least-squares `fits` takes the points near the one before. Source: RANSAC, Fischler and Bolles 1981.
     """
     if len(points) < 3:
         return None

@@ -11,10 +11,7 @@ from dro_grasp.kinds import Checked
 class ControllerConfig(Checked):
     """How far joints move from a grasp."""
 
-    outer: float = 0.25
-    """Share of the remaining range by which the pregrasp opens. Source: official release."""
-    inner: float = 0.30
-    """Share of the remaining range by which the squeeze closes."""
+    outer: float = 0.25  # share of the remaining range by which the pregrasp opens. Source: official release.
+    inner: float = 0.30  # share of the remaining range by which the squeeze closes
     # Differs from the paper's release (0.15), which leaves small objects without contact; the controls gain as well.
-    dead_zone: float = 1e-3
-    """Joints whose downstream points approach the object's centre more slowly stay [m/rad] (ours)."""
+    dead_zone: float = 1e-3  # joints whose downstream points approach the object's centre more slowly stay [m/rad] (ours)

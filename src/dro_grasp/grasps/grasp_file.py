@@ -122,11 +122,7 @@ def _leaves(schema: pa.Schema) -> list[tuple[str, pa.DataType]]:
 
 
 def read_table(path: Path | str | io.BytesIO) -> tuple[pa.Table, dict[str, Any]]:
-    """Read a grasp file's table and header.
-
-    Raises:
-        GraspFileError: No such file, a truncated or foreign one, or one of another version.
-    """
+    """A grasp file's table and header; GraspFileError: it is missing, truncated, foreign, or of another version."""
     with reading(path, GraspFileError, EXPECTED, pa.ArrowException):
         table = pq.read_table(_existing(path))
         header = read_header(path, table.schema)
@@ -187,11 +183,7 @@ def fixed_column(values: Float[Tensor, "n k"]) -> pa.Array:
 
 
 def floats(column: pa.ChunkedArray, width: int | None, where: str) -> Float[Tensor, "n *width"]:
-    """The inverse of `float_column` and `fixed_column`, for lists of length `width` or plain numbers; null becomes NaN.
-
-    Raises:
-        GraspFileError: A list has another length, or the column does not hold numbers; it names the file and column, `where`.
-    """
+    """The inverse of `float_column` and `fixed_column`; GraspFileError: no numbers, or lists of another length than `width`."""
     array = column.combine_chunks()
     try:
         if width is None:

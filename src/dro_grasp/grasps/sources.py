@@ -27,7 +27,7 @@ def with_sources(grasps: GraspBatch, hand: str, obj: str, scale: float, camera: 
     """
     import torch
 
-    from dro_grasp.hands.description.part import named, split_part
+    from dro_grasp.hands.description.loader import named, split_part
     from dro_grasp.hands.library import locate_hand
 
     n, extra = len(grasps), dict(grasps.extra)

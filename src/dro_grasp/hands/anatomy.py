@@ -1,4 +1,4 @@
-"""A hand's anatomy, read off its tree: fingertips, palm link, rigid groups, fingers, thumb, opening signs.
+"""A hand's anatomy, read off its tree: fingertips, palm link, rigid groups, fingers, thumb, opening signs, rods of linkages.
 
 Nothing else in the package defines fingers and thumb: `HandBuilder` calls these functions, and other code reads the `Hand`.
 """
@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -15,6 +17,9 @@ from torch import Tensor
 from dro_grasp.errors import HandError
 from dro_grasp.geometry import se3
 from dro_grasp.hands.kinematics.tree import FIXED, KinematicTree
+
+if TYPE_CHECKING:
+    from dro_grasp.hands.description.tree_reading import LinkGeometry
 
 Joints = Float[Tensor, " n_dof"]  # a value of each independent joint
 JointMask = Bool[Tensor, " n_dof"]
@@ -38,8 +43,7 @@ class Finger:
 
     chain: tuple[int, ...]
     """Links from the palm (excluded) to the tip (included); a link that several fingers share is in each of their chains."""
-    links: tuple[int, ...]
-    """Links of this finger alone: those of the chain and their side links, such as a pad."""
+    links: tuple[int, ...]  # links of this finger alone: those of the chain and their side links, such as a pad
     joints_to_tip: tuple[int, ...]
     """For each of `links`, the number of moving joints between it and the tip; 0 for links beside the chain."""
 
@@ -64,11 +68,7 @@ def rigid_groups(tree: KinematicTree) -> tuple[int, ...]:
 
 
 def find_tips(tree: KinematicTree, shaped: Collection[int]) -> tuple[int, ...]:
-    """Fingertips: below each last moving joint, the deepest link with a (visual or collision) shape.
-
-    Raises:
-        HandError: No moving joint carries a shape, or too many end in one.
-    """
+    """The deepest link with a shape below each last moving joint; HandError: there is none, or there are too many."""
     paths = [path_to(tree, link) for link in range(tree.n_links)]
     last_moving = {link: max((i for i in paths[link] if tree.kind[i] != FIXED), default=None) for link in shaped}
     tips = []
@@ -111,13 +111,8 @@ def find_fingers(
     """The finger of each tip.
 
     A link that carries one tip, or a rod of its finger, belongs to that finger; a link that carries none belongs to the finger
-    of its parent. A link fixed to the palm belongs to no finger, even if it carries one, because it does not move.
-
-    Args:
-        rods: As `find_rods` gives them.
-
-    Raises:
-        HandError: A finger has more joints than any has.
+    of its parent. A link fixed to the palm belongs to no finger, even if it carries one, because it does not move. `rods` are
+    as `find_rods` gives them. HandError: a finger has more joints than any has.
     """
     still, below = set(fixed_below(tree, palm)), tree.descends[:, palm].tolist()
     chains = [tuple(i for i in path_to(tree, tip) if below[i] and i not in still) for tip in tips]
@@ -144,11 +139,7 @@ def measure_opposition(
     tree: KinematicTree, q: Joints, rate: Joints, tips: Sequence[int],
     tip_offsets: Float[Tensor, "n_tips 3"],
 ) -> Float[Tensor, " n_tips"]:
-    """How much each fingertip moves against the others at joints `q`, while all joints close at `rate`.
-
-    Returns:
-        Minus the mean cosine to the other tips' directions: -1 if all move alike, 1 if the others all move the opposite way.
-    """
+    """Minus the mean cosine of each fingertip's motion to the others', at joints that close at `rate`: -1 if all move alike."""
     poses, links = tree.forward(q), torch.tensor(tips, device=q.device)
     points = se3.apply(poses[links], tip_offsets)
     velocity = tree.point_jacobian(poses, points, links) @ rate
@@ -190,3 +181,95 @@ def axes_along(tree: KinematicTree, q: Joints, direction: Point) -> JointMask:
     parallel = (angular @ angular.T).abs() > PARALLEL
     along = moving & below.any(0) & ~(below & parallel).any(0) & ((angular @ direction).abs() > AXIS_ALONG_PALM)
     return (along[:, None] | (tree.link_coupling == 0)).all(0)
+
+
+Place = Float[np.ndarray, "3"]
+POSTURES = 16  # Random postures in which a pin must be where both links have it (ours)
+LOOSE = 0.03
+"""How far a pin may be from its mean place, as a share of its distance from the two links' own joints (ours): couplings state
+some linkages only about. Of five grippers it is 0.014 at most; jaws that turn against each other about near axes have 0.09."""
+TURN = 0.1  # Least angle that two links turn about their pin [rad] (ours); with none, any point would do
+APART = 3e-3  # Least distance of a pin from the axes of the two links' own joints [m] (ours)
+OUTSIDE = 5e-3  # Largest distance of a pin from the bounding boxes of both links [m] (ours)
+
+
+@dataclass(frozen=True, eq=False)
+class _End:
+    """A last link of the hand, with all that is fixed to it."""
+
+    tip: int
+    link: int  # its topmost link, in whose frame the rest is
+    vertices: Float[np.ndarray, "n 3"]  # corners of its shapes [m]
+    anchor: Place  # a point on the axis of its joint [m]
+    axis: Place
+
+    def has(self, pin: Place) -> bool:
+        """Whether a point is at this link."""
+        low, high = self.vertices.min(0) - OUTSIDE, self.vertices.max(0) + OUTSIDE
+        return bool(((pin >= low) & (pin <= high)).all())
+
+    def lever(self, pin: Place) -> float:
+        """Distance of a point from the axis of this link's own joint [m]."""
+        return float(np.linalg.norm(np.cross(pin - self.anchor, self.axis)))
+
+
+def find_rods(tree: KinematicTree, tips: Sequence[int], geometry: Sequence[LinkGeometry]) -> dict[int, int]:
+    """For each rod among the last links the tip of the finger that it is pinned to.
+
+    Two last links that turn about one point in all postures are pinned together. The rod is the one that reaches less far
+    from the link where their chains part.
+    """
+    if tree.n_dof == len(tree.moving_names):
+        return {}  # a linkage has joints that follow
+    share = torch.rand(POSTURES, tree.n_dof, generator=torch.Generator().manual_seed(0))
+    poses = tree.forward(tree.lower + share * (tree.upper - tree.lower)).double().numpy()
+    ends, pinned = [_end(tree, tip, poses[0], geometry) for tip in tips], {}
+    for i, first in enumerate(ends):
+        for second in ends[i + 1:]:
+            if _are_pinned(poses, first, second):
+                shared = (tree.descends[first.link] & tree.descends[second.link]).nonzero()[-1, 0]
+                reach = [_reach(poses, end, int(shared)) for end in (first, second)]
+                rod, finger = (first, second) if reach[0] < reach[1] else (second, first)
+                pinned[rod.tip] = finger.tip
+    return {rod: _last(pinned, rod) for rod in pinned}
+
+
+def _end(tree: KinematicTree, tip: int, poses: Float[np.ndarray, "n_links 4 4"], geometry: Sequence[LinkGeometry]) -> _End:
+    group = rigid_groups(tree)
+    link = group[tip]
+    to_link = np.linalg.inv(poses[link])
+    fixed = [(to_link @ poses[shape.link], shape.vertices) for shape in geometry if group[shape.link] == link]
+    corners = np.concatenate([vertices @ T[:3, :3].T + T[:3, 3] for T, vertices in fixed])
+    return _End(tip, link, corners, tree.anchor[link].double().numpy(), tree.axis[link].double().numpy())
+
+
+def _are_pinned(poses: Float[np.ndarray, "k n_links 4 4"], first: _End, second: _End) -> bool:
+    """Whether two links turn about one point that is at both."""
+    T = np.linalg.inv(poses[:, first.link]) @ poses[:, second.link]  # second's frame in first's, in each posture
+    turned = np.trace(T[0, :3, :3].T @ T[:, :3, :3], axis1=1, axis2=2)
+    if np.arccos(((turned - 1) / 2).clip(-1, 1)).max() < TURN:
+        return False
+    # A pin p of second is where first has it, in all postures: (R_k - R_0) p = t_0 - t_k; along its axis any point will do.
+    middle = second.vertices.mean(0)
+    moved = T[:, :3, :3] @ middle + T[:, :3, 3]
+    slopes, gaps = (T[1:, :3, :3] - T[0, :3, :3]).reshape(-1, 3), (moved[0] - moved[1:]).reshape(-1)
+    pin = middle + np.linalg.lstsq(slopes, gaps, 1e-3)[0]
+    places = T[:, :3, :3] @ pin + T[:, :3, 3]
+    lever = min(first.lever(places.mean(0)), second.lever(pin))
+    loose = np.linalg.norm(places - places.mean(0), axis=1).max() > LOOSE * lever
+    return not loose and lever > APART and second.has(pin) and first.has(places.mean(0))
+
+
+def _reach(poses: Float[np.ndarray, "k n_links 4 4"], end: _End, origin: int) -> float:
+    """Mean over postures of the largest distance of a link's shapes from the origin of another [m]."""
+    corners = end.vertices @ poses[:, end.link, :3, :3].mT + poses[:, end.link, None, :3, 3]
+    return float(np.linalg.norm(corners - poses[:, None, origin, :3, 3], axis=2).max(1).mean())
+
+
+def _last(pinned: dict[int, int], rod: int) -> int:
+    """The finger at the end of a row of rods."""
+    finger, seen = pinned[rod], {rod}
+    while finger in pinned and finger not in seen:
+        seen.add(finger)
+        finger = pinned[finger]
+    return finger

@@ -5,25 +5,102 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.errors import HandError, OptionError
-from dro_grasp.geometry.point_clouds import farthest_points
-from dro_grasp.hands.anatomy import Finger, find_fingers, find_palm_link, find_tips, fixed_below, path_to, rigid_groups
-from dro_grasp.hands.closing import Closing, ClosingFinder
-from dro_grasp.hands.description.loader import Description
-from dro_grasp.hands.description.part import named
+from dro_grasp.geometry import se3
+from dro_grasp.geometry.point_clouds import farthest_points, sample_surface
+from dro_grasp.hands import anatomy
+from dro_grasp.hands.anatomy import Finger, fixed_below, path_to
+from dro_grasp.hands.closing import EARLY_CLOSINGS, MUCH_BETTER, WELL_ENCLOSED, Closing, ClosingFinder
+from dro_grasp.hands.description.loader import Description, named
+from dro_grasp.hands.description.tree_reading import LinkGeometry
 from dro_grasp.hands.hand import POINTS_PER_LINK, Hand
 from dro_grasp.hands.kinematics.tree import FIXED, KinematicTree
-from dro_grasp.hands.linkages import find_rods
 from dro_grasp.hands.opening import ROLLING_UP
-from dro_grasp.hands.palm import EARLY_CLOSINGS, MUCH_BETTER, WELL_ENCLOSED
-from dro_grasp.hands.surface import LinkSurface, sample_links
+
+SAMPLES_PER_LINK = 512
+"""Points sampled on each link before farthest point sampling. Source: appendix, robot point cloud sampling."""
+NUDGE = 5e-4  # Samples this close to another shape of their link lie where the two shapes meet, not outside [m] (ours)
+
+
+@dataclass(frozen=True)
+class LinkSurface:
+    """Samples on the links from the palm on."""
+
+    points: Float[Tensor, "n 3"]  # in their links' frames [m]
+    normals: Float[Tensor, "n 3"]  # outward unit normals, in their links' frames
+    link: Int[Tensor, " n"]  # the link of each point
+
+    def thinned(self, step: int) -> LinkSurface:
+        """Every `step`-th sample."""
+        return LinkSurface(self.points[::step], self.normals[::step], self.link[::step])
+
+    def middle(self, link: int) -> Float[Tensor, "3"]:
+        """Mean of a link's samples, in its frame [m]."""
+        return self.points[self.link == link].mean(0)
+
+    def posed(
+        self, tree: KinematicTree, q: Float[Tensor, " n_dof"]
+    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+        """Points [m] and normals in the root link's frame."""
+        T = tree.forward(q)[self.link]
+        return se3.apply(T, self.points).numpy(), se3.rotate(T[:, :3, :3], self.normals).numpy()
+
+
+def sample_links(description: Description, links: list[int], seed: int) -> LinkSurface:
+    """Samples of links' collision shapes as MuJoCo uses them, or else of visual ones; HandError: a link's have no area."""
+    generator = torch.Generator().manual_seed(seed)
+    points, normals, index = [], [], []
+    for link in links:
+        shapes = [g for g in description.geometry if g.link == link]
+        shapes = [g for g in shapes if g.collides] or shapes
+        try:
+            p, n = _sample_shapes(shapes, generator)
+        except ValueError as error:
+            raise HandError(f"the shapes of link '{description.tree.link_names[link]}' have no area; give it a shape that is "
+                            "not flat in two directions") from error
+        points.append(p)
+        normals.append(n)
+        index.append(torch.full((len(p),), link))
+    return LinkSurface(torch.cat(points), torch.cat(normals), torch.cat(index))
+
+
+def _sample_shapes(shapes: list[LinkGeometry], generator: torch.Generator) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Points and normals on the outside of a union of convex shapes."""
+    vertices = torch.cat([torch.tensor(s.vertices, dtype=torch.float32) for s in shapes])
+    starts = np.cumsum([0, *[len(s.vertices) for s in shapes]])
+    faces = torch.cat([torch.tensor(s.faces.astype(np.int64)) + int(i) for s, i in zip(shapes, starts, strict=False)])
+    owner = torch.cat([torch.full((len(s.faces),), i) for i, s in enumerate(shapes)])
+    points, normals, face = sample_surface(vertices, faces, 4 * SAMPLES_PER_LINK, generator)
+    hidden = torch.zeros(len(points), dtype=torch.bool)
+    if len(shapes) > 1:
+        for i, shape in enumerate(shapes):
+            others = (owner[face] != i).nonzero()[:, 0]
+            hidden[others] |= _inside_convex(points[others] + NUDGE * normals[others], shape)
+    seen = (~hidden).nonzero()[:, 0]
+    seen = seen if len(seen) >= SAMPLES_PER_LINK // 4 else torch.arange(len(points))
+    seen = seen[:SAMPLES_PER_LINK]
+    return points[seen], normals[seen]
+
+
+def _inside_convex(points: Float[Tensor, "n 3"], shape: LinkGeometry) -> Bool[Tensor, " n"]:
+    """Whether each point lies behind all faces of a convex shape."""
+    corners = torch.tensor(shape.vertices, dtype=torch.float32)[torch.tensor(shape.faces.astype(np.int64))]
+    normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    low, high = corners.amin((0, 1)), corners.amax((0, 1))
+    inside = ((points >= low) & (points <= high)).all(1)
+    near = points[inside]
+    height = ((near[:, None] - corners[None, :, 0]) * normal).sum(-1)
+    inside[inside.clone()] = (height < -1e-4 * normal.norm(dim=-1)).all(1)
+    return inside
+
 
 TIP_OFFSET = 0.03  # Distance of the extra target beyond a fingertip [m]. Source: appendix, URDF file preprocessing
 LARGEST_HAND = 1.5  # Largest extent, from the palm on, that a hand in metres has [m] (ours)
@@ -38,16 +115,10 @@ MAX_NAMED = 6  # Most hands that an error names (ours)
 
 
 def build_hand(description: Description, *, name: str | None = None, seed: int = 0, n_points: int = 512) -> Hand:
-    """Derive everything the method needs from a description.
+    """Derive everything the method needs from a description; the file's stem is the hand's name by default.
 
-    Args:
-        name: Name of the hand in files and tables; the file's stem by default.
-        seed: Seed of the point sampling.
-        n_points: Surface points to keep: enough for the fingertips, and no more than are sampled (SAMPLES_PER_LINK on a link).
-
-    Raises:
-        HandError: The description has no finger, no link with a surface, or a size that no hand has.
-        OptionError: So many points cannot be kept.
+    Of the surface points, `n_points` are kept: enough for the fingertips, and no more than are sampled (SAMPLES_PER_LINK on a
+    link), else OptionError. HandError: the description has no finger, no link with a surface, or a size that no hand has.
     """
     try:
         hand = HandBuilder(description, seed).build(name or description.name)
@@ -80,7 +151,7 @@ class HandBuilder:
         collides = {g.link for g in self.description.geometry if g.collides}
         return Hand(
             name=name, tree=tree, link_points=surface.points, link_normals=surface.normals, link_index=surface.link,
-            fingers=self.fingers, rigid_group=rigid_groups(tree), tip_offsets=self.tip_offsets(), palm=self.palm,
+            fingers=self.fingers, rigid_group=anatomy.rigid_groups(tree), tip_offsets=self.tip_offsets(), palm=self.palm,
             palm_centre=to_palm(closing.palm.centre),
             palm_direction=T[:3, :3] @ torch.tensor(closing.palm.direction, dtype=torch.float32),
             grasp_centre=to_palm(closing.palm.grasp_centre), opening_signs=closing.opening_signs,
@@ -101,7 +172,7 @@ class HandBuilder:
     def ends(self) -> tuple[int, ...]:
         """Fingertip links, and the ends of linkages' rods."""
         try:
-            return find_tips(self.tree, self.shaped)
+            return anatomy.find_tips(self.tree, self.shaped)
         except HandError as error:
             lost = [note.text for note in self.description.notes if note.level == "warning"]
             raise HandError("; ".join([str(error), *lost[:3]])) from error
@@ -109,7 +180,7 @@ class HandBuilder:
     @cached_property
     def rods(self) -> dict[int, int]:
         """For each end of a linkage's rod the fingertip that it is pinned to."""
-        return find_rods(self.tree, self.ends, self.description.geometry)
+        return anatomy.find_rods(self.tree, self.ends, self.description.geometry)
 
     @cached_property
     def tips(self) -> tuple[int, ...]:
@@ -119,7 +190,7 @@ class HandBuilder:
     @cached_property
     def palm(self) -> int:
         """The palm link."""
-        palm = find_palm_link(self.tree, self.tips, self.shaped)
+        palm = anatomy.find_palm_link(self.tree, self.tips, self.shaped)
         if self.description.link is None:
             require_one_hand(self.tree, self.tips, palm, self.description.path.name)
         return palm
@@ -127,7 +198,7 @@ class HandBuilder:
     @cached_property
     def fingers(self) -> tuple[Finger, ...]:
         """One for each fingertip."""
-        return find_fingers(self.tree, self.tips, self.palm, self.rods)
+        return anatomy.find_fingers(self.tree, self.tips, self.palm, self.rods)
 
     @cached_property
     def links(self) -> list[int]:
@@ -219,11 +290,7 @@ def find_hands(tree: KinematicTree, tips: Sequence[int]) -> list[int]:
 
 
 def require_one_hand(tree: KinematicTree, tips: Sequence[int], palm: int, file: str) -> None:
-    """Refuse a whole robot, of which nobody could say what its hand is.
-
-    Raises:
-        HandError: It has several hands, or one beside other moving ends, or arms alone; the message says how to ask for one.
-    """
+    """Refuse a robot with several hands, one beside other moving ends, or arms alone; the HandError says how to ask for one."""
     hands = find_hands(tree, tips)
     if hands and not bool(tree.descends[list(tips), hands[0]].all()):
         more = ", ..." if len(hands) > MAX_NAMED else ""

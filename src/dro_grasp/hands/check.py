@@ -16,14 +16,13 @@ from dro_grasp.geometry.point_clouds import enclosed_volume
 from dro_grasp.geometry.rendering.rasterizer import Camera, Mesh, arrow, render
 from dro_grasp.hands.anatomy import Finger
 from dro_grasp.hands.build import LONGEST_REACH, build_hand, reach
+from dro_grasp.hands.closing import fixed_jaw_of
 from dro_grasp.hands.description.compiling import Note
-from dro_grasp.hands.description.loader import Description
-from dro_grasp.hands.description.part import named
+from dro_grasp.hands.description.loader import Description, named
 from dro_grasp.hands.hand import Hand
 from dro_grasp.hands.kinematics.tree import KinematicTree
 from dro_grasp.hands.library import load_hand_description
 from dro_grasp.hands.opening import FingerMotion, opening_notes
-from dro_grasp.hands.palm import fixed_jaw_of
 
 TILE = (560, 520)  # Width and height of one view [pixels]
 COLOURS = {"contact": (0.93, 0.66, 0.30), "other": (0.62, 0.66, 0.72), "direction": (0.85, 0.15, 0.15),
@@ -157,7 +156,6 @@ def _finger_notes(hand: Hand) -> list[Note]:
 
 
 def _shape_notes(hand: Hand, description: Description) -> list[Note]:
-    """Links that cannot touch anything, whose shapes enclose nothing, or that have too few points."""
     notes = []
     for link, name in enumerate(hand.tree.link_names):
         if not bool(hand.tree.descends[link, hand.palm]):
@@ -183,15 +181,7 @@ def _words(value: Any) -> list[str]:
 
 
 def picture(hand: Hand, path: Path | str) -> None:
-    """Draw the hand open and closed, with its contact links, its palm direction and the path of each fingertip.
-
-    Args:
-        hand: From `load_hand` or a report; it needs its description.
-        path: PNG to write.
-
-    Raises:
-        OutputError: It cannot be written.
-    """
+    """Draw the hand, which needs its description, open and closed; OutputError: the PNG cannot be written."""
     from PIL import Image, ImageDraw, ImageFont
 
     path = check_output(path)
@@ -224,7 +214,6 @@ def _camera(hand: Hand) -> Camera:
 
 
 def _meshes(hand: Hand, openness: float) -> list[Mesh]:
-    """The posed hand, the palm direction, and the fingertips' tracks."""
     poses = hand.tree.forward(hand.canonical_joints(openness)).numpy()
     meshes = [
         Mesh(g.vertices @ poses[g.link, :3, :3].T + poses[g.link, :3, 3], g.faces,

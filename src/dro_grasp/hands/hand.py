@@ -182,7 +182,6 @@ class Hand:
     def _point_poses(
         self, q: Float[Tensor, "*batch n_dof"], T_world_wrist: Float[Tensor, "*batch 4 4"] | None
     ) -> Float[Tensor, "*batch n_hand 4 4"]:
-        """The pose of the link of each surface point."""
         poses = self.tree.forward(q)
         if T_world_wrist is not None:
             poses = T_world_wrist[..., None, :, :] @ poses

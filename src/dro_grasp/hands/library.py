@@ -11,8 +11,7 @@ from typing import NamedTuple
 from dro_grasp.errors import HandError
 from dro_grasp.files import given_path
 from dro_grasp.hands.build import build_hand
-from dro_grasp.hands.description.loader import Description, load_description
-from dro_grasp.hands.description.part import named, split_part
+from dro_grasp.hands.description.loader import Description, load_description, named, split_part
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import checked
 
@@ -76,11 +75,7 @@ class HandFile(NamedTuple):
 
 
 def locate_hand(name: str | Path) -> HandFile:
-    """The file of a hand, and its part; the file need not exist.
-
-    Raises:
-        HandError: No hand has this name.
-    """
+    """The file of a hand, and its part; the file need not exist. HandError: no hand has this name."""
     text, link = split_part(str(name))
     path, label = _locate(text)
     return HandFile(path, named(label, link), link)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dro_grasp.errors import HandError, OptionError
 from dro_grasp.files import command
-from dro_grasp.hands.description.part import part_of_urdf
+from dro_grasp.hands.description.loader import part_of_urdf
 from dro_grasp.hands.description.urdf import MOVING, find_mesh
 from dro_grasp.hands.description.xml_files import parse_xml
 from dro_grasp.hands.library import locate_hand

@@ -17,10 +17,9 @@ import trimesh
 from dro_grasp.errors import ObjectError
 from dro_grasp.files import given_path
 from dro_grasp.kinds import checked
-from dro_grasp.objects.builtin import BUILTIN, make_builtin
+from dro_grasp.objects.builtin import BUILTIN, PROCEDURAL, make_builtin, procedural_object
 from dro_grasp.objects.convex_parts import as_part
 from dro_grasp.objects.loading import check_scale, load_file, mesh_object, object_in_memory
-from dro_grasp.objects.procedural import NAME as PROCEDURAL, procedural_object
 from dro_grasp.objects.reading import ObjectSource, read_geometry
 from dro_grasp.objects.shape import ObjectModel
 
@@ -117,7 +116,6 @@ def resolve_objects(names: list[str]) -> list[str]:
 
 
 def _members(source: str, split: str) -> list[str]:
-    """Objects of a split, sorted."""
     names = BUILTIN if source == "builtin" else _assets()
     members = sorted(name for name, kind in object_names().items() if name in names and kind == split)
     if not members:
@@ -127,7 +125,6 @@ def _members(source: str, split: str) -> list[str]:
 
 
 def _procedural(first: int, last: int) -> list[str]:
-    """Names of the objects of a range of seeds, both ends included."""
     if last < first:
         raise ObjectError(f"no object is in 'procedural:{first}-{last}'; give the smaller seed first")
     if last - first >= MAX_SEEDS:

@@ -13,12 +13,12 @@ from scipy.spatial import ConvexHull
 from dro_grasp.errors import ObjectError
 from dro_grasp.geometry.point_clouds import even_directions
 from dro_grasp.objects.cache import Arrays, cached_arrays, content_hash
-from dro_grasp.objects.repair import OPEN_FILL
 from dro_grasp.objects.surface_distances import signed_distances
 
 THRESHOLD = 0.08  # CoACD's concavity threshold [1] (ours)
 MAX_PARTS = 24  # Most parts of one object (ours)
 MAX_VERTICES = 64  # Most vertices of one part (ours): collision cost grows with them
+OPEN_FILL = 0.05  # Share of its hull that a mesh with holes must fill (ours); a bent sheet appears to fill a little
 COARSE_VERTICES = 48  # Most vertices of a coarse part. Ours: the surface of a ball then lies up to 9 % of its radius inside
 COARSE_SHARE = 0.5  # Share of the parts that is left, rounded up (ours)
 
@@ -99,10 +99,8 @@ def unpack(stored: Arrays) -> tuple[Part, ...]:
 
 
 def coarse_parts(parts: Sequence[Part]) -> tuple[Part, ...]:
-    """Half as many parts: those whose common hull adds the least volume are joined, pair by pair; each is then simplified.
-
-    A part keeps the vertices that are outermost in evenly spread directions, so thin parts stay solid. Cached.
-    """
+    """Half as many parts: those whose common hull adds the least volume are joined, pair by pair; each is then simplified."""
+    # A part keeps the vertices that are outermost in evenly spread directions, so thin parts stay solid. Cached.
     key = content_hash(*(array for part in parts for array in part))
     settings = f"{COARSE_VERTICES}-{COARSE_SHARE * 100:.0f}"
     stored = cached_arrays(f"coarse-{key[:24]}-{settings}", lambda: pack(_joined(parts)))

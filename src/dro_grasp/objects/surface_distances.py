@@ -35,11 +35,9 @@ def bake_grid(surface: Float[np.ndarray, "n 3"], distance: Distances, banded: bo
 def banded_values(
     distance: Distances, low: Float[np.ndarray, "3"], counts: Int[np.ndarray, "3"], spacing: float
 ) -> Float[np.ndarray, "nx ny nz"]:
-    """Signed distances on a grid, computed where they are below NEAR or change sign, and interpolated elsewhere [m].
-
-    A distance changes no faster than its point moves: where all corners of a coarse cell are farther away than NEAR and half
-    the cell's diagonal, so is everything in it.
-    """
+    """Signed distances on a grid, computed where they are below NEAR or change sign, and interpolated elsewhere [m]."""
+    # A distance changes no faster than its point moves: where all corners of a coarse cell are farther away than NEAR and half
+    # the cell's diagonal, so is everything in it.
     cells = -(-(counts - 1) // STRIDE)
     coarse = distance(_places(low, cells + 1, STRIDE * spacing)).reshape(cells + 1)
     corner = (slice(1, None),) * 3  # a filter of size 2 looks back: these are the cells
@@ -55,26 +53,21 @@ def banded_values(
 
 
 def _places(low: Float[np.ndarray, "3"], counts: Int[np.ndarray, "3"], spacing: float) -> Float[np.ndarray, "n 3"]:
-    """Points of a grid [m]."""
     return low + spacing * np.indices(tuple(counts)).reshape(3, -1).T
 
 
 def search_tree(points: Float[np.ndarray, "n 3"]) -> KDTree:
-    """For the nearest of some points, from places that may be far from all of them.
-
-    Nodes keep the whole of their cells: those that shrink to their points lie alike far before a flat surface, and the search
-    visits most of them, which takes ten times as long.
-    """
+    """For the nearest of some points, from places that may be far from all of them."""
+    # Nodes keep the whole of their cells: those that shrink to their points lie alike far before a flat surface, and the search
+    # visits most of them, which takes ten times as long.
     return KDTree(points, leafsize=32, compact_nodes=False)  # (ours) half the time that 10 take
 
 
 def cloud_distances(
     cloud: Float[np.ndarray, "m 3"], normals: Float[np.ndarray, "m 3"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Distance of each point to the disc around the nearest point of a cloud [m], negative behind the disc.
-
-    Discs are perpendicular to the normals and extend to the neighbours: they close the surface and leave its rims open.
-    """
+    """Distance of each point to the disc around the nearest point of a cloud [m], negative behind the disc."""
+    # Discs are perpendicular to the normals and extend to the neighbours: they close the surface and leave its rims open.
     tree = search_tree(cloud)
     some = cloud[:: max(1, len(cloud) // 256)]
     reach = float(np.median(tree.query(some, k=min(DISC_NEIGHBOURS, len(cloud)))[0][:, -1]))
@@ -88,11 +81,9 @@ def cloud_distances(
 def closed_cloud_distances(
     cloud: Float[np.ndarray, "m 3"], normals: Float[np.ndarray, "m 3"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, " n"]:
-    """As `cloud_distances`, but a rim that is left open, as under an object on a table, is no inside of its own.
-
-    Behind the rim's discs a point may be far outside. Away from the surface the winding number of the cloud decides, and beyond
-    the cloud's extent nothing is inside.
-    """
+    """As `cloud_distances`, but a rim that is left open, as under an object on a table, is no inside of its own."""
+    # Behind the rim's discs a point may be far outside. Away from the surface the winding number of the cloud decides, and
+    # beyond the cloud's extent nothing is inside.
     import igl
 
     distance = cloud_distances(cloud, normals, points)
@@ -111,10 +102,8 @@ def closed_cloud_distances(
 def signed_distances(
     vertices: Float[np.ndarray, "n_vertices 3"], faces: Int[np.ndarray, "n_faces 3"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Distance of each point to a mesh [m], negative inside.
-
-    Magnitude and sign are computed separately: winding numbers cope with holes, flipped faces and overlapping shells.
-    """
+    """Distance of each point to a mesh [m], negative inside."""
+    # Magnitude and sign are computed separately: winding numbers cope with holes, flipped faces and overlapping shells.
     import igl
 
     corners, triangles = np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64)

@@ -23,10 +23,8 @@ class LinkPoints:
     points: each point's column holds its homogeneous coordinates in the four rows of its own link, and zeros elsewhere.
     """
 
-    layout: Float[Tensor, "rows p"]
-    """The columns; rows is 4 n_links [m]."""
-    members: Float[Tensor, "p n_links"]
-    """One-hot link of each point."""
+    layout: Float[Tensor, "rows p"]  # the columns; rows is 4 n_links [m]
+    members: Float[Tensor, "p n_links"]  # one-hot link of each point
 
     @staticmethod
     def of(local: Float[Tensor, "p 3"], links: Int[Tensor, " p"], n_links: int) -> LinkPoints:
@@ -46,10 +44,8 @@ class LinkPoints:
 class LinkSpheres:
     """Spheres that fill the links, and the pairs of them that must not overlap."""
 
-    centres: Float[Tensor, "s 3"]
-    """In their links' frames [m]."""
-    radii: Float[Tensor, " s"]
-    """[m]"""
+    centres: Float[Tensor, "s 3"]  # in their links' frames [m]
+    radii: Float[Tensor, " s"]  # [m]
     links: Int[Tensor, " s"]
     pairs: Int[Tensor, "k 2"]
 
@@ -111,16 +107,12 @@ def _neighbours(hand: Hand) -> Bool[Tensor, "n_links n_links"]:
 class ContactConfig(Checked):
     """Selection of contact candidates."""
 
-    closing: float = 0.55
-    """Share of the way from open to closed at which inner sides are determined (ours)."""
-    inner_cosine: float = 0.3
-    """Least cosine between a candidate's normal and the direction to the grasp centre (ours)."""
+    closing: float = 0.55  # share of the way from open to closed at which inner sides are determined (ours)
+    inner_cosine: float = 0.3  # least cosine between a candidate's normal and the direction to the grasp centre (ours)
     level_weights: tuple[float, ...] = (1.0, 0.35, 0.1)
     """Weights of a finger's links, by their number of joints to the tip (ours); links farther up have no candidates."""
-    palm_weight: float = 0.3
-    """Weight of the palm as a whole, against 1 for a finger, in the slots that are free (ours)."""
-    min_contacts: int = 4
-    """Least number of contacts. Source: DexGraspNet (four)."""
+    palm_weight: float = 0.3  # weight of the palm as a whole, against 1 for a finger, in the slots that are free (ours)
+    min_contacts: int = 4  # least number of contacts. Source: DexGraspNet (four).
     idle: float = 0.6
     """Probability that a finger other than the thumb holds nothing, in hands with a thumb (ours: hands that always use all
     fingers grasp every object alike). The thumb and one more finger always hold."""
@@ -130,19 +122,14 @@ class ContactConfig(Checked):
 class ContactCandidates:
     """Points of a hand's surface from which contacts are drawn, one per slot."""
 
-    points: Float[Tensor, "k 3"]
-    """In their links' frames [m]."""
-    normals: Float[Tensor, "k 3"]
-    """Outward unit normals in their links' frames."""
+    points: Float[Tensor, "k 3"]  # in their links' frames [m]
+    normals: Float[Tensor, "k 3"]  # outward unit normals in their links' frames
     links: Int[Tensor, " k"]
-    fingers: Int[Tensor, " k"]
-    """Index of the finger of each candidate, or PALM."""
+    fingers: Int[Tensor, " k"]  # index of the finger of each candidate, or PALM
     slot_weights: Float[Tensor, "n_slots k"]
     """Probability of each candidate in each slot; the slots of the fingers come first, the free slots last."""
-    slot_finger: tuple[int, ...]
-    """Finger of each slot; PALM for the free slots."""
-    thumb: int | None
-    """Index of the thumb, which always holds; None if all fingers do."""
+    slot_finger: tuple[int, ...]  # finger of each slot; PALM for the free slots
+    thumb: int | None  # index of the thumb, which always holds; None if all fingers do
 
     def draw(self, n: int, generator: torch.Generator) -> Int[Tensor, "n n_slots"]:
         """Random candidates, one for each grasp and slot, drawn on the CPU."""

@@ -229,12 +229,10 @@ def _first(hand: Hand, bends: Bool[Tensor, "n_tips n_dof"]) -> Bool[Tensor, "n_t
 class EasingConfig(Checked):
     """How much room fingers leave (ours)."""
 
-    clearance: float = 0.004
-    """Distance from which on a finger stands clear [m]: 6 mm cost a little where the cloud is whole."""
+    clearance: float = 0.004  # distance from which on a finger stands clear [m]: 6 mm cost a little where the cloud is whole
     unseen: float = 0.015
     """The same at most, where the surface is a guess: as far as it is from the nearest point that was seen [m]."""
-    steps: int = 11
-    """Samples of the way from the grasp to the pregrasp."""
+    steps: int = 11  # samples of the way from the grasp to the pregrasp
     batch_size: int = 64
 
 

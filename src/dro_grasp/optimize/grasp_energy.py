@@ -1,24 +1,155 @@
-"""The grasp energy of one hand on one object: the weighted terms and their gradient, for a batch of grasps."""
+"""The grasp energy of one hand on one object: the weighted terms and their gradient, and where the hand may be and touch."""
 
 from __future__ import annotations
 
 import math
 from copy import copy
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dro_grasp.devices import Rows, on_device
 from dro_grasp.geometry import se3
 from dro_grasp.geometry.distance_field import Balls, DistanceField
+from dro_grasp.grasps.controller_config import ControllerConfig
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked
 from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize import terms as energies
 from dro_grasp.optimize.contacts import ContactCandidates, ContactConfig, LinkPoints, contact_candidates, link_spheres
-from dro_grasp.optimize.workspace import Clearance, ContactRegionTerm, Surroundings
+from dro_grasp.optimize.terms import PointTerm
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """Signed distances to whatever is nearest, negative inside."""
+
+    plane: Float[Tensor, "4"] | None = None  # upward unit normal of a plane, and its height along the normal [m]
+    obstacles: DistanceField | None = None  # signed distances of other things
+    spared: Balls | None = None  # places where the hand is not wanted
+
+    @property
+    def up(self) -> Float[Tensor, "3"] | None:
+        """Normal of the plane."""
+        return None if self.plane is None else self.plane[:3]
+
+    @property
+    def parts(self) -> dict[str, Surroundings]:
+        """The same one by one: plane, obstacles, spared."""
+        return {name: Surroundings(**{name: part}) for name in ("plane", "obstacles", "spared")
+                if (part := getattr(self, name)) is not None}
+
+    def distances(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
+        """Signed distance [m] and its gradient, as of a `DistanceField`."""
+        distance, gradient = torch.full_like(points[..., 0], torch.inf), torch.zeros_like(points)
+        if self.plane is not None:
+            distance, gradient = points @ self.plane[:3] - self.plane[3], self.plane[:3].expand_as(points)
+        for part in (self.obstacles, self.spared):
+            if part is not None:
+                other, slope = part.distances(points)
+                nearer = other < distance
+                distance = torch.where(nearer, other, distance)
+                gradient = torch.where(nearer[..., None], slope, gradient)
+        return distance, gradient
+
+    def lift(self, points: Float[Tensor, "*b p 3"], clear: float) -> Float[Tensor, "*b 3"]:
+        """The shift up the plane's normal that brings points this far above it [m]; none where they are already."""
+        if self.plane is None:
+            return torch.zeros_like(points[..., 0, :])
+        lowest = (points @ self.plane[:3]).amin(-1) - self.plane[3]
+        return (clear - lowest).clamp_min(0)[..., None] * self.plane[:3]
+
+    def to(self, device: torch.device | str) -> Surroundings:
+        """The same on another device."""
+        plane = None if self.plane is None else self.plane.to(device)
+        obstacles = None if self.obstacles is None else on_device(self.obstacles, device)
+        return Surroundings(plane, obstacles, None if self.spared is None else on_device(self.spared, device))
+
+
+@dataclass(frozen=True)
+class ContactRegionTerm:
+    """A place on an object, as balls, in which all contacts are to be."""
+
+    place: Balls
+    clear: float  # distance that the hand keeps from the object elsewhere [m]
+
+    def beside(self, points: Float[Tensor, "*b p 3"]) -> Bool[Tensor, "*b p"]:
+        """Which points are outside the place."""
+        return self.place.distances(points)[0] > 0
+
+    def pull(self, contacts: Float[Tensor, "*b c 3"]) -> PointTerm:
+        """Distance of each contact to the place [m]; zero inside."""
+        distance, gradient = self.place.distances(contacts)
+        outside = (distance > 0).to(distance.dtype)
+        return PointTerm(distance * outside, gradient * outside[..., None])
+
+    def push(
+        self, points: Float[Tensor, "*b p 3"], distance: Float[Tensor, "*b p"], gradient: Float[Tensor, "*b p 3"]
+    ) -> PointTerm:
+        """How much nearer than `clear` each hand point outside the place is to the object [m], by its signed distance [m]."""
+        near = (self.beside(points) & (distance < self.clear)).to(distance.dtype)
+        return PointTerm((self.clear - distance) * near, -gradient * near[..., None])
+
+
+class ClearanceTerm(NamedTuple):
+    """The weighted term with its gradient."""
+
+    value: Float[Tensor, "n 1"]
+    by_pose: Float[Tensor, "n 6"]
+    by_joint: Float[Tensor, "n n_dof"]
+
+
+class Clearance:
+    """Keeps surface points, and the spheres that fill the links, out of the surroundings."""
+
+    def __init__(
+        self, hand: Hand, surroundings: Surroundings, body: LinkPoints, ball: LinkPoints, radii: Float[Tensor, " s"],
+        clear: float, weight: float,
+    ) -> None:
+        """Surface points, centres and radii of spheres [m], distance to keep [m], weight of the summed penetration [1/m]."""
+        self.hand, self.surroundings, self.weight, self.clear = hand, surroundings, weight, clear
+        # Of a plane, the spheres know nothing that surface points do not know; other things may be thin or small.
+        filled = surroundings.obstacles is not None or surroundings.spared is not None
+        self.parts = ((body, torch.zeros_like(body.layout[0])), (ball, radii))[: 1 + filled]
+        config, moving = ControllerConfig(), hand.movable & ~hand.abduction
+        self.postures = [
+            (end, torch.where(moving, share, 0.0).to(end))
+            for end, share in ((hand.open_ends, config.outer), (hand.closed_ends, config.inner))]
+        """Pregrasp and squeeze: where each joint moves to from the grasp, and how much of the way."""
+
+    def __call__(
+        self, T: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"], poses: Float[Tensor, "n n_links 4 4"],
+        pivot: Float[Tensor, "n 3"],
+    ) -> ClearanceTerm:
+        """The term of n grasps, from wrist poses, joints, poses of links, and the points about which hands turn [m]."""
+        tree, n = self.hand.tree, len(q)
+        joints = torch.cat([q + share * (end - q) for end, share in self.postures])
+        follow = torch.cat([torch.ones_like(q), *((1 - share).expand_as(q) for _, share in self.postures)])
+        poses = torch.cat([poses, T.repeat(len(self.postures), 1, 1)[:, None] @ tree.forward(joints)])
+        depth, wrenches = poses.new_zeros(len(poses)), poses.new_zeros(*poses.shape[:2], 6)
+        for points, radii in self.parts:
+            placed = points.place(poses)
+            distance, gradient = self.surroundings.distances(placed)
+            inside = energies.penetration(distance - radii - self.clear, gradient)
+            depth = depth + inside.value.sum(-1)
+            wrenches = wrenches + energies.link_wrenches(placed, self.weight * inside.by_point, points.members)
+        by_pose, by_joint = energies.joint_gradient(tree, poses, wrenches, pivot.repeat(len(follow) // n, 1))
+        value, by_pose, by_joint = (
+            x.unflatten(0, (-1, n)).sum(0) for x in (self.weight * depth[:, None], by_pose, by_joint * follow))
+        return ClearanceTerm(value, by_pose, by_joint)
+
+    def distance(
+        self, T: Float[Tensor, "*n 4 4"], q: Float[Tensor, "*n n_dof"], surroundings: Surroundings | None = None
+    ) -> Float[Tensor, "*n"]:
+        """Least distance of hands to the surroundings, or to others [m]."""
+        poses = (T[..., None, :, :] @ self.hand.tree.forward(q)).flatten(0, -4)
+        around = surroundings or self.surroundings
+        nearest = [(around.distances(points.place(poses))[0] - radii).amin(-1) for points, radii in self.parts]
+        return torch.stack(nearest).amin(0).reshape(q.shape[:-1])
+
 
 TERMS = ("force_closure", "distance", "penetration", "self_penetration", "alignment", "joints")
 """Names of the terms, in the order of every array of terms."""
@@ -28,47 +159,34 @@ TERMS = ("force_closure", "distance", "penetration", "self_penetration", "alignm
 class EnergyConfig(Checked):
     """Weights and geometry of the energy. Source: DexGraspNet, unless stated otherwise."""
 
-    force_closure: float = 1.0
-    """Weight of the squared net wrench."""
-    distance: float = 100.0
-    """Weight of the contacts' distance to the surface [1/m]."""
-    penetration: float = 100.0
-    """Weight of the hand points' penetration into the object [1/m]."""
+    force_closure: float = 1.0  # weight of the squared net wrench
+    distance: float = 100.0  # weight of the contacts' distance to the surface [1/m]
+    penetration: float = 100.0  # weight of the hand points' penetration into the object [1/m]
     filled: bool = False
     """Whether penetration is also measured at the spheres that fill the links, with the same weight (ours): a thin object
     finds its way between the hand points."""
-    self_penetration: float = 50.0
-    """Weight of self-penetration [1/m] (DexGraspNet: 10; its spheres are finer)."""
-    alignment: float = 1.0
-    """Weight of the angle between hand and object normals (ours)."""
-    joints: float = 1.0
-    """Weight of joints closer to their closed end than `closing_room` [1/rad or 1/m]."""
-    closing_room: float = 0.1
-    """Share of a joint's range that is kept for the squeeze (ours)."""
-    hand_points: int = 200
-    """Number of hand points at which penetration is measured."""
-    margin: float = 0.001
-    """Clearance that hand points keep from the object before they count as penetrating [m] (ours)."""
+    self_penetration: float = 50.0  # weight of self-penetration [1/m] (DexGraspNet: 10; its spheres are finer)
+    alignment: float = 1.0  # weight of the angle between hand and object normals (ours)
+    joints: float = 1.0  # weight of joints closer to their closed end than `closing_room` [1/rad or 1/m]
+    closing_room: float = 0.1  # share of a joint's range that is kept for the squeeze (ours)
+    hand_points: int = 200  # number of hand points at which penetration is measured
+    margin: float = 0.001  # clearance that hand points keep from the object before they count as penetrating [m] (ours)
     clearance: float = 100.0
     """Weight of the hand's penetration into its surroundings, in pregrasp, grasp and squeeze, and of the distance of contacts
     and other hand points from where they may be [1/m] (ours)."""
-    clearance_points: int = 120
-    """Number of hand points at which that is measured (ours)."""
-    clear: float = 0.005
-    """Distance that the hand keeps from its surroundings [m] (ours)."""
+    clearance_points: int = 120  # number of hand points at which that is measured (ours)
+    clear: float = 0.005  # distance that the hand keeps from its surroundings [m] (ours)
 
 
 @dataclass(frozen=True)
 class Evaluation(Rows):
     """Energy and gradient of n grasps."""
 
-    terms: Float[Tensor, "n 6"]
-    """Weighted terms in the order of TERMS."""
+    terms: Float[Tensor, "n 6"]  # weighted terms in the order of TERMS
     clearance: Float[Tensor, "n 1"]
     """Weighted penetration into the surroundings, and touch beside the contact region. It says nothing about the grasp itself,
     so it is not among the terms."""
-    by_pose: Float[Tensor, "n 6"]
-    """Derivative by the hand's translation [1/m] and rotation about its grasp centre [1/rad]."""
+    by_pose: Float[Tensor, "n 6"]  # derivative by the hand's translation [1/m] and rotation about its grasp centre [1/rad]
     by_joint: Float[Tensor, "n n_dof"]
 
     @property
@@ -81,10 +199,8 @@ class Evaluation(Rows):
 class Workspace:
     """Where a hand may be, and where it may touch the object; anywhere by default."""
 
-    surroundings: Surroundings | None = None
-    """What it stays clear of."""
-    contact_region: Balls | None = None
-    """The only place where it touches the object."""
+    surroundings: Surroundings | None = None  # what it stays clear of
+    contact_region: Balls | None = None  # the only place where it touches the object
 
     def to(self, device: torch.device | str) -> Workspace:
         """The same on another device."""
@@ -101,11 +217,8 @@ class GraspEnergy:
     ) -> None:
         """Prepare everything that stays the same from step to step.
 
-        Args:
-            field: Signed distances of the object.
-            centre: The object's centre of mass [m].
-            length: Typical distance of its surface from there [m].
-            device: Device of the evaluations; all that is given is on the CPU.
+        `centre` is the object's centre of mass, `length` a typical distance of its surface from there [m]. The device is that
+        of the evaluations; all that is given is on the CPU.
         """
         self.length, workspace = length, workspace or Workspace()
         self.workspace = workspace.to(device)
@@ -136,7 +249,6 @@ class GraspEnergy:
         return other
 
     def _weigh(self, config: EnergyConfig) -> None:
-        """Set the weights and everything that depends on them."""
         hand = self.hand
         thin = self.source.with_points(min(config.hand_points, hand.n_points)).to(hand.link_points.device)
         self.config, self.body = config, LinkPoints.of(thin.link_points, thin.link_index, hand.tree.n_links)
@@ -261,16 +373,11 @@ class NearestPoints:
     """For n grasps, the point nearest to the object on each of the l links that have surface points."""
 
     links: Int[Tensor, " l"]
-    index: Int[Tensor, "n l"]
-    """Which of the hand's surface points."""
-    points: Float[Tensor, "n l 3"]
-    """Where they are, in the object's frame [m]."""
-    link_normals: Float[Tensor, "n l 3"]
-    """Outward normals of the links there."""
-    gap: Float[Tensor, "n l"]
-    """Signed distance to the object [m]."""
-    object_normals: Float[Tensor, "n l 3"]
-    """Outward normals of the object there."""
+    index: Int[Tensor, "n l"]  # which of the hand's surface points
+    points: Float[Tensor, "n l 3"]  # where they are, in the object's frame [m]
+    link_normals: Float[Tensor, "n l 3"]  # outward normals of the links there
+    gap: Float[Tensor, "n l"]  # signed distance to the object [m]
+    object_normals: Float[Tensor, "n l 3"]  # outward normals of the object there
 
     @staticmethod
     def of(energy: GraspEnergy, T_object_wrist: Float[Tensor, "n 4 4"], q: Float[Tensor, "n n_dof"]) -> NearestPoints:

@@ -108,5 +108,4 @@ def _descend(
 
 
 def _within(vector: Float[Tensor, "n 3"], length: float) -> Float[Tensor, "n 3"]:
-    """Vectors shortened to a length where they are longer."""
     return vector * (length / vector.norm(dim=-1, keepdim=True).clamp_min(1e-9)).clamp_max(1.0)

@@ -14,8 +14,7 @@ from dro_grasp.geometry.distance_field import Ball, Balls, DistanceField
 from dro_grasp.geometry.se3 import apply_to_cloud, compose, random_rotations, roma, rotate, rotation_between
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked, renamed
-from dro_grasp.optimize.grasp_energy import EnergyConfig
-from dro_grasp.optimize.workspace import Surroundings
+from dro_grasp.optimize.grasp_energy import EnergyConfig, Surroundings
 
 Direction = tuple[float, float, float]  # A vector in the object's frame, of any length but zero
 CLEAR = EnergyConfig.clear  # Distance from its surroundings at which a hand starts [m]: the one that it keeps later
@@ -67,10 +66,8 @@ def _tilt(wanted: Float[Tensor, "3"], up: Float[Tensor, "3"]) -> tuple[Float[Ten
 class Spread(NamedTuple):
     """How palm directions are spread around the wanted one."""
 
-    deviation: float
-    """Standard deviation [rad]."""
-    max_tilt: float | None = None
-    """Evenly within this angle instead [rad]."""
+    deviation: float  # standard deviation [rad]
+    max_tilt: float | None = None  # evenly within this angle instead [rad]
 
 
 def wrist_rotations(
@@ -107,27 +104,18 @@ CHOICES = 8  # Wrist rotations among which each hand takes the one with most roo
 class StartConfig(Checked):
     """Distribution of the starts. Source of the scheme: DexGraspNet; the numbers are ours."""
 
-    openness: tuple[float, float] = (0.0, 1.0)
-    """Range of the share of the way from closed to open, one draw a grasp."""
+    openness: tuple[float, float] = (0.0, 1.0)  # range of the share of the way from closed to open, one draw a grasp
     joint_noise: float = 0.6
     """Standard deviation of each joint, as a share of its range; many joints start at a limit. (0.08 halves the diversity of
     the joints and yields no more.)"""
-    aim: float = 0.6
-    """Largest share of the way from the object's centre to a random surface point at which the palm aims."""
-    direction: Direction | None = None
-    """Palm direction in the object's frame; any by default."""
-    direction_spread: float = math.radians(5.0)
-    """Standard deviation of the palm direction around the given one [rad]."""
-    max_tilt: float | None = None
-    """Palm directions are spread evenly within this angle of the given one instead [rad]."""
-    contact_region: tuple[Ball, ...] = ()
-    """Places at which palms aim, where there are any; at all of the object by default."""
-    gap: tuple[float, float] = (0.0, 0.01)
-    """Range of the distance between hand and object [m]."""
-    clearance: float = 0.6
-    """How far outside the object's bounding sphere the approach begins [radius of the hand]."""
-    approach_steps: int = 24
-    """Steps of the approach along the palm direction."""
+    aim: float = 0.6  # largest share of the way from the object's centre to a random surface point at which the palm aims
+    direction: Direction | None = None  # palm direction in the object's frame; any by default
+    direction_spread: float = math.radians(5.0)  # standard deviation of the palm direction around the given one [rad]
+    max_tilt: float | None = None  # palm directions are spread evenly within this angle of the given one instead [rad]
+    contact_region: tuple[Ball, ...] = ()  # places at which palms aim, where there are any; at all of the object by default
+    gap: tuple[float, float] = (0.0, 0.01)  # range of the distance between hand and object [m]
+    clearance: float = 0.6  # how far outside the object's bounding sphere the approach begins [radius of the hand]
+    approach_steps: int = 24  # steps of the approach along the palm direction
 
 
 def start_joints(hand: Hand, n: int, config: StartConfig, generator: torch.Generator) -> Float[Tensor, "n n_dof"]:

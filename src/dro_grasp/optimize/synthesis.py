@@ -61,12 +61,10 @@ class SynthesisConfig(Checked):
 class State(Rows):
     """n grasps during the optimisation."""
 
-    T: Float[Tensor, "n 4 4"]
-    """T_object_wrist [m]."""
+    T: Float[Tensor, "n 4 4"]  # T_object_wrist [m]
     q: Float[Tensor, "n n_dof"]
     contacts: Int[Tensor, "n c"]
-    slots: Int[Tensor, "n c"]
-    """The slot that each contact draws its candidates from."""
+    slots: Int[Tensor, "n c"]  # the slot that each contact draws its candidates from
     result: Evaluation
 
 

@@ -23,8 +23,7 @@ class PointTerm(NamedTuple):
     """Unreduced values of a term that depends on positions."""
 
     value: Float[Tensor, "*b k"]
-    by_point: Float[Tensor, "*b c 3"]
-    """Derivative of the summed values by the points given [unit of the value per m]."""
+    by_point: Float[Tensor, "*b c 3"]  # derivative of the summed values by the points given [unit of the value per m]
 
 
 class ContactTerm(NamedTuple):
@@ -32,8 +31,7 @@ class ContactTerm(NamedTuple):
 
     value: Float[Tensor, "*b k"]
     by_point: Float[Tensor, "*b c 3"]
-    by_normal: Float[Tensor, "*b c 3"]
-    """Derivative of the summed values by the normals given."""
+    by_normal: Float[Tensor, "*b c 3"]  # derivative of the summed values by the normals given
 
 
 def force_closure(points: Float[Tensor, "*b c 3"], normals: Float[Tensor, "*b c 3"], length: float) -> ContactTerm:

@@ -26,7 +26,7 @@ from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import Checked, checked
 from dro_grasp.objects.shape import ObjectModel, solid_of
 from dro_grasp.pictures.appearance import CONTACT_COLOUR, best_camera, hand_meshes, object_meshes, success_colour
-from dro_grasp.simulation import closed_poses
+from dro_grasp.simulation import trial
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, PROTOCOLS
 
 TILE = (320, 280)  # Width and height of the picture of one grasp [pixels]
@@ -125,7 +125,7 @@ def after_closing(hand: Hand, obj: ObjectModel, grasps: GraspBatch) -> GraspBatc
     joints, poses = grasps.joints.clone(), grasps.T_object_wrist.clone()
     for name in set(names):
         rows = torch.tensor([i for i, own in enumerate(names) if own == name])
-        closed = closed_poses.after_closing(hand, solid, grasps[rows], name)
+        closed = trial.after_closing(hand, solid, grasps[rows], name)
         joints[rows], poses[rows] = closed.joints, closed.T_object_wrist
     return grasps.replace(joints=joints, T_object_wrist=poses)
 

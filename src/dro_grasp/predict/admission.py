@@ -14,9 +14,9 @@ from torch import Tensor
 from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.anatomy import PALM
 from dro_grasp.kinds import Checked
+from dro_grasp.optimize.grasp_energy import Surroundings
 from dro_grasp.optimize.squeeze import GripConfig
 from dro_grasp.optimize.starts import APPROACH, angle_to_arc
-from dro_grasp.optimize.workspace import Surroundings
 from dro_grasp.predict.problem import GraspProblem
 
 APPROACH_CHECKS = 9  # Places on the approach at which the hand is checked, both ends included (ours)

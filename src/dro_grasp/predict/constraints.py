@@ -16,9 +16,8 @@ from dro_grasp.geometry.distance_field import Ball, Balls
 from dro_grasp.kinds import FORMER_CONSTRAINTS, Checked, plain, renamed
 from dro_grasp.objects.scenery import Scene
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.optimize.grasp_energy import Workspace
+from dro_grasp.optimize.grasp_energy import Surroundings, Workspace
 from dro_grasp.optimize.starts import Direction
-from dro_grasp.optimize.workspace import Surroundings
 
 SAME_TABLE_WITHIN = 0.01  # A table farther than this from the one in the cloud is another [m] (ours)
 MIN_UPRIGHT_COSINE = math.cos(math.radians(5.0))

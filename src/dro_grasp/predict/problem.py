@@ -14,9 +14,8 @@ from dro_grasp.geometry.distance_field import Balls, DistanceField
 from dro_grasp.grasps.sources import require_pair
 from dro_grasp.hands.hand import Hand
 from dro_grasp.objects.shape import ObjectModel, solid_of
-from dro_grasp.optimize.grasp_energy import EnergyConfig, GraspEnergy, Workspace
+from dro_grasp.optimize.grasp_energy import Clearance, EnergyConfig, GraspEnergy, Surroundings, Workspace
 from dro_grasp.optimize.starts import APPROACH
-from dro_grasp.optimize.workspace import Clearance, Surroundings
 from dro_grasp.predict.constraints import Constraints
 
 

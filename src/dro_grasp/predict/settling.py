@@ -24,9 +24,9 @@ from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.holding_score import holding_score
 from dro_grasp.predict.score.score import ScoreConfig
 from dro_grasp.predict.stages import complete, grip, refine, scored
-from dro_grasp.simulation.closed_poses import hand_shift, settle
 from dro_grasp.simulation.contacts import deepest_penetration
 from dro_grasp.simulation.grasp_state import GraspState, grasp_state
+from dro_grasp.simulation.trial import hand_shift, settle
 
 
 @renamed(room_worth="clearance_worth")

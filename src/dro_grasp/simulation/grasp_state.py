@@ -40,22 +40,14 @@ NO_ANSWER = 3.0  # Largest value of `unanswered`; its value without contacts, an
 class GraspState(Rows):
     """How the object is held in n closed grasps."""
 
-    shift: Float[Tensor, " n"]
-    """How far closing moved the object [m]."""
-    turn: Float[Tensor, " n"]
-    """How far it turned the object [rad]."""
-    speed: Float[Tensor, " n"]
-    """How fast the object still moves [m/s]."""
-    spin: Float[Tensor, " n"]
-    """How fast it still turns [rad/s]."""
-    contacts: Float[Tensor, " n"]
-    """Number of contact points of hand and object."""
-    links: Float[Tensor, " n"]
-    """Number of links that touch the object."""
-    pressure: Float[Tensor, " n"]
-    """Sum of the normal forces [N]."""
-    slip: Float[Tensor, " n"]
-    """Largest ratio of tangential to normal force at a contact that bears; NO_ANSWER without one."""
+    shift: Float[Tensor, " n"]  # how far closing moved the object [m]
+    turn: Float[Tensor, " n"]  # how far it turned the object [rad]
+    speed: Float[Tensor, " n"]  # how fast the object still moves [m/s]
+    spin: Float[Tensor, " n"]  # how fast it still turns [rad/s]
+    contacts: Float[Tensor, " n"]  # number of contact points of hand and object
+    links: Float[Tensor, " n"]  # number of links that touch the object
+    pressure: Float[Tensor, " n"]  # sum of the normal forces [N]
+    slip: Float[Tensor, " n"]  # largest ratio of tangential to normal force at a contact that bears; NO_ANSWER without one
     unanswered: Float[Tensor, "n 2"]
     """What is missing for contacts near their present forces to answer a push: for the worst direction, and on average."""
 
@@ -65,14 +57,10 @@ class ContactForces:
     """Contacts of one configuration with the object; normals point into it."""
 
     normal: Float[np.ndarray, "k 3"]
-    arm: Float[np.ndarray, "k 3"]
-    """From the object's centre of mass [m]."""
-    pressure: Float[np.ndarray, " k"]
-    """Normal force [N]."""
-    tangential: Float[np.ndarray, " k"]
-    """Tangential force [N]."""
-    links: int
-    """Number of links that they are on."""
+    arm: Float[np.ndarray, "k 3"]  # from the object's centre of mass [m]
+    pressure: Float[np.ndarray, " k"]  # normal force [N]
+    tangential: Float[np.ndarray, " k"]  # tangential force [N]
+    links: int  # number of links that they are on
 
     @property
     def slip(self) -> float:
@@ -93,7 +81,6 @@ def grasp_state(
 
 
 def _observed(rollout: Rollout) -> GraspState:
-    """Close the hands of a rollout."""
     scene, closed = rollout.scene, rollout.close()
     first = int(scene.model.body_dofadr[scene.object_body])
     velocity = np.nan_to_num(np.array(rollout.batch.bind("qvel"))[:, first:first + 6])
@@ -137,11 +124,9 @@ def _contacts(rollout: Rollout) -> list[ContactForces]:
 
 
 def unanswered(contacts: list[ContactForces], mass: Float[Tensor, " n"], friction: float) -> Float[Tensor, "n 2"]:
-    """What is missing for the contacts to answer pushes: for the worst of six directions, and on average.
-
-    Each contact may change its force within its friction cone; a change relative to its present pressure costs as much as a
-    share of the push that stays unanswered.
-    """
+    """What is missing for the contacts to answer pushes: for the worst of six directions, and on average."""
+    # Each contact may change its force within its friction cone; a change relative to its present pressure costs as much as a
+    # share of the push that stays unanswered.
     n = len(contacts)
     normal, arm = torch.zeros(n, CONTACTS, 3), torch.zeros(n, CONTACTS, 3)
     normal[..., 2], pressure = 1.0, torch.zeros(n, CONTACTS)

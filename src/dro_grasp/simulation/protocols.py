@@ -187,11 +187,7 @@ def protocol(name: str | Protocol) -> Protocol:
 
 
 def changed(name: str | Protocol, *, friction: float | None = None, mass_factor: float = 1.0) -> Protocol:
-    """A protocol with another friction, unless that is None, or with another multiple of the object's mass.
-
-    Raises:
-        OptionError: A value is out of range, or no protocol has the name.
-    """
+    """A protocol with another friction (None: its own), or multiple of the mass; OptionError: out of range, or no protocol."""
     rules = protocol(name)
     if friction is not None and not 0 < friction <= 10:
         raise OptionError(f"friction is {friction}; give a coefficient between 0 and 10")

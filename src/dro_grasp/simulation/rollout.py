@@ -34,10 +34,8 @@ RESOLUTION = 1e-4  # Grasps that agree to this have the same draws [m or rad]. O
 class Conditions(Rows):
     """What differs from the protocol in n trials; the factors are those of Perturbations."""
 
-    shift: Float[np.ndarray, "n 3"]
-    """Displacement of the object, in its own frame [m]."""
-    turn: Float[np.ndarray, "n 3"]
-    """Rotation vector of the object about its centre of mass, in its own frame [rad]."""
+    shift: Float[np.ndarray, "n 3"]  # displacement of the object, in its own frame [m]
+    turn: Float[np.ndarray, "n 3"]  # rotation vector of the object about its centre of mass, in its own frame [rad]
     friction: Float[np.ndarray, " n"]
     mass: Float[np.ndarray, " n"]
     gain: Float[np.ndarray, " n"]
@@ -52,10 +50,8 @@ class Conditions(Rows):
 
 
 def draw(config: Perturbations, grasps: GraspBatch) -> Conditions:
-    """Conditions of all trials but the first: the second trial of every grasp, then the third, and so on.
-
-    A grasp's position and joints are the seed of its draws, so they depend neither on its company nor on a file between.
-    """
+    """Conditions of all trials but the first: the second trial of every grasp, then the third, and so on."""
+    # A grasp's position and joints are the seed of its draws, so they depend neither on its company nor on a file between.
     k = config.trials - 1
     drawn = [_draw(config, k, _generator(p, q)) for p, q in zip(grasps.T_object_wrist[:, :3, 3], grasps.joints, strict=True)]
     columns = {name: np.stack([d[name] for d in drawn], 1) for name in ("shift", "turn", *FACTORS)}
@@ -89,11 +85,9 @@ STATE = ("qpos", "qvel", "qacc_warmstart")  # Quantities that a trial needs to c
 class ObjectState(Rows):
     """The object in n trials, in the wrist frame."""
 
-    position: Float[np.ndarray, "n 3"]
-    """Centre of mass [m]."""
+    position: Float[np.ndarray, "n 3"]  # centre of mass [m]
     rotation: Float[np.ndarray, "n 3 3"]
-    stable: Bool[np.ndarray, " n"]
-    """Whether the simulation is sound so far."""
+    stable: Bool[np.ndarray, " n"]  # whether the simulation is sound so far
 
     def shift(self, other: ObjectState) -> Float[np.ndarray, " n"]:
         """Distance to another state [m]."""
@@ -117,11 +111,8 @@ class Rollout:
     ) -> None:
         """Place hands and objects.
 
-        Args:
-            grasps: At least one; each states its pregrasp and squeeze if the protocol closes the hand.
-            workers: Threads.
-            stride: Record a frame every so many time steps; None records nothing.
-            conditions: What differs from the protocol; None if nothing does.
+        Grasps, one at least, state pregrasp and squeeze if the protocol closes the hand. A frame is recorded every `stride`
+        time steps, none by default; `workers` are threads, and `conditions` differ from the protocol.
         """
         rules = scene.protocol
         start, target = grasps.joints, grasps.joints
@@ -159,9 +150,7 @@ class Rollout:
     ) -> tuple[Float[np.ndarray, "n 6"], Float[np.ndarray, "n 6"], Bool[np.ndarray, " n"]]:
         """Apply all forces in turn to the trials that are alive; a lost object is left alone.
 
-        Returns:
-            Displacement [m] and rotation [rad] after each force, NaN where none was applied; whether the simulation
-            stayed sound.
+        Displacement [m] and rotation [rad] after each force, NaN where none was applied; whether the simulation stayed sound.
         """
         displacement, rotation = np.full((self.size, 6), np.nan), np.full((self.size, 6), np.nan)
         stable, alive = closed.stable.copy(), alive & closed.stable

@@ -1,4 +1,4 @@
-"""Run trials of grasps: close the hand, push the object along six directions, see whether it stays.
+"""Run trials of grasps: close the hand, push the object along six directions, see whether it stays; or close it alone.
 
 Source: paper, evaluation metric details.
 """
@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dro_grasp.devices import cores
@@ -18,13 +18,11 @@ from dro_grasp.grasps.batch import GraspBatch
 from dro_grasp.hands.hand import Hand
 from dro_grasp.kinds import checked
 from dro_grasp.objects.shape import ObjectModel
-from dro_grasp.simulation.contacts import Penetration, count_fingers, find_contact_links, measure_penetration
-from dro_grasp.simulation.outcome import DIRECTIONS, LOST_DISTANCE, Failure, Measurements, TrialResult, verdict
+from dro_grasp.simulation.contacts import Penetration, contact_mask, count_fingers, find_contact_links, measure_penetration
+from dro_grasp.simulation.outcome import LOST_DISTANCE, Failure, Measurements, TrialResult, verdict
 from dro_grasp.simulation.protocols import DEFAULT_PROTOCOL, Protocol
 from dro_grasp.simulation.rollout import Rollout, draw, rollouts
 from dro_grasp.simulation.scene import TrialScene, cached_scene, scene_of
-
-__all__ = ["DIRECTIONS", "Failure", "TrialResult", "record", "simulate"]
 
 
 @checked
@@ -66,16 +64,10 @@ def record(
     hand: Hand, obj: ObjectModel, grasps: GraspBatch, index: int, protocol: str | Protocol = DEFAULT_PROTOCOL, *,
     stride: int = 10,
 ) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames n_dof"]]:
-    """Frames of one grasp's trial, as `simulate` runs it: it ends where the trial ends; arguments and errors are the same.
+    """Frames of one grasp's trial: object poses in the wrist frame [m], and joints [rad or m]; errors as of `simulate`.
 
-    Of several trials under a protocol that perturbs, it is the one that `simulate` measures.
-
-    Args:
-        index: Which grasp.
-        stride: Time steps between two frames; the end of closing and of each force gets a frame in any case.
-
-    Returns:
-        Object poses in the wrist frame [m], and joints [rad or m].
+    It runs and ends as `simulate` does; of several trials under a protocol that perturbs, it is the one that `simulate`
+    measures. There are `stride` time steps between two frames; the end of closing and of each force gets a frame in any case.
     """
     scene = scene_of(hand, obj, grasps, protocol)
     (grasp, rollout), = rollouts(scene, hand, grasps[index], workers=1, stride=stride)
@@ -90,7 +82,6 @@ def record(
 
 
 def _run(rollout: Rollout, penetration: Penetration) -> TrialResult:
-    """Take a rollout through the whole protocol; the labelled grasps' penetration is known."""
     scene, rules = rollout.scene, rollout.scene.protocol
     closed = rollout.close()
     contacts = find_contact_links(scene, rollout.qpos)
@@ -128,3 +119,57 @@ def _scene_of_trial(scene: TrialScene, trial: int) -> TrialScene:
     rules = scene.protocol.perturbations
     fine = trial < rules.trials - rules.coarse
     return scene if fine else cached_scene(scene.hand, scene.obj.coarse, scene.protocol)
+
+
+def settle(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *, workers: int | None = None
+) -> GraspBatch:
+    """The same grasps, relabelled with the poses of hand and object after closing.
+
+    A joint above a link that touches the object takes the value it reached, held back by the contact, so that the
+    label touches the surface. The other joints keep their values: closing would only drive them towards a fist. A
+    grasp whose simulation is unstable keeps its label. Energies and depth stay those before settling; scores and
+    outcomes are dropped. Errors are those of `simulate`.
+    """
+    scene = scene_of(hand, obj, grasps, protocol)
+    joints, poses = [grasps.joints[:0]], [grasps.T_object_wrist[:0]]
+    for part, rollout in rollouts(scene, hand, grasps, workers):
+        reached, T_object_wrist = _reached(part, rollout, hand, torch.from_numpy(rollout.close().stable))
+        touching = contact_mask(hand, find_contact_links(scene, rollout.qpos))
+        holding = touching.float() @ hand.tree.moves.float() > 0  # joints that move a contact link
+        joints.append(torch.where(holding, reached, part.joints))
+        poses.append(T_object_wrist)
+    unsettled = grasps.without("pregrasp_joints", "squeeze_joints", "score").without_trial()
+    return unsettled.replace(T_object_wrist=torch.cat(poses), joints=torch.cat(joints))
+
+
+def hand_shift(hand: Hand, before: GraspBatch, after: GraspBatch) -> Float[Tensor, " n"]:
+    """How far each hand moved relative to the object, at its grasp centre [m]."""
+    return (hand.grasp_centres(after.T_object_wrist) - hand.grasp_centres(before.T_object_wrist)).norm(dim=-1)
+
+
+def after_closing(
+    hand: Hand, obj: ObjectModel, grasps: GraspBatch, protocol: str | Protocol = DEFAULT_PROTOCOL, *, workers: int | None = None
+) -> GraspBatch:
+    """The same grasps, outcomes included, in the poses of hand and object after closing, from where a trial goes on.
+
+    A grasp whose simulation is unstable, or that pushes the object farther than LOST_DISTANCE, stays as it is. Errors are those
+    of `simulate`.
+    """
+    scene, parts = scene_of(hand, obj, grasps, protocol), [(grasps.joints[:0], grasps.T_object_wrist[:0])]
+    for part, rollout in rollouts(scene, hand, grasps, workers):
+        closed = rollout.close()
+        sound = torch.from_numpy(closed.stable & (closed.shift(rollout.start) < LOST_DISTANCE))
+        parts.append(_reached(part, rollout, hand, sound))
+    joints, poses = (torch.cat(column) for column in zip(*parts, strict=True))
+    return grasps.replace(joints=joints, T_object_wrist=poses)
+
+
+def _reached(
+    part: GraspBatch, rollout: Rollout, hand: Hand, sound: Bool[Tensor, " n"]
+) -> tuple[Float[Tensor, "n n_dof"], Float[Tensor, "n 4 4"]]:
+    """Joints and wrist poses relative to the object as a rollout has them now; those of the grasp where it is not sound."""
+    q, T = (torch.from_numpy(x) for x in rollout.poses())
+    q = q.to(part.joints.dtype).clamp(hand.tree.lower, hand.tree.upper)
+    T_object_wrist = torch.linalg.inv(torch.where(sound[:, None, None], T, torch.eye(4, dtype=T.dtype))).to(q.dtype)
+    return torch.where(sound[:, None], q, part.joints), torch.where(sound[:, None, None], T_object_wrist, part.T_object_wrist)

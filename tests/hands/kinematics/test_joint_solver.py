@@ -9,9 +9,7 @@ import torch
 
 from dro_grasp.errors import OptionError
 from dro_grasp.geometry.se3 import roma
-from dro_grasp.hands.kinematics.joint_reading import read_joints
-from dro_grasp.hands.kinematics.joint_solver import JointSolverConfig, Targets, solve_joints
-from dro_grasp.hands.kinematics.joint_step import StepConfig, best_step
+from dro_grasp.hands.kinematics.joint_solver import JointSolverConfig, StepConfig, Targets, best_step, read_joints, solve_joints
 from dro_grasp.hands.kinematics.tree import PRISMATIC, KinematicTree
 from tests.helpers.toy_hand import toy_tree
 

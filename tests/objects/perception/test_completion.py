@@ -15,9 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from dro_grasp.network.completion_network import SurfaceNetwork, shipped_surface
 from dro_grasp.objects.catalogue import load_object
-from dro_grasp.objects.perception.completion import GUESSES, complete_cloud, surface_features, to_view_axes
+from dro_grasp.objects.perception.completion import GUESSES, Guess, VisibleSide, complete_cloud, surface_features, to_view_axes
 from dro_grasp.objects.perception.partial_views import DepthCamera, visible_points, visible_side
-from dro_grasp.objects.perception.symmetry import Guess, VisibleSide
 
 Shape = tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]
 

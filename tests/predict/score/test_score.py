@@ -16,8 +16,7 @@ from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
 from dro_grasp.predict.problem import GraspProblem
 from dro_grasp.predict.score.score import ScoreConfig
 from dro_grasp.predict.stages import scored
-from dro_grasp.simulation.closed_poses import settle
-from dro_grasp.simulation.trial import simulate
+from dro_grasp.simulation.trial import settle, simulate
 from tests.helpers.loaded_hands import loaded_hand
 from tests.helpers.toy_hand import toy_hand
 

@@ -236,7 +236,7 @@ def test_idle_fingers_of_new_grasps_close():
 
 
 def test_settled_labels_move_only_joints_that_hold(tmp_path):
-    from dro_grasp.simulation.closed_poses import settle
+    from dro_grasp.simulation.trial import settle
 
     hand, can = loaded_hand("allegro"), load_object("can")
     grasps = valid_grasps(hand, can, 1, EngineConfig(

@@ -21,12 +21,9 @@ SAMPLES_AT_ONCE = 500_000  # Samples that are shaded together (ours); likewise
 class Mesh:
     """Triangles of one colour."""
 
-    vertices: Num[np.ndarray, "n 3"]
-    """World coordinates [m]."""
-    faces: Int[np.ndarray, "m 3"]
-    """Vertex indices."""
-    colour: Colour
-    """Before shading."""
+    vertices: Num[np.ndarray, "n 3"]  # world coordinates [m]
+    faces: Int[np.ndarray, "m 3"]  # vertex indices
+    colour: Colour  # before shading
 
 
 def arrow(
@@ -88,14 +85,10 @@ def unit(v: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
 class Camera:
     """A pinhole camera."""
 
-    position: tuple[float, float, float]
-    """Optical centre [m]."""
-    target: tuple[float, float, float]
-    """The point in the middle of the picture [m]."""
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Direction that points up in the picture."""
-    field_of_view: float = 0.6
-    """Angle between the upper and lower edges [rad]."""
+    position: tuple[float, float, float]  # optical centre [m]
+    target: tuple[float, float, float]  # the point in the middle of the picture [m]
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # direction that points up in the picture
+    field_of_view: float = 0.6  # angle between the upper and lower edges [rad]
 
     @staticmethod
     def around(
@@ -145,20 +138,13 @@ class Camera:
 class Style:
     """Light and finish of a picture. Values are ours."""
 
-    ambient: float = 0.44
-    """Share of the colour that needs no light."""
-    diffuse: float = 0.64
-    """Share of the colour that grows with the cosine between normal and light."""
-    specular: float = 0.16
-    """Strength of the gloss."""
-    shininess: float = 24.0
-    """Exponent of the gloss: larger makes it smaller."""
-    crease: float = 0.85
-    """Faces whose normal has a smaller cosine to the vertex normal keep a sharp edge."""
-    outline: float = 4.0
-    """Darkening at depth steps, which separates fingers from the background."""
-    outline_scale: float = 0.02
-    """Depth step that is darkened fully [m]."""
+    ambient: float = 0.44  # share of the colour that needs no light
+    diffuse: float = 0.64  # share of the colour that grows with the cosine between normal and light
+    specular: float = 0.16  # strength of the gloss
+    shininess: float = 24.0  # exponent of the gloss: larger makes it smaller
+    crease: float = 0.85  # faces whose normal has a smaller cosine to the vertex normal keep a sharp edge
+    outline: float = 4.0  # darkening at depth steps, which separates fingers from the background
+    outline_scale: float = 0.02  # depth step that is darkened fully [m]
     light: tuple[float, float, float] = (-0.45, 0.65, 0.75)
     """Direction towards the light: right, up and backward of the picture."""
 
@@ -167,15 +153,11 @@ class Style:
 class _Triangles:
     """All triangles of a picture, three corners each."""
 
-    corners: Float[np.ndarray, "f 3 3"]
-    """Positions in the camera's axes [m]."""
-    normals: Float[np.ndarray, "f 3 3"]
-    """Unit normals in the camera's axes."""
+    corners: Float[np.ndarray, "f 3 3"]  # positions in the camera's axes [m]
+    normals: Float[np.ndarray, "f 3 3"]  # unit normals in the camera's axes
     colours: Float[np.ndarray, "f 3"]
-    screen: Float[np.ndarray, "f 3 3"]
-    """Pixel coordinates, and inverse depth [1/m]."""
-    visible: Bool[np.ndarray, " f"]
-    """Whether the triangle lies before the camera."""
+    screen: Float[np.ndarray, "f 3 3"]  # pixel coordinates, and inverse depth [1/m]
+    visible: Bool[np.ndarray, " f"]  # whether the triangle lies before the camera
 
     @cached_property
     def shares(self) -> Float[np.ndarray, "3 3 f"]:
@@ -199,10 +181,8 @@ class _Canvas:
 
     width: int
     height: int
-    inverse: Float[np.ndarray, " samples"]
-    """Inverse depth of the nearest triangle [1/m]; 0 where there is none."""
-    face: Int[np.ndarray, " samples"]
-    """That triangle, where there is one."""
+    inverse: Float[np.ndarray, " samples"]  # inverse depth of the nearest triangle [1/m]; 0 where there is none
+    face: Int[np.ndarray, " samples"]  # that triangle, where there is one
 
 
 def render(
@@ -229,7 +209,6 @@ def render(
 
 
 def _gather(meshes: Sequence[Mesh], camera: Camera, canvas: _Canvas, style: Style) -> _Triangles:
-    """The triangles of all meshes, as the camera sees them."""
     axes = camera.axes()
     corners, normals, colours = [np.zeros((0, 3, 3))], [np.zeros((0, 3, 3))], [np.zeros((0, 3))]
     for mesh in meshes:
@@ -282,7 +261,6 @@ def _draw(rows: Int[np.ndarray, "rows 2"], triangles: _Triangles, canvas: _Canva
 
 
 def _shaded(triangles: _Triangles, canvas: _Canvas, background: Colour, style: Style) -> Float[np.ndarray, "samples 3"]:
-    """The colour of every sample."""
     colours = np.broadcast_to(np.asarray(background, np.float32), (len(canvas.face), 3)).copy()
     shares = triangles.shares
     corners, normals_of, colours_of = (

@@ -15,31 +15,23 @@ if TYPE_CHECKING:
 class ExportJob:
     """Grasps of one object on their way into another program's format."""
 
-    grasps: GraspBatch
-    """Each states pregrasp and squeeze."""
+    grasps: GraspBatch  # each states pregrasp and squeeze
     frame: Frame
-    hand: Hand | None = None
-    """The grasps' hand, for formats that need it."""
-    object_path: str = ""
-    """File or name of the object."""
-    object_scale: float = 1.0
-    """Scale of that file."""
+    hand: Hand | None = None  # the grasps' hand, for formats that need it
+    object_path: str = ""  # file or name of the object
+    object_scale: float = 1.0  # scale of that file
 
 
 @dataclass(frozen=True)
 class ExportFormat:
     """One format and how its files are called."""
 
-    name: str
-    """Name in FORMATS and WRITERS."""
+    name: str  # name in FORMATS and WRITERS
     title: str
     suffix: str
-    explanation: str
-    """What the files hold."""
-    needs_hand: bool = False
-    """Whether it writes more of the hand than its name."""
-    file_per_grasp: bool = False
-    """Whether an object becomes a folder with one file per grasp."""
+    explanation: str  # what the files hold
+    needs_hand: bool = False  # whether it writes more of the hand than its name
+    file_per_grasp: bool = False  # whether an object becomes a folder with one file per grasp
 
     def content(self, job: ExportJob) -> bytes | list[bytes]:
         """The object's file, or one file per grasp."""

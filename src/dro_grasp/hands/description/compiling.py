@@ -60,11 +60,7 @@ def mujoco_speaks_to(notes: list[Note], path: Path) -> Iterator[None]:
 
 
 def compile_hand(spec: mujoco.MjSpec, path: Path, notes: list[Note]) -> mujoco.MjModel:
-    """The compiled model. Repairs change the specification, so simulation gets them too.
-
-    Raises:
-        HandError: MuJoCo refuses the description for a reason that cannot be repaired, or a number is absurd.
-    """
+    """The compiled model, after repairs of the specification; HandError: MuJoCo refuses it, or a number is absurd."""
     for body in list(spec.bodies)[1:]:
         if body.mass < 0:  # MuJoCo may raise it to its least without a word
             notes.append(Note("warning", body.name, f"states a mass of {body.mass:g} kg; taken as {LEAST_MASS:g} kg"))

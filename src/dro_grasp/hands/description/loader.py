@@ -1,14 +1,15 @@
-"""A hand description, URDF or MJCF, read once into a kinematic tree and link geometry.
+"""A hand description, URDF or MJCF, or the part of it that is the hand, read once into a kinematic tree and link geometry.
 
 MuJoCo reads the file, so kinematics and simulation agree on every link, limit and coupling.
 """
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import os
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -21,7 +22,6 @@ from torch import Tensor
 from dro_grasp.errors import HandError
 from dro_grasp.files import given_path
 from dro_grasp.hands.description.compiling import Note, collide, compile_hand, guess_unit, mujoco_speaks_to
-from dro_grasp.hands.description.part import arm_in_mjcf, arm_in_urdf, named, part_of_mjcf, part_of_urdf
 from dro_grasp.hands.description.reduction import keep_hand_only
 from dro_grasp.hands.description.tree_reading import Coupling, LinkGeometry, read_couplings, read_geometry, read_tree
 from dro_grasp.hands.description.urdf import as_obj, prepare_urdf
@@ -32,16 +32,12 @@ OPEN = "open"  # Name of the state or keyframe (ours; MoveIt's own examples use 
 
 
 def load_description(path: Path | str, link: str | None = None, *, arm: bool = False) -> Description:
-    """Read a URDF or MJCF file, or the part of it that begins at a link.
+    """Read a URDF or MJCF file, or the part of it that begins at a link; HandError: it cannot be used, or has no such link.
 
     Args:
-        path: The file.
         link: The link at which the hand begins; by default the file is the hand's, or the arm's.
         arm: Read the arm instead of the hand, up to this link. Its root stands still; a hand is free, so joints that move all
             of it are left out.
-
-    Raises:
-        HandError: The file cannot be used, or has no such link; the message gives the reason and a remedy.
     """
     path = given_path(path)
     root = parse_xml(path)
@@ -155,11 +151,7 @@ def _digest(path: Path, files: tuple[Path, ...], link: str | None) -> str:
 
 
 def open_state(srdf: Path) -> dict[str, float]:
-    """Joint values of every `<group_state name="open">` of an SRDF file [rad or m]; empty if it has none.
-
-    Raises:
-        HandError: The file is not valid XML, or a value is not a number.
-    """
+    """Joints in every `<group_state name="open">` of an SRDF [rad or m]; HandError: it is no XML, or a value is no number."""
     stated = {}
     for state in parse_xml(srdf).iter("group_state"):
         for joint in state.iter("joint") if state.get("name") == OPEN else ():
@@ -197,3 +189,105 @@ def self_penetration(description: Description, q: Float[Tensor, " n_dof"]) -> di
             pair = model.body(first).name, model.body(second).name
             depths[pair] = max(depths.get(pair, 0.0), -float(contact.dist))
     return depths
+
+
+MARK = "#"
+"""What stands between a file and the link at which a hand begins in it."""
+
+
+def named(file: object, link: str | None) -> str:
+    """A file, or the part of it that begins at a link, as users write it."""
+    return str(file) if link is None else f"{file}{MARK}{link}"
+
+
+def split_part(name: str) -> tuple[str, str | None]:
+    """What a user wrote of a hand, and the link at which it begins, if that was written behind it."""
+    if MARK not in name or given_path(name).exists():
+        return name, None
+    file, _, link = name.rpartition(MARK)
+    return file, link
+
+
+def part_of_urdf(root: ET.Element, link: str, path: Path) -> None:
+    """Keep, in place, a link of a URDF and what hangs on it."""
+    ends = _ends(root)
+    kept = _below(ends, link)
+    _require(link, [element.get("name", "") for element in root.findall("link")], path)
+    for joint, (above, below) in ends.items():
+        if above not in kept or below == link:
+            root.remove(joint)
+    for element in root.findall("link"):
+        if element.get("name", "") not in kept:
+            root.remove(element)
+
+
+def arm_in_urdf(root: ET.Element, link: str, path: Path) -> None:
+    """Keep, in place, all of a URDF but a hand; of the link at which it begins, a frame. Only joints that move it move."""
+    _require(link, [element.get("name", "") for element in root.findall("link")], path)
+    ends = _ends(root)
+    hand, carriers = _below(ends, link), {link}
+    while grown := {above for above, below in ends.values() if below in carriers} - carriers:
+        carriers |= grown
+    for joint, (above, below) in ends.items():
+        if above in hand:
+            root.remove(joint)
+        elif below not in carriers:
+            joint.set("type", "fixed")
+            for mimic in joint.findall("mimic"):
+                joint.remove(mimic)
+    for element in root.findall("link"):
+        if element.get("name") == link:
+            element[:] = [child for child in element if child.tag not in {"visual", "collision", "inertial"}]
+        elif element.get("name") in hand:
+            root.remove(element)
+
+
+def arm_in_mjcf(spec: mujoco.MjSpec, link: str, path: Path) -> None:
+    """The same of an MJCF, in place; its keyframes are lost."""
+    _require(link, [body.name for body in list(spec.bodies)[1:]], path)
+    hand = spec.body(link)
+    for item in [*hand.bodies, *hand.geoms, *spec.keys]:
+        spec.delete(item)
+    hand.explicitinertial, carriers, above = False, {link}, hand.parent
+    while above is not None and above.name != "world":
+        carriers.add(above.name)
+        above = above.parent
+    for joint in list(spec.joints):
+        if joint.parent.name not in carriers:
+            spec.delete(joint)
+
+
+def part_of_mjcf(spec: mujoco.MjSpec, link: str, path: Path) -> mujoco.MjSpec:
+    """A body of an MJCF and what hangs on it, with the couplings, tendons, actuators and keyframes of its joints."""
+    _require(link, [body.name for body in list(spec.bodies)[1:]], path)
+    part = mujoco.MjSpec()
+    part.compiler.degree = spec.compiler.degree
+    with mujoco_speaks_to([], path):  # of its options, all of which the protocol sets
+        part.worldbody.add_frame().attach_body(spec.body(link), "", "")
+    shown = {geom.meshname for geom in part.geoms}
+    for mesh in list(part.meshes):
+        if mesh.name not in shown:
+            part.delete(mesh)
+    return part
+
+
+def _ends(root: ET.Element) -> dict[ET.Element, tuple[str, str]]:
+    """Parent and child link of every joint of a URDF."""
+    link_of = lambda end: "" if end is None else end.get("link", "")  # noqa: E731
+    return {joint: (link_of(joint.find("parent")), link_of(joint.find("child"))) for joint in root.findall("joint")}
+
+
+def _below(ends: Mapping[ET.Element, tuple[str, str]], link: str) -> set[str]:
+    """A link and all links that hang on it."""
+    found = {link}
+    while grown := {below for above, below in ends.values() if above in found} - found:
+        found |= grown
+    return found
+
+
+def _require(link: str, links: Sequence[str], path: Path) -> None:
+    if link and link in links:
+        return
+    near = difflib.get_close_matches(link, links, n=3)
+    hint = f"perhaps {' or '.join(near)}" if near else f"it has {', '.join(links[:12])}{', ...' if len(links) > 12 else ''}"
+    raise HandError(f"{path} has no link '{link}', at which a hand could begin; {hint}")

@@ -1,15 +1,25 @@
-"""Reduce a MuJoCo specification to the hand alone: one body tree, its couplings as joint equalities, nothing else."""
+"""Reduce a MuJoCo specification to the hand alone: one body tree, its couplings as joint equalities, nothing else.
+
+A linkage, such as that of most parallel grippers, is a tree whose ends are tied together. Its ties are closed here from one
+end of each leader's range to the other, and what the other joints do meanwhile becomes a linear rule. Where the ties leave
+them free, the file's springs decide, as they do while nothing is touched. Ties between tendons, and joints that follow by a
+polynomial, become linear rules in the same way.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import least_squares
 
 from dro_grasp.errors import HandError
-from dro_grasp.hands.description.closed_loops import couple_closed_loops, driven_joints, is_linear
-from dro_grasp.hands.description.compiling import MAX_JOINTS, Note
+from dro_grasp.hands.description.compiling import MAX_JOINTS, Note, compile_hand
 
 NO_LIMITS = "states no limits"  # Beginning of the note of a joint whose limits had to be assumed
 CONTINUOUS_LIMIT = math.pi  # Limits of hinges that state none, both ways from zero [rad] (ours)
@@ -20,9 +30,7 @@ def keep_hand_only(spec: mujoco.MjSpec, path: Path, *, fixed_base: bool = False)
     """Reduce a file, in place, to its largest articulated body tree, with its root at identity.
 
     Everything else that is not the hand is deleted, and unless the base is fixed the joints that move all of the hand, too.
-
-    Raises:
-        HandError: Nothing moves, or a joint is neither a hinge nor a slide.
+    HandError: nothing moves, or a joint is neither a hinge nor a slide.
     """
     notes: list[Note] = []
     hand = _largest_tree(spec, path)
@@ -68,7 +76,6 @@ def _free_wrist(spec: mujoco.MjSpec, hand: mujoco.MjsBody, notes: list[Note]) ->
 
 
 def _largest_tree(spec: mujoco.MjSpec, path: Path) -> mujoco.MjsBody:
-    """The top-level body with the most moving joints below it."""
     roots = list(spec.worldbody.bodies)
     if not roots:
         raise HandError(f"{path} has no body; expected a hand with moving joints")
@@ -170,3 +177,219 @@ def _let_visuals_collide(spec: mujoco.MjSpec, notes: list[Note]) -> None:
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 1
     notes.append(Note("warning", "collision", "the description has no collision geometry; its visual shapes collide"))
+
+
+Joints = Float[np.ndarray, " n"]  # a value of each joint
+CLOSED = 1e-3  # Largest gap of a loop that counts as closed [m or rad] (ours)
+STEPS = 32  # Steps from one end of a leader's range to the other (ours)
+SPRING = 1e-2  # Weight of the strongest spring beside a gap, which counts in units of `CLOSED` (ours)
+STAY = 1e-3  # Weight of staying where a joint was a step before, which decides where nothing else does (ours)
+OFF_CENTRE = 0.1
+"""Share of the way to the middle of the ranges at which freedoms are counted: at their start, some are singular (ours)."""
+STRAIGHT = 0.05  # Largest distance from a linear rule that is no reason for a warning [rad or m] (ours)
+STILL = 1e-3  # Motion over a leader's whole range below which a joint is held [rad or m] (ours)
+MINOR = 0.1  # Share of a joint's motion that other leaders may make without a warning (ours)
+
+
+def driven_joints(spec: mujoco.MjSpec) -> set[str]:
+    """Names of the joints that actuators move, by themselves or through a fixed tendon."""
+    wrapped = {t.name: [w.target.name for w in t.path if w.type == mujoco.mjtWrap.mjWRAP_JOINT and w.target is not None]
+               for t in spec.tendons}
+    driven: set[str] = set()
+    for actuator in spec.actuators:
+        through_tendon = actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON
+        driven.update(wrapped.get(actuator.target, ()) if through_tendon else (actuator.target,))
+    return driven & {joint.name for joint in spec.joints}
+
+
+def couple_closed_loops(spec: mujoco.MjSpec, driven: Collection[str], path: Path, notes: list[Note]) -> None:
+    """Replace, in place, ties of closed loops by joint equalities that driven joints lead; ties that cannot be closed stay."""
+    if not any(e.active and not is_linear(e) for e in spec.equalities):
+        return
+    linkage, ties = Linkage(spec, path), [e for e in spec.equalities if e.active]
+    for group in linkage.groups():
+        leaders = linkage.leaders(group, driven)
+        sweeps = {leader: linkage.sweep(group, leaders, leader) for leader in leaders}
+        if sweeps and all(len(sweep) > 1 for sweep in sweeps.values()):
+            for tie in group.ties:
+                spec.delete(ties[tie])
+            _state(spec, linkage, group, sweeps, notes)
+
+
+def is_linear(equality: mujoco.MjsEquality) -> bool:
+    """Whether a tie is a joint that is held, or follows another by a linear rule."""
+    return equality.type == mujoco.mjtEq.mjEQ_JOINT and bool((np.abs(equality.data[2:5]) < 1e-9).all())
+
+
+@dataclass(frozen=True)
+class Group:
+    """Joints that ties connect."""
+
+    joints: tuple[int, ...]  # their numbers, shallow ones first
+    ties: tuple[int, ...]  # numbers of the ties
+
+
+class Linkage:
+    """A hand with its ties, and the joint values at which they are closed."""
+
+    def __init__(self, spec: mujoco.MjSpec, path: Path) -> None:
+        """Compile a copy of the hand, in which nothing but ties acts."""
+        spec, off = spec.copy(), mujoco.mjtDisableBit
+        for equality in [e for e in spec.equalities if not e.active]:
+            spec.delete(equality)
+        self.ties = list(spec.equalities)
+        self.model = compile_hand(spec, path, [])
+        self.model.eq_solref[:] = 0.02, 1.0  # MuJoCo's own; it prints what it finds wrong with others
+        self.model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+        self.model.opt.disableflags = int(off.mjDSBL_CONTACT | off.mjDSBL_LIMIT | off.mjDSBL_FRICTIONLOSS)
+        self.data = mujoco.MjData(self.model)
+        self.lower, self.upper = self.model.jnt_range.T
+        self.start = self.model.qpos0.clip(self.lower, self.upper)
+        springs = self.model.jnt_stiffness.reshape(self.model.njnt, -1)[:, 0].clip(0)
+        self.springs = SPRING * np.sqrt(springs / max(springs.max(initial=0.0), 1e-12))
+
+    def gaps(self, q: Joints, ties: Sequence[int]) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
+        """Gaps of some ties [m or rad], and their derivatives by the joints."""
+        self.data.qpos[:] = q
+        for step in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_tendon, mujoco.mj_makeConstraint):
+            step(self.model, self.data)
+        n, of_these = self.data.nefc, np.isin(self.data.efc_id, ties)
+        # Gaps that no joint moves are left out, but room for their derivatives may be there.
+        return self.data.efc_pos[of_these], self.data.efc_J.reshape(-1, self.model.nv)[:n][of_these]
+
+    def groups(self) -> list[Group]:
+        """The groups of joints that ties connect, those without any but linear rules left out."""
+        places = (self.start, self._off_centre())
+        jacobians = [np.concatenate([self.gaps(q, [tie])[1] for q in places]) for tie in range(len(self.ties))]
+        moved = [np.abs(jacobian).sum(0) > 1e-9 for jacobian in jacobians]
+        connected = np.eye(self.model.njnt, dtype=bool)
+        for its in moved:
+            connected |= its[:, None] & its
+        for _ in range(self.model.njnt.bit_length()):
+            connected = connected @ connected
+        found = []
+        for its in np.unique(connected, axis=0):
+            joints = sorted(np.flatnonzero(its).tolist(), key=lambda j: (self._depth(j), j))
+            ties = tuple(tie for tie, by in enumerate(moved) if (by & its).any())
+            if any(not is_linear(self.ties[tie]) for tie in ties):
+                found.append(Group(tuple(joints), ties))
+        return found
+
+    def leaders(self, group: Group, driven: Collection[str]) -> list[int]:
+        """The joints of a group that lead: driven ones, then those that neither a tie nor a spring determines."""
+        jacobian = self.gaps(self.close(group, self._off_centre(), {}), group.ties)[1][:, list(group.joints)]
+        following = {self.ties[tie].name1 for tie in group.ties}
+        names = {j: self.model.joint(j).name for j in group.joints}
+        moved = sorted((j for j in group.joints if names[j] in driven), key=lambda j: names[j] in following)
+        sprung = any(self.springs[j] > 0 for j in group.joints)
+        found: list[int] = []
+        for joint in moved if moved and sprung else [*moved, *(j for j in group.joints if j not in moved)]:
+            held = np.array([[float(j == k) for j in group.joints] for k in [*found, joint]])
+            if np.linalg.matrix_rank(np.vstack([jacobian, held]), 1e-4) == np.linalg.matrix_rank(jacobian, 1e-4) + len(held):
+                found.append(joint)
+        return found
+
+    def close(self, group: Group, q: Joints, held: Mapping[int, float]) -> Joints:
+        """The joint values near some at which the loops of a group close and its springs rest, with some joints held."""
+        free = [j for j in group.joints if j not in held and self.upper[j] - self.lower[j] > 1e-9]
+        q = q.copy()
+        q[list(held)] = list(held.values())
+        if not free:
+            return q
+        before, rest = q[free].clip(self.lower[free], self.upper[free]), self.model.qpos_spring[free]
+
+        def full(x: Float[np.ndarray, " k"]) -> Joints:
+            q[free] = x
+            return q
+
+        def errors(x: Float[np.ndarray, " k"]) -> Float[np.ndarray, " e"]:
+            gaps = self.gaps(full(x), group.ties)[0]
+            return np.concatenate([gaps / CLOSED, self.springs[free] * (x - rest), STAY * (x - before)])
+
+        def slopes(x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "e k"]:
+            jacobian = self.gaps(full(x), group.ties)[1][:, free]
+            return np.vstack([jacobian / CLOSED, np.diag(self.springs[free]), STAY * np.eye(len(free))])
+
+        bounds = self.lower[free], self.upper[free]
+        # The stubs know no function as jac.
+        return full(least_squares(errors, before, slopes, bounds, xtol=1e-12, ftol=1e-12).x)  # pyright: ignore[reportArgumentType]
+
+    def sweep(self, group: Group, leaders: Sequence[int], leader: int) -> Float[np.ndarray, "k n"]:
+        """Joint values while one leader goes through its range and the others stay, as far as the loops close."""
+        others = {j: self.start[j] for j in leaders if j != leader}
+        first = self.close(group, self.start, {**others, leader: self.start[leader]})
+        values, ways = np.linspace(self.lower[leader], self.upper[leader], STEPS + 1), []
+        for further in (values[values < self.start[leader]][::-1], values[values >= self.start[leader]]):
+            q, way = first, []
+            for value in further:
+                q = self.close(group, q, {**others, leader: value})
+                if np.abs(self.gaps(q, group.ties)[0]).max() > CLOSED:
+                    break
+                way.append(q)
+            ways.append(way)
+        return np.array([*ways[0][::-1], *ways[1]]).reshape(-1, self.model.njnt)
+
+    def _depth(self, joint: int) -> int:
+        depth, body = 0, int(self.model.jnt_bodyid[joint])
+        while body:
+            depth, body = depth + 1, int(self.model.body_parentid[body])
+        return depth
+
+    def _off_centre(self) -> Joints:
+        return self.start + OFF_CENTRE * ((self.lower + self.upper) / 2 - self.start)
+
+
+@dataclass(frozen=True)
+class Rule:
+    """How far a joint is from its reference value: slope * how far its leader is from its own, + offset."""
+
+    leader: int
+    slope: float
+    offset: float
+    error: float  # largest distance from the rule while the leader goes through its range [rad or m]
+    also: tuple[int, ...]  # other leaders that move the joint
+
+    @classmethod
+    def of(cls, joint: int, sweeps: Mapping[int, Float[np.ndarray, "k n"]], reference: Joints) -> Rule:
+        """The best rule for the leader that moves a joint most, by least squares."""
+        moved = {leader: float(np.ptp(sweep[:, joint])) for leader, sweep in sweeps.items()}
+        leader = max(moved, key=lambda k: moved[k])
+        also = tuple(k for k in moved if k != leader and moved[k] > max(STILL, MINOR * moved[leader]))
+        x, y = (sweeps[leader] - reference)[:, [leader, joint]].T
+        slope, offset = np.polyfit(x, y, 1).round(5).tolist() if moved[leader] > STILL else (0.0, float(y.mean()))
+        return cls(leader, slope, offset, float(np.abs(slope * x + offset - y).max()), also)
+
+    def told(self, names: Sequence[str]) -> str:
+        """The rule in words."""
+        text = f"follows '{names[self.leader]}' {self.slope:.3g} times" if self.slope else "is held"
+        text += ", as its ties make it" + (f", which miss it by up to {self.error:.2g}" if self.error > STRAIGHT else "")
+        return text + "".join(f"; that it also moves with '{names[k]}' is left out" for k in self.also)
+
+
+def _state(
+    spec: mujoco.MjSpec, linkage: Linkage, group: Group, sweeps: Mapping[int, Float[np.ndarray, "k n"]], notes: list[Note]
+) -> None:
+    """Add the rules of a group, and let its joints' ranges be those in which they hold."""
+    names, reference = [linkage.model.joint(j).name for j in range(linkage.model.njnt)], linkage.model.qpos0
+    for leader, sweep in sweeps.items():
+        first, last = sweep[[0, -1], leader]
+        if last - first < linkage.upper[leader] - linkage.lower[leader] - 1e-9:
+            _limit(spec, names[leader], first, last)
+            notes.append(Note("warning", names[leader], f"its ties hold from {first:.3g} to {last:.3g}; now its limits"))
+    for joint in (j for j in group.joints if j not in sweeps):
+        rule = Rule.of(joint, sweeps, reference)
+        tie = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, objtype=mujoco.mjtObj.mjOBJ_JOINT, name1=names[joint],
+                                name2=names[rule.leader] if rule.slope else "")
+        tie.data[:2] = [rule.offset, rule.slope]
+        ends = sweeps[rule.leader][[0, -1], rule.leader] - reference[rule.leader]
+        reached = reference[joint] + rule.offset + rule.slope * ends
+        _limit(spec, names[joint], min(*reached, linkage.lower[joint]), max(*reached, linkage.upper[joint]))
+        level = "warning" if rule.error > STRAIGHT or rule.also else "info"
+        notes.append(Note(level, names[joint], rule.told(names)))
+
+
+def _limit(spec: mujoco.MjSpec, name: str, lower: float, upper: float) -> None:
+    """Limit a joint [rad or m], in the unit of the file."""
+    joint = spec.joint(name)
+    turns = joint.type == mujoco.mjtJoint.mjJNT_HINGE and spec.compiler.degree
+    joint.range = [math.degrees(lower), math.degrees(upper)] if turns else [lower, upper]

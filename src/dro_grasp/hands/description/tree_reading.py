@@ -145,11 +145,7 @@ class Coupling:
 def resolve_couplings(
     couplings: tuple[Coupling, ...], names: Sequence[str], path: Path
 ) -> tuple[list[int], Float[np.ndarray, "n_joints n_dof"], Float[np.ndarray, " n_joints"]]:
-    """Indices of the independent joints, coupling and offset: joints = coupling @ independent joints + offset.
-
-    Raises:
-        HandError: Followers follow each other in a cycle, or absurdly fast, or all joints are held.
-    """
+    """Free joints, coupling and offset: joints = coupling @ free ones + offset; HandError: cycles, none free, absurd speeds."""
     n_joints, rule = len(names), {c.follower: c for c in couplings}
     free = [j for j in range(n_joints) if j not in rule]
     coupling, offset = np.zeros((n_joints, len(free))), np.zeros(n_joints)

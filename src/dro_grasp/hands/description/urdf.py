@@ -23,12 +23,8 @@ MOVING = {"revolute", "continuous", "prismatic"}  # URDF joint types with one de
 def prepare_urdf(root: ET.Element, path: Path, notes: list[Note]) -> tuple[str, list[Path], dict[str, Path]]:
     """Check the link tree, resolve meshes and set MuJoCo's options.
 
-    Returns:
-        XML for MuJoCo, the mesh files in use, and those that MuJoCo cannot read (GLB, DAE, ...) by the names that stand in.
-
-    Raises:
-        HandError: A name is used twice, a number is not one, no joint moves, links form a cycle or several trees, or no mesh
-            is found.
+    Returns XML for MuJoCo, and files as `resolve_meshes` does. HandError: a name is used twice, a number is not one, no joint
+    moves, links form a cycle or several trees, or no mesh is found.
     """
     _check_names(root, path)
     _settle_joints(root, path, notes)
@@ -185,11 +181,8 @@ def _check_mimic(root: ET.Element, notes: list[Note]) -> None:
 def resolve_meshes(root: ET.Element, path: Path, notes: list[Note]) -> tuple[list[Path], dict[str, Path]]:
     """Point every mesh to its file, in place; drop shapes whose mesh cannot be found, if any shape is left.
 
-    Returns:
-        The mesh files in use, and those in formats that MuJoCo cannot read by the names that stand in for them.
-
-    Raises:
-        HandError: No mesh can be found, and there is no other shape.
+    Returns the mesh files in use, and those in formats that MuJoCo cannot read by the names that stand in for them. HandError:
+    no mesh can be found, and there is no other shape.
     """
     files: dict[str, Path] = {}
     missing: list[str] = []
@@ -239,7 +232,6 @@ def as_obj(file: Path) -> bytes:
 
 
 def _collide_with_visuals(link: ET.Element, notes: list[Note]) -> None:
-    """Let a link whose collision meshes are all missing collide with its visual shapes."""
     visuals = link.findall("visual")
     for visual in visuals:
         shape = copy.deepcopy(visual)

@@ -23,11 +23,7 @@ UNUSED = {"composite", "flexcomp", "flex", "hfield", "skin", "plugin"}
 
 
 def parse_xml(path: Path) -> ET.Element:
-    """Parse a description.
-
-    Raises:
-        HandError: The file is missing, is not XML, declares entities, or is larger or deeper than any hand's.
-    """
+    """Parse a description; HandError: it is missing, no XML, declares entities, or is larger or deeper than any hand's."""
     if path.is_dir():
         raise HandError(f"{path} is a folder; give the URDF or MJCF file inside it")
     if not path.is_file():
@@ -54,11 +50,7 @@ def parse_xml(path: Path) -> ET.Element:
 
 
 def included_files(root: ET.Element, path: Path) -> tuple[Path, ...]:
-    """Every file that an MJCF includes, or takes as a model to attach, directly or through others.
-
-    Raises:
-        HandError: A file is missing, or a model contains itself, on which MuJoCo dies.
-    """
+    """Every file that an MJCF includes or attaches, directly or not; HandError: one is missing, or contains itself."""
     found: dict[Path, None] = {}
     waiting: list[tuple[ET.Element, Path, tuple[Path, ...]]] = [(root, path, (path.resolve(),))]
     while waiting:
@@ -79,7 +71,6 @@ def included_files(root: ET.Element, path: Path) -> tuple[Path, ...]:
 
 
 def _check_elements(root: ET.Element, path: Path) -> None:
-    """Refuse a file of too many elements or links, too deep ones, or elements that can grow without limit."""
     waiting, elements, links = [(root, 1, 1.0)], 0, 0.0
     while waiting:
         element, depth, times = waiting.pop()

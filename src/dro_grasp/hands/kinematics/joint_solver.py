@@ -1,7 +1,7 @@
 """Target positions of points on links -> wrist pose and joint values, for many grasps at once.
 
-Each iteration linearises the kinematics and takes the best step of `joint_step`; a step that does not lower the
-objective is undone and damped. The wrist moves by local se(3) increments, so nothing is singular.
+Each iteration linearises the kinematics and takes the best step; a step that does not lower the objective is undone and
+damped. The wrist moves by local se(3) increments, so nothing is singular. Joints can be read off link poses as a first guess.
 
 Layout: residuals are coordinate-major. With t targets, a row of k = 3 t numbers holds x of all targets, then all y,
 then all z. The norm of each target is then a sum of three contiguous chunks, and the Jacobian, stored transposed
@@ -14,6 +14,7 @@ Source: paper section III-D, joint configurations.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -22,21 +23,233 @@ from torch import Tensor
 
 from dro_grasp.devices import Rows
 from dro_grasp.errors import OptionError
-from dro_grasp.geometry.se3 import apply, compose, roma
-from dro_grasp.hands.kinematics.joint_step import StepConfig, best_step, point_norms, smoothed_norms
-from dro_grasp.hands.kinematics.tree import KinematicTree
+from dro_grasp.geometry.se3 import apply, compose, invert, roma, rotate
+from dro_grasp.hands.kinematics.tree import FIXED, REVOLUTE, KinematicTree
 from dro_grasp.kinds import Checked
+
+ROUNDS = 8  # Sweeps of coordinate descent where several joints lie between two known links (ours)
+RIDGE = 1e-6  # Pull towards the given values, for joints that no pose determines [1] (ours)
+
+
+@torch.no_grad()
+def read_joints(
+    tree: KinematicTree, T_world_link: Float[Tensor, "*b n_links 4 4"], valid: Bool[Tensor, " n_links"],
+    q: Float[Tensor, "*b n_dof"],
+) -> Float[Tensor, "*b n_dof"]:
+    """Joints that reproduce the relative poses of neighbouring known links, inside their limits; noise is allowed.
+
+    Each joint between two links of known pose takes the value that brings the lower one closest to its pose. Joints that no
+    pair of links with a `valid` pose encloses keep the values from which the sweeps start, q [rad or m]. Source: ours; the
+    paper starts from the given open hand.
+    """
+    segments = _segments(tree, valid)
+    if not segments:
+        return q
+    known = torch.zeros(len(tree.moving_names), dtype=torch.bool, device=q.device)
+    known[[tree.link_joint[link] for _, _, chain in segments for link in chain]] = True
+    longest = max(len(chain) for _, _, chain in segments)
+    for _ in range(1 if longest == 1 else ROUNDS):
+        for place in range(longest):
+            rows = [(top, bottom, chain[place]) for top, bottom, chain in segments if len(chain) > place]
+            top, bottom, moving = (torch.tensor(column, device=q.device) for column in zip(*rows, strict=True))
+            q = _update(tree, T_world_link, q, known, top, bottom, moving)
+    return q
+
+
+def _segments(tree: KinematicTree, valid: Bool[Tensor, " n_links"]) -> list[tuple[int, int, list[int]]]:
+    """Triples: a known link, the next known link below it, and the moving links between them, topmost first."""
+    found = []
+    for bottom in valid.nonzero()[:, 0].tolist():
+        chain, link = [], bottom
+        while link >= 0 and (link == bottom or not bool(valid[link])):
+            if tree.kind[link] != FIXED:
+                chain.append(link)
+            link = tree.parent[link]
+        if link >= 0 and chain:
+            found.append((link, bottom, chain[::-1]))
+    return found
+
+
+def _update(
+    tree: KinematicTree, target: Float[Tensor, "*b n_links 4 4"], q: Float[Tensor, "*b n_dof"],
+    known: Bool[Tensor, " n_joints"], top: Int[Tensor, " s"], bottom: Int[Tensor, " s"], moving: Int[Tensor, " s"],
+) -> Float[Tensor, "*b n_dof"]:
+    """Set one joint of each segment to its best value and keep the others."""
+    poses = tree.forward(q)
+    parent = torch.tensor(tree.parent, device=q.device)[moving]
+    # T_top_bottom = before @ joint motion @ after: solve for the motion that gives the wanted relative pose.
+    before = invert(poses[..., top, :, :]) @ poses[..., parent, :, :] @ tree.origin[moving]
+    after = invert(poses[..., moving, :, :]) @ poses[..., bottom, :, :]
+    wanted = invert(target[..., top, :, :]) @ target[..., bottom, :, :]
+    motion = invert(before) @ wanted @ invert(after)
+    x = q @ tree.coupling.T + tree.offset
+    joint = torch.tensor(tree.link_joint, device=q.device)[moving]
+    x[..., joint] = _joint_value(tree, motion, moving, x[..., joint])
+    return _independent(tree, x, q, known)
+
+
+def _joint_value(
+    tree: KinematicTree, motion: Float[Tensor, "*b s 4 4"], moving: Int[Tensor, " s"], near: Float[Tensor, "*b s"]
+) -> Float[Tensor, "*b s"]:
+    """Angle about, or shift along, each joint's axis a that comes closest to a motion (R, t)."""
+    # The rotation about a closest to R in the Frobenius norm maximises trace(R(x)^T R), which is sin(x) (a . v) + cos(x) (trace
+    # R - a^T R a) + a^T R a, with v the axial vector of R - R^T.
+    axis = tree.axis[moving]
+    rotation = motion[..., :3, :3]
+    turned = torch.stack([
+        rotation[..., 2, 1] - rotation[..., 1, 2],
+        rotation[..., 0, 2] - rotation[..., 2, 0],
+        rotation[..., 1, 0] - rotation[..., 0, 1],
+    ], -1)
+    trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1)
+    along = (axis * rotate(rotation, axis)).sum(-1)
+    angle = torch.atan2((axis * turned).sum(-1), trace - along)
+    # Angles are equal up to whole turns: take the one nearest to the present value.
+    angle = angle + 2 * math.pi * torch.round((near - angle) / (2 * math.pi))
+    revolute = torch.tensor(tree.kind, device=axis.device)[moving] == REVOLUTE
+    return torch.where(revolute, angle, (axis * motion[..., :3, 3]).sum(-1))
+
+
+def _independent(
+    tree: KinematicTree, x: Float[Tensor, "*b n_joints"], q: Float[Tensor, "*b n_dof"], known: Bool[Tensor, " n_joints"]
+) -> Float[Tensor, "*b n_dof"]:
+    """Independent joints that fit all known joints best; the fit is exact without couplings."""
+    rows = tree.coupling[known]
+    matrix = rows.T @ rows + RIDGE * torch.eye(tree.n_dof, dtype=q.dtype, device=q.device)
+    right = (x - tree.offset)[..., known] @ rows + RIDGE * q
+    fitted = torch.linalg.solve(matrix, right[..., None])[..., 0]
+    return fitted.clamp(tree.lower, tree.upper)
+
+
+@dataclass(frozen=True)
+class StepConfig(Checked):
+    """How precisely one step is solved: a convex problem per grasp, for a whole batch at once. Values are ours.
+
+    Minimise over d the sum of un-squared norms |r_i + J_i d|, with d inside a box. One reweighting of iteratively reweighted
+    least squares (IRLS) handles the norms, an active set the box; each of its passes is one batched Cholesky factorisation.
+
+    A norm |r| has the curvature (I - u u^T) / |r| with u = r / |r|. IRLS takes I / |r| instead: it never overshoots, but it
+    converges slowly near an optimum that misses its targets. `sharpness` s in [0, 1] takes (I - s u u^T) / |r|: 0 is IRLS,
+    1 is Newton's method.
+    """
+
+    active_set_passes: int = 3  # most solves with a corrected active set; they end when the set no longer changes
+    norm_floor: float = 3e-4
+    """Below this, norms are replaced by parabolas [m]: the weights stay finite and the optimum moves by less than this."""
+
+
+@dataclass(frozen=True)
+class _Quadratic(Rows):
+    """d^T H d / 2 + g^T d over the box [lower, upper]."""
+
+    matrix: Float[Tensor, "b p p"]
+    gradient: Float[Tensor, "b p"]
+    lower: Float[Tensor, "b p"]
+    upper: Float[Tensor, "b p"]
+
+
+def best_step(
+    jacobian: Float[Tensor, "b p k"], residual: Float[Tensor, "b k"], lower: Float[Tensor, "b p"], upper: Float[Tensor, "b p"],
+    damping: Float[Tensor, " b"], sharpness: Float[Tensor, " b"] | None = None, config: StepConfig | None = None,
+) -> Float[Tensor, "b p"]:
+    """The step that brings all points closest to their targets, to first order.
+
+    The step is between `lower`, at most 0, and `upper`, at least 0 [rad or m]. `damping` times the identity is added to the
+    normal equations [1/m]; `sharpness` is between IRLS (0, the default) and Newton's method (1).
+    """
+    config = config or StepConfig()
+    matrix, gradient = _model(jacobian, residual, sharpness, config)
+    matrix.diagonal(dim1=-2, dim2=-1).add_(damping[:, None])
+    return _minimum_in_box(_Quadratic(matrix, gradient, lower, upper), config.active_set_passes)
+
+
+def _model(
+    jacobian: Float[Tensor, "b p k"], residual: Float[Tensor, "b k"], sharpness: Float[Tensor, " b"] | None, config: StepConfig
+) -> tuple[Float[Tensor, "b p p"], Float[Tensor, "b p"]]:
+    """Curvature H and slope g of the sum of norms."""
+    # With weights w_i = 1 / |r_i|, IRLS has H = sum w_i J_i^T J_i. The correction -s w_i (J_i^T u_i)(J_i^T u_i)^T is of rank
+    # one per target, so it joins the same matrix product as one more column per target.
+    norms = point_norms(residual)
+    floored = norms.clamp(min=config.norm_floor)
+    scale = floored.reciprocal()
+    weighted, plain = jacobian * scale.repeat(1, 3)[:, None], jacobian
+    gradient = (weighted @ residual[..., None])[..., 0]
+    if sharpness is not None:
+        # Below the floor the function is a parabola, and IRLS has its exact curvature.
+        share = torch.where(norms > config.norm_floor, sharpness[:, None] * scale, 0.0)
+        directions = residual / floored.repeat(1, 3)
+        x, y, z = (jacobian * directions[:, None]).chunk(3, -1)
+        along = x + y + z
+        weighted, plain = torch.cat([weighted, -along * share[:, None]], -1), torch.cat([jacobian, along], -1)
+    return weighted @ plain.mT, gradient
+
+
+def point_norms(residual: Float[Tensor, "*b k"]) -> Float[Tensor, "*b t"]:
+    """Length of each target's residual [m]."""
+    x, y, z = residual.square().chunk(3, -1)
+    return (x + y + z).sqrt()
+
+
+def smoothed_norms(residual: Float[Tensor, "*b k"], floor: float) -> Float[Tensor, "*b t"]:
+    """Norms that IRLS with a floor minimises [m]: a parabola below the floor, joined with equal value and slope."""
+    norms = point_norms(residual)
+    return torch.where(norms > floor, norms, (norms.square() + floor**2) / (2 * floor))
+
+
+def _minimum_in_box(quadratic: _Quadratic, passes: int) -> Float[Tensor, "b p"]:
+    """Minimum of the quadratic in its box, by a primal-dual active set."""
+    # Each unknown is free, held at its lower bound or held at its upper bound. A pass minimises over the free unknowns. Then a
+    # free unknown beyond a bound is held there, and a held unknown is released if the slope pulls it back inside. Most sets
+    # settle in two or three passes; passes after the first one see only the rows whose set has changed.
+    lower, upper, gradient = quadratic.lower, quadratic.upper, quadratic.gradient
+    # Joints that cannot move have equal bounds: they stay at the lower one whatever the slope.
+    frozen = lower >= upper
+    # First guess: a bound already reached, with the steepest descent pointing out of the box.
+    at_lower, at_upper = (lower >= 0) & (gradient > 0) | frozen, (upper <= 0) & (gradient < 0) & ~frozen
+    step, at_lower, at_upper, changed = _pass(quadratic, at_lower, at_upper)
+    for _ in range(passes - 1):
+        rows = changed.nonzero()[:, 0]
+        if len(rows) == 0:
+            break
+        again = _pass(quadratic.rows(rows), at_lower[rows], at_upper[rows])
+        step[rows], at_lower[rows], at_upper[rows], changed[rows] = again
+    return step.clamp(lower, upper)
+
+
+def _pass(
+    quadratic: _Quadratic, at_lower: Bool[Tensor, "b p"], at_upper: Bool[Tensor, "b p"]
+) -> tuple[Float[Tensor, "b p"], Bool[Tensor, "b p"], Bool[Tensor, "b p"], Bool[Tensor, " b"]]:
+    """The minimum for an active set, the next active set, and the rows in which the two differ."""
+    step = _solve_free(quadratic, at_lower, at_upper)
+    slope = (quadratic.matrix @ step[..., None])[..., 0] + quadratic.gradient
+    frozen = quadratic.lower >= quadratic.upper
+    fixed = at_lower | at_upper
+    next_lower = torch.where(fixed, at_lower & (slope > 0), step < quadratic.lower) | frozen
+    next_upper = torch.where(fixed, at_upper & (slope < 0), step > quadratic.upper) & ~frozen
+    changed = ((next_lower != at_lower) | (next_upper != at_upper)).any(-1)
+    return step, next_lower, next_upper, changed
+
+
+def _solve_free(quadratic: _Quadratic, at_lower: Bool[Tensor, "b p"], at_upper: Bool[Tensor, "b p"]) -> Float[Tensor, "b p"]:
+    """Minimum over the free unknowns, with the others at their bounds."""
+    # Rows and columns of held unknowns become those of the identity, so that all problems of the batch keep one size.
+    fixed = at_lower | at_upper
+    value = torch.where(at_lower, quadratic.lower, torch.where(at_upper, quadratic.upper, 0.0))
+    free = (~fixed).to(value.dtype)
+    matrix = quadratic.matrix * free[:, :, None] * free[:, None, :]
+    matrix.diagonal(dim1=-2, dim2=-1).add_(1 - free)
+    right = -(quadratic.gradient + (quadratic.matrix @ value[..., None])[..., 0]) * free
+    factor, _ = torch.linalg.cholesky_ex(matrix)
+    return torch.cholesky_solve(right[..., None], factor)[..., 0] * free + value
 
 
 @dataclass(frozen=True)
 class Targets:
     """World positions for points that are fixed to links."""
 
-    positions: Float[Tensor, "*b t 3"]
-    """Where each point should be [m]."""
+    positions: Float[Tensor, "*b t 3"]  # where each point should be [m]
     links: Int[Tensor, " t"]
-    local: Float[Tensor, "t 3"]
-    """Each point in the frame of its link [m]."""
+    local: Float[Tensor, "t 3"]  # each point in the frame of its link [m]
 
 
 @dataclass(frozen=True)
@@ -46,25 +259,19 @@ class JointSolverConfig(Checked):
     max_iterations: int = 32
     step_limit: float = 0.5
     """Largest change of a joint or of a wrist coordinate per iteration [rad or m]. Source: section III-D."""
-    tolerance: float = 2e-5
-    """A grasp is done when no coordinate changes by more than this [rad or m]."""
+    tolerance: float = 2e-5  # a grasp is done when no coordinate changes by more than this [rad or m]
     objective_tolerance: float = 5e-4
     """A grasp is also done when a step lowers the objective by less than this share, or when two steps in a row fail
     to lower it."""
-    damping: float = 1e-2
-    """Initial damping, in units of the mean IRLS weight times `damping_length` squared."""
-    damping_range: tuple[float, float] = (1e-6, 1e8)
-    """Smallest and largest damping, in the same unit."""
+    damping: float = 1e-2  # initial damping, in units of the mean IRLS weight times `damping_length` squared
+    damping_range: tuple[float, float] = (1e-6, 1e8)  # smallest and largest damping, in the same unit
     damping_length: float = 0.01
     """Lever arm that gives the damping its scale [m]: it makes 1 rad of a joint comparable to so many metres."""
-    damping_decrease: float = 8.0
-    """Divides the damping after a step that lowers the objective (Levenberg-Marquardt)."""
+    damping_decrease: float = 8.0  # divides the damping after a step that lowers the objective (Levenberg-Marquardt)
     damping_increase: float = 16.0
     """Multiplies the damping after a step that does not; larger than the decrease, so that failures do not alternate."""
-    sharpness: float = 0.8
-    """Once steps are small: share of Newton's curvature in place of IRLS's; see joint_step."""
-    sharpen_below: float = 0.1
-    """Steps whose largest coordinate is below this count as small [rad or m]."""
+    sharpness: float = 0.8  # once steps are small: share of Newton's curvature in place of IRLS's; see `StepConfig`
+    sharpen_below: float = 0.1  # steps whose largest coordinate is below this count as small [rad or m]
     step: StepConfig = field(default_factory=StepConfig)
 
 
@@ -73,12 +280,9 @@ class JointSolution:
     """Result of the solver, per grasp."""
 
     T_world_wrist: Float[Tensor, "*b 4 4"]
-    joints: Float[Tensor, "*b n_dof"]
-    """Independent joints, inside their limits [rad or m]."""
-    residual: Float[Tensor, "*b"]
-    """Mean distance of the points from their targets [m]."""
-    converged: Bool[Tensor, "*b"]
-    """Whether steps or gains fell below their tolerances."""
+    joints: Float[Tensor, "*b n_dof"]  # independent joints, inside their limits [rad or m]
+    residual: Float[Tensor, "*b"]  # mean distance of the points from their targets [m]
+    converged: Bool[Tensor, "*b"]  # whether steps or gains fell below their tolerances
     iterations: Int[Tensor, "*b"]
 
 
@@ -92,8 +296,7 @@ class _Problem:
     drive: Float[Tensor, "pairs k"]
     """Change of a pair's joint per unit of its dof where that joint moves the target, else zero; coordinate-major."""
     pair_link: Int[Tensor, " pairs"]
-    pair_dof: Float[Tensor, "n_dof pairs"] | None
-    """Sums pairs into dofs; None if pair i is dof i."""
+    pair_dof: Float[Tensor, "n_dof pairs"] | None  # sums pairs into dofs; None if pair i is dof i
     positions: Float[Tensor, "b t 3"]
     lower: Float[Tensor, "b n_dof"]
     upper: Float[Tensor, "b n_dof"]
@@ -109,11 +312,9 @@ class _State(Rows):
 
     T: Float[Tensor, "b 4 4"]
     q: Float[Tensor, "b n_dof"]
-    residual: Float[Tensor, "b k"]
-    """Points minus targets in the wrist frame, coordinate-major [m]."""
+    residual: Float[Tensor, "b k"]  # points minus targets in the wrist frame, coordinate-major [m]
     jacobian: Float[Tensor, "b p k"]
-    cost: Float[Tensor, " b"]
-    """Sum of smoothed norms [m]."""
+    cost: Float[Tensor, " b"]  # sum of smoothed norms [m]
     damping: Float[Tensor, " b"]
     sharpness: Float[Tensor, " b"]
     stalled: Int[Tensor, " b"]
@@ -125,18 +326,11 @@ def solve_joints(
     tree: KinematicTree, targets: Targets, T_world_wrist: Float[Tensor, "*b 4 4"], q: Float[Tensor, "*b n_dof"],
     movable: Bool[Tensor, " n_dof"] | None = None, config: JointSolverConfig | None = None,
 ) -> JointSolution:
-    """Wrist pose and joints that bring points on links closest to target positions.
+    """Wrist pose and joints, from initial ones, that bring points on links closest to targets; OptionError: there is none.
 
-    Minimises the sum of un-squared distances within the joint limits; couplings hold exactly. Each grasp stops on its own
-    criterion, and its result does not depend on the other grasps in the batch.
-
-    Args:
-        T_world_wrist: Initial pose of the root link.
-        q: Initial independent joints; clamped to the limits [rad or m].
-        movable: False for joints that keep their initial value, inside the limits or not; all move by default.
-
-    Raises:
-        OptionError: There is no target.
+    Minimises the sum of un-squared distances within the joint limits [rad or m]; couplings hold exactly. Each grasp stops on
+    its own criterion, and its result does not depend on the other grasps in the batch. Joints that are not `movable` keep their
+    initial value, inside the limits or not; all move by default.
     """
     config = config or JointSolverConfig()
     if len(targets.links) == 0:
@@ -202,7 +396,6 @@ def _advance(problem: _Problem, state: _State, config: JointSolverConfig) -> tup
 
 
 def _move(state: _State, step: Float[Tensor, "b p"]) -> tuple[Float[Tensor, "b 4 4"], Float[Tensor, "b n_dof"]]:
-    """Apply a step: the wrist moves in its own frame."""
     local = compose(roma.rotvec_to_rotmat(step[:, 3:6]), step[:, :3])
     return state.T @ local, state.q + step[:, 6:]
 
@@ -238,11 +431,9 @@ def _state(problem: _Problem, T: Float[Tensor, "b 4 4"], q: Float[Tensor, "b n_d
 def _jacobian(
     problem: _Problem, poses: Float[Tensor, "b n_links 4 4"], points: Float[Tensor, "b t 3"]
 ) -> Float[Tensor, "b p k"]:
-    """Transposed derivative of the points with respect to wrist shift, wrist rotation and joints.
-
-    A twist (v, w) moves a point p by v + w x p. `twist` holds this map, six rows over all coordinates; it is the wrist's
-    part of the Jacobian, and a joint's row is its own twist times these six rows.
-    """
+    """Transposed derivative of the points with respect to wrist shift, wrist rotation and joints."""
+    # A twist (v, w) moves a point p by v + w x p. `twist` holds this map, six rows over all coordinates; it is the wrist's part
+    # of the Jacobian, and a joint's row is its own twist times these six rows.
     zero, one = torch.zeros_like(points[..., 0]), torch.ones_like(points[..., 0])
     x, y, z = points.unbind(-1)
     # Entry 3 i + c: coordinate c of a point's velocity per unit of twist coordinate i.

@@ -28,30 +28,19 @@ class KinematicTree:
 
     link_names: tuple[str, ...]
     """Names of the n_links links. A body with several joints is split; its extra links are named `name/1`, ..."""
-    joint_names: tuple[str, ...]
-    """Names of the n_dof independent joints, the order of every `q`."""
-    moving_names: tuple[str, ...]
-    """Names of all n_joints moving joints, followers included."""
-    parent: tuple[int, ...]
-    """Index of each link's parent; -1 for the root; always smaller than the link's own index."""
+    joint_names: tuple[str, ...]  # names of the n_dof independent joints, the order of every `q`
+    moving_names: tuple[str, ...]  # names of all n_joints moving joints, followers included
+    parent: tuple[int, ...]  # index of each link's parent; -1 for the root; always smaller than the link's own index
     link_joint: tuple[int, ...]
     """Index into moving_names of the joint above each link, or -1 where the link is fixed to its parent."""
-    kind: tuple[int, ...]
-    """FIXED, REVOLUTE or PRISMATIC, one per link."""
-    origin: Float[Tensor, "n_links 4 4"]
-    """T_parent_link at joint value zero [m]."""
-    axis: Float[Tensor, "n_links 3"]
-    """Unit joint axis in the link frame; zero for fixed links."""
-    anchor: Float[Tensor, "n_links 3"]
-    """A point on a revolute joint's axis, in the link frame [m] (zero in every URDF)."""
-    lower: Float[Tensor, " n_dof"]
-    """Lower limits of the independent joints [rad or m]."""
-    upper: Float[Tensor, " n_dof"]
-    """Upper limits of the independent joints [rad or m]."""
-    coupling: Float[Tensor, "n_joints n_dof"]
-    """All moving joints = coupling @ q + offset."""
-    offset: Float[Tensor, " n_joints"]
-    """See coupling [rad or m]."""
+    kind: tuple[int, ...]  # FIXED, REVOLUTE or PRISMATIC, one per link
+    origin: Float[Tensor, "n_links 4 4"]  # T_parent_link at joint value zero [m]
+    axis: Float[Tensor, "n_links 3"]  # unit joint axis in the link frame; zero for fixed links
+    anchor: Float[Tensor, "n_links 3"]  # a point on a revolute joint's axis, in the link frame [m] (zero in every URDF)
+    lower: Float[Tensor, " n_dof"]  # lower limits of the independent joints [rad or m]
+    upper: Float[Tensor, " n_dof"]  # upper limits of the independent joints [rad or m]
+    coupling: Float[Tensor, "n_joints n_dof"]  # all moving joints = coupling @ q + offset
+    offset: Float[Tensor, " n_joints"]  # see coupling [rad or m]
 
     def __repr__(self) -> str:
         return f"KinematicTree({self.n_links} links from '{self.link_names[0]}', {self.n_dof} independent joints)"
@@ -117,11 +106,9 @@ class KinematicTree:
 
     @cached_tensor
     def _local_basis(self) -> Float[Tensor, "4 n_links 4 4"]:
-        """Four constant matrices B_k per link: T_parent_link = B_0 + sin(x) B_1 + (1 - cos(x)) B_2 + x B_3.
-
-        For an axis a through the anchor c, Rodrigues' formula is R = I + sin(x) K + (1 - cos(x)) K^2, K = [a]_x, and the
-        motion is p -> R (p - c) + c: K c and K^2 c move into the translation. A slide is x a.
-        """
+        """Four constant matrices B_k per link: T_parent_link = B_0 + sin(x) B_1 + (1 - cos(x)) B_2 + x B_3."""
+        # For an axis a through the anchor c, Rodrigues' formula is R = I + sin(x) K + (1 - cos(x)) K^2, K = [a]_x, and the
+        # motion is p -> R (p - c) + c: K c and K^2 c move into the translation. A slide is x a.
         turns = self._revolute[:, None]
         slides = torch.tensor(self.kind, device=self.axis.device)[:, None] == PRISMATIC
         k = _skew(self.axis * turns)

@@ -26,13 +26,11 @@ POINTS = 1024  # Points of the paper's half of a cloud (twice the network's 512 
 
 
 def partial_view(obj: ObjectModel, view: View, seed: int, camera: DepthCamera | None = None) -> ObjectModel:
-    """The object in a view: itself, or a bare cloud in its frame with the unseen side completed.
+    """An object with a mesh in a view: itself, or a bare cloud in its frame with the unseen side completed.
 
-    Args:
-        obj: An object with a mesh.
-        view: `whole` is the object itself. `cloud` keeps all points and normals and completes nothing. `half` keeps the
-            half of the points farthest along a random direction, as in the paper's appendix, without a camera. `depth` is
-            one noisy depth image from a random direction.
+    `whole` is the object itself. `cloud` keeps all points and normals and completes nothing. `half` keeps the half of the
+    points farthest along a random direction, as in the paper's appendix, without a camera. `depth` is one noisy depth image
+    from a random direction.
     """
     if view == "whole":
         return obj
@@ -158,11 +156,9 @@ def _depth_of_mesh(
 def _depth_of_cloud(
     obj: ObjectModel, T_object_camera: Float[np.ndarray, "4 4"], radius: float, camera: DepthCamera
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    """Like `_depth_of_mesh`, for the points that no others hide. Source: Katz, Tal and Basri 2007.
-
-    Reflect every point in a sphere about the camera: it is visible exactly if its image lies on the convex hull of all images
-    and the camera.
-    """
+    """Like `_depth_of_mesh`, for the points that no others hide. Source: Katz, Tal and Basri 2007."""
+    # Reflect every point in a sphere about the camera: it is visible exactly if its image lies on the convex hull of all images
+    # and the camera.
     local = (obj.cloud.astype(np.float64) - T_object_camera[:3, 3]) @ T_object_camera[:3, :3]
     away = np.linalg.norm(local, axis=1, keepdims=True)
     radius = 300.0 * away.max()  # (ours): a larger sphere sees more, a smaller one hides more

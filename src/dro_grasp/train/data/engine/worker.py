@@ -24,9 +24,8 @@ from dro_grasp.objects.shape import ObjectModel
 from dro_grasp.optimize.fingers import close_idle_fingers
 from dro_grasp.optimize.grasp_energy import EnergyConfig, GraspEnergy
 from dro_grasp.optimize.synthesis import SynthesisConfig, synthesize
-from dro_grasp.simulation.closed_poses import hand_shift, settle
 from dro_grasp.simulation.protocols import Protocol
-from dro_grasp.simulation.trial import simulate
+from dro_grasp.simulation.trial import hand_shift, settle, simulate
 from dro_grasp.train.data.bundle.training_file import split_of
 from dro_grasp.train.data.engine.shards import Shard, Yield, notes_of
 
